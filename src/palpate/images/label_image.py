@@ -1,0 +1,73 @@
+"""A label image: integers on a voxel grid with its place in the world (RAS mm)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import InputDataError
+
+__all__ = ["LabelImage", "VoxelGrid"]
+
+
+@dataclass(frozen=True, slots=True)
+class VoxelGrid:
+    """A voxel grid: `shape` (3,) counts; `affine` (4, 4) voxel index -> RAS mm; voxel centres are at integers."""
+
+    shape: tuple[int, int, int]
+    affine: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        affine = np.array(self.affine, dtype=np.float64)
+        if (
+            affine.shape != (4, 4)
+            or not np.isfinite(affine).all()
+            or abs(np.linalg.det(affine[:3, :3])) < 1e-12
+        ):
+            raise InputDataError(
+                f"the affine {affine.tolist()} does not place a voxel grid in the world: it must be a finite,"
+                " invertible 4 x 4 matrix; repair the image's header (sform or qform)"
+            )
+        affine.setflags(write=False)
+        object.__setattr__(self, "affine", affine)
+
+    @property
+    def spacing(self) -> NDArray[np.float64]:
+        """Distance between neighbouring voxel centres along each axis, (3,) mm."""
+        return np.asarray(np.linalg.norm(self.affine[:3, :3], axis=0))
+
+    @property
+    def voxel_volume(self) -> float:
+        """Volume of a voxel, mm^3."""
+        return float(abs(np.linalg.det(self.affine[:3, :3])))
+
+    def world(self, index: NDArray[np.float64]) -> NDArray[np.float64]:
+        """RAS mm (n, 3) of voxel indices (n, 3), which need not be integers."""
+        return np.asarray(index @ self.affine[:3, :3].T + self.affine[:3, 3])
+
+    def index(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Voxel indices (n, 3), not rounded, of points (n, 3) in RAS mm."""
+        inverse = np.linalg.inv(self.affine)
+        return np.asarray(points @ inverse[:3, :3].T + inverse[:3, 3])
+
+
+@dataclass(frozen=True, slots=True)
+class LabelImage:
+    """Labels (nx, ny, nz) int on `grid`, with `names`: label -> name where a table gave one."""
+
+    labels: NDArray[np.int32]
+    grid: VoxelGrid
+    names: Mapping[int, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        labels = np.array(self.labels, dtype=np.int32)
+        if labels.shape != self.grid.shape:
+            raise InputDataError(
+                f"labels have the shape {labels.shape}, their grid {self.grid.shape}: they must agree"
+            )
+        labels.setflags(write=False)
+        object.__setattr__(self, "labels", labels)
+        object.__setattr__(self, "names", dict(self.names))

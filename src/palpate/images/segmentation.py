@@ -1,0 +1,71 @@
+"""A segmentation: every voxel belongs to one tissue of the case."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import ConfigurationError, InputDataError
+from palpate.images.label_image import LabelImage, VoxelGrid
+from palpate.images.tissue import Tissue
+
+__all__ = ["Segmentation", "segment"]
+
+
+@dataclass(frozen=True, slots=True)
+class Segmentation:
+    """`index` (nx, ny, nz) int16: which of `tissues` a voxel of `grid` belongs to."""
+
+    index: NDArray[np.int16]
+    grid: VoxelGrid
+    tissues: tuple[Tissue, ...]
+
+    def __post_init__(self) -> None:
+        index = np.array(self.index, dtype=np.int16)
+        index.setflags(write=False)
+        object.__setattr__(self, "index", index)
+
+    def mask(self, tissue: int) -> NDArray[np.bool_]:
+        """Which voxels (nx, ny, nz) belong to the tissue of that index."""
+        return np.asarray(self.index == tissue)
+
+    def volume(self, tissue: int) -> float:
+        """Volume of the tissue by counting voxels, mm^3."""
+        return float(np.count_nonzero(self.index == tissue)) * self.grid.voxel_volume
+
+
+def segment(image: LabelImage, tissues: tuple[Tissue, ...]) -> Segmentation:
+    """Give every voxel of `image` to its tissue.
+
+    Raises `ConfigurationError` when two tissues claim one label or two are "remaining", `InputDataError` when a
+    voxel's label belongs to no tissue or a tissue has no voxel.
+    """
+    owner = _owners(tissues)
+    rest = [i for i, tissue in enumerate(tissues) if not tissue.labels]
+    if len(rest) > 1:
+        raise ConfigurationError(
+            f"tissues {[tissues[i].name for i in rest]} are both 'remaining'; only one can be"
+        )
+    labels, inverse = np.unique(image.labels, return_inverse=True)
+    orphans = [int(label) for label in labels if int(label) not in owner]
+    if orphans and not rest:
+        raise InputDataError(
+            f"labels {orphans[:10]} belong to no tissue; name them in a tissue, or give one tissue label = 'remaining'"
+        )
+    table = np.array([owner.get(int(label), rest[0] if rest else -1) for label in labels], dtype=np.int16)
+    return Segmentation(table[inverse].reshape(image.labels.shape), image.grid, tissues)
+
+
+def _owners(tissues: tuple[Tissue, ...]) -> dict[int, int]:
+    owner: dict[int, int] = {}
+    for i, tissue in enumerate(tissues):
+        for label in tissue.labels:
+            if label in owner:
+                raise ConfigurationError(
+                    f"label {label} is claimed by '{tissues[owner[label]].name}' and by '{tissue.name}';"
+                    " a voxel can belong to one tissue only"
+                )
+            owner[label] = i
+    return owner

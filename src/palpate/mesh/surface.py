@@ -1,0 +1,83 @@
+"""The surface of one tissue in a mesh, with what lies on its other side."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.mesh.tet_mesh import FACES, TetMesh
+
+__all__ = ["Surface", "tissue_surface", "triangle_normals"]
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """Closed surface of a tissue (open where a hollow tissue leaves the domain).
+
+    triangles (n_faces, 3) node numbers of the mesh, normals pointing out of the tissue;
+    other (n_faces,) index of the tissue on the other side, or OUTER.
+    """
+
+    triangles: NDArray[np.int64]
+    other: NDArray[np.int64]
+
+    @property
+    def nodes(self) -> NDArray[np.int64]:
+        """Sorted numbers (n_surface_nodes,) of the mesh nodes on the surface."""
+        return np.asarray(np.unique(self.triangles))
+
+    def where(self, keep: NDArray[np.bool_]) -> Surface:
+        """The part of the surface whose faces are marked in `keep` (n_faces,)."""
+        return Surface(self.triangles[keep], self.other[keep])
+
+
+def tissue_surface(mesh: TetMesh, tissue: int) -> Surface:
+    """Surface of a tissue, meshed or hollow, by its index in `mesh.tissues`."""
+    if not mesh.tissues[tissue].meshed:
+        keep = mesh.beyond == tissue
+        flipped = mesh.boundary[keep][:, ::-1]
+        return Surface(flipped, _region_behind(mesh, mesh.boundary[keep]))
+    inside = mesh.tets[mesh.region == tissue][:, FACES].reshape(-1, 3)
+    rest = mesh.tets[mesh.region != tissue][:, FACES].reshape(-1, 3)
+    regions = np.repeat(mesh.region[mesh.region != tissue], 4)
+    keys, place, count = np.unique(_keys(inside, mesh), return_index=True, return_counts=True)
+    single = place[count == 1]
+    triangles = inside[single]
+    other = _look_up(keys[count == 1], _keys(rest, mesh), regions)
+    on_boundary = _look_up(keys[count == 1], _keys(mesh.boundary, mesh), mesh.beyond)
+    return Surface(triangles, np.where(other == MISSING, on_boundary, other))
+
+
+def triangle_normals(points: NDArray[np.float64], triangles: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Normals (n_faces, 3) of triangles with the length of their area, mm^2; points (n_nodes, 3) mm."""
+    corner = points[triangles]
+    return np.asarray(0.5 * np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
+
+
+MISSING = -9
+
+
+def _keys(triangles: NDArray[np.int64], mesh: TetMesh) -> NDArray[np.int64]:
+    """One number a triangle, whatever the order of its corners."""
+    ordered = np.sort(triangles, axis=1)
+    n = len(mesh.nodes)
+    return np.asarray((ordered[:, 0] * n + ordered[:, 1]) * n + ordered[:, 2])
+
+
+def _look_up(
+    keys: NDArray[np.int64], table: NDArray[np.int64], values: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Value of each key in the table, MISSING where it is not there."""
+    if len(table) == 0:
+        return np.full(len(keys), MISSING)
+    order = np.argsort(table)
+    place = np.clip(np.searchsorted(table, keys, sorter=order), 0, len(table) - 1)
+    found = table[order[place]] == keys
+    return np.asarray(np.where(found, values[order[place]], MISSING))
+
+
+def _region_behind(mesh: TetMesh, triangles: NDArray[np.int64]) -> NDArray[np.int64]:
+    faces = mesh.tets[:, FACES].reshape(-1, 3)
+    return _look_up(_keys(triangles, mesh), _keys(faces, mesh), np.repeat(mesh.region, 4))

@@ -1,0 +1,63 @@
+"""Tetrahedra of several tissues that share their faces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import GeometryError
+from palpate.images.tissue import Tissue
+
+__all__ = ["FACES", "OUTER", "TetMesh"]
+
+OUTER = -1  # what lies beyond the domain's own border: the cut of the image
+FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])  # faces of a tetrahedron, seen from outside
+
+
+@dataclass(frozen=True, slots=True)
+class TetMesh:
+    """A conforming mesh of the meshed tissues.
+
+    nodes (n_nodes, 3) RAS mm; tets (n_tets, 4) node numbers, positive volume; region (n_tets,) index into `tissues`;
+    boundary (n_boundary, 3) the mesh's outer faces, normals pointing out of the mesh; beyond (n_boundary,) the hollow
+    tissue behind each of them (index into `tissues`) or OUTER where the image is cut.
+    """
+
+    nodes: NDArray[np.float64]
+    tets: NDArray[np.int64]
+    region: NDArray[np.int64]
+    boundary: NDArray[np.int64]
+    beyond: NDArray[np.int64]
+    tissues: tuple[Tissue, ...]
+
+    def __post_init__(self) -> None:
+        for name, dtype in (
+            ("nodes", float),
+            ("tets", int),
+            ("region", int),
+            ("boundary", int),
+            ("beyond", int),
+        ):
+            array = np.array(getattr(self, name), dtype=dtype)
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        if len(self.region) != len(self.tets) or len(self.beyond) != len(self.boundary):
+            raise GeometryError(
+                f"{len(self.tets)} tetrahedra with {len(self.region)} regions and {len(self.boundary)} boundary faces"
+                f" with {len(self.beyond)} neighbours: give one region a tetrahedron and one neighbour a face"
+            )
+
+    @property
+    def volumes(self) -> NDArray[np.float64]:
+        """Signed volumes of the tetrahedra, (n_tets,) mm^3."""
+        corner = self.nodes[self.tets]
+        return np.asarray(np.linalg.det(corner[:, 1:] - corner[:, :1]) / 6.0)
+
+    def tissue_index(self, name: str) -> int:
+        """Index of the tissue of that name in `tissues`; raises `GeometryError` when there is none."""
+        names = [tissue.name for tissue in self.tissues]
+        if name not in names:
+            raise GeometryError(f"the mesh has no tissue '{name}'; it has {names}")
+        return names.index(name)
