@@ -34,9 +34,7 @@ class DistanceMap:
     def gradient_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Gradient (n, 3), mm per mm, of the interpolated map at points (n, 3) in RAS mm."""
         index = self._inside(self.grid.index(points))
-        by_index = np.stack(
-            [_spline(self.coefficients, index, tuple(np.eye(3, dtype=int)[a])) for a in range(3)], 1
-        )
+        by_index = np.stack([_spline(self.coefficients, index, tuple(np.eye(3, dtype=int)[a])) for a in range(3)], 1)
         return np.asarray(by_index @ np.linalg.inv(self.grid.affine[:3, :3]))
 
     def shifted(self, bias: float) -> DistanceMap:
@@ -87,9 +85,7 @@ def _spline(
     """Value or first derivative of the cubic B-spline at voxel indices (n, 3); mirror beyond the border."""
     base = np.floor(index).astype(np.int64)
     fraction = index - base
-    weights = [
-        _slope_weights(fraction[:, a]) if derivative[a] else _value_weights(fraction[:, a]) for a in range(3)
-    ]
+    weights = [_slope_weights(fraction[:, a]) if derivative[a] else _value_weights(fraction[:, a]) for a in range(3)]
     places = [_mirror(base[:, a, None] + np.arange(-1, 3), coefficients.shape[a]) for a in range(3)]
     total = np.zeros(len(index))
     for i in range(4):

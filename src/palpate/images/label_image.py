@@ -22,11 +22,7 @@ class VoxelGrid:
 
     def __post_init__(self) -> None:
         affine = np.array(self.affine, dtype=np.float64)
-        if (
-            affine.shape != (4, 4)
-            or not np.isfinite(affine).all()
-            or abs(np.linalg.det(affine[:3, :3])) < 1e-12
-        ):
+        if affine.shape != (4, 4) or not np.isfinite(affine).all() or abs(np.linalg.det(affine[:3, :3])) < 1e-12:
             raise InputDataError(
                 f"the affine {affine.tolist()} does not place a voxel grid in the world: it must be a finite,"
                 " invertible 4 x 4 matrix; repair the image's header (sform or qform)"
@@ -65,9 +61,7 @@ class LabelImage:
     def __post_init__(self) -> None:
         labels = np.array(self.labels, dtype=np.int32)
         if labels.shape != self.grid.shape:
-            raise InputDataError(
-                f"labels have the shape {labels.shape}, their grid {self.grid.shape}: they must agree"
-            )
+            raise InputDataError(f"labels have the shape {labels.shape}, their grid {self.grid.shape}: they must agree")
         labels.setflags(write=False)
         object.__setattr__(self, "labels", labels)
         object.__setattr__(self, "names", dict(self.names))

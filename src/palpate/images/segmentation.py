@@ -45,9 +45,7 @@ def segment(image: LabelImage, tissues: tuple[Tissue, ...]) -> Segmentation:
     owner = _owners(tissues)
     rest = [i for i, tissue in enumerate(tissues) if not tissue.labels]
     if len(rest) > 1:
-        raise ConfigurationError(
-            f"tissues {[tissues[i].name for i in rest]} are both 'remaining'; only one can be"
-        )
+        raise ConfigurationError(f"tissues {[tissues[i].name for i in rest]} are both 'remaining'; only one can be")
     labels, inverse = np.unique(image.labels, return_inverse=True)
     orphans = [int(label) for label in labels if int(label) not in owner]
     if orphans and not rest:

@@ -66,9 +66,7 @@ def _keys(triangles: NDArray[np.int64], mesh: TetMesh) -> NDArray[np.int64]:
     return np.asarray((ordered[:, 0] * n + ordered[:, 1]) * n + ordered[:, 2])
 
 
-def _look_up(
-    keys: NDArray[np.int64], table: NDArray[np.int64], values: NDArray[np.int64]
-) -> NDArray[np.int64]:
+def _look_up(keys: NDArray[np.int64], table: NDArray[np.int64], values: NDArray[np.int64]) -> NDArray[np.int64]:
     """Value of each key in the table, MISSING where it is not there."""
     if len(table) == 0:
         return np.full(len(keys), MISSING)

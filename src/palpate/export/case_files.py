@@ -1,0 +1,126 @@
+"""The files of an estimate and of a simulation that other programs read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.export.rasterise import region_image
+from palpate.export.vtk_xml import write_pvd, write_vtp, write_vtu
+from palpate.images.readers import write_label_image, write_scalar_image
+from palpate.images.tissue import Tissue
+from palpate.mesh.space import LagrangeSpace
+from palpate.mesh.surface import tissue_surface
+from palpate.mesh.tet_mesh import TetMesh
+from palpate.study.outputs import make_folder
+from palpate.study.result import CaseResult, MeshResult, Simulation
+
+__all__ = ["file_name", "write_estimate_files", "write_mesh_files", "write_simulation_files"]
+
+
+def write_estimate_files(result: CaseResult, folder: Path) -> tuple[Path, ...]:
+    """Write mesh.vtu (displacement of the last image) and stiffness.nii.gz (`result.unit`) to `folder`.
+
+    Returns the paths written; raises `ResourceError` when the disk refuses.
+    """
+    make_folder(folder)
+    mesh, space = result.space.mesh, result.space
+    paths = (folder / "mesh.vtu", folder / "stiffness.nii.gz")
+    kilopascals = result.stiffness if result.unit == "kPa" else np.full(len(mesh.tissues), np.nan)
+    extra = {} if result.unit == "kPa" else {"youngs_modulus_ratio": result.stiffness[mesh.region]}
+    displacements = result.estimation.displacements
+    last = displacements[-1] if displacements else np.zeros_like(space.points)
+    write_vtu(paths[0], space, point_data={"displacement_mm": last}, cell_data=_cell_data(mesh, kilopascals) | extra)
+    write_scalar_image(paths[1], _stiffness_image(result), result.before.grid)
+    return paths
+
+
+def write_mesh_files(result: MeshResult, folder: Path) -> tuple[Path, ...]:
+    """Write mesh.vtu (moduli: NaN where the case gives none) and a surface of each tissue to `folder`; as above."""
+    make_folder(folder)
+    mesh, space = result.space.mesh, result.space
+    given = np.array([tissue.youngs_modulus_kpa or np.nan for tissue in mesh.tissues])
+    path = folder / "mesh.vtu"
+    still = np.zeros_like(space.points)
+    write_vtu(path, space, point_data={"displacement_mm": still}, cell_data=_cell_data(mesh, given))
+    return (path, *_write_surfaces(space, still, folder / "surfaces", ending="before"))
+
+
+def write_simulation_files(result: Simulation, folder: Path) -> tuple[Path, ...]:
+    """Write both label images, mesh.vtu, surfaces before and after, and mesh.pvd for several steps; as above."""
+    make_folder(folder)
+    images = (folder / "before.nii.gz", folder / "after.nii.gz")
+    write_label_image(images[0], result.before)
+    write_label_image(images[1], result.after)
+    space, last = result.space, result.displacements[-1]
+    moduli = np.array([result.moduli_kpa.get(tissue.name, np.nan) for tissue in space.mesh.tissues])
+    cells = _cell_data(space.mesh, moduli)
+    write_vtu(folder / "mesh.vtu", space, point_data={"displacement_mm": last}, cell_data=cells)
+    surfaces = folder / "surfaces"
+    return (
+        *images,
+        folder / "mesh.vtu",
+        *_write_surfaces(space, np.zeros_like(last), surfaces, ending="before"),
+        *_write_surfaces(space, last, surfaces, ending="after"),
+        *_write_series(result, cells, folder),
+    )
+
+
+def file_name(name: str) -> str:
+    """A tissue's name as a part of a file name: letters, digits, hyphen and underscore only."""
+    plain = "".join(letter if letter.isalnum() or letter in "-_" else "_" for letter in name)
+    return plain[:60] or "tissue"
+
+
+def _write_series(result: Simulation, cells: Mapping[str, NDArray[Any]], folder: Path) -> tuple[Path, ...]:
+    if len(result.displacements) < 2:
+        return ()
+    steps = make_folder(folder / "steps")
+    still = np.zeros_like(result.displacements[0])
+    paths = []
+    for number, displacement in enumerate((still, *result.displacements)):
+        paths.append(steps / f"step_{number:03d}.vtu")
+        write_vtu(paths[-1], result.space, point_data={"displacement_mm": displacement}, cell_data=cells)
+    times = np.linspace(0.0, 1.0, len(paths))
+    write_pvd(folder / "mesh.pvd", [(float(t), f"steps/{path.name}") for t, path in zip(times, paths, strict=True)])
+    return (folder / "mesh.pvd", *paths)
+
+
+def _write_surfaces(
+    space: LagrangeSpace, displacement: NDArray[np.float64], folder: Path, *, ending: str
+) -> tuple[Path, ...]:
+    make_folder(folder)
+    mesh = space.mesh
+    moved = mesh.nodes + displacement[: len(mesh.nodes)]
+    paths = []
+    for number, tissue in enumerate(mesh.tissues):
+        triangles = tissue_surface(mesh, number).triangles
+        if len(triangles):
+            paths.append(folder / f"{number:02d}_{file_name(tissue.name)}_{ending}.vtp")
+            write_vtp(paths[-1], moved, triangles)
+    return tuple(paths)
+
+
+def _cell_data(mesh: TetMesh, moduli: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
+    poisson = np.array([tissue.poisson_ratio for tissue in mesh.tissues])
+    return {
+        "label": _labels(mesh.tissues)[mesh.region],
+        "youngs_modulus_kpa": moduli[mesh.region],
+        "poisson_ratio": poisson[mesh.region],
+    }
+
+
+def _labels(tissues: tuple[Tissue, ...]) -> NDArray[np.int32]:
+    """First label of each tissue (n_tissues,); the remaining tissue gets the smallest number that no other claims."""
+    claimed = {label for tissue in tissues for label in tissue.labels}
+    free = next(number for number in range(len(claimed) + 1) if number not in claimed)
+    return np.array([min(tissue.labels, default=free) for tissue in tissues], dtype=np.int32)
+
+
+def _stiffness_image(result: CaseResult) -> NDArray[np.float64]:
+    region = region_image(result.space.mesh, result.before.grid)
+    return np.asarray(np.append(result.stiffness, np.nan)[region])  # region -1 takes the last entry, NaN

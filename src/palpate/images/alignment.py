@@ -1,0 +1,385 @@
+"""Rigid motion between two images, measured on the surfaces of rigid tissues; images are moved by their affine only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+
+from palpate.errors import InputDataError
+from palpate.images.distance import DistanceMap, distance_map, smoothing_width
+from palpate.images.label_image import VoxelGrid
+from palpate.images.segmentation import Segmentation
+from palpate.images.tissue import Role
+
+__all__ = [
+    "Alignment",
+    "RigidFit",
+    "RigidMotion",
+    "SurfacePoints",
+    "align",
+    "fit_rigid_motion",
+    "measure_rigid_motion",
+    "moved",
+    "surface_points",
+]
+
+BORDER_VOXELS = 3.0  # nearer to the image's border the map continues what it cannot see
+MAX_POINTS = 20_000
+MIN_POINTS = 30
+MAX_STEPS = 50
+STEP_TOLERANCE_MM = 1e-5
+TUKEY = 4.685  # 95 % efficiency for Gaussian residuals
+EXTRA_SMOOTHING = 0.8  # voxels; a rigid surface keeps its shape, so a wide Gaussian takes its stairs and biases nothing
+UNDETERMINED = 4e-3  # (lever / radius)^2 of a turn; the stairs left on a ball give 2e-3 at any radius
+
+
+@dataclass(frozen=True, slots=True)
+class RigidMotion:
+    """x -> rotation x + translation in RAS mm: rotation (3, 3) orthogonal with determinant 1, translation (3,) mm."""
+
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        for name, shape in (("rotation", (3, 3)), ("translation", (3,))):
+            array = np.array(getattr(self, name), dtype=np.float64).reshape(shape)
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        if not np.allclose(self.rotation.T @ self.rotation, np.eye(3), atol=1e-6) or np.linalg.det(self.rotation) < 0.0:
+            raise InputDataError(
+                f"{self.rotation.tolist()} is no rotation: its columns must be a right-handed unit frame"
+            )
+
+    @classmethod
+    def identity(cls) -> RigidMotion:
+        """The motion that leaves every point where it is."""
+        return cls(np.eye(3), np.zeros(3))
+
+    @property
+    def angle_deg(self) -> float:
+        """Angle of the rotation about its axis, degrees, 0 to 180."""
+        return float(np.rad2deg(Rotation.from_matrix(self.rotation).magnitude()))
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """The motion as a matrix (4, 4) on homogeneous coordinates, mm."""
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = self.rotation, self.translation
+        return matrix
+
+    def apply(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points (n, 3) RAS mm after the motion."""
+        return np.asarray(points @ self.rotation.T + self.translation)
+
+    def inverse(self) -> RigidMotion:
+        """The motion back."""
+        return RigidMotion(self.rotation.T, -self.rotation.T @ self.translation)
+
+    def compose(self, first: RigidMotion) -> RigidMotion:
+        """The motion that applies `first` and then this one."""
+        return RigidMotion(self.rotation @ first.rotation, self.rotation @ first.translation + self.translation)
+
+
+@dataclass(frozen=True, slots=True)
+class SurfacePoints:
+    """Points (n, 3) RAS mm on a surface and the area (n,) mm^2 that each stands for."""
+
+    points: NDArray[np.float64]
+    areas: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class RigidFit:
+    """A measured motion with what it rests on.
+
+    rms_mm: robust root mean square of the remaining distance; n_points: surface points that took part;
+    undetermined (k, 3): unit axes about which the surface does not show a rotation, so that none was given to it.
+    """
+
+    motion: RigidMotion
+    rms_mm: float
+    n_points: int
+    undetermined: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """Motion before -> after: `overall` of all rigid tissues as one body, `tissues` of each by its name."""
+
+    overall: RigidFit
+    tissues: Mapping[str, RigidFit]
+
+    def remaining(self, tissue: str) -> RigidMotion:
+        """The tissue's own motion once the after image has been moved by `overall.motion.inverse()`."""
+        return self.overall.motion.inverse().compose(self.tissues[tissue].motion)
+
+
+@dataclass(frozen=True, slots=True)
+class _Match:
+    """Surface points of the before image with their rest distance (n,) mm, and the after map they are laid on."""
+
+    surface: SurfacePoints
+    rest: NDArray[np.float64]
+    after: DistanceMap
+
+
+@dataclass(frozen=True, slots=True)
+class _State:
+    """A trial motion: residuals (n,) mm, their derivative (n, 6) by turn (rad) and shift (mm), areas (n,) mm^2."""
+
+    motion: RigidMotion
+    residual: NDArray[np.float64]
+    jacobian: NDArray[np.float64]
+    areas: NDArray[np.float64]
+    centre: NDArray[np.float64]
+    radius: float
+
+
+def surface_points(surface: DistanceMap, *, border_voxels: float = BORDER_VOXELS) -> SurfacePoints:
+    """Where the zero level of a distance map crosses the edges between neighbouring voxel centres.
+
+    Crossings are found by linear interpolation. A surface with the unit normal n has sum_a |n_a| / (h_b h_c) crossings
+    per area, h the voxel edges; the inverse is the area that a point stands for. Points nearer than `border_voxels` to
+    the image's border are left out.
+    """
+    values = _node_values(surface)
+    found = [_crossings(values, axis) for axis in range(3)]
+    index = np.concatenate(found)
+    last = np.array(values.shape) - 1.0
+    index = index[((index >= border_voxels) & (index <= last - border_voxels)).all(axis=1)]
+    points = surface.grid.world(index)
+    axes = surface.grid.affine[:3, :3] / surface.grid.spacing
+    normals = np.abs(surface.gradient_at(points) @ axes)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    density = normals @ (surface.grid.spacing / surface.grid.voxel_volume)
+    return SurfacePoints(points, 1.0 / np.maximum(density, 1e-12))
+
+
+def measure_rigid_motion(before: DistanceMap, after: DistanceMap) -> RigidMotion:
+    """Motion of one rigid tissue from its distance map in the before image to that in the after image.
+
+    Raises `InputDataError` when either image shows too little of its surface. See `fit_rigid_motion`.
+    """
+    return fit_rigid_motion([(before, after)]).motion
+
+
+def fit_rigid_motion(pairs: Sequence[tuple[DistanceMap, DistanceMap]]) -> RigidFit:
+    """One motion for several surfaces, each given by its (before, after) distance maps.
+
+    Minimises sum_i a_i rho(phi_after(R x_i + t) - phi_before(x_i)) over surface points x_i of area a_i, rho Tukey's, by
+    Gauss-Newton from the centroids; from the principal axes too when the first start ends badly. Turns that the
+    surfaces do not show (a ball's) are left at zero. Raises `InputDataError` when too few points lie in both images.
+    """
+    voxel = max(float(surface.grid.spacing.max()) for pair in pairs for surface in pair)
+    smooth = [(_smoothed(before, voxel), _smoothed(after, voxel)) for before, after in pairs]
+    matches = [_match(before, after) for before, after in smooth]
+    target = [surface_points(after) for _, after in smooth]
+    _check_enough(matches, target)
+    source, aim = _joined([match.surface for match in matches]), _joined(target)
+    best = _descend(_about_centroids(np.eye(3), source, aim), matches)
+    if _scale(best) > 0.25 * voxel:
+        others = [_descend(_about_centroids(turn, source, aim), matches) for turn in _principal_turns(source, aim)]
+        best = min([best, *others], key=_cost)
+    return _fit(best)
+
+
+def align(before: Segmentation, after: Segmentation) -> Alignment:
+    """Motion of the `rigid` tissues between two segmentations of the same tissues, together and each by itself.
+
+    Raises `InputDataError` when there is no rigid tissue or one shows too little of its surface.
+    """
+    rigid = [i for i, tissue in enumerate(before.tissues) if tissue.role is Role.RIGID]
+    if not rigid:
+        raise InputDataError("no tissue is `rigid`, so nothing shows the motion between the images; set align = 'none'")
+    width = smoothing_width(before.grid, after.grid)
+    pairs = [
+        (
+            distance_map(before.mask(i), before.grid, smoothing_mm=width),
+            distance_map(after.mask(i), after.grid, smoothing_mm=width),
+        )
+        for i in rigid
+    ]
+    each = {
+        before.tissues[i].name: _named_fit(pair, before.tissues[i].name) for i, pair in zip(rigid, pairs, strict=True)
+    }
+    return Alignment(fit_rigid_motion(pairs), each)
+
+
+def moved(segmentation: Segmentation, motion: RigidMotion) -> Segmentation:
+    """The segmentation after a rigid motion (mm): the voxels are the same, only their affine changes."""
+    grid = VoxelGrid(segmentation.grid.shape, motion.matrix @ segmentation.grid.affine)
+    return replace(segmentation, grid=grid)
+
+
+def _named_fit(pair: tuple[DistanceMap, DistanceMap], name: str) -> RigidFit:
+    try:
+        return fit_rigid_motion([pair])
+    except InputDataError as error:
+        raise InputDataError(f"tissue '{name}': {error}") from error
+
+
+def _smoothed(surface: DistanceMap, voxel: float) -> DistanceMap:
+    sigma = EXTRA_SMOOTHING * voxel / surface.grid.spacing
+    return replace(surface, coefficients=ndimage.gaussian_filter(surface.coefficients, sigma, mode="mirror"))
+
+
+def _node_values(surface: DistanceMap) -> NDArray[np.float64]:
+    """The spline at the voxel centres (nx, ny, nz), mm."""
+    values = surface.coefficients
+    for axis in range(3):
+        values = ndimage.correlate1d(values, [1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0], axis=axis, mode="mirror")
+    return np.asarray(values + surface.bias)
+
+
+def _crossings(values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+    """Voxel indices (n, 3) at which the linear interpolant along `axis` changes sign."""
+    low, high = (np.take(values, np.arange(values.shape[axis])[cut], axis) for cut in (slice(-1), slice(1, None)))
+    place = np.argwhere((low < 0.0) != (high < 0.0))
+    start, end = low[tuple(place.T)], high[tuple(place.T)]
+    index = place.astype(np.float64)
+    index[:, axis] += start / (start - end)
+    return index
+
+
+def _match(before: DistanceMap, after: DistanceMap) -> _Match:
+    surface = surface_points(before)
+    step = -(-len(surface.points) // MAX_POINTS) or 1
+    thinned = SurfacePoints(surface.points[::step], surface.areas[::step] * step)
+    return _Match(thinned, before.at(thinned.points), after)
+
+
+def _check_enough(matches: Sequence[_Match], target: Sequence[SurfacePoints]) -> None:
+    for where, surfaces in (("before", [match.surface for match in matches]), ("after", target)):
+        n = sum(len(surface.points) for surface in surfaces)
+        if n < MIN_POINTS:
+            raise InputDataError(
+                f"the {where} image shows {n} surface points of the rigid tissue away from its border, {MIN_POINTS} are"
+                " needed; enlarge the image, or give the tissue another role"
+            )
+
+
+def _joined(surfaces: Sequence[SurfacePoints]) -> SurfacePoints:
+    return SurfacePoints(np.concatenate([s.points for s in surfaces]), np.concatenate([s.areas for s in surfaces]))
+
+
+def _moments(surface: SurfacePoints) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Centroid (3,) mm and covariance (3, 3) mm^2 of a surface."""
+    weight = surface.areas / surface.areas.sum()
+    centre = weight @ surface.points
+    offset = surface.points - centre
+    return centre, (offset * weight[:, None]).T @ offset
+
+
+def _about_centroids(turn: NDArray[np.float64], source: SurfacePoints, target: SurfacePoints) -> RigidMotion:
+    return RigidMotion(turn, _moments(target)[0] - turn @ _moments(source)[0])
+
+
+def _principal_turns(source: SurfacePoints, target: SurfacePoints) -> list[NDArray[np.float64]]:
+    """The four proper rotations that lay the principal axes of one surface on those of the other."""
+    first, second = (np.linalg.eigh(_moments(surface)[1])[1] for surface in (source, target))
+    turns = [second @ np.diag(signs) @ first.T for signs in product((1.0, -1.0), repeat=3)]
+    return [turn for turn in turns if np.linalg.det(turn) > 0.0]
+
+
+def _descend(motion: RigidMotion, matches: Sequence[_Match]) -> _State:
+    """Gauss-Newton with Tukey weights; a step that does not lower the cost at the weights' scale is halved."""
+    state = _state(motion, matches)
+    for _ in range(MAX_STEPS):
+        scale = _scale(state)
+        step, cost = _step(state, scale), _cost(state, scale)
+        for _ in range(6):
+            trial = _state(_stepped(state, step), matches)
+            if _cost(trial, scale) <= cost:
+                break
+            step = 0.5 * step
+        else:
+            return state
+        state = trial
+        if np.abs(step * np.array([state.radius] * 3 + [1.0] * 3)).max() < STEP_TOLERANCE_MM:
+            return state
+    return state
+
+
+def _state(motion: RigidMotion, matches: Sequence[_Match]) -> _State:
+    """Residuals and derivatives at a motion; points that leave the after image's inside get no area."""
+    places = [motion.apply(match.surface.points) for match in matches]
+    points, areas = np.concatenate(places), np.concatenate([match.surface.areas for match in matches])
+    centre, spread = _moments(SurfacePoints(points, areas))
+    residual = np.concatenate([m.after.at(x) - m.rest for m, x in zip(matches, places, strict=True)])
+    slope = np.concatenate([m.after.gradient_at(x) for m, x in zip(matches, places, strict=True)])
+    inside = np.concatenate([_inside(m.after.grid, x) for m, x in zip(matches, places, strict=True)])
+    if np.count_nonzero(inside) < MIN_POINTS:
+        raise InputDataError(
+            f"only {np.count_nonzero(inside)} of {len(points)} surface points of the rigid tissue come to lie inside"
+            " the after image; the images show different parts of the body"
+        )
+    jacobian = np.hstack([np.cross(points - centre, slope), slope])
+    return _State(motion, residual, jacobian, areas * inside, centre, float(np.sqrt(np.trace(spread))))
+
+
+def _inside(grid: VoxelGrid, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    index = grid.index(points)
+    return np.asarray(((index >= BORDER_VOXELS) & (index <= np.array(grid.shape) - 1.0 - BORDER_VOXELS)).all(axis=1))
+
+
+def _scale(state: _State) -> float:
+    """Robust standard deviation of the residuals, mm: 1.4826 times the median of their sizes."""
+    return max(1.4826 * float(np.median(np.abs(state.residual[state.areas > 0.0]))), 1e-4)
+
+
+def _tukey(state: _State, scale: float) -> NDArray[np.float64]:
+    return np.asarray(np.maximum(1.0 - (state.residual / (TUKEY * scale)) ** 2, 0.0) ** 2)
+
+
+def _cost(state: _State, scale: float | None = None) -> float:
+    """Mean of Tukey's rho over the area; without a scale, the mean size of the residuals (to compare starts), mm."""
+    share = state.areas / state.areas.sum()
+    if scale is None:
+        return float(share @ np.abs(state.residual))
+    return float(share @ (1.0 - np.maximum(1.0 - (state.residual / (TUKEY * scale)) ** 2, 0.0) ** 3))
+
+
+def _normal_matrix(state: _State, weight: NDArray[np.float64]) -> NDArray[np.float64]:
+    """J^T W J per weight, with turns measured in mm at the surface's radius of gyration, so that it has no unit."""
+    scaled = state.jacobian / np.array([state.radius] * 3 + [1.0] * 3)
+    return np.asarray((scaled * (weight / weight.sum())[:, None]).T @ scaled)
+
+
+def _shown(state: _State, weight: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Turns that the surface shows (3, m) and does not show (3, k), as orthonormal columns.
+
+    A turn counts by what is left of its normal matrix when the shifts have been eliminated (Schur complement).
+    """
+    normal = _normal_matrix(state, weight)
+    coupling = normal[:3, 3:] @ np.linalg.pinv(normal[3:, 3:], rcond=1e-6, hermitian=True) @ normal[3:, :3]
+    values, axes = np.linalg.eigh(normal[:3, :3] - coupling)
+    return axes[:, values > UNDETERMINED], axes[:, values <= UNDETERMINED]
+
+
+def _step(state: _State, scale: float) -> NDArray[np.float64]:
+    """Turn (rad) and shift (mm), (6,), of one Gauss-Newton step among the turns that the surface shows."""
+    weight = state.areas * _tukey(state, scale)
+    shown, _ = _shown(state, weight)
+    basis = np.zeros((6, shown.shape[1] + 3))
+    basis[:3, :-3], basis[3:, -3:] = shown / state.radius, np.eye(3)
+    reduced = state.jacobian @ basis
+    normal = (reduced * weight[:, None]).T @ reduced
+    slope = reduced.T @ (weight * state.residual)
+    return np.asarray(-basis @ np.linalg.pinv(normal, rcond=1e-6, hermitian=True) @ slope)
+
+
+def _stepped(state: _State, step: NDArray[np.float64]) -> RigidMotion:
+    turn = Rotation.from_rotvec(step[:3]).as_matrix()
+    return RigidMotion(turn, state.centre - turn @ state.centre + step[3:]).compose(state.motion)
+
+
+def _fit(state: _State) -> RigidFit:
+    weight = state.areas * _tukey(state, _scale(state))
+    rms = float(np.sqrt(weight @ state.residual**2 / weight.sum()))
+    return RigidFit(state.motion, rms, int(np.count_nonzero(weight)), _shown(state, weight)[1].T)

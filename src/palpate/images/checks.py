@@ -1,0 +1,273 @@
+"""Checks of segmented images before anything is computed from them: what is refused, and what the user should know."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from palpate.errors import InputDataError
+from palpate.images.label_image import VoxelGrid
+from palpate.images.segmentation import Segmentation
+from palpate.images.tissue import Role, Tissue
+
+__all__ = ["Finding", "check_images", "check_pair", "check_segmentation"]
+
+OBSERVED = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
+VOLUME_CHANGE = 0.05  # no modulus explains a filling between the scans
+VOLUME_IMPLAUSIBLE = 0.30
+SMALL_VOXELS = 50
+THIN_VOXELS = 4
+THIN_SHARE = 0.2
+ISLAND_SHARE = 1e-3
+COMMON_SHARE = 0.5
+SPACING_MM = (0.02, 20.0)  # outside of this a voxel edge is more likely in metres or micrometres
+MIRROR_CERTAIN = 0.25  # gain in agreement, of 1, at which a mirrored image is refused
+MIRROR_LIKELY = 0.10
+MIRROR_SAMPLES = 4000
+DIRECTIONS = ("left-right", "front-back", "head-foot")
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something the user should know: `code` for programs (lower case, hyphens), `message` a sentence with advice."""
+
+    code: str
+    message: str
+
+
+def check_images(before: Segmentation, after: Sequence[Segmentation]) -> tuple[Finding, ...]:
+    """All findings on the images of one case: each image by itself, then each later state against `before`.
+
+    Raises `InputDataError` as `check_pair` does; names the later state by its number, from 1, when there are several.
+    """
+    names = ["after" if len(after) == 1 else f"after[{i}]" for i in range(1, len(after) + 1)]
+    findings = list(check_segmentation(before, "before"))
+    for name, image in zip(names, after, strict=True):
+        findings += check_segmentation(image, name)
+        findings += check_pair(before, image, name=name)
+    return tuple(findings)
+
+
+def check_segmentation(segmentation: Segmentation, name: str) -> tuple[Finding, ...]:
+    """Findings on one image, called `name` in the text: voxel size, cut organs, small or thin organs, islands."""
+    findings = _voxel_size(segmentation.grid, name)
+    for i, tissue in enumerate(segmentation.tissues):
+        if tissue.role not in OBSERVED:
+            continue
+        box = ndimage.find_objects(segmentation.mask(i).astype(np.int8))
+        if not box:
+            continue  # a tissue that is absent is refused by check_pair
+        findings += _cut_by_border(segmentation.mask(i), tissue, name)
+        mask = segmentation.index[box[0]] == i
+        if tissue.role is not Role.RIGID:
+            findings += _too_thin(np.pad(mask, THIN_VOXELS, mode="edge"), mask, tissue, name)
+        findings += _islands(mask, tissue, name)
+    return tuple(findings)
+
+
+def check_pair(before: Segmentation, after: Segmentation, *, name: str = "after") -> tuple[Finding, ...]:
+    """Findings on two states of one body: volumes, shifts, a mirrored image, the part that the images share.
+
+    Raises `InputDataError` when the two are the same image, an organ is missing in one, they share no part of the
+    world, or one is clearly the mirror image of the other.
+    """
+    if [t.name for t in before.tissues] != [t.name for t in after.tissues]:
+        raise InputDataError(f"'before' and '{name}' have been segmented into different tissues; use one list for both")
+    _refuse_identical(before, after, name)
+    for segmentation, where in ((before, "before"), (after, name)):
+        _refuse_absent(segmentation, where)
+    findings = _common_part(before, after, name)
+    observed = [i for i, tissue in enumerate(before.tissues) if tissue.role in OBSERVED]
+    findings += _mirrored(before, after, observed, name)
+    findings += _shifts(before, after, observed, name)
+    for i in observed:
+        findings += _volume_change(before, after, i, name)
+    return tuple(findings)
+
+
+def _refuse_identical(before: Segmentation, after: Segmentation, name: str) -> None:
+    if np.array_equal(before.index, after.index):
+        raise InputDataError(
+            f"'before' and '{name}' are the same label image, voxel by voxel; without a deformation nothing can be"
+            " estimated: check the two paths"
+        )
+
+
+def _refuse_absent(segmentation: Segmentation, where: str) -> None:
+    present = set(np.unique(segmentation.index).tolist())
+    for i, tissue in enumerate(segmentation.tissues):
+        if tissue.role in OBSERVED and i not in present:
+            labels = ", ".join(map(str, tissue.labels)) or "remaining"
+            raise InputDataError(
+                f"tissue '{tissue.name}' (label {labels}, role {tissue.role}) has no voxel in '{where}'; an organ must"
+                " be seen in both states: check its label in the image, or take the tissue out of the case"
+            )
+
+
+def _voxel_size(grid: VoxelGrid, name: str) -> list[Finding]:
+    low, high = float(grid.spacing.min()), float(grid.spacing.max())
+    if SPACING_MM[0] <= low and high <= SPACING_MM[1]:
+        return []
+    size = " x ".join(f"{edge:.4g}" for edge in grid.spacing)
+    text = f"'{name}' has voxels of {size} mm; is its header in metres or micrometres? Set its unit of length"
+    return [Finding("voxel-size", text)]
+
+
+def _cut_by_border(mask: NDArray[np.bool_], tissue: Tissue, name: str) -> list[Finding]:
+    faces = [mask[cut] for axis in range(3) for cut in _ends(axis)]
+    touching = sum(int(np.count_nonzero(face)) for face in faces)
+    if not touching:
+        return []
+    surface = touching + sum(int(np.count_nonzero(np.diff(mask, axis=axis))) for axis in range(3))
+    text = (
+        f"'{tissue.name}' reaches the border of '{name}': {touching / surface:.1%} of its surface is a cut of the"
+        " image, which says nothing about its stiffness; a larger field of view is better"
+    )
+    return [Finding("cut-by-border", text)]
+
+
+def _ends(axis: int) -> list[tuple[slice | int, ...]]:
+    return [tuple(end if a == axis else slice(None) for a in range(3)) for end in (0, -1)]
+
+
+def _too_thin(padded: NDArray[np.bool_], mask: NDArray[np.bool_], tissue: Tissue, name: str) -> list[Finding]:
+    """Few voxels at all, or too many that no cube of THIN_VOXELS inside the organ covers (`padded` goes on outside)."""
+    count = int(np.count_nonzero(mask))
+    if count < SMALL_VOXELS:
+        text = f"'{tissue.name}' has only {count} voxels in '{name}'; its surface cannot be trusted: use finer images"
+        return [Finding("too-small", text)]
+    cube = np.ones((THIN_VOXELS,) * 3, dtype=bool)
+    inner = (slice(THIN_VOXELS, -THIN_VOXELS),) * 3
+    thick = ndimage.binary_opening(padded, cube)[inner]
+    share = 1.0 - np.count_nonzero(thick & mask) / count
+    if share <= THIN_SHARE:
+        return []
+    text = (
+        f"{share:.0%} of '{tissue.name}' in '{name}' is thinner than {THIN_VOXELS} voxels; its surface there is known"
+        " to about half a voxel only: use finer images, or join it to its neighbour"
+    )
+    return [Finding("thin", text)]
+
+
+def _islands(mask: NDArray[np.bool_], tissue: Tissue, name: str) -> list[Finding]:
+    parts, count = ndimage.label(mask, structure=np.ones((3, 3, 3)))
+    if count < 2:
+        return []
+    sizes = np.sort(np.bincount(parts.ravel())[1:])
+    rest = float(sizes[:-1].sum() / sizes.sum())
+    if tissue.role is Role.RIGID:
+        text = f"the {count} pieces of '{tissue.name}' in '{name}' move as one body; give each bone its own tissue"
+        return [Finding("several-bodies", text)] if rest > ISLAND_SHARE else []
+    text = (
+        f"'{tissue.name}' has {count} separate pieces in '{name}', {rest:.2%} of it outside the largest; remove stray"
+        " voxels from the labels"
+    )
+    return [Finding("islands", text)]
+
+
+def _common_part(before: Segmentation, after: Segmentation, name: str) -> list[Finding]:
+    share = max(_share_inside(before.grid, after.grid), _share_inside(after.grid, before.grid))
+    if share == 0.0:
+        centres = [grid.world((np.array([grid.shape]) - 1.0) / 2.0)[0] for grid in (before.grid, after.grid)]
+        raise InputDataError(
+            f"'before' and '{name}' have no part of the world in common: their centres lie at"
+            f" {np.round(centres[0], 1).tolist()} and {np.round(centres[1], 1).tolist()} mm; check the headers, or"
+            " register the images first"
+        )
+    if share >= COMMON_SHARE:
+        return []
+    text = f"'before' and '{name}' share only {share:.0%} of the smaller image; what lies outside of it is left out"
+    return [Finding("little-in-common", text)]
+
+
+def _share_inside(grid: VoxelGrid, other: VoxelGrid) -> float:
+    """Share of the grid's volume that lies inside the other one, by a lattice of 33^3 points out to the outer faces."""
+    ticks = [np.linspace(-0.5, n - 0.5, 33) for n in grid.shape]
+    lattice = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+    index = other.index(grid.world(lattice))
+    return float(((index >= -0.5) & (index <= np.array(other.shape) - 0.5)).all(axis=1).mean())
+
+
+def _mirrored(before: Segmentation, after: Segmentation, observed: Sequence[int], name: str) -> list[Finding]:
+    """Lay the organs of one image on the other, as they are and mirrored along one, two or three axes.
+
+    The agreement is the mean over the organs of the share of voxels that find their own organ; the organs' common
+    centroids are laid on each other, so neither a shift nor the size of the field of view matters.
+    """
+    points = [_sample(before, i) for i in observed]
+    middle = np.mean([p.mean(axis=0) for p in points], axis=0)
+    target = np.mean([_centroid(after, i) for i in observed], axis=0)
+    agreement = {
+        signs: float(
+            np.mean([_hits(after, i, target + (p - middle) * signs) for i, p in zip(observed, points, strict=True)])
+        )
+        for signs in product((1.0, -1.0), repeat=3)
+    }
+    plain = agreement.pop((1.0, 1.0, 1.0))
+    signs, best = max(agreement.items(), key=lambda item: (round(item[1], 3), sum(item[0])))
+    if best - plain < MIRROR_LIKELY:
+        return []
+    axes = " and ".join(direction for direction, sign in zip(DIRECTIONS, signs, strict=True) if sign < 0.0)
+    text = (
+        f"'{name}' looks mirrored {axes} against 'before': {best:.0%} of the organs' voxels agree when it is flipped,"
+        f" {plain:.0%} as it is; check how the images were exported (RAS and LPS confused?)"
+    )
+    if best - plain >= MIRROR_CERTAIN:
+        raise InputDataError(text)
+    return [Finding("mirrored", text)]
+
+
+def _sample(segmentation: Segmentation, tissue: int) -> NDArray[np.float64]:
+    """At most MIRROR_SAMPLES voxel centres (n, 3) of a tissue, evenly picked, RAS mm."""
+    index = np.argwhere(segmentation.mask(tissue))
+    return segmentation.grid.world(index[:: -(-len(index) // MIRROR_SAMPLES)].astype(np.float64))
+
+
+def _centroid(segmentation: Segmentation, tissue: int) -> NDArray[np.float64]:
+    index = np.argwhere(segmentation.mask(tissue)).mean(axis=0, keepdims=True)
+    return np.asarray(segmentation.grid.world(index)[0])
+
+
+def _hits(segmentation: Segmentation, tissue: int, points: NDArray[np.float64]) -> float:
+    index = np.rint(segmentation.grid.index(points)).astype(np.int64)
+    inside = ((index >= 0) & (index < segmentation.grid.shape)).all(axis=1)
+    return float(np.count_nonzero(segmentation.index[tuple(index[inside].T)] == tissue) / len(points))
+
+
+def _shifts(before: Segmentation, after: Segmentation, observed: Sequence[int], name: str) -> list[Finding]:
+    """Organs that move by more than their own size, measured against the rigid tissues where there are any."""
+    shift = {i: _centroid(after, i) - _centroid(before, i) for i in observed}
+    rigid = [shift[i] for i in observed if before.tissues[i].role is Role.RIGID]
+    common = np.mean(rigid, axis=0) if rigid else np.zeros(3)
+    findings = []
+    for i, vector in shift.items():
+        size = (6.0 * before.volume(i) / np.pi) ** (1.0 / 3.0)
+        length = float(np.linalg.norm(vector - common))
+        if length > size:
+            text = (
+                f"'{before.tissues[i].name}' moves by {length:.1f} mm from 'before' to '{name}', more than its size of"
+                f" {size:.1f} mm; check that its label means the same organ, and that the images are aligned"
+            )
+            findings.append(Finding("large-shift", text))
+    return findings
+
+
+def _volume_change(before: Segmentation, after: Segmentation, i: int, name: str) -> list[Finding]:
+    tissue = before.tissues[i]
+    change = after.volume(i) / before.volume(i) - 1.0
+    if tissue.role is not Role.ESTIMATE or abs(change) <= VOLUME_CHANGE:
+        return []
+    text = (
+        f"the volume of '{tissue.name}' changes by {change:+.1%} from 'before' ({before.volume(i) / 1000.0:.4g} mL) to"
+        f" '{name}' ({after.volume(i) / 1000.0:.4g} mL); a filling between the scans is no deformation that a modulus"
+        " explains: give a hollow organ the role driver"
+    )
+    if abs(change) > VOLUME_IMPLAUSIBLE:
+        text += "; so large a change is implausible for one organ: check that the label means the same in both images"
+        return [Finding("volume-implausible", text)]
+    return [Finding("volume-change", text)]

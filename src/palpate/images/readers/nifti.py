@@ -1,0 +1,268 @@
+"""NIfTI-1 and NIfTI-2 files (.nii, .nii.gz): read with every size checked before memory is taken, and written.
+
+Layout of the header: https://nifti.nimh.nih.gov/pub/dist/src/niftilib/nifti1.h and nifti2.h. nibabel decodes the
+header; the voxels are read here, because a header or a gzip stream may promise far more than the file holds.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gzip
+import io
+import math
+import os
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import nibabel
+import numpy as np
+from nibabel.spatialimages import HeaderDataError
+from numpy.typing import NDArray
+
+from palpate.errors import ConfigurationError, InputDataError, ResourceError
+from palpate.images.label_image import LabelImage, VoxelGrid
+from palpate.images.readers.registry import ImageFormat, StoredImage, register
+
+__all__ = ["read_nifti", "write_label_image", "write_scalar_image"]
+
+MAX_VOXELS = 2**29  # 512 x 512 x 2048, a whole body at 1 mm; a distance map of it would take 4 GiB
+MAX_OFFSET = 2**26  # bytes that header extensions may take
+MAX_DEFLATE_RATIO = 1032  # no deflate stream expands further (zlib's technical notes)
+SLACK = 2**20  # bytes that may follow the voxels
+CHUNK = 2**22
+MILLIMETRES = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}  # xyzt_units: unknown, metre, millimetre, micrometre
+HEADERS = {348: nibabel.Nifti1Header, 540: nibabel.Nifti2Header}
+MAGIC = {348: b"n+1\0", 540: b"n+2\0\r\n\032\n"}
+
+
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """What the header says: `shape` and `dtype` of the voxels, where they begin (bytes), their scale, their place."""
+
+    shape: tuple[int, int, int]
+    dtype: np.dtype[Any]
+    offset: int
+    slope: float
+    intercept: float
+    affine: NDArray[np.float64]
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of the voxels, bytes."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+
+def read_nifti(path: Path) -> StoredImage:
+    """Read one image of three axes from `path`; raises `InputDataError` with a sentence for whatever is wrong."""
+    try:
+        with path.open("rb") as file:
+            stream = _uncompressed(file, path)
+            header, used = _header(stream, path)
+            layout = _layout(header, path)
+            _check_size(layout, path)
+            _exactly(stream, layout.offset - used, path)
+            values = _exactly(stream, layout.n_bytes, path).view(layout.dtype)
+            _check_end(stream, layout, path)
+    except (OSError, EOFError, zlib.error) as error:
+        raise InputDataError(
+            f"'{path}' cannot be read: {str(error).rstrip('.')}; the file is damaged or cut short, export or copy it"
+            " again"
+        ) from error
+    return StoredImage(_scaled(values.reshape(layout.shape, order="F"), layout), layout.affine)
+
+
+def _uncompressed(file: BinaryIO, path: Path) -> BinaryIO:
+    zipped = file.read(2) == b"\x1f\x8b"
+    file.seek(0)
+    if zipped != path.name.lower().endswith(".gz"):
+        is_and_should = ("is compressed", ".nii.gz") if zipped else ("is not compressed by gzip", ".nii")
+        raise InputDataError(f"'{path}' {is_and_should[0]}, against its ending; rename it to {is_and_should[1]}")
+    return io.BufferedReader(gzip.GzipFile(fileobj=file, mode="rb")) if zipped else file
+
+
+def _header(stream: BinaryIO, path: Path) -> tuple[Any, int]:
+    """The decoded header and its length in bytes."""
+    block = _exactly(stream, 348, path).tobytes()
+    for sign in ("<", ">"):
+        length = int(np.frombuffer(block[:4], dtype=f"{sign}i4")[0])
+        if length in HEADERS:
+            block += _exactly(stream, length - len(block), path).tobytes()
+            magic = block[344:348] if length == 348 else block[4:12]
+            if magic == MAGIC[length]:
+                return HEADERS[length](block, endianness=sign, check=False), length
+            raise InputDataError(
+                f"'{path}' has the mark {magic!r}, which is not that of a NIfTI file in one piece; convert Analyze and"
+                " .hdr/.img pairs to .nii.gz"
+            )
+    raise InputDataError(f"'{path}' does not begin as a NIfTI file does; export the image as NIfTI (.nii.gz)")
+
+
+def _layout(header: Any, path: Path) -> _Layout:
+    try:
+        dtype = np.dtype(header.get_data_dtype())
+        slope, intercept = header.get_slope_inter()
+    except (HeaderDataError, KeyError, ValueError) as error:
+        raise InputDataError(f"the header of '{path}' is damaged: {error}; export the image again") from error
+    if dtype.kind not in "iuf" or dtype.itemsize > 8:
+        raise InputDataError(
+            f"the voxels of '{path}' are of the type {dtype}; only integers and floats of up to 64 bits are read:"
+            " export one grey or label channel"
+        )
+    return _Layout(
+        shape=_shape(header, path),
+        dtype=dtype,
+        offset=_offset(header, path),
+        slope=1.0 if slope is None else float(slope),
+        intercept=0.0 if intercept is None else float(intercept),
+        affine=_affine(header, path),
+    )
+
+
+def _shape(header: Any, path: Path) -> tuple[int, int, int]:
+    dim = [int(n) for n in header["dim"]]
+    sizes = dim[1 : 1 + dim[0]] if 1 <= dim[0] <= 7 else []
+    if not sizes or min(sizes) < 1:
+        raise InputDataError(f"the header of '{path}' gives the sizes {dim}, not positive counts; export it again")
+    if len(sizes) < 3 or any(n > 1 for n in sizes[3:]):
+        raise InputDataError(
+            f"'{path}' has the sizes {sizes}, but an image of three axes is needed; extract one volume (a time point,"
+            " a channel) or stack the slices"
+        )
+    return sizes[0], sizes[1], sizes[2]
+
+
+def _offset(header: Any, path: Path) -> int:
+    stated = float(header["vox_offset"])
+    first = int(header["sizeof_hdr"]) + 4  # four bytes announce extensions; 0 is written by old programs for this
+    if stated == 0.0:
+        return first
+    if not math.isfinite(stated) or not first <= stated <= MAX_OFFSET:
+        raise InputDataError(
+            f"the header of '{path}' puts the first voxel at byte {stated:g}, not between {first} and {MAX_OFFSET};"
+            " export the image again"
+        )
+    return int(stated)
+
+
+def _affine(header: Any, path: Path) -> NDArray[np.float64]:
+    """Index -> RAS mm by the sform, else by the qform."""
+    try:
+        affine = header.get_sform(coded=True)[0]
+        affine = header.get_qform(coded=True)[0] if affine is None else affine
+    except (HeaderDataError, ValueError) as error:
+        raise InputDataError(f"the qform in the header of '{path}' is damaged: {error}; set an sform") from error
+    if affine is None:
+        raise InputDataError(
+            f"the header of '{path}' has neither sform nor qform, so left and right are unknown; export the image with"
+            " its orientation, or set the sform yourself"
+        )
+    unit = int(header["xyzt_units"]) & 7
+    if unit not in MILLIMETRES:
+        raise InputDataError(f"the header of '{path}' has the unit of length {unit}, unknown; set it to 2 (millimetre)")
+    scaled = np.array(affine, dtype=np.float64)
+    scaled[:3] *= MILLIMETRES[unit]
+    return scaled
+
+
+def _check_size(layout: _Layout, path: Path) -> None:
+    if math.prod(layout.shape) > MAX_VOXELS:
+        raise InputDataError(
+            f"the header of '{path}' promises {math.prod(layout.shape)} voxels ({layout.shape}), more than the"
+            f" {MAX_VOXELS} that are read; crop the image to the organs, or the header is damaged"
+        )
+    size, needed = path.stat().st_size, layout.offset + layout.n_bytes
+    possible = size * MAX_DEFLATE_RATIO if path.name.lower().endswith(".gz") else size
+    if needed > possible:
+        raise InputDataError(
+            f"the header of '{path}' promises {needed} bytes ({layout.shape} voxels of {layout.dtype}), but its {size}"
+            " bytes cannot hold them; the file is cut short or its header damaged: export or copy it again"
+        )
+
+
+def _exactly(stream: BinaryIO, n_bytes: int, path: Path) -> NDArray[np.uint8]:
+    """The next `n_bytes` of the stream; pages of the buffer are only taken as the data come."""
+    buffer = np.empty(n_bytes, dtype=np.uint8)
+    done = 0
+    while done < n_bytes:
+        chunk = stream.read(min(CHUNK, n_bytes - done))
+        if not chunk:
+            raise InputDataError(
+                f"'{path}' is cut short: {n_bytes - done} of {n_bytes} bytes are missing; export or copy it again"
+            )
+        buffer[done : done + len(chunk)] = np.frombuffer(chunk, dtype=np.uint8)
+        done += len(chunk)
+    return buffer
+
+
+def _check_end(stream: BinaryIO, layout: _Layout, path: Path) -> None:
+    """Reading to the end lets gzip check its sum; a stream that does not end is not followed."""
+    if len(stream.read(SLACK + 1)) > SLACK:
+        raise InputDataError(
+            f"'{path}' goes on for more than {SLACK} bytes after the {layout.n_bytes} bytes of voxels that its header"
+            " declares; it is damaged or not what it claims to be: export it again"
+        )
+
+
+def _scaled(values: NDArray[Any], layout: _Layout) -> NDArray[Any]:
+    native = values.astype(layout.dtype.newbyteorder("="), copy=False)
+    if layout.slope == 1.0 and layout.intercept == 0.0:
+        return native
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(native * layout.slope + layout.intercept)
+
+
+def write_label_image(path: Path | str, image: LabelImage) -> None:
+    """Write labels as NIfTI (.nii or .nii.gz) in the smallest of uint8, uint16, int32; sform and qform in mm.
+
+    The file appears whole or not at all. Raises `ConfigurationError` for another ending, `ResourceError` when the disk
+    refuses.
+    """
+    low, high = int(image.labels.min()), int(image.labels.max())
+    narrow = np.uint8 if high <= 255 else np.uint16 if high <= 65535 else np.int32
+    _write(Path(path), image.labels.astype(narrow if low >= 0 else np.int32), image.grid)
+
+
+def write_scalar_image(path: Path | str, array: NDArray[np.floating[Any]], grid: VoxelGrid) -> None:
+    """Write a scalar field (nx, ny, nz), any unit, as float32 NIfTI on `grid`; NaN stays NaN.
+
+    Raises `InputDataError` when shape and grid disagree, else as `write_label_image` does.
+    """
+    if array.shape != grid.shape:
+        raise InputDataError(f"an image of shape {array.shape} cannot be written on a grid of shape {grid.shape}")
+    with np.errstate(over="ignore"):
+        _write(Path(path), np.asarray(array, dtype=np.float32), grid)
+
+
+def _write(path: Path, values: NDArray[Any], grid: VoxelGrid) -> None:
+    if not path.name.lower().endswith((".nii", ".nii.gz")):
+        raise ConfigurationError(f"'{path}' cannot be written: images are written as .nii or .nii.gz; choose one")
+    image = nibabel.Nifti1Image(values, grid.affine)
+    image.set_sform(grid.affine, code="scanner")
+    image.set_qform(grid.affine, code="scanner")
+    image.header.set_xyzt_units("mm")
+    content: bytes = image.to_bytes()
+    if path.name.lower().endswith(".gz"):
+        content = gzip.compress(content, compresslevel=6, mtime=0)  # no time stamp: equal images give equal files
+    _replace(path, content)
+
+
+def _replace(path: Path, content: bytes) -> None:
+    """Put `content` at `path` in one step, so that a crash never leaves half a file there."""
+    temporary = path.with_name(f".{path.name[:50]}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise ResourceError(
+            f"'{path}' cannot be written ({error}); check that the folder exists, is writable and not full"
+        ) from error
+
+
+register(ImageFormat("NIfTI", (".nii", ".nii.gz"), read_nifti))

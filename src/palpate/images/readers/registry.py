@@ -1,0 +1,57 @@
+"""Which reader opens which file: a format is added by a file that registers it, never by editing an `if`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import ConfigurationError, InputDataError
+
+__all__ = ["ImageFormat", "StoredImage", "format_of", "register"]
+
+
+@dataclass(frozen=True, slots=True)
+class StoredImage:
+    """A file's voxels as they are stored: `values` (n1, n2, n3) integers or floats, `affine` (4, 4) index -> RAS mm."""
+
+    values: NDArray[Any]
+    affine: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class ImageFormat:
+    """A file format: its name, the endings of its files (lower case, with the dot) and the function that reads one.
+
+    `read` takes the path of an existing, non-empty file; it raises `InputDataError` and lets nothing else out.
+    """
+
+    name: str
+    endings: tuple[str, ...]
+    read: Callable[[Path], StoredImage]
+
+
+_FORMATS: dict[str, ImageFormat] = {}
+
+
+def register(image_format: ImageFormat) -> None:
+    """Make a format known; raises `ConfigurationError` when another format has one of its endings."""
+    for ending in image_format.endings:
+        owner = _FORMATS.setdefault(ending, image_format)
+        if owner is not image_format:
+            raise ConfigurationError(
+                f"the ending '{ending}' belongs to {owner.name} already; register {image_format.name} under another one"
+            )
+
+
+def format_of(path: Path) -> ImageFormat:
+    """The format of a file by the longest ending that fits; raises `InputDataError` when none does."""
+    for ending in sorted(_FORMATS, key=len, reverse=True):
+        if path.name.lower().endswith(ending):
+            return _FORMATS[ending]
+    known = ", ".join(sorted(_FORMATS))
+    raise InputDataError(f"no reader for '{path}': the endings known are {known}; convert the image to one of these")

@@ -1,0 +1,46 @@
+"""Distance map of one tissue of a segmentation, on the part of the grid around it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from palpate.errors import InputDataError
+from palpate.images.distance import DistanceMap, distance_map
+from palpate.images.label_image import VoxelGrid
+from palpate.images.segmentation import Segmentation
+
+__all__ = ["REACH_MM", "cropped", "tissue_distance_map", "window_around"]
+
+REACH_MM = 25.0  # organs that move further are not found again
+
+
+def tissue_distance_map(segmentation: Segmentation, tissue: int, *, smoothing_mm: float) -> DistanceMap:
+    """Signed distance map of a tissue by its index; it reaches 25 mm beyond the tissue's bounding box.
+
+    `smoothing_mm`: see `distance_map`. Raises `InputDataError` when the image has no voxel of the tissue.
+    """
+    mask = segmentation.mask(tissue)
+    if not mask.any():
+        raise InputDataError(f"tissue '{segmentation.tissues[tissue].name}' has no voxel in the image")
+    window = window_around(mask, segmentation.grid, reach_mm=REACH_MM)
+    return distance_map(mask[window], cropped(segmentation.grid, window), smoothing_mm=smoothing_mm)
+
+
+def window_around(mask: NDArray[np.bool_], grid: VoxelGrid, *, reach_mm: float) -> tuple[slice, slice, slice]:
+    """Index ranges of the voxels within `reach_mm` of the bounding box of `mask` (nx, ny, nz), which is not empty."""
+    found = ndimage.find_objects(mask.astype(np.int8))[0]
+    margin = np.ceil(reach_mm / grid.spacing).astype(int)
+    i, j, k = (
+        slice(max(s.start - m, 0), min(s.stop + m, n)) for s, m, n in zip(found, margin, mask.shape, strict=True)
+    )
+    return (i, j, k)
+
+
+def cropped(grid: VoxelGrid, window: tuple[slice, slice, slice]) -> VoxelGrid:
+    """The grid of the voxels in `window`, at the same places in the world."""
+    affine = np.array(grid.affine)
+    affine[:3, 3] = grid.world(np.array([[s.start for s in window]], dtype=float))[0]
+    i, j, k = (s.stop - s.start for s in window)
+    return VoxelGrid((i, j, k), affine)

@@ -1,0 +1,177 @@
+"""The misfit of all surfaces and images, with the prior of the driver's motion, as a function of every unknown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.inversion.modulus_map import ModulusMap
+from palpate.mechanics.forward import ForwardModel
+from palpate.observation.misfit import SurfaceResiduals, observed_image_points, surface_residuals
+from palpate.observation.target import SurfaceTarget
+
+__all__ = ["Evaluation", "Linearisation", "Objective", "State", "Weighting"]
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """One later state of the body: its model, which answers at the observed points only, and its surfaces.
+
+    `model` gives displacements (n_dofs,) mm at the unknowns of all `targets`, one after the other.
+    """
+
+    model: ForwardModel
+    targets: tuple[SurfaceTarget, ...]
+
+    def slices(self) -> list[slice]:
+        """Rows of the model's answer that belong to each target."""
+        ends = np.cumsum([len(target.surface.dofs) for target in self.targets])
+        return [slice(end - len(t.surface.dofs), end) for end, t in zip(ends, self.targets, strict=True)]
+
+
+@dataclass(frozen=True, slots=True)
+class Weighting:
+    """How the residuals of one surface count: `precision` (mm^-2) of its mean square, Tukey `cutoff` (mm, inf: none).
+
+    kept (n_i,) marks the image points in use.
+    """
+
+    precision: float
+    cutoff: float
+    kept: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Linearisation:
+    """Residuals of one surface with their derivative (n, n_unknowns) by all unknowns, and robust weights (n,)."""
+
+    residuals: SurfaceResiduals
+    jacobian: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    precision: float
+    target: SurfaceTarget
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """Value (dimensionless, minus log-posterior) with its parts, gradient (n,) and Gauss-Newton matrix (n, n)."""
+
+    value: float
+    misfit_mm2: float
+    gradient: NDArray[np.float64]
+    matrix: NDArray[np.float64]
+    surfaces: tuple[Linearisation, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Objective:
+    """J(theta, q) = 1/2 sum_s precision_s sum_j w_j rho(r_j) + 1/2 |q|^2 over all surfaces s of all states.
+
+    The unknowns are theta (n_parameters,), then the mode coefficients q of each state. rho is Tukey's biweight,
+    rho(r) = c^2/3 (1 - (1 - (r/c)^2)^3), with the slope of r^2 at 0 (Huber 1981, section 4.8).
+    """
+
+    states: tuple[State, ...]
+    modulus_map: ModulusMap
+    weighting: tuple[tuple[Weighting, ...], ...]
+
+    @property
+    def n_parameters(self) -> int:
+        """Number of moduli among the unknowns."""
+        return len(self.modulus_map.tissues)
+
+    @property
+    def n_unknowns(self) -> int:
+        """Number of all unknowns."""
+        return self.n_parameters + sum(state.model.n_modes for state in self.states)
+
+    def coefficients(self, unknowns: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """Mode coefficients (n_modes,) of each state."""
+        return np.split(unknowns[self.n_parameters :], np.cumsum([s.model.n_modes for s in self.states])[:-1])
+
+    def value(self, unknowns: NDArray[np.float64]) -> float:
+        """J alone, for trial steps."""
+        total = 0.5 * float(np.sum(unknowns[self.n_parameters :] ** 2))
+        for s, displacement in enumerate(self._displacements(unknowns)):
+            for target, motion, weighting in self._surfaces(s, displacement):
+                residuals = surface_residuals(target, motion, weighting.kept)
+                total += 0.5 * weighting.precision * _robust_sum(residuals, weighting.cutoff)
+        return total
+
+    def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
+        """J with gradient, Gauss-Newton matrix and residuals at `unknowns` (n_unknowns,)."""
+        prior = np.concatenate([np.zeros(self.n_parameters), unknowns[self.n_parameters :]])
+        value, gradient = 0.5 * float(prior @ prior), prior.copy()
+        matrix = np.diag(np.concatenate([np.zeros(self.n_parameters), np.ones(len(prior) - self.n_parameters)]))
+        surfaces = [line for s in range(len(self.states)) for line in self._linearise(s, unknowns)]
+        misfit = 0.0
+        for line, weighting in zip(surfaces, self._flat_weighting(), strict=True):
+            scaled = line.precision * line.weights[:, None] * line.jacobian
+            gradient += scaled.T @ line.residuals.values
+            matrix += scaled.T @ line.jacobian
+            mean = _robust_sum(line.residuals, weighting.cutoff)
+            misfit += mean / len(surfaces)
+            value += 0.5 * line.precision * mean
+        return Evaluation(value, misfit, gradient, matrix, tuple(surfaces))
+
+    def with_fresh_correspondence(self, unknowns: NDArray[np.float64]) -> Objective:
+        """Choose anew which image points face the observed part of each surface."""
+        fresh = [
+            tuple(
+                replace(weighting, kept=observed_image_points(target, motion))
+                for target, motion, weighting in self._surfaces(s, displacement)
+            )
+            for s, displacement in enumerate(self._displacements(unknowns))
+        ]
+        return replace(self, weighting=tuple(fresh))
+
+    def _displacements(self, unknowns: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        moduli = self.modulus_map.moduli(unknowns[: self.n_parameters])
+        q = self.coefficients(unknowns)
+        return [state.model.solve(moduli, c).displacement.ravel() for state, c in zip(self.states, q, strict=True)]
+
+    def _surfaces(
+        self, state: int, displacement: NDArray[np.float64]
+    ) -> list[tuple[SurfaceTarget, NDArray[np.float64], Weighting]]:
+        parts = [displacement[rows].reshape(-1, 3) for rows in self.states[state].slices()]
+        return list(zip(self.states[state].targets, parts, self.weighting[state], strict=True))
+
+    def _linearise(self, s: int, unknowns: NDArray[np.float64]) -> list[Linearisation]:
+        state = self.states[s]
+        theta = unknowns[: self.n_parameters]
+        solution = state.model.solve(self.modulus_map.moduli(theta), self.coefficients(unknowns)[s])
+        tangent = solution.tangent()
+        n_regions = tangent.shape[1] - state.model.n_modes
+        columns = np.concatenate([self.modulus_map.columns, np.arange(n_regions, tangent.shape[1])])
+        places = np.concatenate([np.arange(self.n_parameters), self._mode_places(s)])
+        lines = []
+        triples = self._surfaces(s, solution.displacement.ravel())
+        for rows, (target, motion, weighting) in zip(state.slices(), triples, strict=True):
+            residuals = surface_residuals(target, motion, weighting.kept)
+            jacobian = np.zeros((len(residuals.values), len(unknowns)))
+            jacobian[:, places] = np.asarray(residuals.jacobian @ tangent[rows][:, columns])
+            weights = residuals.weights * _robust_weight(residuals.values, weighting.cutoff)
+            lines.append(Linearisation(residuals, jacobian, weights, weighting.precision, target))
+        return lines
+
+    def _mode_places(self, state: int) -> NDArray[np.int64]:
+        start = self.n_parameters + sum(s.model.n_modes for s in self.states[:state])
+        return np.arange(start, start + self.states[state].model.n_modes)
+
+    def _flat_weighting(self) -> list[Weighting]:
+        return [weighting for weightings in self.weighting for weighting in weightings]
+
+
+def _robust_weight(values: NDArray[np.float64], cutoff: float) -> NDArray[np.float64]:
+    """Tukey's weight (n,), (1 - (r/c)^2)^2 within the cutoff c (mm) and 0 beyond."""
+    return np.asarray(np.maximum(1.0 - (values / cutoff) ** 2, 0.0) ** 2)
+
+
+def _robust_sum(residuals: SurfaceResiduals, cutoff: float) -> float:
+    """Weighted sum of rho(r), mm^2."""
+    if not np.isfinite(cutoff):
+        return float(residuals.weights @ residuals.values**2)
+    inside = np.maximum(1.0 - (residuals.values / cutoff) ** 2, 0.0)
+    return float(residuals.weights @ (cutoff**2 / 3.0 * (1.0 - inside**3)))

@@ -1,0 +1,1 @@
+"""Elastic equilibrium: stiffness, boundary conditions, linear solvers, forward models and their derivatives."""

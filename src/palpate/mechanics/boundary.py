@@ -1,0 +1,102 @@
+"""Boundary conditions: what the image's cut holds, what drivers and bones prescribe."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from palpate.errors import ConfigurationError
+from palpate.images.tissue import Role
+from palpate.mechanics.rigid import refuse_floating
+from palpate.mesh.constraint import Constraint
+from palpate.mesh.space import LagrangeSpace
+from palpate.mesh.surface import tissue_surface, triangle_normals
+from palpate.mesh.tet_mesh import OUTER
+
+__all__ = ["outer_constraint"]
+
+OUTER_KINDS = ("fixed", "sliding", "free")
+SAME_PLANE = 1e-3  # share of the normals' second moment: directions that differ by less than 2 deg are one plane
+
+
+def outer_constraint(
+    space: LagrangeSpace,
+    *,
+    outer: str,
+    modes: NDArray[np.float64],
+    offset: NDArray[np.float64],
+    prescribed: NDArray[np.bool_],
+) -> Constraint:
+    """Admissible displacements of a body whose `prescribed` (n_points,) points move by modes q + offset.
+
+    modes (n_dof, n_modes) mm and offset (n_dof,) mm must vanish elsewhere. outer holds the points on the cut of the
+    image: "fixed", "sliding" (not along the normals of the cut's faces: one on a face, two on an edge, three in a
+    corner) or "free". The cut faces of `estimate` tissues are free in any case; a point that is also on the cut face
+    of a `known` tissue is held; a prescribed point follows its prescription. Raises `GeometryError` when nothing
+    opposes some rigid motion, `ConfigurationError` for another `outer` or for arrays that do not fit.
+    """
+    if outer not in OUTER_KINDS:
+        raise ConfigurationError(f"outer_boundary is '{outer}'; it must be one of {list(OUTER_KINDS)}")
+    _check_prescription(space, modes, offset, prescribed)
+    faces = _held_faces(space)
+    held = np.zeros((len(space.points), 3, 3))
+    if outer == "fixed":
+        held[np.unique(space.facets(faces))] = np.eye(3)
+    elif outer == "sliding":
+        held = _normal_moments(space, faces)
+    held[prescribed] = np.eye(3)
+    free = _free_directions(held)
+    refuse_floating(space, free)
+    return Constraint(free=free, modes=np.array(modes, dtype=float), offset=np.array(offset, dtype=float))
+
+
+def _check_prescription(
+    space: LagrangeSpace, modes: NDArray[np.float64], offset: NDArray[np.float64], prescribed: NDArray[np.bool_]
+) -> None:
+    n = len(space.points)
+    if modes.ndim != 2 or len(modes) != 3 * n or offset.shape != (3 * n,) or prescribed.shape != (n,):
+        raise ConfigurationError(
+            f"{n} points need modes ({3 * n}, n_modes), offset ({3 * n},) and prescribed ({n},);"
+            f" got {modes.shape}, {offset.shape} and {prescribed.shape}"
+        )
+    moved = np.any(modes != 0.0, axis=1) | (offset != 0.0)
+    stray = moved.reshape(-1, 3).any(axis=1) & ~prescribed
+    if stray.any():
+        raise ConfigurationError(
+            f"modes or offset move {int(stray.sum())} points that are not prescribed (the first is number"
+            f" {int(np.flatnonzero(stray)[0])}): mark them in `prescribed` or set their rows to zero"
+        )
+
+
+def _held_faces(space: LagrangeSpace) -> NDArray[np.int64]:
+    """Faces (n, 3) of `known` tissues on the cut of the image."""
+    tissues = space.mesh.tissues
+    known = [number for number, tissue in enumerate(tissues) if tissue.role is Role.KNOWN]
+    surfaces = [tissue_surface(space.mesh, number) for number in known]
+    cuts = [surface.triangles[surface.other == OUTER] for surface in surfaces]
+    return np.concatenate([np.zeros((0, 3), dtype=np.int64), *cuts])
+
+
+def _normal_moments(space: LagrangeSpace, faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Sum of n (x) n over the unit normals n of the faces at each point, (n_points, 3, 3)."""
+    normals = triangle_normals(space.mesh.nodes, faces)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    dyads = np.einsum("fi,fj->fij", normals, normals)
+    moments = np.zeros((len(space.points), 3, 3))
+    for column in space.facets(faces).T:
+        np.add.at(moments, column, dyads)
+    return moments
+
+
+def _free_directions(held: NDArray[np.float64]) -> sparse.csr_matrix[np.float64]:
+    """Orthonormal columns (n_dof, n_free) that span, point by point, the directions with no part in `held`."""
+    n = len(held)
+    values, vectors = np.linalg.eigh(held)
+    free = values <= SAME_PLANE * np.maximum(values[:, -1:], np.finfo(float).tiny)
+    point, direction = np.nonzero(free)
+    columns = np.repeat(np.arange(len(point)), 3)
+    rows = (3 * point[:, None] + np.arange(3)).ravel()
+    matrix = sparse.csr_matrix((vectors[point, :, direction].ravel(), (rows, columns)), shape=(3 * n, len(point)))
+    matrix.eliminate_zeros()
+    return matrix

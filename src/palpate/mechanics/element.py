@@ -1,0 +1,86 @@
+"""Linear and quadratic reference tetrahedra: quadrature, shape functions and their derivatives.
+
+Everything is written in barycentric coordinates (lambda_0, ..., lambda_3) of a straight-sided tetrahedron.
+Zienkiewicz & Taylor, The Finite Element Method, vol. 1, 5th ed., section 8.8.2.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import roots_jacobi
+
+from palpate.mesh.space import TET_EDGES
+
+__all__ = ["barycentric_gradients", "quadrature", "reference_tensor", "shape_derivatives", "shape_functions"]
+
+
+def quadrature(degree: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Points (n_q, 4) barycentric and positive weights (n_q,), sum 1, exact for polynomials up to `degree`.
+
+    Degree 1: the centroid; degree 2: four points (Keast 1986); above: the conical product of Gauss-Jacobi rules
+    (Stroud 1971), with ceil((degree + 1) / 2) points a direction.
+    """
+    if degree <= 1:
+        return np.full((1, 4), 0.25), np.ones(1)
+    if degree == 2:
+        low = (5.0 - np.sqrt(5.0)) / 20.0
+        return np.full((4, 4), low) + (1.0 - 4.0 * low) * np.eye(4), np.full(4, 0.25)
+    return _conical_rule(degree // 2 + 1)
+
+
+def _conical_rule(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """n^3 points from the cube by lambda_1 = x, lambda_2 = (1 - x) y, lambda_3 = (1 - x)(1 - y) z."""
+    rules = [roots_jacobi(n, power, 0.0) for power in (2.0, 1.0, 0.0)]
+    x, y, z = np.meshgrid(*[0.5 * (1.0 + points) for points, _ in rules], indexing="ij")
+    weights = np.einsum("i,j,k->ijk", *[w / w.sum() for _, w in rules])
+    first, second, third = x, (1.0 - x) * y, (1.0 - x) * (1.0 - y) * z
+    points = np.stack([1.0 - first - second - third, first, second, third], axis=-1)
+    return np.asarray(points.reshape(-1, 4)), np.asarray(weights.ravel())
+
+
+def shape_functions(order: int, barycentric: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Shape functions (n_q, 4 or 10), dimensionless, at `barycentric` (n_q, 4) places.
+
+    P1: lambda_a; P2: lambda_a (2 lambda_a - 1) at the corners, 4 lambda_a lambda_b on the edges of TET_EDGES.
+    """
+    if order == 1:
+        return barycentric
+    corners = barycentric * (2.0 * barycentric - 1.0)
+    edges = 4.0 * barycentric[:, TET_EDGES[:, 0]] * barycentric[:, TET_EDGES[:, 1]]
+    return np.concatenate([corners, edges], axis=1)
+
+
+def shape_derivatives(order: int, barycentric: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Derivatives dN_a / dlambda_k (n_q, 4 or 10, 4), dimensionless, at `barycentric` (n_q, 4) places."""
+    if order == 1:
+        return np.tile(np.eye(4), (len(barycentric), 1, 1))
+    derivatives = np.zeros((len(barycentric), 10, 4))
+    for corner in range(4):
+        derivatives[:, corner, corner] = 4.0 * barycentric[:, corner] - 1.0
+    for edge, (first, second) in enumerate(TET_EDGES):
+        derivatives[:, 4 + edge, first] = 4.0 * barycentric[:, second]
+        derivatives[:, 4 + edge, second] = 4.0 * barycentric[:, first]
+    return derivatives
+
+
+def reference_tensor(order: int) -> NDArray[np.float64]:
+    """Mean T (n_a, n_a, 4, 4), dimensionless: T_abkl = (1 / V) int dN_a/dlambda_k dN_b/dlambda_l dV, exact."""
+    points, weights = quadrature(2)
+    derivatives = shape_derivatives(order, points)
+    return np.asarray(np.einsum("q,qak,qbl->abkl", weights, derivatives, derivatives))
+
+
+def barycentric_gradients(
+    nodes: NDArray[np.float64], tets: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Gradients of lambda_k (n_tets, 4, 3) in 1/mm and signed volumes (n_tets,) in mm^3.
+
+    nodes (n_nodes, 3) mm; tets (n_tets, 4). The rows of the inverse of [x_1 - x_0, x_2 - x_0, x_3 - x_0] are the
+    gradients of lambda_1 to lambda_3; all four sum to zero.
+    """
+    corner = nodes[tets]
+    edges = np.swapaxes(corner[:, 1:] - corner[:, :1], 1, 2)
+    inverse = np.linalg.inv(edges)
+    gradients = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
+    return gradients, np.asarray(np.linalg.det(edges) / 6.0)

@@ -1,0 +1,230 @@
+"""Small-strain equilibrium of several tissues: affine in the moduli, linear in the boundary modes.
+
+K(E) = sum_r E_r K_r; an admissible u = F z + M q + o is in equilibrium when F^T K u = 0, that is
+K_ff z = -F^T K (M q + o) with K_ff = F^T K F.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from palpate.errors import ConfigurationError
+from palpate.mechanics.forward import SolveCounts, checked_coefficients, checked_moduli
+from palpate.mechanics.rigid import rigid_modes
+from palpate.mechanics.solvers.contract import Factorisation
+from palpate.mechanics.solvers.registry import factorise
+from palpate.mechanics.stiffness import tissue_stiffness
+from palpate.mesh.constraint import Constraint
+from palpate.mesh.space import LagrangeSpace
+
+__all__ = ["LinearEquilibrium", "LinearModel", "LinearSystem", "linear_model"]
+
+
+@dataclass(frozen=True, slots=True)
+class LinearModel:
+    """Assembled stiffness of every meshed tissue under one constraint.
+
+    regions: indices in `space.mesh.tissues` of the meshed ones; per region at 1 kPa: stiffness K_r (n_dof, n_dof),
+    free_stiffness F^T K_r F (n_free, n_free), coupling F^T K_r [M, o] (n_free, n_modes + 1), all mN/mm.
+    """
+
+    space: LagrangeSpace
+    constraint: Constraint
+    regions: tuple[int, ...]
+    stiffness: tuple[sparse.csr_matrix[np.float64], ...]
+    free_stiffness: tuple[sparse.csr_matrix[np.float64], ...]
+    coupling: tuple[sparse.csr_matrix[np.float64], ...]
+    solver: str
+
+    @property
+    def n_regions(self) -> int:
+        """Number of moduli."""
+        return len(self.regions)
+
+    @property
+    def n_modes(self) -> int:
+        """Number of boundary modes."""
+        return self.constraint.n_modes
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the tissues in the order of the moduli."""
+        return tuple(self.space.mesh.tissues[region].name for region in self.regions)
+
+    def system(self, moduli: NDArray[np.float64]) -> LinearSystem:
+        """The factorised system at moduli (n_regions,) kPa, for any number of solves; raises `SolverError`."""
+        checked = checked_moduli(moduli, self.names)
+        near_nullspace = self.constraint.free.T @ rigid_modes(self.space.points)
+        matrix = weighted_sum(checked, self.free_stiffness)
+        return LinearSystem(
+            self, checked, factorise(matrix, solver=self.solver, near_nullspace=np.asarray(near_nullspace))
+        )
+
+    def solve(self, moduli: NDArray[np.float64], coefficients: NDArray[np.float64]) -> LinearEquilibrium:
+        """Equilibrium at moduli (n_regions,) kPa and mode coefficients (n_modes,); raises `SolverError`."""
+        return self.system(moduli).solve(coefficients)
+
+    def responses(self, moduli: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Displacement (n_dof, n_modes + 1) mm for each unit mode and, last, for the offset; raises `SolverError`."""
+        return self.system(moduli).responses()
+
+    def residual(self, moduli: NDArray[np.float64], displacements: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Out-of-balance forces F^T K(E) u (n_free, k), mN, of displacements u (n_dof, k) mm."""
+        return np.asarray(self.constraint.free.T @ self.forces(moduli, displacements))
+
+    def forces(self, moduli: NDArray[np.float64], displacements: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Nodal forces K(E) u (n_dof, k), mN, that hold displacements u (n_dof, k) mm at moduli (n_regions,) kPa."""
+        total = np.zeros_like(displacements)
+        for modulus, matrix in zip(moduli, self.stiffness, strict=True):
+            total += modulus * (matrix @ displacements)
+        return total
+
+
+@dataclass(frozen=True, slots=True)
+class LinearSystem:
+    """A linear model at fixed moduli (n_regions,) kPa with its factorisation."""
+
+    model: LinearModel
+    moduli: NDArray[np.float64]
+    factorisation: Factorisation
+
+    @property
+    def response_counts(self) -> SolveCounts:
+        """What this system and one call of `responses` cost together."""
+        return SolveCounts(forward=self.model.n_modes + 1, factorisations=1)
+
+    def responses(self) -> NDArray[np.float64]:
+        """Displacement (n_dof, n_modes + 1) mm for each unit mode without the offset and, last, for the offset."""
+        constraint = self.model.constraint
+        loads = weighted_sum(self.moduli, self.model.coupling).toarray()
+        given = np.column_stack([constraint.modes, constraint.offset])
+        return np.asarray(given - constraint.free @ self.factorisation.solve(loads))
+
+    def modulus_responses(self, displacements: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivatives dw / d ln E_r (n_regions, n_dof, k), mm, of equilibria w (n_dof, k) mm at these moduli.
+
+        F K_ff^-1 F^T (-E_r K_r w); they sum to zero over the regions, for no load sets a scale.
+        """
+        free = self.model.constraint.free
+        derivatives = np.empty((self.model.n_regions, *displacements.shape))
+        for number, forces in enumerate(self._modulus_forces(displacements)):
+            derivatives[number] = free @ self.factorisation.solve(-forces)
+        return derivatives
+
+    def solve(self, coefficients: NDArray[np.float64]) -> LinearEquilibrium:
+        """Equilibrium at mode coefficients (n_modes,), dimensionless; one right-hand side."""
+        checked = checked_coefficients(coefficients, self.model.n_modes)
+        constraint = self.model.constraint
+        loads = weighted_sum(self.moduli, self.model.coupling) @ np.append(checked, 1.0)
+        given = constraint.modes @ checked + constraint.offset
+        values = given - constraint.free @ self.factorisation.solve(loads[:, None])[:, 0]
+        values.setflags(write=False)
+        return LinearEquilibrium(self, checked, values)
+
+    def error_bound(self, moduli: NDArray[np.float64], displacements: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Upper bound (k,) of the relative energy-norm error of admissible displacements (n_dof, k) mm at `moduli`.
+
+        With the residual r = F^T K(E) u the error is exactly |r|_{K(E)^-1}; the system's own K(E0) stands in for K(E),
+        for K(E) >= min_r(E_r / E0_r) K(E0): |e|_K / |u|_K <= sqrt(r^T K(E0)^-1 r / min_r(E_r / E0_r)) / |u|_K.
+        Source: Patera & Rozza, Reduced Basis Approximation (2007), section 4.2 (min-theta approach).
+        """
+        residual = self.model.residual(moduli, displacements)
+        squared = np.einsum("ij,ij->j", residual, self.factorisation.solve(residual))
+        energy = np.einsum("ij,ij->j", displacements, self.model.forces(moduli, displacements))
+        least = float(np.min(np.asarray(moduli) / self.moduli))
+        return np.asarray(np.sqrt(squared / least / np.maximum(energy, np.finfo(float).tiny)))
+
+    def _modulus_forces(self, displacements: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """E_r F^T K_r u, one (n_free, k) mN for each region."""
+        free = self.model.constraint.free
+        pairs = zip(self.moduli, self.model.stiffness, strict=True)
+        return [modulus * np.asarray(free.T @ np.asarray(matrix @ displacements)) for modulus, matrix in pairs]
+
+    def tangent_loads(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Loads (n_free, n_regions + n_modes), mN, whose responses are the free part of the tangent at u (n_dof,)."""
+        by_modulus = np.stack(self._modulus_forces(values), axis=1)
+        by_mode = weighted_sum(self.moduli, self.model.coupling)[:, :-1].toarray()
+        return -np.concatenate([by_modulus, by_mode], axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class LinearEquilibrium:
+    """The displacement at one system and one set of mode coefficients; implements `Equilibrium`."""
+
+    system: LinearSystem
+    coefficients: NDArray[np.float64]
+    values: NDArray[np.float64]
+
+    @property
+    def displacement(self) -> NDArray[np.float64]:
+        """Displacement u (n_points, 3) mm."""
+        return self.values.reshape(-1, 3)
+
+    @property
+    def counts(self) -> SolveCounts:
+        """One factorisation and one right-hand side."""
+        return SolveCounts(forward=1, factorisations=1)
+
+    @property
+    def tangent_counts(self) -> SolveCounts:
+        """One right-hand side a modulus and a mode."""
+        return SolveCounts(tangent=self.system.model.n_regions + self.system.model.n_modes)
+
+    @property
+    def adjoint_counts(self) -> SolveCounts:
+        """One right-hand side."""
+        return SolveCounts(adjoint=1)
+
+    def tangent(self) -> NDArray[np.float64]:
+        """T (n_dof, n_regions + n_modes), mm: columns du / d ln E_r = -F K_ff^-1 F^T E_r K_r u, then du / dq_k."""
+        constraint = self.system.model.constraint
+        solution = self.system.factorisation.solve(self.system.tangent_loads(self.values))
+        tangent = np.asarray(constraint.free @ solution)
+        tangent[:, self.system.model.n_regions :] += constraint.modes
+        return tangent
+
+    def adjoint(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
+        """T^T g (n_regions + n_modes,) for g (n_dof,): one solve K_ff p = F^T g, then p^T of the tangent's loads."""
+        constraint = self.system.model.constraint
+        load = np.asarray(constraint.free.T @ gradient)
+        adjoint = self.system.factorisation.solve(load[:, None])[:, 0]
+        result = np.asarray(self.system.tangent_loads(self.values).T @ adjoint)
+        result[self.system.model.n_regions :] += constraint.modes.T @ gradient
+        return result
+
+
+def linear_model(space: LagrangeSpace, constraint: Constraint, *, solver: str = "auto") -> LinearModel:
+    """Assemble the linear model of all meshed tissues of `space.mesh`, with their Poisson's ratios.
+
+    solver: a name of `palpate.mechanics.solvers.registry.SOLVERS` or "auto". Raises `ConfigurationError` when the
+    constraint is of another space, `GeometryError` for tetrahedra without positive volume.
+    """
+    n_dof = 3 * len(space.points)
+    if constraint.free.shape[0] != n_dof or len(constraint.modes) != n_dof or len(constraint.offset) != n_dof:
+        raise ConfigurationError(
+            f"the constraint has {constraint.free.shape[0]} unknowns and the space {n_dof}: make both of the same space"
+        )
+    tissues = space.mesh.tissues
+    regions = tuple(number for number, tissue in enumerate(tissues) if tissue.meshed)
+    stiffness = tuple(tissue_stiffness(space, region, tissues[region].poisson_ratio) for region in regions)
+    given = sparse.csr_matrix(np.column_stack([constraint.modes, constraint.offset]))
+    projections = [sparse.csr_matrix(constraint.free.T @ matrix) for matrix in stiffness]
+    free_stiffness = tuple(sparse.csr_matrix(rows @ constraint.free) for rows in projections)
+    coupling = tuple(sparse.csr_matrix(rows @ given) for rows in projections)
+    return LinearModel(space, constraint, regions, stiffness, free_stiffness, coupling, solver)
+
+
+def weighted_sum(
+    weights: NDArray[np.float64], matrices: tuple[sparse.csr_matrix[np.float64], ...]
+) -> sparse.csr_matrix[np.float64]:
+    """Sum of weights[r] matrices[r], sorted by column."""
+    total = weights[0] * matrices[0]
+    for weight, matrix in zip(weights[1:], matrices[1:], strict=True):
+        total = total + weight * matrix
+    result = sparse.csr_matrix(total)
+    result.sort_indices()
+    return result

@@ -1,0 +1,209 @@
+"""Reduced models: Galerkin projection on a basis of displacements, whose online cost forgets the mesh.
+
+u = F V a + M q + o with V^T K_ff(E) V a = -V^T F^T K(E) (M q + o); all blocks are affine in the moduli and kept
+densely, one for each region. Quarteroni, Manzoni & Negri, Reduced Basis Methods (2016), chapter 3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, sparse
+
+from palpate.errors import ConfigurationError, SolverError
+from palpate.mechanics.forward import SolveCounts, checked_coefficients, checked_moduli
+from palpate.mechanics.linear_model import LinearModel
+
+__all__ = ["ReducedEquilibrium", "ReducedModel", "ReducedSystem", "orthonormal_basis", "reduce"]
+
+RANK_TOLERANCE = 1e-10  # of the largest singular value of the normalised snapshots
+CHUNK = 64  # basis vectors multiplied with a stiffness at once
+
+
+@dataclass(frozen=True, slots=True)
+class ReducedModel:
+    """A linear model on m basis vectors; implements `ForwardModel`.
+
+    Per region at 1 kPa: stiffness (n_regions, m, m) and coupling (n_regions, m, n_modes + 1), mN/mm. Outputs (rows):
+    output_basis (n_outputs, m), output_given (n_outputs, n_modes + 1) mm: modes and, last, the offset.
+    """
+
+    names: tuple[str, ...]
+    stiffness: NDArray[np.float64]
+    coupling: NDArray[np.float64]
+    output_basis: NDArray[np.float64]
+    output_given: NDArray[np.float64]
+
+    @property
+    def n_regions(self) -> int:
+        """Number of moduli."""
+        return len(self.stiffness)
+
+    @property
+    def n_modes(self) -> int:
+        """Number of boundary modes."""
+        return int(self.coupling.shape[2]) - 1
+
+    @property
+    def n_basis(self) -> int:
+        """Number m of basis vectors."""
+        return int(self.stiffness.shape[1])
+
+    def at(self, dofs: NDArray[np.int64]) -> ReducedModel:
+        """The same model with the outputs `dofs` (n,) only, by their place among the present outputs."""
+        return replace(self, output_basis=self.output_basis[dofs], output_given=self.output_given[dofs])
+
+    def through(self, operator: sparse.csr_matrix[np.float64]) -> ReducedModel:
+        """The same model with the outputs H u for an operator H (n, n_outputs), such as a surface interpolation."""
+        return replace(
+            self,
+            output_basis=np.asarray(operator @ self.output_basis),
+            output_given=np.asarray(operator @ self.output_given),
+        )
+
+    def system(self, moduli: NDArray[np.float64]) -> ReducedSystem:
+        """The factorised reduced system at moduli (n_regions,) kPa; raises `SolverError`."""
+        checked = checked_moduli(moduli, self.names)
+        matrix = np.tensordot(checked, self.stiffness, axes=1)
+        try:
+            factor = linalg.cho_factor(matrix, lower=True, check_finite=False)
+        except linalg.LinAlgError as error:
+            raise SolverError(
+                f"the reduced stiffness of {len(matrix)} basis vectors is not positive definite ({error}): the moduli"
+                f" {checked.tolist()} kPa differ too much, or the basis holds nearly equal displacements"
+            ) from error
+        amplitudes = -linalg.cho_solve(factor, np.tensordot(checked, self.coupling, axes=1), check_finite=False)
+        return ReducedSystem(self, checked, factor[0], amplitudes)
+
+    def solve(self, moduli: NDArray[np.float64], coefficients: NDArray[np.float64]) -> ReducedEquilibrium:
+        """Equilibrium at moduli (n_regions,) kPa and mode coefficients (n_modes,); raises `SolverError`."""
+        return self.system(moduli).solve(coefficients)
+
+    def responses(self, moduli: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Outputs (n_outputs, n_modes + 1) mm for each unit mode and, last, for the offset; raises `SolverError`."""
+        return self.system(moduli).responses()
+
+
+@dataclass(frozen=True, slots=True)
+class ReducedSystem:
+    """A reduced model at fixed moduli (n_regions,) kPa.
+
+    factor (m, m): lower Cholesky factor; amplitudes (m, n_modes + 1): basis coefficients of every unit response.
+    """
+
+    model: ReducedModel
+    moduli: NDArray[np.float64]
+    factor: NDArray[np.float64]
+    amplitudes: NDArray[np.float64]
+
+    def responses(self) -> NDArray[np.float64]:
+        """Outputs (n_outputs, n_modes + 1) mm for each unit mode without the offset and, last, for the offset."""
+        return np.asarray(self.model.output_given + self.model.output_basis @ self.amplitudes)
+
+    def solve(self, coefficients: NDArray[np.float64]) -> ReducedEquilibrium:
+        """Equilibrium at mode coefficients (n_modes,), dimensionless: no further solve."""
+        checked = checked_coefficients(coefficients, self.model.n_modes)
+        weights = np.append(checked, 1.0)
+        amplitude = self.amplitudes @ weights
+        values = self.model.output_given @ weights + self.model.output_basis @ amplitude
+        values.setflags(write=False)
+        return ReducedEquilibrium(self, checked, amplitude, values)
+
+    def backward(self, loads: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Basis coefficients (m, k) of the responses to reduced loads (m, k) mN."""
+        return np.asarray(linalg.cho_solve((self.factor, True), loads, check_finite=False))
+
+
+@dataclass(frozen=True, slots=True)
+class ReducedEquilibrium:
+    """Outputs (n_outputs,) mm and basis coefficients (m,) at one system; implements `Equilibrium`."""
+
+    system: ReducedSystem
+    coefficients: NDArray[np.float64]
+    amplitude: NDArray[np.float64]
+    values: NDArray[np.float64]
+
+    @property
+    def displacement(self) -> NDArray[np.float64]:
+        """Displacement u (n_outputs / 3, 3) mm; raises `ConfigurationError` when the outputs are not whole points."""
+        if len(self.values) % 3:
+            raise ConfigurationError(f"the model has {len(self.values)} outputs, not three a point: use `values`")
+        return self.values.reshape(-1, 3)
+
+    @property
+    def counts(self) -> SolveCounts:
+        """Nothing of the size of the mesh was solved."""
+        return SolveCounts()
+
+    @property
+    def tangent_counts(self) -> SolveCounts:
+        """Nothing of the size of the mesh is solved."""
+        return SolveCounts()
+
+    @property
+    def adjoint_counts(self) -> SolveCounts:
+        """Nothing of the size of the mesh is solved."""
+        return SolveCounts()
+
+    def tangent(self) -> NDArray[np.float64]:
+        """T (n_outputs, n_regions + n_modes), mm: columns du / d ln E_r, then du / dq_k."""
+        model, system = self.system.model, self.system
+        by_modulus = system.backward(-self._modulus_forces())
+        amplitudes = np.concatenate([by_modulus, system.amplitudes[:, :-1]], axis=1)
+        tangent = model.output_basis @ amplitudes
+        tangent[:, model.n_regions :] += model.output_given[:, :-1]
+        return np.asarray(tangent)
+
+    def adjoint(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
+        """T^T g (n_regions + n_modes,) for g (n_outputs,), by one dense adjoint solve."""
+        model = self.system.model
+        reduced = model.output_basis.T @ gradient
+        adjoint = self.system.backward(reduced[:, None])[:, 0]
+        by_modulus = -self._modulus_forces().T @ adjoint
+        by_mode = self.system.amplitudes[:, :-1].T @ reduced + model.output_given[:, :-1].T @ gradient
+        return np.concatenate([by_modulus, by_mode])
+
+    def _modulus_forces(self) -> NDArray[np.float64]:
+        """E_r (A_r a + B_r [q, 1]), (m, n_regions) mN."""
+        model = self.system.model
+        forces = model.stiffness @ self.amplitude + model.coupling @ np.append(self.coefficients, 1.0)
+        return np.asarray((self.system.moduli[:, None] * forces).T)
+
+
+def orthonormal_basis(snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Orthonormal columns (n, m) that span the snapshots (n, k), each first scaled to length 1.
+
+    Directions below 1e-10 of the largest singular value are dropped; raises `ConfigurationError` when none is left.
+    """
+    lengths = np.linalg.norm(snapshots, axis=0)
+    if snapshots.ndim != 2 or not np.all(np.isfinite(lengths)) or not np.any(lengths > 0.0):
+        raise ConfigurationError(f"a reduced basis needs finite, non-zero snapshots (n, k); got {snapshots.shape}")
+    q, r = np.linalg.qr(snapshots[:, lengths > 0.0] / lengths[lengths > 0.0])
+    rotation, sizes, _ = np.linalg.svd(r)
+    return np.asarray(q @ rotation[:, : int(np.sum(sizes > RANK_TOLERANCE * sizes[0]))])
+
+
+def reduce(model: LinearModel, basis: NDArray[np.float64]) -> ReducedModel:
+    """Project `model` on the span of `basis` (n_free, k), free coordinates F^T u of displacements u, mm.
+
+    The basis is made orthonormal and its rank cut; raises `ConfigurationError` when its rows are not n_free.
+    """
+    free = model.constraint.free
+    if basis.ndim != 2 or len(basis) != free.shape[1]:
+        raise ConfigurationError(f"the basis has the shape {basis.shape}; it must have {free.shape[1]} rows (n_free)")
+    vectors = orthonormal_basis(basis)
+    stiffness = np.stack([_project(matrix, vectors) for matrix in model.free_stiffness])
+    coupling = np.stack([np.asarray((matrix.T @ vectors).T) for matrix in model.coupling])
+    given = np.column_stack([model.constraint.modes, model.constraint.offset])
+    return ReducedModel(model.names, stiffness, coupling, np.asarray(free @ vectors), given)
+
+
+def _project(matrix: sparse.csr_matrix[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """V^T A V (m, m), symmetric to the last digit."""
+    result = np.empty((vectors.shape[1], vectors.shape[1]))
+    for start in range(0, vectors.shape[1], CHUNK):
+        part = np.ascontiguousarray(vectors[:, start : start + CHUNK])
+        result[:, start : start + CHUNK] = vectors.T @ np.asarray(matrix @ part)
+    return np.asarray(0.5 * (result + result.T))

@@ -1,0 +1,63 @@
+"""Intel MKL PARDISO: the fastest direct solver on x86, an optional extra.
+
+Schenk & Gaertner, Future Generation Computer Systems 20 (2004) 475-487.
+"""
+
+from __future__ import annotations
+
+import importlib
+import weakref
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from palpate.errors import SolverError
+from palpate.mechanics.solvers.contract import Factorisation, Solver
+
+__all__ = ["SOLVER"]
+
+SYMMETRIC_POSITIVE_DEFINITE = 2  # PARDISO's `mtype`
+
+
+class PardisoFactorisation:
+    """Cholesky factors in PARDISO's own memory, given back when this object is dropped."""
+
+    __slots__ = ("__weakref__", "_solver", "_upper")
+
+    def __init__(self, matrix: sparse.csr_matrix[np.float64]) -> None:
+        pypardiso = importlib.import_module("pypardiso")
+        self._upper = sparse.csr_matrix(sparse.triu(matrix, format="csr"))
+        self._upper.sort_indices()
+        self._solver = pypardiso.PyPardisoSolver(mtype=SYMMETRIC_POSITIVE_DEFINITE, size_limit_storage=np.inf)
+        try:
+            self._solver.factorize(self._upper)
+        except (ValueError, pypardiso.pardiso_wrapper.PyPardisoError) as error:
+            self._solver.free_memory(everything=True)
+            raise SolverError(
+                f"PARDISO could not factorise {matrix.shape[0]} unknowns ({error}); code -4 means that the stiffness"
+                " is not positive definite: hold the body somewhere and check for inverted tetrahedra;"
+                " code -2 means that memory ran out: use a coarser mesh or solver 'multigrid'"
+            ) from error
+        self._solver.factorized_A = self._upper  # the wrapper would keep a copy to compare with
+        weakref.finalize(self, self._solver.free_memory, everything=True)
+
+    def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Solution X (n, m) of A X = rhs (n, m), all columns at once."""
+        return np.asarray(self._solver.solve(self._upper, np.asfortranarray(rhs)))
+
+
+def _available() -> bool:
+    try:
+        importlib.import_module("pypardiso")
+    except (ImportError, OSError):  # the package, or MKL itself
+        return False
+    return True
+
+
+def _factorise(matrix: sparse.csr_matrix[np.float64], near_nullspace: NDArray[np.float64] | None) -> Factorisation:
+    del near_nullspace  # elimination has no use for it
+    return PardisoFactorisation(matrix)
+
+
+SOLVER = Solver("pardiso", _factorise, True, _available, "install it with: pip install 'palpate[pardiso]'")

@@ -1,0 +1,104 @@
+"""The registered solvers, the choice between them, and the check that each of their answers must pass."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from palpate.errors import ConfigurationError, ResourceError, SolverError
+from palpate.mechanics.solvers import multigrid, pardiso, superlu
+from palpate.mechanics.solvers.contract import Factorisation, Solver
+
+__all__ = ["SOLVERS", "factorise"]
+
+SOLVERS = {solver.name: solver for solver in (pardiso.SOLVER, superlu.SOLVER, multigrid.SOLVER)}
+TOLERANCE = 1e-8  # of a residual, relative to its right-hand side
+LARGEST_CONDITION = 1e13  # beyond it a direct solution has lost three digits of four to rounding
+LARGEST_SUPERLU = 250_000  # unknowns; above, its factors outgrow a desktop's memory
+
+
+@dataclass(frozen=True, slots=True)
+class CheckedFactorisation:
+    """A factorisation whose every solution is refined once if need be, and refused when its residual is too large."""
+
+    matrix: sparse.csr_matrix[np.float64]
+    inner: Factorisation
+    solver: str
+
+    def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Solution X (n, m) of A X = rhs (n, m); raises `SolverError` above a relative residual of 1e-8."""
+        if not np.all(np.isfinite(rhs)):
+            raise SolverError("a load of the linear system is not finite: check moduli and prescribed displacements")
+        solution = self.inner.solve(rhs)
+        share, residual = self._residual(rhs, solution)
+        if share > TOLERANCE:
+            solution = solution + self.inner.solve(residual)
+            share, _ = self._residual(rhs, solution)
+        if share > TOLERANCE:
+            raise SolverError(
+                f"solver '{self.solver}' left a relative residual of {share:.2g} (tolerance {TOLERANCE:g}) in"
+                f" {len(rhs)} unknowns: the moduli may differ too much, Poisson's ratio may be too close to 0.5, or"
+                " tetrahedra may be too flat; try another solver or a better mesh"
+            )
+        return solution
+
+    def _residual(self, rhs: NDArray[np.float64], solution: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        residual = rhs - self.matrix @ solution
+        norms = np.linalg.norm(rhs, axis=0)
+        shares = np.linalg.norm(residual, axis=0) / np.where(norms > 0.0, norms, 1.0)
+        largest = float(np.max(shares, initial=0.0))
+        return (largest if np.isfinite(largest) else np.inf), residual
+
+
+def factorise(
+    matrix: sparse.csr_matrix[np.float64],
+    *,
+    solver: str = "auto",
+    near_nullspace: NDArray[np.float64] | None = None,
+) -> Factorisation:
+    """Make the symmetric positive definite `matrix` (n, n), mN/mm, ready to be solved with.
+
+    solver: a name of `SOLVERS`, or "auto": PARDISO where it is installed, else SuperLU up to 250 000 unknowns, else
+    multigrid. near_nullspace (n, k), mm: displacements of little energy (the rigid motions), which multigrid needs to
+    converge fast. Raises `SolverError` for a singular or indefinite matrix, `ConfigurationError` for an unknown name,
+    `ResourceError` for a solver that is not installed.
+    """
+    chosen = _choose(solver, matrix.shape[0])
+    if matrix.shape[0] == 0:
+        raise SolverError("no displacement is free: every point of the mesh is prescribed, nothing is left to solve")
+    if not np.all(np.isfinite(matrix.data)):
+        raise SolverError("the stiffness is not finite: check the moduli and the mesh's volumes")
+    checked = CheckedFactorisation(matrix, chosen.factorise(matrix, near_nullspace), chosen.name)
+    if chosen.direct:
+        _refuse_singular(checked)
+    return checked
+
+
+def _choose(name: str, n: int) -> Solver:
+    if name == "auto":
+        if SOLVERS["pardiso"].available():
+            return SOLVERS["pardiso"]
+        return SOLVERS["superlu" if n <= LARGEST_SUPERLU else "multigrid"]
+    if name not in SOLVERS:
+        raise ConfigurationError(f"solver is '{name}'; it must be 'auto' or one of {sorted(SOLVERS)}")
+    if not SOLVERS[name].available():
+        raise ResourceError(f"solver '{name}' is not installed; {SOLVERS[name].missing}")
+    return SOLVERS[name]
+
+
+def _refuse_singular(checked: CheckedFactorisation) -> None:
+    """Probe the condition: |A| |x| / |b| for a random b is a lower estimate; a floating body makes it 1e16."""
+    n = checked.matrix.shape[0]
+    probe = np.random.default_rng(0).standard_normal((n, 1))
+    response = checked.inner.solve(probe)
+    size = float(np.max(abs(checked.matrix).sum(axis=1)))
+    condition = size * float(np.linalg.norm(response) / np.linalg.norm(probe))
+    if not condition < LARGEST_CONDITION:
+        raise SolverError(
+            f"the stiffness of {n} unknowns is singular (condition number at least {condition:.1g}): some part of the"
+            " body can move without resistance; hold it (outer boundary 'fixed', a rigid or driver tissue) or join it"
+            " to its neighbours"
+        )

@@ -1,0 +1,203 @@
+"""What is to be meshed: a level set for every tissue and the box that cuts the body."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from palpate.errors import GeometryError, InputDataError
+from palpate.images.distance import DistanceMap, distance_map
+from palpate.images.label_image import VoxelGrid
+from palpate.images.segmentation import Segmentation
+from palpate.images.tissue import Tissue
+
+__all__ = ["Anatomy", "Box", "LevelSet", "anatomy_of", "domain_box", "margin_box"]
+
+CROP_MM = 24.0  # a map is kept so far around its tissue; beyond, only "far away" matters to the mesh
+
+
+class LevelSet(Protocol):
+    """A function of space that is negative inside a tissue and, near its surface, the distance to it in mm."""
+
+    def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Values (n,) mm at points (n, 3) in RAS mm."""
+        ...
+
+    def gradient_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Gradient (n, 3), mm per mm, at points (n, 3) in RAS mm."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A box in RAS mm: corner `origin` (3,) mm, rows of `axes` (3, 3) unit vectors, `lengths` (3,) mm along them."""
+
+    origin: NDArray[np.float64]
+    axes: NDArray[np.float64]
+    lengths: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        for name in ("origin", "axes", "lengths"):
+            array = np.array(getattr(self, name), dtype=np.float64)
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        if self.axes.shape != (3, 3) or not np.allclose(self.axes @ self.axes.T, np.eye(3), atol=1e-6):
+            raise GeometryError(f"the axes {self.axes.tolist()} of a box must be three orthogonal unit vectors in rows")
+        if not (self.lengths > 0.0).all():
+            raise GeometryError(
+                f"a box of {np.round(self.lengths, 1).tolist()} mm is empty: do the images show the same place?"
+            )
+
+    @property
+    def volume(self) -> float:
+        """Volume, mm^3."""
+        return float(np.prod(self.lengths))
+
+    def local(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Coordinates (n, 3) mm along the box's axes, from its origin, of points (n, 3) in RAS mm."""
+        return np.asarray((points - self.origin) @ self.axes.T)
+
+    def world(self, local: NDArray[np.float64]) -> NDArray[np.float64]:
+        """RAS mm (n, 3) of coordinates (n, 3) mm along the box's axes."""
+        return np.asarray(self.origin + local @ self.axes)
+
+
+@dataclass(frozen=True, slots=True)
+class Anatomy:
+    """Tissues in a box, a level set each; None for the one tissue that fills what is left.
+
+    Where level sets overlap, hollow tissues (driver, rigid, void) win over meshed ones, and of two of the same kind
+    the one that comes first in `tissues`: list a tumour before the organ that surrounds it.
+    """
+
+    tissues: tuple[Tissue, ...]
+    level_sets: tuple[LevelSet | None, ...]
+    box: Box
+
+    def __post_init__(self) -> None:
+        fillers = [tissue.name for tissue, phi in zip(self.tissues, self.level_sets, strict=True) if phi is None]
+        if len(fillers) != 1:
+            raise GeometryError(
+                f"an anatomy needs exactly one tissue without a level set, to fill what the others leave; got {fillers}"
+            )
+
+    @property
+    def filler(self) -> int:
+        """Index of the tissue that fills what is left."""
+        return self.level_sets.index(None)
+
+    @property
+    def priority(self) -> tuple[int, ...]:
+        """Indices of the tissues that have a level set; where two overlap, the earlier one wins."""
+        return _priority(self.tissues, self.filler)
+
+    def values(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Level sets (n_tissues - 1, n) mm, in the order of `priority`, at points (n, 3) in RAS mm."""
+        chosen = [self.level_sets[i] for i in self.priority]
+        return np.array([phi.at(points) for phi in chosen if phi is not None]).reshape(-1, len(points))
+
+    def tissue_at(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Index (n,) of the tissue that has each point (n, 3) in RAS mm."""
+        inside = self.values(points) < 0.0
+        order = np.array([*self.priority, self.filler])
+        return np.asarray(order[np.where(inside.any(axis=0), inside.argmax(axis=0), len(inside))])
+
+
+def anatomy_of(segmentation: Segmentation, *, box: Box, smoothing_mm: float) -> Anatomy:
+    """Smooth level sets of the tissues of a label image.
+
+    The filler is the "remaining" tissue when it is meshed, else the largest meshed one. The voxels of tissues that
+    win over a tissue are first given to their nearest other neighbour, so that the tissue's surface crosses theirs
+    instead of ending in a smoothed corner. `smoothing_mm`: see `images.distance.distance_map`.
+    Raises `InputDataError` when a tissue has no voxel.
+    """
+    tissues = segmentation.tissues
+    filler = _filler(segmentation)
+    order = _priority(tissues, filler)
+    level_sets: list[LevelSet | None] = [None] * len(tissues)
+    for rank, tissue in enumerate(order):
+        level_sets[tissue] = _extended_map(segmentation, tissue, order[:rank], smoothing_mm)
+    return Anatomy(tissues, tuple(level_sets), box)
+
+
+def domain_box(grids: Sequence[VoxelGrid]) -> Box:
+    """The part common to the images, out to the outer faces of their voxels, along the first grid's axes.
+
+    Raises `GeometryError` when the images share no volume.
+    """
+    axes = _axes(grids[0])
+    extents = [_extent(grid, axes) for grid in grids]
+    low = np.max([extent[0] for extent in extents], axis=0)
+    high = np.min([extent[1] for extent in extents], axis=0)
+    return Box(low @ axes, axes, high - low)
+
+
+def margin_box(box: Box, points: NDArray[np.float64], *, margin_mm: float) -> Box:
+    """The part of `box` within `margin_mm` of the bounding box of points (n, 3) in RAS mm."""
+    local = box.local(points)
+    low = np.maximum(local.min(axis=0) - margin_mm, 0.0)
+    high = np.minimum(local.max(axis=0) + margin_mm, box.lengths)
+    return Box(box.world(low), box.axes, high - low)
+
+
+def _priority(tissues: tuple[Tissue, ...], filler: int) -> tuple[int, ...]:
+    rest = [i for i in range(len(tissues)) if i != filler]
+    return tuple(sorted(rest, key=lambda i: tissues[i].meshed))
+
+
+def _filler(segmentation: Segmentation) -> int:
+    meshed = [i for i, tissue in enumerate(segmentation.tissues) if tissue.meshed]
+    if not meshed:
+        raise GeometryError("no tissue of the case is `estimate` or `known`: there is nothing to mesh")
+    remaining = [i for i in meshed if not segmentation.tissues[i].labels]
+    return remaining[0] if remaining else max(meshed, key=segmentation.volume)
+
+
+def _extended_map(
+    segmentation: Segmentation, tissue: int, winners: tuple[int, ...], smoothing_mm: float
+) -> DistanceMap:
+    mask = segmentation.mask(tissue)
+    if not mask.any():
+        raise InputDataError(f"tissue '{segmentation.tissues[tissue].name}' has no voxel in the image")
+    window = _window(mask, np.ceil(CROP_MM / segmentation.grid.spacing).astype(int))
+    index, part = segmentation.index[window], mask[window]
+    won = np.isin(index, winners)
+    if won.any() and not won.all():
+        nearest = ndimage.distance_transform_edt(
+            won, sampling=segmentation.grid.spacing, return_distances=False, return_indices=True
+        )
+        part = part[tuple(nearest)]
+    return distance_map(part, _cropped(segmentation.grid, window, part.shape), smoothing_mm=smoothing_mm)
+
+
+def _window(mask: NDArray[np.bool_], margin: NDArray[np.int64]) -> tuple[slice, ...]:
+    found = ndimage.find_objects(mask.astype(np.int8))[0]
+    return tuple(slice(max(s.start - m, 0), min(s.stop + m, n)) for s, m, n in zip(found, margin, mask.shape, strict=True))
+
+
+def _cropped(grid: VoxelGrid, window: tuple[slice, ...], shape: tuple[int, ...]) -> VoxelGrid:
+    affine = np.array(grid.affine)
+    affine[:3, 3] = grid.world(np.array([[s.start for s in window]], dtype=float))[0]
+    return VoxelGrid((shape[0], shape[1], shape[2]), affine)
+
+
+def _axes(grid: VoxelGrid) -> NDArray[np.float64]:
+    """The grid's axes as rows of the nearest rotation (an oblique header may be slightly sheared)."""
+    u, _, vt = np.linalg.svd((grid.affine[:3, :3] / grid.spacing).T)
+    return np.asarray(u @ vt)
+
+
+def _extent(grid: VoxelGrid, axes: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Range along `axes` inside the grid: all of it, or for a grid turned against them a box about its centre."""
+    shape = np.array(grid.shape, dtype=float)
+    centre = axes @ grid.world(((shape - 1.0) / 2.0)[None])[0]
+    own = 0.5 * shape * grid.spacing
+    turn = np.abs((grid.affine[:3, :3] / grid.spacing).T @ axes.T)  # grid axis by box axis
+    half = own[turn.argmax(axis=0)]
+    half = half * min(1.0, float((own / (turn @ half)).min()) + 1e-9)
+    return centre - half, centre + half

@@ -1,0 +1,234 @@
+"""Splitting tetrahedra: graded grids by bisection, and cuts along a level set that keep neighbours conforming."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.mesh.anatomy import Box, LevelSet
+from palpate.mesh.space import TET_EDGES
+
+__all__ = ["Grid", "cut", "edge_lengths", "graded_grid", "signed_volumes", "within_faces"]
+
+TOUCH = 0.25  # a node nearer to the surface than this share of its shortest edge is moved onto it
+ON_FACE_MM = 1e-4
+MAX_ROUNDS = 60
+CUBE_PATHS = np.array([[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]])
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Tetrahedra under construction: nodes (n_nodes, 3) mm, tets (n_tets, 4), region (n_tets,) tissue indices."""
+
+    nodes: NDArray[np.float64]
+    tets: NDArray[np.int64]
+    region: NDArray[np.int64]
+
+
+def graded_grid(
+    box: Box, size: Callable[[NDArray[np.float64]], NDArray[np.float64]], *, coarsest_mm: float, region: int
+) -> Grid:
+    """Tetrahedra of a box whose longest edges are at most `size` (points (n, 3) mm -> (n,) mm) at their centres.
+
+    Kuhn's six tetrahedra of each cell of a lattice of about `coarsest_mm`, bisected at their longest edges
+    (Rivara 1984), which keeps all angles above 30 degrees. All tetrahedra get `region`.
+    """
+    grid = _lattice(box, coarsest_mm, region)
+    for _ in range(MAX_ROUNDS):
+        too_large = edge_lengths(grid).max(axis=1) > size(grid.nodes[grid.tets].mean(axis=1))
+        if not too_large.any():
+            break
+        grid = _bisected(grid, too_large)
+    return grid
+
+
+def edge_lengths(grid: Grid) -> NDArray[np.float64]:
+    """Lengths (n_tets, 6) mm of the edges of each tetrahedron, in the order of TET_EDGES."""
+    ends = grid.nodes[grid.tets[:, TET_EDGES]]
+    return np.asarray(np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2))
+
+
+def cut(grid: Grid, phi: LevelSet, *, inside: int, splittable: NDArray[np.bool_], box: Box) -> Grid:
+    """Give the part of the `splittable` (n_tets,) tetrahedra where `phi` is negative to the region `inside`.
+
+    Nodes almost on the surface are moved onto it, where they are free to; edges that cross it are divided where phi, along them, is zero.
+    """
+    active = np.unique(grid.tets[splittable])
+    values = np.zeros(len(grid.nodes))
+    values[active] = phi.at(grid.nodes[active])
+    shortest = _shortest_edge(grid)
+    touching = np.flatnonzero(np.abs(values) < TOUCH * shortest)
+    values[touching] = 0.0
+    grid = _moved_onto(grid, phi, np.intersect1d(touching, active), box)
+    ends = grid.tets[:, TET_EDGES]
+    crossed = np.prod(np.sign(values[ends]), axis=2) < 0
+    divided, parent = _divide(grid, crossed, lambda pairs: _roots(grid.nodes[pairs], values[pairs], phi))
+    values = np.concatenate([values, np.zeros(len(divided.nodes) - len(values))])
+    total = values[divided.tets].sum(axis=1)
+    flat = np.flatnonzero((total == 0.0) & splittable[parent])
+    total[flat] = phi.at(divided.nodes[divided.tets[flat]].mean(axis=1))
+    region = np.where(splittable[parent] & (total < 0.0), inside, divided.region)
+    return Grid(divided.nodes, divided.tets, region)
+
+
+def _lattice(box: Box, coarsest_mm: float, region: int) -> Grid:
+    counts = np.maximum(np.round(box.lengths / coarsest_mm).astype(int), 1)
+    steps = [np.linspace(0.0, length, n + 1) for length, n in zip(box.lengths, counts, strict=True)]
+    nodes = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    strides = np.array([(counts[1] + 1) * (counts[2] + 1), counts[2] + 1, 1])
+    cells = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), axis=-1).reshape(-1, 3) @ strides
+    walks = np.concatenate([np.zeros((6, 1), dtype=int), np.cumsum(strides[CUBE_PATHS], axis=1)], axis=1)
+    tets = (cells[:, None, None] + walks).reshape(-1, 4)
+    return Grid(box.world(nodes), _oriented(box.world(nodes), tets), np.full(len(tets), region))
+
+
+def _moved_onto(grid: Grid, phi: LevelSet, chosen: NDArray[np.int64], box: Box) -> Grid:
+    """Move the chosen nodes onto the surface along its gradient, the box's faces kept; not those of earlier surfaces."""
+    free = np.setdiff1d(chosen, _interface_nodes(grid))
+    nodes = grid.nodes.copy()
+    for _ in range(2):
+        slope = within_faces(phi.gradient_at(nodes[free]), nodes[free], box)
+        step = -phi.at(nodes[free]) / np.maximum((slope**2).sum(axis=1), 0.25)
+        nodes[free] += step[:, None] * slope
+    before = signed_volumes(grid.nodes, grid.tets)
+    for _ in range(MAX_ROUNDS):
+        bad = signed_volumes(nodes, grid.tets) < 0.2 * before
+        if not bad.any():
+            break
+        nodes[grid.tets[bad]] = grid.nodes[grid.tets[bad]]
+    return Grid(nodes, grid.tets, grid.region)
+
+
+def within_faces(vectors: NDArray[np.float64], points: NDArray[np.float64], box: Box) -> NDArray[np.float64]:
+    """Vectors (n, 3) at points (n, 3) mm, less their part normal to the faces of the box that a point lies on."""
+    local = box.local(points)
+    on_face = (np.abs(local) < ON_FACE_MM) | (np.abs(local - box.lengths) < ON_FACE_MM)
+    return np.asarray(np.where(on_face, 0.0, vectors @ box.axes.T) @ box.axes)
+
+
+def signed_volumes(nodes: NDArray[np.float64], tets: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Volumes (n_tets,) mm^3 of tets (n_tets, 4), negative when inverted; nodes (n_nodes, 3) mm."""
+    corner = nodes[tets]
+    a, b, c = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0], corner[:, 3] - corner[:, 0]
+    return np.asarray(np.einsum("ni,ni->n", np.cross(a, b), c) / 6.0)
+
+
+def _interface_nodes(grid: Grid) -> NDArray[np.int64]:
+    """Nodes that belong to tetrahedra of more than one region."""
+    low = np.full(len(grid.nodes), np.iinfo(np.int64).max)
+    high = np.full(len(grid.nodes), -1)
+    np.minimum.at(low, grid.tets, grid.region[:, None])
+    np.maximum.at(high, grid.tets, grid.region[:, None])
+    return np.asarray(np.flatnonzero(high > low))
+
+
+def _oriented(nodes: NDArray[np.float64], tets: NDArray[np.int64]) -> NDArray[np.int64]:
+    flip = signed_volumes(nodes, tets) < 0.0
+    turned = tets.copy()
+    turned[flip, 0], turned[flip, 1] = tets[flip, 1], tets[flip, 0]
+    return turned
+
+
+def _bisected(grid: Grid, chosen: NDArray[np.bool_]) -> Grid:
+    """Bisect the chosen tetrahedra at their longest edge, and others where that keeps the grid conforming and good."""
+    n = len(grid.nodes)
+    pairs = np.sort(grid.tets[:, TET_EDGES], axis=2)
+    keys, number = np.unique(pairs[..., 0] * n + pairs[..., 1], return_inverse=True)
+    number = number.reshape(-1, 6)
+    longest = np.take_along_axis(number, edge_lengths(grid).argmax(axis=1)[:, None], axis=1)[:, 0]
+    marked = np.zeros(len(keys), dtype=bool)
+    marked[longest[chosen]] = True
+    while True:
+        reached = longest[marked[number].any(axis=1)]
+        if marked[reached].all():
+            break
+        marked[reached] = True
+    return _divide(grid, marked[number], lambda ends: grid.nodes[ends].mean(axis=1))[0]
+
+
+def _divide(
+    grid: Grid, marked: NDArray[np.bool_], place: Callable[[NDArray[np.int64]], NDArray[np.float64]]
+) -> tuple[Grid, NDArray[np.int64]]:
+    """Divide every marked edge (n_tets, 6) at `place` (edge ends (n, 2) -> (n, 3) mm); also the parent of each child.
+
+    In each tetrahedron the longest marked edge goes first. That order is the same on both sides of a face, so the
+    result conforms.
+    """
+    n = len(grid.nodes)
+    pairs = np.sort(grid.tets[:, TET_EDGES][marked], axis=1)
+    length = np.linalg.norm(grid.nodes[pairs[:, 0]] - grid.nodes[pairs[:, 1]], axis=1)
+    keys, first = np.unique(pairs[:, 0] * n + pairs[:, 1], return_index=True)
+    rank = np.empty(len(keys), dtype=np.int64)
+    rank[np.argsort(-np.round(length[first], 6), kind="stable")] = np.arange(len(keys))
+    nodes = np.concatenate([grid.nodes, place(np.stack([keys // n, keys % n], axis=1))])
+    tets, parent = grid.tets, np.arange(len(grid.tets))
+    done: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
+    while len(tets):
+        edge, whole = _first_edge(tets, keys, rank, n)
+        done.append((tets[whole], parent[whole]))
+        tets, parent, edge = tets[~whole], parent[~whole], edge[~whole]
+        tets, parent = _halved(tets, parent, edge, keys, n)
+    return Grid(nodes, np.concatenate([t for t, _ in done]), grid.region[np.concatenate([p for _, p in done])]), (
+        np.concatenate([p for _, p in done])
+    )
+
+
+def _first_edge(
+    tets: NDArray[np.int64], keys: NDArray[np.int64], rank: NDArray[np.int64], n: int
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Which of its six edges each tetrahedron divides first, and whether it has none to divide."""
+    if len(keys) == 0:
+        return np.zeros(len(tets), dtype=np.int64), np.ones(len(tets), dtype=bool)
+    key = _edge_keys(tets, n)
+    place = np.clip(np.searchsorted(keys, key), 0, len(keys) - 1)
+    order = np.where(keys[place] == key, rank[place], len(keys))
+    first = order.argmin(axis=1)
+    return first, order.min(axis=1) == len(keys)
+
+
+def _edge_keys(tets: NDArray[np.int64], n: int) -> NDArray[np.int64]:
+    """One number for each edge (n_tets, 6); -1 for edges to nodes that are new (n and above): never divided."""
+    pairs = np.sort(tets[:, TET_EDGES], axis=2)
+    return np.asarray(np.where(pairs[..., 1] < n, pairs[..., 0] * n + pairs[..., 1], -1))
+
+
+def _halved(
+    tets: NDArray[np.int64], parent: NDArray[np.int64], edge: NDArray[np.int64], keys: NDArray[np.int64], n: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    rows = np.arange(len(tets))
+    key = _edge_keys(tets, n)[rows, edge]
+    middle = n + np.searchsorted(keys, key)
+    halves = []
+    for end in range(2):
+        half = tets.copy()
+        half[rows, TET_EDGES[edge, end]] = middle
+        halves.append(half)
+    return np.concatenate(halves), np.concatenate([parent, parent])
+
+
+def _shortest_edge(grid: Grid) -> NDArray[np.float64]:
+    shortest = np.full(len(grid.nodes), np.inf)
+    np.minimum.at(shortest, grid.tets[:, TET_EDGES], edge_lengths(grid)[:, :, None])
+    return shortest
+
+
+def _roots(ends: NDArray[np.float64], values: NDArray[np.float64], phi: LevelSet) -> NDArray[np.float64]:
+    """Points (n, 3) of the segments `ends` (n, 2, 3) where phi is zero, by regula falsi (Illinois)."""
+    low, high = np.zeros(len(ends)), np.ones(len(ends))
+    f_low, f_high = values[:, 0].copy(), values[:, 1].copy()
+    at = f_low / (f_low - f_high)
+    for _ in range(4):
+        f = phi.at(ends[:, 0] + at[:, None] * (ends[:, 1] - ends[:, 0]))
+        left = np.sign(f) == np.sign(f_low)
+        low, f_low, f_high = np.where(left, at, low), np.where(left, f, f_low), np.where(left, 0.5 * f_high, f_high)
+        high, f_high, f_low = (
+            np.where(left, high, at),
+            np.where(left, f_high, f),
+            np.where(left, f_low, 0.5 * f_low),
+        )
+        at = (low * f_high - high * f_low) / np.where(f_high == f_low, 1.0, f_high - f_low)
+    at = np.clip(at, 0.05, 0.95)
+    return np.asarray(ends[:, 0] + at[:, None] * (ends[:, 1] - ends[:, 0]))

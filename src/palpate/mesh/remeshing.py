@@ -1,0 +1,116 @@
+"""Mmg's remeshing: better tetrahedra of the wanted size, the surfaces between regions kept."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from mmgpy import MmgMesh3D
+from numpy.typing import NDArray
+
+from palpate.errors import GeometryError
+from palpate.mesh.anatomy import Box
+from palpate.mesh.cutting import Grid
+from palpate.mesh.tet_mesh import FACES
+
+__all__ = ["compact", "remeshed"]
+
+ON_FACE_MM = 1e-4
+HOLLOW_REFERENCE = 8  # references 1 to 6 are the faces of the box, 8 any hollow tissue, the rest pairs of regions
+
+
+def remeshed(grid: Grid, sizes: NDArray[np.float64], *, box: Box, sag_mm: float) -> Grid:
+    """The same regions in tetrahedra of edge length `sizes` (n_nodes,) mm, by Mmg (Dapogny, Dobrzynski, Frey 2014).
+
+    Surfaces move by no more than about `sag_mm`. Raises `GeometryError` when Mmg gives up.
+    """
+    mesh = MmgMesh3D()
+    triangles, references = _surfaces(grid, box)
+    ridges = _ridges(triangles, references)
+    mesh.set_mesh_size(
+        vertices=len(grid.nodes), tetrahedra=len(grid.tets), triangles=len(triangles), edges=len(ridges)
+    )
+    mesh.set_vertices(grid.nodes)
+    mesh.set_tetrahedra(grid.tets.astype(np.int32), (grid.region + 1).astype(np.int32))
+    mesh.set_triangles(triangles.astype(np.int32), references.astype(np.int32))
+    mesh.set_edges(ridges.astype(np.int32))
+    mesh.set_ridge_edges(np.arange(len(ridges), dtype=np.int32))
+    mesh["metric"] = sizes[:, None]
+    try:
+        with _silent():
+            mesh.remesh(
+                hmin=0.4 * float(sizes.min()),
+                hmax=1.2 * float(sizes.max()),
+                hausd=sag_mm,
+                hgrad=1.4,
+                angle=0,
+                verbose=-1,
+            )
+    except RuntimeError as error:
+        raise GeometryError(
+            f"Mmg could not improve a mesh of {len(grid.tets)} tetrahedra ({error}); try another mesh.edge_length_mm"
+        ) from error
+    tets, region = mesh.get_tetrahedra_with_refs()
+    return compact(np.array(mesh.get_vertices()), np.array(tets, dtype=np.int64), np.array(region, dtype=np.int64) - 1)
+
+
+def compact(nodes: NDArray[np.float64], tets: NDArray[np.int64], region: NDArray[np.int64]) -> Grid:
+    """A grid without the nodes that no tetrahedron uses: nodes (n, 3) mm, tets (n_tets, 4), region (n_tets,)."""
+    used, tets = np.unique(tets, return_inverse=True)
+    return Grid(nodes[used], tets.reshape(-1, 4), region)
+
+
+def _surfaces(grid: Grid, box: Box) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Faces (n, 3) between regions and on the border, with Mmg's reference (n,) of the surface they belong to."""
+    faces = grid.tets[:, FACES].reshape(-1, 3)
+    regions = np.repeat(grid.region, 4)
+    order = np.lexsort(np.sort(faces, axis=1).T)
+    same = np.zeros(len(order), dtype=bool)
+    ordered = np.sort(faces, axis=1)[order]
+    same[:-1] = (ordered[1:] == ordered[:-1]).all(axis=1)
+    second = np.zeros(len(order), dtype=bool)
+    second[1:] = same[:-1]
+    pair = np.flatnonzero(same)
+    pair = pair[regions[order[pair]] != regions[order[pair + 1]]]
+    a, b = regions[order[pair]], regions[order[pair + 1]]
+    code = 10 + np.minimum(a, b) * (regions.max() + 1) + np.maximum(a, b)
+    border = order[~same & ~second]
+    triangles = np.concatenate([faces[order[pair]], faces[border]])
+    return triangles, np.concatenate([code, _box_face(grid.nodes[faces[border]], box)])
+
+
+def _ridges(triangles: NDArray[np.int64], references: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Edges (n, 2) where two faces of the box meet, or one meets a hollow tissue: Mmg must keep them sharp."""
+    border = references <= HOLLOW_REFERENCE
+    edges = np.sort(triangles[border][:, [[0, 1], [1, 2], [0, 2]]].reshape(-1, 2), axis=1)
+    kinds = np.unique(np.column_stack([edges, np.repeat(references[border], 3)]), axis=0)
+    unique, count = np.unique(kinds[:, :2], axis=0, return_counts=True)
+    return np.asarray(unique[count > 1])
+
+
+def _box_face(corners: NDArray[np.float64], box: Box) -> NDArray[np.int64]:
+    """Number 1 to 6 of the face of the box that triangles (n, 3, 3) lie on, else HOLLOW_REFERENCE."""
+    local = box.local(corners.reshape(-1, 3)).reshape(-1, 3, 3)
+    on = np.concatenate([np.abs(local) < ON_FACE_MM, np.abs(local - box.lengths) < ON_FACE_MM], axis=2).all(axis=1)
+    return np.asarray(np.where(on.any(axis=1), 1 + on.argmax(axis=1), HOLLOW_REFERENCE))
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Keep what the C library writes to the process's standard streams away from the user's terminal."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    kept = os.dup(1), os.dup(2)
+    with Path(os.devnull).open("w") as nowhere:
+        os.dup2(nowhere.fileno(), 1)
+        os.dup2(nowhere.fileno(), 2)
+        try:
+            yield
+        finally:
+            for stream, copy in enumerate(kept, start=1):
+                os.dup2(copy, stream)
+                os.close(copy)

@@ -1,0 +1,218 @@
+"""Surface nodes put exactly where they belong: on their level sets, less the sag of the facets between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.mesh.anatomy import Anatomy, Box, LevelSet
+from palpate.mesh.cutting import Grid, signed_volumes, within_faces
+from palpate.mesh.tet_mesh import FACES
+
+__all__ = ["Contacts", "contacts_of", "debiased", "snapped"]
+
+GRAZING = 0.25  # two surfaces that meet at a smaller (relative) angle count as one where they meet
+SHRINK_LIMIT = 0.25  # a move that leaves less of a tetrahedron's volume is cut back
+MAX_HALVINGS = 6
+# Strang and Fix: six points, exact to degree four, on the reference triangle
+QUADRATURE = np.array([[0.108103018168070, 0.445948490915965, 0.445948490915965],
+                       [0.816847572980459, 0.091576213509771, 0.091576213509771]])  # fmt: skip
+QUADRATURE_WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
+
+
+@dataclass(frozen=True, slots=True)
+class Union:
+    """Level set of several tissues taken together: the lowest of theirs."""
+
+    parts: tuple[LevelSet, ...]
+
+    def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Values (n,) mm at points (n, 3) in RAS mm."""
+        return np.asarray(np.min([part.at(points) for part in self.parts], axis=0))
+
+    def gradient_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Gradient (n, 3), mm per mm, of the lowest part at points (n, 3) in RAS mm."""
+        lowest = np.argmin([part.at(points) for part in self.parts], axis=0)
+        gradient = np.zeros((len(points), 3))
+        for i, part in enumerate(self.parts):
+            mine = lowest == i
+            gradient[mine] = part.gradient_at(points[mine])
+        return gradient
+
+
+@dataclass(frozen=True, slots=True)
+class Contacts:
+    """Which surfaces the nodes of a grid lie on.
+
+    level_sets: one a surface; faces (n_faces, 3) node numbers and surface (n_faces,) their surface;
+    on (n_nodes, n_surfaces) whether a node is on a surface; target (n_nodes, n_surfaces) mm, the level set's value that
+    the node is to have: zero, or what makes the facets around it unbiased.
+    """
+
+    level_sets: tuple[LevelSet, ...]
+    faces: NDArray[np.int64]
+    surface: NDArray[np.int64]
+    on: NDArray[np.bool_]
+    target: NDArray[np.float64]
+    box: Box
+
+    def values(self, points: NDArray[np.float64], nodes: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Level set less target (n, n_surfaces) mm at `points` (n, 3) mm of the `nodes` (n,); zero where not on it."""
+        result = np.zeros((len(nodes), len(self.level_sets)))
+        for k, phi in enumerate(self.level_sets):
+            rows = np.flatnonzero(self.on[nodes, k])
+            if len(rows):
+                result[rows, k] = phi.at(points[rows]) - self.target[nodes[rows], k]
+        return result
+
+    def gradients(self, points: NDArray[np.float64], nodes: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Gradients (n, n_surfaces, 3) along the box's faces where a node lies on one; zero for other surfaces."""
+        result = np.zeros((len(nodes), len(self.level_sets), 3))
+        for k, phi in enumerate(self.level_sets):
+            rows = np.flatnonzero(self.on[nodes, k])
+            if len(rows):
+                result[rows, k] = within_faces(phi.gradient_at(points[rows]), points[rows], self.box)
+        return result
+
+    def onto(self, points: NDArray[np.float64], nodes: NDArray[np.int64], *, limit_mm: float) -> NDArray[np.float64]:
+        """One Newton step (n, 3) mm, of least length, that brings `points` of the `nodes` onto their surfaces."""
+        inverse = np.linalg.pinv(self.gradients(points, nodes), rcond=GRAZING)
+        step = -np.einsum("nik,nk->ni", inverse, self.values(points, nodes))
+        length = np.linalg.norm(step, axis=1, keepdims=True)
+        return np.asarray(step * np.minimum(1.0, limit_mm / np.maximum(length, 1e-12)))
+
+
+def contacts_of(grid: Grid, anatomy: Anatomy) -> Contacts:
+    """The surfaces of `anatomy` in a grid of its meshed tissues.
+
+    All hollow tissues are one surface, the first; then one a meshed tissue, in the order of priority. A face belongs
+    to the tissue on its two sides that wins. The faces of the box belong to none.
+    """
+    level_sets, number = _surfaces(anatomy)
+    faces, behind = _sides(grid, anatomy)
+    rank = number[behind].min(axis=1)
+    keep = rank < len(level_sets)
+    faces, rank = faces[keep], rank[keep]
+    on = np.zeros((len(grid.nodes), len(level_sets)), dtype=bool)
+    on[faces, rank[:, None]] = True
+    return Contacts(level_sets, faces, rank, on, np.zeros(on.shape), anatomy.box)
+
+
+def snapped(grid: Grid, contacts: Contacts, *, limit_mm: float, sweeps: int = 3) -> Grid:
+    """Move surface nodes onto their level sets along the gradients, no further than keeps every tetrahedron alive."""
+    nodes = np.flatnonzero(contacts.on.any(axis=1))
+    for _ in range(sweeps):
+        step = np.zeros(grid.nodes.shape)
+        step[nodes] = contacts.onto(grid.nodes[nodes], nodes, limit_mm=limit_mm)
+        grid = Grid(_safely_moved(grid, step), grid.tets, grid.region)
+    return grid
+
+
+def debiased(grid: Grid, contacts: Contacts, *, sweeps: int = 3) -> tuple[Grid, Contacts]:
+    """Move surface nodes until the level set's mean over the facets around each, weighted by its hat, vanishes.
+
+    Chords of a curved surface lie on its inner side: with nodes on the surface every convex organ is too small.
+    Returns the grid and the contacts with the targets that it was given.
+    """
+    for _ in range(sweeps):
+        target = contacts.target - _facet_means(grid, contacts)
+        contacts = replace(contacts, target=np.where(contacts.on, target, 0.0))
+        grid = snapped(grid, contacts, limit_mm=1.0, sweeps=1)
+    return grid, contacts
+
+
+def _surfaces(anatomy: Anatomy) -> tuple[tuple[LevelSet, ...], NDArray[np.int64]]:
+    """Level sets of the surfaces, and the number of the surface (n_tissues + 1,) of each tissue; last entry: the box."""
+    level_sets: list[LevelSet] = []
+    hollow = tuple(
+        phi
+        for tissue, phi in zip(anatomy.tissues, anatomy.level_sets, strict=True)
+        if phi is not None and not tissue.meshed
+    )
+    if hollow:
+        level_sets.append(Union(hollow))
+    number = np.full(len(anatomy.tissues) + 1, len(anatomy.tissues) + 1)
+    for i in anatomy.priority:
+        phi = anatomy.level_sets[i]
+        if phi is None or not anatomy.tissues[i].meshed:
+            number[i] = 0
+        else:
+            number[i] = len(level_sets)
+            level_sets.append(phi)
+    return tuple(level_sets), number
+
+
+def _sides(grid: Grid, anatomy: Anatomy) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Faces (n, 3) between different tissues with the two (n, 2) tissues; -1 for a hollow one on the box's faces.
+
+    A hollow tissue is stood for by the first hollow one of the priority, or by the filler when there is no other.
+    """
+    faces = grid.tets[:, FACES].reshape(-1, 3)
+    region = np.repeat(grid.region, 4)
+    _, inverse, count = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True)
+    order = np.argsort(inverse.ravel(), kind="stable")
+    first = np.concatenate([[0], np.cumsum(count)[:-1]])
+    double = first[count == 2]
+    a, b = order[double], order[double + 1]
+    differ = region[a] != region[b]
+    border = order[first[count == 1]]
+    hollow = [i for i in anatomy.priority if not anatomy.tissues[i].meshed] or [anatomy.filler]
+    behind = np.where(_on_box(grid.nodes[faces[border]], anatomy.box), -1, hollow[0])
+    inner = ~_is_box(behind)
+    tissues = np.concatenate([
+        np.column_stack([region[a], region[b]])[differ],
+        np.column_stack([region[border], behind])[inner],
+    ])
+    return np.concatenate([faces[a[differ]], faces[border[inner]]]), tissues
+
+
+def _is_box(behind: NDArray[np.int64]) -> NDArray[np.bool_]:
+    return np.asarray(behind < 0)
+
+
+def _on_box(corners: NDArray[np.float64], box: Box) -> NDArray[np.bool_]:
+    local = box.local(corners.reshape(-1, 3)).reshape(-1, 3, 3)
+    return np.asarray(
+        np.concatenate([local < 1e-3, local > box.lengths - 1e-3], axis=2).all(axis=1).any(axis=1)
+    )
+
+
+def _safely_moved(grid: Grid, step: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Nodes after `step` (n_nodes, 3) mm, halved around every tetrahedron that it would flatten."""
+    before = signed_volumes(grid.nodes, grid.tets)
+    step = step.copy()
+    for _ in range(MAX_HALVINGS):
+        bad = signed_volumes(grid.nodes + step, grid.tets) < SHRINK_LIMIT * before
+        if not bad.any():
+            return np.asarray(grid.nodes + step)
+        step[np.unique(grid.tets[bad])] *= 0.5
+    while bad.any():
+        step[np.unique(grid.tets[bad])] = 0.0
+        bad = signed_volumes(grid.nodes + step, grid.tets) < SHRINK_LIMIT * before
+    return np.asarray(grid.nodes + step)
+
+
+def _facet_means(grid: Grid, contacts: Contacts) -> NDArray[np.float64]:
+    """Mean of the level set (n_nodes, n_surfaces) mm over the facets around each node, weighted by its hat function."""
+    corners = grid.nodes[contacts.faces]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    total, weight = np.zeros(contacts.on.shape), np.zeros(contacts.on.shape)
+    barycentric = np.concatenate([np.roll(row, shift)[None] for row in QUADRATURE for shift in range(3)])
+    for place, share in zip(barycentric, QUADRATURE_WEIGHTS, strict=True):
+        value = _on_faces(contacts, np.einsum("k,nki->ni", place, corners))
+        for corner in range(3):
+            key = (contacts.faces[:, corner], contacts.surface)
+            np.add.at(total, key, share * area * place[corner] * value)
+            np.add.at(weight, key, share * area * place[corner])
+    return np.asarray(total / np.where(weight > 0.0, weight, 1.0))
+
+
+def _on_faces(contacts: Contacts, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    values = np.zeros(len(points))
+    for k, phi in enumerate(contacts.level_sets):
+        mine = contacts.surface == k
+        if mine.any():
+            values[mine] = phi.at(points[mine])
+    return values

@@ -1,0 +1,116 @@
+"""From an anatomy to conforming tetrahedra: grid, cuts, remeshing, exact surfaces, smoothing."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import GeometryError
+from palpate.images.tissue import Role
+from palpate.mesh.anatomy import Anatomy
+from palpate.mesh.cutting import Grid, cut, graded_grid
+from palpate.mesh.remeshing import compact, remeshed
+from palpate.mesh.smoothing import smoothed
+from palpate.mesh.snapping import contacts_of, debiased, snapped
+from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh
+
+__all__ = ["boundary_of", "tetrahedralise"]
+
+COARSEST = 4.0  # longest edge far from all surfaces, in edge lengths
+GRADING = 0.45  # growth of the edge length with the distance from a surface, mm per mm
+GRID_FACTOR = 1.5  # longest over mean edge of the grid's tetrahedra
+SAG = 0.15  # how far remeshing may move a surface, in edge lengths; snapping puts it back
+SMOOTHING_SWEEPS = (30, 15)
+COARSER = 1.5  # edge length on bones, air and known tissues, in edge lengths
+
+
+def tetrahedralise(anatomy: Anatomy, *, edge_length_mm: float) -> TetMesh:
+    """Conforming tetrahedra of the meshed tissues; hollow tissues (driver, rigid, void) are left out.
+
+    `edge_length_mm` holds on the surfaces of `estimate` tissues and drivers; it grows with the distance from them,
+    to four times as much. Surface nodes lie on the level sets. Deterministic.
+    Raises `GeometryError` when nothing is left to mesh or the remeshing fails.
+    """
+    if not 0.0 < edge_length_mm < float(anatomy.box.lengths.min()):
+        raise GeometryError(
+            f"mesh.edge_length_mm is {edge_length_mm}; it must be positive and less than the smallest side of the"
+            f" domain, {anatomy.box.lengths.min():.1f} mm"
+        )
+    grid = _cut_grid(anatomy, edge_length_mm)
+    grid = _meshed_part(grid, anatomy)
+    sizes = _sizes(anatomy, grid.nodes, edge_length_mm)
+    grid = remeshed(grid, sizes, box=anatomy.box, sag_mm=SAG * edge_length_mm)
+    grid = _fitted(grid, anatomy, edge_length_mm)
+    boundary = boundary_of(grid.tets)
+    beyond = _beyond(anatomy, grid.nodes, boundary)
+    return TetMesh(grid.nodes, grid.tets, grid.region, boundary, beyond, anatomy.tissues)
+
+
+def boundary_of(tets: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Faces (n, 3) that belong to one of the tets (n_tets, 4) only, normals pointing out of it."""
+    faces = tets[:, FACES].reshape(-1, 3)
+    _, place, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    return np.asarray(faces[np.sort(place[count == 1])])
+
+
+def _fitted(grid: Grid, anatomy: Anatomy, edge_length_mm: float) -> Grid:
+    """The grid with its surface nodes where they belong and its bad tetrahedra opened."""
+    contacts = contacts_of(grid, anatomy)
+    grid = snapped(grid, contacts, limit_mm=edge_length_mm)
+    for sweeps in SMOOTHING_SWEEPS:
+        grid = smoothed(grid, contacts, step_mm=0.15 * edge_length_mm, sweeps=sweeps)
+        grid, contacts = debiased(grid, contacts)
+    return smoothed(grid, contacts, step_mm=0.05 * edge_length_mm, sweeps=SMOOTHING_SWEEPS[-1])
+
+
+def _cut_grid(anatomy: Anatomy, edge_length_mm: float) -> Grid:
+    def longest_edge(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        return GRID_FACTOR * _sizes(anatomy, points, edge_length_mm)
+
+    grid = graded_grid(
+        anatomy.box, longest_edge, coarsest_mm=COARSEST * edge_length_mm, region=anatomy.filler
+    )
+    for tissue in anatomy.priority:
+        phi = anatomy.level_sets[tissue]
+        if phi is not None:
+            grid = cut(grid, phi, inside=tissue, splittable=grid.region == anatomy.filler, box=anatomy.box)
+    return grid
+
+
+def _sizes(anatomy: Anatomy, points: NDArray[np.float64], edge_length_mm: float) -> NDArray[np.float64]:
+    """Wanted edge length (n,) mm at points (n, 3) mm."""
+    values = anatomy.values(points)
+    fine = [anatomy.tissues[i].role in (Role.ESTIMATE, Role.DRIVER) for i in anatomy.priority]
+    start = edge_length_mm * np.where(fine, 1.0, COARSER)[:, None]
+    sizes = (start + GRADING * np.abs(values)).min(axis=0, initial=np.inf)
+    return np.asarray(np.minimum(sizes, COARSEST * edge_length_mm))
+
+
+def _meshed_part(grid: Grid, anatomy: Anatomy) -> Grid:
+    keep = np.array([tissue.meshed for tissue in anatomy.tissues])[grid.region]
+    if not keep.any():
+        raise GeometryError("no tetrahedron is left: the `estimate` and `known` tissues lie outside the domain")
+    return compact(grid.nodes, grid.tets[keep], grid.region[keep])
+
+
+def _beyond(anatomy: Anatomy, nodes: NDArray[np.float64], boundary: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Hollow tissue (n,) behind each boundary face (n, 3): the nearest one, OUTER on the faces of the box."""
+    local = anatomy.box.local(nodes)[boundary]
+    tolerance = 1e-3
+    on_box = np.concatenate([local < tolerance, local > anatomy.box.lengths - tolerance], axis=2).all(axis=1).any(axis=1)
+    corners = nodes[boundary]
+    centres = corners.mean(axis=1)
+    hollow = [rank for rank, i in enumerate(anatomy.priority) if not anatomy.tissues[i].meshed]
+    index = np.array([anatomy.priority[rank] for rank in hollow])
+    if not anatomy.tissues[anatomy.filler].meshed:
+        index = np.append(index, anatomy.filler)
+    if not len(index):
+        return np.full(len(boundary), OUTER)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    reach = 0.25 * np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
+    values = anatomy.values(centres + reach[:, None] * normals)
+    chosen = values[hollow]
+    if len(index) > len(hollow):
+        chosen = np.concatenate([chosen, -np.abs(values).min(axis=0, keepdims=True)])
+    return np.asarray(np.where(on_box, OUTER, index[chosen.argmin(axis=0)]))

@@ -1,0 +1,168 @@
+"""Signed surface distances between a deformed model and an image, as differences to the rest state."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import igl
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from palpate.observation.target import SurfaceTarget
+
+__all__ = ["SurfaceResiduals", "observed_image_points", "surface_residuals"]
+
+ON_EDGE = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceResiduals:
+    """Residuals of one surface, model -> image first, then image -> model.
+
+    values (n,) mm; weights (n,) dimensionless, 1/2 in total for each direction; places (n, 3) mm and normals (n, 3)
+    of the deformed surface; jacobian (n, 3 n_vertices) d values / d displacement of the surface's points.
+    """
+
+    values: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    places: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    jacobian: sparse.csr_matrix[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class _Closest:
+    """Closest points of the deformed surface to the image's: triangle (n,), barycentric (n, 3), places (n, 3) mm."""
+
+    triangle: NDArray[np.int64]
+    barycentric: NDArray[np.float64]
+    places: NDArray[np.float64]
+
+
+def surface_residuals(
+    target: SurfaceTarget, displacement: NDArray[np.float64], kept: NDArray[np.bool_]
+) -> SurfaceResiduals:
+    """Residuals and their exact derivative at a displacement (n_vertices, 3) mm of the surface's points.
+
+    model -> image: r = d_after(x + u) - d_before(x) at quadrature points of the observed triangles;
+    image -> model: r = s(y) - (d_before(X) - level), where s is the signed distance of the closest model point
+    x = X + u(X) from the image point y, positive when the model lies outside. `kept` (n_i,) marks the image points to
+    use, from `observed_image_points`: it is held while one objective is minimised.
+    """
+    forward = _model_to_image(target, displacement)
+    backward = _image_to_model(target, displacement, kept)
+    return SurfaceResiduals(
+        np.concatenate([forward.values, backward.values]),
+        np.concatenate([forward.weights, backward.weights]),
+        np.concatenate([forward.places, backward.places]),
+        np.concatenate([forward.normals, backward.normals]),
+        sparse.vstack([forward.jacobian, backward.jacobian], format="csr"),
+    )
+
+
+def observed_image_points(target: SurfaceTarget, displacement: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which image points (n_i,) face the observed part of the deformed surface, and not its rim."""
+    closest = _closest(target, displacement, target.image_points)
+    on_edge = closest.barycentric < ON_EDGE
+    at_rim = np.any(on_edge & target.surface.rim[closest.triangle], axis=1)
+    return np.asarray(target.surface.observed[closest.triangle] & ~at_rim)
+
+
+def _model_to_image(target: SurfaceTarget, displacement: NDArray[np.float64]) -> SurfaceResiduals:
+    surface = target.surface
+    corners = surface.triangles[target.triangle]
+    # (n_q, 3 corners) x (n_q, 3 corners, 3 axes) -> (n_q, 3 axes)
+    places = np.einsum("qk,qka->qa", target.barycentric, (surface.rest + displacement)[corners])
+    gradient = target.after.gradient_at(places)
+    values = target.after.at(places) - target.rest_distance
+    rows = np.einsum("qk,qa->qka", target.barycentric, gradient)
+    normals = gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
+    weights = 0.5 * target.area / target.area.sum()
+    return SurfaceResiduals(values, weights, places, normals, _sparse_rows(rows, corners, len(surface.rest)))
+
+
+def _image_to_model(
+    target: SurfaceTarget, displacement: NDArray[np.float64], kept: NDArray[np.bool_]
+) -> SurfaceResiduals:
+    surface = target.surface
+    image = target.image_points[kept]
+    closest = _closest(target, displacement, image)
+    corners = surface.triangles[closest.triangle]
+    deformed = (surface.rest + displacement)[corners]
+    offset = closest.places - image
+    normal = np.cross(deformed[:, 1] - deformed[:, 0], deformed[:, 2] - deformed[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    length = np.linalg.norm(offset, axis=1)
+    side = np.where(np.einsum("na,na->n", offset, normal) < 0.0, -1.0, 1.0)
+    direction = np.where(length[:, None] > 1e-9, side[:, None] * offset / np.maximum(length, 1e-30)[:, None], normal)
+    material = np.einsum("nk,nka->na", closest.barycentric, surface.rest[corners])
+    values = side * length - (target.before.at(material) - target.level)
+    rows = np.einsum("nk,na->nka", closest.barycentric, direction)
+    rows += _slide(closest, deformed, offset, target.before.gradient_at(material), surface.rest[corners])
+    weights = 0.5 * target.image_area[kept] / max(target.image_area[kept].sum(), 1e-30)
+    return SurfaceResiduals(values, weights, closest.places, normal, _sparse_rows(rows, corners, len(surface.rest)))
+
+
+def _slide(
+    closest: _Closest,
+    deformed: NDArray[np.float64],
+    offset: NDArray[np.float64],
+    slope: NDArray[np.float64],
+    rest: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Derivative (n, 3 corners, 3 axes) of -d_before at the closest material point, which slides as the model moves.
+
+    With tangents t_i, Gram matrix G_ij = t_i . t_j and the closest-point condition (x - y) . t_i = 0:
+    G_ij d xi_j = -(t_i . sum_a N_a du_a + (x - y) . d t_i), on an edge with its one tangent, at a corner not at all.
+    """
+    along = _free_directions(closest.barycentric)
+    # (n, 2, 3 corners) x (n, 3 corners, 3 axes) -> (n, 2, 3 axes)
+    tangent = np.einsum("nik,nka->nia", along, deformed)
+    gram = np.einsum("nia,nja->nij", tangent, tangent)
+    still = ~np.any(along != 0.0, axis=2)
+    gram[:, [0, 1], [0, 1]] += still
+    change = np.einsum("na,nik,nka->ni", slope, along, rest)
+    rate = np.linalg.solve(gram, change[..., None])[..., 0]
+    rows = np.einsum("ni,nia,nk->nka", rate, tangent, closest.barycentric)
+    return np.asarray(rows + np.einsum("ni,nik,na->nka", rate, along, offset))
+
+
+def _free_directions(barycentric: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Directions (n, 2, 3) in barycentric coordinates along which a closest point may slide; zero where none."""
+    zero = barycentric < ON_EDGE
+    count = zero.sum(axis=1)
+    along = np.zeros((len(barycentric), 2, 3))
+    along[count == 0] = [[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]]
+    for corner in range(3):
+        first, second = [c for c in range(3) if c != corner]
+        on_edge = (count == 1) & zero[:, corner]
+        along[on_edge, 0, first], along[on_edge, 0, second] = -1.0, 1.0
+    return along
+
+
+def _closest(target: SurfaceTarget, displacement: NDArray[np.float64], image: NDArray[np.float64]) -> _Closest:
+    vertices = np.ascontiguousarray(target.surface.rest + displacement)
+    triangles = np.ascontiguousarray(target.surface.triangles)
+    _, triangle, places = igl.point_mesh_squared_distance(np.ascontiguousarray(image), vertices, triangles)[:3]
+    corner = vertices[triangles[triangle]]
+    barycentric = igl.barycentric_coordinates(
+        np.ascontiguousarray(places),
+        np.ascontiguousarray(corner[:, 0]),
+        np.ascontiguousarray(corner[:, 1]),
+        np.ascontiguousarray(corner[:, 2]),
+    )
+    barycentric = np.clip(barycentric, 0.0, 1.0)
+    barycentric[barycentric < ON_EDGE] = 0.0
+    barycentric /= barycentric.sum(axis=1, keepdims=True)
+    return _Closest(np.asarray(triangle, dtype=np.int64), barycentric, np.asarray(places))
+
+
+def _sparse_rows(
+    rows: NDArray[np.float64], corners: NDArray[np.int64], n_vertices: int
+) -> sparse.csr_matrix[np.float64]:
+    """Rows (n, 3 corners, 3 axes) as a sparse matrix (n, 3 n_vertices)."""
+    columns = (3 * corners[:, :, None] + np.arange(3)).reshape(len(rows), 9)
+    start = 9 * np.arange(len(rows) + 1)
+    shape = (len(rows), 3 * n_vertices)
+    return sparse.csr_matrix((rows.reshape(-1), columns.ravel(), start), shape=shape)

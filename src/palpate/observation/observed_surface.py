@@ -1,0 +1,86 @@
+"""The surface of a tissue as it is compared with an image: flat triangles between the points of the space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import GeometryError
+from palpate.images.tissue import Role
+from palpate.mesh.space import LagrangeSpace
+from palpate.mesh.surface import tissue_surface, triangle_normals
+from palpate.mesh.tet_mesh import OUTER
+
+__all__ = ["ObservedSurface", "observed_surface"]
+
+SUBTRIANGLES = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])  # of a quadratic triangle
+MIN_SHARE = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class ObservedSurface:
+    """Surface of `tissue` (index into the mesh's tissues), all of it, with the part that is observed marked.
+
+    points (n_vertices,) numbers of its points in the space; rest (n_vertices, 3) mm; triangles (n_triangles, 3) into
+    `points`, normals out of the tissue; observed (n_triangles,) is False where the tissue touches a driver, a bone or
+    the cut of the image; rim (n_triangles, 3) marks edges (opposite each corner) where the observed part ends;
+    share of the area that is observed.
+    """
+
+    tissue: int
+    name: str
+    points: NDArray[np.int64]
+    rest: NDArray[np.float64]
+    triangles: NDArray[np.int64]
+    observed: NDArray[np.bool_]
+    rim: NDArray[np.bool_]
+    share: float
+
+    @property
+    def dofs(self) -> NDArray[np.int64]:
+        """Numbers (3 n_vertices,) of its unknowns in the space, 3 point + axis."""
+        return np.asarray((3 * self.points[:, None] + np.arange(3)).ravel())
+
+
+def observed_surface(space: LagrangeSpace, tissue: int) -> ObservedSurface:
+    """Surface of an `estimate` tissue or a driver on `space`.
+
+    Raises `GeometryError` when under 10 % of an `estimate` tissue's surface is left to observe.
+    """
+    mesh = space.mesh
+    surface = tissue_surface(mesh, tissue)
+    seen = _observable(mesh.tissues[tissue].role, surface.other, [t.role for t in mesh.tissues])
+    facets = space.facets(surface.triangles)
+    split = facets[:, SUBTRIANGLES].reshape(-1, 3) if space.order == 2 else facets
+    observed = np.repeat(seen, len(split) // max(len(facets), 1))
+    points, local = np.unique(split, return_inverse=True)
+    triangles = local.reshape(-1, 3)
+    rest = space.points[points]
+    area = np.linalg.norm(triangle_normals(rest, triangles), axis=1)
+    share = float(area[observed].sum() / area.sum())
+    name = mesh.tissues[tissue].name
+    if share < MIN_SHARE:
+        raise GeometryError(
+            f"'{name}': only {100 * share:.0f} % of its surface is free of drivers, bones and the image's border, so"
+            " its modulus cannot be observed; enlarge the image, or make the tissue `known`"
+        )
+    return ObservedSurface(tissue, name, points, rest, triangles, observed, _rim(triangles, observed), share)
+
+
+def _observable(role: Role, other: NDArray[np.int64], roles: list[Role]) -> NDArray[np.bool_]:
+    """Which faces are observed; all of a driver's, whose wall is itself an unknown."""
+    if role is Role.DRIVER:
+        return np.ones(len(other), dtype=bool)
+    prescribed = [i for i, r in enumerate(roles) if r in (Role.DRIVER, Role.RIGID)]
+    return ~np.isin(other, [OUTER, *prescribed])
+
+
+def _rim(triangles: NDArray[np.int64], observed: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Edges (n_triangles, 3), each opposite its corner, that belong to a single observed triangle."""
+    edges = np.sort(triangles[:, [[1, 2], [0, 2], [0, 1]]], axis=2)
+    keys = edges[..., 0] * (triangles.max() + 1) + edges[..., 1]
+    seen = np.sort(keys[observed].ravel())
+    count = np.searchsorted(seen, keys, side="right") - np.searchsorted(seen, keys, side="left")
+    return np.asarray((count == 1) & observed[:, None])

@@ -1,0 +1,62 @@
+"""What the images prescribe: the driver wall's modes, and the measured motion of the bones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.images.alignment import RigidMotion
+from palpate.images.tissue import Role
+from palpate.mesh.space import LagrangeSpace
+from palpate.mesh.surface import tissue_surface
+from palpate.observation.wall_modes import wall_modes
+
+__all__ = ["PrescribedMotion", "prescribed_motion"]
+
+
+@dataclass(frozen=True, slots=True)
+class PrescribedMotion:
+    """Displacement `modes q + offset` of the marked points.
+
+    modes (3 n_points, n_modes) mm, offset (3 n_points,) mm, prescribed (n_points,).
+    """
+
+    modes: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    prescribed: NDArray[np.bool_]
+
+
+def prescribed_motion(
+    space: LagrangeSpace, bones: Mapping[int, RigidMotion], *, n_modes: int, kernel_mm: float, prior_mm: float
+) -> PrescribedMotion:
+    """Modes of every driver's wall and the offset of every rigid tissue (by index in `bones`; held where absent).
+
+    A point that a driver and a bone share follows the bone. Each driver has its own `n_modes` modes (see
+    `wall_modes` for kernel_mm and prior_mm, mm).
+    """
+    n = len(space.points)
+    offset, prescribed, blocks = np.zeros((n, 3)), np.zeros(n, dtype=bool), []
+    roles = [tissue.role for tissue in space.mesh.tissues]
+    for tissue in (i for i, role in enumerate(roles) if role is Role.RIGID):
+        points = _points(space, tissue)
+        prescribed[points] = True
+        if tissue in bones:
+            offset[points] = bones[tissue].apply(space.points[points]) - space.points[points]
+    held = prescribed.copy()
+    for tissue in (i for i, role in enumerate(roles) if role is Role.DRIVER):
+        points = _points(space, tissue)
+        points = points[~held[points]]
+        local = wall_modes(space.points[points], n_modes=n_modes, kernel_mm=kernel_mm, prior_mm=prior_mm)
+        block = np.zeros((n, 3, local.shape[1]))
+        block[points] = local.reshape(len(points), 3, -1)
+        blocks.append(block.reshape(3 * n, -1))
+        prescribed[points] = True
+    modes = np.concatenate(blocks, axis=1) if blocks else np.zeros((3 * n, 0))
+    return PrescribedMotion(modes, offset.ravel(), prescribed)
+
+
+def _points(space: LagrangeSpace, tissue: int) -> NDArray[np.int64]:
+    return np.unique(space.facets(tissue_surface(space.mesh, tissue).triangles))

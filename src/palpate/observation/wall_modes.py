@@ -1,0 +1,41 @@
+"""Smooth modes of a driver wall's motion: the leading terms of a Gaussian process on its nodes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["wall_modes"]
+
+RANK_TOLERANCE = 1e-12
+
+
+def wall_modes(points: NDArray[np.float64], *, n_modes: int, kernel_mm: float, prior_mm: float) -> NDArray[np.float64]:
+    """Displacement modes of wall points (n_points, 3) mm, as columns (3 n_points, n_modes) mm.
+
+    Each component of the wall's displacement is a Gaussian process with the covariance
+    k(x, y) = prior^2 exp(-|x - y|^2 / (2 kernel^2)); the columns are its Karhunen-Loeve modes with their standard
+    deviation as length, so that coefficients q ~ N(0, 1) give displacements of that law. n_modes // 3 scalar modes,
+    each along x, y and z; the unknown of point p along axis a is row 3 p + a. Fewer columns come back when the kernel
+    has no more modes on so small a wall.
+    """
+    factor = _pivoted_cholesky(points, kernel_mm, min(len(points), 4 * (n_modes // 3)))
+    left, scale, _ = np.linalg.svd(factor, full_matrices=False)
+    keep = min(n_modes // 3, int(np.count_nonzero(scale > RANK_TOLERANCE * scale[0])))
+    scalar = prior_mm * left[:, :keep] * scale[:keep]
+    return np.asarray(np.kron(scalar, np.eye(3)))
+
+
+def _pivoted_cholesky(points: NDArray[np.float64], kernel_mm: float, rank: int) -> NDArray[np.float64]:
+    """Factor L (n_points, rank) with L L^T close to exp(-|x - y|^2 / (2 kernel^2)); Harbrecht et al. 2012, Alg. 1."""
+    left = np.ones(len(points))
+    factor = np.zeros((len(points), rank))
+    for k in range(rank):
+        pivot = int(np.argmax(left))
+        if left[pivot] < RANK_TOLERANCE:
+            return factor[:, :k]
+        distance2 = np.sum((points - points[pivot]) ** 2, axis=1)
+        column = np.exp(-distance2 / (2.0 * kernel_mm**2)) - factor[:, :k] @ factor[pivot, :k]
+        factor[:, k] = column / np.sqrt(left[pivot])
+        left = np.maximum(left - factor[:, k] ** 2, 0.0)
+    return factor

@@ -1,0 +1,1 @@
+"""Scenes with a known truth: concentric spheres, pelves, and the noise of their images."""

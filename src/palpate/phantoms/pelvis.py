@@ -1,0 +1,131 @@
+"""A male pelvis in which the rectum fills: scenes of random anatomy with a known truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from palpate.errors import ConfigurationError
+from palpate.images.tissue import Role, Tissue
+from palpate.mesh.anatomy import Anatomy, LevelSet
+from palpate.phantoms.boundary_noise import smooth_field
+from palpate.phantoms.motion import AffineMotion, Filling, WallMotion
+from palpate.phantoms.pelvis_shapes import PelvisShapes, draw_pelvis
+from palpate.phantoms.scene import Noise, Scene, centred_grid, grid_box, make_scene
+from palpate.phantoms.shapes import Ellipsoid, rotation_about
+
+__all__ = ["PelvisOptions", "pelvis"]
+
+SURROUNDINGS_KPA = 10.0
+STRAY = 0.05  # non-radial motion of the rectum's wall, standard deviation a component in parts of the filling
+STRAY_LENGTH_MM = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class PelvisOptions:
+    """What a pelvis is to be; whatever is None is drawn with the seed.
+
+    `filling_mm`: the rectum's wall moves so far where it moves most; `moduli_kpa` by tissue (default: prostate and
+    bladder 15 to 60 kPa, a tumour 2 to 3 times its gland; the surroundings have 10 kPa); `poisson_ratio` of all
+    tissues (default 0.40 to 0.45 each); `bone_motion_mm` and as many degrees move each bone as a rigid body.
+    """
+
+    seed: int
+    filling_mm: float = 7.0
+    spacing_mm: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    field_mm: tuple[float, float, float] = (110.0, 110.0, 120.0)
+    truth_edge_mm: float = 3.0
+    moduli_kpa: Mapping[str, float] | None = None
+    poisson_ratio: float | None = None
+    noise: Noise | None = None
+    bones: bool = False
+    bone_motion_mm: float = 0.0
+    tumour: bool = False
+
+
+def pelvis(options: PelvisOptions) -> Scene:
+    """The scene of `options`.
+
+    Tissues: prostate and bladder (`estimate`), which touch; tumour (`estimate`) in the prostate; rectum (`driver`);
+    left and right bone (`rigid`); surroundings (`known`). The seed's shapes, moduli and motion are drawn apart, so
+    that tumour, noise or voxel size leave the rest of the body as it is. Raises `GeometryError` when the truth folds
+    over, `ConfigurationError` for a field that is too small or a modulus for an unknown tissue.
+    """
+    shape_rng, material_rng, motion_rng = np.random.default_rng(options.seed).spawn(3)
+    grid = centred_grid(options.field_mm, options.spacing_mm)
+    box = grid_box(grid)
+    body = draw_pelvis(shape_rng, box, bones=options.bones)
+    parts = _parts(body, options)
+    tissues = _tissues(tuple(parts), options, material_rng)
+    anatomy = Anatomy(tissues, tuple(parts.values()), box)
+    motions = _motions(body, options, motion_rng)
+    return make_scene(
+        anatomy, motions, grid, edge_length_mm=options.truth_edge_mm, noise=options.noise, seed=options.seed
+    )
+
+
+def _parts(body: PelvisShapes, options: PelvisOptions) -> dict[str, LevelSet | None]:
+    """Level set of each tissue by name, in the order of the labels."""
+    parts: dict[str, LevelSet | None] = {"tumour": body.tumour} if options.tumour else {}
+    parts |= {"prostate": body.prostate, "bladder": body.bladder, "rectum": body.rectum}
+    if options.bones:
+        parts |= {"left bone": body.bones[0], "right bone": body.bones[1]}
+    return parts | {"surroundings": None}
+
+
+def _tissues(names: tuple[str, ...], options: PelvisOptions, rng: np.random.Generator) -> tuple[Tissue, ...]:
+    moduli = _moduli(options, rng)
+    ratios = dict(zip(moduli, rng.uniform(0.40, 0.45, len(moduli)), strict=True))
+    roles = {"rectum": Role.DRIVER, "left bone": Role.RIGID, "right bone": Role.RIGID, "surroundings": Role.KNOWN}
+    tissues = []
+    for label, name in enumerate(names, start=1):
+        role = roles.get(name, Role.ESTIMATE)
+        if name not in moduli:
+            tissues.append(Tissue(name, role, (label,)))
+            continue
+        ratio = ratios[name] if options.poisson_ratio is None else options.poisson_ratio
+        tissues.append(Tissue(name, role, (label,), float(ratio), float(moduli[name])))
+    return tuple(tissues)
+
+
+def _moduli(options: PelvisOptions, rng: np.random.Generator) -> dict[str, float]:
+    """Young's moduli, kPa; the tumour's follows its gland unless it is given."""
+    prostate, bladder = SURROUNDINGS_KPA * np.exp(rng.uniform(np.log(1.5), np.log(6.0), 2))
+    factor = rng.uniform(2.0, 3.0)
+    moduli = {"surroundings": SURROUNDINGS_KPA, "prostate": prostate, "bladder": bladder}
+    given = dict(options.moduli_kpa or {})
+    unknown = sorted(set(given) - {*moduli, "tumour"})
+    if unknown:
+        raise ConfigurationError(f"moduli_kpa names {unknown}; a pelvis has {[*moduli, 'tumour']}")
+    moduli |= given
+    return {**moduli, "tumour": given.get("tumour", factor * moduli["prostate"])}
+
+
+def _motions(body: PelvisShapes, options: PelvisOptions, rng: np.random.Generator) -> dict[str, WallMotion]:
+    profile = rng.uniform(1.5, 2.5, 2)
+    turn = rotation_about(rng.normal(size=3), rng.uniform(0.0, 30.0))
+    motions: dict[str, WallMotion] = {
+        "rectum": Filling(
+            tube=body.rectum,
+            filling_mm=options.filling_mm,
+            profile=(float(profile[0]), float(profile[1])),
+            floor=0.2,
+            towards=turn @ body.forwards,
+            lean=rng.uniform(0.3, 0.6),
+            stray=smooth_field(rng, sd_mm=STRAY * options.filling_mm, correlation_mm=STRAY_LENGTH_MM, features=300),
+        )
+    }
+    for name, bone in zip(("left bone", "right bone"), body.bones, strict=True):
+        motion = _rigid_motion(bone, options.bone_motion_mm, rng)
+        if options.bones and options.bone_motion_mm > 0.0:
+            motions[name] = motion
+    return motions
+
+
+def _rigid_motion(bone: Ellipsoid, size_mm: float, rng: np.random.Generator) -> AffineMotion:
+    """A shift by `size_mm` and a turn by as many degrees about the bone's centre."""
+    axis, direction = rng.normal(size=(2, 3))
+    gradient = rotation_about(axis, size_mm) - np.eye(3)
+    return AffineMotion(gradient, bone.centre, size_mm * direction / np.linalg.norm(direction))

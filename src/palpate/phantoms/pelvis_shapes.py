@@ -1,0 +1,150 @@
+"""Random male pelves: a prostate pressed into the bladder above it, the rectum behind, bones beside."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import ConfigurationError
+from palpate.mesh.anatomy import Box
+from palpate.phantoms.shapes import Ellipsoid, Tube, Union, rotation_about
+
+__all__ = ["PelvisShapes", "draw_pelvis"]
+
+DRAWS = 200
+MARGIN_MM, RECTUM_MARGIN_MM = 5.0, 9.0  # to the border of the image; the rectum is going to fill
+GAP_MM = 3.0  # of bones to anything else
+TURN_DEG = 18.0
+
+
+@dataclass(frozen=True, slots=True)
+class PelvisShapes:
+    """Where the organs are; `forwards` (3,) unit vector from the rectum to the front of the body."""
+
+    prostate: Ellipsoid
+    bladder: Ellipsoid
+    rectum: Tube
+    tumour: Ellipsoid
+    bones: tuple[Ellipsoid, Ellipsoid]
+    forwards: NDArray[np.float64]
+
+
+def draw_pelvis(rng: np.random.Generator, box: Box, *, bones: bool) -> PelvisShapes:
+    """A pelvis of random shape, position and orientation that fits into `box`; axes about right, front and up.
+
+    The same `rng` state gives the same body, whether its tumour or bones are going to be used or not, unless bones
+    do not fit. Raises `ConfigurationError` when the box is too small.
+    """
+    for _ in range(DRAWS):
+        body = _placed(_upright(rng), rng, box)
+        if _fits(body, box, bones=bones):
+            return body
+    raise ConfigurationError(
+        f"no pelvis fits into a field of {np.round(box.lengths, 1).tolist()} mm; give at least 100 x 100 x 110 mm"
+        f"{' (120 mm from side to side with bones)' if bones else ''}"
+    )
+
+
+def _upright(rng: np.random.Generator) -> PelvisShapes:
+    """A body in its own axes, the prostate's centre at the origin."""
+    prostate = Ellipsoid(np.zeros(3), rng.uniform(17.0, 22.0, 3), _turn(rng, 15.0))
+    up = rotation_about(np.array([1.0, 0.0, 0.0]), -rng.uniform(5.0, 20.0)) @ np.array([0.0, 0.0, 1.0])
+    semi_axes = np.array([*rng.uniform(26.0, 33.0, 2), rng.uniform(25.0, 29.0)])
+    turn = _turn(rng, 12.0)
+    reach = _reach(prostate.semi_axes, prostate.rotation, up) + _reach(semi_axes, turn, up)
+    bladder = Ellipsoid((reach - rng.uniform(3.5, 6.0)) * up, semi_axes, turn)
+    rectum = _rectum(rng, prostate, bladder)
+    return PelvisShapes(
+        prostate, bladder, rectum, _tumour(rng, prostate), _bones(rng, prostate), np.array([0.0, 1.0, 0.0])
+    )
+
+
+def _rectum(rng: np.random.Generator, prostate: Ellipsoid, bladder: Ellipsoid) -> Tube:
+    """A tube some 65 mm long behind the organs, brought to a gap of 2.5 to 5 mm from them."""
+    height = np.linspace(-0.5, 0.5, 5)
+    length = rng.uniform(40.0, 44.0)
+    bend, lean, side = rng.uniform(2.0, 8.0), rng.uniform(-3.0, 3.0), rng.uniform(-3.0, 3.0)
+    knots = np.column_stack(
+        [
+            side + rng.uniform(-4.0, 4.0) * height,
+            -45.0 + lean * height - bend * height**2,
+            rng.uniform(-1.0, 3.0) + length * height,
+        ]
+    )
+    radii = rng.uniform(10.7, 12.2, 5)
+    gap, organs = rng.uniform(2.5, 5.0), Union([prostate, bladder])
+    for _ in range(20):
+        distance = float(organs.at(Tube(knots, radii).surface(_directions(400))).min())
+        knots = knots + np.array([0.0, distance - gap, 0.0])
+    return Tube(knots, radii)
+
+
+def _tumour(rng: np.random.Generator, prostate: Ellipsoid) -> Ellipsoid:
+    """An ellipsoid of at least 5 mL, off the prostate's centre, 2 mm or more (if there is room) under its surface."""
+    semi_axes, turn = rng.uniform(10.7, 11.8, 3), _turn(rng, 90.0)
+    away = 6.0 * _directions(1, rng)[0]
+    for share in np.linspace(1.0, 0.0, 11):
+        tumour = Ellipsoid(prostate.centre + share * away, semi_axes, turn)
+        if prostate.at(tumour.surface(_directions(400))).max() < -2.0:
+            return tumour
+    return tumour
+
+
+def _bones(rng: np.random.Generator, prostate: Ellipsoid) -> tuple[Ellipsoid, Ellipsoid]:
+    """Two ellipsoids beside the prostate."""
+    pair = []
+    for side in (-1.0, 1.0):
+        semi_axes = rng.uniform([6.0, 12.0, 12.0], [8.0, 16.0, 16.0])
+        aside = _reach(prostate.semi_axes, prostate.rotation, np.array([1.0, 0.0, 0.0])) + semi_axes[0]
+        centre = np.array([side * (aside + rng.uniform(6.0, 9.0)), *rng.uniform([-4.0, -8.0], [4.0, 0.0])])
+        pair.append(Ellipsoid(centre, semi_axes, _turn(rng, 15.0)))
+    return pair[0], pair[1]
+
+
+def _placed(body: PelvisShapes, rng: np.random.Generator, box: Box) -> PelvisShapes:
+    """The body turned by up to 18 degrees and put, a little off, in the middle of the box."""
+    turn = _turn(rng, TURN_DEG)
+    organs: tuple[Ellipsoid | Tube, ...] = (body.prostate, body.bladder, body.rectum)
+    points = np.concatenate([organ.surface(_directions(400)) for organ in organs]) @ turn.T
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    shift = box.world(0.5 * box.lengths[None])[0] - middle + rng.uniform(-2.0, 2.0, 3)
+
+    def moved(shape: Ellipsoid) -> Ellipsoid:
+        return Ellipsoid(shape.centre @ turn.T + shift, shape.semi_axes, turn @ shape.rotation)
+
+    bones = (moved(body.bones[0]), moved(body.bones[1]))
+    rectum = Tube(body.rectum.knots @ turn.T + shift, body.rectum.radii)
+    forwards = turn @ body.forwards
+    return PelvisShapes(moved(body.prostate), moved(body.bladder), rectum, moved(body.tumour), bones, forwards)
+
+
+def _fits(body: PelvisShapes, box: Box, *, bones: bool) -> bool:
+    margins: list[tuple[Ellipsoid | Tube, float]] = [(body.prostate, MARGIN_MM), (body.bladder, MARGIN_MM)]
+    margins += [(body.rectum, RECTUM_MARGIN_MM), *((bone, GAP_MM) for bone in body.bones if bones)]
+    inside = all(_clearance(shape.surface(_directions(400)), box) > margin for shape, margin in margins)
+    soft = Union([body.prostate, body.bladder, body.rectum])
+    apart = not bones or all(soft.at(bone.surface(_directions(400))).min() > GAP_MM for bone in body.bones)
+    return inside and apart
+
+
+def _clearance(points: NDArray[np.float64], box: Box) -> float:
+    """Smallest distance (mm) from points (n, 3) mm inside the box to its faces."""
+    local = box.local(points)
+    return float(min(local.min(), (box.lengths - local).min()))
+
+
+def _reach(semi_axes: NDArray[np.float64], rotation: NDArray[np.float64], direction: NDArray[np.float64]) -> float:
+    """Distance (mm) from an ellipsoid's centre to its surface along a unit direction."""
+    return float(1.0 / np.linalg.norm((direction @ rotation) / semi_axes))
+
+
+def _turn(rng: np.random.Generator, largest_deg: float) -> NDArray[np.float64]:
+    return rotation_about(rng.normal(size=3), rng.uniform(0.0, largest_deg))
+
+
+def _directions(n: int, rng: np.random.Generator | None = None) -> NDArray[np.float64]:
+    """Unit vectors (n, 3); without `rng` always the same."""
+    vectors = (rng or np.random.default_rng(0)).normal(size=(n, 3))
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

@@ -1,0 +1,158 @@
+"""A scene: a body with known moduli, imaged at rest and deformed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import GeometryError
+from palpate.images.label_image import LabelImage, VoxelGrid
+from palpate.images.tissue import Role, Tissue
+from palpate.mechanics.boundary import outer_constraint
+from palpate.mechanics.element import barycentric_gradients, shape_derivatives
+from palpate.mechanics.linear_model import linear_model
+from palpate.mesh.anatomy import Anatomy, Box
+from palpate.mesh.space import LagrangeSpace, lagrange_space
+from palpate.mesh.tet_mesh import TetMesh
+from palpate.mesh.tetrahedralise import tetrahedralise
+from palpate.mesh.voxelise import Warp, voxelise
+from palpate.phantoms.boundary_noise import smooth_field
+from palpate.phantoms.motion import WallMotion
+
+__all__ = ["Noise", "Scene", "centred_grid", "deformation_determinants", "grid_box", "imaged", "make_scene"]
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Smooth noise of the imaged surfaces, drawn anew for each image: standard deviation a component and length, mm."""
+
+    surface_sd_mm: float
+    correlation_length_mm: float
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """A truth and its two images.
+
+    `space` (P2) with its mesh and `displacement` (n_points, 3) mm; the tissues' `youngs_modulus_kpa` are the truth.
+    `before` and `after` show the rest state and the deformed state of that mesh, label = index of the tissue + 1.
+    `motions`: by name of a hollow tissue, how its wall moves; a hollow tissue that is not there holds still.
+    """
+
+    space: LagrangeSpace
+    displacement: NDArray[np.float64]
+    before: LabelImage
+    after: LabelImage
+    motions: Mapping[str, WallMotion]
+    seed: int
+
+    @property
+    def mesh(self) -> TetMesh:
+        """The truth mesh."""
+        return self.space.mesh
+
+    @property
+    def tissues(self) -> tuple[Tissue, ...]:
+        """The tissues, with their true moduli."""
+        return self.space.mesh.tissues
+
+    @property
+    def moduli_kpa(self) -> dict[str, float]:
+        """True Young's modulus (kPa) of every meshed tissue, by name."""
+        return {t.name: t.youngs_modulus_kpa for t in self.tissues if t.meshed and t.youngs_modulus_kpa is not None}
+
+
+def make_scene(
+    anatomy: Anatomy,
+    motions: Mapping[str, WallMotion],
+    grid: VoxelGrid,
+    *,
+    edge_length_mm: float,
+    noise: Noise | None,
+    seed: int,
+) -> Scene:
+    """Mesh the anatomy, move the walls of its hollow tissues (linear elasticity, outer border held), image both states.
+
+    Every meshed tissue of the anatomy needs its `youngs_modulus_kpa`. `edge_length_mm` is the mesh's at the surfaces;
+    `seed` only draws the noise. Raises `GeometryError` where the truth folds over or cannot be meshed.
+    """
+    space = lagrange_space(tetrahedralise(anatomy, edge_length_mm=edge_length_mm), "P2")
+    displacement = _equilibrium(space, motions)
+    smallest = float(deformation_determinants(space, displacement).min())
+    if smallest <= 0.0:
+        raise GeometryError(
+            f"the truth folds over (smallest determinant of the deformation gradient {smallest:.3f}): move the walls"
+            " less or leave more room around them"
+        )
+    rngs = np.random.default_rng([seed, 1]).spawn(2)
+    warps = [_warp(noise, rng) for rng in rngs]
+    before = imaged(space, np.zeros_like(displacement), grid, warp=warps[0])
+    after = imaged(space, displacement, grid, warp=warps[1])
+    return Scene(space, displacement, before, after, dict(motions), seed)
+
+
+def imaged(
+    space: LagrangeSpace, displacement: NDArray[np.float64], grid: VoxelGrid, *, warp: Warp | None = None
+) -> LabelImage:
+    """Label image on `grid` of the mesh under `displacement` (n_points, 3) mm; label = index of the tissue + 1."""
+    index = voxelise(space, displacement, grid, subdivisions=2, warp=warp)
+    names = {label + 1: tissue.name for label, tissue in enumerate(space.mesh.tissues)}
+    return LabelImage(index.astype(np.int32) + 1, grid, names)
+
+
+def centred_grid(field_mm: tuple[float, float, float], spacing_mm: tuple[float, float, float]) -> VoxelGrid:
+    """The smallest grid of voxels of `spacing_mm` that covers `field_mm`, centred at the world's origin."""
+    spacing = np.asarray(spacing_mm, dtype=np.float64)
+    shape = np.ceil(np.asarray(field_mm) / spacing - 1e-9).astype(int)
+    affine = np.diag([*spacing, 1.0])
+    affine[:3, 3] = -0.5 * (shape - 1) * spacing
+    return VoxelGrid((int(shape[0]), int(shape[1]), int(shape[2])), affine)
+
+
+def grid_box(grid: VoxelGrid) -> Box:
+    """The box of all voxels of an upright grid, out to their outer faces."""
+    lengths = np.array(grid.shape) * grid.spacing
+    return Box(grid.world(np.full((1, 3), -0.5))[0], np.eye(3), lengths)
+
+
+def deformation_determinants(space: LagrangeSpace, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Determinant (n_tets, 5) of F = I + grad u at corners and centres of the tetrahedra.
+
+    displacement (n_points, 3) mm. Positive at all of them: no element is turned inside out.
+    """
+    places = np.vstack([np.eye(4), np.full((1, 4), 0.25)])
+    gradients, _ = barycentric_gradients(space.mesh.nodes, space.mesh.tets)
+    by_barycentric = np.einsum("qak,nai->nqik", shape_derivatives(space.order, places), displacement[space.cells])
+    return np.asarray(np.linalg.det(np.eye(3) + by_barycentric @ gradients[:, None]))
+
+
+def _equilibrium(space: LagrangeSpace, motions: Mapping[str, WallMotion]) -> NDArray[np.float64]:
+    """Displacement (n_points, 3) mm of the body whose hollow tissues move as `motions` say."""
+    walls, offset = _walls(space, motions)
+    no_modes = np.zeros((offset.size, 0))
+    constraint = outer_constraint(space, outer="fixed", modes=no_modes, offset=offset.ravel(), prescribed=walls)
+    moduli = [tissue.youngs_modulus_kpa or np.nan for tissue in space.mesh.tissues if tissue.meshed]
+    return np.asarray(linear_model(space, constraint).solve(np.array(moduli), np.zeros(0)).displacement)
+
+
+def _walls(space: LagrangeSpace, motions: Mapping[str, WallMotion]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Which points (n_points,) are on walls of drivers and rigid tissues; the displacement (n_points, 3) mm there."""
+    offset = np.zeros_like(space.points)
+    walls = np.zeros(len(space.points), dtype=np.bool_)
+    for index, tissue in enumerate(space.mesh.tissues):
+        if tissue.role not in (Role.DRIVER, Role.RIGID):
+            continue
+        points = np.unique(space.facets(space.mesh.boundary[space.mesh.beyond == index]))
+        walls[points] = True
+        if tissue.name in motions:
+            offset[points] = motions[tissue.name].at(space.points[points])
+    return walls, offset
+
+
+def _warp(noise: Noise | None, rng: np.random.Generator) -> Warp | None:
+    if noise is None:
+        return None
+    return smooth_field(rng, sd_mm=noise.surface_sd_mm, correlation_mm=noise.correlation_length_mm).warp

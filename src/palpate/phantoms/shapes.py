@@ -1,0 +1,163 @@
+"""Bodies given by their signed distance: ellipsoids, balls, tubes, and what boolean operations make of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.spatial import KDTree
+
+__all__ = ["Complement", "Ellipsoid", "Shape", "Tube", "Union", "ball", "rotation_about"]
+
+NEWTON_STEPS = 40  # for the closest point of an ellipsoid; the iteration is monotone and rarely needs ten
+STEP_MM = 1e-4  # of the differences that give a tube's gradient
+
+
+class Shape(Protocol):
+    """A body: signed distance (mm, negative inside) and its gradient at points (n, 3) in RAS mm."""
+
+    def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Signed distance (n,) mm."""
+        ...
+
+    def gradient_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Gradient (n, 3), mm per mm."""
+        ...
+
+
+def rotation_about(axis: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
+    """Matrix (3, 3) of the rotation by `degrees` about `axis` (3,), by Rodrigues' formula."""
+    x, y, z = axis / np.linalg.norm(axis)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    angle = np.deg2rad(degrees)
+    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross)
+
+
+@dataclass(frozen=True, slots=True)
+class Ellipsoid:
+    """An ellipsoid: `centre` (3,) and `semi_axes` (3,) mm along the columns of `rotation` (3, 3)."""
+
+    centre: NDArray[np.float64]
+    semi_axes: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+
+    def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Exact Euclidean signed distance (n,) mm."""
+        local = (points - self.centre) @ self.rotation
+        distance = np.linalg.norm(local - self._closest(local), axis=1)
+        return np.asarray(np.where(self._outside(local), distance, -distance))
+
+    def gradient_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Outward normal (n, 3), dimensionless, at the closest point of the surface."""
+        normal = self._closest((points - self.centre) @ self.rotation) / self.semi_axes**2
+        return np.asarray(normal @ self.rotation.T / np.linalg.norm(normal, axis=1, keepdims=True))
+
+    def surface(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points (n, 3) mm of the surface that belong to unit `directions` (n, 3)."""
+        return np.asarray(self.centre + (directions * self.semi_axes) @ self.rotation.T)
+
+    def _outside(self, local: NDArray[np.float64]) -> NDArray[np.bool_]:
+        return np.asarray(((local / self.semi_axes) ** 2).sum(axis=1) > 1.0)
+
+    def _closest(self, local: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Closest surface point: q = a^2 p / (t + a^2) with sum (a p / (t + a^2))^2 = 1 (Eberly 2013)."""
+        axes = self.semi_axes
+        away = np.where(local < 0.0, -1.0, 1.0) * np.maximum(np.abs(local), 1e-7 * axes)  # off the symmetry planes
+        t = (axes * np.abs(away) - axes**2).max(axis=1)  # left of the root of a convex, falling function
+        for _ in range(NEWTON_STEPS):
+            ratio = axes * away / (t[:, None] + axes**2)
+            value = (ratio**2).sum(axis=1) - 1.0
+            t = t + value / (2.0 * ratio**2 / (t[:, None] + axes**2)).sum(axis=1)
+            if np.abs(value).max(initial=0.0) < 1e-13:
+                break
+        return np.asarray(axes**2 * away / (t[:, None] + axes**2))
+
+
+def ball(centre: NDArray[np.float64], radius: float) -> Ellipsoid:
+    """The ball of `radius` (mm) about `centre` (3,) mm."""
+    return Ellipsoid(np.asarray(centre, dtype=np.float64), np.full(3, radius), np.eye(3))
+
+
+@dataclass(frozen=True, slots=True)
+class Tube:
+    """A tube with rounded ends about a curve through `knots` (n, 3) mm.
+
+    `radii` (n,) mm at the knots; both vary as cubic splines. The distance is |p - c| - r at the closest point c of the
+    centre line: exact for a constant radius, to first order for a slowly varying one.
+    """
+
+    knots: NDArray[np.float64]
+    radii: NDArray[np.float64]
+
+    def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Signed distance (n,) mm."""
+        place, spoke = self.coordinates(points)
+        radius = CubicSpline(self._parameters(), self.radii)(place)
+        return np.asarray(np.linalg.norm(spoke, axis=1) - radius)
+
+    def gradient_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Gradient (n, 3), mm per mm, by central differences."""
+        steps = STEP_MM * np.eye(3)
+        return np.stack([(self.at(points + s) - self.at(points - s)) / (2.0 * STEP_MM) for s in steps], axis=1)
+
+    def coordinates(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Place (n,) of the closest point on the centre line, 0 to 1, and the vector (n, 3) mm from there."""
+        curve = CubicSpline(self._parameters(), self.knots)
+        samples = np.linspace(0.0, 1.0, 401)
+        place = samples[KDTree(curve(samples)).query(points)[1]]
+        for _ in range(3):  # Newton on (p - c) . c' = 0, whose derivative is close to -|c'|^2
+            slope = curve(place, 1)
+            rest = ((points - curve(place)) * slope).sum(axis=1)
+            bend = (slope**2).sum(axis=1) - ((points - curve(place)) * curve(place, 2)).sum(axis=1)
+            place = np.clip(place + rest / np.maximum(bend, 0.2 * (slope**2).sum(axis=1)), 0.0, 1.0)
+        return np.asarray(place), np.asarray(points - curve(place))
+
+    def surface(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points (n, 3) mm of the surface, in unit `directions` (n, 3) from places all along the centre line."""
+        place = np.linspace(0.0, 1.0, len(directions))
+        centre = CubicSpline(self._parameters(), self.knots)(place)
+        reach = CubicSpline(self._parameters(), self.radii)(place)[:, None] * directions
+        points = centre + reach
+        for _ in range(2):
+            points = points - self.at(points)[:, None] * self.gradient_at(points)
+        return np.asarray(points)
+
+    def _parameters(self) -> NDArray[np.float64]:
+        chords = np.linalg.norm(np.diff(self.knots, axis=0), axis=1)
+        return np.concatenate([[0.0], np.cumsum(chords) / chords.sum()])
+
+
+@dataclass(frozen=True, slots=True)
+class Union:
+    """What lies in any of `parts`."""
+
+    parts: Sequence[Shape]
+
+    def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Signed distance (n,) mm; inside an overlap a lower bound of its depth."""
+        return np.asarray(np.min([part.at(points) for part in self.parts], axis=0))
+
+    def gradient_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Gradient (n, 3), mm per mm, of the nearest part."""
+        nearest = np.argmin([part.at(points) for part in self.parts], axis=0)
+        gradients = np.stack([part.gradient_at(points) for part in self.parts])
+        return np.asarray(gradients[nearest, np.arange(len(points))])
+
+
+@dataclass(frozen=True, slots=True)
+class Complement:
+    """What lies outside `part`."""
+
+    part: Shape
+
+    def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Signed distance (n,) mm."""
+        return -self.part.at(points)
+
+    def gradient_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Gradient (n, 3), mm per mm."""
+        return -self.part.gradient_at(points)

@@ -1,0 +1,120 @@
+"""Balls in balls: small scenes with a known truth, for benchmarks and first steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import ConfigurationError
+from palpate.images.tissue import Role, Tissue
+from palpate.mesh.anatomy import Anatomy, LevelSet
+from palpate.phantoms.boundary_noise import smooth_field
+from palpate.phantoms.motion import AffineMotion, Filling, WallMotion
+from palpate.phantoms.scene import Noise, Scene, centred_grid, grid_box, make_scene
+from palpate.phantoms.shapes import Complement, Tube, ball
+
+__all__ = ["SPHERES_KINDS", "SpheresOptions", "spheres"]
+
+SPHERES_KINDS = ("squeezed", "pushed", "tumour")
+CORE, SHELL, OUTSIDE = 10.0, 20.0, 30.0  # radii, mm
+MODULI_KPA = {"core": 60.0, "shell": 30.0, "organ": 30.0, "tumour": 75.0, "surroundings": 10.0}
+MARGIN_MM = 6.0  # of the image around the outermost ball
+LEAN = 0.6
+STRAY = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class SpheresOptions:
+    """What the balls are to be.
+
+    `kind`: "squeezed", a core (10 mm) in a shell (20 mm) in surroundings (30 mm) whose outside, the driver `frame`,
+    is squeezed by a random stretch; "tumour", the same with a tumour out of the organ's centre; "pushed", a hollow
+    core, the driver `cavity`, that grows in the shell, in a box of surroundings that is held. `push_mm`: the wall
+    moves so far where it moves most. `moduli_kpa` by tissue (default: core 60, shell or organ 30, tumour 75,
+    surroundings 10).
+    """
+
+    seed: int
+    kind: str = "squeezed"
+    push_mm: float = 3.0
+    spacing_mm: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    truth_edge_mm: float = 2.5
+    moduli_kpa: Mapping[str, float] | None = None
+    poisson_ratio: float = 0.45
+    noise: Noise | None = None
+
+
+def spheres(options: SpheresOptions) -> Scene:
+    """The scene of `options`; the balls' common centre is a random part of a voxel off the grid.
+
+    Raises `ConfigurationError` for an unknown kind or tissue, `GeometryError` when the truth folds over.
+    """
+    if options.kind not in SPHERES_KINDS:
+        raise ConfigurationError(f"kind is '{options.kind}'; it must be one of {list(SPHERES_KINDS)}")
+    rng = np.random.default_rng(options.seed)
+    grid = centred_grid((2.0 * (OUTSIDE + MARGIN_MM),) * 3, options.spacing_mm)
+    centre = rng.uniform(-0.5, 0.5, 3) * grid.spacing
+    parts, motions = (_pushed if options.kind == "pushed" else _squeezed)(options, centre, rng)
+    anatomy = Anatomy(_tissues(tuple(parts), options), tuple(parts.values()), grid_box(grid))
+    return make_scene(
+        anatomy, motions, grid, edge_length_mm=options.truth_edge_mm, noise=options.noise, seed=options.seed
+    )
+
+
+Parts = dict[str, LevelSet | None]
+
+
+def _squeezed(
+    options: SpheresOptions, centre: NDArray[np.float64], rng: np.random.Generator
+) -> tuple[Parts, dict[str, WallMotion]]:
+    """Balls in a frame that is stretched along one axis and squeezed along another, with a turn in it."""
+    inner, outer = ("tumour", "organ") if options.kind == "tumour" else ("core", "shell")
+    away = rng.normal(size=3)
+    off = 5.0 * away / np.linalg.norm(away) if options.kind == "tumour" else np.zeros(3)
+    parts: Parts = {
+        inner: ball(centre + off, CORE),
+        outer: ball(centre, SHELL),
+        "frame": Complement(ball(centre, OUTSIDE)),
+        "surroundings": None,
+    }
+    gradient = rng.normal(size=(3, 3))
+    gradient -= np.trace(gradient) / 3.0 * np.eye(3)
+    gradient *= options.push_mm / OUTSIDE / np.linalg.norm(gradient, ord=2)
+    return parts, {"frame": AffineMotion(gradient, centre, np.zeros(3))}
+
+
+def _pushed(
+    options: SpheresOptions, centre: NDArray[np.float64], rng: np.random.Generator
+) -> tuple[Parts, dict[str, WallMotion]]:
+    """A cavity that grows, more to one side, in a ball in a box."""
+    parts: Parts = {"cavity": ball(centre, CORE), "shell": ball(centre, SHELL), "surroundings": None}
+    towards = rng.normal(size=3)
+    towards /= np.linalg.norm(towards)
+    point = Tube(centre + 1e-3 * np.outer([-1.0, 0.0, 1.0], towards), np.full(3, CORE))
+    stray = smooth_field(rng, sd_mm=STRAY * options.push_mm, correlation_mm=CORE, features=300)
+    filling = Filling(
+        tube=point,
+        filling_mm=options.push_mm,
+        profile=(1.0, 1.0),
+        floor=1.0,
+        towards=towards,
+        lean=LEAN,
+        stray=stray,
+    )
+    return parts, {"cavity": filling}
+
+
+def _tissues(names: tuple[str, ...], options: SpheresOptions) -> tuple[Tissue, ...]:
+    given = dict(options.moduli_kpa or {})
+    unknown = sorted(set(given) - set(names))
+    if unknown:
+        raise ConfigurationError(f"moduli_kpa names {unknown}; these spheres have {list(names)}")
+    moduli = MODULI_KPA | given
+    roles = {"frame": Role.DRIVER, "cavity": Role.DRIVER, "surroundings": Role.KNOWN}
+    return tuple(
+        Tissue(name, roles.get(name, Role.ESTIMATE), (label,), options.poisson_ratio, moduli.get(name))
+        for label, name in enumerate(names, start=1)
+    )

@@ -1,0 +1,1 @@
+"""One case: what it says, what came out of it."""

@@ -1,0 +1,283 @@
+"""One case: all that a case.toml says, with the defaults of its schema."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from palpate.errors import ConfigurationError
+from palpate.images.tissue import Role, Tissue
+from palpate.study.schema import nearest, rule
+
+__all__ = [
+    "REMAINING",
+    "Case",
+    "CaseTissue",
+    "Domain",
+    "DriverMotion",
+    "Estimate",
+    "Images",
+    "Mechanics",
+    "MeshSettings",
+    "Motion",
+    "Noise",
+    "Pair",
+    "Phantom",
+]
+
+REMAINING = "remaining"
+
+ALL_POSITIVE = "a list of positive numbers"
+LOW_HIGH = "[low, high] with 0 < low < high"
+
+
+def _above_zero(value: float) -> bool:
+    return value > 0
+
+
+def _all_above_zero(values: tuple[float, ...]) -> bool:
+    return len(values) > 0 and min(values) > 0
+
+
+def _ordered(bounds: tuple[float, float]) -> bool:
+    return 0 < bounds[0] < bounds[1]
+
+
+POSITIVE = rule(test=_above_zero, wanted="greater than zero")
+NOT_EMPTY = rule(test=bool, wanted="a list with at least one entry")
+
+
+def _label(value: object) -> tuple[int, ...] | str:
+    """A tissue's `label`: an integer, a list of integers, a name of the table, or "remaining"."""
+    if isinstance(value, str) and value:
+        return value
+    items = value if isinstance(value, list) else [value]
+    if not items or not all(isinstance(item, int) and not isinstance(item, bool) and item >= 0 for item in items):
+        raise ConfigurationError(
+            f"a tissue's label is {value!r}; it must be an integer >= 0, a list of them, a name of the label table,"
+            f" or '{REMAINING}'"
+        )
+    return tuple(items)
+
+
+@dataclass(frozen=True, slots=True)
+class Images:
+    """Label images: `before` the reference state, `after` the later states; `names` a label table; grey images."""
+
+    before: Path
+    after: tuple[Path, ...] = field(metadata=NOT_EMPTY)
+    names: Path | None = None
+    intensities_before: Path | None = None
+    intensities_after: tuple[Path, ...] = ()
+    align: str | None = field(default=None, metadata=rule(choices=("rigid-tissues", "none")))
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """A further pair of images of the same patient, with its own reference state."""
+
+    before: Path
+    after: tuple[Path, ...] = field(metadata=NOT_EMPTY)
+
+
+@dataclass(frozen=True, slots=True)
+class Domain:
+    """What is meshed, and how its outer border is held."""
+
+    extent: str = field(default="image", metadata=rule(choices=("image", "margin")))
+    margin_mm: float = field(default=40.0, metadata=POSITIVE)
+    outer_boundary: str = field(default="fixed", metadata=rule(choices=("fixed", "sliding", "free")))
+
+
+@dataclass(frozen=True, slots=True)
+class CaseTissue:
+    """A tissue as the case names it: `label` is a tuple of labels, a name of the label table, or "remaining"."""
+
+    name: str
+    label: tuple[int, ...] | str = field(metadata=rule(convert=_label))
+    role: Role
+    poisson_ratio: float = 0.45
+    youngs_modulus_kpa: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.name == "after" or not self.name.isprintable() or not self.name.strip():
+            raise ConfigurationError(f"a tissue cannot be called {self.name!r}; choose another name for it")
+        self.with_labels(())  # a tissue's constants are checked by the tissue itself
+
+    def with_labels(self, labels: tuple[int, ...]) -> Tissue:
+        """The tissue with its labels; raises `ConfigurationError` when its constants are impossible."""
+        return Tissue(self.name, self.role, labels, self.poisson_ratio, self.youngs_modulus_kpa)
+
+    def resolve(self, names: Mapping[int, str]) -> Tissue:
+        """The tissue with the labels that `names` (label -> name) gives to its label's name.
+
+        Raises `ConfigurationError` when the table has no such name.
+        """
+        if self.label == REMAINING:
+            return self.with_labels(())
+        if not isinstance(self.label, str):
+            return self.with_labels(self.label)
+        labels = tuple(sorted(number for number, name in names.items() if name == self.label))
+        if not labels:
+            known = nearest(self.label, names.values()) if names else "give a label table, [images] names"
+            raise ConfigurationError(
+                f"tissue '{self.name}': no label is called '{self.label}' in the label table; {known}"
+            )
+        return self.with_labels(labels)
+
+
+@dataclass(frozen=True, slots=True)
+class Mechanics:
+    """Material law and finite element."""
+
+    law: str = field(default="linear", metadata=rule(choices=("linear",), later=("neo-hookean", "mooney-rivlin")))
+    element: str = field(default="P2", metadata=rule(choices=("P1", "P2"), later=("auto",)))
+    c01_over_c10: float = field(default=0.25, metadata=rule(test=lambda value: value >= 0, wanted="zero or more"))
+
+
+@dataclass(frozen=True, slots=True)
+class MeshSettings:
+    """Edge length (mm) of the tetrahedra at the organs."""
+
+    edge_length_mm: float = field(default=4.0, metadata=POSITIVE)
+
+
+@dataclass(frozen=True, slots=True)
+class DriverMotion:
+    """Smooth modes of the driver's wall: how many, Gaussian kernel's length and prior amplitude, mm."""
+
+    modes: int = field(default=90, metadata=POSITIVE)
+    kernel_mm: float = field(default=20.0, metadata=POSITIVE)
+    prior_mm: float = field(default=5.0, metadata=POSITIVE)
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Error of the segmented surfaces, mm; None: estimated from the residuals."""
+
+    surface_sd_mm: float | None = field(default=None, metadata=POSITIVE)
+    correlation_length_mm: float | None = field(default=None, metadata=POSITIVE)
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """How the unknowns are found; starts and bounds to the `known` tissue, or in kPa where these are given."""
+
+    method: str = field(default="gauss-newton", metadata=rule(choices=("gauss-newton", "lbfgs")))
+    parameters: tuple[str, ...] = field(
+        default=("youngs_modulus",), metadata=rule(choices=("youngs_modulus",), later=("poisson_ratio",))
+    )
+    start_ratios: tuple[float, ...] = field(
+        default=(0.5, 2.0, 8.0), metadata=rule(test=_all_above_zero, wanted=ALL_POSITIVE)
+    )
+    starts_kpa: tuple[float, ...] | None = field(
+        default=None, metadata=rule(instead_of="start_ratios", test=_all_above_zero, wanted=ALL_POSITIVE)
+    )
+    bounds_ratio: tuple[float, float] = field(default=(0.02, 200.0), metadata=rule(test=_ordered, wanted=LOW_HIGH))
+    bounds_kpa: tuple[float, float] | None = field(
+        default=None, metadata=rule(instead_of="bounds_ratio", test=_ordered, wanted=LOW_HIGH)
+    )
+
+    def __post_init__(self) -> None:
+        for starts, bounds, name in (
+            (self.start_ratios, self.bounds_ratio, "start_ratios"),
+            (self.starts_kpa, self.bounds_kpa, "starts_kpa"),
+        ):
+            outside = [start for start in starts or () if bounds and not bounds[0] <= start <= bounds[1]]
+            if outside:
+                raise ConfigurationError(f"[estimate] {name}: {outside} lie outside the bounds {list(bounds or ())}")
+
+
+@dataclass(frozen=True, slots=True)
+class Phantom:
+    """A scene with a known truth instead of images."""
+
+    kind: str = field(metadata=rule(choices=("pelvis", "spheres")))
+    seed: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """The driver's motion in a simulation: how far its wall moves outwards, mm."""
+
+    filling_mm: float = 7.0
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """Everything that one run depends on; one value, checked when it is made.
+
+    Raises `ConfigurationError` when the tissues contradict each other, or images and phantom are both or neither there.
+    """
+
+    id: str
+    patient: str = ""
+    stage: int | None = None
+    seed: int = 0
+    images: Images | None = None
+    pairs: tuple[Pair, ...] = ()
+    phantom: Phantom | None = None
+    motion: Motion | None = None
+    tissues: tuple[CaseTissue, ...] = ()
+    domain: Domain = Domain()
+    mechanics: Mechanics = Mechanics()
+    mesh: MeshSettings = MeshSettings()
+    driver: DriverMotion = DriverMotion()
+    noise: Noise = Noise()
+    estimate: Estimate = Estimate()
+
+    def __post_init__(self) -> None:
+        if not self.id.isprintable() or not self.id.strip() or len(self.id) > 200:
+            raise ConfigurationError(f"the case's id is {self.id[:50]!r}; give a printable name of 1 to 200 characters")
+        object.__setattr__(self, "patient", self.patient or self.id)
+        if (self.images is None) == (self.phantom is None):
+            raise ConfigurationError(
+                f"case '{self.id}' needs either [images] (with before and after) or [phantom], and not both"
+            )
+        if self.pairs:
+            raise ConfigurationError(
+                f"case '{self.id}' has [[pairs]]: further pairs with their own reference state are not offered by this"
+                " version of Palpate yet; list later states of the same reference in [images] after"
+            )
+        self._check_tissues()
+
+    @property
+    def align(self) -> str:
+        """How the later images are brought to the first: as the case says, else on the rigid tissues, if any."""
+        if self.images is not None and self.images.align is not None:
+            return self.images.align
+        return "rigid-tissues" if any(tissue.role is Role.RIGID for tissue in self.tissues) else "none"
+
+    def resolve_tissues(self, names: Mapping[int, str]) -> tuple[Tissue, ...]:
+        """The tissues with their labels; `names` (label -> name) is the label table, empty when there is none.
+
+        Raises `ConfigurationError` when a name is not in the table or a label is claimed twice.
+        """
+        tissues = tuple(tissue.resolve(names) for tissue in self.tissues)
+        _check_claims([(tissue.name, tissue.labels) for tissue in tissues])
+        return tissues
+
+    def _check_tissues(self) -> None:
+        estimated = any(tissue.role is Role.ESTIMATE for tissue in self.tissues)
+        if not estimated and (self.tissues or self.phantom is None):  # a phantom brings its own tissues
+            raise ConfigurationError(
+                f"case '{self.id}' has no tissue with role = \"estimate\", so there is nothing to find;"
+                " give that role to the organs whose stiffness you want"
+            )
+        remaining = [tissue.name for tissue in self.tissues if tissue.label == REMAINING]
+        if len(remaining) > 1:
+            raise ConfigurationError(f"tissues {remaining} all have label = '{REMAINING}'; only one can be the rest")
+        _check_claims([(t.name, (t.label,) if isinstance(t.label, str) else t.label) for t in self.tissues])
+
+
+def _check_claims(claims: list[tuple[str, tuple[int, ...] | tuple[str, ...]]]) -> None:
+    owner: dict[int | str, str] = {}
+    for name, labels in claims:
+        for label in labels:
+            if label in owner:
+                raise ConfigurationError(
+                    f"label {label!r} is claimed by tissue '{owner[label]}' and by tissue '{name}';"
+                    " a voxel can belong to one tissue only"
+                )
+            owner[label] = name

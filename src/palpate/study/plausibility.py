@@ -1,0 +1,178 @@
+"""Published tissue stiffness, to ask whether an estimate can be right."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from palpate.images.tissue import Role
+from palpate.inversion.estimation import Remark
+from palpate.study.case import Case
+
+__all__ = ["PUBLISHED", "PublishedStiffness", "plausibility_warnings", "published_for", "unit_warnings"]
+
+MARGIN = 3.0  # methods differ by ten to a hundred times: an estimate is doubtful only well outside what was published
+SOFT_TISSUE_KPA = (0.05, 2.0e4)  # from brain-like fat to gut wall under tension, with room on both sides
+
+
+@dataclass(frozen=True, slots=True)
+class PublishedStiffness:
+    """Young's modulus (kPa) of a tissue from `low` to `high`, how it was measured, and where it was published.
+
+    words: parts of a tissue's name that mean this tissue.
+    """
+
+    tissue: str
+    words: tuple[str, ...]
+    low: float
+    high: float
+    method: str
+    source: str
+
+
+PUBLISHED = (
+    PublishedStiffness(
+        "prostate",
+        ("prostate", "prostatic", "central_gland", "peripheral_zone", "transition_zone"),
+        8.0,
+        26.0,
+        "indentation ex vivo, 552 sites of 46 glands, without cancer: 17.0 +- 9.0 kPa",
+        "Ahn et al., Urology 76 (2010) 1007",
+    ),
+    PublishedStiffness(
+        "prostate",
+        ("prostate", "prostatic", "central_gland", "peripheral_zone", "transition_zone"),
+        12.9,
+        36.7,
+        "static palpation in vivo, 12 patients, without cancer: 24.8 (interquartile range 11.9) kPa",
+        "doi 10.1177/09544119231154305",
+    ),
+    PublishedStiffness(
+        "prostate",
+        ("prostate", "prostatic"),
+        660.0,
+        660.0,
+        "tensile test, cadaver, transverse",
+        "Berardo et al.",
+    ),
+    PublishedStiffness(
+        "prostate cancer",
+        ("tumour", "tumor", "lesion", "cancer", "carcinoma"),
+        9.6,
+        38.6,
+        "indentation ex vivo, 552 sites of 46 glands: 24.1 +- 14.5 kPa",
+        "Ahn et al., Urology 76 (2010) 1007",
+    ),
+    PublishedStiffness(
+        "bladder wall",
+        ("bladder",),
+        214.0,
+        470.0,
+        "tensile test of the wall, linear range",
+        "Muslov et al. (2025)",
+    ),
+    PublishedStiffness(
+        "colon and rectum wall",
+        ("colon", "rectum", "colorectal", "bowel"),
+        1830.0,
+        5180.0,
+        "tensile test of the wall: pig 1.83 MPa, human 5.18 MPa",
+        "doi 10.1186/s40064-015-0922-x",
+    ),
+    PublishedStiffness(
+        "liver",
+        ("liver", "hepatic"),
+        4.2,
+        6.6,
+        "shear modulus 1.8 +- 0.4 kPa, E = 3 G",
+        "PMC6925591, table 1",
+    ),
+    PublishedStiffness(
+        "fat",
+        ("fat", "adipose"),
+        2.25,
+        2.25,
+        "magnetic resonance elastography at 50 Hz: shear modulus 0.75 kPa, E = 3 G",
+        "Hatt et al. (2023), doi 10.1016/j.jmbbm.2023.105924",
+    ),
+    PublishedStiffness(
+        "muscle",
+        ("muscle", "gluteal", "gluteus", "iliopsoas"),
+        3.0,
+        3.0,
+        "magnetic resonance elastography at 50 Hz: shear modulus 1.0 kPa, E = 3 G",
+        "Hatt et al. (2023), doi 10.1016/j.jmbbm.2023.105924",
+    ),
+    PublishedStiffness(
+        "muscle",
+        ("muscle", "gluteal", "gluteus", "iliopsoas"),
+        1.5,
+        282.0,
+        "shear wave speed in vivo 0.7 to 9.7 m/s, E = 3 rho c^2 with rho = 1000 kg/m^3",
+        "PMC9631468, table 3",
+    ),
+)
+
+
+def published_for(name: str) -> tuple[PublishedStiffness, ...]:
+    """The published values whose words occur in a tissue's `name`, whatever its case, blanks and hyphens."""
+    plain = name.lower().replace(" ", "_").replace("-", "_")
+    found = [entry for entry in PUBLISHED if any(word in plain for word in entry.words)]
+    tumours = [entry for entry in found if entry.tissue == "prostate cancer"]
+    return tuple(tumours or found)
+
+
+def plausibility_warnings(moduli_kpa: Mapping[str, float]) -> tuple[Remark, ...]:
+    """Warnings on moduli (tissue name -> kPa) far outside what was published, each naming its source.
+
+    A bladder's modulus is called effective: a filled bladder meshed as one solid has no wall.
+    """
+    return tuple(
+        warning
+        for name, value in moduli_kpa.items()
+        for warning in (*_out_of_range(name, value), *_effective_modulus(name))
+    )
+
+
+def unit_warnings(case: Case) -> tuple[Remark, ...]:
+    """Warnings on moduli in the case that look as if they were given in Pa or in MPa."""
+    low, high = SOFT_TISSUE_KPA
+    given = [(t.name, t.youngs_modulus_kpa) for t in case.tissues if t.youngs_modulus_kpa and t.role is not Role.RIGID]
+    hints = []
+    for name, value in given:
+        if not low <= value <= high:
+            unit, factor = ("Pa", 1e-3) if value > high else ("MPa", 1e3)
+            hints.append(
+                Remark(
+                    "units",
+                    f"tissue '{name}': youngs_modulus_kpa = {value:g} is unusual for soft tissue ({low:g} to {high:g}"
+                    f" kPa); if you meant {value:g} {unit}, write {value * factor:g}",
+                )
+            )
+    return tuple(hints)
+
+
+def _out_of_range(name: str, value: float) -> Iterable[Remark]:
+    entries = published_for(name)
+    if not entries:
+        return
+    low, high = min(entry.low for entry in entries), max(entry.high for entry in entries)
+    if low / MARGIN <= value <= high * MARGIN:
+        return
+    closest = min(entries, key=lambda entry: min(abs(value - entry.low), abs(value - entry.high)))
+    yield Remark(
+        "implausible-stiffness",
+        f"{name}: {value:.3g} kPa lies more than {MARGIN:g} times outside the published range for {closest.tissue}"
+        f" ({low:g} to {high:g} kPa; nearest: {closest.method}; {closest.source}). Check the `known` tissue's modulus,"
+        " the labels and the boundary before you believe it",
+    )
+
+
+def _effective_modulus(name: str) -> Iterable[Remark]:
+    plain = name.lower()
+    if "bladder" in plain and "wall" not in plain and "gall" not in plain:
+        yield Remark(
+            "effective-modulus",
+            f"{name}: meshed as one solid, a filled bladder has an effective modulus, not that of its wall; compare it"
+            " with other estimates made this way only",
+        )

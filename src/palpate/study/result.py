@@ -1,0 +1,277 @@
+"""What comes out of a case: results as values, and their JSON documents."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import NotConverged, PalpateError
+from palpate.images.label_image import LabelImage
+from palpate.images.segmentation import Segmentation
+from palpate.images.tissue import Role, Tissue
+from palpate.inversion.estimation import Estimation, ModulusEstimate, Remark, Start, TissueFit
+from palpate.mesh.space import LagrangeSpace
+from palpate.study.case import Case
+
+__all__ = ["CaseResult", "MeshResult", "MeshSummary", "Provenance", "Simulation", "failure_document", "json_object"]
+
+SCHEMA = "palpate.result/1"
+
+
+@dataclass(frozen=True, slots=True)
+class MeshSummary:
+    """Size and quality of a mesh; angles in degrees; volume_error: tissue -> (mesh - image) / image, dimensionless."""
+
+    nodes: int
+    tets: int
+    dofs: int
+    min_dihedral_deg: float
+    p5_dihedral_deg: float
+    volume_error: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """Seconds of each stage, SHA-256 of each input by its key, versions of the software."""
+
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    inputs: Mapping[str, str] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class CaseResult:
+    """The whole outcome of one estimate.
+
+    space: the displacements' points on the mesh of the reference state; before, after: segmentations, the later ones
+    brought to the first (aligned), all in RAS mm; remarks: those of the study, beside the estimation's own;
+    note: a sentence that must stand wherever the numbers are shown (of what a demo simulates, say).
+    """
+
+    case: Case
+    estimation: Estimation
+    space: LagrangeSpace
+    mesh_summary: MeshSummary
+    before: Segmentation
+    after: tuple[Segmentation, ...]
+    provenance: Provenance
+    remarks: tuple[Remark, ...] = ()
+    note: str = ""
+
+    @property
+    def tissues(self) -> tuple[Tissue, ...]:
+        """The case's tissues with their labels, in the mesh's order."""
+        return self.space.mesh.tissues
+
+    @property
+    def all_remarks(self) -> tuple[Remark, ...]:
+        """Warnings of the study and of the estimation, each once."""
+        return tuple(dict.fromkeys((*self.remarks, *self.estimation.remarks)))
+
+    @property
+    def unit(self) -> str:
+        """Unit of `stiffness`: "kPa", or "ratio" when no tissue's modulus is known."""
+        return "kPa" if any(tissue.role is Role.KNOWN for tissue in self.tissues) else "ratio"
+
+    @property
+    def stiffness(self) -> NDArray[np.float64]:
+        """Young's modulus of each tissue in `unit`, (n_tissues,); NaN where none was found or the tissue is hollow."""
+        found = {e.tissue: e for e in self.estimation.estimates if e.parameter == "youngs_modulus"}
+        values = [_stiffness(tissue, found.get(tissue.name), self.unit) for tissue in self.tissues]
+        usable = self.estimation.status == "converged"
+        return np.array(
+            [v if usable or t.role is Role.KNOWN else math.nan for v, t in zip(values, self.tissues, strict=True)]
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """The document `result.json`, schema palpate.result/1, ready for strict JSON."""
+        estimation = self.estimation
+        document = _heading(self.case, estimation.status, estimation.reason) | {
+            "estimates": [_estimate(item, estimation.status) for item in estimation.estimates],
+            "correlation": estimation.correlation.tolist(),
+            "fit": [_fit(name, fits) for name, fits in zip(_after_names(self.case), estimation.fits, strict=False)],
+            "starts": [_start(start) for start in estimation.starts],
+            "counts": dict(estimation.counts),
+            "mesh": _plain(self.mesh_summary),
+        }
+        return json_object(document | _closing(self.case, self.provenance, self.all_remarks) | {"note": self.note})
+
+
+@dataclass(frozen=True, slots=True)
+class MeshResult:
+    """A mesh made from the reference image: `before` is its segmentation."""
+
+    case: Case
+    space: LagrangeSpace
+    mesh_summary: MeshSummary
+    before: Segmentation
+    provenance: Provenance
+    remarks: tuple[Remark, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """A JSON document, schema palpate.mesh/1."""
+        document = {"schema": "palpate.mesh/1", "id": self.case.id, "mesh": _plain(self.mesh_summary)}
+        return json_object(document | _closing(self.case, self.provenance, self.remarks))
+
+
+@dataclass(frozen=True, slots=True)
+class Simulation:
+    """A simulated later state.
+
+    displacements: one (n_points, 3) mm on `space.points` a step, the last one the whole motion; before, after: label
+    images; moduli_kpa: Young's modulus of each meshed tissue, kPa.
+    """
+
+    case: Case
+    space: LagrangeSpace
+    mesh_summary: MeshSummary
+    displacements: tuple[NDArray[np.float64], ...]
+    before: LabelImage
+    after: LabelImage
+    moduli_kpa: Mapping[str, float]
+    provenance: Provenance
+    remarks: tuple[Remark, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """A JSON document, schema palpate.simulation/1."""
+        length = np.linalg.norm(self.displacements[-1], axis=1)
+        document = {
+            "schema": "palpate.simulation/1",
+            "id": self.case.id,
+            "law": self.case.mechanics.law,
+            "element": self.case.mechanics.element,
+            "youngs_modulus_kpa": dict(self.moduli_kpa),
+            "largest_displacement_mm": float(length.max()),
+            "steps": len(self.displacements),
+            "mesh": _plain(self.mesh_summary),
+        }
+        return json_object(document | _closing(self.case, self.provenance, self.remarks))
+
+
+def failure_document(case: Case, error: PalpateError) -> dict[str, Any]:
+    """`result.json` of an estimate that ended in `error`: every key, no value."""
+    status = "not converged" if isinstance(error, NotConverged) else "failed"
+    why = f"the estimation ended with the status '{status}'"
+    unknown = [tissue.name for tissue in case.tissues if tissue.role is Role.ESTIMATE]
+    known = [tissue.name for tissue in case.tissues if tissue.role is Role.KNOWN]
+    empty: dict[str, Any] = {
+        "estimates": [_estimate(_no_estimate(name, (known or unknown)[0], why), status) for name in unknown],
+        "correlation": [],
+        "fit": [],
+        "starts": [],
+        "counts": {},
+        "mesh": None,
+    }
+    return json_object(_heading(case, status, str(error)) | empty | _closing(case, Provenance(), ()))
+
+
+def _no_estimate(tissue: str, relative_to: str, why: str) -> ModulusEstimate:
+    return ModulusEstimate(
+        tissue=tissue,
+        parameter="youngs_modulus",
+        unit="kPa",
+        value=None,
+        interval95=None,
+        interval_kind="linearised",
+        relative_to=relative_to,
+        ratio=None,
+        ratio_interval95=None,
+        verdict="not identified",
+        why=why,
+    )
+
+
+def json_object(mapping: Mapping[str, Any]) -> dict[str, Any]:
+    """`mapping` in JSON's own types: tuples as lists, numpy numbers as numbers, NaN and infinity as null."""
+    return {str(key): _json(item) for key, item in mapping.items()}
+
+
+def _json(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return json_object(value)
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_json(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return str(value) if isinstance(value, Path) else value
+
+
+def _plain(value: Any) -> dict[str, Any]:
+    """The fields of a dataclass, not copied; slots leave no __dict__."""
+    return {item.name: getattr(value, item.name) for item in fields(value)}
+
+
+def _heading(case: Case, status: str, reason: str) -> dict[str, Any]:
+    return {
+        "schema": SCHEMA,
+        "id": case.id,
+        "patient": case.patient,
+        "stage": case.stage,
+        "status": status,
+        "reason": reason,
+        "law": case.mechanics.law,
+        "element": case.mechanics.element,
+        "method": case.estimate.method,
+    }
+
+
+def _closing(case: Case, provenance: Provenance, remarks: tuple[Remark, ...]) -> dict[str, Any]:
+    return {
+        "seconds": dict(provenance.seconds),
+        "inputs": {key: {"sha256": digest} for key, digest in provenance.inputs.items()},
+        "versions": dict(provenance.versions),
+        "seed": case.seed,
+        "warnings": [{"code": warning.code, "message": warning.message} for warning in remarks],
+    }
+
+
+def _estimate(item: ModulusEstimate, status: str) -> dict[str, Any]:
+    """One entry of "estimates"; an estimate that did not converge must not look like a result."""
+    document = _plain(item)
+    if status != "converged":
+        document |= dict.fromkeys(("value", "interval95", "ratio", "ratio_interval95"))
+        document["verdict"] = "not identified"
+    return document
+
+
+def _fit(name: str, fits: tuple[TissueFit, ...]) -> dict[str, Any]:
+    entries = {
+        fit.tissue: {"start": _plain(fit.start), "end": _plain(fit.end), "observed_share": fit.observed_share}
+        for fit in fits
+    }
+    return {"after": name} | entries
+
+
+def _start(start: Start) -> dict[str, Any]:
+    return {
+        "start": dict(start.start),
+        "end": dict(start.end),
+        "objective_mm2": start.objective_mm2,
+        "status": start.status,
+        "iterations": start.iterations,
+        "minimum": start.minimum,
+        "history_mm2": [step.objective_mm2 for step in start.history],
+    }
+
+
+def _after_names(case: Case) -> list[str]:
+    return [path.name for path in case.images.after] if case.images else ["after"]
+
+
+def _stiffness(tissue: Tissue, estimate: ModulusEstimate | None, unit: str) -> float:
+    """Modulus of one tissue, kPa or ratio; NaN when nothing is known of it."""
+    if not tissue.meshed:
+        return math.nan
+    if tissue.role is Role.KNOWN:
+        value = tissue.youngs_modulus_kpa
+    else:
+        value = None if estimate is None else (estimate.value if unit == "kPa" else estimate.ratio)
+    return math.nan if value is None else value
