@@ -1,102 +1,22 @@
-"""Small structured meshes of known shape, for the laws of mechanics."""
+"""Fixtures of the mechanics' tests."""
 
 from __future__ import annotations
 
-from itertools import permutations
+import importlib.util
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from palpate.images.tissue import Role, Tissue
-from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh
 
-
-def kuhn_tets(n: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Grid places (n_nodes, 3) in steps and tetrahedra (6 a cell) of a box of n cells."""
-    grid = np.stack(np.meshgrid(*[np.arange(k + 1) for k in n], indexing="ij"), axis=-1)
-    number = np.arange(grid[..., 0].size).reshape(grid.shape[:3])
-    tets = []
-    for order in permutations(range(3)):
-        steps = np.cumsum(np.vstack([np.zeros(3, int), np.eye(3, dtype=int)[list(order)]]), axis=0)
-        corners = [
-            number[s[0] : s[0] + n[0], s[1] : s[1] + n[1], s[2] : s[2] + n[2]].ravel() for s in steps
-        ]
-        tets.append(np.stack(corners, axis=1))
-    return grid.reshape(-1, 3).astype(float), np.concatenate(tets)
-
-
-def oriented(nodes: np.ndarray, tets: np.ndarray) -> np.ndarray:
-    corner = nodes[tets]
-    flip = np.linalg.det(corner[:, 1:] - corner[:, :1]) < 0
-    result = tets.copy()
-    result[flip] = result[flip][:, [1, 0, 2, 3]]
-    return result
-
-
-def boundary_faces(tets: np.ndarray) -> np.ndarray:
-    faces = tets[:, FACES].reshape(-1, 3)
-    _, place, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    return faces[place[count == 1]]
-
-
-def make_mesh(nodes, tets, region, tissues, beyond=None) -> TetMesh:
-    """A mesh; beyond(centroids (n, 3)) gives the neighbour of each outer face, OUTER by default."""
-    tets = oriented(nodes, tets)
-    boundary = boundary_faces(tets)
-    behind = np.full(len(boundary), OUTER) if beyond is None else beyond(nodes[boundary].mean(axis=1))
-    return TetMesh(nodes, tets, region, boundary, behind, tuple(tissues))
-
-
-def known(name: str, modulus: float = 1.0, nu: float = 0.3) -> Tissue:
-    return Tissue(name, Role.KNOWN, poisson_ratio=nu, youngs_modulus_kpa=modulus)
-
-
-def unknown(name: str, nu: float = 0.3) -> Tissue:
-    return Tissue(name, Role.ESTIMATE, poisson_ratio=nu)
-
-
-def box_mesh(n=3, *, size=1.0, tissues=None, region=None, distortion=0.0, beyond=None) -> TetMesh:
-    """Box of edge `size` with n cells a side; region(centroids) -> tissue index; inner nodes moved by `distortion`."""
-    n = (n, n, n) if isinstance(n, int) else n
-    places, tets = kuhn_tets(n)
-    inner = np.all((places > 0) & (places < np.array(n)), axis=1)
-    nodes = places / np.array(n)
-    nodes[inner] += distortion / np.array(n) * np.random.default_rng(1).uniform(-1, 1, (int(inner.sum()), 3))
-    nodes *= size
-    number = np.zeros(len(tets), int) if region is None else region(nodes[tets].mean(axis=1))
-    return make_mesh(nodes, tets, number, tissues or [known("block")], beyond)
-
-
-def octant_mesh(radii, n_radial, n_surface, tissues) -> TetMesh:
-    """Layers between `radii` of an eighth of a ball (a hollow one, radii[0] > 0), its flat sides on the three planes.
-
-    The spherical triangle is a regular grid of barycentric places, lifted to the sphere; each prism is split in 3.
-    """
-    places = [(i, j) for i in range(n_surface + 1) for j in range(n_surface + 1 - i)]
-    index = {p: k for k, p in enumerate(places)}
-    flat = np.array([[i, j, n_surface - i - j] for i, j in places]) / n_surface
-    # equal angles along the edges: better elements than central projection
-    lifted = np.sin(0.5 * np.pi * flat)
-    directions = lifted / np.linalg.norm(lifted, axis=1, keepdims=True)
-    triangles = []
-    for i, j in places:
-        if i + j < n_surface:
-            triangles.append((index[i, j], index[i + 1, j], index[i, j + 1]))
-        if i + j < n_surface - 1:
-            triangles.append((index[i + 1, j], index[i + 1, j + 1], index[i, j + 1]))
-    triangles = np.sort(np.array(triangles), axis=1)
-    levels = np.concatenate([np.linspace(a, b, m + 1)[:-1] for a, b, m in zip(radii, radii[1:], n_radial)] + [radii[-1:]])
-    nodes = (levels[:, None, None] * directions).reshape(-1, 3)
-    tets, region = [], []
-    layer_of = np.repeat(np.arange(len(n_radial)), n_radial)
-    for level in range(len(levels) - 1):
-        low, high = triangles + level * len(places), triangles + (level + 1) * len(places)
-        a, b, c = low.T
-        d, e, f = high.T
-        for corners in ((a, b, c, f), (a, b, e, f), (a, d, e, f)):
-            tets.append(np.stack(corners, axis=1))
-            region.append(np.full(len(triangles), layer_of[level]))
-    return make_mesh(nodes, np.concatenate(tets), np.concatenate(region), tissues)
+@pytest.fixture(scope="session")
+def meshes():
+    """The module `structured_meshes`, loaded by its path: tests are no package."""
+    path = Path(__file__).parents[1] / "mechanics" / "structured_meshes.py"
+    spec = importlib.util.spec_from_file_location("structured_meshes", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture

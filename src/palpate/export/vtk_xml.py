@@ -1,7 +1,8 @@
 """VTK XML files in RAS millimetres: unstructured grids (.vtu), surfaces (.vtp), collections to animate (.pvd).
 
 Format: "VTK XML formats", https://docs.vtk.org/en/latest/vtk_file_formats/vtkxml_file_format.html; arrays are written
-inline, base64 of zlib-compressed little-endian blocks. The field SPACE=RAS tells 3D Slicer not to flip the model.
+inline, base64 of zlib-compressed little-endian blocks. In surfaces the field SPACE=RAS tells 3D Slicer not to flip the
+model; grids say it in a comment only, because meshio refuses files with a text field.
 """
 
 from __future__ import annotations
@@ -73,7 +74,7 @@ def write_vtp(
         + _points(points[used])
         + f"<Polys>{_arrays(polygons)}</Polys></Piece>"
     )
-    write_bytes(path, _file("PolyData", piece))
+    write_bytes(path, _file("PolyData", piece, field=_space_field()))
 
 
 def write_pvd(path: Path, files: Sequence[tuple[float, str]]) -> None:
@@ -94,14 +95,18 @@ def _check(data: Arrays, size: int, what: str) -> None:
             raise InputDataError(f"the array '{name}' has {len(array)} rows for {size} {what}: give one row each")
 
 
-def _file(kind: str, piece: str) -> bytes:
-    space = " ".join(str(code) for code in (*b"RAS", 0))
-    field = f'<FieldData><DataArray type="String" Name="SPACE" NumberOfTuples="1" format="ascii">{space}</DataArray>'
+def _file(kind: str, piece: str, *, field: str = "") -> bytes:
     return (
-        '<?xml version="1.0"?>\n'
+        '<?xml version="1.0"?>\n<!-- SPACE=RAS; lengths in mm -->\n'
         f'<VTKFile type="{kind}" version="1.0" byte_order="LittleEndian" header_type="UInt64"'
-        f' compressor="vtkZLibDataCompressor"><{kind}>{field}</FieldData>{piece}</{kind}></VTKFile>\n'
+        f' compressor="vtkZLibDataCompressor"><{kind}>{field}{piece}</{kind}></VTKFile>\n'
     ).encode()
+
+
+def _space_field() -> str:
+    """The text RAS in the field SPACE, as VTK writes it: codes that end in zero."""
+    codes = " ".join(str(code) for code in (*b"RAS", 0))
+    return f'<FieldData><Array type="String" Name="SPACE" NumberOfTuples="1" format="ascii">{codes}</Array></FieldData>'
 
 
 def _points(points: NDArray[np.float64]) -> str:

@@ -12,21 +12,21 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from palpate.errors import InputDataError
-from palpate.images.distance import DistanceMap, distance_map, smoothing_width
+from palpate.images.distance import DistanceMap, smoothing_width
+from palpate.images.isosurface import IsosurfacePoints, isosurface_points
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
+from palpate.images.tissue_distance import tissue_distance_map
 
 __all__ = [
     "Alignment",
     "RigidFit",
     "RigidMotion",
-    "SurfacePoints",
     "align",
     "fit_rigid_motion",
     "measure_rigid_motion",
     "moved",
-    "surface_points",
 ]
 
 BORDER_VOXELS = 3.0  # nearer to the image's border the map continues what it cannot see
@@ -87,14 +87,6 @@ class RigidMotion:
 
 
 @dataclass(frozen=True, slots=True)
-class SurfacePoints:
-    """Points (n, 3) RAS mm on a surface and the area (n,) mm^2 that each stands for."""
-
-    points: NDArray[np.float64]
-    areas: NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
 class RigidFit:
     """A measured motion with what it rests on.
 
@@ -124,41 +116,29 @@ class Alignment:
 class _Match:
     """Surface points of the before image with their rest distance (n,) mm, and the after map they are laid on."""
 
-    surface: SurfacePoints
+    surface: IsosurfacePoints
     rest: NDArray[np.float64]
     after: DistanceMap
 
 
 @dataclass(frozen=True, slots=True)
+class _Moments:
+    """Centroid (3,) mm and covariance (3, 3) mm^2 of surfaces, by area."""
+
+    centre: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
 class _State:
-    """A trial motion: residuals (n,) mm, their derivative (n, 6) by turn (rad) and shift (mm), areas (n,) mm^2."""
+    """A trial motion: residuals (n,) mm, their derivative (n, 6) by turn (rad) and shift (mm), area (n,) mm^2."""
 
     motion: RigidMotion
     residual: NDArray[np.float64]
     jacobian: NDArray[np.float64]
-    areas: NDArray[np.float64]
+    area: NDArray[np.float64]
     centre: NDArray[np.float64]
     radius: float
-
-
-def surface_points(surface: DistanceMap, *, border_voxels: float = BORDER_VOXELS) -> SurfacePoints:
-    """Where the zero level of a distance map crosses the edges between neighbouring voxel centres.
-
-    Crossings are found by linear interpolation. A surface with the unit normal n has sum_a |n_a| / (h_b h_c) crossings
-    per area, h the voxel edges; the inverse is the area that a point stands for. Points nearer than `border_voxels` to
-    the image's border are left out.
-    """
-    values = _node_values(surface)
-    found = [_crossings(values, axis) for axis in range(3)]
-    index = np.concatenate(found)
-    last = np.array(values.shape) - 1.0
-    index = index[((index >= border_voxels) & (index <= last - border_voxels)).all(axis=1)]
-    points = surface.grid.world(index)
-    axes = surface.grid.affine[:3, :3] / surface.grid.spacing
-    normals = np.abs(surface.gradient_at(points) @ axes)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    density = normals @ (surface.grid.spacing / surface.grid.voxel_volume)
-    return SurfacePoints(points, 1.0 / np.maximum(density, 1e-12))
 
 
 def measure_rigid_motion(before: DistanceMap, after: DistanceMap) -> RigidMotion:
@@ -179,13 +159,14 @@ def fit_rigid_motion(pairs: Sequence[tuple[DistanceMap, DistanceMap]]) -> RigidF
     voxel = max(float(surface.grid.spacing.max()) for pair in pairs for surface in pair)
     smooth = [(_smoothed(before, voxel), _smoothed(after, voxel)) for before, after in pairs]
     matches = [_match(before, after) for before, after in smooth]
-    target = [surface_points(after) for _, after in smooth]
+    target = [_surface(after) for _, after in smooth]
     _check_enough(matches, target)
-    source, aim = _joined([match.surface for match in matches]), _joined(target)
+    source, aim = _moments([match.surface for match in matches]), _moments(target)
     best = _descend(_about_centroids(np.eye(3), source, aim), matches)
     if _scale(best) > 0.25 * voxel:
-        others = [_descend(_about_centroids(turn, source, aim), matches) for turn in _principal_turns(source, aim)]
-        best = min([best, *others], key=_cost)
+        starts = [_about_centroids(turn, source, aim) for turn in _principal_turns(source, aim)]
+        others = [_descend(start, matches) for start in starts if _n_inside(start, matches) >= MIN_POINTS]
+        best = min([best, *others], key=_misfit)
     return _fit(best)
 
 
@@ -199,10 +180,7 @@ def align(before: Segmentation, after: Segmentation) -> Alignment:
         raise InputDataError("no tissue is `rigid`, so nothing shows the motion between the images; set align = 'none'")
     width = smoothing_width(before.grid, after.grid)
     pairs = [
-        (
-            distance_map(before.mask(i), before.grid, smoothing_mm=width),
-            distance_map(after.mask(i), after.grid, smoothing_mm=width),
-        )
+        (tissue_distance_map(before, i, smoothing_mm=width), tissue_distance_map(after, i, smoothing_mm=width))
         for i in rigid
     ]
     each = {
@@ -229,34 +207,23 @@ def _smoothed(surface: DistanceMap, voxel: float) -> DistanceMap:
     return replace(surface, coefficients=ndimage.gaussian_filter(surface.coefficients, sigma, mode="mirror"))
 
 
-def _node_values(surface: DistanceMap) -> NDArray[np.float64]:
-    """The spline at the voxel centres (nx, ny, nz), mm."""
-    values = surface.coefficients
-    for axis in range(3):
-        values = ndimage.correlate1d(values, [1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0], axis=axis, mode="mirror")
-    return np.asarray(values + surface.bias)
-
-
-def _crossings(values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-    """Voxel indices (n, 3) at which the linear interpolant along `axis` changes sign."""
-    low, high = (np.take(values, np.arange(values.shape[axis])[cut], axis) for cut in (slice(-1), slice(1, None)))
-    place = np.argwhere((low < 0.0) != (high < 0.0))
-    start, end = low[tuple(place.T)], high[tuple(place.T)]
-    index = place.astype(np.float64)
-    index[:, axis] += start / (start - end)
-    return index
+def _surface(distance: DistanceMap) -> IsosurfacePoints:
+    """The zero level, away from the image's border."""
+    found = isosurface_points(distance)
+    keep = _inside(distance.grid, found.places)
+    return IsosurfacePoints(found.places[keep], found.normals[keep], found.area[keep])
 
 
 def _match(before: DistanceMap, after: DistanceMap) -> _Match:
-    surface = surface_points(before)
-    step = -(-len(surface.points) // MAX_POINTS) or 1
-    thinned = SurfacePoints(surface.points[::step], surface.areas[::step] * step)
-    return _Match(thinned, before.at(thinned.points), after)
+    surface = _surface(before)
+    step = -(-len(surface.area) // MAX_POINTS) or 1
+    thinned = IsosurfacePoints(surface.places[::step], surface.normals[::step], surface.area[::step] * step)
+    return _Match(thinned, before.at(thinned.places), after)
 
 
-def _check_enough(matches: Sequence[_Match], target: Sequence[SurfacePoints]) -> None:
+def _check_enough(matches: Sequence[_Match], target: Sequence[IsosurfacePoints]) -> None:
     for where, surfaces in (("before", [match.surface for match in matches]), ("after", target)):
-        n = sum(len(surface.points) for surface in surfaces)
+        n = sum(len(surface.area) for surface in surfaces)
         if n < MIN_POINTS:
             raise InputDataError(
                 f"the {where} image shows {n} surface points of the rigid tissue away from its border, {MIN_POINTS} are"
@@ -264,25 +231,21 @@ def _check_enough(matches: Sequence[_Match], target: Sequence[SurfacePoints]) ->
             )
 
 
-def _joined(surfaces: Sequence[SurfacePoints]) -> SurfacePoints:
-    return SurfacePoints(np.concatenate([s.points for s in surfaces]), np.concatenate([s.areas for s in surfaces]))
+def _moments(surfaces: Sequence[IsosurfacePoints]) -> _Moments:
+    places, area = np.concatenate([s.places for s in surfaces]), np.concatenate([s.area for s in surfaces])
+    share = area / area.sum()
+    centre = share @ places
+    offset = places - centre
+    return _Moments(centre, (offset * share[:, None]).T @ offset)
 
 
-def _moments(surface: SurfacePoints) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Centroid (3,) mm and covariance (3, 3) mm^2 of a surface."""
-    weight = surface.areas / surface.areas.sum()
-    centre = weight @ surface.points
-    offset = surface.points - centre
-    return centre, (offset * weight[:, None]).T @ offset
+def _about_centroids(turn: NDArray[np.float64], source: _Moments, target: _Moments) -> RigidMotion:
+    return RigidMotion(turn, target.centre - turn @ source.centre)
 
 
-def _about_centroids(turn: NDArray[np.float64], source: SurfacePoints, target: SurfacePoints) -> RigidMotion:
-    return RigidMotion(turn, _moments(target)[0] - turn @ _moments(source)[0])
-
-
-def _principal_turns(source: SurfacePoints, target: SurfacePoints) -> list[NDArray[np.float64]]:
+def _principal_turns(source: _Moments, target: _Moments) -> list[NDArray[np.float64]]:
     """The four proper rotations that lay the principal axes of one surface on those of the other."""
-    first, second = (np.linalg.eigh(_moments(surface)[1])[1] for surface in (source, target))
+    first, second = (np.linalg.eigh(moments.covariance)[1] for moments in (source, target))
     turns = [second @ np.diag(signs) @ first.T for signs in product((1.0, -1.0), repeat=3)]
     return [turn for turn in turns if np.linalg.det(turn) > 0.0]
 
@@ -308,19 +271,20 @@ def _descend(motion: RigidMotion, matches: Sequence[_Match]) -> _State:
 
 def _state(motion: RigidMotion, matches: Sequence[_Match]) -> _State:
     """Residuals and derivatives at a motion; points that leave the after image's inside get no area."""
-    places = [motion.apply(match.surface.points) for match in matches]
-    points, areas = np.concatenate(places), np.concatenate([match.surface.areas for match in matches])
-    centre, spread = _moments(SurfacePoints(points, areas))
-    residual = np.concatenate([m.after.at(x) - m.rest for m, x in zip(matches, places, strict=True)])
-    slope = np.concatenate([m.after.gradient_at(x) for m, x in zip(matches, places, strict=True)])
-    inside = np.concatenate([_inside(m.after.grid, x) for m, x in zip(matches, places, strict=True)])
+    groups = [motion.apply(match.surface.places) for match in matches]
+    places = np.concatenate(groups)
+    area = np.concatenate([match.surface.area for match in matches])
+    centre = area @ places / area.sum()
+    radius = float(np.sqrt(area @ ((places - centre) ** 2).sum(axis=1) / area.sum()))
+    residual = np.concatenate([m.after.at(x) - m.rest for m, x in zip(matches, groups, strict=True)])
+    slope = np.concatenate([m.after.gradient_at(x) for m, x in zip(matches, groups, strict=True)])
+    inside = np.concatenate([_inside(m.after.grid, x) for m, x in zip(matches, groups, strict=True)])
     if np.count_nonzero(inside) < MIN_POINTS:
         raise InputDataError(
-            f"only {np.count_nonzero(inside)} of {len(points)} surface points of the rigid tissue come to lie inside"
+            f"only {np.count_nonzero(inside)} of {len(places)} surface points of the rigid tissue come to lie inside"
             " the after image; the images show different parts of the body"
         )
-    jacobian = np.hstack([np.cross(points - centre, slope), slope])
-    return _State(motion, residual, jacobian, areas * inside, centre, float(np.sqrt(np.trace(spread))))
+    return _State(motion, residual, np.hstack([np.cross(places - centre, slope), slope]), area * inside, centre, radius)
 
 
 def _inside(grid: VoxelGrid, points: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -328,21 +292,29 @@ def _inside(grid: VoxelGrid, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray(((index >= BORDER_VOXELS) & (index <= np.array(grid.shape) - 1.0 - BORDER_VOXELS)).all(axis=1))
 
 
+def _n_inside(motion: RigidMotion, matches: Sequence[_Match]) -> int:
+    return sum(int(np.count_nonzero(_inside(m.after.grid, motion.apply(m.surface.places)))) for m in matches)
+
+
 def _scale(state: _State) -> float:
     """Robust standard deviation of the residuals, mm: 1.4826 times the median of their sizes."""
-    return max(1.4826 * float(np.median(np.abs(state.residual[state.areas > 0.0]))), 1e-4)
+    return max(1.4826 * float(np.median(np.abs(state.residual[state.area > 0.0]))), 1e-4)
 
 
 def _tukey(state: _State, scale: float) -> NDArray[np.float64]:
     return np.asarray(np.maximum(1.0 - (state.residual / (TUKEY * scale)) ** 2, 0.0) ** 2)
 
 
-def _cost(state: _State, scale: float | None = None) -> float:
-    """Mean of Tukey's rho over the area; without a scale, the mean size of the residuals (to compare starts), mm."""
-    share = state.areas / state.areas.sum()
-    if scale is None:
-        return float(share @ np.abs(state.residual))
-    return float(share @ (1.0 - np.maximum(1.0 - (state.residual / (TUKEY * scale)) ** 2, 0.0) ** 3))
+def _cost(state: _State, scale: float) -> float:
+    """Mean of Tukey's rho over the area."""
+    rho = 1.0 - np.maximum(1.0 - (state.residual / (TUKEY * scale)) ** 2, 0.0) ** 3
+    return float(state.area @ rho / state.area.sum())
+
+
+def _misfit(state: _State) -> float:
+    """Mean size of the residuals, mm, over the share of points that are inside: compares the ends of several starts."""
+    inside = np.count_nonzero(state.area) / len(state.area)
+    return float(state.area @ np.abs(state.residual) / state.area.sum() / inside)
 
 
 def _normal_matrix(state: _State, weight: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -364,7 +336,7 @@ def _shown(state: _State, weight: NDArray[np.float64]) -> tuple[NDArray[np.float
 
 def _step(state: _State, scale: float) -> NDArray[np.float64]:
     """Turn (rad) and shift (mm), (6,), of one Gauss-Newton step among the turns that the surface shows."""
-    weight = state.areas * _tukey(state, scale)
+    weight = state.area * _tukey(state, scale)
     shown, _ = _shown(state, weight)
     basis = np.zeros((6, shown.shape[1] + 3))
     basis[:3, :-3], basis[3:, -3:] = shown / state.radius, np.eye(3)
@@ -380,6 +352,6 @@ def _stepped(state: _State, step: NDArray[np.float64]) -> RigidMotion:
 
 
 def _fit(state: _State) -> RigidFit:
-    weight = state.areas * _tukey(state, _scale(state))
+    weight = state.area * _tukey(state, _scale(state))
     rms = float(np.sqrt(weight @ state.residual**2 / weight.sum()))
     return RigidFit(state.motion, rms, int(np.count_nonzero(weight)), _shown(state, weight)[1].T)

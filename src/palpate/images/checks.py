@@ -63,10 +63,9 @@ def check_segmentation(segmentation: Segmentation, name: str) -> tuple[Finding, 
         if not box:
             continue  # a tissue that is absent is refused by check_pair
         findings += _cut_by_border(segmentation.mask(i), tissue, name)
-        mask = segmentation.index[box[0]] == i
         if tissue.role is not Role.RIGID:
-            findings += _too_thin(np.pad(mask, THIN_VOXELS, mode="edge"), mask, tissue, name)
-        findings += _islands(mask, tissue, name)
+            findings += _too_thin(_surrounded(segmentation, i, box[0]), tissue, name)
+        findings += _islands(segmentation.index[box[0]] == i, tissue, name)
     return tuple(findings)
 
 
@@ -119,8 +118,7 @@ def _voxel_size(grid: VoxelGrid, name: str) -> list[Finding]:
 
 
 def _cut_by_border(mask: NDArray[np.bool_], tissue: Tissue, name: str) -> list[Finding]:
-    faces = [mask[cut] for axis in range(3) for cut in _ends(axis)]
-    touching = sum(int(np.count_nonzero(face)) for face in faces)
+    touching = _touching(mask)
     if not touching:
         return []
     surface = touching + sum(int(np.count_nonzero(np.diff(mask, axis=axis))) for axis in range(3))
@@ -131,20 +129,30 @@ def _cut_by_border(mask: NDArray[np.bool_], tissue: Tissue, name: str) -> list[F
     return [Finding("cut-by-border", text)]
 
 
-def _ends(axis: int) -> list[tuple[slice | int, ...]]:
-    return [tuple(end if a == axis else slice(None) for a in range(3)) for end in (0, -1)]
+def _touching(mask: NDArray[np.bool_]) -> int:
+    """Number of outer voxel faces of the image that belong to the organ."""
+    return sum(int(np.count_nonzero(np.take(mask, end, axis))) for axis in range(3) for end in (0, -1))
 
 
-def _too_thin(padded: NDArray[np.bool_], mask: NDArray[np.bool_], tissue: Tissue, name: str) -> list[Finding]:
-    """Few voxels at all, or too many that no cube of THIN_VOXELS inside the organ covers (`padded` goes on outside)."""
-    count = int(np.count_nonzero(mask))
+def _surrounded(segmentation: Segmentation, tissue: int, box: tuple[slice, ...]) -> NDArray[np.bool_]:
+    """The tissue's bounding box and THIN_VOXELS around it; where the image ends, the tissue goes on."""
+    window = tuple(slice(max(s.start - THIN_VOXELS, 0), s.stop + THIN_VOXELS) for s in box)
+    missing = [
+        (max(THIN_VOXELS - s.start, 0), max(s.stop + THIN_VOXELS - n, 0))
+        for s, n in zip(box, segmentation.index.shape, strict=True)
+    ]
+    return np.pad(segmentation.index[window] == tissue, missing, mode="edge")
+
+
+def _too_thin(mask: NDArray[np.bool_], tissue: Tissue, name: str) -> list[Finding]:
+    """Few voxels at all, or many that no cube of THIN_VOXELS inside the organ covers; `mask` as `_surrounded` gives."""
+    inner = (slice(THIN_VOXELS, -THIN_VOXELS),) * 3
+    count = int(np.count_nonzero(mask[inner]))
     if count < SMALL_VOXELS:
         text = f"'{tissue.name}' has only {count} voxels in '{name}'; its surface cannot be trusted: use finer images"
         return [Finding("too-small", text)]
-    cube = np.ones((THIN_VOXELS,) * 3, dtype=bool)
-    inner = (slice(THIN_VOXELS, -THIN_VOXELS),) * 3
-    thick = ndimage.binary_opening(padded, cube)[inner]
-    share = 1.0 - np.count_nonzero(thick & mask) / count
+    thick = ndimage.binary_opening(mask, np.ones((THIN_VOXELS,) * 3, dtype=bool))
+    share = 1.0 - np.count_nonzero(thick[inner] & mask[inner]) / count
     if share <= THIN_SHARE:
         return []
     text = (
@@ -267,6 +275,8 @@ def _volume_change(before: Segmentation, after: Segmentation, i: int, name: str)
         f" '{name}' ({after.volume(i) / 1000.0:.4g} mL); a filling between the scans is no deformation that a modulus"
         " explains: give a hollow organ the role driver"
     )
+    if any(_touching(image.mask(i)) for image in (before, after)):
+        return [Finding("volume-change", text + "; here the image's border cuts the organ, which may be the cause")]
     if abs(change) > VOLUME_IMPLAUSIBLE:
         text += "; so large a change is implausible for one organ: check that the label means the same in both images"
         return [Finding("volume-implausible", text)]

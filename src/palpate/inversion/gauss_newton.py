@@ -80,15 +80,15 @@ def gauss_newton(
     *,
     bounds: Bounds,
     hold_theta: bool = False,
-    tolerance: float = 1e-5,
+    tolerance: float = 1e-4,
     max_steps: int = 40,
 ) -> Minimum:
     """Minimise `objective` from `start` (n_unknowns,).
 
-    Step: (J^T W J + P + mu D) d = -g with the log-moduli's part no longer than the trust radius; a step is taken when
-    it reduces the objective (Nocedal & Wright 2006, Algorithm 4.1). It ends when the decrement -g.d / 2, the
-    reduction that the quadratic model still promises in units of log-likelihood, is under `tolerance`.
-    `hold_theta` moves the driver's coefficients only.
+    Step: (J^T W J + P + mu D) d = -s, s the score, with the log-moduli's part no longer than the trust radius; a step
+    is taken when it reduces the objective (Nocedal & Wright 2006, Algorithm 4.1) or lowers by a tenth the decrement -s.d / 2, the
+    reduction that the quadratic model still promises in units of log-likelihood. It ends when that is under
+    `tolerance`. `hold_theta` moves the driver's coefficients only.
     """
     unknowns, region, history = start.copy(), _Region(), list[Iterate]()
     now = objective(unknowns)
@@ -104,8 +104,7 @@ def gauss_newton(
         if found is None:
             outcome = Outcome.STALLED if decrement < STALLED else Outcome.STUCK
             return Minimum(unknowns, now, outcome, tuple(history))
-        unknowns, region = found
-        now = objective(unknowns)
+        unknowns, now, region = found
     return Minimum(unknowns, now, Outcome.STEPS, tuple(history))
 
 
@@ -117,17 +116,19 @@ def _search(
     free: NDArray[np.bool_],
     bounds: Bounds,
     region: _Region,
-) -> tuple[NDArray[np.float64], _Region] | None:
-    """First step that reduces the objective, with the region for the next; None when twelve did not."""
+) -> tuple[NDArray[np.float64], Evaluation, _Region] | None:
+    """First step that makes progress, with the region for the next; None when eight did not."""
     n = objective.n_parameters
-    for _ in range(12):
+    before = _decrement(now, free)
+    for _ in range(8):
         step = _step(now, free, n, region)
         trial = unknowns + step
         trial[:n] = np.clip(trial[:n], bounds.lower, bounds.upper)
-        promised = -now.gradient @ step - 0.5 * step @ now.matrix @ step
-        gain = now.value - objective.value(trial)
-        if gain > 1e-4 * promised:
-            return trial, region.larger() if gain > 0.5 * promised else region
+        there = objective(trial)
+        promised = -now.score @ step - 0.5 * step @ now.matrix @ step
+        gain = now.value - there.value
+        if gain > 1e-4 * promised or _decrement(there, free) < 0.9 * before:
+            return trial, there, region.larger() if gain > 0.25 * promised else region
         region = region.smaller()
     return None
 
@@ -137,14 +138,14 @@ def _free(
 ) -> NDArray[np.bool_]:
     """Unknowns that may move: not a log-modulus at a bound that pulls outwards, nor any when theta is held."""
     n = objective.n_parameters
-    theta, slope = unknowns[:n], now.gradient[:n]
+    theta, slope = unknowns[:n], now.score[:n]
     held = ((theta <= bounds.lower) & (slope > 0.0)) | ((theta >= bounds.upper) & (slope < 0.0)) | hold_theta
     return np.concatenate([~held, np.ones(len(unknowns) - n, dtype=bool)])
 
 
 def _decrement(now: Evaluation, free: NDArray[np.bool_]) -> float:
-    matrix, gradient = now.matrix[np.ix_(free, free)], now.gradient[free]
-    return float(0.5 * gradient @ _solve(matrix, gradient))
+    matrix, score = now.matrix[np.ix_(free, free)], now.score[free]
+    return float(0.5 * score @ _solve(matrix, score))
 
 
 def _step(now: Evaluation, free: NDArray[np.bool_], n_parameters: int, region: _Region) -> NDArray[np.float64]:
@@ -154,7 +155,7 @@ def _step(now: Evaluation, free: NDArray[np.bool_], n_parameters: int, region: _
     step = np.zeros(len(free))
     weight = 0.0
     for _ in range(60):
-        step[free] = -_solve((matrix + weight * ridge)[np.ix_(free, free)], now.gradient[free])
+        step[free] = -_solve((matrix + weight * ridge)[np.ix_(free, free)], now.score[free])
         if np.abs(step[:n_parameters]).max(initial=0.0) <= region.radius * 1.01:
             break
         weight = max(2.0 * weight, 0.05)

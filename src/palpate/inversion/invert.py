@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.errors import NotConverged
 from palpate.inversion.gauss_newton import Bounds, Minimum, gauss_newton
 from palpate.inversion.lbfgs import lbfgs
 from palpate.inversion.modulus_map import ModulusMap
@@ -18,7 +19,7 @@ from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import LinearModel
 from palpate.observation.target import SurfaceTarget
 
-__all__ = ["InverseProblem", "Inversion", "InversionSettings", "invert", "invert_with"]
+__all__ = ["InverseProblem", "Inversion", "InversionSettings", "fit_driver", "invert", "invert_with"]
 
 TUKEY = 4.685  # cutoff in standard deviations, 95 % efficient for normal errors (Huber 1981)
 MAD = 1.4826  # standard deviations of a normal law in one median absolute deviation
@@ -124,6 +125,28 @@ def invert_with(
         evaluations,
         counts,
     )
+
+
+def fit_driver(problem: InverseProblem, moduli: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Displacements (n_points, 3) mm of each later image at given moduli (n_regions,) kPa; the driver's motion is fitted.
+
+    Raises `NotConverged` when the driver's wall cannot be brought to the images.
+    """
+    columns = problem.modulus_map.columns[:0]
+    surrogates = tuple(first_surrogate(model, moduli, columns) for model in problem.models)
+    held = replace(problem, modulus_map=replace(problem.modulus_map, base=moduli))
+    n = len(held.modulus_map.tissues)
+    bounds = Bounds(np.full(n, -1.0), np.full(n, 1.0))
+    objective = _objective(held, surrogates, FIRST_LAW)
+    unknowns = np.zeros(objective.n_unknowns)
+    for _ in range(2):
+        objective = objective.with_fresh_correspondence(unknowns)
+        found = gauss_newton(objective, unknowns, bounds=bounds, hold_theta=True)
+        unknowns = found.unknowns
+    if not found.outcome.converged:
+        raise NotConverged(f"the driver's wall could not be fitted to the later image: {found.outcome.value}")
+    parts = zip(surrogates, objective.coefficients(unknowns), strict=True)
+    return tuple(surrogate.reduced.solve(moduli, q).displacement for surrogate, q in parts)
 
 
 def _from_starts(

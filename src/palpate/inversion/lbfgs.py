@@ -13,7 +13,7 @@ __all__ = ["lbfgs"]
 
 
 def lbfgs(
-    objective: Objective, start: NDArray[np.float64], *, bounds: Bounds, tolerance: float = 1e-5, max_steps: int = 60
+    objective: Objective, start: NDArray[np.float64], *, bounds: Bounds, tolerance: float = 1e-4, max_steps: int = 60
 ) -> Minimum:
     """Minimise min_q J(theta, q) over theta from `start` (n_unknowns,) with L-BFGS-B (Byrd et al. 1995).
 

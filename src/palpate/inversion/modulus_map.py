@@ -28,6 +28,11 @@ class ModulusMap:
     relative_to: str
     absolute: bool
 
+    @property
+    def scale_kpa(self) -> float:
+        """Modulus (kPa) of the tissue that holds the scale; 1 when none is known."""
+        return float(self.base[self.columns[0]])
+
     def moduli(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         """Young's moduli (n_regions,) kPa of theta (n_parameters,)."""
         moduli = self.base.copy()

@@ -45,22 +45,32 @@ class Weighting:
 
 @dataclass(frozen=True, slots=True)
 class Linearisation:
-    """Residuals of one surface with their derivative (n, n_unknowns) by all unknowns, and robust weights (n,)."""
+    """Residuals of one surface with robust weights (n,) and their derivative (n, n_unknowns) by all unknowns.
+
+    `jacobian` is that of a smooth surface (see `SurfaceResiduals.normal_jacobian`); `gradient` (n_unknowns,) is the
+    exact one of precision / 2 sum w rho(r).
+    """
 
     residuals: SurfaceResiduals
     jacobian: NDArray[np.float64]
     weights: NDArray[np.float64]
     precision: float
     target: SurfaceTarget
+    gradient: NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """Value (dimensionless, minus log-posterior) with its parts, gradient (n,) and Gauss-Newton matrix (n, n)."""
+    """Value (dimensionless, minus log-posterior) with its exact gradient (n,), and the Gauss-Newton system.
+
+    matrix (n, n) = J^T W J + P and score (n,) = J^T W r + P q with the smooth surface's J: the estimate is where the
+    score vanishes.
+    """
 
     value: float
     misfit_mm2: float
     gradient: NDArray[np.float64]
+    score: NDArray[np.float64]
     matrix: NDArray[np.float64]
     surfaces: tuple[Linearisation, ...]
 
@@ -103,18 +113,19 @@ class Objective:
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
         """J with gradient, Gauss-Newton matrix and residuals at `unknowns` (n_unknowns,)."""
         prior = np.concatenate([np.zeros(self.n_parameters), unknowns[self.n_parameters :]])
-        value, gradient = 0.5 * float(prior @ prior), prior.copy()
+        value, gradient, score = 0.5 * float(prior @ prior), prior.copy(), prior.copy()
         matrix = np.diag(np.concatenate([np.zeros(self.n_parameters), np.ones(len(prior) - self.n_parameters)]))
         surfaces = [line for s in range(len(self.states)) for line in self._linearise(s, unknowns)]
         misfit = 0.0
         for line, weighting in zip(surfaces, self._flat_weighting(), strict=True):
             scaled = line.precision * line.weights[:, None] * line.jacobian
-            gradient += scaled.T @ line.residuals.values
+            gradient += line.gradient
+            score += scaled.T @ line.residuals.values
             matrix += scaled.T @ line.jacobian
             mean = _robust_sum(line.residuals, weighting.cutoff)
             misfit += mean / len(surfaces)
             value += 0.5 * line.precision * mean
-        return Evaluation(value, misfit, gradient, matrix, tuple(surfaces))
+        return Evaluation(value, misfit, gradient, score, matrix, tuple(surfaces))
 
     def with_fresh_correspondence(self, unknowns: NDArray[np.float64]) -> Objective:
         """Choose anew which image points face the observed part of each surface."""
@@ -151,9 +162,13 @@ class Objective:
         for rows, (target, motion, weighting) in zip(state.slices(), triples, strict=True):
             residuals = surface_residuals(target, motion, weighting.kept)
             jacobian = np.zeros((len(residuals.values), len(unknowns)))
-            jacobian[:, places] = np.asarray(residuals.jacobian @ tangent[rows][:, columns])
+            by_surface = tangent[rows][:, columns]
+            jacobian[:, places] = np.asarray(residuals.normal_jacobian @ by_surface)
             weights = residuals.weights * _robust_weight(residuals.values, weighting.cutoff)
-            lines.append(Linearisation(residuals, jacobian, weights, weighting.precision, target))
+            pull = weighting.precision * (residuals.jacobian.T @ (weights * residuals.values))
+            gradient = np.zeros(len(unknowns))
+            gradient[places] = by_surface.T @ pull
+            lines.append(Linearisation(residuals, jacobian, weights, weighting.precision, target, gradient))
         return lines
 
     def _mode_places(self, state: int) -> NDArray[np.int64]:

@@ -34,10 +34,10 @@ def first_surrogate(model: LinearModel, moduli: NDArray[np.float64], columns: ND
     """Responses to every boundary mode at moduli (n_regions,) kPa, and their derivatives by ln E of `columns`."""
     system = model.system(moduli)
     responses = system.responses()
-    derivatives = [system.modulus_responses(responses)[column] for column in columns]
+    derivatives = system.modulus_responses(responses, regions=columns)
     free = model.constraint.free
     snapshots = np.concatenate([free.T @ part for part in (responses, *derivatives)], axis=1)
-    counts = system.response_counts + SolveCounts(tangent=responses.shape[1] * model.n_regions)
+    counts = system.response_counts + SolveCounts(tangent=responses.shape[1] * len(columns))
     return Surrogate(model, snapshots, reduce(model, snapshots), system, counts)
 
 

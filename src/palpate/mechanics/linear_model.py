@@ -6,7 +6,7 @@ K_ff z = -F^T K (M q + o) with K_ff = F^T K F.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from palpate.mechanics.stiffness import tissue_stiffness
 from palpate.mesh.constraint import Constraint
 from palpate.mesh.space import LagrangeSpace
 
-__all__ = ["LinearEquilibrium", "LinearModel", "LinearSystem", "linear_model"]
+__all__ = ["LinearEquilibrium", "LinearModel", "LinearSystem", "linear_model", "weighted_sum", "with_constraint"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,15 +104,20 @@ class LinearSystem:
         given = np.column_stack([constraint.modes, constraint.offset])
         return np.asarray(given - constraint.free @ self.factorisation.solve(loads))
 
-    def modulus_responses(self, displacements: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives dw / d ln E_r (n_regions, n_dof, k), mm, of equilibria w (n_dof, k) mm at these moduli.
+    def modulus_responses(
+        self, displacements: NDArray[np.float64], regions: NDArray[np.int64] | None = None
+    ) -> NDArray[np.float64]:
+        """Derivatives dw / d ln E_r (n, n_dof, k), mm, of equilibria w (n_dof, k) mm at these moduli.
 
-        F K_ff^-1 F^T (-E_r K_r w); they sum to zero over the regions, for no load sets a scale.
+        F K_ff^-1 F^T (-E_r K_r w) for r in `regions` (n,), by default all; over all of them they sum to zero, for no
+        load sets a scale.
         """
         free = self.model.constraint.free
-        derivatives = np.empty((self.model.n_regions, *displacements.shape))
-        for number, forces in enumerate(self._modulus_forces(displacements)):
-            derivatives[number] = free @ self.factorisation.solve(-forces)
+        chosen = np.arange(self.model.n_regions) if regions is None else regions
+        derivatives = np.empty((len(chosen), *displacements.shape))
+        for number, region in enumerate(chosen):
+            forces = free.T @ (self.model.stiffness[region] @ displacements)
+            derivatives[number] = free @ self.factorisation.solve(-self.moduli[region] * np.asarray(forces))
         return derivatives
 
     def solve(self, coefficients: NDArray[np.float64]) -> LinearEquilibrium:
@@ -211,17 +216,32 @@ def linear_model(space: LagrangeSpace, constraint: Constraint, *, solver: str = 
     tissues = space.mesh.tissues
     regions = tuple(number for number, tissue in enumerate(tissues) if tissue.meshed)
     stiffness = tuple(tissue_stiffness(space, region, tissues[region].poisson_ratio) for region in regions)
+    rows = [sparse.csr_matrix(constraint.free.T @ matrix) for matrix in stiffness]
+    free_stiffness = tuple(sparse.csr_matrix(part @ constraint.free) for part in rows)
+    model = LinearModel(space, constraint, regions, stiffness, free_stiffness, (), solver)
+    return with_constraint(model, constraint)
+
+
+def with_constraint(model: LinearModel, constraint: Constraint) -> LinearModel:
+    """The same body under other modes and another offset of the same prescribed points; nothing is assembled again.
+
+    Raises `ConfigurationError` when the constraint leaves other displacements free than the model's own.
+    """
+    free, other = model.constraint.free, constraint.free
+    if free is not other and (free.shape != other.shape or abs(free - other).max() > 0.0):
+        raise ConfigurationError(
+            f"the constraint frees other displacements ({other.shape[1]}) than the model ({free.shape[1]}):"
+            " assemble it with `linear_model`"
+        )
     given = sparse.csr_matrix(np.column_stack([constraint.modes, constraint.offset]))
-    projections = [sparse.csr_matrix(constraint.free.T @ matrix) for matrix in stiffness]
-    free_stiffness = tuple(sparse.csr_matrix(rows @ constraint.free) for rows in projections)
-    coupling = tuple(sparse.csr_matrix(rows @ given) for rows in projections)
-    return LinearModel(space, constraint, regions, stiffness, free_stiffness, coupling, solver)
+    coupling = tuple(sparse.csr_matrix(constraint.free.T @ (matrix @ given)) for matrix in model.stiffness)
+    return replace(model, constraint=constraint, coupling=coupling)
 
 
 def weighted_sum(
     weights: NDArray[np.float64], matrices: tuple[sparse.csr_matrix[np.float64], ...]
 ) -> sparse.csr_matrix[np.float64]:
-    """Sum of weights[r] matrices[r], sorted by column."""
+    """Sum over r of weights[r] (n_regions,) times matrices[r], (n, k) each, in the unit of their products."""
     total = weights[0] * matrices[0]
     for weight, matrix in zip(weights[1:], matrices[1:], strict=True):
         total = total + weight * matrix

@@ -201,9 +201,11 @@ def reduce(model: LinearModel, basis: NDArray[np.float64]) -> ReducedModel:
 
 
 def _project(matrix: sparse.csr_matrix[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """V^T A V (m, m), symmetric to the last digit."""
+    """V^T A V (m, m), symmetric to the last digit; only the rows that a tissue's stiffness touches take part."""
+    touched = np.flatnonzero(np.diff(matrix.indptr))
+    inner, rows = sparse.csr_matrix(matrix[touched][:, touched]), vectors[touched]
     result = np.empty((vectors.shape[1], vectors.shape[1]))
     for start in range(0, vectors.shape[1], CHUNK):
-        part = np.ascontiguousarray(vectors[:, start : start + CHUNK])
-        result[:, start : start + CHUNK] = vectors.T @ np.asarray(matrix @ part)
+        part = np.ascontiguousarray(rows[:, start : start + CHUNK])
+        result[:, start : start + CHUNK] = rows.T @ np.asarray(inner @ part)
     return np.asarray(0.5 * (result + result.T))

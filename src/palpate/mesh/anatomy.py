@@ -18,6 +18,7 @@ from palpate.images.tissue import Tissue
 
 __all__ = ["Anatomy", "Box", "LevelSet", "anatomy_of", "domain_box", "margin_box"]
 
+ON_FACE_MM = 1e-4  # rounding in the coordinates of nodes on the faces of a box
 CROP_MM = 24.0  # a map is kept so far around its tissue; beyond, only "far away" matters to the mesh
 
 
@@ -61,6 +62,15 @@ class Box:
     def local(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Coordinates (n, 3) mm along the box's axes, from its origin, of points (n, 3) in RAS mm."""
         return np.asarray((points - self.origin) @ self.axes.T)
+
+    def faces_at(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which of its six faces (n, 6), three low ones then three high ones, points (n, 3) in RAS mm lie on."""
+        local = self.local(points)
+        return np.asarray(np.abs(np.concatenate([local, self.lengths - local], axis=1)) < ON_FACE_MM)
+
+    def faces_of(self, triangles: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which of its six faces (n, 6) triangles with corners (n, 3, 3) in RAS mm lie on."""
+        return np.asarray(np.all(self.faces_at(triangles.reshape(-1, 3)).reshape(-1, 3, 6), axis=1))
 
     def world(self, local: NDArray[np.float64]) -> NDArray[np.float64]:
         """RAS mm (n, 3) of coordinates (n, 3) mm along the box's axes."""
@@ -177,7 +187,9 @@ def _extended_map(
 
 def _window(mask: NDArray[np.bool_], margin: NDArray[np.int64]) -> tuple[slice, ...]:
     found = ndimage.find_objects(mask.astype(np.int8))[0]
-    return tuple(slice(max(s.start - m, 0), min(s.stop + m, n)) for s, m, n in zip(found, margin, mask.shape, strict=True))
+    return tuple(
+        slice(max(s.start - m, 0), min(s.stop + m, n)) for s, m, n in zip(found, margin, mask.shape, strict=True)
+    )
 
 
 def _cropped(grid: VoxelGrid, window: tuple[slice, ...], shape: tuple[int, ...]) -> VoxelGrid:

@@ -13,8 +13,6 @@ from palpate.mesh.space import TET_EDGES
 
 __all__ = ["Grid", "cut", "edge_lengths", "graded_grid", "signed_volumes", "within_faces"]
 
-TOUCH = 0.25  # a node nearer to the surface than this share of its shortest edge is moved onto it
-ON_FACE_MM = 1e-4
 MAX_ROUNDS = 60
 CUBE_PATHS = np.array([[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]])
 
@@ -51,16 +49,18 @@ def edge_lengths(grid: Grid) -> NDArray[np.float64]:
     return np.asarray(np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2))
 
 
-def cut(grid: Grid, phi: LevelSet, *, inside: int, splittable: NDArray[np.bool_], box: Box) -> Grid:
+def cut(
+    grid: Grid, phi: LevelSet, *, inside: int, splittable: NDArray[np.bool_], touch_mm: NDArray[np.float64], box: Box
+) -> Grid:
     """Give the part of the `splittable` (n_tets,) tetrahedra where `phi` is negative to the region `inside`.
 
-    Nodes almost on the surface are moved onto it, where they are free to; edges that cross it are divided where phi, along them, is zero.
+    Nodes within `touch_mm` (n_nodes,) of the surface are moved onto it, or if they lie on an earlier surface count as
+    lying on both; edges that cross it are divided where phi, along them, is zero.
     """
     active = np.unique(grid.tets[splittable])
     values = np.zeros(len(grid.nodes))
     values[active] = phi.at(grid.nodes[active])
-    shortest = _shortest_edge(grid)
-    touching = np.flatnonzero(np.abs(values) < TOUCH * shortest)
+    touching = np.flatnonzero(np.abs(values) < touch_mm)
     values[touching] = 0.0
     grid = _moved_onto(grid, phi, np.intersect1d(touching, active), box)
     ends = grid.tets[:, TET_EDGES]
@@ -86,7 +86,7 @@ def _lattice(box: Box, coarsest_mm: float, region: int) -> Grid:
 
 
 def _moved_onto(grid: Grid, phi: LevelSet, chosen: NDArray[np.int64], box: Box) -> Grid:
-    """Move the chosen nodes onto the surface along its gradient, the box's faces kept; not those of earlier surfaces."""
+    """Move the chosen nodes onto the surface along its gradient, but for those of earlier surfaces."""
     free = np.setdiff1d(chosen, _interface_nodes(grid))
     nodes = grid.nodes.copy()
     for _ in range(2):
@@ -104,8 +104,8 @@ def _moved_onto(grid: Grid, phi: LevelSet, chosen: NDArray[np.int64], box: Box) 
 
 def within_faces(vectors: NDArray[np.float64], points: NDArray[np.float64], box: Box) -> NDArray[np.float64]:
     """Vectors (n, 3) at points (n, 3) mm, less their part normal to the faces of the box that a point lies on."""
-    local = box.local(points)
-    on_face = (np.abs(local) < ON_FACE_MM) | (np.abs(local - box.lengths) < ON_FACE_MM)
+    on_face = box.faces_at(points)
+    on_face = on_face[:, :3] | on_face[:, 3:]
     return np.asarray(np.where(on_face, 0.0, vectors @ box.axes.T) @ box.axes)
 
 
@@ -207,12 +207,6 @@ def _halved(
         half[rows, TET_EDGES[edge, end]] = middle
         halves.append(half)
     return np.concatenate(halves), np.concatenate([parent, parent])
-
-
-def _shortest_edge(grid: Grid) -> NDArray[np.float64]:
-    shortest = np.full(len(grid.nodes), np.inf)
-    np.minimum.at(shortest, grid.tets[:, TET_EDGES], edge_lengths(grid)[:, :, None])
-    return shortest
 
 
 def _roots(ends: NDArray[np.float64], values: NDArray[np.float64], phi: LevelSet) -> NDArray[np.float64]:

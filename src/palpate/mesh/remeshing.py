@@ -19,7 +19,6 @@ from palpate.mesh.tet_mesh import FACES
 
 __all__ = ["compact", "remeshed"]
 
-ON_FACE_MM = 1e-4
 HOLLOW_REFERENCE = 8  # references 1 to 6 are the faces of the box, 8 any hollow tissue, the rest pairs of regions
 
 
@@ -31,9 +30,7 @@ def remeshed(grid: Grid, sizes: NDArray[np.float64], *, box: Box, sag_mm: float)
     mesh = MmgMesh3D()
     triangles, references = _surfaces(grid, box)
     ridges = _ridges(triangles, references)
-    mesh.set_mesh_size(
-        vertices=len(grid.nodes), tetrahedra=len(grid.tets), triangles=len(triangles), edges=len(ridges)
-    )
+    mesh.set_mesh_size(vertices=len(grid.nodes), tetrahedra=len(grid.tets), triangles=len(triangles), edges=len(ridges))
     mesh.set_vertices(grid.nodes)
     mesh.set_tetrahedra(grid.tets.astype(np.int32), (grid.region + 1).astype(np.int32))
     mesh.set_triangles(triangles.astype(np.int32), references.astype(np.int32))
@@ -94,9 +91,8 @@ def _ridges(triangles: NDArray[np.int64], references: NDArray[np.int64]) -> NDAr
 
 def _box_face(corners: NDArray[np.float64], box: Box) -> NDArray[np.int64]:
     """Number 1 to 6 of the face of the box that triangles (n, 3, 3) lie on, else HOLLOW_REFERENCE."""
-    local = box.local(corners.reshape(-1, 3)).reshape(-1, 3, 3)
-    on = np.concatenate([np.abs(local) < ON_FACE_MM, np.abs(local - box.lengths) < ON_FACE_MM], axis=2).all(axis=1)
-    return np.asarray(np.where(on.any(axis=1), 1 + on.argmax(axis=1), HOLLOW_REFERENCE))
+    on = box.faces_of(corners)
+    return np.asarray(np.where(np.any(on, axis=1), 1 + on.argmax(axis=1), HOLLOW_REFERENCE))
 
 
 @contextmanager

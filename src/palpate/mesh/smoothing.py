@@ -12,18 +12,19 @@ from palpate.mesh.snapping import Contacts
 
 __all__ = ["smoothed"]
 
-GOOD_DEG = 20.0  # nodes of tetrahedra with a smaller angle are moved
 SHARPNESS_DEG = 4.0  # in the penalty sum exp(-angle / sharpness): small, so that the worst angles dominate
 INVERTED_DEG = -60.0  # what an inverted tetrahedron's angles count as
 TRIALS = 12
 
 
-def smoothed(grid: Grid, contacts: Contacts, *, step_mm: float, sweeps: int, seed: int = 0) -> Grid:
+def smoothed(
+    grid: Grid, contacts: Contacts, *, step_mm: float, sweeps: int, below_deg: float = 20.0, seed: int = 0
+) -> Grid:
     """Move the nodes of bad tetrahedra to where sum exp(-angle / 4 deg) over the tetrahedra around them is least.
 
     A pattern search for many nodes at a time, no two of which share a tetrahedron: interior nodes are free, those of
     the box stay on its faces, those of surfaces slide on them. Only improvements are kept, so nothing gets inverted.
-    `step_mm` is the first step's length; `seed` that of the search directions.
+    Bad is an angle under `below_deg`; `step_mm` is the first step's length; `seed` that of the search directions.
     """
     rng = np.random.default_rng(seed)
     nodes = grid.nodes.copy()
@@ -34,7 +35,7 @@ def smoothed(grid: Grid, contacts: Contacts, *, step_mm: float, sweeps: int, see
     reach = np.full(len(nodes), step_mm)
     worst = tet_dihedrals(nodes[grid.tets]).min(axis=1)
     for _ in range(sweeps):
-        chosen = _independent(grid.tets, worst < GOOD_DEG, rng.random(len(nodes)))
+        chosen = _independent(grid.tets, worst < below_deg, rng.random(len(nodes)))
         if not len(chosen):
             break
         better, points = _search(nodes, grid.tets, contacts, star[chosen], chosen, _steps(reach[chosen], rng))
@@ -45,16 +46,14 @@ def smoothed(grid: Grid, contacts: Contacts, *, step_mm: float, sweeps: int, see
     return Grid(nodes, grid.tets, grid.region)
 
 
-def _independent(
-    tets: NDArray[np.int64], bad: NDArray[np.bool_], priority: NDArray[np.float64]
-) -> NDArray[np.int64]:
+def _independent(tets: NDArray[np.int64], bad: NDArray[np.bool_], priority: NDArray[np.float64]) -> NDArray[np.int64]:
     """Nodes of bad tetrahedra, no two of them in one tetrahedron: those of the lowest `priority` (n_nodes,) around."""
     rank = np.full(len(priority), np.inf)
     candidates = np.unique(tets[bad])
     rank[candidates] = priority[candidates]
     lowest = np.full(len(priority), np.inf)
     np.minimum.at(lowest, tets, rank[tets].min(axis=1)[:, None])
-    return candidates[lowest[candidates] == rank[candidates]]
+    return np.asarray(candidates[lowest[candidates] == rank[candidates]])
 
 
 def _steps(reach: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:

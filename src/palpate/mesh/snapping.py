@@ -58,6 +58,10 @@ class Contacts:
     target: NDArray[np.float64]
     box: Box
 
+    def released(self) -> Contacts:
+        """The same box, but nodes are free to leave the surfaces."""
+        return replace(self, on=np.zeros_like(self.on))
+
     def values(self, points: NDArray[np.float64], nodes: NDArray[np.int64]) -> NDArray[np.float64]:
         """Level set less target (n, n_surfaces) mm at `points` (n, 3) mm of the `nodes` (n,); zero where not on it."""
         result = np.zeros((len(nodes), len(self.level_sets)))
@@ -124,7 +128,7 @@ def debiased(grid: Grid, contacts: Contacts, *, sweeps: int = 3) -> tuple[Grid, 
 
 
 def _surfaces(anatomy: Anatomy) -> tuple[tuple[LevelSet, ...], NDArray[np.int64]]:
-    """Level sets of the surfaces, and the number of the surface (n_tissues + 1,) of each tissue; last entry: the box."""
+    """Level sets of the surfaces, the number (n_tissues + 1,) of each tissue's; last: the box."""
     level_sets: list[LevelSet] = []
     hollow = tuple(
         phi
@@ -159,24 +163,28 @@ def _sides(grid: Grid, anatomy: Anatomy) -> tuple[NDArray[np.int64], NDArray[np.
     differ = region[a] != region[b]
     border = order[first[count == 1]]
     hollow = [i for i in anatomy.priority if not anatomy.tissues[i].meshed] or [anatomy.filler]
-    behind = np.where(_on_box(grid.nodes[faces[border]], anatomy.box), -1, hollow[0])
-    inner = ~_is_box(behind)
-    tissues = np.concatenate([
-        np.column_stack([region[a], region[b]])[differ],
-        np.column_stack([region[border], behind])[inner],
-    ])
+    behind = np.where(np.any(anatomy.box.faces_of(grid.nodes[faces[border]]), axis=1), -1, hollow[0])
+    behind[(behind >= 0) & _faces_filler(anatomy, grid.nodes[faces[border]].mean(axis=1), region[border])] = (
+        anatomy.filler
+    )
+    inner = behind >= 0
+    tissues = np.concatenate(
+        [
+            np.column_stack([region[a], region[b]])[differ],
+            np.column_stack([region[border], behind])[inner],
+        ]
+    )
     return np.concatenate([faces[a[differ]], faces[border[inner]]]), tissues
 
 
-def _is_box(behind: NDArray[np.int64]) -> NDArray[np.bool_]:
-    return np.asarray(behind < 0)
-
-
-def _on_box(corners: NDArray[np.float64], box: Box) -> NDArray[np.bool_]:
-    local = box.local(corners.reshape(-1, 3)).reshape(-1, 3, 3)
-    return np.asarray(
-        np.concatenate([local < 1e-3, local > box.lengths - 1e-3], axis=2).all(axis=1).any(axis=1)
-    )
+def _faces_filler(anatomy: Anatomy, centres: NDArray[np.float64], region: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether border faces (n,) of tetrahedra of `region` (n,) look at a hollow filler, not another hollow tissue."""
+    if anatomy.tissues[anatomy.filler].meshed:
+        return np.zeros(len(centres), dtype=bool)
+    hollow = [rank for rank, i in enumerate(anatomy.priority) if not anatomy.tissues[i].meshed]
+    values = np.abs(anatomy.values(centres))
+    rank = np.array([anatomy.priority.index(int(i)) for i in region], dtype=int)
+    return np.asarray(values[hollow].min(axis=0, initial=np.inf) > values[rank, np.arange(len(centres))])
 
 
 def _safely_moved(grid: Grid, step: NDArray[np.float64]) -> NDArray[np.float64]:

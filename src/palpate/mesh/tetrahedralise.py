@@ -5,10 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from scipy import sparse
+
 from palpate.errors import GeometryError
 from palpate.images.tissue import Role
 from palpate.mesh.anatomy import Anatomy
-from palpate.mesh.cutting import Grid, cut, graded_grid
+from palpate.mesh.closing import closed
+from palpate.mesh.cutting import Grid, cut, graded_grid, signed_volumes
+from palpate.mesh.dihedral import tet_dihedrals
 from palpate.mesh.remeshing import compact, remeshed
 from palpate.mesh.smoothing import smoothed
 from palpate.mesh.snapping import contacts_of, debiased, snapped
@@ -20,7 +24,13 @@ COARSEST = 4.0  # longest edge far from all surfaces, in edge lengths
 GRADING = 0.45  # growth of the edge length with the distance from a surface, mm per mm
 GRID_FACTOR = 1.5  # longest over mean edge of the grid's tetrahedra
 SAG = 0.15  # how far remeshing may move a surface, in edge lengths; snapping puts it back
-SMOOTHING_SWEEPS = (30, 15)
+GAPS = (0.4, 0.75, 0.55)  # gaps and slivers thinner than 3/4 of this share of the edge length are closed
+GOOD_ENOUGH_DEG = 8.0  # no further attempt when the smallest dihedral angle is larger
+TOUCH = 0.25  # grid nodes so near to a surface, in edge lengths, are moved onto it
+CRUMB = 0.001  # a piece with a smaller share of the meshed volume that hangs on nothing is dropped
+SMOOTHING_SWEEPS = (20, 12)
+RESCUE_SWEEPS = 40
+RESCUE_DEG = 10.0
 COARSER = 1.5  # edge length on bones, air and known tissues, in edge lengths
 
 
@@ -36,14 +46,44 @@ def tetrahedralise(anatomy: Anatomy, *, edge_length_mm: float) -> TetMesh:
             f"mesh.edge_length_mm is {edge_length_mm}; it must be positive and less than the smallest side of the"
             f" domain, {anatomy.box.lengths.min():.1f} mm"
         )
-    grid = _cut_grid(anatomy, edge_length_mm)
-    grid = _meshed_part(grid, anatomy)
-    sizes = _sizes(anatomy, grid.nodes, edge_length_mm)
-    grid = remeshed(grid, sizes, box=anatomy.box, sag_mm=SAG * edge_length_mm)
-    grid = _fitted(grid, anatomy, edge_length_mm)
+    grid = _best_grid(anatomy, edge_length_mm)
     boundary = boundary_of(grid.tets)
     beyond = _beyond(anatomy, grid.nodes, boundary)
     return TetMesh(grid.nodes, grid.tets, grid.region, boundary, beyond, anatomy.tissues)
+
+
+def _best_grid(anatomy: Anatomy, edge_length_mm: float) -> Grid:
+    """The first grid without a bad angle, or the best: a gap as wide as the closing's reach closes in patches."""
+    best, best_angle = None, -np.inf
+    failure: GeometryError | None = None
+    for gap in GAPS:
+        try:
+            grid = _grid(closed(anatomy, gap_mm=gap * edge_length_mm), edge_length_mm)
+        except GeometryError as error:
+            failure = error
+            continue
+        angle = float(tet_dihedrals(grid.nodes[grid.tets]).min())
+        if best is None or angle > best_angle:
+            best, best_angle = grid, angle
+        if angle > GOOD_ENOUGH_DEG:
+            break
+    if best is None:
+        raise failure or GeometryError("no attempt at meshing was made")
+    return best
+
+
+def _grid(anatomy: Anatomy, edge_length_mm: float) -> Grid:
+    grid = _meshed_part(_cut_grid(anatomy, edge_length_mm), anatomy)
+    grid = _fitted(_remeshed(grid, anatomy, edge_length_mm), anatomy, edge_length_mm)
+    try:
+        return _fitted(_remeshed(grid, anatomy, edge_length_mm), anatomy, edge_length_mm)
+    except GeometryError:  # the second remeshing only saves tetrahedra; its input is a mesh already
+        return grid
+
+
+def _remeshed(grid: Grid, anatomy: Anatomy, edge_length_mm: float) -> Grid:
+    sizes = _sizes(anatomy, grid.nodes, edge_length_mm)
+    return remeshed(grid, sizes, box=anatomy.box, sag_mm=SAG * edge_length_mm)
 
 
 def boundary_of(tets: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -60,20 +100,23 @@ def _fitted(grid: Grid, anatomy: Anatomy, edge_length_mm: float) -> Grid:
     for sweeps in SMOOTHING_SWEEPS:
         grid = smoothed(grid, contacts, step_mm=0.15 * edge_length_mm, sweeps=sweeps)
         grid, contacts = debiased(grid, contacts)
-    return smoothed(grid, contacts, step_mm=0.05 * edge_length_mm, sweeps=SMOOTHING_SWEEPS[-1])
+    grid = smoothed(grid, contacts, step_mm=0.05 * edge_length_mm, sweeps=SMOOTHING_SWEEPS[-1])
+    # where surfaces meet in too thin a wedge, a good element is worth more than a tenth of a millimetre of surface
+    step = 0.03 * edge_length_mm
+    return smoothed(grid, contacts.released(), step_mm=step, sweeps=RESCUE_SWEEPS, below_deg=RESCUE_DEG)
 
 
 def _cut_grid(anatomy: Anatomy, edge_length_mm: float) -> Grid:
     def longest_edge(points: NDArray[np.float64]) -> NDArray[np.float64]:
         return GRID_FACTOR * _sizes(anatomy, points, edge_length_mm)
 
-    grid = graded_grid(
-        anatomy.box, longest_edge, coarsest_mm=COARSEST * edge_length_mm, region=anatomy.filler
-    )
+    grid = graded_grid(anatomy.box, longest_edge, coarsest_mm=COARSEST * edge_length_mm, region=anatomy.filler)
     for tissue in anatomy.priority:
         phi = anatomy.level_sets[tissue]
         if phi is not None:
-            grid = cut(grid, phi, inside=tissue, splittable=grid.region == anatomy.filler, box=anatomy.box)
+            touch = TOUCH * _sizes(anatomy, grid.nodes, edge_length_mm)
+            free = grid.region == anatomy.filler
+            grid = cut(grid, phi, inside=tissue, splittable=free, touch_mm=touch, box=anatomy.box)
     return grid
 
 
@@ -90,15 +133,25 @@ def _meshed_part(grid: Grid, anatomy: Anatomy) -> Grid:
     keep = np.array([tissue.meshed for tissue in anatomy.tissues])[grid.region]
     if not keep.any():
         raise GeometryError("no tetrahedron is left: the `estimate` and `known` tissues lie outside the domain")
+    return _without_crumbs(compact(grid.nodes, grid.tets[keep], grid.region[keep]))
+
+
+def _without_crumbs(grid: Grid) -> Grid:
+    """The grid without small pieces that share no face with the rest, as between bones that touch."""
+    faces = np.sort(grid.tets[:, FACES].reshape(-1, 3), axis=1)
+    _, number = np.unique(faces, axis=0, return_inverse=True)
+    owner = np.repeat(np.arange(len(grid.tets)), 4)
+    by_face = sparse.csr_matrix((np.ones(len(owner)), (owner, number.ravel())))
+    piece = sparse.csgraph.connected_components(by_face @ by_face.T, directed=False)[1]
+    volume = np.bincount(piece, signed_volumes(grid.nodes, grid.tets))
+    keep = volume[piece] > CRUMB * volume.sum()
     return compact(grid.nodes, grid.tets[keep], grid.region[keep])
 
 
 def _beyond(anatomy: Anatomy, nodes: NDArray[np.float64], boundary: NDArray[np.int64]) -> NDArray[np.int64]:
     """Hollow tissue (n,) behind each boundary face (n, 3): the nearest one, OUTER on the faces of the box."""
-    local = anatomy.box.local(nodes)[boundary]
-    tolerance = 1e-3
-    on_box = np.concatenate([local < tolerance, local > anatomy.box.lengths - tolerance], axis=2).all(axis=1).any(axis=1)
     corners = nodes[boundary]
+    on_box = np.any(anatomy.box.faces_of(corners), axis=1)
     centres = corners.mean(axis=1)
     hollow = [rank for rank, i in enumerate(anatomy.priority) if not anatomy.tissues[i].meshed]
     index = np.array([anatomy.priority[rank] for rank in hollow])

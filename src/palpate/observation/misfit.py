@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from palpate.mesh.surface import triangle_normals
 from palpate.observation.target import SurfaceTarget
 
 __all__ = ["SurfaceResiduals", "observed_image_points", "surface_residuals"]
@@ -21,7 +22,9 @@ class SurfaceResiduals:
     """Residuals of one surface, model -> image first, then image -> model.
 
     values (n,) mm; weights (n,) dimensionless, 1/2 in total for each direction; places (n, 3) mm and normals (n, 3)
-    of the deformed surface; jacobian (n, 3 n_vertices) d values / d displacement of the surface's points.
+    of the deformed surface; jacobian (n, 3 n_vertices) d values / d displacement of the surface's points;
+    normal_jacobian: the same for a smooth surface without noise, n . du. The exact one also holds how voxel noise and
+    facets change as the surface slides along itself, which tells nothing of how it slides.
     """
 
     values: NDArray[np.float64]
@@ -29,6 +32,7 @@ class SurfaceResiduals:
     places: NDArray[np.float64]
     normals: NDArray[np.float64]
     jacobian: sparse.csr_matrix[np.float64]
+    normal_jacobian: sparse.csr_matrix[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +62,7 @@ def surface_residuals(
         np.concatenate([forward.places, backward.places]),
         np.concatenate([forward.normals, backward.normals]),
         sparse.vstack([forward.jacobian, backward.jacobian], format="csr"),
+        sparse.vstack([forward.normal_jacobian, backward.normal_jacobian], format="csr"),
     )
 
 
@@ -77,9 +82,13 @@ def _model_to_image(target: SurfaceTarget, displacement: NDArray[np.float64]) ->
     gradient = target.after.gradient_at(places)
     values = target.after.at(places) - target.rest_distance
     rows = np.einsum("qk,qa->qka", target.barycentric, gradient)
-    normals = gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
+    normals = _smooth_normals(surface.rest + displacement, surface.triangles, corners, target.barycentric)
+    slope = np.einsum("qa,qa->q", gradient, normals)
+    smooth = np.einsum("qk,qa->qka", target.barycentric, slope[:, None] * normals)
     weights = 0.5 * target.area / target.area.sum()
-    return SurfaceResiduals(values, weights, places, normals, _sparse_rows(rows, corners, len(surface.rest)))
+    n = len(surface.rest)
+    exact, normal = _sparse_rows(rows, corners, n), _sparse_rows(smooth, corners, n)
+    return SurfaceResiduals(values, weights, places, normals, exact, normal)
 
 
 def _image_to_model(
@@ -100,8 +109,28 @@ def _image_to_model(
     values = side * length - (target.before.at(material) - target.level)
     rows = np.einsum("nk,na->nka", closest.barycentric, direction)
     rows += _slide(closest, deformed, offset, target.before.gradient_at(material), surface.rest[corners])
+    normals = _smooth_normals(surface.rest + displacement, surface.triangles, corners, closest.barycentric)
+    smooth = np.einsum("nk,na->nka", closest.barycentric, normals)
     weights = 0.5 * target.image_area[kept] / max(target.image_area[kept].sum(), 1e-30)
-    return SurfaceResiduals(values, weights, closest.places, normal, _sparse_rows(rows, corners, len(surface.rest)))
+    n = len(surface.rest)
+    exact, plane = _sparse_rows(rows, corners, n), _sparse_rows(smooth, corners, n)
+    return SurfaceResiduals(values, weights, closest.places, normals, exact, plane)
+
+
+def _smooth_normals(
+    vertices: NDArray[np.float64],
+    triangles: NDArray[np.int64],
+    corners: NDArray[np.int64],
+    barycentric: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Unit normals (n, 3) interpolated from area-weighted ones at the corners (n, 3) of the places' triangles."""
+    faces = triangle_normals(vertices, triangles)
+    at_vertices = np.stack(
+        [np.bincount(triangles.ravel(), np.repeat(faces[:, a], 3), minlength=len(vertices)) for a in range(3)], axis=1
+    )
+    at_vertices /= np.maximum(np.linalg.norm(at_vertices, axis=1, keepdims=True), 1e-30)
+    normals = np.einsum("nk,nka->na", barycentric, at_vertices[corners])
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30))
 
 
 def _slide(

@@ -36,7 +36,7 @@ class PelvisOptions:
     filling_mm: float = 7.0
     spacing_mm: tuple[float, float, float] = (1.0, 1.0, 1.0)
     field_mm: tuple[float, float, float] = (110.0, 110.0, 120.0)
-    truth_edge_mm: float = 3.0
+    truth_edge_mm: float = 3.4
     moduli_kpa: Mapping[str, float] | None = None
     poisson_ratio: float | None = None
     noise: Noise | None = None
@@ -112,8 +112,8 @@ def _motions(body: PelvisShapes, options: PelvisOptions, rng: np.random.Generato
             filling_mm=options.filling_mm,
             profile=(float(profile[0]), float(profile[1])),
             floor=0.2,
-            towards=turn @ body.forwards,
-            lean=rng.uniform(0.3, 0.6),
+            towards=-turn @ body.forwards,  # the soft way: pressed flat against the prostate, the truth would fold over
+            lean=rng.uniform(0.15, 0.3),
             stray=smooth_field(rng, sd_mm=STRAY * options.filling_mm, correlation_mm=STRAY_LENGTH_MM, features=300),
         )
     }

@@ -13,10 +13,11 @@ from palpate.phantoms.shapes import Ellipsoid, Tube, Union, rotation_about
 
 __all__ = ["PelvisShapes", "draw_pelvis"]
 
-DRAWS = 200
-MARGIN_MM, RECTUM_MARGIN_MM = 5.0, 9.0  # to the border of the image; the rectum is going to fill
+DRAWS = 40
+MARGIN_MM, RECTUM_MARGIN_MM = 5.0, 13.0  # to the border of the image; the rectum is going to fill
 GAP_MM = 3.0  # of bones to anything else
 TURN_DEG = 18.0
+FORWARDS_MM = 4.0  # of the image's middle: leaves room behind the rectum
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +63,7 @@ def _upright(rng: np.random.Generator) -> PelvisShapes:
 
 
 def _rectum(rng: np.random.Generator, prostate: Ellipsoid, bladder: Ellipsoid) -> Tube:
-    """A tube some 65 mm long behind the organs, brought to a gap of 2.5 to 5 mm from them."""
+    """A tube some 65 mm long behind the organs, brought to a gap of 3.5 to 5 mm from them."""
     height = np.linspace(-0.5, 0.5, 5)
     length = rng.uniform(40.0, 44.0)
     bend, lean, side = rng.uniform(2.0, 8.0), rng.uniform(-3.0, 3.0), rng.uniform(-3.0, 3.0)
@@ -74,10 +75,12 @@ def _rectum(rng: np.random.Generator, prostate: Ellipsoid, bladder: Ellipsoid) -
         ]
     )
     radii = rng.uniform(10.7, 12.2, 5)
-    gap, organs = rng.uniform(2.5, 5.0), Union([prostate, bladder])
+    gap, organs = rng.uniform(3.5, 5.0), Union([prostate, bladder])
     for _ in range(20):
-        distance = float(organs.at(Tube(knots, radii).surface(_directions(400))).min())
-        knots = knots + np.array([0.0, distance - gap, 0.0])
+        excess = float(organs.at(Tube(knots, radii).surface(_directions(400))).min()) - gap
+        if abs(excess) < 1e-3:
+            break
+        knots = knots + np.array([0.0, excess, 0.0])
     return Tube(knots, radii)
 
 
@@ -104,19 +107,20 @@ def _bones(rng: np.random.Generator, prostate: Ellipsoid) -> tuple[Ellipsoid, El
 
 
 def _placed(body: PelvisShapes, rng: np.random.Generator, box: Box) -> PelvisShapes:
-    """The body turned by up to 18 degrees and put, a little off, in the middle of the box."""
+    """The body turned by up to 18 degrees and put near the middle of the box."""
     turn = _turn(rng, TURN_DEG)
     organs: tuple[Ellipsoid | Tube, ...] = (body.prostate, body.bladder, body.rectum)
     points = np.concatenate([organ.surface(_directions(400)) for organ in organs]) @ turn.T
+    forwards = turn @ body.forwards
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    shift = box.world(0.5 * box.lengths[None])[0] - middle + rng.uniform(-2.0, 2.0, 3)
+    target = box.world(0.5 * box.lengths[None])[0] + FORWARDS_MM * forwards + rng.uniform(-2.0, 2.0, 3)
+    shift = target - middle
 
     def moved(shape: Ellipsoid) -> Ellipsoid:
         return Ellipsoid(shape.centre @ turn.T + shift, shape.semi_axes, turn @ shape.rotation)
 
     bones = (moved(body.bones[0]), moved(body.bones[1]))
     rectum = Tube(body.rectum.knots @ turn.T + shift, body.rectum.radii)
-    forwards = turn @ body.forwards
     return PelvisShapes(moved(body.prostate), moved(body.bladder), rectum, moved(body.tumour), bones, forwards)
 
 

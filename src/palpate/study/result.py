@@ -167,6 +167,7 @@ def failure_document(case: Case, error: PalpateError) -> dict[str, Any]:
         "starts": [],
         "counts": {},
         "mesh": None,
+        "note": "",
     }
     return json_object(_heading(case, status, str(error)) | empty | _closing(case, Provenance(), ()))
 

@@ -130,9 +130,9 @@ def _convert(hint: Any, value: object, place: _Place) -> object:
     if dataclasses.is_dataclass(hint):
         return _convert_table(hint, value, place)
     if hint is Path:
-        return place.folder / Path(_expect(value, str, "a path in quotes", place)).expanduser()
+        return place.folder / Path(_expect(value, str, "a path in quotes", place=place)).expanduser()
     if issubclass(hint, StrEnum):
-        word = _expect(value, str, "a word in quotes", place)
+        word = _expect(value, str, "a word in quotes", place=place)
         if word not in list(hint):
             raise ConfigurationError(f"{place} is '{word}': {nearest(word, list(hint))}")
         return hint(word)
@@ -147,26 +147,26 @@ def _convert_plain(hint: Any, value: object, place: _Place) -> object:
         raise ConfigurationError(f"{place} is {_shown(value)}, but it must be {wanted}")
     if isinstance(value, float) and not math.isfinite(value):
         raise ConfigurationError(f"{place} is {value}, but it must be a finite number")
-    return _expect(value, hint, wanted, place)
+    return _expect(value, hint, wanted, place=place)
 
 
 def _convert_table(kind: Any, value: object, place: _Place) -> object:
-    return read_table(kind, _expect(value, dict, "a table", place), where=place.table, folder=place.folder)
+    return read_table(kind, _expect(value, dict, "a table", place=place), where=place.table, folder=place.folder)
 
 
 def _convert_tuple(arms: tuple[Any, ...], value: object, place: _Place) -> object:
     kind = arms[0]
     if dataclasses.is_dataclass(kind) and isinstance(value, dict):  # [tissues.NAME]: the key is the name
         places = {name: _Place(name, place.table, place.folder) for name in value}
-        tables = {name: _expect(table, dict, "a table", places[name]) for name, table in value.items()}
+        tables = {name: _expect(table, dict, "a table", place=places[name]) for name, table in value.items()}
         return tuple(_convert_table(kind, {**table, "name": name}, places[name]) for name, table in tables.items())
-    items = _expect(value, list, "a list in square brackets", place)
+    items = _expect(value, list, "a list in square brackets", place=place)
     if arms[-1] is not Ellipsis and len(items) != len(arms):
         raise ConfigurationError(f"{place} is {_shown(items)}, but it must hold {len(arms)} values")
     return tuple(_convert(kind, item, place) for item in items)
 
 
-def _expect(value: object, kind: type[Any], wanted: str, place: _Place) -> Any:
+def _expect(value: object, kind: type[Any], wanted: str, *, place: _Place) -> Any:
     if not isinstance(value, kind):
         raise ConfigurationError(f"{place} is {_shown(value)}, but it must be {wanted}")
     return value

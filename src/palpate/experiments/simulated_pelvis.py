@@ -1,0 +1,114 @@
+"""A later state for the real pelvis: simulated, for the scan that Palpate ships has one state only.
+
+The labels of a real male pelvis CT (3 mm voxels; Wasserthal et al. 2023, doi 10.1148/ryai.230024) become a mesh that is
+finer than the one that inverts it; the rectum is filled, linear elasticity moves the rest under known moduli, and both
+states of that mesh are turned into label images of 1 mm voxels. Run `python -m palpate.experiments.simulated_pelvis`
+to make the two images again.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from palpate.images.distance import smoothing_width
+from palpate.images.label_image import LabelImage, VoxelGrid
+from palpate.images.label_table import read_label_table
+from palpate.images.readers import read_label_image, write_label_image
+from palpate.images.segmentation import Segmentation, segment
+from palpate.images.tissue import Role, Tissue
+from palpate.mesh.anatomy import Box, anatomy_of, domain_box, margin_box
+from palpate.mesh.quality import check_mesh
+from palpate.mesh.space import LagrangeSpace, lagrange_space
+from palpate.mesh.tetrahedralise import tetrahedralise
+from palpate.phantoms.scene import imaged
+from palpate.study.simulate import filled
+
+__all__ = ["DATA", "TISSUES", "SimulatedPelvis", "simulate_pelvis"]
+
+DATA = Path(__file__).parent / "data"
+FILLING_MM = 10.0
+MARGIN_MM = 40.0
+TRUTH_EDGE_MM = 4.0
+VOXEL_MM = 1.0
+
+TISSUES = (
+    Tissue("prostate", Role.ESTIMATE, (1,), 0.45, 30.0),
+    Tissue("bladder", Role.ESTIMATE, (2,), 0.45, 20.0),
+    Tissue("rectum", Role.DRIVER, (3,)),
+    Tissue("sacrum", Role.RIGID, (6,)),
+    Tissue("right hip", Role.RIGID, (7,)),
+    Tissue("left hip", Role.RIGID, (8,)),
+    Tissue("right femur", Role.RIGID, (9,)),
+    Tissue("left femur", Role.RIGID, (10,)),
+    Tissue("outside", Role.VOID, (0,)),
+    Tissue("surroundings", Role.KNOWN, (), 0.45, 10.0),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedPelvis:
+    """The truth (P2 space and displacement (n_points, 3) mm) and both label images at 1 mm."""
+
+    space: LagrangeSpace
+    displacement: np.ndarray[tuple[int, int], np.dtype[np.float64]]
+    before: LabelImage
+    after: LabelImage
+
+
+def simulate_pelvis(progress: Callable[[str], None]) -> SimulatedPelvis:
+    """Make the truth and its two images; about two minutes."""
+    names = read_label_table(DATA / "labels.json")
+    scan = segment(read_label_image(DATA / "labels.nii.gz", names=names), TISSUES)
+    box = _field(scan)
+    anatomy = anatomy_of(scan, box=box, smoothing_mm=smoothing_width(scan.grid))
+    progress(f"meshing {np.round(box.lengths).astype(int).tolist()} mm at {TRUTH_EDGE_MM:g} mm")
+    mesh = tetrahedralise(anatomy, edge_length_mm=TRUTH_EDGE_MM)
+    check_mesh(mesh, anatomy)
+    space = lagrange_space(mesh, "P2")
+    progress(f"solving {3 * len(space.points)} unknowns")
+    displacement = filled(space, scan, filling_mm=FILLING_MM, outer="fixed")
+    progress("turning both states into voxels")
+    grid = _grid(box)
+    still = np.zeros_like(displacement)
+    before, after = (_labelled(imaged(space, motion, grid)) for motion in (still, displacement))
+    return SimulatedPelvis(space, displacement, before, after)
+
+
+def _field(scan: Segmentation) -> Box:
+    """The part of the scan within 40 mm of prostate, bladder and rectum."""
+    observed = [i for i, t in enumerate(scan.tissues) if t.role in (Role.ESTIMATE, Role.DRIVER)]
+    voxels = np.argwhere(np.isin(scan.index, observed)).astype(float)
+    box = margin_box(domain_box([scan.grid]), scan.grid.world(voxels), margin_mm=MARGIN_MM)
+    return replace(box, lengths=np.floor(box.lengths / VOXEL_MM) * VOXEL_MM)
+
+
+def _grid(box: Box) -> VoxelGrid:
+    """Voxels of 1 mm that fill the box exactly."""
+    shape = np.round(box.lengths / VOXEL_MM).astype(int)
+    affine = np.eye(4)
+    affine[:3, :3] = box.axes.T * VOXEL_MM
+    affine[:3, 3] = box.origin + 0.5 * VOXEL_MM * box.axes.sum(axis=0)
+    return VoxelGrid((int(shape[0]), int(shape[1]), int(shape[2])), affine)
+
+
+def _labelled(image: LabelImage) -> LabelImage:
+    """The image with the labels of the scan instead of the tissues' numbers; the rest is 20, as in the scan."""
+    table = np.array([0] + [tissue.labels[0] if tissue.labels else 20 for tissue in TISSUES], dtype=np.int32)
+    names = {int(table[i + 1]): tissue.name for i, tissue in enumerate(TISSUES)}
+    return LabelImage(table[image.labels], image.grid, names)
+
+
+def main() -> None:
+    """Write the two images into the package's data folder."""
+    pelvis = simulate_pelvis(lambda message: print(message, file=sys.stderr, flush=True))  # noqa: T201
+    write_label_image(DATA / "simulated_before.nii.gz", pelvis.before)
+    write_label_image(DATA / "simulated_after.nii.gz", pelvis.after)
+
+
+if __name__ == "__main__":
+    main()

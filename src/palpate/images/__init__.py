@@ -1,0 +1,1 @@
+"""Label images: reading, tissues, distance maps, alignment, checks."""

@@ -1,0 +1,1 @@
+"""From misfit to moduli: parameters, objective, optimisers, starts, posterior."""

@@ -1,0 +1,77 @@
+"""How far the place of the voxel grid moves the estimate: the fitted model is imaged again on shifted grids."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.images.label_image import VoxelGrid
+from palpate.images.segmentation import Segmentation
+from palpate.images.tissue_distance import tissue_distance_map
+from palpate.inversion.invert import Inversion
+from palpate.inversion.posterior import gain
+from palpate.mesh.space import LagrangeSpace
+from palpate.mesh.voxelise import voxelise
+
+__all__ = ["FittedState", "grid_position_shifts"]
+
+
+@dataclass(frozen=True, slots=True)
+class FittedState:
+    """A fitted later state: displacement (n_points, 3) mm, the grids of both images, the maps' smoothing (mm)."""
+
+    displacement: NDArray[np.float64]
+    before: VoxelGrid
+    after: VoxelGrid
+    smoothing_mm: float
+
+
+def grid_position_shifts(
+    inversion: Inversion,
+    space: LagrangeSpace,
+    states: tuple[FittedState, ...],
+    *,
+    draws: int,
+    rng: np.random.Generator,
+) -> NDArray[np.float64]:
+    """Shifts (draws, n_parameters) of the estimated log-moduli when an exact model is imaged on random grids.
+
+    The fitted model, at rest and deformed, is turned into voxels on grids shifted at random by up to a voxel, and the
+    errors e of the distance maps at the model's surface go through the gain of one Gauss-Newton step, -2 G e: both
+    directions of the distance see the same error, and `gain` holds half the weight in each.
+    """
+    evaluation = inversion.minimum.evaluation
+    rows = gain(evaluation, inversion.objective.n_parameters)
+    shifts = np.zeros((draws, inversion.objective.n_parameters))
+    for draw in range(draws):
+        number = 0
+        for state, fitted in zip(inversion.objective.states, states, strict=True):
+            before = _imaged(space, np.zeros_like(fitted.displacement), fitted.before, rng)
+            after = _imaged(space, fitted.displacement, fitted.after, rng)
+            for target in state.targets:
+                surface = evaluation.surfaces[number]
+                n = len(target.area)
+                rest = np.einsum(
+                    "qk,qka->qa",
+                    target.barycentric,
+                    target.surface.rest[target.surface.triangles[target.triangle]],
+                )
+                maps = [
+                    tissue_distance_map(image, target.surface.tissue, smoothing_mm=fitted.smoothing_mm)
+                    for image in (before, after)
+                ]
+                error = maps[1].at(surface.residuals.places[:n]) - maps[0].at(rest)
+                shifts[draw] -= 2.0 * rows[number][:, :n] @ error
+                number += 1
+    return shifts
+
+
+def _imaged(
+    space: LagrangeSpace, displacement: NDArray[np.float64], grid: VoxelGrid, rng: np.random.Generator
+) -> Segmentation:
+    affine = np.array(grid.affine)
+    affine[:3, 3] += affine[:3, :3] @ rng.uniform(-0.5, 0.5, 3)
+    shifted = replace(grid, affine=affine)
+    return Segmentation(voxelise(space, displacement, shifted), shifted, space.mesh.tissues)

@@ -1,0 +1,1 @@
+"""Conforming tetrahedra of several tissues, their surfaces, spaces and voxels."""

@@ -1,0 +1,197 @@
+"""Is a mesh good enough to compute with: angles, volumes, conformity, connection; and the gate that decides."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from palpate.errors import MeshQualityError
+from palpate.mesh.anatomy import Anatomy
+from palpate.mesh.dihedral import tet_dihedrals
+from palpate.mesh.tet_mesh import FACES, TetMesh
+
+__all__ = ["MeshQuality", "check_mesh", "dihedral_angles", "level_set_volumes", "mesh_quality"]
+
+MIN_DIHEDRAL_DEG = 5.0
+P5_DIHEDRAL_DEG = 25.0
+LEVEL_SET_TOLERANCE = 0.01
+VOXEL_TOLERANCE = 0.03
+COARSE_CELL_MM = 8.0
+FINE_CELLS = 8  # fine cells along the side of a coarse one
+
+
+@dataclass(frozen=True, slots=True)
+class MeshQuality:
+    """Figures of a mesh; angles in degrees, volumes in mm^3, errors relative to the level sets' or voxels' volumes.
+
+    `p5_dihedral_deg` is the 5th percentile over tetrahedra of their smallest angle. `components` counts the pieces
+    that tetrahedra form through shared faces; `overfull_faces` those shared by more than two.
+    """
+
+    nodes: int
+    tets: int
+    min_dihedral_deg: float
+    p5_dihedral_deg: float
+    max_dihedral_deg: float
+    worst_place: tuple[float, float, float]
+    worst_tissue: str
+    min_volume: float
+    volume: Mapping[str, float]
+    volume_error: Mapping[str, float]
+    voxel_volume_error: Mapping[str, float] = field(default_factory=dict)
+    components: int = 1
+    overfull_faces: int = 0
+
+
+def dihedral_angles(mesh: TetMesh) -> NDArray[np.float64]:
+    """Dihedral angles (n_tets, 6) of each tetrahedron, degrees."""
+    return tet_dihedrals(mesh.nodes[mesh.tets])
+
+
+def mesh_quality(mesh: TetMesh, anatomy: Anatomy, *, voxel_volumes: Mapping[str, float] | None = None) -> MeshQuality:
+    """Measure a mesh against the anatomy that it was made from, and against counted voxels where they are given.
+
+    `voxel_volumes`: tissue name -> mm^3 inside the box.
+    """
+    angles = dihedral_angles(mesh)
+    smallest = angles.min(axis=1)
+    worst = int(smallest.argmin())
+    place = mesh.nodes[mesh.tets[worst]].mean(axis=0)
+    volume = _tissue_volumes(mesh)
+    target = level_set_volumes(anatomy)
+    counted = voxel_volumes or {}
+    components, overfull = _connection(mesh)
+    return MeshQuality(
+        nodes=len(mesh.nodes),
+        tets=len(mesh.tets),
+        min_dihedral_deg=float(smallest[worst]),
+        p5_dihedral_deg=float(np.percentile(smallest, 5.0)),
+        max_dihedral_deg=float(angles.max()),
+        worst_place=(float(place[0]), float(place[1]), float(place[2])),
+        worst_tissue=mesh.tissues[mesh.region[worst]].name,
+        min_volume=float(mesh.volumes.min()),
+        volume=volume,
+        volume_error=_errors(volume, target),
+        voxel_volume_error=_errors(volume, counted),
+        components=components,
+        overfull_faces=overfull,
+    )
+
+
+def check_mesh(
+    mesh: TetMesh,
+    anatomy: Anatomy,
+    *,
+    voxel_volumes: Mapping[str, float] | None = None,
+    thin: tuple[str, ...] = (),
+) -> MeshQuality:
+    """The gate: the mesh's quality, or `MeshQualityError` that names every region and place that fails.
+
+    Smallest dihedral angle >= 5 degrees, 5th percentile >= 25; every region within 1 % of its level set's volume and
+    within 3 % of its voxels' (regions in `thin`, under four voxels thick: only reported); no inverted tetrahedron; one
+    piece; no face in more than two tetrahedra. `voxel_volumes`: tissue name -> mm^3 inside the box.
+    """
+    quality = mesh_quality(mesh, anatomy, voxel_volumes=voxel_volumes)
+    failures = [*_shape_failures(quality), *_volume_failures(quality, thin)]
+    if failures:
+        raise MeshQualityError(
+            f"the mesh of {quality.tets} tetrahedra is not fit to compute with: {'; '.join(failures)};"
+            " try a smaller mesh.edge_length_mm, or repair the labels at that place"
+        )
+    return quality
+
+
+def level_set_volumes(anatomy: Anatomy) -> dict[str, float]:
+    """Volume (mm^3) of each tissue inside the box, from the level sets alone: tissue name -> mm^3.
+
+    Cells of 8 mm that a surface crosses are divided into 1 mm ones; of a fine cell the share
+    clip(1/2 - phi / edge, 0, 1) counts as inside.
+    """
+    lengths = anatomy.box.lengths
+    counts = np.ceil(lengths / COARSE_CELL_MM).astype(int)
+    centres = _cell_centres(counts) * (lengths / counts)
+    values = anatomy.values(anatomy.box.world(centres))
+    reach = float(np.linalg.norm(lengths / counts))
+    cell = float(np.prod(lengths / counts))
+    crossed = (np.abs(values) < reach).any(axis=0)
+    total = cell * _shares(values[:, ~crossed], 1e-9).sum(axis=1)
+    fine = (_cell_centres(np.full(3, FINE_CELLS)) / FINE_CELLS - 0.5) * (lengths / counts)
+    for block in np.array_split(centres[crossed], max(1, int(crossed.sum()) // 200)):
+        points = (block[:, None] + fine).reshape(-1, 3)
+        edge = cell ** (1 / 3) / FINE_CELLS
+        total += cell / FINE_CELLS**3 * _shares(anatomy.values(anatomy.box.world(points)), edge).sum(axis=1)
+    order = (*anatomy.priority, anatomy.filler)
+    return {anatomy.tissues[i].name: float(total[rank]) for rank, i in enumerate(order)}
+
+
+def _cell_centres(counts: NDArray[np.int64]) -> NDArray[np.float64]:
+    steps = [np.arange(n) + 0.5 for n in counts]
+    return np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _shares(values: NDArray[np.float64], edge: float) -> NDArray[np.float64]:
+    """Share (n_tissues, n) of each cell that each tissue has, by priority; the last row is the filler's."""
+    left = np.ones(values.shape[1])
+    shares = []
+    for value in values:
+        reach = np.clip(0.5 - value / edge, 0.0, 1.0)
+        shares.append(np.minimum(reach, left))
+        left = left - shares[-1]
+    return np.array([*shares, left])
+
+
+def _tissue_volumes(mesh: TetMesh) -> dict[str, float]:
+    sums = np.bincount(mesh.region, mesh.volumes, minlength=len(mesh.tissues))
+    return {tissue.name: float(sums[i]) for i, tissue in enumerate(mesh.tissues) if tissue.meshed}
+
+
+def _errors(volume: Mapping[str, float], target: Mapping[str, float]) -> dict[str, float]:
+    return {name: volume[name] / target[name] - 1.0 for name in volume if target.get(name, 0.0) > 0.0}
+
+
+def _connection(mesh: TetMesh) -> tuple[int, int]:
+    """Number of pieces joined through faces, and number of faces in more than two tetrahedra."""
+    faces = np.sort(mesh.tets[:, FACES].reshape(-1, 3), axis=1)
+    _, inverse, count = np.unique(faces, axis=0, return_inverse=True, return_counts=True)
+    owner = np.repeat(np.arange(len(mesh.tets)), 4)
+    by_face = sparse.csr_matrix((np.ones(len(owner)), (owner, inverse.ravel())))
+    pieces = sparse.csgraph.connected_components(by_face @ by_face.T, directed=False)[0]
+    return int(pieces), int(np.count_nonzero(count > 2))
+
+
+def _shape_failures(quality: MeshQuality) -> list[str]:
+    where = f"in '{quality.worst_tissue}' near RAS {np.round(quality.worst_place, 1).tolist()} mm"
+    failures = []
+    if quality.min_volume <= 0.0:
+        failures.append(f"an inverted tetrahedron of {quality.min_volume:.3g} mm^3, the worst one {where}")
+    if quality.min_dihedral_deg < MIN_DIHEDRAL_DEG:
+        failures.append(f"a dihedral angle of {quality.min_dihedral_deg:.1f} deg (limit {MIN_DIHEDRAL_DEG:g}) {where}")
+    if quality.p5_dihedral_deg < P5_DIHEDRAL_DEG:
+        failures.append(
+            f"5 % of the tetrahedra have an angle below {quality.p5_dihedral_deg:.1f} deg (limit {P5_DIHEDRAL_DEG:g})"
+        )
+    if quality.components != 1:
+        failures.append(f"it falls into {quality.components} pieces that share no face")
+    if quality.overfull_faces:
+        failures.append(f"{quality.overfull_faces} faces belong to more than two tetrahedra")
+    return failures
+
+
+def _volume_failures(quality: MeshQuality, thin: tuple[str, ...]) -> list[str]:
+    failures = []
+    checks = (
+        ("level set", quality.volume_error, LEVEL_SET_TOLERANCE),
+        ("voxels", quality.voxel_volume_error, VOXEL_TOLERANCE),
+    )
+    for of, errors, limit in checks:
+        for name, error in errors.items():
+            if abs(error) > limit and name not in thin:
+                failures.append(
+                    f"region '{name}' of {quality.volume[name]:.0f} mm^3 differs by {100 * error:+.1f} % from the"
+                    f" volume of its {of} (limit {100 * limit:g} %)"
+                )
+    return failures

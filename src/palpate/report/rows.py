@@ -1,0 +1,133 @@
+"""Numbers and sentences of a report's tables, ready to be set."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from palpate.inversion.estimation import Interval, ModulusEstimate
+from palpate.report.colours import tissue_colours
+from palpate.study.result import CaseResult
+
+__all__ = ["Bar", "EstimateRow", "estimate_rows", "number"]
+
+NONE = "–"
+BAR = 200.0  # width of a bar, in its own units
+
+
+@dataclass(frozen=True, slots=True)
+class Bar:
+    """Places of interval, value and truth on a common logarithmic scale from 0 to BAR; None: open or not there."""
+
+    low: float
+    high: float
+    value: float | None
+    truth: float | None
+    open_low: bool
+    open_high: bool
+
+
+@dataclass(frozen=True, slots=True)
+class EstimateRow:
+    """One tissue of the result table, all texts."""
+
+    tissue: str
+    colour: str
+    value: str
+    interval: str
+    unit: str
+    ratio: str
+    ratio_interval: str
+    relative_to: str
+    verdict: str
+    why: str
+    truth: str
+    error: str
+    bar: Bar | None
+
+
+def number(value: float | None, *, digits: int = 3) -> str:
+    """`value` with so many significant digits, without exponent where it can be read; a dash for nothing."""
+    if value is None or not math.isfinite(value):
+        return NONE
+    if value == 0.0:
+        return "0"
+    magnitude = math.floor(math.log10(abs(value)))
+    if not -4 <= magnitude < 7:
+        return f"{value:.{digits - 1}e}"
+    return f"{round(value, digits - 1 - magnitude):.{max(digits - 1 - magnitude, 0)}f}"
+
+
+def estimate_rows(result: CaseResult) -> tuple[EstimateRow, ...]:
+    """A row for each estimate; nothing that did not converge shows a number."""
+    colours = {tissue.name: c for tissue, c in zip(result.tissues, tissue_colours(result.tissues), strict=True)}
+    shown = result.estimation.status == "converged"
+    scale = _scale(result.estimation.estimates) if shown else None
+    return tuple(
+        _row(item, colour=colours.get(item.tissue, "#888888"), shown=shown, scale=scale)
+        for item in result.estimation.estimates
+    )
+
+
+def _row(item: ModulusEstimate, *, colour: str, shown: bool, scale: tuple[float, float] | None) -> EstimateRow:
+    value, interval = _main(item)
+    return EstimateRow(
+        tissue=item.tissue,
+        colour=colour,
+        value=number(item.value if shown else None),
+        interval=_interval(item.interval95 if shown else None),
+        unit=item.unit,
+        ratio=number(item.ratio if shown else None),
+        ratio_interval=_interval(item.ratio_interval95 if shown else None),
+        relative_to=item.relative_to,
+        verdict=item.verdict if shown else "not identified",
+        why=item.why,
+        truth=number(item.truth),
+        error=f"{100.0 * (value / item.truth - 1.0):+.1f} %" if shown and value and item.truth else NONE,
+        bar=_bar(value, interval, truth=item.truth, scale=scale) if scale and value else None,
+    )
+
+
+def _main(item: ModulusEstimate) -> tuple[float | None, Interval | None]:
+    """The number that the tissue is judged by: kPa, or the ratio where there is no kPa."""
+    return (item.value, item.interval95) if item.value is not None else (item.ratio, item.ratio_interval95)
+
+
+def _interval(interval: Interval | None) -> str:
+    if interval is None:
+        return NONE
+    low, high = interval
+    if low is None and high is None:
+        return "any"
+    if low is None:
+        return f"< {number(high)}"
+    return f"> {number(low)}" if high is None else f"{number(low)} to {number(high)}"
+
+
+def _scale(items: Iterable[ModulusEstimate]) -> tuple[float, float] | None:
+    """Natural logarithms of the smallest and the largest number to be shown, with room on both sides."""
+    numbers: list[float] = []
+    for item in items:
+        value, interval = _main(item)
+        numbers += [n for n in (value, item.truth, *(interval or ())) if n is not None and n > 0.0]
+    if not numbers:
+        return None
+    low, high = math.log(min(numbers)), math.log(max(numbers))
+    room = 0.08 * (high - low) + 0.1
+    return low - room, high + room
+
+
+def _bar(value: float, interval: Interval | None, *, truth: float | None, scale: tuple[float, float]) -> Bar:
+    def place(number: float | None, otherwise: float) -> float:
+        return BAR * (math.log(number) - scale[0]) / (scale[1] - scale[0]) if number and number > 0 else otherwise
+
+    low, high = interval if interval is not None else (value, value)
+    return Bar(
+        low=place(low, 0.0),
+        high=place(high, BAR),
+        value=place(value, 0.0),
+        truth=None if truth is None else place(truth, 0.0),
+        open_low=low is None,
+        open_high=high is None,
+    )

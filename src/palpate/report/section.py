@@ -1,0 +1,117 @@
+"""Plane sections of images, segmentations and deformed surfaces, in world coordinates (RAS mm)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from palpate.images.label_image import VoxelGrid
+from palpate.images.segmentation import Segmentation
+
+__all__ = ["VIEWS", "Plane", "View", "cut_image", "cut_surface", "cut_tissue"]
+
+PIXEL_MM = 0.8
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A way of looking: `normal`, `across`, `up` are world axes; +`across` points to the viewer's left.
+
+    letters: left, right, top, bottom of the picture, in the radiological convention.
+    """
+
+    name: str
+    normal: int
+    across: int
+    up: int
+    letters: tuple[str, str, str, str]
+
+
+VIEWS = (
+    View("axial", 2, 0, 1, ("R", "L", "A", "P")),
+    View("coronal", 1, 0, 2, ("R", "L", "S", "I")),
+    View("sagittal", 0, 1, 2, ("A", "P", "S", "I")),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Plane:
+    """The plane of `view` at `position` (mm along the normal), cut to a box `low` to `high`, (3,) mm each."""
+
+    view: View
+    position: float
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+
+    @property
+    def axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Places of the pixels' centres across (n,) and up (m,), mm."""
+        return self._ticks(self.view.across), self._ticks(self.view.up)
+
+    @property
+    def points(self) -> NDArray[np.float64]:
+        """World points (m, n, 3) mm of the pixels' centres."""
+        across, up = self.axes
+        points = np.empty((len(up), len(across), 3))
+        points[..., self.view.normal] = self.position
+        points[..., self.view.across] = across
+        points[..., self.view.up] = up[:, None]
+        return points
+
+    def _ticks(self, axis: int) -> NDArray[np.float64]:
+        count = max(round((self.high[axis] - self.low[axis]) / PIXEL_MM), 2)
+        return np.asarray(np.linspace(self.low[axis], self.high[axis], count))
+
+
+def cut_image(values: NDArray[Any], grid: VoxelGrid, plane: Plane, *, order: Literal[0, 1] = 1) -> NDArray[np.float64]:
+    """Values (m, n) of a field (nx, ny, nz) on the plane's pixels; NaN outside its grid. order 0: nearest voxel."""
+    points = plane.points
+    index = grid.index(points.reshape(-1, 3))
+    window, origin = _window(index, grid.shape)
+    sampled = ndimage.map_coordinates(
+        values[window].astype(np.float64), (index - origin).T, order=order, mode="nearest"
+    )
+    outside = ((index < -0.5) | (index > np.array(grid.shape) - 0.5)).any(axis=1)
+    return np.asarray(np.where(outside, np.nan, sampled).reshape(points.shape[:2]))
+
+
+def cut_tissue(segmentation: Segmentation, tissue: int, plane: Plane, *, smoothing_mm: float) -> NDArray[np.float64]:
+    """Share (m, n) of the tissue, blurred by a Gaussian of `smoothing_mm`; its contour at 0.5 is the surface."""
+    grid = segmentation.grid
+    points = plane.points
+    index = grid.index(points.reshape(-1, 3))
+    window, origin = _window(index, grid.shape, margin=int(np.ceil(4 * smoothing_mm / grid.spacing.min())) + 1)
+    mask = (segmentation.index[window] == tissue).astype(np.float32)
+    blurred = ndimage.gaussian_filter(mask, smoothing_mm / grid.spacing, mode="nearest")
+    share = ndimage.map_coordinates(blurred, (index - origin).T, order=1, mode="nearest")
+    outside = ((index < -0.5) | (index > np.array(grid.shape) - 0.5)).any(axis=1)
+    return np.asarray(np.where(outside, 0.0, share).reshape(points.shape[:2]))
+
+
+def cut_surface(points: NDArray[np.float64], triangles: NDArray[np.int64], plane: Plane) -> NDArray[np.float64]:
+    """Segments (n, 2, 2) mm, (across, up) of both ends, where triangles (n_faces, 3) of points (n, 3) mm cross it."""
+    height = points[:, plane.view.normal] - plane.position
+    height = np.where(height == 0.0, 1e-9, height)  # a node in the plane counts as just above it
+    corner = height[triangles]
+    pairs = np.array([[0, 1], [1, 2], [2, 0]])
+    crossed = np.sign(corner[:, pairs[:, 0]]) != np.sign(corner[:, pairs[:, 1]])  # (n_faces, 3): none or two of them
+    hit = crossed.any(axis=1)
+    a, b = triangles[hit][:, pairs[:, 0]], triangles[hit][:, pairs[:, 1]]
+    share = height[a] / np.where(crossed[hit], height[a] - height[b], 1.0)
+    flat = points[:, [plane.view.across, plane.view.up]]
+    ends = flat[a] + share[..., None] * (flat[b] - flat[a])
+    return np.asarray(ends[crossed[hit]].reshape(-1, 2, 2))
+
+
+def _window(
+    index: NDArray[np.float64], shape: tuple[int, int, int], *, margin: int = 2
+) -> tuple[tuple[slice, slice, slice], NDArray[np.int64]]:
+    """The part of an array that voxel indices (n, 3) need, and its first voxel (3,)."""
+    last = np.array(shape) - 1
+    low = np.clip(np.floor(index.min(axis=0)).astype(np.int64) - margin, 0, last)
+    high = np.clip(np.ceil(index.max(axis=0)).astype(np.int64) + margin, 0, last)
+    return (slice(low[0], high[0] + 1), slice(low[1], high[1] + 1), slice(low[2], high[2] + 1)), low

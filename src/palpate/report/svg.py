@@ -1,0 +1,64 @@
+"""Matplotlib figures as SVG that stands in an HTML page and takes the page's colours."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Callable
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
+__all__ = ["INK", "draw_svg"]
+
+INK = "#010203"  # stands for the page's text colour, which differs between light and dark pages
+STYLE = {
+    "svg.fonttype": "path",
+    "svg.hashsalt": "palpate",
+    "text.parse_math": False,  # a tissue called $x is a name, not a formula
+    "font.size": 9.0,
+    "font.family": "DejaVu Sans",
+    "text.color": INK,
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "axes.titlecolor": INK,
+    "axes.titlesize": 9.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.7,
+    "axes.facecolor": "none",
+    "figure.facecolor": "none",
+    "grid.color": INK,
+    "grid.alpha": 0.15,
+    "grid.linewidth": 0.6,
+    "xtick.color": INK,
+    "ytick.color": INK,
+}
+
+
+def draw_svg(draw: Callable[[Figure], None], *, size: tuple[float, float], name: str) -> str:
+    """The SVG element that `draw` paints on an empty figure of `size` (inches).
+
+    `name`, unique in the page, keeps the figure's identifiers apart from those of others. Elements that `draw` gave
+    the gid "layer-X" get the class "layer-X". No state of matplotlib outlives the call.
+    """
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=size)
+        draw(figure)
+        text = io.StringIO()
+        figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    return _embedded(text.getvalue(), name)
+
+
+def _embedded(svg: str, name: str) -> str:
+    """The bare element: no prologue, no comments (they repeat names), scalable, identifiers with a prefix."""
+    element = svg[svg.index("<svg") :]
+    element = re.sub(r"<!--.*?-->", "", element, flags=re.DOTALL)
+    element = re.sub(r"<metadata>.*?</metadata>", "", element, flags=re.DOTALL)
+    element = re.sub(r'id="(layer-[a-z]+)[^"]*"', r'class="\1"', element)
+    element = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", element, count=1)
+    element = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", element, count=1)
+    element = re.sub(r'\bid="', f'id="{name}-', element)
+    element = re.sub(r"url\(#", f"url(#{name}-", element)
+    element = re.sub(r'(xlink:)?href="#', f'href="#{name}-', element)
+    return element.replace(INK, "currentColor")

@@ -1,0 +1,173 @@
+"""From the images of a case to a body that can be computed with: alignment, mesh, space, motion, targets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from palpate.images.alignment import RigidMotion, align, moved
+from palpate.images.checks import Finding, check_images
+from palpate.images.distance import smoothing_width
+from palpate.images.segmentation import Segmentation
+from palpate.images.tissue import Role
+from palpate.images.tissue_distance import tissue_distance_map
+from palpate.inversion.invert import InverseProblem
+from palpate.inversion.modulus_map import modulus_map
+from palpate.mechanics.boundary import outer_constraint
+from palpate.mechanics.linear_model import LinearModel, linear_model, with_constraint
+from palpate.mesh.anatomy import Anatomy, Box, anatomy_of, domain_box, margin_box
+from palpate.mesh.quality import MeshQuality, check_mesh
+from palpate.mesh.space import LagrangeSpace, lagrange_space
+from palpate.mesh.tetrahedralise import tetrahedralise
+from palpate.observation.observed_surface import ObservedSurface, observed_surface
+from palpate.observation.prescribed_motion import prescribed_motion
+from palpate.observation.target import SurfaceTarget, surface_target
+from palpate.study.case import Case
+
+__all__ = ["Body", "ImagedStates", "aligned", "inverse_problem", "make_body"]
+
+THIN_VOXELS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class ImagedStates:
+    """The reference state and the later states, brought to it; `bones`: each later state's motions by tissue index."""
+
+    before: Segmentation
+    after: tuple[Segmentation, ...]
+    bones: tuple[Mapping[int, RigidMotion], ...]
+    findings: tuple[Finding, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """A meshed reference state with its images; `smoothing_mm` is the width of every distance map."""
+
+    states: ImagedStates
+    space: LagrangeSpace
+    quality: MeshQuality
+    smoothing_mm: float
+
+
+def aligned(before: Segmentation, after: tuple[Segmentation, ...], *, method: str) -> ImagedStates:
+    """Bring the later images to the first on their rigid tissues (`method` "rigid-tissues") and check them all.
+
+    Raises `InputDataError` as `check_images` and `align` do.
+    """
+    images, bones, findings = [], [], list[Finding]()
+    for number, image in enumerate(after, start=1):
+        if method == "none":
+            images.append(image)
+            bones.append(dict[int, RigidMotion]())
+            continue
+        alignment = align(before, image)
+        images.append(moved(image, alignment.overall.motion.inverse()))
+        rigid = {i: t.name for i, t in enumerate(before.tissues) if t.role is Role.RIGID}
+        bones.append({i: alignment.remaining(name) for i, name in rigid.items()})
+        findings += [
+            Finding(
+                "rotation-undetermined",
+                f"after image {number}: the surface of '{name}' does not show its rotation about"
+                f" {len(fit.undetermined)} of three axes; it is taken as not turning about them",
+            )
+            for name, fit in alignment.tissues.items()
+            if len(fit.undetermined)
+        ]
+    findings += check_images(before, images)
+    return ImagedStates(before, tuple(images), tuple(bones), tuple(findings))
+
+
+def make_body(states: ImagedStates, case: Case, *, progress: Callable[[str], None]) -> Body:
+    """Mesh the reference state of the images; raises `MeshQualityError` when the mesh does not pass its gate."""
+    before = states.before
+    width = smoothing_width(before.grid, *(image.grid for image in states.after))
+    box = _domain(states, case)
+    anatomy = anatomy_of(before, box=box, smoothing_mm=width)
+    progress(f"meshing {np.round(box.lengths).astype(int).tolist()} mm at {case.mesh.edge_length_mm:g} mm")
+    mesh = tetrahedralise(anatomy, edge_length_mm=case.mesh.edge_length_mm)
+    quality = _gate(states.before, anatomy, mesh_box=box, mesh=lagrange_space(mesh, "P1"))
+    space = lagrange_space(mesh, case.mechanics.element)
+    progress(
+        f"{quality.tets} tetrahedra, {3 * len(space.points)} unknowns, smallest dihedral angle"
+        f" {quality.min_dihedral_deg:.1f} degrees"
+    )
+    return Body(states, space, quality, width)
+
+
+def inverse_problem(body: Body, case: Case, *, progress: Callable[[str], None]) -> InverseProblem:
+    """Models and targets of every later image."""
+    space, states = body.space, body.states
+    tissues = space.mesh.tissues
+    observed = [i for i, tissue in enumerate(tissues) if tissue.role in (Role.ESTIMATE, Role.DRIVER)]
+    surfaces = [observed_surface(space, tissue) for tissue in observed]
+    targets = tuple(tuple(_target(body, surface, image) for surface in surfaces) for image in states.after)
+    progress("assembling one stiffness matrix a tissue")
+    models = _models(body, case)
+    estimated = frozenset(tissue.name for tissue in tissues if tissue.role is Role.ESTIMATE)
+    return InverseProblem(models, targets, modulus_map(tissues, models[0].regions), estimated)
+
+
+def _models(body: Body, case: Case) -> tuple[LinearModel, ...]:
+    """One model a later image; they share the stiffness and differ in the motion of the bones."""
+    models: list[LinearModel] = []
+    for bones in body.states.bones:
+        motion = prescribed_motion(
+            body.space,
+            bones,
+            n_modes=case.driver.modes,
+            kernel_mm=case.driver.kernel_mm,
+            prior_mm=case.driver.prior_mm,
+        )
+        constraint = outer_constraint(
+            body.space,
+            outer=case.domain.outer_boundary,
+            modes=motion.modes,
+            offset=motion.offset,
+            prescribed=motion.prescribed,
+        )
+        models.append(with_constraint(models[0], constraint) if models else linear_model(body.space, constraint))
+    return tuple(models)
+
+
+def _target(body: Body, surface: ObservedSurface, image: Segmentation) -> SurfaceTarget:
+    maps = [
+        tissue_distance_map(states, surface.tissue, smoothing_mm=body.smoothing_mm)
+        for states in (body.states.before, image)
+    ]
+    return surface_target(surface, *maps)
+
+
+def _domain(states: ImagedStates, case: Case) -> Box:
+    box = domain_box([states.before.grid, *(image.grid for image in states.after)])
+    if case.domain.extent == "image":
+        return box
+    roles = [tissue.role for tissue in states.before.tissues]
+    shown = [i for i, role in enumerate(roles) if role in (Role.ESTIMATE, Role.DRIVER)]
+    voxels = np.argwhere(np.isin(states.before.index, shown)).astype(float)
+    return margin_box(box, states.before.grid.world(voxels), margin_mm=case.domain.margin_mm)
+
+
+def _gate(before: Segmentation, anatomy: Anatomy, *, mesh_box: Box, mesh: LagrangeSpace) -> MeshQuality:
+    """Pass the mesh through its gate; voxels are counted inside the domain."""
+    index = np.argwhere(np.ones(before.grid.shape, dtype=bool))
+    local = mesh_box.local(before.grid.world(index.astype(float)))
+    inside = np.all((local > 0.0) & (local < mesh_box.lengths), axis=1).reshape(before.grid.shape)
+    volumes = {
+        tissue.name: float(np.count_nonzero(inside & before.mask(i))) * before.grid.voxel_volume
+        for i, tissue in enumerate(before.tissues)
+        if tissue.meshed
+    }
+    return check_mesh(mesh.mesh, anatomy, voxel_volumes=volumes, thin=_thin(before))
+
+
+def _thin(before: Segmentation) -> tuple[str, ...]:
+    """Names of meshed tissues that are under four voxels thick along some axis."""
+    thin = []
+    for i, tissue in enumerate(before.tissues):
+        mask = before.mask(i)
+        spans = [np.flatnonzero(mask.any(axis=tuple({0, 1, 2} - {a}))) for a in range(3)]
+        if tissue.meshed and min(span[-1] - span[0] + 1 for span in spans if len(span)) < THIN_VOXELS:
+            thin.append(tissue.name)
+    return tuple(thin)

@@ -1,0 +1,132 @@
+"""The later state of a body whose moduli are given, from the images, a filling or a phantom."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import ConfigurationError
+from palpate.images.label_image import LabelImage
+from palpate.images.segmentation import Segmentation
+from palpate.images.tissue import Role, Tissue
+from palpate.inversion.estimation import Remark
+from palpate.inversion.invert import fit_driver
+from palpate.mechanics.boundary import outer_constraint
+from palpate.mechanics.linear_model import linear_model
+from palpate.mesh.dihedral import tet_dihedrals
+from palpate.mesh.space import LagrangeSpace
+from palpate.mesh.voxelise import voxelise
+from palpate.observation.prescribed_motion import prescribed_motion
+from palpate.phantoms.wall_filling import wall_filling
+from palpate.study.body import Body, inverse_problem, make_body
+from palpate.study.case import Case
+from palpate.study.provenance import input_digests, software_versions
+from palpate.study.read import phantom_scene, read_states
+from palpate.study.result import MeshSummary, Provenance, Simulation
+from palpate.study.summary import mesh_summary
+
+__all__ = ["filled", "simulate"]
+
+Progress = Callable[[str], None]
+
+
+def simulate(case: Case, *, progress: Progress, steps: int = 1) -> Simulation:
+    """Deform the reference state of a case under the moduli that its tissues state (`youngs_modulus_kpa`).
+
+    The driver moves as in the later image (its wall is fitted together with the organs' surfaces, the moduli held),
+    by [motion] filling_mm, or as in the [phantom]. `steps`: how many displacements to give, the last one the whole.
+    Raises `ConfigurationError` when an `estimate` tissue has no modulus.
+    """
+    began = time.perf_counter()
+    if case.phantom is not None:
+        scene = phantom_scene(case)
+        space, last, tissues = scene.space, scene.displacement, scene.tissues
+        before, after, summary, remarks = scene.before, scene.after, _plain_summary(space), tuple[Remark, ...]()
+    else:
+        progress("reading and aligning the images")
+        states = read_states(case)
+        tissues = states.before.tissues
+        _refuse_unknown(tissues)
+        body = make_body(states, case, progress=progress)
+        space, summary = body.space, mesh_summary(body)
+        progress("solving for the displacement")
+        last = _displacement(body, case, progress)
+        before, after = (_labels(states.before, space, motion) for motion in (np.zeros_like(last), last))
+        remarks = tuple(Remark(finding.code, finding.message) for finding in states.findings)
+    moduli = {t.name: t.youngs_modulus_kpa for t in tissues if t.meshed and t.youngs_modulus_kpa is not None}
+    seconds = {"total": round(time.perf_counter() - began, 3)}
+    provenance = Provenance(seconds, input_digests(case), software_versions())
+    displacements = tuple(last * (step / steps) for step in range(1, steps + 1))
+    return Simulation(case, space, summary, displacements, before, after, moduli, provenance, remarks)
+
+
+def filled(space: LagrangeSpace, segmentation: Segmentation, *, filling_mm: float, outer: str) -> NDArray[np.float64]:
+    """Displacement (n_points, 3) mm of a body whose drivers fill by `filling_mm`, whose bones are held.
+
+    segmentation: the labels that the drivers' walls come from; outer: see `outer_constraint`. The tissues of the
+    space's mesh state their moduli.
+    """
+    tissues = space.mesh.tissues
+    _refuse_unknown(tissues)
+    motion = prescribed_motion(space, {}, n_modes=0, kernel_mm=1.0, prior_mm=1.0)
+    offset = np.zeros_like(space.points)
+    for i, tissue in enumerate(tissues):
+        if tissue.role is Role.DRIVER:
+            walls = np.unique(space.facets(space.mesh.boundary[space.mesh.beyond == i]))
+            offset[walls] = wall_filling(segmentation, i, filling_mm=filling_mm).at(space.points[walls])
+    for i, tissue in enumerate(tissues):
+        if tissue.role is Role.RIGID:
+            offset[np.unique(space.facets(space.mesh.boundary[space.mesh.beyond == i]))] = 0.0
+    no_modes = np.zeros((offset.size, 0))
+    constraint = outer_constraint(
+        space, outer=outer, modes=no_modes, offset=offset.ravel(), prescribed=motion.prescribed
+    )
+    moduli = np.array([tissue.youngs_modulus_kpa for tissue in tissues if tissue.meshed], dtype=float)
+    return np.asarray(linear_model(space, constraint).solve(moduli, np.zeros(0)).displacement)
+
+
+def _displacement(body: Body, case: Case, progress: Progress) -> NDArray[np.float64]:
+    if case.motion is not None:
+        return filled(
+            body.space,
+            body.states.before,
+            filling_mm=case.motion.filling_mm,
+            outer=case.domain.outer_boundary,
+        )
+    problem = inverse_problem(body, case, progress=progress)
+    tissues = [t for t in body.space.mesh.tissues if t.meshed]
+    moduli = np.array([tissue.youngs_modulus_kpa for tissue in tissues], dtype=float)
+    return fit_driver(problem, moduli)[-1]
+
+
+def _refuse_unknown(tissues: tuple[Tissue, ...]) -> None:
+    missing = [t.name for t in tissues if t.meshed and t.youngs_modulus_kpa is None]
+    if missing:
+        raise ConfigurationError(
+            f"a simulation needs the youngs_modulus_kpa (kPa) of every meshed tissue; {missing} lack it"
+        )
+
+
+def _labels(segmentation: Segmentation, space: LagrangeSpace, displacement: NDArray[np.float64]) -> LabelImage:
+    """Label image of the deformed mesh on the segmentation's grid, with the first label of each tissue."""
+    tissues = space.mesh.tissues
+    used = {label for tissue in tissues for label in tissue.labels}
+    rest = next(label for label in range(len(used) + 1) if label not in used)
+    table = np.array([tissue.labels[0] if tissue.labels else rest for tissue in tissues], dtype=np.int32)
+    names = {int(label): tissue.name for label, tissue in zip(table, tissues, strict=True)}
+    return LabelImage(table[voxelise(space, displacement, segmentation.grid)], segmentation.grid, names)
+
+
+def _plain_summary(space: LagrangeSpace) -> MeshSummary:
+    smallest = tet_dihedrals(space.mesh.nodes[space.mesh.tets]).min(axis=1)
+    return MeshSummary(
+        len(space.mesh.nodes),
+        len(space.mesh.tets),
+        3 * len(space.points),
+        float(smallest.min()),
+        float(np.percentile(smallest, 5.0)),
+        {},
+    )

@@ -1,0 +1,134 @@
+"""A synthetic result for the tests of reports, exports and the command line: quick, and known to the last number."""
+
+from __future__ import annotations
+
+import dataclasses
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.images.label_image import LabelImage, VoxelGrid
+from palpate.images.segmentation import segment
+from palpate.images.tissue import Role
+from palpate.inversion.estimation import Estimation, Iteration, ModulusEstimate, Remark, Start, SurfaceFit, TissueFit
+from palpate.mesh.space import lagrange_space
+from palpate.mesh.tet_mesh import OUTER, TetMesh
+from palpate.mesh.tetrahedralise import boundary_of
+from palpate.study.case import Case, CaseTissue, Images
+from palpate.study.result import CaseResult, MeshSummary, Provenance
+
+EDGE = 4.0
+CELLS = 10
+
+
+def tissue_at(points: np.ndarray) -> np.ndarray:
+    """Index of the tissue at points (n, 3) mm: 0 prostate, 1 bladder (balls), 2 rectum (a tube), 3 the rest."""
+    index = np.full(len(points), 3)
+    index[np.linalg.norm(points - [20, 22, 13], axis=1) < 8] = 0
+    index[np.linalg.norm(points - [20, 22, 29], axis=1) < 8] = 1
+    index[np.linalg.norm(points[:, :2] - [20, 6], axis=1) < 4] = 2
+    return index
+
+
+def motion(points: np.ndarray) -> np.ndarray:
+    """A smooth displacement (n, 3) mm, largest beside the rectum."""
+    size = 3.0 * np.exp(-np.linalg.norm(points[:, :2] - [20, 6], axis=1) / 12.0)
+    return np.stack([0 * size, size, 0.3 * size], axis=1)
+
+
+def make_case(**changes) -> Case:
+    tissues = (
+        CaseTissue("prostate", (1,), Role.ESTIMATE),
+        CaseTissue("bladder", (2,), Role.ESTIMATE),
+        CaseTissue("rectum", (3,), Role.DRIVER),
+        CaseTissue("surroundings", "remaining", Role.KNOWN, youngs_modulus_kpa=10.0),
+    )
+    images = Images(Path("before.nii.gz"), (Path("after.nii.gz"),))
+    return dataclasses.replace(Case(id="sub-01", images=images, tissues=tissues), **changes)
+
+
+def make_mesh(case: Case) -> TetMesh:
+    steps = np.stack(np.meshgrid(*[np.arange(CELLS + 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    first = (steps.max(axis=1) < CELLS).nonzero()[0]
+    jump = np.array([(CELLS + 1) ** 2, CELLS + 1, 1])
+    tets = []
+    for order in permutations(range(3)):
+        corners = np.stack([first, *(first + np.cumsum(jump[list(order)])[:, None])], axis=1)
+        odd = np.linalg.det(np.eye(3)[list(order)]) < 0
+        tets.append(corners[:, [1, 0, 2, 3]] if odd else corners)
+    nodes, tets = EDGE * steps.astype(float), np.concatenate(tets)
+    region = tissue_at(nodes[tets].mean(axis=1))
+    tets, region = tets[region != 2], region[region != 2]
+    boundary = boundary_of(tets)
+    centre = nodes[boundary].mean(axis=1)
+    outer = ((centre < 1e-6) | (centre > EDGE * CELLS - 1e-6)).any(axis=1)
+    return TetMesh(nodes, tets, region, boundary, np.where(outer, OUTER, 2), case.resolve_tissues({}))
+
+
+def make_segmentation(mesh: TetMesh, *, moved: bool):
+    grid = VoxelGrid((26, 27, 28), np.array([[1.6, 0, 0, 0.3], [0, 1.6, 0, -0.4], [0, 0, 1.6, -1.0], [0, 0, 0, 1.0]]))
+    index = np.stack(np.meshgrid(*[np.arange(n) for n in grid.shape], indexing="ij"), axis=-1).reshape(-1, 3)
+    points = grid.world(index.astype(float))
+    labels = np.array([1, 2, 3, 0])[tissue_at(points - motion(points) if moved else points)]
+    return segment(LabelImage(labels.reshape(grid.shape), grid), mesh.tissues)
+
+
+def make_estimate(tissue: str, value: float, truth: float | None = None) -> ModulusEstimate:
+    return ModulusEstimate(
+        tissue=tissue,
+        unit="kPa",
+        value=value,
+        interval95=(0.8 * value, 1.25 * value),
+        interval_kind="linearised",
+        relative_to="surroundings",
+        ratio=value / 10,
+        ratio_interval95=(0.08 * value, 0.125 * value),
+        verdict="identified",
+        why="high / low is 1.56",
+        truth=truth,
+    )
+
+
+def make_start(ratio: float) -> Start:
+    history = tuple(
+        Iteration(0.02 + 0.5 * 0.2**k, {"prostate": 60 * (ratio / 6) ** 0.3**k, "bladder": 30.0}, 0.1**k)
+        for k in range(5)
+    )
+    begin = {"prostate": 10 * ratio, "bladder": 10 * ratio}
+    return Start(begin, history[-1].moduli, history[-1].objective_mm2, "converged", "ok", 0, history)
+
+
+def make_estimation(displacement: np.ndarray) -> Estimation:
+    fit = TissueFit("prostate", SurfaceFit(0.6, 0.8, 1.6, 0.91), SurfaceFit(0.08, 0.11, 0.22, 0.984), 0.93)
+    return Estimation(
+        status="converged",
+        reason="the decrement fell under its tolerance",
+        estimates=(make_estimate("prostate", 58.9, 60.0), make_estimate("bladder", 31.2)),
+        covariance=np.array([[0.01, -0.003], [-0.003, 0.06]]),
+        starts=tuple(make_start(ratio) for ratio in (0.5, 2.0, 8.0)),
+        fits=((fit, dataclasses.replace(fit, tissue="bladder")),),
+        displacements=(displacement,),
+        counts={"forward": 3, "adjoint": 0, "tangent": 2, "factorisations": 4, "evaluations": 9},
+        remarks=(Remark("example", "a warning to be shown"),),
+    )
+
+
+@pytest.fixture(scope="session")
+def case_result() -> CaseResult:
+    """A converged estimate of two organs in a box of 40 mm, made without computing anything."""
+    case = make_case()
+    mesh = make_mesh(case)
+    space = lagrange_space(mesh, "P2")
+    return CaseResult(
+        case=case,
+        estimation=make_estimation(motion(space.points)),
+        space=space,
+        mesh_summary=MeshSummary(
+            len(mesh.nodes), len(mesh.tets), 3 * len(space.points), 45.0, 45.0, {"prostate": 0.01}
+        ),
+        before=make_segmentation(mesh, moved=False),
+        after=(make_segmentation(mesh, moved=True),),
+        provenance=Provenance({"total": 1.5}, {"before": "ab" * 32}, {"palpate": "0.1.0"}),
+    )

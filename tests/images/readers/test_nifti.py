@@ -1,0 +1,332 @@
+"""Reading and writing NIfTI: the way of storing never matters, and a bad file always gives one clear sentence."""
+
+from __future__ import annotations
+
+import gzip
+import itertools
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from palpate.errors import ConfigurationError, InputDataError, ResourceError
+from palpate.images.label_image import LabelImage, VoxelGrid
+from palpate.images.readers import nifti, read_intensities, read_label_image, write_label_image, write_scalar_image
+
+ORIENTATIONS = list(itertools.product(itertools.permutations(range(3)), itertools.product((1, -1), repeat=3)))
+AFFINE = np.array([[0.5, 0, 0, -20], [0, 1.0, 0, 7], [0, 0, 2.5, -3.5], [0, 0, 0, 1]])
+HEADER = 348
+
+
+def labels() -> NDArray[np.uint8]:
+    return np.random.default_rng(3).integers(0, 5, (4, 5, 6), dtype=np.uint8)
+
+
+def oblique() -> NDArray[np.float64]:
+    affine = AFFINE.copy()
+    affine[:3, :3] = Rotation.from_euler("xyz", [20, -12, 31], degrees=True).as_matrix() @ affine[:3, :3]
+    return affine
+
+
+def stored_otherwise(
+    values: NDArray[np.uint8], affine: NDArray[np.float64], order: tuple[int, ...], signs: tuple[int, ...]
+) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """The same image with its axes in another order and direction."""
+    turned = values.transpose(order)[tuple(slice(None, None, sign) for sign in signs)]
+    change = np.zeros((4, 4))  # index of `turned` -> index of `values`
+    change[3, 3] = 1
+    for new, (old, sign) in enumerate(zip(order, signs, strict=True)):
+        change[old, new] = sign
+        change[old, 3] = 0 if sign > 0 else values.shape[old] - 1
+    return turned, affine @ change
+
+
+def saved(path: Path, values: NDArray[np.generic], affine: NDArray[np.float64] | None = AFFINE) -> Path:
+    nibabel.save(nibabel.Nifti1Image(values, affine), path)
+    return path
+
+
+def raw(path: Path, *, change: Callable[[bytearray], None] | None = None, tail: bytes = b"") -> Path:
+    """A valid .nii or .nii.gz with `change` applied to its bytes."""
+    content = bytearray(nibabel.Nifti1Image(labels(), AFFINE).to_bytes())
+    if change is not None:
+        change(content)
+    content += tail
+    path.write_bytes(gzip.compress(bytes(content)) if path.suffix == ".gz" else bytes(content))
+    return path
+
+
+@pytest.mark.parametrize(("order", "signs"), ORIENTATIONS)
+def test_all_48_orientations_are_read_as_the_same_image(
+    tmp_path: Path, order: tuple[int, ...], signs: tuple[int, ...]
+) -> None:
+    values, affine = stored_otherwise(labels(), AFFINE, order, signs)
+    image = read_label_image(saved(tmp_path / "a.nii", values, affine))
+    assert np.array_equal(image.labels, labels())
+    assert np.array_equal(image.grid.affine, AFFINE)
+
+
+@pytest.mark.parametrize(("order", "signs"), ORIENTATIONS[::5])
+@pytest.mark.parametrize("turn", [0, 45])
+def test_oblique_images_do_not_depend_on_how_they_are_stored(
+    tmp_path: Path, order: tuple[int, ...], signs: tuple[int, ...], turn: int
+) -> None:
+    affine = oblique()
+    affine[:3, :3] = Rotation.from_euler("z", turn, degrees=True).as_matrix() @ affine[:3, :3]
+    first = read_label_image(saved(tmp_path / "a.nii.gz", labels(), affine))
+    second = read_label_image(saved(tmp_path / "b.nii.gz", *stored_otherwise(labels(), affine, order, signs)))
+    assert np.array_equal(first.labels, second.labels)
+    np.testing.assert_allclose(first.grid.affine, second.grid.affine, atol=1e-5)
+
+
+def test_reading_moves_no_voxel_in_the_world(tmp_path: Path) -> None:
+    affine = oblique()
+    values, turned = stored_otherwise(labels(), affine, (2, 0, 1), (-1, 1, -1))
+    image = read_label_image(saved(tmp_path / "a.nii.gz", values, turned))
+    for label in range(5):
+        before = VoxelGrid((4, 5, 6), affine).world(np.argwhere(labels() == label).astype(float))
+        after = image.grid.world(np.argwhere(image.labels == label).astype(float))
+        np.testing.assert_allclose(np.sort(before, axis=0), np.sort(after, axis=0), atol=1e-4)
+
+
+@pytest.mark.parametrize("ending", [".nii", ".nii.gz", ".NII.GZ"])
+def test_writing_and_reading_give_the_image_back(tmp_path: Path, ending: str) -> None:
+    image = LabelImage(labels() * 200, VoxelGrid((4, 5, 6), oblique()))
+    path = tmp_path / f"a{ending}"
+    write_label_image(path, image)
+    again = read_label_image(path, names={1: "prostate"})
+    assert np.array_equal(again.labels, image.labels)
+    np.testing.assert_allclose(again.grid.affine, image.grid.affine, atol=1e-5)
+    assert again.names == {1: "prostate"}
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_sform_and_qform_of_a_written_image_agree_with_millimetres(tmp_path: Path) -> None:
+    write_scalar_image(tmp_path / "e.nii.gz", np.full((4, 5, 6), np.nan), VoxelGrid((4, 5, 6), oblique()))
+    header = nibabel.load(tmp_path / "e.nii.gz").header
+    np.testing.assert_allclose(header.get_sform(), header.get_qform(), atol=1e-4)
+    assert int(header["sform_code"]) > 0
+    assert int(header["qform_code"]) > 0
+    assert header.get_xyzt_units()[0] == "mm"
+    assert header.get_data_dtype() == np.float32
+    assert np.isnan(read_intensities(tmp_path / "e.nii.gz")[0]).all()
+
+
+def test_equal_images_give_equal_files(tmp_path: Path) -> None:
+    image = LabelImage(labels(), VoxelGrid((4, 5, 6), AFFINE))
+    write_label_image(tmp_path / "a.nii.gz", image)
+    write_label_image(tmp_path / "b.nii.gz", image)
+    assert (tmp_path / "a.nii.gz").read_bytes() == (tmp_path / "b.nii.gz").read_bytes()
+
+
+def test_a_failed_write_is_a_resource_error_and_leaves_nothing(tmp_path: Path) -> None:
+    image = LabelImage(labels(), VoxelGrid((4, 5, 6), AFFINE))
+    with pytest.raises(ResourceError, match="cannot be written"):
+        write_label_image(tmp_path / "missing" / "a.nii.gz", image)
+    with pytest.raises(ConfigurationError, match=r"\.nii"):
+        write_label_image(tmp_path / "a.png", image)
+    with pytest.raises(InputDataError, match="shape"):
+        write_scalar_image(tmp_path / "a.nii", np.zeros((2, 2, 2)), image.grid)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("mm", 1.0), ("meter", 1000.0), ("micron", 0.001), ("unknown", 1.0)])
+def test_the_unit_of_length_in_the_header_is_honoured(tmp_path: Path, unit: str, factor: float) -> None:
+    image = nibabel.Nifti1Image(labels(), np.diag([4.0, 2.0, 8.0, 1.0]))
+    image.header.set_xyzt_units(unit)
+    nibabel.save(image, tmp_path / "a.nii.gz")
+    np.testing.assert_allclose(read_label_image(tmp_path / "a.nii.gz").grid.spacing, factor * np.array([4.0, 2.0, 8.0]))
+
+
+def test_the_sform_wins_over_the_qform_which_serves_alone(tmp_path: Path) -> None:
+    image = nibabel.Nifti1Image(labels(), None)
+    image.set_qform(np.diag([1.0, 1.0, 2.5, 1.0]), code=1)
+    nibabel.save(image, tmp_path / "q.nii")
+    np.testing.assert_allclose(read_label_image(tmp_path / "q.nii").grid.spacing, [1.0, 1.0, 2.5])
+    image.set_sform(AFFINE, code=1)
+    nibabel.save(image, tmp_path / "s.nii")
+    np.testing.assert_allclose(read_label_image(tmp_path / "s.nii").grid.affine, AFFINE)
+
+
+@pytest.mark.parametrize("dtype", ["i1", "u2", "<i4", ">i4", ">f4", "f8", "i8", "u8"])
+def test_every_number_type_and_byte_order_gives_the_same_labels(tmp_path: Path, dtype: str) -> None:
+    kind = np.dtype(dtype)
+    header = nibabel.Nifti1Header(endianness=">" if kind.byteorder == ">" else "<")
+    header.set_data_dtype(kind)
+    image = nibabel.Nifti1Image(labels().astype(kind), AFFINE, header=header, dtype=kind)
+    nibabel.save(image, tmp_path / "a.nii.gz")
+    assert np.array_equal(read_label_image(tmp_path / "a.nii.gz").labels, labels())
+
+
+def test_nifti_2_is_read_like_nifti_1(tmp_path: Path) -> None:
+    nibabel.save(nibabel.Nifti2Image(labels(), AFFINE), tmp_path / "a.nii.gz")
+    assert np.array_equal(read_label_image(tmp_path / "a.nii.gz").labels, labels())
+
+
+def test_intensities_are_scaled_as_the_header_says(tmp_path: Path) -> None:
+    def scale(content: bytearray) -> None:
+        struct.pack_into("<ff", content, 112, 2.0, -1000.0)
+
+    values, grid = read_intensities(raw(tmp_path / "a.nii.gz", change=scale))
+    assert values.dtype == np.float32
+    np.testing.assert_allclose(values, labels() * 2.0 - 1000.0)
+    np.testing.assert_allclose(grid.affine, AFFINE)
+
+
+def test_floats_close_to_integers_are_labels_and_others_are_refused(tmp_path: Path) -> None:
+    near = labels().astype(np.float32)
+    near[near == 1] = 0.9999
+    assert np.array_equal(read_label_image(saved(tmp_path / "a.nii.gz", near)).labels, labels())
+    for value, words in [
+        (0.5, "not integers"),
+        (np.nan, "NaN"),
+        (np.inf, "NaN or inf"),
+        (-1, "from -1"),
+        (65536, "65536"),
+    ]:
+        bad = labels().astype(np.float32)
+        bad[1, 2, 3] = value
+        with pytest.raises(InputDataError, match=words):
+            read_label_image(saved(tmp_path / "b.nii.gz", bad))
+
+
+@pytest.mark.parametrize("shape", [(4, 5, 6, 1), (4, 5, 6, 1, 1), (4, 5, 1)])
+def test_trailing_axes_of_one_are_accepted(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    path = saved(tmp_path / "a.nii.gz", np.ones(shape, dtype=np.uint8))
+    assert read_label_image(path).labels.shape == shape[:3]
+
+
+@pytest.mark.parametrize("shape", [(4, 5), (4, 5, 6, 2), (4, 5, 6, 1, 3)])
+def test_images_of_other_dimensions_are_refused(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    with pytest.raises(InputDataError, match="three axes"):
+        read_label_image(saved(tmp_path / "a.nii.gz", np.ones(shape, dtype=np.uint8)))
+
+
+@pytest.mark.parametrize("dtype", ["c8", [("R", "u1"), ("G", "u1"), ("B", "u1")]])
+def test_colours_and_complex_numbers_are_refused(tmp_path: Path, dtype: object) -> None:
+    with pytest.raises(InputDataError, match="of the type"):
+        read_label_image(saved(tmp_path / "a.nii.gz", np.zeros((3, 3, 3), dtype=np.dtype(dtype))))
+
+
+def put(form: str, offset: int, *numbers: float) -> Callable[[bytearray], None]:
+    return lambda content: struct.pack_into(form, content, offset, *numbers)
+
+
+BAD_HEADERS = {
+    "negative size": (put("<h", 42, -1), "positive counts"),
+    "zero size": (put("<h", 46, 0), "positive counts"),
+    "no axes": (put("<h", 40, 0), "positive counts|begin"),
+    "too many axes": (put("<h", 40, 9), "positive counts"),
+    "a huge array": (put("<3h", 42, 32767, 32767, 32767), "more than"),
+    "more than the file": (put("<3h", 42, 600, 600, 600), "cannot hold|cut short"),
+    "unknown type": (put("<h", 70, 77), "damaged"),
+    "offset NaN": (put("<f", 108, np.nan), "first voxel"),
+    "offset too low": (put("<f", 108, 100.0), "first voxel"),
+    "offset negative": (put("<f", 108, -352.0), "first voxel"),
+    "offset beyond the file": (put("<f", 108, 1e9), "first voxel"),
+    "intercept NaN": (put("<ff", 112, 1.0, np.nan), "damaged"),
+    "no orientation": (put("<hh", 252, 0, 0), "neither sform nor qform"),
+    "sform NaN": (put("<f", 280, np.nan), "not finite"),
+    "sform infinite": (put("<f", 284, np.inf), "not finite"),
+    "sform singular": (put("<4f", 280, 0.0, 0.0, 0.0, 0.0), "flattens"),
+    "sform sheared": (put("<4f", 280, 0.5, 0.3, 0.0, 0.0), "right angles"),
+    "unit unknown": (put("<B", 123, 7), "unit of length"),
+    "a pair's mark": (put("<4s", 344, b"ni1\0"), "in one piece"),
+    "no NIfTI": (put("<i", 0, 347), "does not begin"),
+}
+
+
+@pytest.mark.parametrize("ending", [".nii", ".nii.gz"])
+@pytest.mark.parametrize("name", list(BAD_HEADERS))
+def test_a_bad_header_is_refused_with_its_reason(tmp_path: Path, name: str, ending: str) -> None:
+    change, words = BAD_HEADERS[name]
+    path = raw(tmp_path / f"a{ending}", change=change)
+    with pytest.raises(InputDataError, match=words) as caught:
+        read_label_image(path)
+    assert str(path) in str(caught.value)
+
+
+def test_files_that_are_no_images_are_refused_with_advice(tmp_path: Path) -> None:
+    good = raw(tmp_path / "good.nii.gz").read_bytes()
+    (tmp_path / "folder.nii.gz").mkdir()
+    contents = {
+        "empty.nii.gz": (b"", "empty"),
+        "ten.nii.gz": (good[:10], "cut short|damaged"),
+        "plain.nii.gz": (gzip.decompress(good), "not compressed"),
+        "text.nii.gz": (b"this is no image", "not compressed"),
+        "zipped.nii": (good, "is compressed"),
+        "short.nii": (gzip.decompress(good)[:-5], "cut short"),
+        "stub.nii": (gzip.decompress(good)[:100], "cut short"),
+        "cut.nii.gz": (good[:-30], "cut short|damaged"),
+        "sum.nii.gz": (good[:-8] + b"\0" * 8, "damaged"),
+        "bits.nii.gz": (good[:40] + bytes(b ^ 0xFF for b in good[40:60]) + good[60:], "damaged|begin|header"),
+        "a.png": (good, "no reader"),
+    }
+    for name, (content, _) in contents.items():
+        (tmp_path / name).write_bytes(content)
+    wanted = {name: words for name, (_, words) in contents.items()}
+    wanted |= {
+        "folder.nii.gz": "folder",
+        "missing.nii.gz": "no file",
+        "x" * 300 + ".nii": "cannot be opened",
+        "\0.nii": "no file|cannot be opened",
+    }
+    for name, words in wanted.items():
+        for read in (read_label_image, read_intensities):
+            with pytest.raises(InputDataError, match=words):
+                read(tmp_path / name)
+
+
+def test_a_gzip_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = raw(tmp_path / "a.nii.gz", tail=bytes(50_000_000))
+    unpacked: list[int] = []
+    plain_read = gzip.GzipFile.read
+
+    def counted(self: gzip.GzipFile, size: int = -1) -> bytes:
+        content = plain_read(self, size)
+        unpacked.append(len(content))
+        return content
+
+    monkeypatch.setattr(gzip.GzipFile, "read", counted)
+    with pytest.raises(InputDataError, match="goes on for more than"):
+        read_label_image(path)
+    assert HEADER < sum(unpacked) < 3_000_000
+
+
+def test_a_small_file_cannot_make_the_reader_take_much_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes: list[int] = []
+    empty = np.empty
+
+    def counted(size: int, dtype: type) -> NDArray[np.uint8]:
+        sizes.append(int(size))
+        return empty(size, dtype=dtype)
+
+    path = raw(tmp_path / "a.nii.gz", change=put("<3h", 42, 800, 800, 800))
+    monkeypatch.setattr(nifti.np, "empty", counted)
+    with pytest.raises(InputDataError, match="cannot hold"):
+        read_label_image(path)
+    assert max(sizes) <= HEADER
+
+
+def test_no_damaged_byte_lets_a_foreign_error_out(tmp_path: Path) -> None:
+    rng = np.random.default_rng(11)
+    path = tmp_path / "a.nii"
+    good = nibabel.Nifti1Image(labels(), AFFINE).to_bytes()
+    texts: list[str] = []
+    for _ in range(1500):
+        content = bytearray(good)
+        for place in rng.integers(0, HEADER, rng.integers(1, 4)):
+            content[place] = rng.integers(0, 256)
+        path.write_bytes(bytes(content))
+        for read in (read_label_image, read_intensities):
+            try:
+                read(path)
+            except InputDataError as error:  # any other exception or warning fails the test
+                texts.append(str(error))
+    assert len(texts) > 100
+    assert all(str(path) in text for text in texts)

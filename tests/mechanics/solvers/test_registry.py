@@ -1,0 +1,130 @@
+"""Linear solvers: they agree, check themselves, and refuse what has no one solution."""
+
+from __future__ import annotations
+
+import gc
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from palpate.errors import ConfigurationError, ResourceError, SolverError
+from palpate.mechanics.boundary import outer_constraint
+from palpate.mechanics.linear_model import linear_model, weighted_sum
+from palpate.mechanics.rigid import rigid_modes
+from palpate.mechanics.solvers import registry
+from palpate.mechanics.solvers.contract import Solver, always
+from palpate.mechanics.solvers.pattern import twin_rows
+from palpate.mechanics.solvers.registry import SOLVERS, factorise
+from palpate.mechanics.stiffness import tissue_stiffness
+from palpate.mesh.space import lagrange_space
+
+AVAILABLE = [name for name, solver in SOLVERS.items() if solver.available()]
+
+
+@pytest.fixture(params=["fixed", "sliding"])
+def problem(request, meshes):
+    """Matrix of a stiff ball in a soft block, its rigid motions, and loads."""
+    mesh = meshes.box_mesh(
+        6,
+        size=50.0,
+        tissues=[meshes.known("fat", nu=0.45), meshes.unknown("organ", nu=0.45)],
+        region=lambda c: (np.linalg.norm(c - 25.0, axis=1) < 15.0).astype(int),
+    )
+    space = lagrange_space(mesh, "P2")
+    nothing = meshes.prescribe(space, np.zeros(0, int), np.zeros((0, 3)))
+    constraint = outer_constraint(space, outer=request.param, **nothing)
+    matrix = weighted_sum(np.array([1.0, 20.0]), linear_model(space, constraint).free_stiffness)
+    loads = np.random.default_rng(3).standard_normal((matrix.shape[0], 4))
+    return matrix, constraint.free.T @ rigid_modes(space.points), loads
+
+
+def laplacian(n):
+    """A one-dimensional chain held at its first node."""
+    matrix = sparse.diags_array([-np.ones(n - 1), 2 * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1]).tolil()
+    matrix[n - 1, n - 1] = 1.0
+    return sparse.csr_matrix(matrix)
+
+
+@pytest.mark.parametrize("solver", AVAILABLE)
+def test_every_solver_inverts_the_stiffness(problem, solver):
+    matrix, motions, loads = problem
+    solution = factorise(matrix, solver=solver, near_nullspace=motions).solve(matrix @ loads)
+    assert np.linalg.norm(solution - loads) < 1e-7 * np.linalg.norm(loads)
+
+
+@pytest.mark.parametrize("solver", AVAILABLE)
+def test_a_zero_load_gives_a_zero_solution_and_leaves_its_neighbours_alone(solver):
+    matrix, loads = laplacian(40), np.random.default_rng(0).standard_normal((40, 3))
+    loads[:, 1] = 0.0
+    before = loads.copy()
+    solution = factorise(matrix, solver=solver, near_nullspace=np.ones((40, 1))).solve(loads)
+    assert np.all(solution[:, 1] == 0.0)
+    assert np.allclose(matrix @ solution, loads, atol=1e-8)
+    assert np.array_equal(loads, before)
+
+
+@pytest.mark.parametrize("solver", AVAILABLE)
+def test_several_factorisations_live_side_by_side(solver):
+    loads = np.ones((60, 1))
+    first = factorise(laplacian(60), solver=solver, near_nullspace=np.ones((60, 1)))
+    second = factorise(5.0 * laplacian(60), solver=solver, near_nullspace=np.ones((60, 1)))
+    dropped = factorise(7.0 * laplacian(60), solver=solver, near_nullspace=np.ones((60, 1)))
+    del dropped
+    gc.collect()
+    assert np.allclose(first.solve(loads), 5.0 * second.solve(loads), rtol=1e-7)
+
+
+@pytest.mark.parametrize("solver", AVAILABLE)
+def test_an_indefinite_matrix_is_refused_with_what_to_do(solver):
+    matrix = laplacian(40) - 0.5 * sparse.eye_array(40)
+    with pytest.raises(SolverError, match="inverted tetrahedra"):
+        factorise(sparse.csr_matrix(matrix), solver=solver, near_nullspace=np.ones((40, 1))).solve(np.ones((40, 1)))
+
+
+@pytest.mark.parametrize("solver", [name for name in AVAILABLE if SOLVERS[name].direct])
+@pytest.mark.parametrize("element", ["P1", "P2"])
+def test_a_floating_body_is_refused(solver, element, meshes):
+    stiffness = tissue_stiffness(lagrange_space(meshes.box_mesh(4, distortion=0.2), element), 0, 0.45)
+    with pytest.raises(SolverError, match="hold"):
+        factorise(stiffness, solver=solver)
+
+
+def test_a_solver_that_misses_its_tolerance_is_found_out(monkeypatch):
+    class Sloppy:
+        def solve(self, rhs):
+            return 0.4 * rhs
+
+    solver = Solver("sloppy", lambda *_: Sloppy(), direct=False, available=always)
+    monkeypatch.setitem(registry.SOLVERS, "sloppy", solver)
+    with pytest.raises(SolverError, match="'sloppy' left a relative residual of"):
+        factorise(laplacian(10), solver="sloppy").solve(np.ones((10, 1)))
+
+
+def test_a_load_that_is_no_number_is_refused():
+    with pytest.raises(SolverError, match="not finite"):
+        factorise(laplacian(10)).solve(np.full((10, 1), np.nan))
+
+
+def test_a_body_with_no_free_point_is_refused():
+    with pytest.raises(SolverError, match="every point of the mesh is prescribed"):
+        factorise(sparse.csr_matrix((0, 0)))
+
+
+def test_an_unknown_solver_is_refused_with_the_known_ones():
+    with pytest.raises(ConfigurationError, match="superlu"):
+        factorise(laplacian(5), solver="magic")
+
+
+def test_a_solver_that_is_not_installed_says_how_to_install_it(monkeypatch):
+    absent = Solver("pardiso", SOLVERS["pardiso"].factorise, True, lambda: False, "install it with: pip")
+    monkeypatch.setitem(registry.SOLVERS, "pardiso", absent)
+    with pytest.raises(ResourceError, match="pip"):
+        factorise(laplacian(5), solver="pardiso")
+    assert factorise(laplacian(5)).solver == "superlu"
+
+
+def test_twin_rows_are_the_unknowns_of_one_node(problem, meshes):
+    space = lagrange_space(meshes.box_mesh(2), "P2")
+    assert np.array_equal(twin_rows(tissue_stiffness(space, 0, 0.3)), np.repeat(np.arange(len(space.points)), 3))
+    assert np.all(np.bincount(twin_rows(problem[0])) <= 3)

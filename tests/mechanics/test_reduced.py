@@ -1,0 +1,120 @@
+"""Reduced models: exact on their snapshots, converging between them, certified everywhere."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from palpate.errors import ConfigurationError, SolverError
+from palpate.mechanics.boundary import outer_constraint
+from palpate.mechanics.linear_model import linear_model
+from palpate.mechanics.reduced import orthonormal_basis, reduce
+from palpate.mesh.space import lagrange_space
+
+RATIOS = (0.2, 1.0, 5.0, 25.0)
+
+
+@pytest.fixture(scope="module")
+def model(meshes):
+    mesh = meshes.box_mesh(
+        4,
+        size=40.0,
+        tissues=[meshes.known("fat", nu=0.45), meshes.unknown("organ", nu=0.45)],
+        region=lambda c: (np.linalg.norm(c - 20.0, axis=1) < 14.0).astype(int),
+    )
+    space = lagrange_space(mesh, "P2")
+    floor = np.flatnonzero(space.points[:, 2] < 1e-9)
+    x, y = space.points[floor, 0] / 40.0, space.points[floor, 1] / 40.0
+    modes = np.zeros((len(floor), 3, 2))
+    modes[:, 2, 0], modes[:, 0, 1] = np.sin(np.pi * x) * np.sin(np.pi * y), x * y
+    given = meshes.prescribe(space, floor, np.column_stack([0 * x, 0 * x, x]), modes)
+    return linear_model(space, outer_constraint(space, outer="sliding", **given))
+
+
+def basis(model, ratios=RATIOS):
+    snapshots = [model.responses(np.array([1.0, ratio])) for ratio in ratios]
+    return model.constraint.free.T @ np.concatenate(snapshots, axis=1)
+
+
+@pytest.fixture(scope="module")
+def small(model):
+    return reduce(model, basis(model))
+
+
+def relative(one, other):
+    return float(np.max(np.abs(one - other)) / np.max(np.abs(other)))
+
+
+@pytest.mark.parametrize("ratio", RATIOS)
+def test_a_snapshot_is_reproduced(model, small, ratio):
+    moduli = np.array([3.0, 3.0 * ratio])
+    assert relative(small.responses(moduli), model.responses(moduli)) < 1e-9
+
+
+def test_more_snapshots_come_closer_between_them(model):
+    moduli, q = np.array([1.0, 2.3]), np.array([1.0, -2.0])
+    truth = model.solve(moduli, q).values
+    errors = [relative(reduce(model, basis(model, RATIOS[:k])).solve(moduli, q).values, truth) for k in (1, 2, 3, 4)]
+    assert np.all(np.diff(errors) < 0.0)
+    assert errors[-1] < 5e-3
+
+
+def test_derivative_snapshots_make_the_tangent_exact(model):
+    moduli, q = np.array([1.0, 4.0]), np.array([1.0, 0.5])
+    system = model.system(moduli)
+    responses = system.responses()
+    enriched = np.concatenate([responses, system.modulus_responses(responses)[1]], axis=1)
+    tangent = reduce(model, model.constraint.free.T @ enriched).solve(moduli, q).tangent()
+    assert relative(tangent, system.solve(q).tangent()) < 1e-9
+
+
+def test_the_frozen_factor_certifies_the_reduced_answer(model, small):
+    frozen = model.system(np.array([1.0, 3.0]))
+    q = np.array([0.3, 1.0])
+    for ratio in (0.5, 2.0, 10.0):
+        moduli = np.array([1.0, ratio])
+        answer, truth = small.solve(moduli, q).values, model.solve(moduli, q).values
+        error = answer - truth
+        energies = [v @ model.forces(moduli, v[:, None])[:, 0] for v in (error, answer)]
+        assert np.sqrt(energies[0] / energies[1]) <= frozen.error_bound(moduli, answer[:, None])[0] < 0.1
+
+
+def test_selected_outputs_are_the_rows_of_all(small, rng):
+    moduli, q = np.array([1.0, 6.0]), np.array([1.0, 2.0])
+    dofs = rng.permutation(len(small.output_basis))[:30]
+    whole, part = small.solve(moduli, q), small.at(dofs).solve(moduli, q)
+    assert np.allclose(part.values, whole.values[dofs], atol=1e-13)
+    assert np.allclose(part.tangent(), whole.tangent()[dofs], atol=1e-13)
+
+
+def test_outputs_through_an_operator_are_its_product(small, rng):
+    operator = sparse.csr_matrix(rng.standard_normal((4, len(small.output_basis))))
+    moduli, q = np.array([1.0, 6.0]), np.array([1.0, 2.0])
+    whole, part = small.solve(moduli, q), small.through(operator).solve(moduli, q)
+    assert np.allclose(part.values, operator @ whole.values)
+    with pytest.raises(ConfigurationError, match="4 outputs"):
+        _ = part.displacement
+
+
+def test_repeated_and_empty_snapshots_add_no_basis_vector(rng):
+    snapshots = rng.standard_normal((50, 3))
+    vectors = orthonormal_basis(np.column_stack([snapshots, 1e6 * snapshots, np.zeros(50)]))
+    assert vectors.shape == (50, 3)
+    assert np.allclose(vectors.T @ vectors, np.eye(3), atol=1e-12)
+
+
+def test_a_basis_of_another_mesh_is_refused(model):
+    with pytest.raises(ConfigurationError, match="n_free"):
+        reduce(model, np.ones((5, 2)))
+
+
+def test_a_basis_of_nothing_is_refused():
+    with pytest.raises(ConfigurationError, match="non-zero"):
+        orthonormal_basis(np.zeros((5, 2)))
+
+
+def test_a_reduced_stiffness_that_is_not_definite_is_refused(small):
+    broken = type(small)(small.names, -small.stiffness, small.coupling, small.output_basis, small.output_given)
+    with pytest.raises(SolverError, match="not positive definite"):
+        broken.solve(np.ones(2), np.zeros(2))

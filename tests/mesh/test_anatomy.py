@@ -1,0 +1,86 @@
+import numpy as np
+import pytest
+
+from palpate.errors import GeometryError, InputDataError
+from palpate.images.label_image import VoxelGrid
+from palpate.images.segmentation import Segmentation
+from palpate.images.tissue import Role, Tissue
+from palpate.mesh.anatomy import Anatomy, Box, anatomy_of, domain_box, margin_box
+
+ORGAN = Tissue("organ", Role.ESTIMATE, (1,))
+DRIVER = Tissue("driver", Role.DRIVER, (2,))
+REST = Tissue("rest", Role.KNOWN, youngs_modulus_kpa=10.0)
+
+
+def _grid(shape=(20, 24, 28), spacing=(1.0, 1.0, 2.0), origin=(5.0, -3.0, 2.0)):
+    affine = np.diag([*spacing, 1.0])
+    affine[:3, 3] = origin
+    return VoxelGrid(shape, affine)
+
+
+def _touching_slabs():
+    grid = _grid()
+    index = np.full(grid.shape, 2, dtype=np.int16)
+    index[:, 6:12] = 0
+    index[:, 12:18] = 1
+    return Segmentation(index, grid, (ORGAN, DRIVER, REST))
+
+
+def test_the_domain_reaches_to_the_outer_faces_of_the_voxels():
+    box = domain_box([_grid()])
+    assert np.allclose(box.origin, [4.5, -3.5, 1.0])
+    assert np.allclose(box.lengths, [20.0, 24.0, 56.0])
+
+
+def test_the_domain_is_what_the_images_have_in_common():
+    box = domain_box([_grid(), _grid(origin=(9.0, -3.0, 2.0))])
+    assert np.allclose(box.origin, [8.5, -3.5, 1.0])
+    assert np.allclose(box.lengths, [16.0, 24.0, 56.0])
+
+
+def test_flipped_axes_give_the_same_domain():
+    affine = np.diag([-1.0, -1.0, 2.0, 1.0])
+    affine[:3, 3] = [24.0, 20.0, 2.0]
+    box, plain = domain_box([VoxelGrid((20, 24, 28), affine)]), domain_box([_grid()])
+    corners = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
+    reach = [b.world(corners * b.lengths) for b in (box, plain)]
+    assert np.allclose(np.sort(reach[0], axis=0), np.sort(reach[1], axis=0))
+
+
+def test_images_without_a_common_part_are_refused():
+    with pytest.raises(GeometryError, match="same place"):
+        domain_box([_grid(), _grid(origin=(500.0, 0.0, 0.0))])
+
+
+def test_the_margin_is_clipped_to_the_image():
+    box = domain_box([_grid()])
+    cut = margin_box(box, np.array([[6.0, 5.0, 30.0]]), margin_mm=5.0)
+    assert np.allclose(cut.origin, [4.5, 0.0, 25.0])
+    assert np.allclose(cut.lengths, [6.5, 10.0, 10.0])
+
+
+def test_a_level_set_crosses_the_tissue_that_wins():
+    segmentation = _touching_slabs()
+    anatomy = anatomy_of(segmentation, box=domain_box([segmentation.grid]), smoothing_mm=1.2)
+    assert anatomy.priority == (1, 0)
+    y = np.linspace(4.0, 14.0, 41)
+    points = np.column_stack([np.full(41, 14.0), y, np.full(41, 28.0)])
+    organ = anatomy.level_sets[0].at(points)
+    beside = (y > 6.0) & (y < 10.0)
+    assert (organ[beside] < 0.0).all(), "the organ's level set must run on under the driver that it touches"
+    assert set(anatomy.tissue_at(points[(y > 9.0) & (y < 14.0)])) == {1}
+
+
+def test_a_tissue_without_voxels_is_named():
+    segmentation = _touching_slabs()
+    empty = Segmentation(
+        np.where(segmentation.index == 1, 2, segmentation.index), segmentation.grid, segmentation.tissues
+    )
+    with pytest.raises(InputDataError, match="driver"):
+        anatomy_of(empty, box=domain_box([empty.grid]), smoothing_mm=1.2)
+
+
+def test_an_anatomy_has_one_filler():
+    box = Box(np.zeros(3), np.eye(3), np.ones(3))
+    with pytest.raises(GeometryError, match="exactly one"):
+        Anatomy((ORGAN, REST), (None, None), box)

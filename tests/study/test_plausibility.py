@@ -1,0 +1,56 @@
+"""Plausibility: published ranges are named with their source, units that slipped are noticed."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from palpate.study.case import Case
+from palpate.study.plausibility import PUBLISHED, plausibility_warnings, published_for, unit_warnings
+
+
+def test_every_published_value_has_range_method_and_source():
+    for entry in PUBLISHED:
+        assert 0 < entry.low <= entry.high
+        assert entry.method
+        assert entry.source
+
+
+@pytest.mark.parametrize(
+    ("name", "tissue"),
+    [("Prostate", "prostate"), ("urinary_bladder", "bladder wall"), ("prostate tumour", "prostate cancer")],
+)
+def test_names_find_their_tissue(name, tissue):
+    assert {entry.tissue for entry in published_for(name)} == {tissue}
+
+
+def test_an_unknown_tissue_is_not_judged():
+    assert plausibility_warnings({"spleen": 1e6}) == ()
+
+
+def test_a_value_within_the_published_range_is_not_warned_of():
+    assert plausibility_warnings({"prostate": 25.0}) == ()
+
+
+@pytest.mark.parametrize("value", [0.1, 1e5])
+def test_a_value_far_outside_is_warned_of_with_its_source(value):
+    (warning,) = plausibility_warnings({"prostate": value})
+    assert warning.code == "implausible-stiffness"
+    assert any(entry.source in warning.message for entry in published_for("prostate"))
+
+
+def test_a_filled_bladder_has_an_effective_modulus():
+    assert [w.code for w in plausibility_warnings({"bladder": 300.0})] == ["effective-modulus"]
+
+
+@pytest.mark.parametrize(("value", "hint"), [(10000000.0, "Pa, write 10000"), (0.01, "MPa, write 10")])
+def test_units_that_slipped_are_noticed(case_result, value, hint):
+    case: Case = case_result.case
+    known = dataclasses.replace(case.tissues[3], youngs_modulus_kpa=value)
+    (warning,) = unit_warnings(dataclasses.replace(case, tissues=(*case.tissues[:3], known)))
+    assert hint in warning.message
+
+
+def test_usual_units_pass(case_result):
+    assert unit_warnings(case_result.case) == ()

@@ -1,0 +1,276 @@
+"""The command line: exit codes by class of error, one JSON document on stdout, progress on stderr, no traceback."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import os
+import subprocess
+import sys
+import time
+import types
+import warnings
+
+import pytest
+
+import palpate.study
+from palpate import errors
+from palpate.cli import main
+from palpate.images.label_image import LabelImage
+from palpate.report import case_report
+from palpate.study.result import MeshResult, Simulation
+
+CASE = """
+[images]
+before = "before.nii.gz"
+after = ["after.nii.gz"]
+[tissues.prostate]
+label = 1
+role = "estimate"
+[tissues.surroundings]
+label = "remaining"
+role = "known"
+youngs_modulus_kpa = 10.0
+"""
+
+
+@pytest.fixture
+def case_file(tmp_path):
+    path = tmp_path / "case.toml"
+    path.write_text(CASE)
+    return path
+
+
+@pytest.fixture
+def runner(monkeypatch, case_result):
+    """Put functions in the place of those that compute; each gets the case and the progress callback."""
+
+    def estimate(_, *, progress):
+        progress("working")
+        return case_result
+
+    def install(**functions):
+        module = types.ModuleType("palpate.study.run")
+        for name, function in ({"estimate": estimate} | functions).items():
+            setattr(module, name, function)
+        monkeypatch.setitem(sys.modules, "palpate.study.run", module)
+        monkeypatch.setattr(palpate.study, "run", module, raising=False)
+
+    install()
+    return install
+
+
+@pytest.mark.usefixtures("runner")
+def test_an_estimate_writes_all_its_files(case_file, tmp_path, capfd):
+    assert main(["estimate", str(case_file), "--output", str(tmp_path / "out")]) == 0
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {"result.json", "report.html", "mesh.vtu", "stiffness.nii.gz", "log.txt"}
+    out, err = capfd.readouterr()
+    assert "58.9 kPa" in out
+    assert "47.1 to 73.6 kPa" in out
+    assert "warning: a warning to be shown" in out
+    assert "working" in err
+    assert "working" in (tmp_path / "out" / "log.txt").read_text()
+
+
+def test_with_json_stdout_is_result_json_and_nothing_else(case_file, tmp_path, runner, capfd, case_result):
+    def noisy(*_, **__):
+        os.write(1, b"a C library talks\n")
+        warnings.warn("a library warns", stacklevel=1)
+        return case_result
+
+    runner(estimate=noisy)
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        assert main(["estimate", str(case_file), "--output", str(tmp_path), "--json", "--quiet"]) == 0
+    out, err = capfd.readouterr()
+    assert json.loads(out) == json.loads((tmp_path / "result.json").read_text())
+    assert err == ""
+    log = (tmp_path / "log.txt").read_text()
+    assert "a C library talks" in log
+    assert "a library warns" in log
+
+
+@pytest.mark.usefixtures("runner")
+def test_quiet_leaves_nothing_but_errors(case_file, tmp_path, capfd):
+    assert main(["estimate", str(case_file), "--output", str(tmp_path), "--quiet"]) == 0
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (errors.ConfigurationError, 2),
+        (errors.InputDataError, 3),
+        (errors.GeometryError, 4),
+        (errors.MeshQualityError, 4),
+        (errors.SolverError, 5),
+        (errors.NotConverged, 5),
+        (errors.ResourceError, 6),
+        (MemoryError, 6),
+        (KeyboardInterrupt, 130),
+        (ZeroDivisionError, 1),
+    ],
+)
+def test_every_class_of_error_has_its_exit_code_and_no_traceback(case_file, tmp_path, runner, capfd, error, code):
+    def fail(*_, **__):
+        raise error("the organ is gone")
+
+    runner(estimate=fail)
+    (tmp_path / "stiffness.nii.gz").write_text("earlier")
+    assert main(["estimate", str(case_file), "--output", str(tmp_path), "--json"]) == code
+    out, err = capfd.readouterr()
+    document = json.loads(out)
+    assert "Traceback" not in err
+    assert err.startswith("palpate: ")
+    assert len(err.strip().splitlines()) == 1
+    assert document["schema"] == ("palpate.result/1" if code == 5 else "palpate.error/1")
+    assert (tmp_path / "stiffness.nii.gz").read_text() == "earlier"
+
+
+@pytest.mark.parametrize(("error", "status"), [(errors.NotConverged, "not converged"), (errors.SolverError, "failed")])
+def test_an_estimate_without_result_still_writes_its_file(case_file, tmp_path, runner, error, status):
+    def fail(*_, **__):
+        raise error("stopped after 40 steps")
+
+    runner(estimate=fail)
+    assert main(["estimate", str(case_file), "--output", str(tmp_path), "--quiet"]) == 5
+    document = json.loads((tmp_path / "result.json").read_text())
+    assert (document["status"], document["reason"]) == (status, "stopped after 40 steps")
+    assert [estimate["value"] for estimate in document["estimates"]] == [None]
+    assert "stopped after 40 steps" in (tmp_path / "report.html").read_text()
+
+
+def test_a_result_that_did_not_converge_ends_with_5(case_file, tmp_path, runner, case_result, capfd):
+    estimation = dataclasses.replace(case_result.estimation, status="not converged", reason="it stopped")
+    result = dataclasses.replace(case_result, estimation=estimation)
+    runner(estimate=lambda *_, **__: result)
+    assert main(["estimate", str(case_file), "--output", str(tmp_path)]) == 5
+    out, err = capfd.readouterr()
+    assert "58.9" not in out
+    assert "not converged: it stopped" in err
+    assert json.loads((tmp_path / "result.json").read_text())["estimates"][0]["value"] is None
+
+
+def test_a_bug_is_reported_with_the_place_of_its_log(case_file, tmp_path, runner, capfd):
+    def fail(*_, **__):
+        raise ZeroDivisionError("division by zero")
+
+    runner(estimate=fail)
+    assert main(["estimate", str(case_file), "--output", str(tmp_path)]) == 1
+    assert str(tmp_path / "log.txt") in capfd.readouterr().err
+    assert "Traceback" in (tmp_path / "log.txt").read_text()
+
+
+@pytest.mark.usefixtures("runner")
+def test_a_report_that_fails_does_not_sink_the_estimate(case_file, tmp_path, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("no ink")
+
+    monkeypatch.setattr(case_report, "write_case_report", fail)
+    assert main(["estimate", str(case_file), "--output", str(tmp_path), "--quiet"]) == 0
+    codes = [warning["code"] for warning in json.loads((tmp_path / "result.json").read_text())["warnings"]]
+    assert codes == ["example", "report"]
+
+
+@pytest.mark.usefixtures("runner")
+def test_a_bad_case_touches_nothing(tmp_path, capfd):
+    path = tmp_path / "case.toml"
+    path.write_text(CASE.replace("role", "rolle", 1))
+    assert main(["estimate", str(path), "--output", str(tmp_path / "out")]) == 2
+    assert capfd.readouterr().err.startswith("palpate: unknown key 'rolle' in [tissues.prostate]: did you mean 'role'?")
+    assert not (tmp_path / "out").exists()
+
+
+def test_overrides_reach_the_case(case_file, tmp_path, runner, case_result):
+    seen = []
+
+    def estimate(case, **_):
+        seen.append(case)
+        return case_result
+
+    runner(estimate=estimate)
+    arguments = [
+        "--output",
+        str(tmp_path),
+        "--quiet",
+        "--set",
+        "mesh.edge_length_mm=3",
+        "--set",
+        "mechanics.element=P1",
+    ]
+    assert main(["estimate", str(case_file), *arguments]) == 0
+    assert (seen[0].mesh.edge_length_mm, seen[0].mechanics.element) == (3.0, "P1")
+
+
+def test_mesh_and_simulate_write_their_files(case_file, tmp_path, runner, case_result, capfd):
+    r = case_result
+    image = LabelImage(r.before.index + 1, r.before.grid)
+    displacements = r.estimation.displacements * 2
+
+    def simulate(case, *, steps, **_):
+        assert steps == 2
+        return Simulation(
+            case=case,
+            space=r.space,
+            mesh_summary=r.mesh_summary,
+            displacements=displacements,
+            before=image,
+            after=image,
+            moduli_kpa={"prostate": 60.0},
+            provenance=r.provenance,
+        )
+
+    runner(mesh=lambda case, **_: MeshResult(case, r.space, r.mesh_summary, r.before, r.provenance), simulate=simulate)
+    assert main(["mesh", str(case_file), "--output", str(tmp_path / "m"), "--json"]) == 0
+    assert json.loads(capfd.readouterr().out)["mesh"]["tets"] == len(r.space.mesh.tets)
+    assert (tmp_path / "m" / "mesh.vtu").exists()
+    assert main(["simulate", str(case_file), "--output", str(tmp_path / "s"), "--steps", "2", "--quiet"]) == 0
+    assert {"after.nii.gz", "mesh.vtu", "mesh.pvd", "simulation.json"} <= {p.name for p in (tmp_path / "s").iterdir()}
+
+
+def test_the_demo_is_written_like_an_estimate(tmp_path, monkeypatch, case_result, capfd):
+    module = types.ModuleType("palpate.experiments.demo")
+    noted = dataclasses.replace(case_result, note="The later state is simulated.")
+    module.run_demo = lambda *_: noted
+    package = types.ModuleType("palpate.experiments")
+    package.demo = module
+    monkeypatch.setitem(sys.modules, "palpate.experiments", package)
+    monkeypatch.setitem(sys.modules, "palpate.experiments.demo", module)
+    assert main(["demo", "--output", str(tmp_path)]) == 0
+    out = capfd.readouterr().out
+    assert "The later state is simulated." in out
+    assert "60.0" in out  # the truth beside the estimate
+    assert (tmp_path / "report.html").exists()
+
+
+@pytest.mark.usefixtures("runner")
+def test_the_log_is_let_go_of(case_file, tmp_path):
+    main(["estimate", str(case_file), "--output", str(tmp_path), "--quiet"])
+    handlers = logging.getLogger("palpate").handlers
+    assert not [handler for handler in handlers if isinstance(handler, logging.FileHandler)]
+
+
+@pytest.mark.parametrize("arguments", [[], ["estimat"], ["estimate"], ["simulate", "x.toml", "--steps", "0"]])
+def test_wrong_usage_ends_with_2(arguments):
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    assert stop.value.code == 2
+
+
+@pytest.mark.usefixtures("runner")
+def test_an_output_folder_that_cannot_be_made_ends_with_6(case_file, tmp_path):
+    (tmp_path / "file").write_text("x")
+    assert main(["estimate", str(case_file), "--output", str(tmp_path / "file")]) == 6
+
+
+def test_help_is_quick():
+    heavy = {"numpy", "scipy", "matplotlib"}
+    code = f"import sys, palpate.cli as c; sys.exit(bool({heavy} & set(sys.modules)) or c.main(['--help']))"
+    began = time.monotonic()
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert time.monotonic() - began < 5.0
+    assert done.returncode == 0
+    for command in ("demo", "mesh", "simulate", "estimate"):
+        assert command in done.stdout
