@@ -1,1 +1,28 @@
-"""Palpate."""
+"""Palpate: how stiff each organ is, from segmented images of one body."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from palpate.study.case import Case
+    from palpate.study.case_file import read_case
+    from palpate.study.result import CaseResult
+    from palpate.study.run import estimate
+
+__all__ = ["Case", "CaseResult", "estimate", "read_case"]
+
+_HOMES = {
+    "Case": "palpate.study.case",
+    "CaseResult": "palpate.study.result",
+    "estimate": "palpate.study.run",
+    "read_case": "palpate.study.case_file",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used: the command line answers before numpy is loaded."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'palpate' has no attribute '{name}'")
+    return getattr(import_module(_HOMES[name]), name)

@@ -147,7 +147,7 @@ def _fits(inversion: Inversion, observed: Observed) -> tuple[tuple[TissueFit, ..
 def _surface_fit(line: Linearisation, dice: float) -> SurfaceFit:
     distance, weights = np.abs(line.residuals.values), line.residuals.weights
     order = np.argsort(distance)
-    share = np.cumsum(weights[order]) / weights.sum()
+    share = np.cumsum(weights[order]) / float(weights.sum())
     return SurfaceFit(
         mean_mm=float(np.average(distance, weights=weights)),
         rms_mm=float(np.sqrt(np.average(distance**2, weights=weights))),
@@ -158,7 +158,8 @@ def _surface_fit(line: Linearisation, dice: float) -> SurfaceFit:
 
 def _dice(model: NDArray[np.bool_], image: NDArray[np.bool_]) -> float:
     """Dice coefficient 2 |A and B| / (|A| + |B|)."""
-    return float(2.0 * np.count_nonzero(model & image) / max(np.count_nonzero(model) + np.count_nonzero(image), 1))
+    voxels = int(model.sum()) + int(image.sum())
+    return 2.0 * int((model & image).sum()) / max(voxels, 1)
 
 
 def _counts(inversion: Inversion) -> dict[str, int]:

@@ -86,9 +86,9 @@ def gauss_newton(
     """Minimise `objective` from `start` (n_unknowns,).
 
     Step: (J^T W J + P + mu D) d = -s, s the score, with the log-moduli's part no longer than the trust radius; a step
-    is taken when it reduces the objective (Nocedal & Wright 2006, Algorithm 4.1) or lowers by a tenth the decrement -s.d / 2, the
-    reduction that the quadratic model still promises in units of log-likelihood. It ends when that is under
-    `tolerance`. `hold_theta` moves the driver's coefficients only.
+    is taken when it reduces the objective (Nocedal & Wright 2006, Algorithm 4.1) or lowers by a tenth the decrement
+    -s.d / 2, the reduction that the quadratic model still promises in units of log-likelihood. It ends when that is
+    under `tolerance`. `hold_theta` moves the driver's coefficients only.
     """
     unknowns, region, history = start.copy(), _Region(), list[Iterate]()
     now = objective(unknowns)

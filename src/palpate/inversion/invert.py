@@ -128,7 +128,7 @@ def invert_with(
 
 
 def fit_driver(problem: InverseProblem, moduli: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """Displacements (n_points, 3) mm of each later image at given moduli (n_regions,) kPa; the driver's motion is fitted.
+    """Displacements (n_points, 3) mm of each later image at given moduli (n_regions,) kPa, the driver fitted to it.
 
     Raises `NotConverged` when the driver's wall cannot be brought to the images.
     """

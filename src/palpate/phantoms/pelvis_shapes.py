@@ -43,8 +43,7 @@ def draw_pelvis(rng: np.random.Generator, box: Box, *, bones: bool) -> PelvisSha
         if _fits(body, box, bones=bones):
             return body
     raise ConfigurationError(
-        f"no pelvis fits into a field of {np.round(box.lengths, 1).tolist()} mm; give at least 100 x 100 x 110 mm"
-        f"{' (120 mm from side to side with bones)' if bones else ''}"
+        f"no pelvis fits into a field of {np.round(box.lengths, 1).tolist()} mm; give at least 110 x 120 x 120 mm"
     )
 
 

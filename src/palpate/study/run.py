@@ -35,16 +35,17 @@ def silent(message: str) -> None:
     del message
 
 
-def estimate(case: Case, *, progress: Progress = silent) -> CaseResult:
+def estimate(case: Case, *, progress: Progress = silent, truth: Mapping[str, float] | None = None) -> CaseResult:
     """Estimate the Young's modulus of every `estimate` tissue of a case, from its images or its phantom.
 
+    `truth`: true moduli (kPa) by tissue, to stand beside the estimates of a simulation; a phantom brings its own.
     Raises `PalpateError`s of reading, meshing and solving; an iteration that did not converge is no error but a
     result whose status says so, with no values.
     """
     began = time.perf_counter()
     progress("reading and aligning the images")
     states = read_states(case)
-    truth = _truth(states) if case.phantom else None
+    truth = _truth(states) if case.phantom else truth
     seconds = time.perf_counter() - began
     result = estimate_states(states, case, progress=progress, truth=truth, read_seconds=seconds)
     provenance = replace(result.provenance, inputs=input_digests(case))
