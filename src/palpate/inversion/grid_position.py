@@ -11,11 +11,12 @@ from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue_distance import tissue_distance_map
 from palpate.inversion.invert import Inversion
+from palpate.inversion.objective import Linearisation
 from palpate.inversion.posterior import gain
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
 
-__all__ = ["FittedState", "grid_position_shifts"]
+__all__ = ["FittedState", "grid_position_shifts", "voxel_errors"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,34 +39,39 @@ def grid_position_shifts(
 ) -> NDArray[np.float64]:
     """Shifts (draws, n_parameters) of the estimated log-moduli when an exact model is imaged on random grids.
 
-    The fitted model, at rest and deformed, is turned into voxels on grids shifted at random by up to a voxel, and the
-    errors e of the distance maps at the model's surface go through the gain of one Gauss-Newton step, -2 G e: both
-    directions of the distance see the same error, and `gain` holds half the weight in each.
+    The errors e of the distance maps go through the gain of one Gauss-Newton step, -2 G e: both directions of the
+    distance see the same error, and `gain` holds half the weight in each.
     """
-    evaluation = inversion.minimum.evaluation
-    rows = gain(evaluation, inversion.objective.n_parameters)
+    rows = gain(inversion.minimum.evaluation, inversion.objective.n_parameters)
     shifts = np.zeros((draws, inversion.objective.n_parameters))
     for draw in range(draws):
-        number = 0
-        for state, fitted in zip(inversion.objective.states, states, strict=True):
-            before = _imaged(space, np.zeros_like(fitted.displacement), fitted.before, rng)
-            after = _imaged(space, fitted.displacement, fitted.after, rng)
-            for target in state.targets:
-                surface = evaluation.surfaces[number]
-                n = len(target.area)
-                rest = np.einsum(
-                    "qk,qka->qa",
-                    target.barycentric,
-                    target.surface.rest[target.surface.triangles[target.triangle]],
-                )
-                maps = [
-                    tissue_distance_map(image, target.surface.tissue, smoothing_mm=fitted.smoothing_mm)
-                    for image in (before, after)
-                ]
-                error = maps[1].at(surface.residuals.places[:n]) - maps[0].at(rest)
-                shifts[draw] -= 2.0 * rows[number][:, :n] @ error
-                number += 1
+        for row, error in zip(rows, voxel_errors(inversion, space, states, rng=rng), strict=True):
+            shifts[draw] -= 2.0 * row[:, : len(error)] @ error
     return shifts
+
+
+def voxel_errors(
+    inversion: Inversion, space: LagrangeSpace, states: tuple[FittedState, ...], *, rng: np.random.Generator
+) -> list[NDArray[np.float64]]:
+    """Errors (n_q,) mm of the model -> image residuals of each surface when the fitted model itself is imaged.
+
+    The model, at rest and deformed, is turned into voxels on grids shifted at random by up to half a voxel.
+    """
+    lines = iter(inversion.minimum.evaluation.surfaces)
+    errors = []
+    for state, fitted in zip(inversion.objective.states, states, strict=True):
+        before = _imaged(space, np.zeros_like(fitted.displacement), fitted.before, rng)
+        after = _imaged(space, fitted.displacement, fitted.after, rng)
+        errors += [_error(next(lines), before, after, fitted.smoothing_mm) for _ in state.targets]
+    return errors
+
+
+def _error(line: Linearisation, before: Segmentation, after: Segmentation, smoothing_mm: float) -> NDArray[np.float64]:
+    target = line.target
+    corners = target.surface.rest[target.surface.triangles[target.triangle]]
+    rest = np.einsum("qk,qka->qa", target.barycentric, corners)
+    maps = [tissue_distance_map(image, target.surface.tissue, smoothing_mm=smoothing_mm) for image in (before, after)]
+    return np.asarray(maps[1].at(line.residuals.places[: len(rest)]) - maps[0].at(rest))
 
 
 def _imaged(

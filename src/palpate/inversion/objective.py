@@ -165,9 +165,9 @@ class Objective:
             by_surface = tangent[rows][:, columns]
             jacobian[:, places] = np.asarray(residuals.normal_jacobian @ by_surface)
             weights = residuals.weights * _robust_weight(residuals.values, weighting.cutoff)
-            pull = weighting.precision * (residuals.jacobian.T @ (weights * residuals.values))
+            pull = np.asarray(residuals.jacobian.T @ (weighting.precision * weights * residuals.values))
             gradient = np.zeros(len(unknowns))
-            gradient[places] = by_surface.T @ pull
+            gradient[places] = np.asarray(by_surface.T @ pull)
             lines.append(Linearisation(residuals, jacobian, weights, weighting.precision, target, gradient))
         return lines
 

@@ -120,12 +120,26 @@ def level_set_volumes(anatomy: Anatomy) -> dict[str, float]:
     crossed = (np.abs(values) < reach).any(axis=0)
     total = cell * _shares(values[:, ~crossed], 1e-9).sum(axis=1)
     fine = (_cell_centres(np.full(3, FINE_CELLS)) / FINE_CELLS - 0.5) * (lengths / counts)
-    for block in np.array_split(centres[crossed], max(1, int(crossed.sum()) // 200)):
-        points = (block[:, None] + fine).reshape(-1, 3)
+    for block in np.array_split(np.flatnonzero(crossed), max(1, int(crossed.sum()) // 200)):
+        points = anatomy.box.world((centres[block][:, None] + fine).reshape(-1, 3))
         edge = cell ** (1 / 3) / FINE_CELLS
-        total += cell / FINE_CELLS**3 * _shares(anatomy.values(anatomy.box.world(points)), edge).sum(axis=1)
+        inside = _refined(anatomy, points, values[:, block], reach)
+        total += cell / FINE_CELLS**3 * _shares(inside, edge).sum(axis=1)
     order = (*anatomy.priority, anatomy.filler)
     return {anatomy.tissues[i].name: float(total[rank]) for rank, i in enumerate(order)}
+
+
+def _refined(
+    anatomy: Anatomy, points: NDArray[np.float64], coarse: NDArray[np.float64], reach: float
+) -> NDArray[np.float64]:
+    """Level sets (n_tissues - 1, n) at points (n, 3); `coarse` values where a cell is not crossed by one."""
+    values = np.repeat(coarse, FINE_CELLS**3, axis=1)
+    for rank, tissue in enumerate(anatomy.priority):
+        near = np.abs(values[rank]) < reach
+        phi = anatomy.level_sets[tissue]
+        if phi is not None and near.any():
+            values[rank, near] = phi.at(points[near])
+    return values
 
 
 def _cell_centres(counts: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -125,10 +125,9 @@ def _smooth_normals(
 ) -> NDArray[np.float64]:
     """Unit normals (n, 3) interpolated from area-weighted ones at the corners (n, 3) of the places' triangles."""
     faces = triangle_normals(vertices, triangles)
-    at_vertices = np.stack(
-        [np.bincount(triangles.ravel(), np.repeat(faces[:, a], 3), minlength=len(vertices)) for a in range(3)], axis=1
-    )
-    at_vertices /= np.maximum(np.linalg.norm(at_vertices, axis=1, keepdims=True), 1e-30)
+    columns = [np.bincount(triangles.ravel(), np.repeat(faces[:, a], 3), minlength=len(vertices)) for a in range(3)]
+    summed = np.stack(columns, axis=1).astype(np.float64)
+    at_vertices = summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-30)
     normals = np.einsum("nk,nka->na", barycentric, at_vertices[corners])
     return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30))
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.images.distance import DistanceMap
 from palpate.images.isosurface import isosurface_points
+from palpate.mesh.anatomy import LevelSet
 from palpate.mesh.surface import triangle_normals
 from palpate.observation.observed_surface import ObservedSurface
 
-__all__ = ["SurfaceTarget", "surface_target"]
+__all__ = ["QUADRATURE", "SurfaceTarget", "surface_target", "target_from"]
 
 # Strang & Fix 1973: three interior points, exact for quadratics
 QUADRATURE = np.array([[4.0, 1.0, 1.0], [1.0, 4.0, 1.0], [1.0, 1.0, 4.0]]) / 6.0
@@ -28,8 +29,8 @@ class SurfaceTarget:
     """
 
     surface: ObservedSurface
-    before: DistanceMap
-    after: DistanceMap
+    before: LevelSet
+    after: LevelSet
     triangle: NDArray[np.int64]
     barycentric: NDArray[np.float64]
     area: NDArray[np.float64]
@@ -45,16 +46,29 @@ def surface_target(surface: ObservedSurface, before: DistanceMap, after: Distanc
     The later surface is taken where `after` equals the mean of `before` over the model's rest surface, so that a bias
     common to both maps changes nothing.
     """
+    rest = target_from(surface, before, after, level=0.0, image=(np.zeros((0, 3)), np.zeros(0)))
+    level = float(np.average(rest.rest_distance, weights=rest.area))
+    points = isosurface_points(after, level)
+    return replace(rest, level=level, image_points=points.places, image_area=points.area)
+
+
+def target_from(
+    surface: ObservedSurface,
+    before: LevelSet,
+    after: LevelSet,
+    *,
+    level: float,
+    image: tuple[NDArray[np.float64], NDArray[np.float64]],
+) -> SurfaceTarget:
+    """Make a target from any two distances and from points (n_i, 3) mm with areas (n_i,) mm^2 of the later surface.
+
+    level (mm): where `after` is on those points.
+    """
     seen = np.flatnonzero(surface.observed)
     triangle = np.repeat(seen, len(QUADRATURE))
     barycentric = np.tile(QUADRATURE, (len(seen), 1))
     size = np.linalg.norm(triangle_normals(surface.rest, surface.triangles[seen]), axis=1)
     area = np.repeat(size / len(QUADRATURE), len(QUADRATURE))
-    # (n_q, 3 corners, 3 axes) -> (n_q, 3)
+    # (n_q, 3 corners) x (n_q, 3 corners, 3 axes) -> (n_q, 3)
     places = np.einsum("qk,qka->qa", barycentric, surface.rest[surface.triangles[triangle]])
-    rest_distance = before.at(places)
-    level = float(np.average(rest_distance, weights=area))
-    points = isosurface_points(after, level)
-    return SurfaceTarget(
-        surface, before, after, triangle, barycentric, area, rest_distance, level, points.places, points.area
-    )
+    return SurfaceTarget(surface, before, after, triangle, barycentric, area, before.at(places), level, *image)

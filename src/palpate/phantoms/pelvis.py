@@ -16,7 +16,7 @@ from palpate.phantoms.pelvis_shapes import PelvisShapes, draw_pelvis
 from palpate.phantoms.scene import Noise, Scene, centred_grid, grid_box, make_scene
 from palpate.phantoms.shapes import Ellipsoid, rotation_about
 
-__all__ = ["PelvisOptions", "pelvis"]
+__all__ = ["PelvisOptions", "pelvis", "pelvis_anatomy"]
 
 SURROUNDINGS_KPA = 10.0
 STRAY = 0.05  # non-radial motion of the rectum's wall, standard deviation a component in parts of the filling
@@ -53,17 +53,26 @@ def pelvis(options: PelvisOptions) -> Scene:
     that tumour, noise or voxel size leave the rest of the body as it is. Raises `GeometryError` when the truth folds
     over, `ConfigurationError` for a field that is too small or a modulus for an unknown tissue.
     """
-    shape_rng, material_rng, motion_rng = np.random.default_rng(options.seed).spawn(3)
+    motion_rng = np.random.default_rng(options.seed).spawn(3)[2]
     grid = centred_grid(options.field_mm, options.spacing_mm)
-    box = grid_box(grid)
-    body = draw_pelvis(shape_rng, box, bones=options.bones)
-    parts = _parts(body, options)
-    tissues = _tissues(tuple(parts), options, material_rng)
-    anatomy = Anatomy(tissues, tuple(parts.values()), box)
-    motions = _motions(body, options, motion_rng)
+    motions = _motions(_body(options), options, motion_rng)
+    anatomy = pelvis_anatomy(options)
     return make_scene(
         anatomy, motions, grid, edge_length_mm=options.truth_edge_mm, noise=options.noise, seed=options.seed
     )
+
+
+def pelvis_anatomy(options: PelvisOptions) -> Anatomy:
+    """The analytic shapes, tissues and true moduli of `options`, in the box of the images' voxels."""
+    parts = _parts(_body(options), options)
+    material_rng = np.random.default_rng(options.seed).spawn(3)[1]
+    tissues = _tissues(tuple(parts), options, material_rng)
+    return Anatomy(tissues, tuple(parts.values()), grid_box(centred_grid(options.field_mm, options.spacing_mm)))
+
+
+def _body(options: PelvisOptions) -> PelvisShapes:
+    shape_rng = np.random.default_rng(options.seed).spawn(3)[0]
+    return draw_pelvis(shape_rng, grid_box(centred_grid(options.field_mm, options.spacing_mm)), bones=options.bones)
 
 
 def _parts(body: PelvisShapes, options: PelvisOptions) -> dict[str, LevelSet | None]:

@@ -25,7 +25,7 @@ from palpate.study.result import CaseResult, MeshResult, Provenance
 from palpate.study.simulate import simulate
 from palpate.study.summary import mesh_summary
 
-__all__ = ["estimate", "estimate_states", "mesh", "simulate"]
+__all__ = ["estimate", "estimate_states", "fitted_states", "inversion_settings", "mesh", "simulate"]
 
 Progress = Callable[[str], None]
 
@@ -69,10 +69,10 @@ def estimate_states(
     clock.append(time.perf_counter())
     problem = inverse_problem(body, case, progress=progress)
     clock.append(time.perf_counter())
-    settings = _settings(case, problem.modulus_map)
+    settings = inversion_settings(case, problem.modulus_map)
     inversion = invert(problem, settings, progress=progress)
     progress("intervals: residuals' correlation, grid position, driver")
-    observed = Observed(body.space, _fitted(inversion, body), tuple(image.index for image in states.after))
+    observed = Observed(body.space, fitted_states(inversion, body), tuple(image.index for image in states.after))
     estimation = conclude(inversion, settings, observed, truth=truth or {}, seed=case.seed)
     clock.append(time.perf_counter())
     stages = np.diff(clock)
@@ -101,7 +101,7 @@ def mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
     return MeshResult(case, body.space, mesh_summary(body), states.before, provenance, _remarks(states, case))
 
 
-def _settings(case: Case, mapping: ModulusMap) -> InversionSettings:
+def inversion_settings(case: Case, mapping: ModulusMap) -> InversionSettings:
     """Starts and bounds as theta; those in kPa are divided by the scale's modulus."""
     scale = mapping.scale_kpa
     options = case.estimate
@@ -116,7 +116,7 @@ def _settings(case: Case, mapping: ModulusMap) -> InversionSettings:
     return InversionSettings(tuple(np.full(n, np.log(start)) for start in starts), limits, options.method, law)
 
 
-def _fitted(inversion: Inversion, body: Body) -> tuple[FittedState, ...]:
+def fitted_states(inversion: Inversion, body: Body) -> tuple[FittedState, ...]:
     """Displacements of the whole mesh at the estimate, with the grids that they were seen on."""
     objective, unknowns = inversion.objective, inversion.minimum.unknowns
     moduli = objective.modulus_map.moduli(unknowns[: objective.n_parameters])

@@ -1,0 +1,306 @@
+"""How near the estimates come to the truth: same mesh, other mesh, voxels, noise, a tumour, a small filling.
+
+    python benchmarks/accuracy.py [--rows clean,noise,...] [--cases N] [--first-seed S] [--output FILE] [--json]
+
+Every row draws random pelves (shape, position, orientation to the voxel grid, moduli 1.5 to 6 times the surroundings,
+Poisson's ratios 0.40 to 0.45) by seed. The truth is made on a finer mesh than the one that inverts it. Each case is
+appended to FILE (JSON lines) as soon as it is done, and a case that is there is not computed again. Simulated data.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.images.segmentation import segment
+from palpate.images.tissue import Role
+from palpate.inversion.conclude import GRID_DRAWS, Observed, conclude
+from palpate.inversion.grid_position import FittedState, grid_position_shifts, voxel_errors
+from palpate.inversion.invert import InverseProblem, Inversion, invert
+from palpate.inversion.modulus_map import modulus_map
+from palpate.inversion.noise import NoiseLaw, fit_noise_law
+from palpate.inversion.posterior import cramer_rao
+from palpate.mechanics.boundary import outer_constraint
+from palpate.mechanics.linear_model import linear_model
+from palpate.mesh.space import LagrangeSpace, lagrange_space
+from palpate.mesh.surface import triangle_normals
+from palpate.mesh.tetrahedralise import tetrahedralise
+from palpate.observation.observed_surface import observed_surface
+from palpate.observation.prescribed_motion import prescribed_motion
+from palpate.phantoms.exact_targets import exact_target
+from palpate.phantoms.pelvis import PelvisOptions, pelvis, pelvis_anatomy
+from palpate.phantoms.scene import Noise, Scene
+from palpate.study.body import aligned, inverse_problem, make_body
+from palpate.study.case import Case, MeshSettings, Phantom
+from palpate.study.run import fitted_states, inversion_settings
+
+NOISE = Noise(surface_sd_mm=0.3, correlation_length_mm=6.0)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of the table: how scenes are drawn, and what is shown to the estimate."""
+
+    cases: int
+    filling_mm: tuple[float, float] = (6.0, 8.0)
+    spacing_mm: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    noise: Noise | None = None
+    tumour: bool = False
+    data: str = "voxels"
+    edge_mm: float = 4.0
+
+
+ROWS = {
+    "same-mesh": Row(2, data="same mesh"),
+    "other-mesh-fine": Row(2, data="surfaces", edge_mm=2.7),
+    "other-mesh": Row(4, data="surfaces"),
+    "clean": Row(8),
+    "clean-3mm": Row(4, filling_mm=(3.0, 3.0)),
+    "noise": Row(20, spacing_mm=(1.0, 1.0, 2.5), noise=NOISE),
+    "tumour": Row(3, tumour=True),
+}
+
+
+def main() -> int:
+    """Run the rows that were asked for and print their summaries."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rows", default=",".join(ROWS))
+    parser.add_argument("--cases", type=int, help="cases a row instead of the row's own number")
+    parser.add_argument("--first-seed", type=int, default=101)
+    parser.add_argument("--output", type=Path, default=Path("accuracy.jsonl"))
+    parser.add_argument("--json", action="store_true", help="print one JSON document")
+    arguments = parser.parse_args()
+    done = _read(arguments.output)
+    summaries = {}
+    for name in arguments.rows.split(","):
+        row = ROWS[name]
+        seeds = range(arguments.first_seed, arguments.first_seed + (arguments.cases or row.cases))
+        for seed in seeds:
+            if (name, seed) not in done:
+                done[name, seed] = _case(name, row, seed)
+                with arguments.output.open("a") as file:
+                    file.write(json.dumps(done[name, seed]) + "\n")
+            _say(_line(done[name, seed]))
+        summaries[name] = _summary([done[name, seed] for seed in seeds])
+        _say(f"{name}: {json.dumps(summaries[name])}")
+    print(json.dumps({"rows": summaries}, indent=1) if arguments.json else _table(summaries))
+    return 0
+
+
+def _case(name: str, row: Row, seed: int) -> dict[str, object]:
+    """Make one scene, estimate it, and hold the estimate beside the truth."""
+    began = time.perf_counter()
+    filling = float(np.random.default_rng([seed, 7]).uniform(*row.filling_mm))
+    options = PelvisOptions(
+        seed=seed, filling_mm=filling, spacing_mm=row.spacing_mm, noise=row.noise, tumour=row.tumour
+    )
+    scene = pelvis(options)
+    scene_seconds = time.perf_counter() - began
+    case = Case(f"{name}-{seed}", phantom=Phantom("pelvis", seed), mesh=MeshSettings(row.edge_mm))
+    if row.data == "voxels":
+        space, problem, states = _from_voxels(scene, case)
+    else:
+        space, problem, states = _from_surfaces(scene, case, options, same_mesh=row.data == "same mesh")
+    settings = inversion_settings(case, problem.modulus_map)
+    estimated = time.perf_counter()
+    inversion = invert(problem, settings, progress=lambda _: None)
+    seconds = time.perf_counter() - estimated
+    result = {
+        "row": name,
+        "seed": seed,
+        "filling_mm": filling,
+        "dofs": 3 * len(space.points),
+        "truth_dofs": 3 * len(scene.space.points),
+        "scene_seconds": scene_seconds,
+        "estimate_seconds": seconds,
+        "outcome": inversion.minimum.outcome.name,
+        "starts": [int(group) for group in inversion.groups],
+    }
+    result |= _errors(inversion, scene)
+    if states:
+        result |= _uncertainty(inversion, space, states, scene, settings, row)
+        result |= _driver_error(inversion, space, scene)
+    return result
+
+
+def _from_voxels(scene: Scene, case: Case) -> tuple[LagrangeSpace, InverseProblem, tuple[object, ...]]:
+    before, after = (segment(image, scene.tissues) for image in (scene.before, scene.after))
+    states = aligned(before, (after,), method="none")
+    body = make_body(states, case, progress=lambda _: None)
+    return body.space, inverse_problem(body, case, progress=lambda _: None), (body,)
+
+
+def _from_surfaces(
+    scene: Scene, case: Case, options: PelvisOptions, *, same_mesh: bool
+) -> tuple[LagrangeSpace, InverseProblem, tuple[object, ...]]:
+    """The truth's surfaces as targets; on the same mesh also a wall motion that the modes can make."""
+    if same_mesh:
+        space = lagrange_space(scene.mesh, "P2")
+    else:
+        space = lagrange_space(tetrahedralise(pelvis_anatomy(options), edge_length_mm=case.mesh.edge_length_mm), "P2")
+    driver = case.driver
+    motion = prescribed_motion(space, {}, n_modes=driver.modes, kernel_mm=driver.kernel_mm, prior_mm=driver.prior_mm)
+    constraint = outer_constraint(
+        space, outer="fixed", modes=motion.modes, offset=motion.offset, prescribed=motion.prescribed
+    )
+    model = linear_model(space, constraint)
+    if same_mesh:
+        rows = np.repeat(motion.prescribed, 3)
+        q = np.linalg.lstsq(motion.modes[rows], scene.displacement.ravel()[rows], rcond=None)[0]
+        moduli = np.array([t.youngs_modulus_kpa for t in scene.tissues if t.meshed])
+        scene = replace(scene, displacement=model.solve(moduli, q).displacement)
+    observed = [i for i, t in enumerate(scene.tissues) if t.role in (Role.ESTIMATE, Role.DRIVER)]
+    targets = tuple(exact_target(scene, observed_surface(space, i)) for i in observed)
+    estimated = frozenset(t.name for t in scene.tissues if t.role is Role.ESTIMATE)
+    return space, InverseProblem((model,), (targets,), modulus_map(scene.tissues, model.regions), estimated), ()
+
+
+def _errors(inversion: Inversion, scene: Scene) -> dict[str, object]:
+    mapping = inversion.objective.modulus_map
+    theta = inversion.minimum.unknowns[: len(mapping.tissues)]
+    truth = np.array([scene.moduli_kpa[name] / scene.moduli_kpa[mapping.relative_to] for name in mapping.tissues])
+    return {
+        "tissues": list(mapping.tissues),
+        "truth_ratio": truth.tolist(),
+        "ratio": np.exp(theta).tolist(),
+        "ln_error": (theta - np.log(truth)).tolist(),
+        "law": {"sd_mm": inversion.law.sd, "correlation_area_mm2": inversion.law.correlation_area},
+    }
+
+
+def _uncertainty(
+    inversion: Inversion, space: LagrangeSpace, bodies: tuple, scene: Scene, settings: object, row: Row
+) -> dict[str, object]:
+    """Interval, spread of an exact model over grid positions, and the Cramer-Rao limit of this scene's noise."""
+    fitted = fitted_states(inversion, bodies[0])
+    images = tuple(image.index for image in bodies[0].states.after)
+    estimation = conclude(inversion, settings, Observed(space, fitted, images), truth=scene.moduli_kpa, seed=scene.seed)
+    n = inversion.objective.n_parameters
+    rng = np.random.default_rng([scene.seed, 11])
+    shifts = grid_position_shifts(inversion, space, fitted, draws=2 * GRID_DRAWS, rng=rng)
+    found = {
+        "interval95": [e.ratio_interval95 for e in estimation.estimates],
+        "verdict": [e.verdict for e in estimation.estimates],
+        "sd": np.sqrt(np.diag(estimation.covariance)).tolist(),
+        "grid_sd": np.sqrt(np.mean(shifts**2, axis=0)).tolist(),
+    }
+    if row.noise is not None:
+        limit = cramer_rao(inversion.minimum.evaluation, _true_law(inversion, space, fitted, row.noise, rng), n)
+        found["cramer_rao_sd"] = np.sqrt(np.diag(limit)).tolist()
+    return found
+
+
+def _true_law(
+    inversion: Inversion,
+    space: LagrangeSpace,
+    fitted: tuple[FittedState, ...],
+    noise: Noise,
+    rng: np.random.Generator,
+) -> NoiseLaw:
+    """The noise that was put into both images, and that of the voxels as measured on the fitted model."""
+    errors = voxel_errors(inversion, space, fitted, rng=rng)
+    lines = inversion.minimum.evaluation.surfaces
+    sizes = [len(error) for error in errors]
+    voxels = fit_noise_law(
+        errors,
+        [line.residuals.places[:n] for line, n in zip(lines, sizes, strict=True)],
+        [line.residuals.normals[:n] for line, n in zip(lines, sizes, strict=True)],
+    )
+    smooth = 2.0 * noise.surface_sd_mm**2
+    return NoiseLaw(np.append(voxels.variances, smooth), np.append(voxels.lengths, noise.correlation_length_mm))
+
+
+def _driver_error(inversion: Inversion, space: LagrangeSpace, scene: Scene) -> dict[str, object]:
+    """RMS error (mm) of the estimated wall motion, normal and tangential parts, area-weighted."""
+    objective, unknowns = inversion.objective, inversion.minimum.unknowns
+    moduli = objective.modulus_map.moduli(unknowns[: objective.n_parameters])
+    motion = inversion.surrogates[0].reduced.solve(moduli, objective.coefficients(unknowns)[0]).displacement
+    index = next(i for i, t in enumerate(scene.tissues) if t.role is Role.DRIVER)
+    surface = observed_surface(space, index)
+    error = motion[surface.points] - scene.motions[scene.tissues[index].name].at(surface.rest)
+    faces = triangle_normals(surface.rest, surface.triangles)
+    area = np.linalg.norm(faces, axis=1)
+    at_faces = error[surface.triangles].mean(axis=1)
+    normal = np.einsum("fa,fa->f", at_faces, faces / area[:, None])
+    total = np.sum(at_faces**2, axis=1)
+    return {
+        "driver_normal_rms_mm": float(np.sqrt(np.average(normal**2, weights=area))),
+        "driver_tangential_rms_mm": float(np.sqrt(np.average(np.maximum(total - normal**2, 0.0), weights=area))),
+    }
+
+
+def _summary(results: list[dict]) -> dict[str, object]:
+    errors = np.concatenate([r["ln_error"] for r in results])
+    found: dict[str, object] = {
+        "cases": len(results),
+        "moduli": len(errors),
+        "rms_ln_error": _rms(errors),
+        "worst_ln_error": float(np.abs(errors).max()),
+        "mean_ln_error": float(errors.mean()),
+        "all_converged": all(r["outcome"] in ("CONVERGED", "STALLED") for r in results),
+        "estimate_seconds": float(np.mean([r["estimate_seconds"] for r in results])),
+        "dofs": int(np.mean([r["dofs"] for r in results])),
+    }
+    if "sd" in results[0]:
+        truth = np.concatenate([r["truth_ratio"] for r in results])
+        ends = [end for r in results for end in r["interval95"]]
+        inside = [(low or 0.0) <= t <= (high or np.inf) for (low, high), t in zip(ends, truth, strict=True)]
+        found |= {
+            "grid_spread_rms": _rms(np.concatenate([r["grid_sd"] for r in results])),
+            "inside_95": float(np.mean(inside)),
+            "driver_normal_rms_mm": float(np.mean([r["driver_normal_rms_mm"] for r in results])),
+            "driver_tangential_rms_mm": float(np.mean([r["driver_tangential_rms_mm"] for r in results])),
+        }
+    if "cramer_rao_sd" in results[0]:
+        limit = np.concatenate([r["cramer_rao_sd"] for r in results])
+        sd = np.concatenate([r["sd"] for r in results])
+        found |= {"cramer_rao_rms": _rms(limit), "median_width_over_cramer_rao": float(np.median(sd / limit))}
+    return found
+
+
+def _rms(values: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _line(result: dict) -> str:
+    errors = ", ".join(
+        f"{name} {100 * error:+.2f} %" for name, error in zip(result["tissues"], result["ln_error"], strict=True)
+    )
+    seconds = f"scene {result['scene_seconds']:.0f} s, estimate {result['estimate_seconds']:.0f} s"
+    return f"{result['row']} {result['seed']}: {errors} ({result['outcome']}, {result['dofs']} dof; {seconds})"
+
+
+def _table(summaries: dict[str, dict]) -> str:
+    lines = ["row | moduli | RMS ln-error | worst | grid spread | Cramer-Rao | inside 95 % | converged"]
+    for name, row in summaries.items():
+        cells = [
+            name,
+            str(row["moduli"]),
+            f"{row['rms_ln_error']:.4f}",
+            f"{row['worst_ln_error']:.4f}",
+            *(f"{row[key]:.3f}" if key in row else "-" for key in ("grid_spread_rms", "cramer_rao_rms", "inside_95")),
+            str(row["all_converged"]),
+        ]
+        lines.append(" | ".join(cells))
+    return "\n".join(lines)
+
+
+def _read(path: Path) -> dict[tuple[str, int], dict]:
+    lines = path.read_text().splitlines() if path.exists() else []
+    results = [json.loads(line) for line in lines]
+    return {(result["row"], result["seed"]): result for result in results}
+
+
+def _say(message: str) -> None:
+    print(message, file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
