@@ -1,125 +1,107 @@
-"""Twin problems: two balls beside a driver, with targets that are exact or go through voxels."""
+"""Twin problems: two balls beside a driver, deformed and observed on one mesh, exactly or through voxels."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import igl
 import numpy as np
 
-from palpate.images.segmentation import Segmentation
+from palpate.images.segmentation import segment
 from palpate.images.tissue import Role, Tissue
 from palpate.images.tissue_distance import tissue_distance_map
 from palpate.inversion.gauss_newton import Bounds
 from palpate.inversion.invert import InverseProblem, InversionSettings
 from palpate.inversion.modulus_map import modulus_map
 from palpate.mechanics.boundary import outer_constraint
-from palpate.mechanics.linear_model import linear_model
+from palpate.mechanics.linear_model import LinearModel, linear_model
 from palpate.mesh.anatomy import Anatomy, Box
 from palpate.mesh.space import lagrange_space
-from palpate.mesh.surface import triangle_normals
 from palpate.mesh.tetrahedralise import tetrahedralise
-from palpate.mesh.voxelise import voxelise
 from palpate.observation.observed_surface import observed_surface
 from palpate.observation.prescribed_motion import prescribed_motion
-from palpate.observation.target import QUADRATURE, SurfaceTarget, surface_target
-from palpate.phantoms.scene import centred_grid
+from palpate.observation.target import surface_target
+from palpate.phantoms.exact_targets import exact_target
+from palpate.phantoms.scene import Scene, centred_grid, imaged
 from palpate.phantoms.shapes import ball
 
-GLAND = Tissue("gland", Role.ESTIMATE, (1,))
-SAC = Tissue("sac", Role.ESTIMATE, (2,))
-TUBE = Tissue("tube", Role.DRIVER, (3,))
-REST = Tissue("rest", Role.KNOWN, youngs_modulus_kpa=10.0)
 BALLS = (ball([0.0, -9.0, -4.0], 8.0), ball([0.0, -4.0, 11.0], 7.0), ball([0.0, 9.0, -2.0], 7.0))
-HALF = 22.0
-TRUTH = np.log([3.0, 2.0])  # of gland and sac, to the rest
-WALL = 3.0  # mm by which the wall moves, about
-
-
-@dataclass(frozen=True)
-class FacetedDistance:
-    """Exact signed distance to a closed triangulated surface, in place of a `DistanceMap`."""
-
-    vertices: np.ndarray
-    triangles: np.ndarray
-    bias: float = 0.0
-
-    def at(self, points):
-        return self._closest(points)[0] + self.bias
-
-    def gradient_at(self, points):
-        distance, face, places = self._closest(points)
-        normals = triangle_normals(self.vertices, self.triangles)[face]
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        far = np.abs(distance) > 1e-9
-        away = (points - places) / np.where(far, distance, 1.0)[:, None]
-        return np.where(far[:, None], away, normals)
-
-    def _closest(self, points):
-        return igl.signed_distance(
-            np.ascontiguousarray(points),
-            np.ascontiguousarray(self.vertices),
-            np.ascontiguousarray(self.triangles),
-            sign_type=igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL,
-        )[:3]
-
-
-def exact_target(surface, displacement) -> SurfaceTarget:
-    """Target whose images are the model's own triangles, at rest and under `displacement` (n_vertices, 3)."""
-    seen = np.flatnonzero(surface.observed)
-    triangle, barycentric = np.repeat(seen, 3), np.tile(QUADRATURE, (len(seen), 1))
-    moved = surface.rest + displacement
-    size = np.linalg.norm(triangle_normals(surface.rest, surface.triangles[seen]), axis=1)
-    places = np.einsum("qk,qka->qa", barycentric, moved[surface.triangles[triangle]])
-    before, after = (FacetedDistance(points, surface.triangles) for points in (surface.rest, moved))
-    area = np.repeat(size / 3.0, 3)
-    return SurfaceTarget(
-        surface, before, after, triangle, barycentric, area, np.zeros(len(area)), 0.0, places, area.copy()
-    )
+BOX = Box(np.full(3, -22.0), np.eye(3), np.full(3, 44.0))
+TRUTH = np.log([3.0, 2.0])  # moduli of gland and sac, to the rest's
+WALL_MM = 3.0
+SMOOTHING = 0.6  # voxels
 
 
 @dataclass(frozen=True)
 class Twin:
-    """A problem, what it was made of, and the truth: moduli (kPa), mode coefficients and displacement (mm)."""
+    """A deformed body: its model, its scene, moduli (kPa) and mode coefficients that deformed it."""
 
-    problem: InverseProblem
+    model: LinearModel
+    scene: Scene
     moduli: np.ndarray
     coefficients: np.ndarray
-    displacement: np.ndarray
-    space: object
+
+    @property
+    def surfaces(self):
+        return [observed_surface(self.scene.space, tissue) for tissue in range(3)]
+
+    @property
+    def unknowns(self):
+        return np.concatenate([TRUTH, self.coefficients])
 
 
-def tissues_of(*, known: bool):
-    return (GLAND, SAC, TUBE, REST if known else Tissue("rest", Role.ESTIMATE))
-
-
-def space_of(edge_length_mm, *, known=True, element="P1"):
-    anatomy = Anatomy(tissues_of(known=known), (*BALLS, None), Box(np.full(3, -HALF), np.eye(3), np.full(3, 2 * HALF)))
-    return lagrange_space(tetrahedralise(anatomy, edge_length_mm=edge_length_mm), element)
-
-
-def model_of(space, n_modes):
-    motion = prescribed_motion(space, {}, n_modes=n_modes, kernel_mm=12.0, prior_mm=WALL)
-    constraint = outer_constraint(
-        space, outer="fixed", modes=motion.modes, offset=motion.offset, prescribed=motion.prescribed
+def make_twin(*, element="P1", rest_kpa=10.0, voxel_mm=1.5, seed=5, edge_length_mm=6.0) -> Twin:
+    """The driver pushes gland and sac; where `rest_kpa` is None, the rest is to be estimated, too."""
+    tissues = (
+        Tissue("gland", Role.ESTIMATE, (1,)),
+        Tissue("sac", Role.ESTIMATE, (2,)),
+        Tissue("tube", Role.DRIVER, (3,)),
+        Tissue("rest", Role.KNOWN if rest_kpa else Role.ESTIMATE, (4,), youngs_modulus_kpa=rest_kpa),
     )
-    return linear_model(space, constraint)
+    mesh = tetrahedralise(Anatomy(tissues, (*BALLS, None), BOX), edge_length_mm=edge_length_mm)
+    space = lagrange_space(mesh, element)
+    motion = prescribed_motion(space, {}, n_modes=12, kernel_mm=12.0, prior_mm=WALL_MM)
+    given = {"modes": motion.modes, "offset": motion.offset, "prescribed": motion.prescribed}
+    model = linear_model(space, outer_constraint(space, outer="fixed", **given))
+    return deformed(model, voxel_mm=voxel_mm, seed=seed)
 
 
-def exact_twin(space, *, n_modes=12, theta=TRUTH) -> Twin:
-    """The same mesh makes the data and reads them."""
-    model = model_of(space, n_modes)
-    tissues = space.mesh.tissues
-    mapping = modulus_map(tissues, model.regions)
-    moduli = mapping.moduli(theta)
-    coefficients = np.random.default_rng(5).standard_normal(model.n_modes)
+def deformed(model, *, voxel_mm=1.5, seed=5) -> Twin:
+    space = model.space
+    moduli = (space.mesh.tissues[3].youngs_modulus_kpa or 1.0) * np.append(np.exp(TRUTH), 1.0)
+    coefficients = np.random.default_rng(seed).standard_normal(model.n_modes)
     displacement = model.solve(moduli, coefficients).displacement
-    surfaces = [observed_surface(space, i) for i in range(3)]
-    targets = tuple(exact_target(surface, displacement[surface.points]) for surface in surfaces)
-    problem = InverseProblem((model,), (targets,), mapping, frozenset({"gland", "sac"}))
-    return Twin(problem, moduli, coefficients, displacement, space)
+    grid = centred_grid((44.0,) * 3, (voxel_mm,) * 3)
+    before, after = (imaged(space, motion, grid) for motion in (np.zeros_like(displacement), displacement))
+    return Twin(model, Scene(space, displacement, before, after, {}, seed), moduli, coefficients)
 
 
-def settings(*ratios, method="gauss-newton", law=None, limits=(0.02, 200.0), n=2) -> InversionSettings:
-    starts = tuple(np.full(n, np.log(ratio)) for ratio in ratios)
-    return InversionSettings(starts, Bounds(np.full(n, np.log(limits[0])), np.full(n, np.log(limits[1]))), method, law)
+def problem_of(twins, targets) -> InverseProblem:
+    mapping = modulus_map(twins[0].scene.tissues, twins[0].model.regions)
+    return InverseProblem(tuple(t.model for t in twins), targets, mapping, frozenset({"gland", "sac"}))
+
+
+def exact_problem(*twins) -> InverseProblem:
+    """The images are the model's own triangles."""
+    return problem_of(twins, tuple(tuple(exact_target(t.scene, s) for s in t.surfaces) for t in twins))
+
+
+def voxel_problem(*twins, bias=0.0) -> InverseProblem:
+    """The images are voxels; `bias` (mm) is added to every distance map."""
+    return problem_of(twins, tuple(tuple(voxel_target(t, s, bias) for s in t.surfaces) for t in twins))
+
+
+def voxel_target(twin, surface, bias=0.0):
+    states = [segment(image, twin.scene.tissues) for image in (twin.scene.before, twin.scene.after)]
+    width = SMOOTHING * float(states[0].grid.spacing.max())
+    maps = [tissue_distance_map(state, surface.tissue, smoothing_mm=width).shifted(bias) for state in states]
+    return surface_target(surface, *maps)
+
+
+def settings(*ratios, limits=(0.02, 200.0), **others) -> InversionSettings:
+    """Both unknowns start at each of `ratios`, between `limits`."""
+    starts = tuple(np.full(2, np.log(ratio)) for ratio in ratios)
+    return InversionSettings(starts, Bounds(*np.log(np.outer(limits, np.ones(2)))), **others)
+
+
+def silent(_message):
+    pass

@@ -80,7 +80,7 @@ def gauss_newton(
     *,
     bounds: Bounds,
     hold_theta: bool = False,
-    tolerance: float = 1e-4,
+    tolerance: float = 1e-3,
     max_steps: int = 40,
 ) -> Minimum:
     """Minimise `objective` from `start` (n_unknowns,).

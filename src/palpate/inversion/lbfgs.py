@@ -21,14 +21,14 @@ def lbfgs(
     curvature at the start, falls under the square root of `tolerance`.
     """
     n = objective.n_parameters
-    inner = gauss_newton(objective, start, bounds=bounds, hold_theta=True)
+    inner = gauss_newton(objective, start, bounds=bounds, hold_theta=True, tolerance=tolerance)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(inner.evaluation.matrix)[:n], 1e-30))
     best, history = inner, list[Iterate]()
 
     def reduced(scaled: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         nonlocal best
         unknowns = np.concatenate([scaled * scale, best.unknowns[n:]])
-        best = gauss_newton(objective, unknowns, bounds=bounds, hold_theta=True)
+        best = gauss_newton(objective, unknowns, bounds=bounds, hold_theta=True, tolerance=tolerance)
         now = best.evaluation
         slope = now.gradient[:n] * scale
         history.append(Iterate(best.unknowns[:n], now.value, now.misfit_mm2, float(0.5 * slope @ slope)))

@@ -1,0 +1,88 @@
+"""The law of the residuals is found from the residuals, and its covariance is the double sum over all of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from palpate.inversion.noise import NoiseLaw, fit_noise_law
+from palpate.phantoms.boundary_noise import smooth_field
+
+RADIUS = 20.0
+
+
+def sphere(n, radius=RADIUS):
+    """Places (n, 3) and normals of a Fibonacci lattice on a sphere."""
+    k = np.arange(n) + 0.5
+    height, turn = 1.0 - 2.0 * k / n, np.pi * (1.0 + np.sqrt(5.0)) * k
+    flat = np.sqrt(1.0 - height**2)
+    normals = np.column_stack([flat * np.cos(turn), flat * np.sin(turn), height])
+    return radius * normals, normals
+
+
+def residuals(rng, sd, length, count=6, n=1500):
+    places, normals = sphere(n)
+    fields = [smooth_field(rng, sd_mm=sd, correlation_mm=length, features=500) for _ in range(count)]
+    values = [np.einsum("na,na->n", field.at(places), normals) for field in fields]
+    return values, [places] * count, [normals] * count
+
+
+def dense(law, rows, places, normals):
+    distance2 = np.sum((places[:, None] - places[None]) ** 2, axis=2)
+    terms = zip(law.variances, law.lengths, strict=True)
+    correlation = sum(v * np.exp(-distance2 / (2.0 * length**2)) for v, length in terms)
+    return rows @ (correlation * (normals @ normals.T)) @ rows.T
+
+
+@pytest.mark.parametrize(("sd", "length"), [(0.3, 3.0), (0.3, 6.0), (0.02, 4.5)])
+def test_a_smooth_field_is_recognised(rng, sd, length):
+    law = fit_noise_law(*residuals(rng, sd, length))
+    assert law.sd == pytest.approx(sd, rel=0.15)
+    assert np.sqrt(law.correlation_area / (2.0 * np.pi)) == pytest.approx(length, rel=0.25)
+
+
+def test_independent_residuals_have_no_correlation_length(rng):
+    places, normals = sphere(3000)
+    law = fit_noise_law([0.2 * rng.standard_normal(3000)], [places], [normals])
+    assert law.sd == pytest.approx(0.2, rel=0.15)
+    assert law.correlation_area < 10.0
+
+
+def test_a_mixture_shows_both_of_its_parts(rng):
+    values, places, normals = residuals(rng, 0.3, 6.0)
+    rough = [v + 0.3 * rng.standard_normal(len(v)) for v in values]
+    law = fit_noise_law(rough, places, normals)
+    short = law.lengths < 2.0
+    assert np.sqrt(law.variances[short].sum()) == pytest.approx(0.3, rel=0.2)
+    assert np.sqrt(law.variances[~short].sum()) == pytest.approx(0.3, rel=0.2)
+
+
+def test_residuals_of_nothing_leave_the_floor():
+    places, normals = sphere(200)
+    law = fit_noise_law([np.zeros(200)], [places], [normals])
+    assert law.sd == pytest.approx(1e-3)
+
+
+@pytest.mark.parametrize("lengths", [(3.0,), (1.2, 9.5)])
+def test_the_covariance_is_the_double_sum(rng, lengths):
+    places, normals = sphere(700)
+    rows = np.stack([normals[:, 0], np.ones(700), places[:, 2] * normals[:, 1], rng.standard_normal(700)])
+    law = NoiseLaw(np.full(len(lengths), 0.04), np.array(lengths))
+    expected = dense(law, rows, places, normals)
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert np.abs(law.covariance(rows, places, normals) - expected).max() < 0.06 * scale.max()
+    assert np.diag(law.covariance(rows, places, normals)) == pytest.approx(np.diag(expected), rel=0.06)
+
+
+def test_distant_residuals_are_independent_and_opposite_normals_count_negative():
+    law = NoiseLaw(np.array([0.09]), np.array([2.0]))
+    places = np.array([[0.0, 0.0, 0.0], [30.0, 0.0, 0.0], [1e-3, 0.0, 0.0]])
+    normals = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    one, two, both = np.eye(3)[:1], np.eye(3)[:2], np.array([[1.0, 0.0, 1.0]])
+    assert law.covariance(two, places, normals) == pytest.approx(0.09 * np.eye(2), abs=1e-12)
+    assert law.covariance(one, places, normals) == pytest.approx(0.09)
+    assert law.covariance(both, places, normals) == pytest.approx(0.0, abs=1e-7)
+
+
+def test_the_correlation_area_of_one_gaussian():
+    assert NoiseLaw(np.array([0.5]), np.array([3.0])).correlation_area == pytest.approx(2.0 * np.pi * 9.0)

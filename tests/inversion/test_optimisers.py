@@ -1,0 +1,110 @@
+"""Both optimisers on objectives whose minimum is known by hand."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.inversion.gauss_newton import FIRST_RADIUS, MAX_RADIUS, Bounds, Outcome, gauss_newton
+from palpate.inversion.lbfgs import lbfgs
+
+WIDE = Bounds(np.full(2, -5.0), np.full(2, 5.0))
+METHODS = {"gauss-newton": gauss_newton, "lbfgs": lbfgs}
+
+
+@pytest.fixture(scope="module")
+def toys():
+    spec = importlib.util.spec_from_file_location("inversion_toys", Path(__file__).with_name("toys.py"))
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(params=sorted(METHODS))
+def minimise(request):
+    return METHODS[request.param]
+
+
+def constrained(quadratic, held):
+    """Minimum of a quadratic whose first unknown is held at a value."""
+    rest = quadratic.curvature[1:, 1:]
+    pull = quadratic.curvature[1:, 0] * (held - quadratic.centre[0])
+    return np.concatenate([[held], quadratic.centre[1:] - np.linalg.solve(rest, pull)])
+
+
+def test_the_minimum_of_a_quadratic_is_found(minimise, toys, rng):
+    objective = toys.coupled(rng)
+    found = minimise(objective, np.full(5, 2.0), bounds=WIDE, tolerance=1e-10)
+    assert found.outcome is Outcome.CONVERGED
+    assert found.unknowns == pytest.approx(objective.centre, abs=1e-4)
+
+
+def test_an_unknown_stops_at_its_bound_and_the_others_go_on(minimise, toys, rng):
+    objective = toys.coupled(rng, centre=np.array([3.0, 0.2, -0.1, 0.4, 0.0]))
+    bounds = Bounds(np.array([-1.0, -1.0]), np.array([1.0, 1.0]))
+    found = minimise(objective, np.zeros(5), bounds=bounds, tolerance=1e-10)
+    expected = constrained(objective, 1.0)
+    assert np.all(np.abs(expected[1:2]) < 1.0)
+    assert found.outcome.converged
+    assert found.unknowns == pytest.approx(expected, abs=1e-4)
+
+
+@pytest.mark.parametrize("start", [-3.0, 3.0])
+def test_a_saturating_objective_is_followed_from_both_sides(minimise, toys, start):
+    objective = toys.Saturating(np.array([0.3, -0.5]))
+    found = minimise(objective, np.full(2, start), bounds=WIDE, tolerance=1e-12)
+    assert found.outcome.converged
+    assert found.unknowns == pytest.approx(objective.truth, abs=1e-3)
+
+
+def test_no_step_of_the_log_moduli_is_longer_than_the_radius(toys):
+    objective = toys.Saturating(np.array([3.0, 3.0]))
+    found = gauss_newton(objective, np.full(2, -4.0), bounds=WIDE)
+    thetas = np.stack([iterate.theta for iterate in found.history])
+    steps = np.abs(np.diff(thetas, axis=0)).max(axis=1)
+    assert 0.3 * FIRST_RADIUS < steps[0] < 1.02 * FIRST_RADIUS
+    assert steps.max() < 1.02 * MAX_RADIUS
+
+
+def test_values_fall_along_the_history(toys, rng):
+    found = gauss_newton(toys.Saturating(rng.normal(size=2)), np.full(2, 3.0), bounds=WIDE)
+    assert np.all(np.diff([iterate.value for iterate in found.history]) < 0.0)
+
+
+def test_held_log_moduli_do_not_move(toys, rng):
+    objective = toys.coupled(rng)
+    start = np.array([0.7, -0.7, 0.0, 0.0, 0.0])
+    found = gauss_newton(objective, start, bounds=WIDE, hold_theta=True, tolerance=1e-12)
+    assert np.array_equal(found.unknowns[:2], start[:2])
+    free = objective.curvature[2:, 2:]
+    pull = objective.curvature[2:, :2] @ (start[:2] - objective.centre[:2])
+    assert found.unknowns[2:] == pytest.approx(objective.centre[2:] - np.linalg.solve(free, pull), abs=1e-6)
+
+
+def test_too_few_steps_are_not_called_convergence(toys):
+    found = gauss_newton(toys.Saturating(np.array([3.0, 3.0])), np.full(2, -4.0), bounds=WIDE, max_steps=2)
+    assert found.outcome is Outcome.STEPS
+    assert not found.outcome.converged
+
+
+def test_an_objective_that_no_step_reduces_is_stuck(toys, rng):
+    wrong = toys.Quadratic(np.eye(5), np.zeros(5), pull=-1.0)
+    found = gauss_newton(wrong, rng.standard_normal(5), bounds=WIDE)
+    assert found.outcome is Outcome.STUCK
+    assert not found.outcome.converged
+
+
+def test_an_objective_that_is_no_number_says_so(toys):
+    broken = toys.Quadratic(np.full((3, 3), np.nan), np.zeros(3))
+    assert gauss_newton(broken, np.ones(3), bounds=WIDE).outcome is Outcome.NOT_FINITE
+
+
+def test_the_start_is_not_written_into(minimise, toys, rng):
+    start = np.full(5, 0.5)
+    minimise(toys.coupled(rng), start, bounds=WIDE)
+    assert np.array_equal(start, np.full(5, 0.5))

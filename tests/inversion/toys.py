@@ -1,0 +1,52 @@
+"""Objectives whose minimum is known by hand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from palpate.inversion.objective import Evaluation
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """1/2 (x - centre)^T curvature (x - centre) with `n_parameters` log-moduli; `pull` spoils the score's sign."""
+
+    curvature: np.ndarray
+    centre: np.ndarray
+    n_parameters: int = 2
+    pull: float = 1.0
+
+    def value(self, unknowns):
+        away = unknowns - self.centre
+        return float(0.5 * away @ self.curvature @ away)
+
+    def __call__(self, unknowns):
+        slope = self.curvature @ (unknowns - self.centre)
+        value = self.value(unknowns)
+        return Evaluation(value, value, slope, self.pull * slope, self.curvature.copy(), ())
+
+
+@dataclass(frozen=True)
+class Saturating:
+    """Residuals E - E_true of log-moduli with E = exp(theta): flat to the left, steep to the right."""
+
+    truth: np.ndarray
+
+    @property
+    def n_parameters(self):
+        return len(self.truth)
+
+    def value(self, unknowns):
+        return float(0.5 * np.sum((np.exp(unknowns) - np.exp(self.truth)) ** 2))
+
+    def __call__(self, unknowns):
+        slope = np.exp(unknowns)
+        score = slope * (slope - np.exp(self.truth))
+        return Evaluation(self.value(unknowns), self.value(unknowns), score, score, np.diag(slope**2), ())
+
+
+def coupled(rng, n=5, centre=None):
+    root = rng.standard_normal((n, n))
+    return Quadratic(root @ root.T + 0.5 * np.eye(n), rng.standard_normal(n) * 0.3 if centre is None else centre)
