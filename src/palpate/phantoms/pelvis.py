@@ -121,8 +121,8 @@ def _motions(body: PelvisShapes, options: PelvisOptions, rng: np.random.Generato
             filling_mm=options.filling_mm,
             profile=(float(profile[0]), float(profile[1])),
             floor=0.2,
-            towards=-turn @ body.forwards,  # the soft way: pressed flat against the prostate, the truth would fold over
-            lean=rng.uniform(0.15, 0.3),
+            towards=turn @ body.forwards,
+            lean=rng.uniform(0.1, 0.3),
             stray=smooth_field(rng, sd_mm=STRAY * options.filling_mm, correlation_mm=STRAY_LENGTH_MM, features=300),
         )
     }

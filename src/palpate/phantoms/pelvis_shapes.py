@@ -50,8 +50,8 @@ def draw_pelvis(rng: np.random.Generator, box: Box, *, bones: bool) -> PelvisSha
 def _upright(rng: np.random.Generator) -> PelvisShapes:
     """A body in its own axes, the prostate's centre at the origin."""
     prostate = Ellipsoid(np.zeros(3), rng.uniform(17.0, 22.0, 3), _turn(rng, 15.0))
-    up = rotation_about(np.array([1.0, 0.0, 0.0]), -rng.uniform(5.0, 20.0)) @ np.array([0.0, 0.0, 1.0])
-    semi_axes = np.array([*rng.uniform(26.0, 33.0, 2), rng.uniform(25.0, 29.0)])
+    up = rotation_about(np.array([1.0, 0.0, 0.0]), -rng.uniform(0.0, 12.0)) @ np.array([0.0, 0.0, 1.0])
+    semi_axes = np.array([*rng.uniform(23.0, 29.0, 2), rng.uniform(21.0, 25.0)])
     turn = _turn(rng, 12.0)
     reach = _reach(prostate.semi_axes, prostate.rotation, up) + _reach(semi_axes, turn, up)
     bladder = Ellipsoid((reach - rng.uniform(3.5, 6.0)) * up, semi_axes, turn)
@@ -62,7 +62,7 @@ def _upright(rng: np.random.Generator) -> PelvisShapes:
 
 
 def _rectum(rng: np.random.Generator, prostate: Ellipsoid, bladder: Ellipsoid) -> Tube:
-    """A tube some 65 mm long behind the organs, brought to a gap of 3.5 to 5 mm from them."""
+    """A tube some 65 mm long behind the organs, brought to a gap of 5 to 7 mm from them."""
     height = np.linspace(-0.5, 0.5, 5)
     length = rng.uniform(40.0, 44.0)
     bend, lean, side = rng.uniform(2.0, 8.0), rng.uniform(-3.0, 3.0), rng.uniform(-3.0, 3.0)
@@ -70,11 +70,11 @@ def _rectum(rng: np.random.Generator, prostate: Ellipsoid, bladder: Ellipsoid) -
         [
             side + rng.uniform(-4.0, 4.0) * height,
             -45.0 + lean * height - bend * height**2,
-            rng.uniform(-1.0, 3.0) + length * height,
+            rng.uniform(11.0, 17.0) + length * height,
         ]
     )
     radii = rng.uniform(10.7, 12.2, 5)
-    gap, organs = rng.uniform(3.5, 5.0), Union([prostate, bladder])
+    gap, organs = rng.uniform(5.0, 7.0), Union([prostate, bladder])
     for _ in range(20):
         excess = float(organs.at(Tube(knots, radii).surface(_directions(400))).min()) - gap
         if abs(excess) < 1e-3:
