@@ -28,21 +28,32 @@ class DistanceMap:
 
     def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Signed distance (n,) mm at points (n, 3) in RAS mm."""
-        index = self._inside(self.grid.index(points))
-        return self.bias + _spline(self.coefficients, index, (0, 0, 0))
+        index = self._inside(points).T
+        values = ndimage.map_coordinates(self.coefficients, index, order=3, mode="mirror", prefilter=False)
+        return np.asarray(self.bias + values)
 
     def gradient_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Gradient (n, 3), mm per mm, of the interpolated map at points (n, 3) in RAS mm."""
-        index = self._inside(self.grid.index(points))
-        by_index = np.stack([_spline(self.coefficients, index, tuple(np.eye(3, dtype=int)[a])) for a in range(3)], 1)
-        return np.asarray(by_index @ np.linalg.inv(self.grid.affine[:3, :3]))
+        index = self._inside(points)
+        base = np.floor(index).astype(np.int64)
+        value, slope = _value_weights(index - base), _slope_weights(index - base)
+        stencil = _stencil(self.coefficients, base)
+        plane, along_z = _contract(stencil, value[:, 2]), _contract(stencil, slope[:, 2])
+        line = _contract(plane, value[:, 1])
+        by_index = [
+            _contract(line, slope[:, 0]),
+            _contract(_contract(plane, slope[:, 1]), value[:, 0]),
+            _contract(_contract(along_z, value[:, 1]), value[:, 0]),
+        ]
+        return np.asarray(np.stack(by_index, axis=1) @ np.linalg.inv(self.grid.affine[:3, :3]))
 
     def shifted(self, bias: float) -> DistanceMap:
         """The same map with `bias` (mm) added everywhere."""
         return replace(self, bias=self.bias + bias)
 
-    def _inside(self, index: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(np.clip(index, 0.0, np.array(self.grid.shape) - 1.0))
+    def _inside(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Voxel indices (n, 3) of points, moved to the grid's border when they lie beyond it."""
+        return np.asarray(np.clip(self.grid.index(points), 0.0, np.array(self.grid.shape) - 1.0))
 
 
 def smoothing_width(*grids: VoxelGrid) -> float:
@@ -79,33 +90,30 @@ def _distance_transform(mask: NDArray[np.bool_], grid: VoxelGrid) -> NDArray[np.
     return np.asarray(np.where(mask, half - inside, outside - half))
 
 
-def _spline(
-    coefficients: NDArray[np.float64], index: NDArray[np.float64], derivative: tuple[int, ...]
-) -> NDArray[np.float64]:
-    """Value or first derivative of the cubic B-spline at voxel indices (n, 3); mirror beyond the border."""
-    base = np.floor(index).astype(np.int64)
-    fraction = index - base
-    weights = [_slope_weights(fraction[:, a]) if derivative[a] else _value_weights(fraction[:, a]) for a in range(3)]
-    places = [_mirror(base[:, a, None] + np.arange(-1, 3), coefficients.shape[a]) for a in range(3)]
-    total = np.zeros(len(index))
-    for i in range(4):
-        for j in range(4):
-            weight = weights[0][:, i] * weights[1][:, j]
-            column = coefficients[places[0][:, i, None], places[1][:, j, None], places[2]]
-            total += weight * np.einsum("nk,nk->n", weights[2], column)
-    return total
+def _stencil(coefficients: NDArray[np.float64], base: NDArray[np.int64]) -> NDArray[np.float64]:
+    """The 4 x 4 x 4 spline coefficients (n, 4, 4, 4) around voxels (n, 3); mirrored beyond the border."""
+    x, y, z = (_mirror(base[:, a, None] + np.arange(-1, 3), coefficients.shape[a]) for a in range(3))
+    _, ny, nz = coefficients.shape
+    flat = ((x[:, :, None, None] * ny + y[:, None, :, None]) * nz) + z[:, None, None, :]
+    return np.asarray(coefficients.ravel().take(flat))
+
+
+def _contract(block: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sum of block (n, ..., 4) over its last axis with weights (n, 4)."""
+    flat = block.reshape(len(block), -1, 4)
+    return np.asarray(np.matmul(flat, weights[:, :, None])[..., 0].reshape(block.shape[:-1]))
 
 
 def _value_weights(t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Cubic B-spline weights (n, 4) of the four nodes around a fraction t in [0, 1)."""
+    """Cubic B-spline weights (n, 3, 4) of the four nodes around fractions t (n, 3) in [0, 1)."""
     s = 1.0 - t
-    return np.stack([s**3, 4.0 - 6.0 * t**2 + 3.0 * t**3, 4.0 - 6.0 * s**2 + 3.0 * s**3, t**3], axis=1) / 6.0
+    return np.stack([s**3, 4.0 - 6.0 * t**2 + 3.0 * t**3, 4.0 - 6.0 * s**2 + 3.0 * s**3, t**3], axis=-1) / 6.0
 
 
 def _slope_weights(t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Derivatives of the cubic B-spline weights, per voxel."""
+    """Derivatives (n, 3, 4) of the cubic B-spline weights, per voxel."""
     s = 1.0 - t
-    return np.stack([-(s**2), 3.0 * t**2 - 4.0 * t, 4.0 * s - 3.0 * s**2, t**2], axis=1) / 2.0
+    return np.stack([-(s**2), 3.0 * t**2 - 4.0 * t, 4.0 * s - 3.0 * s**2, t**2], axis=-1) / 2.0
 
 
 def _mirror(place: NDArray[np.int64], size: int) -> NDArray[np.int64]:

@@ -1,0 +1,112 @@
+"""The sandwich is the covariance that repeated experiments show, correlated residuals and driver included."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from palpate.inversion.noise import NoiseLaw
+from palpate.inversion.objective import Evaluation, Linearisation
+from palpate.inversion.posterior import cramer_rao, gain, sandwich_covariance
+from palpate.observation.misfit import SurfaceResiduals
+from palpate.phantoms.boundary_noise import smooth_field
+
+SD = 0.3
+
+
+def sphere(n, radius):
+    k = np.arange(n) + 0.5
+    height, turn = 1.0 - 2.0 * k / n, np.pi * (1.0 + np.sqrt(5.0)) * k
+    flat = np.sqrt(1.0 - height**2)
+    normals = np.column_stack([flat * np.cos(turn), flat * np.sin(turn), height])
+    return radius * normals, normals
+
+
+def surface(places, normals, jacobian, *, precision):
+    n = len(places)
+    weights = np.full(n, 1.0 / n)
+    residuals = SurfaceResiduals(np.zeros(n), weights, places, normals, None, None)
+    return Linearisation(residuals, jacobian, weights, precision, SimpleNamespace(area=np.ones(n)), None)
+
+
+def evaluation(surfaces, n_parameters):
+    """The evaluation of surfaces with a prior of unit variance on all unknowns after the first ones."""
+    n = surfaces[0].jacobian.shape[1]
+    matrix = np.diag(np.where(np.arange(n) < n_parameters, 0.0, 1.0))
+    for line in surfaces:
+        matrix += line.precision * line.jacobian.T @ (line.weights[:, None] * line.jacobian)
+    return Evaluation(0.0, 0.0, np.zeros(n), np.zeros(n), matrix, tuple(surfaces))
+
+
+@pytest.fixture
+def smooth():
+    """A smooth Jacobian on a sphere: two log-moduli, then three modes."""
+    places, normals = sphere(600, 15.0)
+    x, y, z = normals.T
+    jacobian = np.column_stack([0.3 * x * y, 0.3 * z, 0.4 * z + 0.2 * x, 0.5 * y, 0.3 * (z**2 - x**2)])
+    return places, normals, jacobian
+
+
+def test_independent_residuals_give_the_usual_formula(rng):
+    places = 10.0 * np.stack(np.meshgrid(*[np.arange(5.0)] * 3), axis=-1).reshape(-1, 3)
+    normals = np.tile([[0.0, 0.0, 1.0]], (len(places), 1))
+    jacobian = rng.standard_normal((len(places), 4))
+    now = evaluation([surface(places, normals, jacobian, precision=len(places) / SD**2)], 2)
+    law = NoiseLaw(np.array([SD**2]), np.array([0.5]))
+    assert sandwich_covariance(now, law, 2) == pytest.approx(np.linalg.inv(now.matrix)[:2, :2], rel=1e-9)
+
+
+def test_the_gain_moves_the_estimate_as_a_normal_equation_does(smooth, rng):
+    places, normals, jacobian = smooth
+    now = evaluation([surface(places, normals, jacobian, precision=50.0)], 2)
+    errors = rng.standard_normal(len(places))
+    expected = np.linalg.solve(now.matrix, 50.0 / len(places) * jacobian.T @ errors)[:2]
+    assert gain(now, 2)[0] @ errors == pytest.approx(expected, rel=1e-9)
+
+
+def test_the_interval_covers_the_truth_of_repeated_experiments(smooth, rng):
+    places, normals, jacobian = smooth
+    now = evaluation([surface(places, normals, jacobian, precision=200.0)], 2)
+    covariance = sandwich_covariance(now, NoiseLaw(np.array([SD**2]), np.array([5.0])), 2)
+    draws = []
+    for _ in range(400):
+        field = smooth_field(rng, sd_mm=SD, correlation_mm=5.0, features=200)
+        error = np.einsum("na,na->n", field.at(places), normals)
+        prior = np.concatenate([np.zeros(2), rng.standard_normal(3)])
+        score = prior - 200.0 / len(places) * jacobian.T @ error
+        draws.append(-np.linalg.solve(now.matrix, score)[:2])
+    spread = np.cov(np.transpose(draws))
+    assert np.sqrt(np.diag(covariance)) == pytest.approx(np.sqrt(np.diag(spread)), rel=0.12)
+    inside = np.abs(draws) < 1.96 * np.sqrt(np.diag(covariance))
+    assert np.all((inside.mean(axis=0) > 0.92) & (inside.mean(axis=0) < 0.98))
+
+
+def test_correlated_residuals_tell_less(smooth):
+    places, normals, jacobian = smooth
+    now = evaluation([surface(places, normals, jacobian, precision=200.0)], 2)
+    short, long = (
+        sandwich_covariance(now, NoiseLaw(np.array([SD**2]), np.array([length])), 2) for length in (0.8, 6.0)
+    )
+    assert np.all(np.diag(long) > 1.5 * np.diag(short))
+
+
+def test_a_second_image_with_noise_of_its_own_halves_the_variance(smooth):
+    places, normals, jacobian = smooth
+    law = NoiseLaw(np.array([SD**2]), np.array([5.0]))
+    modes, none = jacobian[:, 2:], np.zeros((len(places), 3))
+    first = np.hstack([jacobian[:, :2], modes, none])
+    second = np.hstack([jacobian[:, :2], none, modes])
+    one = evaluation([surface(places, normals, jacobian, precision=200.0)], 2)
+    two = evaluation([surface(places, normals, rows, precision=200.0) for rows in (first, second)], 2)
+    assert sandwich_covariance(two, law, 2) == pytest.approx(0.5 * sandwich_covariance(one, law, 2), rel=1e-6)
+
+
+def test_no_estimate_beats_the_cramer_rao_limit(smooth):
+    places, normals, jacobian = (np.repeat(array[::3], 12, axis=0) for array in smooth)  # twelve places a P2 face
+    law = NoiseLaw(np.array([SD**2]), np.array([5.0]))
+    now = evaluation([surface(places, normals, jacobian, precision=200.0)], 2)
+    limit = cramer_rao(now, law, 2)
+    assert np.linalg.eigvalsh(sandwich_covariance(now, law, 2) - 0.95 * limit).min() > 0.0
+    assert np.linalg.eigvalsh(limit).min() > 0.0

@@ -1,0 +1,178 @@
+"""Surface residuals: exact derivatives, and nothing but the difference to the rest state."""
+
+from __future__ import annotations
+
+import igl
+import numpy as np
+import pytest
+
+from palpate.images.distance import distance_map
+from palpate.images.label_image import VoxelGrid
+from palpate.observation.misfit import observed_image_points, surface_residuals
+from palpate.observation.observed_surface import ObservedSurface
+from palpate.observation.target import surface_target, target_from
+from palpate.phantoms.shapes import Ellipsoid, ball, rotation_about
+
+RADIUS = 10.0
+CENTRE = np.array([0.3, -0.2, 0.4])
+STEPS = np.array([1e-2, 1e-3, 1e-4])
+
+
+def surface_of(vertices, triangles, observed=None, rim=None) -> ObservedSurface:
+    n = len(triangles)
+    seen = np.ones(n, dtype=bool) if observed is None else observed
+    edges = np.zeros((n, 3), dtype=bool) if rim is None else rim
+    return ObservedSurface(0, "ball", np.arange(len(vertices)), CENTRE + RADIUS * vertices, triangles, seen, edges, 1.0)
+
+
+def directions(rng, n):
+    vectors = rng.standard_normal((n, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def smooth_target(surface, rng, n=400):
+    """Two ellipsoids that are neither the model nor each other."""
+    before = Ellipsoid(CENTRE, np.array([10.6, 9.7, 10.2]), rotation_about(np.array([1.0, 2.0, 3.0]), 30.0))
+    after = Ellipsoid(CENTRE + np.array([0.8, -0.5, 0.3]), np.array([9.4, 10.9, 10.4]), before.rotation)
+    points = after.surface(directions(rng, n))
+    return target_from(surface, before, after, level=0.1, image=(points, np.full(n, 3.0)))
+
+
+def everywhere(target):
+    return np.ones(len(target.image_points), dtype=bool)
+
+
+def closest(target, displacement):
+    """Triangle, and which corners the closest point does not use, of each image point."""
+    vertices = target.surface.rest + displacement
+    triangles = target.surface.triangles
+    _, triangle, places = igl.point_mesh_squared_distance(target.image_points, vertices, triangles)[:3]
+    corners = [np.ascontiguousarray(vertices[triangles[triangle]][:, k]) for k in range(3)]
+    return np.column_stack([triangle, igl.barycentric_coordinates(places, *corners) < 1e-9])
+
+
+@pytest.fixture(scope="module")
+def ball_surface(sphere):
+    return surface_of(*sphere(2))
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_the_jacobian_leaves_a_remainder_of_second_order(ball_surface, backwards, rng):
+    target = smooth_target(ball_surface, rng)
+    place = 0.3 * rng.standard_normal(ball_surface.rest.shape)
+    direction = rng.standard_normal(ball_surface.rest.shape)
+    kept = everywhere(target)
+    n = len(target.area)
+    steady = np.ones(len(kept), dtype=bool)
+    for step in STEPS:
+        steady &= np.all(closest(target, place + step * direction) == closest(target, place), axis=1)
+    rows = np.concatenate([np.full(n, not backwards), steady & backwards])
+    assert rows.sum() > 150
+    start = surface_residuals(target, place, kept)
+    slope = start.jacobian @ direction.ravel()
+    remainders = [
+        np.linalg.norm((surface_residuals(target, place + h * direction, kept).values - start.values - h * slope)[rows])
+        for h in STEPS
+    ]
+    assert np.all(np.diff(np.log(remainders)) / np.diff(np.log(STEPS)) > 1.9)
+
+
+def test_the_normal_jacobian_is_the_exact_one_of_a_smooth_surface(sphere, rng):
+    surface = surface_of(*sphere(4))
+    before, after = ball(CENTRE, 10.0), ball(CENTRE, 10.7)
+    points = CENTRE + 10.7 * directions(rng, 600)
+    target = target_from(surface, before, after, level=0.0, image=(points, np.ones(600)))
+    found = surface_residuals(target, np.zeros_like(surface.rest), everywhere(target))
+    smooth = np.stack([np.sin(surface.rest[:, 0] / 5.0), surface.rest[:, 1] / 9.0, np.ones(len(surface.rest))], axis=1)
+    exact, normal = (matrix @ smooth.ravel() for matrix in (found.jacobian, found.normal_jacobian))
+    n = len(target.area)
+    assert np.linalg.norm((exact - normal)[:n]) < 0.02 * np.linalg.norm(exact[:n])
+    assert np.linalg.norm((exact - normal)[n:]) < 0.05 * np.linalg.norm(exact[n:])
+
+
+def test_the_normal_jacobian_knows_no_sliding(sphere):
+    surface = surface_of(*sphere(4))
+    spin = np.cross([0.0, 0.0, 0.2], surface.rest - CENTRE)
+    target = smooth_target(surface, np.random.default_rng(1))
+    found = surface_residuals(target, np.zeros_like(surface.rest), everywhere(target))
+    normal, exact = (np.linalg.norm(rows @ spin.ravel()) for rows in (found.normal_jacobian, found.jacobian))
+    assert normal < 0.1 * exact
+
+
+def test_a_model_that_moves_with_the_image_has_no_misfit(ball_surface):
+    shift = np.array([1.5, -0.7, 0.4])
+    before = Ellipsoid(CENTRE, np.array([10.6, 9.7, 10.2]), np.eye(3))
+    after = Ellipsoid(CENTRE + shift, before.semi_axes, np.eye(3))
+    corners = ball_surface.rest[ball_surface.triangles].mean(axis=1)
+    points = corners + shift  # of the model itself, on which `after` is not zero: only the difference counts
+    target = target_from(ball_surface, before, after, level=0.0, image=(points, np.ones(len(points))))
+    moved = surface_residuals(target, np.tile(shift, (len(ball_surface.rest), 1)), everywhere(target))
+    assert np.abs(moved.values[: len(target.area)]).max() < 1e-10
+    assert moved.values[len(target.area) :] == pytest.approx(-before.at(corners), abs=1e-10)
+
+
+def voxel_map(shift=0.0, radius=10.3):
+    grid = VoxelGrid((34, 34, 34), np.array([[1.0, 0, 0, -16.6], [0, 1, 0, -16.3], [0, 0, 1, -16.4], [0, 0, 0, 1.0]]))
+    index = np.stack(np.meshgrid(*[np.arange(34.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    inside = np.linalg.norm(grid.world(index) - CENTRE - [shift, 0.0, 0.0], axis=1) < radius
+    return distance_map(inside.reshape(grid.shape), grid, smoothing_mm=0.6)
+
+
+def test_facets_are_no_misfit_when_nothing_moved(ball_surface):
+    image = voxel_map()
+    target = surface_target(ball_surface, image, image)
+    still = surface_residuals(target, np.zeros_like(ball_surface.rest), everywhere(target))
+    n = len(target.area)
+    assert np.array_equal(still.values[:n], np.zeros(n))
+    to_facets = np.linalg.norm(still.places[n:] - target.image_points, axis=1)
+    assert np.sqrt(np.mean(still.values[n:] ** 2)) < 0.15 * np.sqrt(np.mean(to_facets**2))
+
+
+def test_a_bias_of_both_maps_changes_no_residual(ball_surface, rng):
+    before, after = voxel_map(), voxel_map(1.2, 10.0)
+    motion = 0.3 * rng.standard_normal(ball_surface.rest.shape) + [1.0, 0.0, 0.0]
+    plain, biased = (surface_target(ball_surface, before.shifted(bias), after.shifted(bias)) for bias in (0.0, 0.35))
+    results = [surface_residuals(target, motion, everywhere(target)) for target in (plain, biased)]
+    assert results[1].values == pytest.approx(results[0].values, abs=1e-9)
+    assert abs(results[1].jacobian - results[0].jacobian).max() < 1e-9
+    assert np.std(results[0].values) > 0.1
+
+
+def test_a_shift_towards_the_image_has_the_sign_of_the_distance(ball_surface, rng):
+    """Where the model lies outside of the later surface, both directions give a positive residual."""
+    before, after = ball(CENTRE, 10.0), ball(CENTRE, 9.0)
+    target = target_from(
+        ball_surface, before, after, level=0.0, image=(CENTRE + 9 * directions(rng, 200), np.ones(200))
+    )
+    still = surface_residuals(target, np.zeros_like(ball_surface.rest), everywhere(target))
+    assert still.values == pytest.approx(1.0, abs=0.1)
+    grown = surface_residuals(target, 0.3 * (ball_surface.rest - CENTRE) / RADIUS, everywhere(target))
+    assert np.all(grown.values > still.values + 0.2)
+
+
+def test_each_direction_has_half_of_the_weight(ball_surface, rng):
+    target = smooth_target(ball_surface, rng)
+    kept = everywhere(target)
+    kept[::3] = False
+    found = surface_residuals(target, np.zeros_like(ball_surface.rest), kept)
+    n = len(target.area)
+    assert found.weights[:n].sum() == pytest.approx(0.5)
+    assert found.weights[n:].sum() == pytest.approx(0.5)
+    assert len(found.values) == n + kept.sum()
+
+
+def test_image_points_that_face_the_hidden_part_are_dropped(sphere, rng):
+    vertices, triangles = sphere(3)
+    upper = vertices[triangles][..., 2].mean(axis=1) > 0.0
+    equator = np.abs(vertices[:, 2]) < 1e-12
+    on_rim = np.stack([equator[triangles[:, [1, 2]]], equator[triangles[:, [0, 2]]], equator[triangles[:, [0, 1]]]], 1)
+    surface = surface_of(vertices, triangles, upper, on_rim.all(axis=2) & upper[:, None])
+    towards = directions(rng, 500)
+    points = CENTRE + 10.5 * towards
+    shape = ball(CENTRE, 10.5)
+    target = target_from(surface, shape, shape, level=0.0, image=(points, np.ones(500)))
+    kept = observed_image_points(target, np.zeros_like(surface.rest))
+    assert np.all(towards[kept, 2] > 0.0)
+    assert kept[towards[:, 2] > 0.1].all()  # nearer to the rim, the rim itself is closest
+    below = surface_residuals(target, np.zeros_like(surface.rest), kept)
+    assert below.places[:, 2].min() > CENTRE[2] - 1e-9
