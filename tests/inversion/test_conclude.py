@@ -12,6 +12,7 @@ from palpate.inversion.gauss_newton import Outcome
 from palpate.inversion.grid_position import FittedState, grid_position_shifts
 from palpate.inversion.invert import invert
 from palpate.inversion.noise import NoiseLaw
+from palpate.inversion.posterior import sandwich_covariance
 
 LAW = NoiseLaw(np.array([0.03**2]), np.array([3.0]))
 
@@ -64,6 +65,13 @@ def test_the_interval_is_that_of_the_covariance(estimation):
     assert np.diag(estimation.correlation) == pytest.approx(1.0)
 
 
+def test_the_place_of_the_grid_adds_to_the_residuals_law(estimation, inversion):
+    residuals = sandwich_covariance(inversion.minimum.evaluation, inversion.law, 2)
+    grid = estimation.covariance - residuals
+    assert np.all(np.diag(grid) > 1e-3 * np.diag(residuals))
+    assert np.linalg.eigvalsh(grid).min() > -1e-12
+
+
 def test_every_start_is_told(estimation):
     assert estimation.status == "converged"
     assert [start.start["gland"] for start in estimation.starts] == pytest.approx([5.0, 80.0])
@@ -107,6 +115,7 @@ def test_an_estimate_at_its_bound_is_not_identified(twins, twin, exact):
     gland = result.estimates[0]
     assert gland.value == pytest.approx(25.0)
     assert gland.verdict == "not identified"
+    assert "lies at its bound" in gland.why
     assert gland.interval95[1] is None
 
 

@@ -20,8 +20,9 @@ def sphere(n, radius=RADIUS):
     return radius * normals, normals
 
 
-def residuals(rng, sd, length, count=6, n=1500):
-    places, normals = sphere(n)
+def residuals(rng, sd, length, radius=RADIUS, count=6):
+    n = int(3.75 * radius**2)
+    places, normals = sphere(n, radius)
     fields = [smooth_field(rng, sd_mm=sd, correlation_mm=length, features=500) for _ in range(count)]
     values = [np.einsum("na,na->n", field.at(places), normals) for field in fields]
     return values, [places] * count, [normals] * count
@@ -34,9 +35,13 @@ def dense(law, rows, places, normals):
     return rows @ (correlation * (normals @ normals.T)) @ rows.T
 
 
-@pytest.mark.parametrize(("sd", "length"), [(0.3, 3.0), (0.3, 6.0), (0.02, 4.5)])
-def test_a_smooth_field_is_recognised(rng, sd, length):
-    law = fit_noise_law(*residuals(rng, sd, length))
+@pytest.mark.parametrize(
+    ("sd", "length", "radius", "count"),
+    [(0.3, 3.0, 20.0, 6), (0.3, 6.0, 20.0, 6), (0.02, 4.5, 20.0, 6), (0.3, 5.0, 8.0, 60)],
+)
+def test_a_smooth_field_is_recognised(rng, sd, length, radius, count):
+    """On the small ball normals turn within a correlation length: the law is that of the field, not of the ball."""
+    law = fit_noise_law(*residuals(rng, sd, length, radius, count))
     assert law.sd == pytest.approx(sd, rel=0.15)
     assert np.sqrt(law.correlation_area / (2.0 * np.pi)) == pytest.approx(length, rel=0.25)
 

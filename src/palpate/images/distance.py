@@ -100,7 +100,8 @@ def _stencil(coefficients: NDArray[np.float64], base: NDArray[np.int64]) -> NDAr
 
 def _contract(block: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
     """Sum of block (n, ..., 4) over its last axis with weights (n, 4)."""
-    flat = block.reshape(len(block), -1, 4)
+    inner = int(np.prod(block.shape[1:-1]))  # not -1, which no points at all would leave undefined
+    flat = block.reshape(len(block), inner, 4)
     return np.asarray(np.matmul(flat, weights[:, :, None])[..., 0].reshape(block.shape[:-1]))
 
 

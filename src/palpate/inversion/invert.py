@@ -97,34 +97,38 @@ def invert_with(
     objective = objective.with_fresh_correspondence(still)
     rest = objective(still)
     minima = _from_starts(objective, settings, progress)
+    chosen = _best(minima)
+    best = minima[chosen]
     for round_ in range(ROUNDS):
-        best = minima[_best(minima)]
         progress(f"round {round_ + 1}: {_words(problem, best)}; the full model is solved there")
-        surrogates = tuple(
-            s
-            if s.relative_error(problem.modulus_map.moduli(best.unknowns[: objective.n_parameters]), q) < EXACT
-            else enriched(s, problem.modulus_map.moduli(best.unknowns[: objective.n_parameters]), q)
-            for s, q in zip(surrogates, objective.coefficients(best.unknowns), strict=True)
-        )
+        surrogates = _enriched(problem, surrogates, objective, best)
         law = settings.law or _law(problem, best.evaluation)
         objective = _reweighted(_objective(problem, surrogates, law), best)
-        minima = tuple(_continued(objective, minimum, settings) for minimum in minima)
-        if _settled(best, minima[_best(minima)], objective.n_parameters):
+        before, best = best, _continued(objective, best, settings)
+        if _settled(before, best, objective.n_parameters):
             break
+    minima = tuple(best if i == chosen else _continued(objective, m, settings) for i, m in enumerate(minima))
     counts = sum((s.counts for s in surrogates), SolveCounts())
-    evaluations = sum(len(minimum.history) for minimum in minima)
-    best_index = _best(minima)
     return Inversion(
         objective,
         minima,
         _groups(minima, objective.n_parameters),
-        best_index,
+        _best(minima),
         law,
         surrogates,
         rest,
-        evaluations,
-        counts,
+        evaluations=sum(len(minimum.history) for minimum in minima),
+        counts=counts,
     )
+
+
+def _enriched(
+    problem: InverseProblem, surrogates: tuple[Surrogate, ...], objective: Objective, minimum: Minimum
+) -> tuple[Surrogate, ...]:
+    """Solve the full models at a minimum where the reduced ones are not exact there."""
+    moduli = problem.modulus_map.moduli(minimum.unknowns[: objective.n_parameters])
+    pairs = zip(surrogates, objective.coefficients(minimum.unknowns), strict=True)
+    return tuple(s if s.relative_error(moduli, q) < EXACT else enriched(s, moduli, q) for s, q in pairs)
 
 
 def fit_driver(problem: InverseProblem, moduli: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
@@ -158,15 +162,17 @@ def _from_starts(
         unknowns = np.concatenate([theta, driver])
         first = gauss_newton(objective, unknowns, bounds=settings.bounds, hold_theta=True, tolerance=1e-2)
         fresh = objective.with_fresh_correspondence(first.unknowns)
-        minima.append(_minimise(fresh, first.unknowns, settings))
+        minima.append(_minimise(fresh, first.unknowns, settings, tolerance=1e-2))
         progress(f"start {number + 1} of {len(settings.starts)}: {len(minima[-1].history)} steps")
     return tuple(minima)
 
 
-def _minimise(objective: Objective, start: NDArray[np.float64], settings: InversionSettings) -> Minimum:
+def _minimise(
+    objective: Objective, start: NDArray[np.float64], settings: InversionSettings, *, tolerance: float = 1e-3
+) -> Minimum:
     if settings.method == "lbfgs":
-        return lbfgs(objective, start, bounds=settings.bounds)
-    return gauss_newton(objective, start, bounds=settings.bounds)
+        return lbfgs(objective, start, bounds=settings.bounds, tolerance=tolerance)
+    return gauss_newton(objective, start, bounds=settings.bounds, tolerance=tolerance)
 
 
 def _continued(objective: Objective, minimum: Minimum, settings: InversionSettings) -> Minimum:

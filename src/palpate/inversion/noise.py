@@ -14,7 +14,7 @@ __all__ = ["NoiseLaw", "fit_noise_law"]
 
 LENGTHS = (0.5, 0.8, 1.2, 2.0, 3.0, 4.5, 6.5, 9.5, 14.0)  # mm
 CELL = 1.0  # mm: residuals nearer than that are averaged before they are compared
-MAX_CELLS = 4000
+MAX_CELLS = 2500
 REACH = 28.0  # mm
 FLOOR = 1e-3  # mm: no surface in an image is known better
 
@@ -97,7 +97,7 @@ def _binned_products(
 def _cells(
     values: NDArray[np.float64], places: NDArray[np.float64], normals: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Means of residuals, places and normals in cells of 1 mm, at most 4000 of them."""
+    """Means of residuals, places and normals in cells of 1 mm, at most 2500 of them."""
     inverse = _cell_numbers(places, CELL)
     count = np.bincount(inverse)
     mean = np.bincount(inverse, values) / count

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from palpate.inversion.noise import NoiseLaw
 from palpate.inversion.objective import Evaluation
 
+MAX_FACES = 1500  # of one surface, in the dense covariance of the Cramer-Rao limit
+
 __all__ = ["cramer_rao", "gain", "sandwich_covariance"]
 
 
@@ -70,8 +72,12 @@ def _states(evaluation: Evaluation) -> Sequence[list[int]]:
 def _face_means(
     evaluation: Evaluation, surface: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Jacobian rows, places and normals of the model -> image residuals, averaged over groups of twelve neighbours."""
+    """Jacobian rows, places and normals of the model -> image residuals, averaged over groups of neighbours."""
     line = evaluation.surfaces[surface]
-    n = len(line.target.area) // 12 * 12
-    parts = (line.jacobian, line.residuals.places, line.residuals.normals)
-    return tuple(part[:n].reshape(n // 12, 12, -1).mean(axis=1) for part in parts)
+    size = max(int(np.ceil(len(line.target.area) / MAX_FACES)), 1)
+    n = len(line.target.area) // size
+    jacobian, places, normals = (
+        part[: n * size].reshape(n, size, -1).mean(axis=1)
+        for part in (line.jacobian, line.residuals.places, line.residuals.normals)
+    )
+    return jacobian, places, normals

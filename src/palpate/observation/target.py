@@ -13,10 +13,12 @@ from palpate.mesh.anatomy import LevelSet
 from palpate.mesh.surface import triangle_normals
 from palpate.observation.observed_surface import ObservedSurface
 
-__all__ = ["QUADRATURE", "SurfaceTarget", "surface_target", "target_from"]
+__all__ = ["SurfaceTarget", "surface_target", "target_from"]
 
-# Strang & Fix 1973: three interior points, exact for quadratics
-QUADRATURE = np.array([[4.0, 1.0, 1.0], [1.0, 4.0, 1.0], [1.0, 1.0, 4.0]]) / 6.0
+# Strang & Fix 1973: three interior points, exact for quadratics; one point where triangles are as small as voxels
+THREE_POINTS = np.array([[4.0, 1.0, 1.0], [1.0, 4.0, 1.0], [1.0, 1.0, 4.0]]) / 6.0
+ONE_POINT = np.full((1, 3), 1.0 / 3.0)
+AREA_OF_A_POINT = 1.6  # mm^2: residuals nearer to each other than about a voxel say the same
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +51,9 @@ def surface_target(surface: ObservedSurface, before: DistanceMap, after: Distanc
     rest = target_from(surface, before, after, level=0.0, image=(np.zeros((0, 3)), np.zeros(0)))
     level = float(np.average(rest.rest_distance, weights=rest.area))
     points = isosurface_points(after, level)
-    return replace(rest, level=level, image_points=points.places, image_area=points.area)
+    stride = max(int(AREA_OF_A_POINT * len(points.area) / max(float(points.area.sum()), 1e-9)), 1)
+    area = points.area[::stride] * (points.area.sum() / points.area[::stride].sum())
+    return replace(rest, level=level, image_points=points.places[::stride], image_area=area)
 
 
 def target_from(
@@ -65,10 +69,11 @@ def target_from(
     level (mm): where `after` is on those points.
     """
     seen = np.flatnonzero(surface.observed)
-    triangle = np.repeat(seen, len(QUADRATURE))
-    barycentric = np.tile(QUADRATURE, (len(seen), 1))
     size = np.linalg.norm(triangle_normals(surface.rest, surface.triangles[seen]), axis=1)
-    area = np.repeat(size / len(QUADRATURE), len(QUADRATURE))
+    rule = ONE_POINT if size.mean() < 2.0 * AREA_OF_A_POINT else THREE_POINTS
+    triangle = np.repeat(seen, len(rule))
+    barycentric = np.tile(rule, (len(seen), 1))
+    area = np.repeat(size / len(rule), len(rule))
     # (n_q, 3 corners) x (n_q, 3 corners, 3 axes) -> (n_q, 3)
     places = np.einsum("qk,qka->qa", barycentric, surface.rest[surface.triangles[triangle]])
     return SurfaceTarget(surface, before, after, triangle, barycentric, area, before.at(places), level, *image)

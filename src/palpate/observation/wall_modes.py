@@ -21,7 +21,7 @@ def wall_modes(points: NDArray[np.float64], *, n_modes: int, kernel_mm: float, p
     """
     factor = _pivoted_cholesky(points, kernel_mm, min(len(points), 4 * (n_modes // 3)))
     left, scale, _ = np.linalg.svd(factor, full_matrices=False)
-    keep = min(n_modes // 3, int(np.count_nonzero(scale > RANK_TOLERANCE * scale[0])))
+    keep = min(n_modes // 3, int(np.count_nonzero(scale > RANK_TOLERANCE * scale.max(initial=0.0))))
     scalar = prior_mm * left[:, :keep] * scale[:keep]
     return np.asarray(np.kron(scalar, np.eye(3)))
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from palpate.mesh.surface import triangle_normals
 from palpate.observation.observed_surface import ObservedSurface, observed_surface
-from palpate.observation.target import QUADRATURE, SurfaceTarget, target_from
+from palpate.observation.target import SurfaceTarget, target_from
 from palpate.phantoms.scene import Scene
 
 __all__ = ["TriangulatedDistance", "exact_target"]
@@ -52,7 +52,5 @@ def exact_target(scene: Scene, surface: ObservedSurface) -> SurfaceTarget:
         for vertices in (truth.rest, deformed)
     )
     seen = truth.triangles[truth.observed]
-    corners = np.repeat(deformed[seen], len(QUADRATURE), axis=0)
-    places = np.einsum("qk,qka->qa", np.tile(QUADRATURE, (len(seen), 1)), corners)
-    area = np.linalg.norm(triangle_normals(deformed, seen), axis=1) / len(QUADRATURE)
-    return target_from(surface, before, after, level=0.0, image=(places, np.repeat(area, len(QUADRATURE))))
+    area = np.linalg.norm(triangle_normals(deformed, seen), axis=1)
+    return target_from(surface, before, after, level=0.0, image=(deformed[seen].mean(axis=1), area))

@@ -36,7 +36,7 @@ class PelvisOptions:
     filling_mm: float = 7.0
     spacing_mm: tuple[float, float, float] = (1.0, 1.0, 1.0)
     field_mm: tuple[float, float, float] = (110.0, 120.0, 120.0)
-    truth_edge_mm: float = 2.5
+    truth_edge_mm: float = 2.7
     moduli_kpa: Mapping[str, float] | None = None
     poisson_ratio: float | None = None
     noise: Noise | None = None

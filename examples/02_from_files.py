@@ -1,0 +1,58 @@
+"""From label images on disk to a mesh: what the files and the case look like, and how good the mesh is.
+
+A ball, the organ, beside a hollow tube, the driver. The asserted number is the ball's volume in the mesh: voxels are
+2 mm wide, and smoothing them over 1.2 mm draws a surface of radius R inwards by about 1.2^2 / R mm, in both images.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from palpate.images.label_image import LabelImage, VoxelGrid
+from palpate.images.readers import write_label_image
+from palpate.study.case_file import read_case
+from palpate.study.run import mesh
+
+RADIUS, VOXEL = 15.0, 2.0
+CASE = """
+images = { before = "before.nii.gz", after = ["after.nii.gz"] }
+[tissues]
+organ = { label = 1, role = "estimate", poisson_ratio = 0.45 }
+tube = { label = 2, role = "driver" }
+surroundings = { label = "remaining", role = "known", youngs_modulus_kpa = 10.0 }
+[mesh]
+edge_length_mm = 6.0
+"""
+
+
+def write_case(folder: Path) -> Path:
+    """Both images and the case; in the later state the tube is 2 mm wider, the organ 2 mm further away."""
+    grid = VoxelGrid((40, 44, 36), np.diag([VOXEL, VOXEL, VOXEL, 1.0]))
+    at = np.stack(np.meshgrid(*map(np.arange, grid.shape), indexing="ij"), -1) * VOXEL
+    for name, more in (("before", 0.0), ("after", 2.0)):
+        labels = np.zeros(grid.shape, dtype=np.int32)
+        labels[np.linalg.norm(at - [39.3, 54.6 + more, 34.7], axis=-1) < RADIUS] = 1
+        labels[np.linalg.norm(at[..., :2] - [39.3, 25.2], axis=-1) < 8.0 + more] = 2
+        write_label_image(folder / f"{name}.nii.gz", LabelImage(labels, grid))
+    (folder / "case.toml").write_text(CASE)
+    return folder / "case.toml"
+
+
+def main() -> float:
+    """Mesh the reference state; the organ's volume in the mesh by that of the ball (dimensionless)."""
+    with tempfile.TemporaryDirectory() as folder:
+        tets = mesh(read_case(write_case(Path(folder)))).space.mesh
+    corners = tets.nodes[tets.tets[tets.region == 0]]
+    volume = np.linalg.det(corners[:, 1:] - corners[:, :1]).sum() / 6.0
+    share = float(volume / (4.0 / 3.0 * np.pi * RADIUS**3))
+    sys.stdout.write(f"{len(tets.tets)} tetrahedra; organ: {100 * share:.1f} % of the ball's volume\n")
+    assert abs(share - (1.0 - (0.6 * VOXEL / RADIUS) ** 2) ** 3) < 0.01
+    return share
+
+
+if __name__ == "__main__":
+    main()
