@@ -1,6 +1,6 @@
-"""The stiffness of a shell around a cavity, from one label image before and one after the cavity has grown.
+"""The stiffness of two balls, one in the other, from one label image before and one after a frame has squeezed them.
 
-The images are made here, from a phantom whose shell has 30 kPa; with images of your own, start at `read_case`.
+The images are made here, from a phantom of 60 and 30 kPa; with images of your own, start at `read_case`.
 """
 
 from __future__ import annotations
@@ -13,31 +13,30 @@ import palpate
 from palpate.images.readers import write_label_image
 from palpate.phantoms.spheres import SpheresOptions, spheres
 
+TRUTH_KPA = {"core": 60.0, "shell": 30.0}
 CASE = """
 [images]
 before = "before.nii.gz"
 after = ["after.nii.gz"]
 
 [tissues]
-cavity = { label = 1, role = "driver" }
+core = { label = 1, role = "estimate" }
 shell = { label = 2, role = "estimate" }
+frame = { label = 3, role = "driver" }
 surroundings = { label = "remaining", role = "known", youngs_modulus_kpa = 10.0 }
 
 [mesh]
 edge_length_mm = 8.0
-
 [driver]
 modes = 30
-
-[noise]
-surface_sd_mm = 0.15
-correlation_length_mm = 3.0
+[estimate]
+start_ratios = [1.0, 4.0]
 """
 
 
 def write_case(folder: Path) -> Path:
     """Write both label images (1.5 mm voxels) and the case that names them."""
-    scene = spheres(SpheresOptions(seed=1, kind="pushed", push_mm=4.0, spacing_mm=(1.5, 1.5, 1.5), truth_edge_mm=5.0))
+    scene = spheres(SpheresOptions(seed=2, spacing_mm=(1.5, 1.5, 1.5), truth_edge_mm=5.0))
     write_label_image(folder / "before.nii.gz", scene.before)
     write_label_image(folder / "after.nii.gz", scene.after)
     (folder / "case.toml").write_text(CASE)
@@ -45,13 +44,13 @@ def write_case(folder: Path) -> Path:
 
 
 def main() -> float:
-    """Estimate, print what was found, and give the shell's Young's modulus (kPa)."""
+    """Estimate, print what was found, and give the core's Young's modulus (kPa)."""
     with tempfile.TemporaryDirectory() as folder:
         result = palpate.estimate(palpate.read_case(write_case(Path(folder))))
     for e in result.estimation.estimates:
         low, high = e.interval95
         sys.stdout.write(f"{e.tissue}: {e.value:.1f} kPa (95 %: {low:.1f} to {high:.1f} kPa), {e.verdict}: {e.why}\n")
-        assert low < 30.0 < high
+        assert low < TRUTH_KPA[e.tissue] < high
     return result.estimation.estimates[0].value
 
 

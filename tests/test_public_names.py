@@ -13,7 +13,7 @@ import pytest
 import palpate
 
 MODULES = sorted(m.name for m in pkgutil.walk_packages(palpate.__path__, "palpate.") if not m.name.startswith("_"))
-COUNT = r"(?:\d+ )?(?:\d+|n\w*|[km])(?: [+/] (?:\d+|n_\w+))?(?: corners| axes)?"
+COUNT = r"(?:\d+ )?(?:\d+|n\w*|[km]|draws)(?: [+/] (?:\d+|n_\w+))?(?: corners| axes)?"
 SHAPE = re.compile(rf"\({COUNT}(?:,|(?:, {COUNT})+)\)")  # (n, 3), (n_nodes,), (3 n_points, n_modes + 1)
 
 

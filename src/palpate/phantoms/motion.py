@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from palpate.phantoms.boundary_noise import SmoothField
 from palpate.phantoms.shapes import Tube
 
-__all__ = ["AffineMotion", "Filling", "WallMotion"]
+__all__ = ["AffineMotion", "Filling", "Swelling", "WallMotion", "filling_of"]
 
 
 class WallMotion(Protocol):
@@ -24,35 +24,80 @@ class WallMotion(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Filling:
-    """A tube that fills: radial motion with a smooth profile, and a little motion of any direction.
+    """A tube that fills: motion away from its middle line, most at one place, as a smooth function of position.
 
-    At the place t (0 to 1) of the centre line the wall moves outwards by
-    filling_mm A(t) (1 + lean e . towards) / (1 + lean), where e is the unit vector from the centre line and
-    A = floor + (1 - floor) t^a (1 - t)^b / max, (a, b) = `profile`, both above 1 so that A is flat at the ends.
-    towards (3,) unit vector; `stray` is added, scaled by A.
+    With s (mm) along the unit vector `axis` (3,) from `origin` (3,), and the spoke e = (x - m(s)) / radius_mm from the
+    parabola m(s) = origin + s axis + bend (s / length_mm)^2 (bend (3,) mm), its part along the axis left out:
+    u = A(s) (filling_mm (1 + lean e . towards) / (1 + lean) e + stray(x)),
+    A(s) = exp(-(s - fullest_mm)^2 / (2 length_mm^2)). towards (3,) unit vector.
     """
 
-    tube: Tube
+    origin: NDArray[np.float64]
+    axis: NDArray[np.float64]
+    bend: NDArray[np.float64]
+    radius_mm: float
     filling_mm: float
-    profile: tuple[float, float]
-    floor: float
+    fullest_mm: float
+    length_mm: float
     towards: NDArray[np.float64]
     lean: float
     stray: SmoothField
 
     def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Displacement (n, 3) mm at wall points (n, 3) in RAS mm."""
-        place, spoke = self.tube.coordinates(points)
-        outward = spoke / np.linalg.norm(spoke, axis=1, keepdims=True)
-        along = self._along(place)[:, None]
-        around = (1.0 + self.lean * outward @ self.towards[:, None]) / (1.0 + self.lean)
-        return np.asarray(along * (self.filling_mm * around * outward + self.stray.at(points)))
+        along = (points - self.origin) @ self.axis
+        middle = self.origin + np.outer(along, self.axis) + np.outer((along / self.length_mm) ** 2, self.bend)
+        spoke = (points - middle) / self.radius_mm
+        spoke = spoke - np.outer(spoke @ self.axis, self.axis)
+        around = (1.0 + self.lean * spoke @ self.towards[:, None]) / (1.0 + self.lean)
+        amplitude = np.exp(-((along - self.fullest_mm) ** 2) / (2.0 * self.length_mm**2))[:, None]
+        return np.asarray(amplitude * (self.filling_mm * around * spoke + self.stray.at(points)))
 
-    def _along(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
-        a, b = self.profile
-        fullest = a / (a + b)
-        peak = fullest**a * (1.0 - fullest) ** b
-        return np.asarray(self.floor + (1.0 - self.floor) * place**a * (1.0 - place) ** b / peak)
+
+def filling_of(
+    tube: Tube,
+    *,
+    filling_mm: float,
+    fullest_mm: float,
+    length_mm: float,
+    towards: NDArray[np.float64],
+    lean: float,
+    stray: SmoothField,
+) -> Filling:
+    """The filling of a tube: its middle line is the parabola through the tube's knots, in the least squares' sense.
+
+    Lengths in mm; towards (3,) unit vector; see `Filling`.
+    """
+    origin = tube.knots.mean(axis=0)
+    axis = tube.knots[-1] - tube.knots[0]
+    axis = axis / np.linalg.norm(axis)
+    along = (tube.knots - origin) @ axis
+    aside = tube.knots - origin - np.outer(along, axis)
+    terms = np.stack([np.ones_like(along), (along / length_mm) ** 2], axis=1)
+    shift, bend = np.linalg.lstsq(terms, aside, rcond=None)[0]
+    radius = float(np.mean(tube.radii))
+    return Filling(origin + shift, axis, bend, radius, filling_mm, fullest_mm, length_mm, towards, lean, stray)
+
+
+@dataclass(frozen=True, slots=True)
+class Swelling:
+    """A ball that grows, more to one side: u = push_mm (1 + lean e . towards) / (1 + lean) e + stray(x).
+
+    e = (x - centre) / radius_mm; centre (3,) mm, towards (3,) unit vector.
+    """
+
+    centre: NDArray[np.float64]
+    radius_mm: float
+    push_mm: float
+    towards: NDArray[np.float64]
+    lean: float
+    stray: SmoothField
+
+    def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Displacement (n, 3) mm at wall points (n, 3) in RAS mm."""
+        spoke = (points - self.centre) / self.radius_mm
+        around = (1.0 + self.lean * spoke @ self.towards[:, None]) / (1.0 + self.lean)
+        return np.asarray(self.push_mm * around * spoke + self.stray.at(points))
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role, Tissue
 from palpate.mesh.anatomy import Anatomy, LevelSet
 from palpate.phantoms.boundary_noise import smooth_field
-from palpate.phantoms.motion import AffineMotion, Filling, WallMotion
+from palpate.phantoms.motion import AffineMotion, WallMotion, filling_of
 from palpate.phantoms.pelvis_shapes import PelvisShapes, draw_pelvis
 from palpate.phantoms.scene import Noise, Scene, centred_grid, grid_box, make_scene
 from palpate.phantoms.shapes import Ellipsoid, rotation_about
@@ -113,16 +113,15 @@ def _moduli(options: PelvisOptions, rng: np.random.Generator) -> dict[str, float
 
 
 def _motions(body: PelvisShapes, options: PelvisOptions, rng: np.random.Generator) -> dict[str, WallMotion]:
-    profile = rng.uniform(1.5, 2.5, 2)
     turn = rotation_about(rng.normal(size=3), rng.uniform(0.0, 30.0))
     motions: dict[str, WallMotion] = {
-        "rectum": Filling(
-            tube=body.rectum,
+        "rectum": filling_of(
+            body.rectum,
             filling_mm=options.filling_mm,
-            profile=(float(profile[0]), float(profile[1])),
-            floor=0.2,
+            fullest_mm=float(rng.uniform(-6.0, 6.0)),
+            length_mm=float(rng.uniform(16.0, 22.0)),
             towards=turn @ body.forwards,
-            lean=rng.uniform(0.1, 0.3),
+            lean=float(rng.uniform(0.0, 0.2)),
             stray=smooth_field(rng, sd_mm=STRAY * options.filling_mm, correlation_mm=STRAY_LENGTH_MM, features=300),
         )
     }

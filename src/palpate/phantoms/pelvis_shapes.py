@@ -62,7 +62,7 @@ def _upright(rng: np.random.Generator) -> PelvisShapes:
 
 
 def _rectum(rng: np.random.Generator, prostate: Ellipsoid, bladder: Ellipsoid) -> Tube:
-    """A tube some 65 mm long behind the organs, brought to a gap of 5 to 7 mm from them."""
+    """A tube some 65 mm long behind the organs, brought to a gap of 8 to 10 mm from them."""
     height = np.linspace(-0.5, 0.5, 5)
     length = rng.uniform(40.0, 44.0)
     bend, lean, side = rng.uniform(2.0, 8.0), rng.uniform(-3.0, 3.0), rng.uniform(-3.0, 3.0)
@@ -74,7 +74,7 @@ def _rectum(rng: np.random.Generator, prostate: Ellipsoid, bladder: Ellipsoid) -
         ]
     )
     radii = rng.uniform(10.7, 12.2, 5)
-    gap, organs = rng.uniform(5.0, 7.0), Union([prostate, bladder])
+    gap, organs = rng.uniform(8.0, 10.0), Union([prostate, bladder])
     for _ in range(20):
         excess = float(organs.at(Tube(knots, radii).surface(_directions(400))).min()) - gap
         if abs(excess) < 1e-3:

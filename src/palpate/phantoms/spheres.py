@@ -12,9 +12,9 @@ from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role, Tissue
 from palpate.mesh.anatomy import Anatomy, LevelSet
 from palpate.phantoms.boundary_noise import smooth_field
-from palpate.phantoms.motion import AffineMotion, Filling, WallMotion
+from palpate.phantoms.motion import AffineMotion, Swelling, WallMotion
 from palpate.phantoms.scene import Noise, Scene, centred_grid, grid_box, make_scene
-from palpate.phantoms.shapes import Complement, Tube, ball
+from palpate.phantoms.shapes import Complement, ball
 
 __all__ = ["SPHERES_KINDS", "SpheresOptions", "spheres"]
 
@@ -93,17 +93,8 @@ def _pushed(
     parts: Parts = {"cavity": ball(centre, CORE), "shell": ball(centre, SHELL), "surroundings": None}
     towards = rng.normal(size=3)
     towards /= np.linalg.norm(towards)
-    point = Tube(centre + 1e-3 * np.outer([-1.0, 0.0, 1.0], towards), np.full(3, CORE))
     stray = smooth_field(rng, sd_mm=STRAY * options.push_mm, correlation_mm=CORE, features=300)
-    filling = Filling(
-        tube=point,
-        filling_mm=options.push_mm,
-        profile=(1.0, 1.0),
-        floor=1.0,
-        towards=towards,
-        lean=LEAN,
-        stray=stray,
-    )
+    filling = Swelling(centre, CORE, options.push_mm, towards, LEAN, stray)
     return parts, {"cavity": filling}
 
 

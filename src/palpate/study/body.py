@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from palpate.errors import ConfigurationError
 from palpate.images.alignment import RigidMotion, align, moved
 from palpate.images.checks import Finding, check_images
 from palpate.images.distance import smoothing_width
@@ -97,7 +98,7 @@ def make_body(states: ImagedStates, case: Case, *, progress: Callable[[str], Non
 
 
 def inverse_problem(body: Body, case: Case, *, progress: Callable[[str], None]) -> InverseProblem:
-    """Models and targets of every later image."""
+    """Models and targets of every later image; raises `ConfigurationError` when nothing moves the body."""
     space, states = body.space, body.states
     tissues = space.mesh.tissues
     observed = [i for i, tissue in enumerate(tissues) if tissue.role in (Role.ESTIMATE, Role.DRIVER)]
@@ -105,6 +106,7 @@ def inverse_problem(body: Body, case: Case, *, progress: Callable[[str], None]) 
     targets = tuple(tuple(_target(body, surface, image) for surface in surfaces) for image in states.after)
     progress("assembling one stiffness matrix a tissue")
     models = _models(body, case)
+    _refuse_rest(models)
     estimated = frozenset(tissue.name for tissue in tissues if tissue.role is Role.ESTIMATE)
     return InverseProblem(models, targets, modulus_map(tissues, models[0].regions), estimated)
 
@@ -129,6 +131,15 @@ def _models(body: Body, case: Case) -> tuple[LinearModel, ...]:
         )
         models.append(with_constraint(models[0], constraint) if models else linear_model(body.space, constraint))
     return tuple(models)
+
+
+def _refuse_rest(models: tuple[LinearModel, ...]) -> None:
+    """Without a motion to start from, every modulus explains the images equally badly."""
+    if not any(model.n_modes or model.constraint.offset.any() for model in models):
+        raise ConfigurationError(
+            'nothing moves this body: no tissue has role = "driver" and no `rigid` tissue moves between the images, so'
+            " no modulus can be estimated; give the role driver to the hollow organ whose wall deforms the others"
+        )
 
 
 def _target(body: Body, surface: ObservedSurface, image: Segmentation) -> SurfaceTarget:

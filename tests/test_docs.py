@@ -1,0 +1,46 @@
+"""What the documentation says of the program is true: links, the schema with its defaults, the codes of warnings."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from palpate.study.case import Domain, DriverMotion, Estimate, Mechanics, MeshSettings
+from palpate.study.case_file import read_case
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
+EXAMPLE = (ROOT / "docs" / "case-file.md").read_text().split("```toml\n")[1].split("```")[0]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_link_to_a_file_leads_to_one(page):
+    targets = re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text())
+    missing = [target for target in targets if not target.endswith(".png") and not (page.parent / target).exists()]
+    assert not missing
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_toml_block_is_toml(page):
+    for block in re.findall(r"```toml\n(.*?)```", page.read_text(), flags=re.DOTALL):
+        tomllib.loads(block)
+
+
+def test_the_schema_in_the_docs_shows_the_defaults(tmp_path):
+    path = tmp_path / "case.toml"
+    path.write_text(EXAMPLE)
+    case = read_case(path)
+    assert (case.domain, case.mechanics, case.mesh) == (Domain(), Mechanics(), MeshSettings())
+    assert (case.driver, case.estimate, case.seed) == (DriverMotion(), Estimate(), 0)
+    assert case.tissues[0].poisson_ratio == 0.45
+
+
+def test_every_code_of_a_warning_is_explained():
+    source = "\n".join(path.read_text() for path in (ROOT / "src").rglob("*.py"))
+    codes = set(re.findall(r'(?:Finding|Remark)\(\s*"([a-z-]+)"', source)) | {"report"}
+    results = (ROOT / "docs" / "results.md").read_text()
+    assert len(codes) > 10
+    assert sorted(code for code in codes if f"`{code}`" not in results) == []
