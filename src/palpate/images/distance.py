@@ -10,7 +10,7 @@ from scipy import ndimage, special
 
 from palpate.images.label_image import VoxelGrid
 
-__all__ = ["DistanceMap", "distance_map", "smoothing_width"]
+__all__ = ["DistanceMap", "distance_map", "observation_width", "smoothing_width"]
 
 PROBIT_LIMIT = 2.5  # beyond so many sigma the smoothed indicator has lost the distance to rounding
 
@@ -20,10 +20,12 @@ class DistanceMap:
     """Signed distance (mm, negative inside) to a tissue's surface, interpolated by cubic B-splines.
 
     `coefficients` (nx, ny, nz) are the spline's; outside the grid the map continues the value on its border.
+    `smoothing_mm`: width of the Gaussian that the map was made with; `bias` (mm) is added everywhere.
     """
 
     coefficients: NDArray[np.float64]
     grid: VoxelGrid
+    smoothing_mm: float = 0.0
     bias: float = 0.0
 
     def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -64,6 +66,16 @@ def smoothing_width(*grids: VoxelGrid) -> float:
     return 0.6 * max(float(grid.spacing.max()) for grid in grids)
 
 
+def observation_width(*grids: VoxelGrid) -> float:
+    """Width sigma (mm) of the Gaussian for the surfaces that are compared, one for all `grids` of a case.
+
+    As `smoothing_width`, but a voxel up to 1 mm: terraces of nearly grid-parallel surfaces vanish, and what the
+    smoothing does to curved surfaces is the same in both images.
+    """
+    edge = max(grid.voxel_volume ** (1.0 / 3.0) for grid in grids)
+    return float(max(smoothing_width(*grids), min(1.0, edge)))
+
+
 def distance_map(mask: NDArray[np.bool_], grid: VoxelGrid, *, smoothing_mm: float) -> DistanceMap:
     """Signed distance map of the voxels in `mask` (nx, ny, nz).
 
@@ -76,7 +88,7 @@ def distance_map(mask: NDArray[np.bool_], grid: VoxelGrid, *, smoothing_mm: floa
     far = _distance_transform(mask, grid)
     weight = np.clip(np.abs(near) / smoothing_mm - (PROBIT_LIMIT - 1.0), 0.0, 1.0)
     values = (1.0 - weight) * near + weight * far
-    return DistanceMap(ndimage.spline_filter(values, order=3, mode="mirror"), grid)
+    return DistanceMap(ndimage.spline_filter(values, order=3, mode="mirror"), grid, smoothing_mm)
 
 
 def _distance_transform(mask: NDArray[np.bool_], grid: VoxelGrid) -> NDArray[np.float64]:

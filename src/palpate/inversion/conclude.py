@@ -20,7 +20,7 @@ from palpate.mesh.voxelise import voxelise
 
 __all__ = ["Observed", "conclude"]
 
-GRID_DRAWS = 6
+GRID_DRAWS = 8
 AT_BOUND = 1e-6
 STRONG_CORRELATION = 0.99
 
@@ -58,6 +58,7 @@ def conclude(
         displacements=tuple(state.displacement for state in observed.states),
         counts=_counts(inversion),
         remarks=_remarks(inversion, covariance),
+        grid_covariance=grid_part,
     )
 
 
@@ -78,6 +79,8 @@ def _estimates(
     theta = inversion.minimum.unknowns[: len(mapping.tissues)]
     bounds = settings.bounds
     scale = mapping.scale_kpa
+    if not inversion.minimum.outcome.converged:
+        return tuple(_no_estimate(inversion, name, truth.get(name)) for name in mapping.tissues)
     found = []
     for i, name in enumerate(mapping.tissues):
         ratio = float(np.exp(theta[i]))
@@ -102,6 +105,24 @@ def _estimates(
             )
         )
     return tuple(found)
+
+
+def _no_estimate(inversion: Inversion, tissue: str, truth: float | None) -> ModulusEstimate:
+    """The entry of a tissue when nothing converged: no value that could be taken for a result."""
+    mapping = inversion.objective.modulus_map
+    return ModulusEstimate(
+        tissue=tissue,
+        unit="kPa" if mapping.absolute else "ratio",
+        value=None,
+        interval95=None,
+        interval_kind="linearised",
+        relative_to=mapping.relative_to,
+        ratio=None,
+        ratio_interval95=None,
+        verdict="not identified",
+        why=f"the estimation did not converge: {inversion.minimum.outcome.value}",
+        truth=truth,
+    )
 
 
 def _start(inversion: Inversion, number: int, theta: NDArray[np.float64]) -> Start:
@@ -182,6 +203,14 @@ def _remarks(inversion: Inversion, covariance: NDArray[np.float64]) -> tuple[Rem
                 "ratio-only",
                 f"no tissue's modulus is known, so only ratios to '{mapping.relative_to}' are determined; give one"
                 " tissue role `known` with its youngs_modulus_kpa to get kPa",
+            )
+        )
+    if not inversion.settled:
+        remarks.append(
+            Remark(
+                "unsettled",
+                "residuals' law and estimate still changed each other in the last round; the model may not fit the"
+                " images (edge length, driver modes, law), or [noise] should be given",
             )
         )
     if len(set(inversion.groups)) > 1:

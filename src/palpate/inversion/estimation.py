@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,7 +94,7 @@ class Estimation:
     """Result of one inversion.
 
     correlation (n, n) of the log-moduli; fits: the tissues of each later image; displacements: (n_points, 3) mm of
-    each later image; covariance (n, n) of the log-moduli.
+    each later image; covariance (n, n) of the log-moduli, grid_covariance (n, n) the part of the voxel grid's place.
     """
 
     status: str
@@ -106,6 +106,7 @@ class Estimation:
     displacements: tuple[NDArray[np.float64], ...]
     counts: Mapping[str, int]
     remarks: tuple[Remark, ...] = ()
+    grid_covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def correlation(self) -> NDArray[np.float64]:

@@ -13,8 +13,8 @@ from palpate.inversion.gauss_newton import Bounds, Minimum, gauss_newton
 from palpate.inversion.lbfgs import lbfgs
 from palpate.inversion.modulus_map import ModulusMap
 from palpate.inversion.noise import NoiseLaw, fit_noise_law
-from palpate.inversion.objective import Evaluation, Objective, State, Weighting
-from palpate.inversion.surrogate import Surrogate, enriched, first_surrogate
+from palpate.inversion.objective import Evaluation, Linearisation, Objective, State, Weighting
+from palpate.inversion.surrogate import Surrogate, enriched, first_surrogate, with_modulus_series
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import LinearModel
 from palpate.observation.target import SurfaceTarget
@@ -26,9 +26,10 @@ MAD = 1.4826  # standard deviations of a normal law in one median absolute devia
 LEAST_CUTOFF = 5e-3  # mm
 FIRST_LAW = NoiseLaw(np.array([0.3**2]), np.array([3.0]))  # until the residuals tell
 SAME_MINIMUM = 0.02  # of ln E
-ROUNDS = 4
-SETTLED = 0.02  # posterior standard deviations by which a round may still move the estimate
-EXACT = 1e-5  # relative error in energy that needs no further snapshot
+ROUNDS = 7
+SETTLED = 0.05  # posterior standard deviations by which a round may still move the estimate
+EXACT = 3e-3  # standard deviations of a residual, per mm of motion: a smaller model error needs no further snapshot
+POLISH = 1e-5  # decrement of the reported minimum
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +54,10 @@ class InversionSettings:
 
 @dataclass(frozen=True, slots=True)
 class Inversion:
-    """All starts' minima under the final objective, the best first noted by `best`; the law of the residuals."""
+    """All starts' minima under the final objective, the best one's number; the law of the residuals.
+
+    rest: the evaluation at no motion; `settled` is False when weights and estimate still changed each other at the end.
+    """
 
     objective: Objective
     minima: tuple[Minimum, ...]
@@ -62,6 +66,7 @@ class Inversion:
     law: NoiseLaw
     surrogates: tuple[Surrogate, ...]
     rest: Evaluation
+    settled: bool = True
     evaluations: int = 0
     counts: SolveCounts = field(default_factory=SolveCounts)
 
@@ -79,7 +84,13 @@ def invert(problem: InverseProblem, settings: InversionSettings, *, progress: Ca
     middle = np.median(np.stack(settings.starts), axis=0)
     moduli = problem.modulus_map.moduli(middle)
     progress("responses of the full model at the middle start")
-    surrogates = tuple(first_surrogate(model, moduli, problem.modulus_map.columns) for model in problem.models)
+    surrogates = tuple(first_surrogate(model, moduli) for model in problem.models)
+    objective = _objective(problem, surrogates, settings.law or FIRST_LAW)
+    held = np.concatenate([middle, np.zeros(objective.n_unknowns - len(middle))])
+    objective = objective.with_fresh_correspondence(held)
+    driven = gauss_newton(objective, held, bounds=settings.bounds, hold_theta=True, tolerance=1e-2)
+    pairs = zip(surrogates, objective.coefficients(driven.unknowns), strict=True)
+    surrogates = tuple(with_modulus_series(s, q, problem.modulus_map.columns) for s, q in pairs)
     return invert_with(problem, settings, surrogates, progress=progress)
 
 
@@ -99,14 +110,17 @@ def invert_with(
     minima = _from_starts(objective, settings, progress)
     chosen = _best(minima)
     best = minima[chosen]
+    settled = False
     for round_ in range(ROUNDS):
         progress(f"round {round_ + 1}: {_words(problem, best)}; the full model is solved there")
-        surrogates = _enriched(problem, surrogates, objective, best)
+        surrogates = _enriched(problem, surrogates, objective, best, exact=min(EXACT * law.sd, 1e-3))
         law = settings.law or _law(problem, best.evaluation)
-        objective = _reweighted(_objective(problem, surrogates, law), best)
+        objective = _reweighted(_objective(problem, surrogates, law), best, law)
         before, best = best, _continued(objective, best, settings)
-        if _settled(before, best, objective.n_parameters):
+        settled = _settled(before, best, objective.n_parameters)
+        if settled:
             break
+    best = _continued(objective, best, settings, tolerance=POLISH)
     minima = tuple(best if i == chosen else _continued(objective, m, settings) for i, m in enumerate(minima))
     counts = sum((s.counts for s in surrogates), SolveCounts())
     return Inversion(
@@ -117,18 +131,24 @@ def invert_with(
         law,
         surrogates,
         rest,
+        settled,
         evaluations=sum(len(minimum.history) for minimum in minima),
         counts=counts,
     )
 
 
 def _enriched(
-    problem: InverseProblem, surrogates: tuple[Surrogate, ...], objective: Objective, minimum: Minimum
+    problem: InverseProblem,
+    surrogates: tuple[Surrogate, ...],
+    objective: Objective,
+    minimum: Minimum,
+    *,
+    exact: float,
 ) -> tuple[Surrogate, ...]:
-    """Solve the full models at a minimum where the reduced ones are not exact there."""
+    """Solve the full models at a minimum where the reduced ones' relative error is above `exact`."""
     moduli = problem.modulus_map.moduli(minimum.unknowns[: objective.n_parameters])
     pairs = zip(surrogates, objective.coefficients(minimum.unknowns), strict=True)
-    return tuple(s if s.relative_error(moduli, q) < EXACT else enriched(s, moduli, q) for s, q in pairs)
+    return tuple(s if s.relative_error(moduli, q) < exact else enriched(s, moduli, q) for s, q in pairs)
 
 
 def fit_driver(problem: InverseProblem, moduli: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
@@ -136,8 +156,7 @@ def fit_driver(problem: InverseProblem, moduli: NDArray[np.float64]) -> tuple[ND
 
     Raises `NotConverged` when the driver's wall cannot be brought to the images.
     """
-    columns = problem.modulus_map.columns[:0]
-    surrogates = tuple(first_surrogate(model, moduli, columns) for model in problem.models)
+    surrogates = tuple(first_surrogate(model, moduli) for model in problem.models)
     held = replace(problem, modulus_map=replace(problem.modulus_map, base=moduli))
     n = len(held.modulus_map.tissues)
     bounds = Bounds(np.full(n, -1.0), np.full(n, 1.0))
@@ -175,9 +194,11 @@ def _minimise(
     return gauss_newton(objective, start, bounds=settings.bounds, tolerance=tolerance)
 
 
-def _continued(objective: Objective, minimum: Minimum, settings: InversionSettings) -> Minimum:
+def _continued(
+    objective: Objective, minimum: Minimum, settings: InversionSettings, *, tolerance: float = 1e-3
+) -> Minimum:
     """Go on from a minimum under a new objective; the history goes on, too."""
-    found = _minimise(objective, minimum.unknowns, settings)
+    found = _minimise(objective, minimum.unknowns, settings, tolerance=tolerance)
     return replace(found, history=minimum.history + found.history)
 
 
@@ -199,14 +220,27 @@ def _precision(problem: InverseProblem, law: NoiseLaw) -> float:
     return max(float(np.mean(areas)) / law.correlation_area, 1.0) / law.sd**2
 
 
-def _reweighted(objective: Objective, minimum: Minimum) -> Objective:
-    """Tukey cutoffs from the residuals at a minimum, and image points chosen anew there."""
-    cutoffs = iter([_cutoff(surface.residuals.values) for surface in minimum.evaluation.surfaces])
+def _reweighted(objective: Objective, minimum: Minimum, law: NoiseLaw) -> Objective:
+    """Tukey cutoffs from the residuals at a minimum, and image points chosen anew there.
+
+    A surface that fits worse than the law of the residuals (a driver whose modes cannot follow its wall) counts by its
+    own mean square, so that its misfit is not forced into the other unknowns.
+    """
+    lines = iter(minimum.evaluation.surfaces)
     weighting = tuple(
-        tuple(replace(weighting, cutoff=next(cutoffs)) for weighting in weightings)
+        tuple(_weighting_of(next(lines), weighting, law) for weighting in weightings)
         for weightings in objective.weighting
     )
     return replace(objective, weighting=weighting).with_fresh_correspondence(minimum.unknowns)
+
+
+def _weighting_of(line: Linearisation, weighting: Weighting, law: NoiseLaw) -> Weighting:
+    values = line.residuals.values
+    cutoff = _cutoff(values)
+    inside = np.abs(values) < cutoff
+    mean_square = float(np.average(values[inside] ** 2, weights=line.residuals.weights[inside]))
+    share = min(1.0, law.sd**2 / max(mean_square, 1e-12))
+    return replace(weighting, cutoff=cutoff, precision=weighting.precision * share)
 
 
 def _cutoff(values: NDArray[np.float64]) -> float:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.errors import EstimationError
 from palpate.inversion.modulus_map import ModulusMap
 from palpate.mechanics.forward import ForwardModel
 from palpate.observation.misfit import SurfaceResiduals, observed_image_points, surface_residuals
@@ -45,7 +46,7 @@ class Weighting:
 
 @dataclass(frozen=True, slots=True)
 class Linearisation:
-    """Residuals of one surface with robust weights (n,) and their derivative (n, n_unknowns) by all unknowns.
+    """Residuals of one surface of one `state` with robust weights (n,) and their derivative (n, n_unknowns).
 
     `jacobian` is that of a smooth surface (see `SurfaceResiduals.normal_jacobian`); `gradient` (n_unknowns,) is the
     exact one of precision / 2 sum w rho(r).
@@ -57,6 +58,7 @@ class Linearisation:
     precision: float
     target: SurfaceTarget
     gradient: NDArray[np.float64]
+    state: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +130,10 @@ class Objective:
         return Evaluation(value, misfit, gradient, score, matrix, tuple(surfaces))
 
     def with_fresh_correspondence(self, unknowns: NDArray[np.float64]) -> Objective:
-        """Choose anew which image points face the observed part of each surface."""
+        """Choose anew which image points face the observed part of each surface.
+
+        Raises `EstimationError` when a surface has none left.
+        """
         fresh = [
             tuple(
                 replace(weighting, kept=observed_image_points(target, motion))
@@ -136,6 +141,9 @@ class Objective:
             )
             for s, displacement in enumerate(self._displacements(unknowns))
         ]
+        for state, weightings in zip(self.states, fresh, strict=True):
+            for target, weighting in zip(state.targets, weightings, strict=True):
+                _refuse_unseen(target, weighting)
         return replace(self, weighting=tuple(fresh))
 
     def _displacements(self, unknowns: NDArray[np.float64]) -> list[NDArray[np.float64]]:
@@ -168,7 +176,7 @@ class Objective:
             pull = np.asarray(residuals.jacobian.T @ (weighting.precision * weights * residuals.values))
             gradient = np.zeros(len(unknowns))
             gradient[places] = np.asarray(by_surface.T @ pull)
-            lines.append(Linearisation(residuals, jacobian, weights, weighting.precision, target, gradient))
+            lines.append(Linearisation(residuals, jacobian, weights, weighting.precision, target, gradient, s))
         return lines
 
     def _mode_places(self, state: int) -> NDArray[np.int64]:
@@ -177,6 +185,14 @@ class Objective:
 
     def _flat_weighting(self) -> list[Weighting]:
         return [weighting for weightings in self.weighting for weighting in weightings]
+
+
+def _refuse_unseen(target: SurfaceTarget, weighting: Weighting) -> None:
+    if not weighting.kept.any():
+        raise EstimationError(
+            f"'{target.surface.name}': none of the {len(weighting.kept)} points of its surface in the later image faces"
+            " the observed part of the model; is it the same organ, and do the images lie on each other?"
+        )
 
 
 def _robust_weight(values: NDArray[np.float64], cutoff: float) -> NDArray[np.float64]:

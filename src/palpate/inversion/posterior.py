@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from palpate.inversion.noise import NoiseLaw
 from palpate.inversion.objective import Evaluation
 
-MAX_FACES = 1500  # of one surface, in the dense covariance of the Cramer-Rao limit
+MAX_FACES = 2500  # of one surface, in the dense covariance of the Cramer-Rao limit
 
 __all__ = ["cramer_rao", "gain", "sandwich_covariance"]
 
@@ -64,9 +64,9 @@ def cramer_rao(evaluation: Evaluation, law: NoiseLaw, n_parameters: int) -> NDAr
 
 
 def _states(evaluation: Evaluation) -> Sequence[list[int]]:
-    """Numbers of the surfaces that belong to one image: those whose coefficients are the same unknowns."""
-    touched = [tuple(np.flatnonzero(np.abs(s.jacobian).max(axis=0) > 0.0)[-1:]) for s in evaluation.surfaces]
-    return [[i for i, t in enumerate(touched) if t == key] for key in dict.fromkeys(touched)]
+    """Numbers of the surfaces of each image; the errors of different images are independent."""
+    states = [surface.state for surface in evaluation.surfaces]
+    return [[i for i, state in enumerate(states) if state == key] for key in dict.fromkeys(states)]
 
 
 def _face_means(

@@ -11,7 +11,9 @@ from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import LinearModel, LinearSystem
 from palpate.mechanics.reduced import ReducedModel, reduce
 
-__all__ = ["Surrogate", "enriched", "first_surrogate"]
+__all__ = ["Surrogate", "enriched", "first_surrogate", "with_modulus_series"]
+
+SERIES = 40  # vectors at the most
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,14 +32,30 @@ class Surrogate:
         return float(self.system.error_bound(moduli, displacement[:, None])[0])
 
 
-def first_surrogate(model: LinearModel, moduli: NDArray[np.float64], columns: NDArray[np.int64]) -> Surrogate:
-    """Responses to every boundary mode at moduli (n_regions,) kPa, and their derivatives by ln E of `columns`."""
+def first_surrogate(model: LinearModel, moduli: NDArray[np.float64]) -> Surrogate:
+    """Responses to every boundary mode at moduli (n_regions,) kPa."""
     system = model.system(moduli)
-    responses = system.responses()
-    derivatives = system.modulus_responses(responses, regions=columns)
-    free = model.constraint.free
-    snapshots = np.concatenate([free.T @ part for part in (responses, *derivatives)], axis=1)
-    counts = system.response_counts + SolveCounts(tangent=responses.shape[1] * len(columns))
+    snapshots = np.asarray(model.constraint.free.T @ system.responses())
+    return Surrogate(model, snapshots, reduce(model, snapshots), system, system.response_counts)
+
+
+def with_modulus_series(
+    surrogate: Surrogate, coefficients: NDArray[np.float64], columns: NDArray[np.int64]
+) -> Surrogate:
+    """Add how the displacement at `coefficients` (n_modes,) changes with ln E of the regions `columns`, to high order.
+
+    The repeated derivatives w -> K^-1 (-E_r K_r w) of all orders up to a number span the dependence on the moduli over
+    a wide range, for K is affine in them (moment matching; Grimme 1997). One right-hand side each, no factorisation.
+    """
+    model, system = surrogate.model, surrogate.system
+    level = surrogate.reduced.solve(system.moduli, coefficients).values[:, None]
+    vectors: list[NDArray[np.float64]] = []
+    while level.shape[1] * len(columns) + sum(v.shape[1] for v in vectors) <= SERIES:
+        level = np.concatenate(list(system.modulus_responses(level, regions=columns)), axis=1)
+        vectors.append(level)
+    fresh = np.asarray(model.constraint.free.T @ np.concatenate(vectors, axis=1))
+    snapshots = np.concatenate([surrogate.snapshots, fresh], axis=1)
+    counts = surrogate.counts + SolveCounts(tangent=fresh.shape[1])
     return Surrogate(model, snapshots, reduce(model, snapshots), system, counts)
 
 

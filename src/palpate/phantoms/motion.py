@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from palpate.phantoms.boundary_noise import SmoothField
 from palpate.phantoms.shapes import Tube
 
-__all__ = ["AffineMotion", "Filling", "Swelling", "WallMotion", "filling_of"]
+__all__ = ["AffineMotion", "Filling", "ScaledMotion", "Swelling", "WallMotion", "filling_of"]
 
 
 class WallMotion(Protocol):
@@ -52,6 +52,18 @@ class Filling:
         around = (1.0 + self.lean * spoke @ self.towards[:, None]) / (1.0 + self.lean)
         amplitude = np.exp(-((along - self.fullest_mm) ** 2) / (2.0 * self.length_mm**2))[:, None]
         return np.asarray(amplitude * (self.filling_mm * around * spoke + self.stray.at(points)))
+
+
+@dataclass(frozen=True, slots=True)
+class ScaledMotion:
+    """`factor` times another motion."""
+
+    motion: WallMotion
+    factor: float
+
+    def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Displacement (n, 3) mm at wall points (n, 3) in RAS mm."""
+        return self.factor * self.motion.at(points)
 
 
 def filling_of(

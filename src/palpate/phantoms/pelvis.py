@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from palpate.errors import ConfigurationError
+from palpate.images.label_image import VoxelGrid
 from palpate.images.tissue import Role, Tissue
 from palpate.mesh.anatomy import Anatomy, LevelSet
 from palpate.phantoms.boundary_noise import smooth_field
@@ -16,7 +17,7 @@ from palpate.phantoms.pelvis_shapes import PelvisShapes, draw_pelvis
 from palpate.phantoms.scene import Noise, Scene, centred_grid, grid_box, make_scene
 from palpate.phantoms.shapes import Ellipsoid, rotation_about
 
-__all__ = ["PelvisOptions", "pelvis", "pelvis_anatomy"]
+__all__ = ["PelvisOptions", "pelvis", "pelvis_anatomy", "pelvis_grid"]
 
 SURROUNDINGS_KPA = 10.0
 STRAY = 0.05  # non-radial motion of the rectum's wall, standard deviation a component in parts of the filling
@@ -54,7 +55,7 @@ def pelvis(options: PelvisOptions) -> Scene:
     over, `ConfigurationError` for a field that is too small or a modulus for an unknown tissue.
     """
     motion_rng = np.random.default_rng(options.seed).spawn(3)[2]
-    grid = centred_grid(options.field_mm, options.spacing_mm)
+    grid = pelvis_grid(options)
     motions = _motions(_body(options), options, motion_rng)
     anatomy = pelvis_anatomy(options)
     return make_scene(
@@ -62,17 +63,22 @@ def pelvis(options: PelvisOptions) -> Scene:
     )
 
 
+def pelvis_grid(options: PelvisOptions) -> VoxelGrid:
+    """The voxel grid of the images of `options`."""
+    return centred_grid(options.field_mm, options.spacing_mm)
+
+
 def pelvis_anatomy(options: PelvisOptions) -> Anatomy:
     """The analytic shapes, tissues and true moduli of `options`, in the box of the images' voxels."""
     parts = _parts(_body(options), options)
     material_rng = np.random.default_rng(options.seed).spawn(3)[1]
     tissues = _tissues(tuple(parts), options, material_rng)
-    return Anatomy(tissues, tuple(parts.values()), grid_box(centred_grid(options.field_mm, options.spacing_mm)))
+    return Anatomy(tissues, tuple(parts.values()), grid_box(pelvis_grid(options)))
 
 
 def _body(options: PelvisOptions) -> PelvisShapes:
     shape_rng = np.random.default_rng(options.seed).spawn(3)[0]
-    return draw_pelvis(shape_rng, grid_box(centred_grid(options.field_mm, options.spacing_mm)), bones=options.bones)
+    return draw_pelvis(shape_rng, grid_box(pelvis_grid(options)), bones=options.bones)
 
 
 def _parts(body: PelvisShapes, options: PelvisOptions) -> dict[str, LevelSet | None]:
@@ -119,7 +125,7 @@ def _motions(body: PelvisShapes, options: PelvisOptions, rng: np.random.Generato
             body.rectum,
             filling_mm=options.filling_mm,
             fullest_mm=float(rng.uniform(-6.0, 6.0)),
-            length_mm=float(rng.uniform(16.0, 22.0)),
+            length_mm=float(rng.uniform(18.0, 24.0)),
             towards=turn @ body.forwards,
             lean=float(rng.uniform(0.0, 0.2)),
             stray=smooth_field(rng, sd_mm=STRAY * options.filling_mm, correlation_mm=STRAY_LENGTH_MM, features=300),

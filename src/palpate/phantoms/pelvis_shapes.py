@@ -73,7 +73,7 @@ def _rectum(rng: np.random.Generator, prostate: Ellipsoid, bladder: Ellipsoid) -
             rng.uniform(11.0, 17.0) + length * height,
         ]
     )
-    radii = rng.uniform(10.7, 12.2, 5)
+    radii = rng.uniform(13.0, 14.5, 5)
     gap, organs = rng.uniform(8.0, 10.0), Union([prostate, bladder])
     for _ in range(20):
         excess = float(organs.at(Tube(knots, radii).surface(_directions(400))).min()) - gap

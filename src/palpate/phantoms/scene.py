@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,19 @@ from palpate.mesh.tet_mesh import TetMesh
 from palpate.mesh.tetrahedralise import tetrahedralise
 from palpate.mesh.voxelise import Warp, voxelise
 from palpate.phantoms.boundary_noise import smooth_field
-from palpate.phantoms.motion import WallMotion
+from palpate.phantoms.motion import ScaledMotion, WallMotion
 
-__all__ = ["Noise", "Scene", "centred_grid", "deformation_determinants", "grid_box", "imaged", "make_scene"]
+__all__ = [
+    "Noise",
+    "Scene",
+    "centred_grid",
+    "deformation_determinants",
+    "grid_box",
+    "imaged",
+    "make_scene",
+    "reimaged",
+    "rescaled",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,11 +97,31 @@ def make_scene(
             f"the truth folds over (smallest determinant of the deformation gradient {smallest:.3f}): move the walls"
             " less or leave more room around them"
         )
-    rngs = np.random.default_rng([seed, 1]).spawn(2)
-    warps = [_warp(noise, rng) for rng in rngs]
-    before = imaged(space, np.zeros_like(displacement), grid, warp=warps[0])
-    after = imaged(space, displacement, grid, warp=warps[1])
+    before, after = _images(space, displacement, grid, noise, seed)
     return Scene(space, displacement, before, after, dict(motions), seed)
+
+
+def reimaged(scene: Scene, grid: VoxelGrid, *, noise: Noise | None) -> Scene:
+    """The same truth seen on another voxel grid, with other noise (drawn with the scene's seed) or none."""
+    before, after = _images(scene.space, scene.displacement, grid, noise, scene.seed)
+    return replace(scene, before=before, after=after)
+
+
+def rescaled(scene: Scene, factor: float) -> Scene:
+    """The scene with `factor` times the motion everywhere, which is again in equilibrium for the linear law.
+
+    The images stay those of the full motion until the scene is `reimaged`.
+    """
+    motions = {name: ScaledMotion(motion, factor) for name, motion in scene.motions.items()}
+    return replace(scene, displacement=factor * scene.displacement, motions=motions)
+
+
+def _images(
+    space: LagrangeSpace, displacement: NDArray[np.float64], grid: VoxelGrid, noise: Noise | None, seed: int
+) -> tuple[LabelImage, LabelImage]:
+    warps = [_warp(noise, rng) for rng in np.random.default_rng([seed, 1]).spawn(2)]
+    before = imaged(space, np.zeros_like(displacement), grid, warp=warps[0])
+    return before, imaged(space, displacement, grid, warp=warps[1])
 
 
 def imaged(

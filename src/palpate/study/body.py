@@ -10,7 +10,7 @@ import numpy as np
 from palpate.errors import ConfigurationError
 from palpate.images.alignment import RigidMotion, align, moved
 from palpate.images.checks import Finding, check_images
-from palpate.images.distance import smoothing_width
+from palpate.images.distance import observation_width, smoothing_width
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.images.tissue_distance import tissue_distance_map
@@ -44,7 +44,7 @@ class ImagedStates:
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """A meshed reference state with its images; `smoothing_mm` is the width of every distance map."""
+    """A meshed reference state with its images; `smoothing_mm` is the width of every distance map that is compared."""
 
     states: ImagedStates
     space: LagrangeSpace
@@ -94,7 +94,7 @@ def make_body(states: ImagedStates, case: Case, *, progress: Callable[[str], Non
         f"{quality.tets} tetrahedra, {3 * len(space.points)} unknowns, smallest dihedral angle"
         f" {quality.min_dihedral_deg:.1f} degrees"
     )
-    return Body(states, space, quality, width)
+    return Body(states, space, quality, observation_width(before.grid, *(image.grid for image in states.after)))
 
 
 def inverse_problem(body: Body, case: Case, *, progress: Callable[[str], None]) -> InverseProblem:
