@@ -74,13 +74,17 @@ def main() -> int:
     parser.add_argument("--rows", default=",".join(ROWS))
     parser.add_argument("--cases", type=int, help="cases a row instead of the row's own number")
     parser.add_argument("--first-seed", type=int, default=101)
+    parser.add_argument("--share", default="0/1", help="k/n: every n-th seed from the k-th, to run n at once")
     parser.add_argument("--output", type=Path, default=Path("accuracy.jsonl"))
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     arguments = parser.parse_args()
     done = _read(arguments.output)
     summaries = {}
     names = arguments.rows.split(",")
+    share = tuple(int(part) for part in arguments.share.split("/"))
     for seed in range(arguments.first_seed, arguments.first_seed + (arguments.cases or max_cases(names))):
+        if (seed - arguments.first_seed) % share[1] != share[0]:
+            continue
         truths: dict[bool, tuple[Scene, float]] = {}
         for name in names:
             if seed - arguments.first_seed >= (arguments.cases or ROWS[name].cases):
@@ -104,7 +108,7 @@ def max_cases(names: list[str]) -> int:
 
 
 def _truth(row: Row, seed: int, truths: dict[bool, tuple[Scene, float]]) -> tuple[Scene, PelvisOptions]:
-    """The scene of a row; rows of one seed share the truth, which is linear in the filling, and differ in the images."""
+    """The scene of a row; rows of one seed share the truth, which is linear in the filling, but not the images."""
     filling = float(np.random.default_rng([seed, 7]).uniform(6.0, 8.0))
     if row.tumour not in truths:
         truths[row.tumour] = pelvis(PelvisOptions(seed=seed, filling_mm=filling, tumour=row.tumour)), filling
