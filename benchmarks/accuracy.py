@@ -63,7 +63,7 @@ ROWS = {
     "other-mesh": Row(4, data="surfaces"),
     "clean": Row(8),
     "clean-3mm": Row(4, filling_mm=3.0),
-    "noise": Row(20, spacing_mm=(1.0, 1.0, 2.5), noise=NOISE),
+    "noise": Row(20, spacing_mm=(1.0, 1.0, 2.5), noise=NOISE, edge_mm=6.0),
     "tumour": Row(3, tumour=True),
 }
 

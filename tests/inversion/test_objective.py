@@ -11,17 +11,22 @@ import numpy as np
 import pytest
 
 import palpate.inversion
-from palpate.inversion.invert import first_surrogate
 from palpate.inversion.objective import Objective, State, Weighting
+from palpate.inversion.surrogate import first_surrogate, with_modulus_series
 
 MEMBERS = ("__call__", "value", "n_parameters", "n_unknowns")
+
+
+def surrogate_of(model, moduli, columns):
+    """A reduced model exact at `moduli`, with series of the moduli along one motion of the driver."""
+    return with_modulus_series(first_surrogate(model, moduli), np.ones(model.n_modes), columns).reduced
 
 
 def objective_of(problem, *, cutoff=np.inf, precision=30.0) -> Objective:
     moduli = problem.modulus_map.moduli(np.zeros(2))
     states, weighting = [], []
     for model, targets in zip(problem.models, problem.targets, strict=True):
-        reduced = first_surrogate(model, moduli, problem.modulus_map.columns).reduced
+        reduced = surrogate_of(model, moduli, problem.modulus_map.columns)
         states.append(State(reduced.at(np.concatenate([t.surface.dofs for t in targets])), targets))
         kept = [np.ones(len(t.image_points), dtype=bool) for t in targets]
         weighting.append(tuple(Weighting(precision, cutoff, k) for k in kept))
@@ -96,7 +101,7 @@ def test_the_modes_of_one_image_do_not_move_the_other(twins, twin):
 
 
 def test_at_the_truth_only_the_prior_pulls(twin, exact):
-    snapshots = first_surrogate(twin.model, twin.moduli, exact.modulus_map.columns).reduced
+    snapshots = surrogate_of(twin.model, twin.moduli, exact.modulus_map.columns)
     objective = objective_of(exact)
     outputs = np.concatenate([t.surface.dofs for t in exact.targets[0]])
     objective = replace(objective, states=(State(snapshots.at(outputs), exact.targets[0]),))

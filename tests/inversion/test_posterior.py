@@ -24,11 +24,11 @@ def sphere(n, radius):
     return radius * normals, normals
 
 
-def surface(places, normals, jacobian, *, precision):
+def surface(places, normals, jacobian, *, precision, state=0):
     n = len(places)
     weights = np.full(n, 1.0 / n)
     residuals = SurfaceResiduals(np.zeros(n), weights, places, normals, None, None)
-    return Linearisation(residuals, jacobian, weights, precision, SimpleNamespace(area=np.ones(n)), None)
+    return Linearisation(residuals, jacobian, weights, precision, SimpleNamespace(area=np.ones(n)), None, state)
 
 
 def evaluation(surfaces, n_parameters):
@@ -99,12 +99,12 @@ def test_a_second_image_with_noise_of_its_own_halves_the_variance(smooth):
     first = np.hstack([jacobian[:, :2], modes, none])
     second = np.hstack([jacobian[:, :2], none, modes])
     one = evaluation([surface(places, normals, jacobian, precision=200.0)], 2)
-    two = evaluation([surface(places, normals, rows, precision=200.0) for rows in (first, second)], 2)
+    two = evaluation([surface(places, normals, rows, precision=200.0, state=i) for i, rows in enumerate((first, second))], 2)
     assert sandwich_covariance(two, law, 2) == pytest.approx(0.5 * sandwich_covariance(one, law, 2), rel=1e-6)
 
 
 def test_no_estimate_beats_the_cramer_rao_limit(smooth):
-    places, normals, jacobian = (np.repeat(array[::3], 12, axis=0) for array in smooth)  # twelve places a P2 face
+    places, normals, jacobian = (array[::3] for array in smooth)
     law = NoiseLaw(np.array([SD**2]), np.array([5.0]))
     now = evaluation([surface(places, normals, jacobian, precision=200.0)], 2)
     limit = cramer_rao(now, law, 2)

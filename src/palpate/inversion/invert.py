@@ -121,7 +121,8 @@ def invert_with(
         if settled:
             break
     best = _continued(objective, best, settings, tolerance=POLISH)
-    minima = tuple(best if i == chosen else _continued(objective, m, settings) for i, m in enumerate(minima))
+    driven = [_with_driver(m, best, objective.n_parameters) for m in minima]
+    minima = tuple(best if i == chosen else _continued(objective, m, settings) for i, m in enumerate(driven))
     counts = sum((s.counts for s in surrogates), SolveCounts())
     return Inversion(
         objective,
@@ -218,6 +219,12 @@ def _precision(problem: InverseProblem, law: NoiseLaw) -> float:
     """Weight (mm^-2) of a surface's mean square: independent residuals on a mean surface, by their variance."""
     areas = [float(target.area.sum()) for targets in problem.targets for target in targets]
     return max(float(np.mean(areas)) / law.correlation_area, 1.0) / law.sd**2
+
+
+def _with_driver(minimum: Minimum, best: Minimum, n_parameters: int) -> Minimum:
+    """The moduli of a minimum with the driver's motion of the best one, which the later rounds have refined."""
+    unknowns = np.concatenate([minimum.unknowns[:n_parameters], best.unknowns[n_parameters:]])
+    return replace(minimum, unknowns=unknowns)
 
 
 def _reweighted(objective: Objective, minimum: Minimum, law: NoiseLaw) -> Objective:
