@@ -55,6 +55,7 @@ class Row:
     tumour: bool = False
     data: str = "voxels"
     edge_mm: float = 4.0
+    draws: int = 1  # of the noise, for each pelvis
 
 
 ROWS = {
@@ -63,7 +64,7 @@ ROWS = {
     "other-mesh": Row(4, data="surfaces"),
     "clean": Row(8),
     "clean-3mm": Row(4, filling_mm=3.0),
-    "noise": Row(20, spacing_mm=(1.0, 1.0, 2.5), noise=NOISE, edge_mm=6.0),
+    "noise": Row(8, spacing_mm=(1.0, 1.0, 2.5), noise=NOISE, edge_mm=6.0, draws=3),
     "tumour": Row(3, tumour=True),
 }
 
@@ -89,13 +90,15 @@ def main() -> int:
         for name in names:
             if seed - arguments.first_seed >= (arguments.cases or ROWS[name].cases):
                 continue
-            if (name, seed) not in done:
-                done[name, seed] = _case(name, ROWS[name], seed, truths)
-                with arguments.output.open("a") as file:
-                    file.write(json.dumps(done[name, seed]) + "\n")
-            _say(_line(done[name, seed]))
+            for draw in range(ROWS[name].draws):
+                key = (name, seed, draw)
+                if key not in done:
+                    done[key] = _case(key, ROWS[name], truths)
+                    with arguments.output.open("a") as file:
+                        file.write(json.dumps(done[key]) + "\n")
+                _say(_line(done[key]))
     for name in names:
-        cases = [result for (row, _), result in sorted(done.items()) if row == name]
+        cases = [result for key, result in sorted(done.items()) if key[0] == name]
         summaries[name] = _summary(cases)
         _say(f"{name}: {json.dumps(summaries[name])}")
     print(json.dumps({"rows": summaries}, indent=1) if arguments.json else _table(summaries))
@@ -107,7 +110,7 @@ def max_cases(names: list[str]) -> int:
     return max(ROWS[name].cases for name in names)
 
 
-def _truth(row: Row, seed: int, truths: dict[bool, tuple[Scene, float]]) -> tuple[Scene, PelvisOptions]:
+def _truth(row: Row, seed: int, draw: int, truths: dict[bool, tuple[Scene, float]]) -> tuple[Scene, PelvisOptions]:
     """The scene of a row; rows of one seed share the truth, which is linear in the filling, but not the images."""
     filling = float(np.random.default_rng([seed, 7]).uniform(6.0, 8.0))
     if row.tumour not in truths:
@@ -119,13 +122,14 @@ def _truth(row: Row, seed: int, truths: dict[bool, tuple[Scene, float]]) -> tupl
     options = PelvisOptions(
         seed=seed, filling_mm=filling, spacing_mm=row.spacing_mm, noise=row.noise, tumour=row.tumour
     )
-    return reimaged(scene, pelvis_grid(options), noise=row.noise), options
+    return reimaged(replace(scene, seed=seed + 1000 * draw), pelvis_grid(options), noise=row.noise), options
 
 
-def _case(name: str, row: Row, seed: int, truths: dict[bool, tuple[Scene, float]]) -> dict[str, object]:
+def _case(key: tuple[str, int, int], row: Row, truths: dict[bool, tuple[Scene, float]]) -> dict[str, object]:
     """Make one scene, estimate it, and hold the estimate beside the truth."""
+    name, seed, draw = key
     began = time.perf_counter()
-    scene, options = _truth(row, seed, truths)
+    scene, options = _truth(row, seed, draw, truths)
     filling = options.filling_mm
     scene_seconds = time.perf_counter() - began
     case = Case(f"{name}-{seed}", phantom=Phantom("pelvis", seed), mesh=MeshSettings(row.edge_mm))
@@ -140,6 +144,7 @@ def _case(name: str, row: Row, seed: int, truths: dict[bool, tuple[Scene, float]
     result = {
         "row": name,
         "seed": seed,
+        "draw": draw,
         "filling_mm": filling,
         "dofs": 3 * len(space.points),
         "truth_dofs": 3 * len(scene.space.points),
@@ -316,10 +321,10 @@ def _table(summaries: dict[str, dict]) -> str:
     return "\n".join(lines)
 
 
-def _read(path: Path) -> dict[tuple[str, int], dict]:
+def _read(path: Path) -> dict[tuple[str, int, int], dict]:
     lines = path.read_text().splitlines() if path.exists() else []
     results = [json.loads(line) for line in lines]
-    return {(result["row"], result["seed"]): result for result in results}
+    return {(result["row"], result["seed"], result.get("draw", 0)): result for result in results}
 
 
 def _say(message: str) -> None:
