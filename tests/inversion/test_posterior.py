@@ -27,7 +27,7 @@ def sphere(n, radius):
 def surface(places, normals, jacobian, *, precision, state=0):
     n = len(places)
     weights = np.full(n, 1.0 / n)
-    residuals = SurfaceResiduals(np.zeros(n), weights, places, normals, None, None)
+    residuals = SurfaceResiduals(np.zeros(n), weights, np.zeros(n), places, normals, None, None)
     return Linearisation(residuals, jacobian, weights, precision, SimpleNamespace(area=np.ones(n)), None, state)
 
 
@@ -99,7 +99,9 @@ def test_a_second_image_with_noise_of_its_own_halves_the_variance(smooth):
     first = np.hstack([jacobian[:, :2], modes, none])
     second = np.hstack([jacobian[:, :2], none, modes])
     one = evaluation([surface(places, normals, jacobian, precision=200.0)], 2)
-    two = evaluation([surface(places, normals, rows, precision=200.0, state=i) for i, rows in enumerate((first, second))], 2)
+    two = evaluation(
+        [surface(places, normals, rows, precision=200.0, state=i) for i, rows in enumerate((first, second))], 2
+    )
     assert sandwich_covariance(two, law, 2) == pytest.approx(0.5 * sandwich_covariance(one, law, 2), rel=1e-6)
 
 

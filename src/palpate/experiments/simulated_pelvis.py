@@ -31,9 +31,9 @@ from palpate.study.simulate import filled
 __all__ = ["DATA", "TISSUES", "SimulatedPelvis", "simulate_pelvis"]
 
 DATA = Path(__file__).parent / "data"
-FILLING_MM = 10.0
-MARGIN_MM = 40.0
-TRUTH_EDGE_MM = 4.0
+FILLING_MM = 6.0
+MARGIN_MM = 12.0
+TRUTH_EDGE_MM = 5.0
 VOXEL_MM = 1.0
 
 TISSUES = (
@@ -80,7 +80,7 @@ def simulate_pelvis(progress: Callable[[str], None]) -> SimulatedPelvis:
 
 
 def _field(scan: Segmentation) -> Box:
-    """The part of the scan within 40 mm of prostate, bladder and rectum."""
+    """The part of the scan within 12 mm of prostate, bladder and rectum."""
     observed = [i for i, t in enumerate(scan.tissues) if t.role in (Role.ESTIMATE, Role.DRIVER)]
     voxels = np.argwhere(np.isin(scan.index, observed)).astype(float)
     box = margin_box(domain_box([scan.grid]), scan.grid.world(voxels), margin_mm=MARGIN_MM)

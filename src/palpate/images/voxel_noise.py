@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from palpate.images.distance import DistanceMap
 
-__all__ = ["terrace_power", "voxel_weights"]
+__all__ = ["terrace_noise", "terrace_power"]
 
-COHERENCE = 16.0  # noise of a terraced pole over that of a tilted patch: variance times correlation area, at 1 mm
+COHERENCE = 1.7  # variance times correlation area of the rounding on a patch along a grid plane, in voxel edges^4
 
 
 def terrace_power(distance: DistanceMap, normals: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -28,11 +28,12 @@ def terrace_power(distance: DistanceMap, normals: NDArray[np.float64]) -> NDArra
     return np.asarray((left * (spacing / mean) ** 2).max(axis=1))
 
 
-def voxel_weights(before: DistanceMap, after: DistanceMap, normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Weights (n,) of residuals at surface places with unit normals (n, 3): low where either map shows terraces.
+def terrace_noise(before: DistanceMap, after: DistanceMap, normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Coherent rounding noise (n,) mm^4 of residuals at surface places with unit normals (n, 3).
 
-    1 / (1 + 16 (p_before + p_after) / 2): where a surface lies along a grid plane its voxels are all wrong by the same
-    fraction, over the whole patch, which no averaging over neighbours cures.
+    Where a surface lies along a grid plane its voxels are all wrong by the same fraction, over the whole patch, which
+    no averaging over neighbours cures: variance (mm^2) times correlation area (mm^2), 1.7 h^4 (p_before + p_after) / 2.
     """
+    edge = 0.5 * (before.grid.voxel_volume ** (1.0 / 3.0) + after.grid.voxel_volume ** (1.0 / 3.0))
     power = 0.5 * (terrace_power(before, normals) + terrace_power(after, normals))
-    return np.asarray(1.0 / (1.0 + COHERENCE * power))
+    return np.asarray(COHERENCE * edge**4 * power)

@@ -208,8 +208,9 @@ def _objective(problem: InverseProblem, surrogates: tuple[Surrogate, ...], law: 
         State(s.reduced.at(np.concatenate([t.surface.dofs for t in targets])), targets)
         for s, targets in zip(surrogates, problem.targets, strict=True)
     )
+    precision, noise = _precision(problem, law), law.sd**2 * law.correlation_area
     weighting = tuple(
-        tuple(Weighting(_precision(problem, law), np.inf, np.ones(len(t.image_points), dtype=bool)) for t in targets)
+        tuple(Weighting(precision, np.inf, np.ones(len(t.image_points), dtype=bool), noise) for t in targets)
         for targets in problem.targets
     )
     return Objective(states, problem.modulus_map, weighting)

@@ -36,12 +36,14 @@ class State:
 class Weighting:
     """How the residuals of one surface count: `precision` (mm^-2) of its mean square, Tukey `cutoff` (mm, inf: none).
 
-    kept (n_i,) marks the image points in use.
+    kept (n_i,) marks the image points in use; `noise` (mm^4, inf: all count by area) is the residuals' variance times
+    their correlation area, against which the voxels' terraces are held.
     """
 
     precision: float
     cutoff: float
     kept: NDArray[np.bool_]
+    noise: float = np.inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +110,7 @@ class Objective:
         total = 0.5 * float(np.sum(unknowns[self.n_parameters :] ** 2))
         for s, displacement in enumerate(self._displacements(unknowns)):
             for target, motion, weighting in self._surfaces(s, displacement):
-                residuals = surface_residuals(target, motion, weighting.kept)
+                residuals = _weighted(surface_residuals(target, motion, weighting.kept), weighting)
                 total += 0.5 * weighting.precision * _robust_sum(residuals, weighting.cutoff)
         return total
 
@@ -168,7 +170,7 @@ class Objective:
         lines = []
         triples = self._surfaces(s, solution.displacement.ravel())
         for rows, (target, motion, weighting) in zip(state.slices(), triples, strict=True):
-            residuals = surface_residuals(target, motion, weighting.kept)
+            residuals = _weighted(surface_residuals(target, motion, weighting.kept), weighting)
             jacobian = np.zeros((len(residuals.values), len(unknowns)))
             by_surface = tangent[rows][:, columns]
             jacobian[:, places] = np.asarray(residuals.normal_jacobian @ by_surface)
@@ -185,6 +187,14 @@ class Objective:
 
     def _flat_weighting(self) -> list[Weighting]:
         return [weighting for weightings in self.weighting for weighting in weightings]
+
+
+def _weighted(residuals: SurfaceResiduals, weighting: Weighting) -> SurfaceResiduals:
+    """Residuals whose weights fall as noise / (noise + terraces), with the same sum."""
+    if not np.isfinite(weighting.noise):
+        return residuals
+    weights = residuals.weights * weighting.noise / (weighting.noise + residuals.terraces)
+    return replace(residuals, weights=weights * (residuals.weights.sum() / weights.sum()))
 
 
 def _refuse_unseen(target: SurfaceTarget, weighting: Weighting) -> None:

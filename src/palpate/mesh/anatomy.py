@@ -14,11 +14,12 @@ from palpate.errors import GeometryError, InputDataError
 from palpate.images.distance import DistanceMap, distance_map
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
-from palpate.images.tissue import Tissue
+from palpate.images.tissue import Role, Tissue
 
 __all__ = ["Anatomy", "Box", "LevelSet", "anatomy_of", "domain_box", "margin_box"]
 
 ON_FACE_MM = 1e-4  # rounding in the coordinates of nodes on the faces of a box
+HELD_SMOOTHING = 2.0  # bones and air are not observed to hundredths of a millimetre; their roughness costs elements
 CROP_MM = 24.0  # a map is kept so far around its tissue; beyond, only "far away" matters to the mesh
 
 
@@ -131,7 +132,9 @@ def anatomy_of(segmentation: Segmentation, *, box: Box, smoothing_mm: float) -> 
     order = _priority(tissues, filler)
     level_sets: list[LevelSet | None] = [None] * len(tissues)
     for rank, tissue in enumerate(order):
-        level_sets[tissue] = _extended_map(segmentation, tissue, order[:rank], smoothing_mm)
+        held = tissues[tissue].role in (Role.RIGID, Role.VOID)
+        width = HELD_SMOOTHING * smoothing_mm if held else smoothing_mm
+        level_sets[tissue] = _extended_map(segmentation, tissue, order[:rank], width)
     return Anatomy(tissues, tuple(level_sets), box)
 
 

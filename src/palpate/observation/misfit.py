@@ -21,14 +21,16 @@ ON_EDGE = 1e-9
 class SurfaceResiduals:
     """Residuals of one surface, model -> image first, then image -> model.
 
-    values (n,) mm; weights (n,) dimensionless, 1/2 in total for each direction; places (n, 3) mm and normals (n, 3)
-    of the deformed surface; jacobian (n, 3 n_vertices) d values / d displacement of the surface's points;
-    normal_jacobian: the same for a smooth surface without noise, n . du. The exact one also holds how voxel noise and
-    facets change as the surface slides along itself, which tells nothing of how it slides.
+    values (n,) mm; weights (n,) dimensionless, 1/2 in total for each direction; terraces (n,) mm^4 (see
+    `SurfaceTarget`); places (n, 3) mm and normals (n, 3) of the deformed surface; jacobian (n, 3 n_vertices)
+    d values / d displacement of the surface's points; normal_jacobian: the same for a smooth surface without noise,
+    n . du. The exact one also holds how voxel noise and facets change as the surface slides along itself, which tells
+    nothing of how it slides.
     """
 
     values: NDArray[np.float64]
     weights: NDArray[np.float64]
+    terraces: NDArray[np.float64]
     places: NDArray[np.float64]
     normals: NDArray[np.float64]
     jacobian: sparse.csr_matrix[np.float64]
@@ -59,6 +61,7 @@ def surface_residuals(
     return SurfaceResiduals(
         np.concatenate([forward.values, backward.values]),
         np.concatenate([forward.weights, backward.weights]),
+        np.concatenate([forward.terraces, backward.terraces]),
         np.concatenate([forward.places, backward.places]),
         np.concatenate([forward.normals, backward.normals]),
         sparse.vstack([forward.jacobian, backward.jacobian], format="csr"),
@@ -88,7 +91,7 @@ def _model_to_image(target: SurfaceTarget, displacement: NDArray[np.float64]) ->
     weights = 0.5 * target.area / target.area.sum()
     n = len(surface.rest)
     exact, normal = _sparse_rows(rows, corners, n), _sparse_rows(smooth, corners, n)
-    return SurfaceResiduals(values, weights, places, normals, exact, normal)
+    return SurfaceResiduals(values, weights, target.terraces, places, normals, exact, normal)
 
 
 def _image_to_model(
@@ -114,7 +117,7 @@ def _image_to_model(
     weights = 0.5 * target.image_area[kept] / max(target.image_area[kept].sum(), 1e-30)
     n = len(surface.rest)
     exact, plane = _sparse_rows(rows, corners, n), _sparse_rows(smooth, corners, n)
-    return SurfaceResiduals(values, weights, closest.places, normals, exact, plane)
+    return SurfaceResiduals(values, weights, target.image_terraces[kept], closest.places, normals, exact, plane)
 
 
 def _smooth_normals(

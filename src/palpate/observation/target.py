@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from palpate.images.distance import DistanceMap
 from palpate.images.isosurface import isosurface_points
-from palpate.images.voxel_noise import voxel_weights
+from palpate.images.voxel_noise import terrace_noise
 from palpate.mesh.anatomy import LevelSet
 from palpate.mesh.surface import triangle_normals
 from palpate.observation.observed_surface import ObservedSurface
@@ -26,9 +26,10 @@ AREA_OF_A_POINT = 1.6  # mm^2: residuals nearer to each other than about a voxel
 class SurfaceTarget:
     """One surface of the model and both images of it.
 
-    triangle (n_q,), barycentric (n_q, 3), area (n_q,) mm^2 that counts: quadrature on the observed triangles;
+    triangle (n_q,), barycentric (n_q, 3), area (n_q,) mm^2: quadrature on the observed triangles;
     rest_distance (n_q,) mm: the map `before` there, subtracted from the map `after` (difference to the rest state);
-    level (mm): its mean; image_points (n_i, 3) mm with areas (n_i,) mm^2: the later surface, taken at `level`.
+    level (mm): its mean; image_points (n_i, 3) mm with areas (n_i,) mm^2: the later surface, taken at `level`;
+    terraces (n_q,) and image_terraces (n_i,) mm^4: coherent rounding noise of the voxels (see `terrace_noise`).
     """
 
     surface: ObservedSurface
@@ -41,24 +42,30 @@ class SurfaceTarget:
     level: float
     image_points: NDArray[np.float64]
     image_area: NDArray[np.float64]
+    terraces: NDArray[np.float64]
+    image_terraces: NDArray[np.float64]
 
 
 def surface_target(surface: ObservedSurface, before: DistanceMap, after: DistanceMap) -> SurfaceTarget:
     """Make the target of `surface` from the maps of its tissue in the two images.
 
     The later surface is taken where `after` equals the mean of `before` over the model's rest surface, so that a bias
-    common to both maps changes nothing. Areas are weighted down where a surface lies along the voxels' planes.
+    common to both maps changes nothing.
     """
     rest = target_from(surface, before, after, level=0.0, image=(np.zeros((0, 3)), np.zeros(0)))
     normals = triangle_normals(surface.rest, surface.triangles)[rest.triangle]
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    area = rest.area * voxel_weights(before, after, normals)
-    level = float(np.average(rest.rest_distance, weights=area))
+    level = float(np.average(rest.rest_distance, weights=rest.area))
     points = isosurface_points(after, level)
     stride = max(int(AREA_OF_A_POINT * len(points.area) / max(float(points.area.sum()), 1e-9)), 1)
-    places, image_normals, image_area = points.places[::stride], points.normals[::stride], points.area[::stride]
-    image_area = image_area * voxel_weights(before, after, image_normals)
-    return replace(rest, area=area, level=level, image_points=places, image_area=image_area)
+    return replace(
+        rest,
+        level=level,
+        image_points=points.places[::stride],
+        image_area=points.area[::stride],
+        terraces=terrace_noise(before, after, normals),
+        image_terraces=terrace_noise(before, after, points.normals[::stride]),
+    )
 
 
 def target_from(
@@ -81,4 +88,5 @@ def target_from(
     area = np.repeat(size / len(rule), len(rule))
     # (n_q, 3 corners) x (n_q, 3 corners, 3 axes) -> (n_q, 3)
     places = np.einsum("qk,qka->qa", barycentric, surface.rest[surface.triangles[triangle]])
-    return SurfaceTarget(surface, before, after, triangle, barycentric, area, before.at(places), level, *image)
+    quiet = np.zeros(len(area)), np.zeros(len(image[1]))
+    return SurfaceTarget(surface, before, after, triangle, barycentric, area, before.at(places), level, *image, *quiet)
