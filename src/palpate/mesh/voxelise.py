@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.spatial import KDTree
 
 from palpate.errors import GeometryError
@@ -13,6 +14,8 @@ from palpate.images.label_image import VoxelGrid
 from palpate.mesh.space import LagrangeSpace, triangle_shape
 from palpate.mesh.surface import tissue_surface
 from palpate.mesh.tet_mesh import OUTER, TetMesh
+
+TIES = 4  # voxels at the most whose column meets an edge that two faces round differently; a neighbour decides
 
 __all__ = ["Warp", "voxelise"]
 
@@ -80,9 +83,13 @@ def _regions(codes: NDArray[np.int64], mesh: TetMesh) -> NDArray[np.int16]:
         here = codes == BASE**region
         tissue[here] = region
         known |= here
-    if not known.all():
+    unknown = int(np.count_nonzero(~known))
+    if 0 < unknown <= TIES:
+        nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+        return np.asarray(tissue[tuple(nearest)])
+    if unknown:
         raise GeometryError(
-            f"{int((~known).sum())} voxel centres lie in two regions at once or in an open surface: the deformed"
+            f"{unknown} voxel centres lie in two regions at once or in an open surface: the deformed"
             " surfaces cross each other; check the displacement for fold-over, or make the boundary noise smaller"
         )
     return tissue

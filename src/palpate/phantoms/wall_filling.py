@@ -2,59 +2,61 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from palpate.errors import GeometryError
-from palpate.images.distance import DistanceMap, distance_map
 from palpate.images.segmentation import Segmentation
-from palpate.images.tissue_distance import cropped, window_around
+from palpate.images.tissue import Role
+from palpate.phantoms.boundary_noise import smooth_field
+from palpate.phantoms.motion import Filling
 
-__all__ = ["WallFilling", "wall_filling"]
+__all__ = ["wall_filling"]
 
-DIRECTION_MM = 6.0  # smoothing of the wall before its normals are taken, so that folds do not cross
-END = 0.1  # share of the filling left at the organ's two ends
+ENDS = 2.2  # half the organ's length in lengths of the filling: 9 % of it is left at the ends
 
 
-@dataclass(frozen=True, slots=True)
-class WallFilling:
-    """The wall moves along the smoothed wall's normal, by `filling_mm` half way along the organ and less to its ends.
+def wall_filling(segmentation: Segmentation, tissue: int, *, filling_mm: float) -> Filling:
+    """The filling of a tissue of the segmentation, by its index, by `filling_mm` where the organs are nearest.
 
-    u(x) = filling_mm (END + (1 - END) cos^2(pi t / 2)) grad(phi) / |grad(phi)|, with t (-1 to 1) the place along the
-    organ's longest `axis` (3,) through `centre` (3,) mm, `half_length` (mm) to either side.
+    It is fullest at the height of the tenth of its voxels that are nearest to the first `estimate` tissue's centre
+    (half way along it when there is none).
+
+    Its middle line is the parabola through its voxels along their longest axis (least squares), its radius that of a
+    round tube with the same spread across, R^2 = 2 mean r^2. Raises `GeometryError` for a tissue of a few voxels.
     """
-
-    wall: DistanceMap
-    filling_mm: float
-    centre: NDArray[np.float64]
-    axis: NDArray[np.float64]
-    half_length: float
-
-    def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Displacement (n, 3) mm at wall points (n, 3) in RAS mm."""
-        normal = self.wall.gradient_at(points)
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-        place = np.clip((points - self.centre) @ self.axis / self.half_length, -1.0, 1.0)
-        along = END + (1.0 - END) * np.cos(0.5 * np.pi * place) ** 2
-        return np.asarray(self.filling_mm * along[:, None] * normal)
-
-
-def wall_filling(segmentation: Segmentation, tissue: int, *, filling_mm: float) -> WallFilling:
-    """The filling of a tissue of the segmentation, by its index; raises `GeometryError` for one of a few voxels."""
-    mask = segmentation.mask(tissue)
-    voxels = segmentation.grid.world(np.argwhere(mask).astype(float))
+    voxels = segmentation.grid.world(np.argwhere(segmentation.mask(tissue)).astype(float))
     if len(voxels) < 10:
         raise GeometryError(
             f"'{segmentation.tissues[tissue].name}' has {len(voxels)} voxels: too few to fill; check its label"
         )
-    window = window_around(mask, segmentation.grid, reach_mm=3.0 * DIRECTION_MM)
-    sigma = DIRECTION_MM / segmentation.grid.spacing
-    sharp = distance_map(mask[window], cropped(segmentation.grid, window), smoothing_mm=1.0 + DIRECTION_MM / 10.0)
-    smooth = DistanceMap(ndimage.gaussian_filter(sharp.coefficients, sigma, mode="nearest"), sharp.grid)
     centre = voxels.mean(axis=0)
     axis = np.linalg.eigh((voxels - centre).T @ (voxels - centre))[1][:, -1]
-    half_length = float(np.abs((voxels - centre) @ axis).max())
-    return WallFilling(smooth, filling_mm, centre, axis, half_length)
+    along = (voxels - centre) @ axis
+    length = float(np.abs(along).max()) / ENDS
+    aside = voxels - centre - np.outer(along, axis)
+    terms = np.stack([np.ones_like(along), along / length, (along / length) ** 2], axis=1)
+    shift, tilt, bend = np.linalg.lstsq(terms, aside, rcond=None)[0]
+    radius = float(np.sqrt(2.0 * np.mean(np.sum((aside - terms @ np.stack([shift, tilt, bend])) ** 2, axis=1))))
+    return Filling(
+        origin=centre + shift,
+        axis=axis,
+        bend=bend,
+        radius_mm=radius,
+        filling_mm=filling_mm,
+        fullest_mm=_fullest(segmentation, voxels, along),
+        length_mm=length,
+        towards=axis,
+        lean=0.0,
+        stray=smooth_field(np.random.default_rng(0), sd_mm=0.0, correlation_mm=20.0, features=1),
+    )
+
+
+def _fullest(segmentation: Segmentation, voxels: NDArray[np.float64], along: NDArray[np.float64]) -> float:
+    """Place (mm along the axis) of the voxels (n, 3) mm that are nearest to the first `estimate` tissue."""
+    estimated = [i for i, tissue in enumerate(segmentation.tissues) if tissue.role is Role.ESTIMATE]
+    if not estimated:
+        return 0.0
+    centre = segmentation.grid.world(np.argwhere(segmentation.mask(estimated[0])).astype(float)).mean(axis=0)
+    distance = np.linalg.norm(voxels - centre, axis=1)
+    return float(along[distance <= np.quantile(distance, 0.1)].mean())
