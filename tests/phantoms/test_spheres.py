@@ -5,7 +5,8 @@ import pytest
 
 from palpate.errors import ConfigurationError, GeometryError
 from palpate.images.tissue import Role
-from palpate.phantoms.scene import Noise, deformation_determinants, imaged
+from palpate.mechanics.deformation import deformation_determinants
+from palpate.phantoms.scene import Noise, imaged
 from palpate.phantoms.spheres import SPHERES_KINDS, SpheresOptions, spheres
 
 

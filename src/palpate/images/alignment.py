@@ -173,7 +173,8 @@ def fit_rigid_motion(pairs: Sequence[tuple[DistanceMap, DistanceMap]]) -> RigidF
 def align(before: Segmentation, after: Segmentation) -> Alignment:
     """Motion of the `rigid` tissues between two segmentations of the same tissues, together and each by itself.
 
-    Raises `InputDataError` when there is no rigid tissue or one shows too little of its surface.
+    A tissue that shows too little of its surface (cut by the image) moves with the others: its fit is the overall one
+    with n_points = 0. Raises `InputDataError` when there is no rigid tissue or all of them show too little.
     """
     rigid = [i for i, tissue in enumerate(before.tissues) if tissue.role is Role.RIGID]
     if not rigid:
@@ -183,10 +184,10 @@ def align(before: Segmentation, after: Segmentation) -> Alignment:
         (tissue_distance_map(before, i, smoothing_mm=width), tissue_distance_map(after, i, smoothing_mm=width))
         for i in rigid
     ]
-    each = {
-        before.tissues[i].name: _named_fit(pair, before.tissues[i].name) for i, pair in zip(rigid, pairs, strict=True)
-    }
-    return Alignment(fit_rigid_motion(pairs), each)
+    overall = fit_rigid_motion(pairs)
+    names = [before.tissues[i].name for i in rigid]
+    each = {name: _fit_or(pair, overall) for name, pair in zip(names, pairs, strict=True)}
+    return Alignment(overall, each)
 
 
 def moved(segmentation: Segmentation, motion: RigidMotion) -> Segmentation:
@@ -195,11 +196,11 @@ def moved(segmentation: Segmentation, motion: RigidMotion) -> Segmentation:
     return replace(segmentation, grid=grid)
 
 
-def _named_fit(pair: tuple[DistanceMap, DistanceMap], name: str) -> RigidFit:
+def _fit_or(pair: tuple[DistanceMap, DistanceMap], overall: RigidFit) -> RigidFit:
     try:
         return fit_rigid_motion([pair])
-    except InputDataError as error:
-        raise InputDataError(f"tissue '{name}': {error}") from error
+    except InputDataError:
+        return replace(overall, n_points=0)
 
 
 def _smoothed(surface: DistanceMap, voxel: float) -> DistanceMap:

@@ -15,6 +15,7 @@ from palpate.inversion.invert import Inversion, InversionSettings
 from palpate.inversion.objective import Linearisation
 from palpate.inversion.posterior import sandwich_covariance
 from palpate.inversion.verdict import log_interval, verdict
+from palpate.mechanics.deformation import deformation_determinants
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
 
@@ -57,7 +58,7 @@ def conclude(
         fits=_fits(inversion, observed),
         displacements=tuple(state.displacement for state in observed.states),
         counts=_counts(inversion),
-        remarks=_remarks(inversion, covariance),
+        remarks=(*_remarks(inversion, covariance), *_folds(observed)),
         grid_covariance=grid_part,
     )
 
@@ -152,7 +153,9 @@ def _fits(inversion: Inversion, observed: Observed) -> tuple[tuple[TissueFit, ..
     fits, number = [], 0
     for state, fitted, image in zip(inversion.objective.states, observed.states, observed.images, strict=True):
         still = np.zeros_like(fitted.displacement)
-        overlaps = [voxelise(observed.space, motion, fitted.after) for motion in (still, fitted.displacement)]
+        overlaps = [
+            voxelise(observed.space, motion, fitted.after, crossing=True) for motion in (still, fitted.displacement)
+        ]
         tissues = []
         for target in state.targets:
             tissue = target.surface.tissue
@@ -163,6 +166,25 @@ def _fits(inversion: Inversion, observed: Observed) -> tuple[tuple[TissueFit, ..
             number += 1
         fits.append(tuple(tissues))
     return tuple(fits)
+
+
+def _folds(observed: Observed) -> tuple[Remark, ...]:
+    """A warning for each later image in which the fitted model turns elements inside out."""
+    remarks = []
+    for number, state in enumerate(observed.states, start=1):
+        smallest = deformation_determinants(observed.space, state.displacement).min(axis=1)
+        folded = int(np.count_nonzero(smallest <= 0.0))
+        if folded:
+            worst = observed.space.mesh.nodes[observed.space.mesh.tets[int(smallest.argmin())]].mean(axis=0)
+            remarks.append(
+                Remark(
+                    "fold-over",
+                    f"after image {number}: {folded} of {len(smallest)} elements are turned inside out, the worst near"
+                    f" {np.round(worst).astype(int).tolist()} mm (RAS): the motion is too large there for the law or"
+                    " the mesh",
+                )
+            )
+    return tuple(remarks)
 
 
 def _surface_fit(line: Linearisation, dice: float) -> SurfaceFit:

@@ -80,4 +80,4 @@ def _imaged(
     affine = np.array(grid.affine)
     affine[:3, 3] += affine[:3, :3] @ rng.uniform(-0.5, 0.5, 3)
     shifted = replace(grid, affine=affine)
-    return Segmentation(voxelise(space, displacement, shifted), shifted, space.mesh.tissues)
+    return Segmentation(voxelise(space, displacement, shifted, crossing=True), shifted, space.mesh.tissues)

@@ -33,6 +33,7 @@ def voxelise(
     *,
     subdivisions: int = 2,
     warp: Warp | None = None,
+    crossing: bool = False,
 ) -> NDArray[np.int16]:
     """Tissue (nx, ny, nz), an index into `space.mesh.tissues`, at each voxel centre of the deformed mesh.
 
@@ -41,8 +42,9 @@ def voxelise(
     (n, 3) mm -> (n, 3) mm. Columns of voxel centres are followed through these triangles: each crossing changes the
     tissue, with one decision for both sides, so that touching regions leave neither gap nor overlap. A voxel in no
     meshed region is of the hollow tissue behind the nearest boundary face, or, where that face is the domain's outer
-    border, of the face's own region. Raises `GeometryError` when surfaces cross each other or the numbers of points
-    differ. Method: scan conversion with a symbolic perturbation at ties.
+    border, of the face's own region. Raises `GeometryError` when surfaces cross each other (unless `crossing`: then
+    voxels in two regions take their nearest neighbour's) or the numbers of points differ. Method: scan conversion with
+    a symbolic perturbation at ties.
     """
     if displacement.shape != space.points.shape:
         raise GeometryError(
@@ -52,7 +54,7 @@ def voxelise(
     pieces = _pieces(space, displacement, triangles, subdivisions=subdivisions, warp=warp)
     count = 4**subdivisions
     code_inner, code_other = (np.repeat(_codes(side, space.mesh), count) for side in (inner, other))
-    tissue = _regions(_accumulate(pieces, code_other - code_inner, grid), space.mesh)
+    tissue = _regions(_accumulate(pieces, code_other - code_inner, grid), space.mesh, crossing)
     hollow = code_other == 0
     behind = np.repeat(np.where(other == OUTER, inner, other), count)
     return _fill_hollows(tissue, grid, centroids=pieces[hollow].mean(axis=1), values=behind[hollow])
@@ -75,7 +77,7 @@ def _codes(side: NDArray[np.int64], mesh: TetMesh) -> NDArray[np.int64]:
     return np.where(np.isin(side, mesh.region), BASE ** np.maximum(side, 0), 0)
 
 
-def _regions(codes: NDArray[np.int64], mesh: TetMesh) -> NDArray[np.int16]:
+def _regions(codes: NDArray[np.int64], mesh: TetMesh, crossing: bool) -> NDArray[np.int16]:
     """Index of the region of each code, -1 where nothing is meshed."""
     tissue = np.full(codes.shape, -1, dtype=np.int16)
     known = codes == 0
@@ -84,7 +86,7 @@ def _regions(codes: NDArray[np.int64], mesh: TetMesh) -> NDArray[np.int16]:
         tissue[here] = region
         known |= here
     unknown = int(np.count_nonzero(~known))
-    if 0 < unknown <= TIES:
+    if 0 < unknown <= (known.size if crossing else TIES):
         nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
         return np.asarray(tissue[tuple(nearest)])
     if unknown:

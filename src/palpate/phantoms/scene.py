@@ -12,7 +12,7 @@ from palpate.errors import GeometryError
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.tissue import Role, Tissue
 from palpate.mechanics.boundary import outer_constraint
-from palpate.mechanics.element import barycentric_gradients, shape_derivatives
+from palpate.mechanics.deformation import deformation_determinants
 from palpate.mechanics.linear_model import linear_model
 from palpate.mesh.anatomy import Anatomy, Box
 from palpate.mesh.space import LagrangeSpace, lagrange_space
@@ -146,17 +146,6 @@ def grid_box(grid: VoxelGrid) -> Box:
     """The box of all voxels of an upright grid, out to their outer faces."""
     lengths = np.array(grid.shape) * grid.spacing
     return Box(grid.world(np.full((1, 3), -0.5))[0], np.eye(3), lengths)
-
-
-def deformation_determinants(space: LagrangeSpace, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Determinant (n_tets, 5) of F = I + grad u at corners and centres of the tetrahedra.
-
-    displacement (n_points, 3) mm. Positive at all of them: no element is turned inside out.
-    """
-    places = np.vstack([np.eye(4), np.full((1, 4), 0.25)])
-    gradients, _ = barycentric_gradients(space.mesh.nodes, space.mesh.tets)
-    by_barycentric = np.einsum("qak,nai->nqik", shape_derivatives(space.order, places), displacement[space.cells])
-    return np.asarray(np.linalg.det(np.eye(3) + by_barycentric @ gradients[:, None]))
 
 
 def _equilibrium(space: LagrangeSpace, motions: Mapping[str, WallMotion]) -> NDArray[np.float64]:

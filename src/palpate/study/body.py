@@ -69,6 +69,15 @@ def aligned(before: Segmentation, after: tuple[Segmentation, ...], *, method: st
         bones.append({i: alignment.remaining(name) for i, name in rigid.items()})
         findings += [
             Finding(
+                "rigid-unseen",
+                f"after image {number}: '{name}' shows too little of its surface for a motion of its own; it moves with"
+                " the other rigid tissues",
+            )
+            for name, fit in alignment.tissues.items()
+            if fit.n_points == 0
+        ]
+        findings += [
+            Finding(
                 "rotation-undetermined",
                 f"after image {number}: the surface of '{name}' does not show its rotation about"
                 f" {len(fit.undetermined)} of three axes; it is taken as not turning about them",
