@@ -31,7 +31,7 @@ from palpate.study.simulate import filled
 __all__ = ["DATA", "TISSUES", "SimulatedPelvis", "simulate_pelvis"]
 
 DATA = Path(__file__).parent / "data"
-FILLING_MM = 5.0
+FILLING_MM = 6.5
 MARGIN_MM = 12.0
 TRUTH_EDGE_MM = 5.0
 VOXEL_MM = 1.0

@@ -62,8 +62,8 @@ def check_segmentation(segmentation: Segmentation, name: str) -> tuple[Finding, 
         box = ndimage.find_objects(segmentation.mask(i).astype(np.int8))
         if not box:
             continue  # a tissue that is absent is refused by check_pair
-        findings += _cut_by_border(segmentation.mask(i), tissue, name)
         if tissue.role is not Role.RIGID:
+            findings += _cut_by_border(segmentation.mask(i), tissue, name)
             findings += _too_thin(_surrounded(segmentation, i, box[0]), tissue, name)
         findings += _islands(segmentation.index[box[0]] == i, tissue, name)
     return tuple(findings)

@@ -19,8 +19,8 @@ ENDS = 2.2  # half the organ's length in lengths of the filling: 9 % of it is le
 def wall_filling(segmentation: Segmentation, tissue: int, *, filling_mm: float) -> Filling:
     """The filling of a tissue of the segmentation, by its index, by `filling_mm` where the organs are nearest.
 
-    It is fullest at the height of the tenth of its voxels that are nearest to the first `estimate` tissue's centre
-    (half way along it when there is none).
+    It is fullest half way from its middle to the tenth of its voxels that are nearest to the first `estimate` tissue's
+    centre (in its middle when there is none).
 
     Its middle line is the parabola through its voxels along their longest axis (least squares), its radius that of a
     round tube with the same spread across, R^2 = 2 mean r^2. Raises `GeometryError` for a tissue of a few voxels.
@@ -59,4 +59,4 @@ def _fullest(segmentation: Segmentation, voxels: NDArray[np.float64], along: NDA
         return 0.0
     centre = segmentation.grid.world(np.argwhere(segmentation.mask(estimated[0])).astype(float)).mean(axis=0)
     distance = np.linalg.norm(voxels - centre, axis=1)
-    return float(along[distance <= np.quantile(distance, 0.1)].mean())
+    return 0.5 * float(along[distance <= np.quantile(distance, 0.1)].mean())
