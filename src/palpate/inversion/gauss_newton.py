@@ -14,7 +14,7 @@ __all__ = ["Bounds", "Iterate", "Minimum", "Outcome", "gauss_newton"]
 
 FIRST_RADIUS = 1.0  # of the log-moduli, per step: a factor e
 MAX_RADIUS = 2.0
-STALLED = 1e-2  # decrement under which a refused step is the noise of re-chosen closest points
+STALLED = 1e-2  # decrement under which a refused step is the noise of re-chosen closest points, whatever it moves
 
 
 class Outcome(StrEnum):
@@ -102,8 +102,8 @@ def gauss_newton(
             return Minimum(unknowns, now, Outcome.CONVERGED, tuple(history))
         found = _search(objective, unknowns, now, free=free, bounds=bounds, region=region)
         if found is None:
-            outcome = Outcome.STALLED if decrement < STALLED else Outcome.STUCK
-            return Minimum(unknowns, now, outcome, tuple(history))
+            near = decrement < STALLED or _near(now, free, objective.n_parameters)
+            return Minimum(unknowns, now, Outcome.STALLED if near else Outcome.STUCK, tuple(history))
         unknowns, now, region = found
     return Minimum(unknowns, now, Outcome.STEPS, tuple(history))
 
@@ -146,6 +146,21 @@ def _free(
 def _decrement(now: Evaluation, free: NDArray[np.bool_]) -> float:
     matrix, score = now.matrix[np.ix_(free, free)], now.score[free]
     return float(0.5 * score @ _solve(matrix, score))
+
+
+def _near(now: Evaluation, free: NDArray[np.bool_], n_parameters: int) -> bool:
+    """Whether the step that finds no smaller value is the noise of re-chosen closest points.
+
+    It moves every free log-modulus by less than a tenth of its posterior width, and promises less than a hundredth of
+    the objective.
+    """
+    step = _step(now, free, n_parameters, _Region(np.inf, 0.0))[:n_parameters]
+    inverse = np.linalg.inv(now.matrix[np.ix_(free, free)])
+    width = np.full(n_parameters, np.inf)
+    moving = free[:n_parameters]
+    width[moving] = np.sqrt(np.diag(inverse)[: int(moving.sum())])
+    small = bool(np.all(np.abs(step) < 0.1 * width))
+    return small and _decrement(now, free) < 1e-2 * now.value + STALLED
 
 
 def _step(now: Evaluation, free: NDArray[np.bool_], n_parameters: int, region: _Region) -> NDArray[np.float64]:

@@ -165,7 +165,7 @@ def fit_driver(problem: InverseProblem, moduli: NDArray[np.float64]) -> tuple[ND
     unknowns = np.zeros(objective.n_unknowns)
     for _ in range(2):
         objective = objective.with_fresh_correspondence(unknowns)
-        found = gauss_newton(objective, unknowns, bounds=bounds, hold_theta=True)
+        found = gauss_newton(objective, unknowns, bounds=bounds, hold_theta=True, tolerance=1e-2)
         unknowns = found.unknowns
     if not found.outcome.converged:
         raise NotConverged(f"the driver's wall could not be fitted to the later image: {found.outcome.value}")
