@@ -151,8 +151,8 @@ def _decrement(now: Evaluation, free: NDArray[np.bool_]) -> float:
 def _near(now: Evaluation, free: NDArray[np.bool_], n_parameters: int) -> bool:
     """Whether the step that finds no smaller value is the noise of re-chosen closest points.
 
-    It moves every free log-modulus by less than a tenth of its posterior width, and promises less than a hundredth of
-    the objective.
+    It moves every free log-modulus by less than a tenth of its posterior width, and promises less than a thousandth of
+    the objective (a hundredth where the moduli are held and only the driver moves).
     """
     step = _step(now, free, n_parameters, _Region(np.inf, 0.0))[:n_parameters]
     inverse = np.linalg.inv(now.matrix[np.ix_(free, free)])
@@ -160,7 +160,8 @@ def _near(now: Evaluation, free: NDArray[np.bool_], n_parameters: int) -> bool:
     moving = free[:n_parameters]
     width[moving] = np.sqrt(np.diag(inverse)[: int(moving.sum())])
     small = bool(np.all(np.abs(step) < 0.1 * width))
-    return small and _decrement(now, free) < 1e-2 * now.value + STALLED
+    share = 1e-3 if moving.any() else 1e-2
+    return small and _decrement(now, free) < share * now.value + STALLED
 
 
 def _step(now: Evaluation, free: NDArray[np.bool_], n_parameters: int, region: _Region) -> NDArray[np.float64]:
