@@ -1,13 +1,16 @@
-"""Label tables: three ways to write one table, and a sentence for each that is none."""
+"""Label tables: every way to write one table gives it, and a sentence for each that is none."""
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 
 import pytest
 
 from palpate.errors import InputDataError
 from palpate.images.label_table import read_label_table
+from palpate.images.named_labels import NamedLabel
+from palpate.images.readers.table_slicer import slicer_table
 
 
 @pytest.mark.parametrize(
@@ -42,6 +45,7 @@ def test_every_spelling_gives_the_same_table(tmp_path: Path, text: str) -> None:
         (b'{"1": {"name": "a"}}', "characters"),
         (b'{"1": "a\\u001b[31m"}', "control characters"),
         (b'{"1": "\xff"}', "UTF-8"),
+        (b'{"1": ' + b"9" * 5000 + b"}", "not JSON|from 0"),
         (b" " * (2**20 + 1), "larger than"),
     ],
 )
@@ -50,6 +54,93 @@ def test_a_bad_table_is_refused_with_its_reason(tmp_path: Path, content: bytes, 
     path.write_bytes(content)
     with pytest.raises(InputDataError, match=words):
         read_label_table(path)
+
+
+TABLES = {
+    "snap.txt": '# IDX R G B A VIS MSH "LABEL"\n1 255 0 128 1 1 1 "left hip"\n 2  0  255  0  0.5  1 0  "bladder"\n',
+    "snap.label": '1 255 0 128 1 1 1 "left hip"\n2 0 255 0 0.5 1 0 "bladder"\n',
+    "slicer.csv": "LabelValue,Name,Color_R,Color_G,Color_B,Color_A\n2,bladder,0,255,0,255\n1,left hip,255,0,128,255\n",
+    "terms.csv": "Name,LabelValue,Color_R,Color_G,Color_B,Type_CodeMeaning\r\n"
+    '"left hip",1,255,0,128,"Bone, hip"\r\n"bladder",2,0,255,0,\r\n',
+    "sub-1_dseg.tsv": "index\tname\tabbreviation\tcolor\n1\tleft hip\tH\t#FF0080\n2\tbladder\tB\t#00ff00\n",
+}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_every_format_gives_names_and_colours(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text(TABLES[name], encoding="utf-8")
+    table = read_label_table(tmp_path / name)
+    assert dict(table) == {1: "left hip", 2: "bladder"}
+    assert table.colours == {1: "#ff0080", 2: "#00ff00"}
+
+
+@pytest.mark.parametrize("name", ["slicer.ctbl", "lut.txt"])
+def test_a_colour_table_keeps_its_names_as_they_stand_there(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("# Color table file\n1 left_hip 255 0 128 255\n2 bladder 0 255 0 0\n")
+    table = read_label_table(tmp_path / name)
+    assert dict(table) == {1: "left_hip", 2: "bladder"}
+    assert table.colours == {1: "#ff0080", 2: "#00ff00"}
+
+
+def test_a_table_without_colours_or_with_impossible_ones_has_none(tmp_path: Path) -> None:
+    texts = {
+        "a.tsv": "index\tname\tcolor\n1\tbladder\tn/a\n",
+        "b.tsv": "name\tindex\nbladder\t1\n",
+        "c.csv": "LabelValue,Name\n1,bladder\n",
+        "d.csv": "LabelValue,Name,Color_R,Color_G,Color_B\n1,bladder,999,0,0\n",
+        "e.json": '{"bladder": 1}',
+    }
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
+        table = read_label_table(tmp_path / name)
+        assert dict(table) == {1: "bladder"}
+        assert table.colours == {}
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("a.txt", '1 255 0 0 1 1 1 "a"\n2 0 0 0\n', "line 2"),
+        ("a.txt", "1,prostate\n", "does not look like"),
+        ("a.txt", "", "does not look like"),
+        ("a.txt", '1 255 0 0 1 1 1 "a"\n1 0 255 0 1 1 1 "b"\n', "twice"),
+        ("a.txt", '70000 255 0 0 1 1 1 "a"\n', "from 0"),
+        ("a.txt", '1 255 0 0 1 1 1 "a\x1b[2J"\n', "control characters"),
+        ("a.ctbl", "1 left hip 255 0 0 255\n", "does not look like"),
+        ("a.ctbl", "1 hip 255 0 0 255\n2 left hip 255 0 0 255\n", "line 2"),
+        ("a.csv", "a,b\n1,2\n", "lacks the columns"),
+        ("a.csv", "LabelValue,Name\nx,bladder\n", "whole number"),
+        ("a.csv", "LabelValue,Name\n1\n", "characters"),
+        ("a.csv", 'LabelValue,Name\n1,"' + "x" * 200_000 + '"\n', "damaged"),
+        ("a.csv", "LabelValue,Name\n", "names no label"),
+        ("a.tsv", "index\tlabel\n1\ta\n", "lacks the columns"),
+        ("a.tsv", "index\tname\n-1\ta\n", "whole number"),
+        ("a.tsv", "index name\n1 a\n", "does not look like"),
+    ],
+)
+def test_a_bad_table_of_another_format_is_refused(tmp_path: Path, name: str, text: str, words: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputDataError, match=words) as caught:
+        read_label_table(tmp_path / name)
+    assert str(tmp_path / name) in str(caught.value)
+    assert str(caught.value).isprintable()
+
+
+def test_a_written_colour_table_is_read_back_and_computes_nothing_in_a_spreadsheet(tmp_path: Path) -> None:
+    rows = [
+        NamedLabel(1, "=HYPERLINK(1)", "#ff0080"),
+        NamedLabel(2, 'left "hip", lower', None),
+        NamedLabel(3, "-x", "#000000"),
+        NamedLabel(4, "'quoted'"),
+    ]
+    path = tmp_path / "labels.csv"
+    path.write_text(slicer_table(rows), encoding="utf-8")
+    table = read_label_table(path)
+    assert dict(table) == {row.label: row.name for row in rows}
+    assert table.colours == {1: "#ff0080", 3: "#000000"}
+    assert not any(
+        cell.startswith(("=", "+", "-", "@")) for row in csv.reader(path.read_text().splitlines()) for cell in row
+    )
 
 
 def test_a_missing_table_or_an_unknown_ending_is_refused(tmp_path: Path) -> None:

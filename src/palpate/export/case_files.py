@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.export.label_table import first_labels, write_label_table
 from palpate.export.rasterise import region_image
 from palpate.export.vtk_xml import write_pvd, write_vtp, write_vtu
 from palpate.images.readers import write_label_image, write_scalar_image
-from palpate.images.tissue import Tissue
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.surface import tissue_surface
 from palpate.mesh.tet_mesh import TetMesh
@@ -23,35 +23,47 @@ __all__ = ["file_name", "write_estimate_files", "write_mesh_files", "write_simul
 
 
 def write_estimate_files(result: CaseResult, folder: Path) -> tuple[Path, ...]:
-    """Write mesh.vtu (displacement of the last image) and stiffness.nii.gz (`result.unit`) to `folder`.
+    """Write mesh.vtu (displacement of the last image), stiffness.nii.gz (`result.unit`) and labels.csv to `folder`.
 
-    Returns the paths written; raises `ResourceError` when the disk refuses.
+    Each further pair has its own mesh_2.vtu, mesh_3.vtu ... Returns the paths written; raises `ResourceError` when the
+    disk refuses.
     """
     make_folder(folder)
-    mesh, space = result.space.mesh, result.space
-    paths = (folder / "mesh.vtu", folder / "stiffness.nii.gz")
+    paths = [folder / "mesh.vtu", folder / "stiffness.nii.gz"]
+    _write_fitted(paths[0], result, result.space, result.estimation.displacements[: len(result.after)])
+    write_scalar_image(paths[1], _stiffness_image(result), result.before.grid)
+    paths.append(write_label_table(folder / "labels.csv", result.tissues))
+    for number, pair in enumerate(result.further, start=2):
+        paths.append(folder / f"mesh_{number}.vtu")
+        _write_fitted(paths[-1], result, pair.space, pair.displacements)
+    return tuple(paths)
+
+
+def _write_fitted(
+    path: Path, result: CaseResult, space: LagrangeSpace, displacements: tuple[NDArray[np.float64], ...]
+) -> None:
+    """A mesh with the moduli of the result and the last of its displacements."""
+    mesh = space.mesh
     kilopascals = result.stiffness if result.unit == "kPa" else np.full(len(mesh.tissues), np.nan)
     extra = {} if result.unit == "kPa" else {"youngs_modulus_ratio": result.stiffness[mesh.region]}
-    displacements = result.estimation.displacements
     last = displacements[-1] if displacements else np.zeros_like(space.points)
-    write_vtu(paths[0], space, point_data={"displacement_mm": last}, cell_data=_cell_data(mesh, kilopascals) | extra)
-    write_scalar_image(paths[1], _stiffness_image(result), result.before.grid)
-    return paths
+    write_vtu(path, space, point_data={"displacement_mm": last}, cell_data=_cell_data(mesh, kilopascals) | extra)
 
 
 def write_mesh_files(result: MeshResult, folder: Path) -> tuple[Path, ...]:
-    """Write mesh.vtu (moduli: NaN where the case gives none) and a surface of each tissue to `folder`; as above."""
+    """Write mesh.vtu (moduli: NaN where the case gives none), labels.csv and a surface of each tissue; as above."""
     make_folder(folder)
     mesh, space = result.space.mesh, result.space
     given = np.array([tissue.youngs_modulus_kpa or np.nan for tissue in mesh.tissues])
     path = folder / "mesh.vtu"
     still = np.zeros_like(space.points)
     write_vtu(path, space, point_data={"displacement_mm": still}, cell_data=_cell_data(mesh, given))
-    return (path, *_write_surfaces(space, still, folder / "surfaces", ending="before"))
+    table = write_label_table(folder / "labels.csv", mesh.tissues)
+    return (path, table, *_write_surfaces(space, still, folder / "surfaces", ending="before"))
 
 
 def write_simulation_files(result: Simulation, folder: Path) -> tuple[Path, ...]:
-    """Write both label images, mesh.vtu, surfaces before and after, and mesh.pvd for several steps; as above."""
+    """Write both label images, labels.csv, mesh.vtu, surfaces before and after, mesh.pvd for steps; as above."""
     make_folder(folder)
     images = (folder / "before.nii.gz", folder / "after.nii.gz")
     write_label_image(images[0], result.before)
@@ -64,6 +76,7 @@ def write_simulation_files(result: Simulation, folder: Path) -> tuple[Path, ...]
     return (
         *images,
         folder / "mesh.vtu",
+        write_label_table(folder / "labels.csv", space.mesh.tissues),
         *_write_surfaces(space, np.zeros_like(last), surfaces, ending="before"),
         *_write_surfaces(space, last, surfaces, ending="after"),
         *_write_series(result, cells, folder),
@@ -108,17 +121,10 @@ def _write_surfaces(
 def _cell_data(mesh: TetMesh, moduli: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
     poisson = np.array([tissue.poisson_ratio for tissue in mesh.tissues])
     return {
-        "label": _labels(mesh.tissues)[mesh.region],
+        "label": first_labels(mesh.tissues)[mesh.region],
         "youngs_modulus_kpa": moduli[mesh.region],
         "poisson_ratio": poisson[mesh.region],
     }
-
-
-def _labels(tissues: tuple[Tissue, ...]) -> NDArray[np.int32]:
-    """First label of each tissue (n_tissues,); the remaining tissue gets the smallest number that no other claims."""
-    claimed = {label for tissue in tissues for label in tissue.labels}
-    free = next(number for number in range(len(claimed) + 1) if number not in claimed)
-    return np.array([min(tissue.labels, default=free) for tissue in tissues], dtype=np.int32)
 
 
 def _stiffness_image(result: CaseResult) -> NDArray[np.float64]:

@@ -72,11 +72,12 @@ def check_segmentation(segmentation: Segmentation, name: str) -> tuple[Finding, 
 def check_pair(before: Segmentation, after: Segmentation, *, name: str = "after") -> tuple[Finding, ...]:
     """Findings on two states of one body: volumes, shifts, a mirrored image, the part that the images share.
 
-    Raises `InputDataError` when the two are the same image, an organ is missing in one, they share no part of the
-    world, or one is clearly the mirror image of the other.
+    Raises `InputDataError` when the two are the same image, an organ is missing in one or has another name there, they
+    share no part of the world, or one is clearly the mirror image of the other.
     """
     if [t.name for t in before.tissues] != [t.name for t in after.tissues]:
         raise InputDataError(f"'before' and '{name}' have been segmented into different tissues; use one list for both")
+    _refuse_renamed(before, after, name)
     _refuse_identical(before, after, name)
     for segmentation, where in ((before, "before"), (after, name)):
         _refuse_absent(segmentation, where)
@@ -87,6 +88,18 @@ def check_pair(before: Segmentation, after: Segmentation, *, name: str = "after"
     for i in observed:
         findings += _volume_change(before, after, i, name)
     return tuple(findings)
+
+
+def _refuse_renamed(before: Segmentation, after: Segmentation, name: str) -> None:
+    """3D Slicer numbers segments anew in each file: one number may be two organs."""
+    for here, there in zip(before.tissues, after.tissues, strict=True):
+        names = [sorted(word.casefold() for word in tissue.called) for tissue in (here, there)]
+        if all(names) and names[0] != names[1]:
+            raise InputDataError(
+                f"tissue '{here.name}' (label {', '.join(map(str, here.labels))}) is called {list(here.called)} in"
+                f" 'before' and {list(there.called)} in '{name}'; give the tissue a name as its label in the case"
+                f' (label = "{here.called[0]}"), or the same names in both files'
+            )
 
 
 def _refuse_identical(before: Segmentation, after: Segmentation, name: str) -> None:

@@ -52,11 +52,12 @@ class VoxelGrid:
 
 @dataclass(frozen=True, slots=True)
 class LabelImage:
-    """Labels (nx, ny, nz) int on `grid`, with `names`: label -> name where a table gave one."""
+    """Labels (nx, ny, nz) int on `grid`; `names`: label -> name and `colours`: label -> #rrggbb, where given."""
 
     labels: NDArray[np.int32]
     grid: VoxelGrid
     names: Mapping[int, str] = field(default_factory=dict)
+    colours: Mapping[int, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         labels = np.array(self.labels, dtype=np.int32)
@@ -65,3 +66,4 @@ class LabelImage:
         labels.setflags(write=False)
         object.__setattr__(self, "labels", labels)
         object.__setattr__(self, "names", dict(self.names))
+        object.__setattr__(self, "colours", dict(self.colours))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +37,7 @@ class Segmentation:
 
 
 def segment(image: LabelImage, tissues: tuple[Tissue, ...]) -> Segmentation:
-    """Give every voxel of `image` to its tissue.
+    """Give every voxel of `image` to its tissue, which takes the names of its labels, and a colour if it has none.
 
     Raises `ConfigurationError` when two tissues claim one label or two are "remaining", `InputDataError` when a
     voxel's label belongs to no tissue or a tissue has no voxel.
@@ -53,7 +53,14 @@ def segment(image: LabelImage, tissues: tuple[Tissue, ...]) -> Segmentation:
             f"labels {orphans[:10]} belong to no tissue; name them in a tissue, or give one tissue label = 'remaining'"
         )
     table = np.array([owner.get(int(label), rest[0] if rest else -1) for label in labels], dtype=np.int16)
-    return Segmentation(table[inverse].reshape(image.labels.shape), image.grid, tissues)
+    described = tuple(_described(tissue, image) for tissue in tissues)
+    return Segmentation(table[inverse].reshape(image.labels.shape), image.grid, described)
+
+
+def _described(tissue: Tissue, image: LabelImage) -> Tissue:
+    called = tuple(image.names[label] for label in tissue.labels if label in image.names)
+    colour = next((image.colours[label] for label in tissue.labels if label in image.colours), None)
+    return replace(tissue, called=called or tissue.called, colour=tissue.colour or colour)
 
 
 def _owners(tissues: tuple[Tissue, ...]) -> dict[int, int]:

@@ -26,6 +26,7 @@ class Tissue:
 
     `labels` empty means "remaining": every voxel that no other tissue names.
     `youngs_modulus_kpa` is required for `known`, the truth of a simulation for `estimate`, else None.
+    Where the image or its table has them, `colour`: #rrggbb, and `called`: the names of the labels there.
     """
 
     name: str
@@ -33,6 +34,8 @@ class Tissue:
     labels: tuple[int, ...] = ()
     poisson_ratio: float = 0.45
     youngs_modulus_kpa: float | None = None
+    colour: str | None = None
+    called: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not -1.0 < self.poisson_ratio < 0.5:

@@ -6,6 +6,7 @@ import gzip
 import itertools
 import struct
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import nibabel
@@ -15,8 +16,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from palpate.errors import ConfigurationError, InputDataError, ResourceError
+from palpate.images import readers
 from palpate.images.label_image import LabelImage, VoxelGrid
-from palpate.images.readers import nifti, read_intensities, read_label_image, write_label_image, write_scalar_image
+from palpate.images.readers import nifti, write_label_image, write_scalar_image
+
+# In this process: what the process of its own adds is tested in test_isolation.py.
+read_label_image = partial(readers.read_label_image, limits=None)
+read_intensities = partial(readers.read_intensities, limits=None)
 
 ORIENTATIONS = list(itertools.product(itertools.permutations(range(3)), itertools.product((1, -1), repeat=3)))
 AFFINE = np.array([[0.5, 0, 0, -20], [0, 1.0, 0, 7], [0, 0, 2.5, -3.5], [0, 0, 0, 1]])
@@ -103,6 +109,7 @@ def test_writing_and_reading_give_the_image_back(tmp_path: Path, ending: str) ->
     assert np.array_equal(again.labels, image.labels)
     np.testing.assert_allclose(again.grid.affine, image.grid.affine, atol=1e-5)
     assert again.names == {1: "prostate"}
+    assert again.colours == {}
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
@@ -143,12 +150,16 @@ def test_the_unit_of_length_in_the_header_is_honoured(tmp_path: Path, unit: str,
     np.testing.assert_allclose(read_label_image(tmp_path / "a.nii.gz").grid.spacing, factor * np.array([4.0, 2.0, 8.0]))
 
 
-def test_the_sform_wins_over_the_qform_which_serves_alone(tmp_path: Path) -> None:
+def test_sform_or_qform_serves_alone_and_two_that_disagree_are_refused(tmp_path: Path) -> None:
     image = nibabel.Nifti1Image(labels(), None)
     image.set_qform(np.diag([1.0, 1.0, 2.5, 1.0]), code=1)
     nibabel.save(image, tmp_path / "q.nii")
     np.testing.assert_allclose(read_label_image(tmp_path / "q.nii").grid.spacing, [1.0, 1.0, 2.5])
     image.set_sform(AFFINE, code=1)
+    nibabel.save(image, tmp_path / "both.nii")
+    with pytest.raises(InputDataError, match="sform and qform"):
+        read_label_image(tmp_path / "both.nii")
+    image.set_qform(None, code=0)
     nibabel.save(image, tmp_path / "s.nii")
     np.testing.assert_allclose(read_label_image(tmp_path / "s.nii").grid.affine, AFFINE)
 
@@ -233,6 +244,7 @@ BAD_HEADERS = {
     "no orientation": (put("<hh", 252, 0, 0), "neither sform nor qform"),
     "sform NaN": (put("<f", 280, np.nan), "not finite"),
     "sform infinite": (put("<f", 284, np.inf), "not finite"),
+    "sform signalling NaN": (put("<I", 284, 0x7F800001), "not finite"),
     "sform singular": (put("<4f", 280, 0.0, 0.0, 0.0, 0.0), "flattens"),
     "sform sheared": (put("<4f", 280, 0.5, 0.3, 0.0, 0.0), "right angles"),
     "unit unknown": (put("<B", 123, 7), "unit of length"),
@@ -249,6 +261,25 @@ def test_a_bad_header_is_refused_with_its_reason(tmp_path: Path, name: str, endi
     with pytest.raises(InputDataError, match=words) as caught:
         read_label_image(path)
     assert str(path) in str(caught.value)
+
+
+FOUND_BY_FUZZING = {  # the sform of a NIfTI-2 file, in 64 bits
+    "the box of voxels overflows": [1e200, 1e200, 1e200],
+    "one edge is subnormal": [1e-320, 1.0, 1.0],
+    "the determinant underflows": [1e-160, 1e-160, 1.0],
+    "metres made millimetres overflow": [1e307, 1.0, 1.0],
+}
+
+
+@pytest.mark.parametrize("name", FOUND_BY_FUZZING)
+def test_an_affine_beyond_what_floats_hold_is_refused_without_a_warning(tmp_path: Path, name: str) -> None:
+    content = bytearray(nibabel.Nifti2Image(labels(), np.eye(4)).to_bytes())
+    struct.pack_into("<ii", content, 344, 0, 1)  # no qform, a sform
+    struct.pack_into("<12d", content, 400, *(np.diag(FOUND_BY_FUZZING[name]) @ np.eye(3, 4)).ravel())
+    struct.pack_into("<i", content, 500, 1)  # metres
+    (tmp_path / "a.nii").write_bytes(content)
+    with pytest.raises(InputDataError, match=r"flattens|not finite"):
+        read_label_image(tmp_path / "a.nii")
 
 
 def test_files_that_are_no_images_are_refused_with_advice(tmp_path: Path) -> None:

@@ -24,14 +24,10 @@ from numpy.typing import NDArray
 from palpate.errors import ConfigurationError, InputDataError, ResourceError
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
+from palpate.images.readers.voxel_stream import MAX_OFFSET, check_end, check_size, damaged, read_exactly
 
 __all__ = ["read_nifti", "write_label_image", "write_scalar_image"]
 
-MAX_VOXELS = 2**29  # 512 x 512 x 2048, a whole body at 1 mm; a distance map of it would take 4 GiB
-MAX_OFFSET = 2**26  # bytes that header extensions may take
-MAX_DEFLATE_RATIO = 1032  # no deflate stream expands further (zlib's technical notes)
-SLACK = 2**20  # bytes that may follow the voxels
-CHUNK = 2**22
 MILLIMETRES = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}  # xyzt_units: unknown, metre, millimetre, micrometre
 HEADERS = {348: nibabel.Nifti1Header, 540: nibabel.Nifti2Header}
 MAGIC = {348: b"n+1\0", 540: b"n+2\0\r\n\032\n"}
@@ -61,15 +57,13 @@ def read_nifti(path: Path) -> StoredImage:
             stream = _uncompressed(file, path)
             header, used = _header(stream, path)
             layout = _layout(header, path)
-            _check_size(layout, path)
-            _exactly(stream, layout.offset - used, path)
-            values = _exactly(stream, layout.n_bytes, path).view(layout.dtype)
-            _check_end(stream, layout, path)
+            size = os.fstat(file.fileno()).st_size
+            check_size(layout.shape, layout.offset + layout.n_bytes, path, available=size, packed=stream is not file)
+            read_exactly(stream, layout.offset - used, path)
+            values = read_exactly(stream, layout.n_bytes, path).view(layout.dtype)
+            check_end(stream, layout.n_bytes, path)
     except (OSError, EOFError, zlib.error) as error:
-        raise InputDataError(
-            f"'{path}' cannot be read: {str(error).rstrip('.')}; the file is damaged or cut short, export or copy it"
-            " again"
-        ) from error
+        raise damaged(path, error) from error
     return StoredImage(_scaled(values.reshape(layout.shape, order="F"), layout), layout.affine)
 
 
@@ -84,11 +78,11 @@ def _uncompressed(file: BinaryIO, path: Path) -> BinaryIO:
 
 def _header(stream: BinaryIO, path: Path) -> tuple[Any, int]:
     """The decoded header and its length in bytes."""
-    block = _exactly(stream, 348, path).tobytes()
+    block = read_exactly(stream, 348, path).tobytes()
     for sign in ("<", ">"):
         length = int(np.frombuffer(block[:4], dtype=f"{sign}i4")[0])
         if length in HEADERS:
-            block += _exactly(stream, length - len(block), path).tobytes()
+            block += read_exactly(stream, length - len(block), path).tobytes()
             magic = block[344:348] if length == 348 else block[4:12]
             if magic == MAGIC[length]:
                 return HEADERS[length](block, endianness=sign, check=False), length
@@ -147,12 +141,16 @@ def _offset(header: Any, path: Path) -> int:
 
 
 def _affine(header: Any, path: Path) -> NDArray[np.float64]:
-    """Index -> RAS mm by the sform, else by the qform."""
+    """Index -> RAS mm by the sform or the qform; where both are set, they must agree."""
     try:
-        affine = header.get_sform(coded=True)[0]
-        affine = header.get_qform(coded=True)[0] if affine is None else affine
+        with np.errstate(all="ignore"):  # what is not finite is refused later, with its numbers
+            affine = header.get_sform(coded=True)[0]
+            qform = header.get_qform(coded=True)[0]
     except (HeaderDataError, ValueError) as error:
         raise InputDataError(f"the qform in the header of '{path}' is damaged: {error}; set an sform") from error
+    if affine is not None and qform is not None:
+        _refuse_disagreement(affine, qform, header, path)
+    affine = qform if affine is None else affine
     if affine is None:
         raise InputDataError(
             f"the header of '{path}' has neither sform nor qform, so left and right are unknown; export the image with"
@@ -162,46 +160,22 @@ def _affine(header: Any, path: Path) -> NDArray[np.float64]:
     if unit not in MILLIMETRES:
         raise InputDataError(f"the header of '{path}' has the unit of length {unit}, unknown; set it to 2 (millimetre)")
     scaled = np.array(affine, dtype=np.float64)
-    scaled[:3] *= MILLIMETRES[unit]
+    with np.errstate(all="ignore"):
+        scaled[:3] *= MILLIMETRES[unit]
     return scaled
 
 
-def _check_size(layout: _Layout, path: Path) -> None:
-    if math.prod(layout.shape) > MAX_VOXELS:
+def _refuse_disagreement(sform: NDArray[np.float64], qform: NDArray[np.float64], header: Any, path: Path) -> None:
+    """Which of two places is right, nobody can tell here; half a voxel is more than rounding."""
+    sizes = np.maximum(np.array(header["dim"][1:4], dtype=float) - 1.0, 0.0)
+    corners = np.array([[*(sizes * np.array(c)), 1.0] for c in np.ndindex(2, 2, 2)])
+    with np.errstate(all="ignore"):
+        apart = float(np.linalg.norm((corners @ (sform - qform).T)[:, :3], axis=1).max())
+        voxel = float(np.linalg.norm(sform[:3, :3], axis=0).min())
+    if apart > 0.5 * voxel:
         raise InputDataError(
-            f"the header of '{path}' promises {math.prod(layout.shape)} voxels ({layout.shape}), more than the"
-            f" {MAX_VOXELS} that are read; crop the image to the organs, or the header is damaged"
-        )
-    size, needed = path.stat().st_size, layout.offset + layout.n_bytes
-    possible = size * MAX_DEFLATE_RATIO if path.name.lower().endswith(".gz") else size
-    if needed > possible:
-        raise InputDataError(
-            f"the header of '{path}' promises {needed} bytes ({layout.shape} voxels of {layout.dtype}), but its {size}"
-            " bytes cannot hold them; the file is cut short or its header damaged: export or copy it again"
-        )
-
-
-def _exactly(stream: BinaryIO, n_bytes: int, path: Path) -> NDArray[np.uint8]:
-    """The next `n_bytes` of the stream; pages of the buffer are only taken as the data come."""
-    buffer = np.empty(n_bytes, dtype=np.uint8)
-    done = 0
-    while done < n_bytes:
-        chunk = stream.read(min(CHUNK, n_bytes - done))
-        if not chunk:
-            raise InputDataError(
-                f"'{path}' is cut short: {n_bytes - done} of {n_bytes} bytes are missing; export or copy it again"
-            )
-        buffer[done : done + len(chunk)] = np.frombuffer(chunk, dtype=np.uint8)
-        done += len(chunk)
-    return buffer
-
-
-def _check_end(stream: BinaryIO, layout: _Layout, path: Path) -> None:
-    """Reading to the end lets gzip check its sum; a stream that does not end is not followed."""
-    if len(stream.read(SLACK + 1)) > SLACK:
-        raise InputDataError(
-            f"'{path}' goes on for more than {SLACK} bytes after the {layout.n_bytes} bytes of voxels that its header"
-            " declares; it is damaged or not what it claims to be: export it again"
+            f"sform and qform in the header of '{path}' place its corners up to {apart:.3g} mm apart; delete the wrong"
+            " one (set its code to 0), or export the image again"
         )
 
 

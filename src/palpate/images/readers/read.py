@@ -4,55 +4,64 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError, ResourceError
 from palpate.images.label_image import LabelImage, VoxelGrid
+from palpate.images.named_labels import LabelTable, checked_table
 from palpate.images.readers.canonical import to_canonical
-from palpate.images.readers.registry import format_of
+from palpate.images.readers.isolation import ReadLimits, read_stored
+from palpate.images.readers.registry import StoredImage, format_of
+from palpate.images.readers.values import REDUCED
 
 __all__ = ["read_intensities", "read_label_image"]
 
-MAX_LABEL = 65535
-INTEGRAL_TOLERANCE = 1e-3  # resampling and 32-bit scaling leave 0.9999; more is a probability map or a grey image
 MAX_SHEAR = 1e-3  # cosine between two axes; distances are computed on a rectangular grid
+LIMITS = ReadLimits()
 
 
-def read_label_image(path: Path | str, *, names: Mapping[int, str] | None = None) -> LabelImage:
+def read_label_image(
+    path: Path | str, *, names: Mapping[int, str] | None = None, limits: ReadLimits | None = LIMITS
+) -> LabelImage:
     """Read a label image; its axes are brought to the order closest to RAS, its affine (mm) stays exact.
 
-    Labels are integers from 0 to 65535; floats are rounded when they are within 1e-3 of one. `names` is a label table.
-    Raises `InputDataError` for whatever cannot be read or is no label image, `ResourceError` when memory is short.
+    Labels are integers from 0 to 65535; floats are rounded when they are within 1e-3 of one. `names` is a label table,
+    used where the file brings no names of its own. `limits` are those of the process that reads; None reads here.
+    Raises `InputDataError` for whatever cannot be read or is no label image, `ResourceError` when memory or time is
+    short.
     """
-    values, grid = _read(Path(path))
-    return LabelImage(_labels(values, Path(path)), grid, names or {})
+    path = Path(path)
+    stored, grid = _read(path, "labels", limits)
+    own = checked_table(stored.names, path)
+    table = own or (names if isinstance(names, LabelTable) else LabelTable(names or {}))
+    return LabelImage(stored.values, grid, table.names, table.colours)
 
 
-def read_intensities(path: Path | str) -> tuple[NDArray[np.float32], VoxelGrid]:
+def read_intensities(path: Path | str, *, limits: ReadLimits | None = LIMITS) -> tuple[NDArray[np.float32], VoxelGrid]:
     """Read a grey image: intensities (nx, ny, nz) float32 as the header scales them, and their grid (RAS mm).
 
     Raises as `read_label_image` does.
     """
-    values, grid = _read(Path(path))
-    with np.errstate(over="ignore"):
-        return values.astype(np.float32), grid
+    stored, grid = _read(Path(path), "intensities", limits)
+    return stored.values, grid
 
 
-def _read(path: Path) -> tuple[NDArray[Any], VoxelGrid]:
+def _read(path: Path, kind: str, limits: ReadLimits | None) -> tuple[StoredImage, VoxelGrid]:
+    """The image in the order closest to RAS, and its grid; `kind`: what its values are, a key of `REDUCED`."""
     image_format = format_of(path)
     _check_file(path)
     try:
-        stored = image_format.read(path)
+        stored = image_format.read(path) if limits is None else read_stored(path, kind, image_format, limits)
         _check_affine(stored.affine, path)
-        values, affine = to_canonical(stored.values, stored.affine)
+        values, affine = to_canonical(REDUCED[kind](stored.values, path), stored.affine)
     except MemoryError as error:
         raise ResourceError(
             f"'{path}' does not fit into the memory of this machine; crop the image to the organs of the case"
         ) from error
-    return values, VoxelGrid((values.shape[0], values.shape[1], values.shape[2]), affine)
+    grid = VoxelGrid((values.shape[0], values.shape[1], values.shape[2]), affine)
+    return StoredImage(values, affine, stored.names), grid
 
 
 def _check_file(path: Path) -> None:
@@ -76,10 +85,10 @@ def _check_affine(affine: NDArray[np.float64], path: Path) -> None:
     advice = "repair its header (sform or qform), or export the image again"
     if not np.isfinite(affine).all():
         raise InputDataError(f"the header of '{path}' places the voxels at {affine[:3].tolist()}, not finite; {advice}")
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(all="ignore"):
         spacing = np.linalg.norm(affine[:3, :3], axis=0)
-        volume = abs(np.linalg.det(affine[:3, :3]))
-    if not spacing.min() > 0.0 or not np.isfinite(spacing).all() or volume < 1e-6 * np.prod(spacing) or volume < 1e-12:
+        volume, box = abs(np.linalg.det(affine[:3, :3])), np.prod(spacing)
+    if not spacing.min() > 0.0 or not np.isfinite(box) or volume < 1e-6 * box or volume < 1e-12:
         raise InputDataError(
             f"the affine in the header of '{path}', {affine[:3].tolist()}, flattens the image (voxel edges"
             f" {spacing.tolist()} mm, volume {volume:.3g} mm^3); {advice}"
@@ -90,33 +99,3 @@ def _check_affine(affine: NDArray[np.float64], path: Path) -> None:
             f"the voxel axes of '{path}' are not at right angles (cosine {np.abs(cosines).max():.3g}, a tilted"
             " gantry?); resample the image on a rectangular grid"
         )
-
-
-def _labels(values: NDArray[Any], path: Path) -> NDArray[np.int32]:
-    if values.dtype.kind == "f":
-        values = _rounded(values, path)
-    low, high = values.min(), values.max()
-    if low < 0 or high > MAX_LABEL:
-        raise InputDataError(
-            f"the labels of '{path}' run from {low:.9g} to {high:.9g}, but a label is an integer from 0 to {MAX_LABEL};"
-            " is this a grey image? Name the label image (segmentation) instead, or renumber its labels"
-        )
-    return values.astype(np.int32)
-
-
-def _rounded(values: NDArray[np.floating[Any]], path: Path) -> NDArray[np.floating[Any]]:
-    lost = int(values.size - np.count_nonzero(np.isfinite(values)))
-    if lost:
-        raise InputDataError(
-            f"'{path}' has {lost} of {values.size} voxels that are NaN or infinite; a label is an integer from 0 to"
-            f" {MAX_LABEL}: give those voxels a label (0 for background)"
-        )
-    whole = np.rint(values)
-    away = np.abs(values - whole)
-    worst = np.unravel_index(int(np.argmax(away)), values.shape)
-    if away[worst] > INTEGRAL_TOLERANCE:
-        raise InputDataError(
-            f"'{path}' is no label image: {np.count_nonzero(away > INTEGRAL_TOLERANCE)} of {values.size} voxels are not"
-            f" integers, as {values[worst]:.6g}; threshold a probability map, or resample labels with nearest neighbour"
-        )
-    return np.asarray(whole)

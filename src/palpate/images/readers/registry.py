@@ -11,16 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, InputDataError
+from palpate.images.named_labels import NamedLabel
 
 __all__ = ["ImageFormat", "StoredImage", "format_of", "register"]
 
 
 @dataclass(frozen=True, slots=True)
 class StoredImage:
-    """A file's voxels as they are stored: `values` (n1, n2, n3) integers or floats, `affine` (4, 4) index -> RAS mm."""
+    """A file's voxels as they are stored: `values` (n1, n2, n3) integers or floats, `affine` (4, 4) index -> RAS mm.
+
+    `names`: what the file itself says of its labels.
+    """
 
     values: NDArray[Any]
     affine: NDArray[np.float64]
+    names: tuple[NamedLabel, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

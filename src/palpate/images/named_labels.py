@@ -1,0 +1,80 @@
+"""Names and colours of labels, whichever table or image header they came from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from palpate.errors import InputDataError
+
+__all__ = ["MAX_LABEL", "MAX_NAME", "LabelTable", "NamedLabel", "checked_table", "hex_colour", "printable"]
+
+MAX_LABEL = 65535
+MAX_NAME = 200
+
+
+@dataclass(frozen=True, slots=True)
+class NamedLabel:
+    """One line of a label table; `colour` is #rrggbb, None where the table gives none."""
+
+    label: int
+    name: str
+    colour: str | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LabelTable(Mapping[int, str]):
+    """A label table: itself the mapping label -> name; `colours`: label -> #rrggbb where the table has one."""
+
+    names: Mapping[int, str] = field(default_factory=dict)
+    colours: Mapping[int, str] = field(default_factory=dict)
+
+    def __getitem__(self, label: int) -> str:
+        return self.names[label]
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def checked_table(rows: Iterable[NamedLabel], path: Path) -> LabelTable:
+    """The rows of the file `path` as a table sorted by label.
+
+    Raises `InputDataError` for a label or name that is impossible or given twice.
+    """
+    rows = sorted((_checked(row, path) for row in rows), key=lambda row: row.label)
+    seen: set[int | str] = set()
+    for row in rows:
+        if row.label in seen or row.name in seen:
+            raise InputDataError(f"'{path}' names {row.label} or '{row.name}' twice; keep one of the two")
+        seen |= {row.label, row.name}
+    colours = {row.label: row.colour for row in rows if row.colour is not None}
+    return LabelTable({row.label: row.name for row in rows}, colours)
+
+
+def _checked(row: NamedLabel, path: Path) -> NamedLabel:
+    name = row.name.strip()
+    if not 0 <= row.label <= MAX_LABEL or not 1 <= len(name) <= MAX_NAME:
+        raise InputDataError(
+            f"'{path}' has the entry {str(row.label)[:20]}: {printable(row.name[:50])!r}; it must be a label from 0 to"
+            f" {MAX_LABEL} and a name of 1 to {MAX_NAME} characters"
+        )
+    if not name.isprintable():
+        raise InputDataError(f"'{path}' has control characters in the name {name!r}; remove them")
+    return NamedLabel(row.label, name, row.colour)
+
+
+def printable(text: str) -> str:
+    """`text` for a terminal, a page or a file name: what could command one (control, bidirectional) becomes "?"."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
+
+
+def hex_colour(red: float, green: float, blue: float, *, top: float) -> str | None:
+    """Colour #rrggbb of three components from 0 to `top`; None where one lies outside."""
+    parts = (red, green, blue)
+    if not all(0.0 <= part <= top for part in parts):
+        return None
+    return "#" + "".join(f"{round(255 * part / top):02x}" for part in parts)

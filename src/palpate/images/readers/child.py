@@ -1,0 +1,88 @@
+"""The process that reads one image under limits and sends it through a pipe; started by `isolation`."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import PalpateError
+from palpate.images.readers.isolation import GREETING
+from palpate.images.readers.registry import StoredImage, format_of
+from palpate.images.readers.values import REDUCED
+
+__all__ = ["main"]
+
+try:
+    import resource
+except ImportError:  # Windows: the process still keeps a crash to itself
+    LIMITED = False
+else:
+    LIMITED = True
+
+
+def main(arguments: list[str]) -> None:
+    """Read an image; arguments: bytes of address space, seconds of processor time, "labels" or "intensities", path."""
+    memory_bytes, cpu_seconds, kind, path = int(arguments[0]), int(arguments[1]), arguments[2], Path(arguments[3])
+    with _private_stdout() as pipe:
+        pipe.write(GREETING)
+        pipe.flush()
+        _limit(memory_bytes, cpu_seconds)
+        try:
+            stored = format_of(path).read(path)
+            values = np.asfortranarray(REDUCED[kind](stored.values, path))
+        except PalpateError as error:
+            _send(pipe, {"error": type(error).__name__, "message": str(error)})
+        except MemoryError:
+            advice = f"'{path}' does not fit into the memory that reading may take; crop the image to the organs"
+            _send(pipe, {"error": "ResourceError", "message": advice})
+        except Exception as error:
+            flaw = f"the reader of '{path}' failed ({type(error).__name__}: {error})"
+            _send(pipe, {"error": "InputDataError", "message": f"{flaw}; export the image again, and report this"})
+        else:
+            _send_image(pipe, values, stored)
+
+
+def _private_stdout() -> BinaryIO:
+    """The pipe to the parent; what a C library prints on standard output goes nowhere."""
+    pipe = os.fdopen(os.dup(1), "wb")
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.close(nowhere)
+    return pipe
+
+
+def _limit(memory_bytes: int, cpu_seconds: int) -> None:
+    """No more memory or time than this, no file written, no core dumped; an earlier, lower limit stays."""
+    if not LIMITED:
+        return
+    for kind, value in (
+        (resource.RLIMIT_AS, memory_bytes),
+        (resource.RLIMIT_CPU, cpu_seconds),
+        (resource.RLIMIT_FSIZE, 0),
+        (resource.RLIMIT_CORE, 0),
+    ):
+        soft, hard = resource.getrlimit(kind)
+        lowest = min(limit for limit in (value, soft, hard) if limit != resource.RLIM_INFINITY)
+        resource.setrlimit(kind, (lowest, hard))
+
+
+def _send(pipe: BinaryIO, answer: dict[str, Any]) -> None:
+    pipe.write(json.dumps(answer).encode("ascii") + b"\n")
+
+
+def _send_image(pipe: BinaryIO, values: NDArray[Any], stored: StoredImage) -> None:
+    """`values` (n1, n2, n3), in the order of Fortran, with place and names as stored."""
+    names = [[row.label, row.name, row.colour] for row in stored.names]
+    answer = {"shape": values.shape, "dtype": values.dtype.str, "affine": stored.affine.tolist(), "names": names}
+    _send(pipe, answer)
+    pipe.write(values.T.data.cast("B"))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

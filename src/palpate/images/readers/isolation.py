@@ -1,0 +1,175 @@
+"""Images are read in a process of their own with limits: a crash, a bomb or a hang there is a sentence here.
+
+The process answers on a pipe with a line of JSON and the bare numbers; nothing that it sends can be executed.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import ConfigurationError, InputDataError, PalpateError, ResourceError
+from palpate.images.named_labels import NamedLabel, printable
+from palpate.images.readers.registry import ImageFormat, StoredImage
+from palpate.images.readers.voxel_stream import MAX_VOXELS, read_exactly
+
+__all__ = ["GREETING", "ReadLimits", "read_stored"]
+
+GREETING = b"palpate reads\n"
+PIPE = 2**20  # bytes that the pipe holds, where the system lets us choose
+MAX_ANSWER = 2**24  # bytes of the line that goes before the voxels
+DTYPE = re.compile(r"[<>|][iuf][1248]")
+ERRORS: Mapping[str, type[PalpateError]] = {
+    error.__name__: error for error in (ConfigurationError, InputDataError, ResourceError)
+}
+
+
+@dataclass(frozen=True, slots=True)
+class ReadLimits:
+    """What reading one file may take: address space (bytes), processor time and time by the clock (s)."""
+
+    memory_bytes: int = 10 * 2**30
+    cpu_seconds: int = 120
+    wall_seconds: float = 900.0
+
+
+def read_stored(path: Path, kind: str, image_format: ImageFormat, limits: ReadLimits) -> StoredImage:
+    """Read `path` in a process of its own, which reduces its values to `kind`, "labels" or "intensities".
+
+    A format that the program itself registered is read here, as it is.
+    Raises what the reader raises, `InputDataError` when it crashed, `ResourceError` when it ran over a limit.
+    """
+    if not image_format.read.__module__.startswith("palpate."):
+        return image_format.read(path)  # the program's own code, which another process would not find
+    with _reader(_command(path, kind, limits), path, limits) as (pipe, verdict):
+        if pipe.readline(len(GREETING)) != GREETING:
+            raise _not_started(path)
+        answer = _answer(pipe.readline(MAX_ANSWER))
+        stored = None if answer is None else _stored(answer, pipe, path)
+        if stored is None:
+            raise verdict()
+        return stored
+
+
+@contextmanager
+def _reader(
+    command: list[str], path: Path, limits: ReadLimits
+) -> Iterator[tuple[BinaryIO, Callable[[], PalpateError]]]:
+    """The pipe from the reading process, and a function that says why it ended early."""
+    overdue = threading.Event()
+    with _started(command, path) as process:
+
+        def stop() -> None:
+            overdue.set()
+            process.kill()
+
+        def verdict() -> PalpateError:
+            return _verdict(process.wait(), path, limits, overdue=overdue.is_set())
+
+        timer = threading.Timer(limits.wall_seconds, stop)
+        timer.start()
+        try:
+            yield cast("BinaryIO", process.stdout), verdict
+        finally:
+            timer.cancel()
+            process.kill()
+
+
+def _started(command: list[str], path: Path) -> subprocess.Popen[bytes]:
+    try:
+        return subprocess.Popen(  # noqa: S603 - our own interpreter and module, no shell
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=_environment(),
+            pipesize=PIPE,
+        )
+    except OSError as error:
+        raise _not_started(path) from error
+
+
+def _not_started(path: Path) -> ResourceError:
+    return ResourceError(
+        f"the process that reads '{path}' did not start; is Palpate installed in {sys.prefix} and is memory left?"
+    )
+
+
+def _command(path: Path, kind: str, limits: ReadLimits) -> list[str]:
+    # -P: an image's folder, if it is the working folder, must not be searched for modules.
+    numbers = [str(limits.memory_bytes), str(limits.cpu_seconds)]
+    return [sys.executable, "-P", "-W", "ignore", "-m", "palpate.images.readers.child", *numbers, kind, str(path)]
+
+
+def _environment() -> dict[str, str]:
+    """Ours, with the places that we import from; one thread, for a pool of them would eat address space."""
+    places = os.pathsep.join(str(Path(place).resolve()) for place in sys.path if place)
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    return {**os.environ, **threads, "PYTHONPATH": places}
+
+
+def _answer(line: bytes) -> dict[str, Any] | None:
+    """The line before the voxels; None when the process died before or while it wrote it."""
+    if not line.endswith(b"\n"):
+        return None
+    try:
+        answer = json.loads(line)
+    except ValueError:
+        return None
+    return answer if isinstance(answer, dict) else None
+
+
+def _stored(answer: Mapping[str, Any], pipe: BinaryIO, path: Path) -> StoredImage | None:
+    """The image, None when the process died while it sent the voxels; raises what the reader raised."""
+    if "error" in answer:
+        raise ERRORS.get(str(answer["error"]), InputDataError)(printable(str(answer.get("message", ""))))
+    try:
+        shape = tuple(int(n) for n in answer["shape"])
+        affine = np.array(answer["affine"], dtype=np.float64)
+        names = tuple(NamedLabel(int(k), str(name), None if c is None else str(c)) for k, name, c in answer["names"])
+        valid = len(shape) == 3 and min(shape) > 0 and affine.shape == (4, 4) and DTYPE.fullmatch(answer["dtype"])
+    except (KeyError, TypeError, ValueError):
+        valid = None
+    if not valid or math.prod(shape) > MAX_VOXELS:
+        raise InputDataError(
+            f"the process that read '{path}' gave an answer that cannot be used; export the image again"
+        )
+    values = _received(pipe, shape, np.dtype(answer["dtype"]), path)
+    return None if values is None else StoredImage(values, affine, names)
+
+
+def _received(pipe: BinaryIO, shape: tuple[int, ...], dtype: np.dtype[Any], path: Path) -> NDArray[Any] | None:
+    try:
+        content = read_exactly(pipe, math.prod(shape) * dtype.itemsize, path)
+    except InputDataError:
+        return None
+    return content.view(dtype).reshape(shape, order="F")
+
+
+def _verdict(code: int, path: Path, limits: ReadLimits, *, overdue: bool) -> PalpateError:
+    """Why the process ended before its answer was whole; `code` below zero is a signal's number."""
+    name = {-int(number): number.name for number in signal.Signals}.get(code, f"exit code {code}")
+    if overdue or name == "SIGXCPU":
+        return ResourceError(
+            f"reading '{path}' took more than {limits.cpu_seconds} s of processor time, or {limits.wall_seconds:g} s"
+            " in all, that one file gets; copy it to a local disk, or it is damaged: export it again"
+        )
+    if name == "SIGKILL":
+        return ResourceError(
+            f"the system stopped the reading of '{path}', most often because memory is short; crop the image"
+        )
+    return InputDataError(f"the reader of '{path}' crashed ({name}); the file is most likely damaged: export it again")

@@ -1,0 +1,136 @@
+"""The segments of a 3D Slicer segmentation: their names, colours, values and layers, made one label image.
+
+Keys: https://slicer.readthedocs.io/en/latest/developer_guide/modules/segmentations.html (Segment0_Name and so on).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import InputDataError
+from palpate.images.named_labels import MAX_LABEL, MAX_NAME, NamedLabel, hex_colour, printable
+
+__all__ = ["Segment", "flattened", "segments_of"]
+
+KEY = re.compile(r"Segment(\d{1,5})_(\w+)")
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """One segment: the voxels of `layer` that have the value `label`."""
+
+    name: str
+    colour: str | None
+    layer: int
+    label: int
+
+
+def segments_of(keys: Mapping[str, str], path: Path) -> tuple[Segment, ...]:
+    """The segments that an NRRD header's key-values describe, none when it is no segmentation.
+
+    Files of before 2020 have neither values nor layers: there each segment is one layer of zeros and ones.
+    Raises `InputDataError` for numbers that cannot be used or two segments of the same value in one layer.
+    """
+    found: dict[int, dict[str, str]] = {}
+    for key, value in keys.items():
+        match = KEY.fullmatch(key)
+        if match:
+            found.setdefault(int(match[1]), {})[match[2]] = value
+    described = [
+        (number, entry) for number, entry in sorted(found.items()) if {"ID", "Name", "LabelValue"} & set(entry)
+    ]
+    old = not any("Layer" in entry or "LabelValue" in entry for _, entry in described)
+    segments = tuple(_segment(entry, number, path, old=old) for number, entry in described)
+    if len({(s.layer, s.label) for s in segments}) < len(segments):
+        raise InputDataError(
+            f"'{path}' has two segments with the same label value in one layer, so one of them is lost; export the"
+            " segmentation again"
+        )
+    return segments
+
+
+def _segment(entry: Mapping[str, str], number: int, path: Path, *, old: bool) -> Segment:
+    name = printable(entry.get("Name", "").strip())[:MAX_NAME] or f"segment {number + 1}"
+    layer = number if old else _whole(entry.get("Layer", "0"), path, low=0)
+    return Segment(name, _colour(entry.get("Color", "")), layer, _whole(entry.get("LabelValue", "1"), path, low=1))
+
+
+def _whole(text: str, path: Path, *, low: int) -> int:
+    text = text.strip()
+    if not (text.isascii() and text.isdigit() and len(text) <= 6 and low <= int(text) <= MAX_LABEL):
+        raise InputDataError(
+            f"'{path}' has a segment with the label value or layer '{printable(text[:30])}'; it must be a whole number"
+            f" from {low} to {MAX_LABEL}: export the segmentation again"
+        )
+    return int(text)
+
+
+def _colour(text: str) -> str | None:
+    try:
+        parts = [float(word) for word in text.split()]
+    except ValueError:
+        return None
+    return hex_colour(*parts, top=1.0) if len(parts) == 3 else None
+
+
+def flattened(
+    layers: NDArray[Any], segments: tuple[Segment, ...], path: Path
+) -> tuple[NDArray[Any], tuple[NamedLabel, ...]]:
+    """Labels (n1, n2, n3) of `layers` (n_layers, n1, n2, n3), and the names of the labels.
+
+    Values that are unique stay; where two layers use the same one, segments are numbered from 1 as the file has them.
+    Raises `InputDataError` when segments overlap or are in no layer, or a voxel of several layers is in no segment.
+    """
+    beyond = [s.name for s in segments if s.layer >= len(layers)]
+    if beyond:
+        raise InputDataError(
+            f"'{path}' has {len(layers)} layers, but the segments {beyond[:5]} are in others; export it again"
+        )
+    unique = len({s.label for s in segments}) == len(segments)
+    labels = [s.label if unique else number for number, s in enumerate(segments, start=1)]
+    names = tuple(NamedLabel(label, s.name, s.colour) for label, s in zip(labels, segments, strict=True))
+    if len(layers) == 1:
+        return layers[0], names
+    return _merged(layers, segments, labels, path), names
+
+
+def _merged(layers: NDArray[Any], segments: tuple[Segment, ...], labels: list[int], path: Path) -> NDArray[np.uint16]:
+    merged = np.zeros(layers.shape[1:], dtype=np.uint16)
+    for k, layer in enumerate(layers):
+        ours = [(s, label) for s, label in zip(segments, labels, strict=True) if s.layer == k]
+        mapped = _relabelled(layer, ours, path)
+        both = (merged > 0) & (mapped > 0)
+        if both.any():
+            where = tuple(np.argwhere(both)[0])
+            by_label = {label: s.name for s, label in zip(segments, labels, strict=True)}
+            raise InputDataError(
+                f"segments of '{path}' overlap in {np.count_nonzero(both)} voxels, as '{by_label[int(merged[where])]}'"
+                f" and '{by_label[int(mapped[where])]}'; a voxel can belong to one tissue only: erase one of the two"
+                " there (3D Slicer: Segment Editor, allow no overlap)"
+            )
+        merged += mapped
+    return merged
+
+
+def _relabelled(layer: NDArray[Any], segments: list[tuple[Segment, int]], path: Path) -> NDArray[np.uint16]:
+    if layer.dtype.kind not in "iu" or layer.min() < 0 or layer.max() > MAX_LABEL:
+        raise InputDataError(
+            f"the layers of '{path}' hold values that are no labels from 0 to {MAX_LABEL}; export it again"
+        )
+    table = np.zeros(MAX_LABEL + 1, dtype=np.uint16)
+    for segment, label in segments:
+        table[segment.label] = label
+    mapped = np.asarray(table[layer])
+    lost = (mapped == 0) & (layer > 0)
+    if lost.any():
+        raise InputDataError(
+            f"'{path}' has {np.count_nonzero(lost)} voxels that belong to no segment of their layer; export it again"
+        )
+    return mapped

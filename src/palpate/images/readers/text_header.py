@@ -1,0 +1,88 @@
+"""What NRRD and MetaImage share: a header of text lines, numbers in them, voxels in a file beside it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import InputDataError
+from palpate.images.named_labels import printable
+
+__all__ = ["beside", "counts", "header_line", "numbers"]
+
+MAX_LINE = 2**16
+MAX_NUMBER = 1e30  # far beyond any length in mm; products of three stay finite
+MAX_HEADER = 2**22  # bytes; a segmentation of a thousand segments has some 400 kB
+
+
+def header_line(file: BinaryIO, path: Path) -> str | None:
+    """The next line of a header without its end, None at the end of the file.
+
+    Raises `InputDataError` for a line or header longer than any real one.
+    """
+    line = file.readline(MAX_LINE + 1)
+    if len(line) > MAX_LINE or file.tell() > MAX_HEADER:
+        raise InputDataError(
+            f"the header of '{path}' does not end or has a line of over {MAX_LINE} bytes; export it again"
+        )
+    return line.decode("utf-8", errors="replace").rstrip("\r\n") if line else None
+
+
+def numbers(text: str, n: int, path: Path, *, field: str) -> NDArray[np.float64]:
+    """The `n` numbers (n,) in `text`, separated by blanks; raises `InputDataError` when it holds anything else."""
+    try:
+        values = np.array([float(word) for word in text.split()])
+    except ValueError:
+        values = np.zeros(0)
+    if len(values) != n or not (np.abs(values) < MAX_NUMBER).all():  # NaN fails too
+        raise InputDataError(
+            f"the header of '{path}' has '{field}: {printable(text[:60])}', but {n} numbers under {MAX_NUMBER:g} are"
+            " needed; export the image again"
+        )
+    return values
+
+
+def counts(text: str, path: Path, *, field: str) -> tuple[int, ...]:
+    """The whole numbers >= 1 in `text`; raises `InputDataError` when it holds anything else."""
+    words = text.split()
+    if not words or not all(word.isascii() and word.isdigit() and len(word) <= 20 for word in words) or "0" in words:
+        raise InputDataError(
+            f"the header of '{path}' has '{field}: {printable(text[:60])}', not positive counts; export the image again"
+        )
+    sizes = tuple(int(word) for word in words)
+    if math.prod(sizes) == 0:
+        raise InputDataError(f"the header of '{path}' has a size of zero in '{field}'; export the image again")
+    return sizes
+
+
+def beside(path: Path, name: str) -> Path:
+    """The file `name` that holds the voxels of the header `path`; it must lie in the header's folder, links followed.
+
+    Raises `InputDataError` when it lies elsewhere, is missing, or is a list or pattern of several files.
+    """
+    shown = printable(name[:100])
+    if not name or name.upper().startswith("LIST") or "%" in name:
+        raise InputDataError(
+            f"'{path}' keeps its voxels in several files ('{shown}'); save the image as one file (.nrrd, .mha, .nii.gz)"
+        )
+    try:
+        folder = path.parent.resolve()
+        target = (folder / name).resolve()
+        inside = target.is_relative_to(folder) and not Path(name).is_absolute()
+        found = inside and target.is_file()
+    except (OSError, ValueError, RuntimeError):  # a loop of links, a zero byte, a name too long
+        inside, found = True, False
+    if not inside:
+        raise InputDataError(
+            f"'{path}' says that its voxels are in '{shown}', outside its own folder, which is not followed; put both"
+            " files into one folder, or save the image as one file"
+        )
+    if not found:
+        raise InputDataError(
+            f"'{path}' says that its voxels are in '{shown}', but there is no such file beside it; copy it there"
+        )
+    return target

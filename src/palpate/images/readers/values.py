@@ -1,0 +1,64 @@
+"""What an estimate needs of the voxels of a file: labels or intensities, reduced where they are read to save room."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import InputDataError
+from palpate.images.named_labels import MAX_LABEL
+
+__all__ = ["REDUCED", "intensity_values", "label_values"]
+
+INTEGRAL_TOLERANCE = 1e-3  # resampling and 32-bit scaling leave 0.9999; more is a probability map or a grey image
+
+
+def intensity_values(values: NDArray[Any], path: Path) -> NDArray[Any]:
+    """Intensities (n1, n2, n3) as float32."""
+    del path
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32, copy=False)
+
+
+def label_values(values: NDArray[Any], path: Path) -> NDArray[Any]:
+    """Labels (n1, n2, n3) in the smallest unsigned type that holds them, from what the file `path` stores.
+
+    Floats are rounded when they are within 1e-3 of an integer. Raises `InputDataError` for what is no label image.
+    """
+    if values.dtype.kind == "f":
+        values = _rounded(values, path)
+    low, high = values.min(), values.max()
+    if low < 0 or high > MAX_LABEL:
+        raise InputDataError(
+            f"the labels of '{path}' run from {low:.9g} to {high:.9g}, but a label is an integer from 0 to {MAX_LABEL};"
+            " is this a grey image? Name the label image (segmentation) instead, or renumber its labels"
+        )
+    return values.astype(np.uint8 if high <= 255 else np.uint16, copy=False)
+
+
+def _rounded(values: NDArray[np.floating[Any]], path: Path) -> NDArray[np.floating[Any]]:
+    lost = int(values.size - np.count_nonzero(np.isfinite(values)))
+    if lost:
+        raise InputDataError(
+            f"'{path}' has {lost} of {values.size} voxels that are NaN or infinite; a label is an integer from 0 to"
+            f" {MAX_LABEL}: give those voxels a label (0 for background)"
+        )
+    whole = np.rint(values)
+    away = np.abs(values - whole)
+    worst = np.unravel_index(int(np.argmax(away)), values.shape)
+    if away[worst] > INTEGRAL_TOLERANCE:
+        raise InputDataError(
+            f"'{path}' is no label image: {np.count_nonzero(away > INTEGRAL_TOLERANCE)} of {values.size} voxels are not"
+            f" integers, as {values[worst]:.6g}; threshold a probability map, or resample labels with nearest neighbour"
+        )
+    return np.asarray(whole)
+
+
+REDUCED: Mapping[str, Callable[[NDArray[Any], Path], NDArray[Any]]] = {
+    "labels": label_values,
+    "intensities": intensity_values,
+}

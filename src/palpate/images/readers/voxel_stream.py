@@ -1,0 +1,155 @@
+"""Voxels from a file whose header may lie: sizes are checked before memory is taken, unpacking ends where declared."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import math
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import InputDataError
+
+__all__ = ["MAX_OFFSET", "MAX_VOXELS", "VoxelBlock", "check_end", "check_size", "damaged", "read_block", "read_exactly"]
+
+MAX_VOXELS = 2**29  # 512 x 512 x 2048, a whole body at 1 mm; a distance map of it would take 4 GiB
+MAX_OFFSET = 2**26  # bytes that may stand between header and voxels
+MAX_DEFLATE_RATIO = 1032  # no deflate stream expands further (zlib's technical notes)
+SLACK = 2**20  # bytes that may follow the voxels
+CHUNK = 2**22
+
+
+@dataclass(frozen=True, slots=True)
+class VoxelBlock:
+    """What a header says of its voxels: `shape` (fastest axis first), `dtype`, how they are packed.
+
+    packing: "raw", "gzip" or "zlib" (MetaImage's, with either head); skip: bytes before the first voxel, after
+    unpacking; -1: the voxels are the last bytes of the file.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    packing: str = "raw"
+    skip: int = 0
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of the voxels, bytes."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+
+def read_block(file: BinaryIO, block: VoxelBlock, path: Path) -> NDArray[Any]:
+    """The voxels (n1, n2, n3), or with more axes, in the machine's byte order, from where `file` stands.
+
+    `path` is for messages, for voxels may lie in a file beside the header.
+    Raises `InputDataError` when the file cannot hold them or goes on for long after them.
+    """
+    start = file.tell()
+    available = file.seek(0, io.SEEK_END) - start
+    check_size(
+        block.shape, max(block.skip, 0) + block.n_bytes, path, available=available, packed=block.packing != "raw"
+    )
+    file.seek(start if block.skip >= 0 else start + available - block.n_bytes)
+    stream = _UNPACKED[block.packing](file)
+    read_exactly(stream, max(block.skip, 0), path)
+    values = read_exactly(stream, block.n_bytes, path).view(block.dtype)
+    check_end(stream, block.n_bytes, path)
+    return values.astype(block.dtype.newbyteorder("="), copy=False).reshape(block.shape, order="F")
+
+
+def check_size(shape: tuple[int, ...], needed: int, path: Path, *, available: int, packed: bool) -> None:
+    """Refuse what the file cannot hold: `needed` bytes after unpacking, `available` bytes before it."""
+    if math.prod(shape) > MAX_VOXELS:
+        raise InputDataError(
+            f"the header of '{path}' promises {_count(math.prod(shape))} voxels ({_sizes(shape)}), more than the"
+            f" {MAX_VOXELS} that are read; crop the image to the organs, or the header is damaged"
+        )
+    if needed > (available * MAX_DEFLATE_RATIO if packed else available):
+        raise InputDataError(
+            f"the header of '{path}' promises {needed} bytes ({_sizes(shape)} voxels), but the {available} bytes there"
+            " cannot hold them; the file is cut short or its header damaged: export or copy it again"
+        )
+
+
+def read_exactly(stream: BinaryIO, n_bytes: int, path: Path) -> NDArray[np.uint8]:
+    """The next bytes (n_bytes,) of the stream; pages of the buffer are only taken as the data come."""
+    buffer = np.empty(n_bytes, dtype=np.uint8)
+    done = 0
+    while done < n_bytes:
+        chunk = stream.read(min(CHUNK, n_bytes - done))
+        if not chunk:
+            raise InputDataError(
+                f"'{path}' is cut short: {n_bytes - done} of {n_bytes} bytes are missing; export or copy it again"
+            )
+        buffer[done : done + len(chunk)] = np.frombuffer(chunk, dtype=np.uint8)
+        done += len(chunk)
+    return buffer
+
+
+def check_end(stream: BinaryIO, n_bytes: int, path: Path) -> None:
+    """Reading to the end lets gzip check its sum; a stream that does not end is not followed."""
+    if len(stream.read(SLACK + 1)) > SLACK:
+        raise InputDataError(
+            f"'{path}' goes on for more than {SLACK} bytes after the {n_bytes} bytes of voxels that its header"
+            " declares; it is damaged or not what it claims to be: export it again"
+        )
+
+
+def damaged(path: Path, error: Exception) -> InputDataError:
+    """The sentence for a stream that cannot be unpacked or read."""
+    return InputDataError(
+        f"'{path}' cannot be read: {str(error).rstrip('.')}; the file is damaged or cut short, export or copy it again"
+    )
+
+
+class _Inflated(io.RawIOBase):
+    """A zlib or gzip stream, unpacked no further than is asked for."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._inflate = zlib.decompressobj(47)  # 32 + 15: either head
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        target = memoryview(buffer).cast("B")
+        while not self._inflate.eof:
+            packed = self._inflate.unconsumed_tail or self._file.read(CHUNK)
+            content = self._inflate.decompress(packed, len(target))
+            if content:
+                target[: len(content)] = content
+                return len(content)
+            if not packed:
+                raise EOFError("the compressed voxels end before their end mark")
+        return 0
+
+
+def _raw(file: BinaryIO) -> BinaryIO:
+    return file
+
+
+def _gunzipped(file: BinaryIO) -> BinaryIO:
+    return io.BufferedReader(gzip.GzipFile(fileobj=file, mode="rb"))
+
+
+def _inflated(file: BinaryIO) -> BinaryIO:
+    return io.BufferedReader(_Inflated(file), buffer_size=CHUNK)
+
+
+_UNPACKED: dict[str, Callable[[BinaryIO], BinaryIO]] = {"raw": _raw, "gzip": _gunzipped, "zlib": _inflated}
+
+
+def _sizes(shape: tuple[int, ...]) -> str:
+    return " x ".join(map(_count, shape))
+
+
+def _count(number: int) -> str:
+    """A count that a damaged header may have made absurd."""
+    return str(number) if number < 10**12 else f"over {10**12}"

@@ -1,0 +1,210 @@
+"""A process of its own reads each image: what goes wrong there is a sentence here, and no code comes back."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import pytest
+
+from palpate.errors import InputDataError, ResourceError
+from palpate.images.readers import ReadLimits, isolation, nifti, read_intensities, read_label_image
+from palpate.images.readers.isolation import GREETING
+from palpate.images.readers.registry import ImageFormat
+
+AFFINE = np.diag([1.0, 2.0, 3.0, 1.0])
+needs_limits = pytest.mark.skipif(sys.platform != "linux", reason="address space is limited on Linux only")
+
+
+def saved(path: Path, shape: tuple[int, ...] = (4, 5, 6)) -> Path:
+    values = np.random.default_rng(3).integers(0, 5, shape, dtype=np.uint8)
+    nibabel.save(nibabel.Nifti1Image(values, AFFINE), path)
+    return path
+
+
+def stand_in(monkeypatch: pytest.MonkeyPatch, code: str) -> None:
+    """The reading process runs `code` instead of the reader."""
+    monkeypatch.setattr(isolation, "_command", lambda *_: [sys.executable, "-c", f"import os, sys, time\n{code}"])
+
+
+def greet(answer: object, tail: str = "") -> str:
+    line = GREETING + json.dumps(answer).encode() + b"\n"
+    return f"sys.stdout.buffer.write({line!r}); sys.stdout.buffer.flush(); {tail}"
+
+
+def test_the_process_gives_the_same_image_as_reading_here(tmp_path: Path) -> None:
+    path = saved(tmp_path / "a b 'c' ü.nii.gz")
+    there, here = read_label_image(path), read_label_image(path, limits=None)
+    assert np.array_equal(there.labels, here.labels)
+    assert np.array_equal(there.grid.affine, here.grid.affine)
+    (values, _), (same, _) = read_intensities(path), read_intensities(path, limits=None)
+    assert np.array_equal(values, same)
+
+
+def test_names_and_colours_come_through_the_pipe(tmp_path: Path) -> None:
+    head = (
+        "NRRD0004\ntype: uchar\ndimension: 3\nspace: RAS\nsizes: 2 2 2\nspace directions: (1,0,0) (0,1,0) (0,0,1)\n"
+        "encoding: raw\nSegment0_Name:=Blase ü\nSegment0_Color:=1 0 0\nSegment0_LabelValue:=3\n\n"
+    )
+    (tmp_path / "a.seg.nrrd").write_bytes(head.encode() + b"\3" * 8)
+    image = read_label_image(tmp_path / "a.seg.nrrd")
+    assert image.names == {3: "Blase ü"}
+    assert image.colours == {3: "#ff0000"}
+
+
+def test_a_refusal_there_is_the_same_refusal_here(tmp_path: Path) -> None:
+    path = tmp_path / "a.nii.gz"
+    path.write_bytes(saved(tmp_path / "b.nii.gz").read_bytes()[:40])
+    texts = []
+    for limits in (ReadLimits(), None):
+        with pytest.raises(InputDataError) as caught:
+            read_label_image(path, limits=limits)
+        texts.append(str(caught.value))
+    assert texts[0] == texts[1]
+
+
+@pytest.mark.parametrize("name", ["SIGSEGV", "SIGABRT", "SIGBUS", "SIGFPE"])
+def test_a_crash_is_a_sentence_that_names_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    path = saved(tmp_path / "a.nii")
+    for begin in ("", greet({"shape": [4, 5, 6], "dtype": "|u1", "affine": AFFINE.tolist(), "names": []})):
+        code = begin or f"sys.stdout.buffer.write({GREETING!r}); sys.stdout.buffer.flush()"
+        stand_in(monkeypatch, f"{code}\nos.kill(os.getpid(), {int(getattr(signal, name))})")
+        with pytest.raises(InputDataError, match=rf"a\.nii' crashed \({name}\)"):
+            read_label_image(path)
+
+
+def test_a_reader_killed_by_the_system_is_short_of_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in(monkeypatch, f"sys.stdout.buffer.write({GREETING!r}); sys.stdout.flush(); os.kill(os.getpid(), 9)")
+    with pytest.raises(ResourceError, match=r"a\.nii'.*memory"):
+        read_label_image(saved(tmp_path / "a.nii"))
+
+
+def test_a_reader_that_hangs_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in(monkeypatch, f"sys.stdout.buffer.write({GREETING!r}); sys.stdout.flush(); time.sleep(60)")
+    with pytest.raises(ResourceError, match=r"a\.nii' took more than"):
+        read_label_image(saved(tmp_path / "a.nii"), limits=ReadLimits(wall_seconds=0.5))
+
+
+def test_a_process_that_cannot_start_is_a_resource_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = saved(tmp_path / "a.nii")
+    stand_in(monkeypatch, "raise SystemExit(1)")
+    with pytest.raises(ResourceError, match="did not start"):
+        read_label_image(path)
+    monkeypatch.setattr(isolation, "_command", lambda *_: [str(tmp_path / "no-python")])
+    with pytest.raises(ResourceError, match="did not start"):
+        read_label_image(path)
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        [],
+        {"shape": [4, 5]},
+        {"shape": [4, 5, -6], "dtype": "|u1", "affine": AFFINE.tolist(), "names": []},
+        {"shape": [4, 5, 2**40], "dtype": "|u1", "affine": AFFINE.tolist(), "names": []},
+        {"shape": [4, 5, 6], "dtype": "|O8", "affine": AFFINE.tolist(), "names": []},
+        {"shape": [4, 5, 6], "dtype": "u1,O", "affine": AFFINE.tolist(), "names": []},
+        {"shape": [4, 5, 6], "dtype": "|u1", "affine": [[1, 2]], "names": []},
+        {"shape": [4, 5, 6], "dtype": "|u1", "affine": AFFINE.tolist(), "names": [["a"]]},
+        {"shape": [4, 5, 6], "dtype": 3, "affine": AFFINE.tolist(), "names": []},
+        {"error": "SystemExit", "message": "\u001b[2J"},
+        {"error": 3},
+    ],
+)
+def test_an_answer_of_a_process_gone_wrong_is_not_believed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: object
+) -> None:
+    stand_in(monkeypatch, greet(answer))
+    with pytest.raises(InputDataError) as caught:
+        read_label_image(saved(tmp_path / "a.nii"))
+    assert str(caught.value).isprintable()
+
+
+@needs_limits
+def test_memory_beyond_the_limit_is_a_resource_error(tmp_path: Path) -> None:
+    path = saved(tmp_path / "a.nii")
+    content = bytearray(path.read_bytes())
+    struct.pack_into("<3h", content, 42, 512, 1024, 1024)
+    path.write_bytes(content)
+    os.truncate(path, 352 + 2**29)  # a hole: the file is that long, but takes no room
+    with pytest.raises(ResourceError, match=r"a\.nii' does not fit into the memory"):
+        read_label_image(path, limits=ReadLimits(memory_bytes=2**29))
+
+
+@needs_limits
+def test_processor_time_beyond_the_limit_is_a_resource_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    limit = "from palpate.images.readers.child import _limit; _limit(2**34, 1)"
+    stand_in(monkeypatch, f"sys.stdout.buffer.write({GREETING!r}); sys.stdout.flush()\n{limit}\nwhile True: pass")
+    with pytest.raises(ResourceError, match=r"a\.nii' took more than"):
+        read_label_image(saved(tmp_path / "a.nii"))
+
+
+@needs_limits
+def test_the_process_can_write_no_file(tmp_path: Path) -> None:
+    code = (
+        "from palpate.images.readers.child import _limit; _limit(2**34, 10)\n"
+        "import signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "open('written', 'wb', buffering=0).write(b'x')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert "File too large" in done.stderr
+    assert (tmp_path / "written").stat().st_size == 0
+
+
+def test_modules_in_the_working_folder_are_not_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = saved(tmp_path / "a.nii")
+    for module in ("numpy", "nibabel", "json", "palpate"):
+        (tmp_path / f"{module}.py").write_text("import pathlib; pathlib.Path('trapped').touch()")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", ["", *sys.path])
+    assert read_label_image(path.name).labels.shape == (4, 5, 6)
+    assert not (tmp_path / "trapped").exists()
+
+
+def test_what_a_library_prints_does_not_reach_the_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = saved(tmp_path / "a.nii")
+    code = (
+        "import palpate.images.readers.child as child, palpate.images.readers.registry as registry\n"
+        "plain = child.format_of\n"
+        f"child.format_of = lambda path: (os.write(1, b'noise'), print('noise', flush=True), plain(path))[-1]\n"
+        f"child.main([str(2**33), '20', 'labels', {str(path)!r}])"
+    )
+    stand_in(monkeypatch, code)
+    assert read_label_image(path).labels.shape == (4, 5, 6)
+
+
+def test_a_flaw_of_a_reader_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = saved(tmp_path / "a.nii")
+    code = (
+        "import palpate.images.readers.child as child\n"
+        "def broken(path): raise ZeroDivisionError('by zero')\n"
+        "child.format_of = broken\n"
+        f"child.main([str(2**33), '20', 'labels', {str(path)!r}])"
+    )
+    stand_in(monkeypatch, code)
+    with pytest.raises(InputDataError, match=r"reader of '.*a\.nii' failed \(ZeroDivisionError: by zero\)"):
+        read_label_image(path)
+
+
+def test_no_process_stays_behind(tmp_path: Path) -> None:
+    path = saved(tmp_path / "a.nii")
+    read_label_image(path)
+    with pytest.raises(ChildProcessError):
+        os.waitpid(-1, os.WNOHANG)
+
+
+def test_formats_of_other_programs_are_read_in_their_own_process(tmp_path: Path) -> None:
+    def reader(path: Path):
+        return nifti.read_nifti(path)
+
+    stored = isolation.read_stored(
+        saved(tmp_path / "a.nii"), "labels", ImageFormat("Ours", (".ours",), reader), ReadLimits()
+    )
+    assert stored.values.shape == (4, 5, 6)

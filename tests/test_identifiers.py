@@ -1,0 +1,138 @@
+"""Nothing that a header says of a person reaches an output: identifiers are planted, and every file is searched."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import re
+from pathlib import Path
+
+import nibabel
+import nrrd
+import numpy as np
+import pytest
+import SimpleITK
+
+from palpate.cli import main
+from palpate.images.label_image import LabelImage
+from palpate.phantoms.spheres import SpheresOptions, spheres
+
+PLANTED = "Meyer^Erika"
+DATE = "19520229"
+CASE = """
+id = "balls"
+[images]
+before = "before.seg.nrrd"
+after = ["after.nii.gz"]
+intensities_before = "grey.mha"
+names = "labels.txt"
+[tissues.core]
+label = "core of it"
+role = "estimate"
+[tissues.shell]
+label = "shell"
+role = "estimate"
+[tissues.frame]
+label = "frame"
+role = "driver"
+[tissues.surroundings]
+label = "remaining"
+role = "known"
+youngs_modulus_kpa = 10.0
+[mesh]
+edge_length_mm = 9.0
+[mechanics]
+element = "P1"
+[noise]
+surface_sd_mm = 0.5
+[driver]
+modes = 8
+[estimate]
+start_ratios = [2.0]
+"""
+NAMES = {1: ("core of it", "#804020"), 2: ("shell", "#20c040"), 3: ("frame", "#4060ff")}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("identifiers")
+    scene = spheres(SpheresOptions(seed=2, spacing_mm=(1.5, 1.5, 1.5), truth_edge_mm=5.0))
+    write_segmentation(folder / "before.seg.nrrd", scene.before)
+    write_nifti(folder / "after.nii.gz", scene.after)
+    grey = SimpleITK.GetImageFromArray(scene.before.labels.T.astype(np.int16))
+    grey.SetMetaData("PatientName", PLANTED)
+    grey.SetMetaData("Comment", f"born {DATE}")
+    SimpleITK.WriteImage(grey, str(folder / "grey.mha"))
+    lines = [f'{k} {" ".join(map(str, bytes.fromhex(c[1:])))} 1 1 1 "{name}"' for k, (name, c) in NAMES.items()]
+    (folder / "labels.txt").write_text(f"# {PLANTED} {DATE}\n" + "\n".join(lines) + "\n")
+    (folder / "case.toml").write_text(CASE)
+    return folder
+
+
+def write_segmentation(path: Path, image: LabelImage) -> None:
+    lps = np.diag([-1.0, -1.0, 1.0]) @ image.grid.affine[:3]
+    fields: dict[str, object] = {
+        "space": "left-posterior-superior",
+        "space directions": lps[:, :3].T,
+        "space origin": lps[:, 3],
+        "encoding": "gzip",
+        "content": f"{PLANTED} {DATE}",
+        "PatientName": PLANTED,
+        "DICOM.PatientBirthDate": DATE,
+        "Segmentation_ConversionParameters": PLANTED,
+    }
+    labels = np.where(image.labels <= 3, image.labels, 0).astype(np.uint8)
+    for k, (name, colour) in enumerate(NAMES.values()):
+        rgb = " ".join(f"{part / 255:.6f}" for part in bytes.fromhex(colour[1:]))
+        fields |= {f"Segment{k}_Name": name, f"Segment{k}_Color": rgb, f"Segment{k}_LabelValue": k + 1}
+        fields |= {
+            f"Segment{k}_ID": f"{PLANTED}_{k}",
+            f"Segment{k}_Tags": f"Patient:{PLANTED}|",
+            f"Segment{k}_Layer": 0,
+        }
+    nrrd.write(str(path), labels, fields)
+
+
+def write_nifti(path: Path, image: LabelImage) -> None:
+    labels = np.where(image.labels <= 3, image.labels, 0).astype(np.uint8)
+    nifti = nibabel.Nifti1Image(labels, image.grid.affine)
+    nifti.header["descrip"] = f"{PLANTED} {DATE}".encode()
+    nifti.header["aux_file"] = PLANTED.encode()
+    nifti.header["db_name"] = PLANTED.encode()
+    nifti.header["intent_name"] = PLANTED.encode()
+    nifti.header.extensions.append(nibabel.nifti1.Nifti1Extension("comment", f"{PLANTED} {DATE}".encode()))
+    nibabel.save(nifti, path)
+
+
+def contents(path: Path) -> list[bytes]:
+    """The bytes of a file, and what is packed in them."""
+    plain = path.read_bytes()
+    unpacked = [gzip.decompress(plain)] if plain[:2] == b"\x1f\x8b" else []
+    packed = [base64.b64decode(text + b"=" * (-len(text) % 4)) for text in re.findall(rb"[A-Za-z0-9+/]{40,}", plain)]
+    inner = [gzip.decompress(part) for part in packed if part[:3] == b"\x1f\x8b\x08"]
+    return [plain, *unpacked, *packed, *inner]
+
+
+def planted_in(path: Path) -> bool:
+    traces = [trace.encode() for trace in (PLANTED, DATE, "Meyer", "Erika")]
+    return any(trace.lower() in content.lower() for content in contents(path) for trace in traces)
+
+
+def test_the_search_finds_what_was_planted(folder: Path) -> None:
+    assert all(planted_in(folder / name) for name in ("before.seg.nrrd", "after.nii.gz", "labels.txt"))
+
+
+@pytest.mark.parametrize("command", ["estimate", "mesh"])
+def test_no_identifier_of_a_header_is_in_any_output(
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], command: str
+) -> None:
+    output = tmp_path / "out"
+    assert main([command, str(folder / "case.toml"), "--output", str(output)]) == 0
+    files = [path for path in output.rglob("*") if path.is_file()]
+    assert len(files) >= 5
+    assert [path.name for path in files if planted_in(path)] == []
+    spoken = capfd.readouterr()
+    assert "Meyer" not in spoken.out + spoken.err
+    table = (output / "labels.csv").read_text()
+    assert "1,core,128,64,32,255" in table
+    assert "3,frame,64,96,255,255" in table
