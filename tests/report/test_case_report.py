@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
+import hashlib
+import json
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from palpate.errors import NotConverged
+from palpate.errors import InputDataError, NotConverged
 from palpate.images.readers import write_scalar_image
-from palpate.report import case_report
-from palpate.report.case_report import write_case_report, write_failure_report
+from palpate.inversion.estimation import Remark
+from palpate.report import collect as collect_module
+from palpate.report import page as page_module
+from palpate.report.case_report import rewrite_report, write_case_report, write_failure_report
 
 EVIL = '</script><img src=x onerror=alert(1)>$\\frac{"&'
 
@@ -47,7 +53,7 @@ def test_every_estimate_stands_with_unit_interval_verdict_and_truth(page):
         "identified",
         "60.0",
         "-1.8 %",
-        "to surroundings",
+        "× surroundings",
         "a warning to be",
     ):
         assert text in page
@@ -56,16 +62,26 @@ def test_every_estimate_stands_with_unit_interval_verdict_and_truth(page):
 def test_the_page_is_self_contained(page):
     assert "default-src 'none'" in page
     for tag, attributes in tags(page):
-        assert tag not in ("script", "link", "iframe", "object", "base")
+        assert tag not in ("link", "iframe", "object", "base")
+        assert not [name for name in attributes if name.startswith("on")]
         for name in ("src", "href", "xlink:href"):
             assert attributes.get(name, "#").startswith(("#", "data:image/png"))
-    assert not re.findall(r"url\((?!#)", page)
+    assert not re.findall(r"url\((?!#)", page[: page.index("<script")])
+
+
+def test_the_policy_allows_the_pages_own_scripts_and_no_other(page):
+    scripts = re.findall(r"<script>(.*?)</script>", page, flags=re.DOTALL)
+    policy = next(a["content"] for _, a in tags(page) if a.get("http-equiv") == "Content-Security-Policy")
+    digests = {base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts}
+    assert len(scripts) == 7
+    assert digests == set(re.findall(r"'sha256-([^']+)'", policy))
+    assert "unsafe-inline" not in policy.split("script-src")[1].split(";")[0]
 
 
 def test_identifiers_are_unique_and_every_reference_is_met(page):
     names = [attributes["id"] for _, attributes in tags(page) if "id" in attributes]
     assert len(names) == len(set(names))
-    used = re.findall(r'(?:href="#|url\(#)([^")]+)', page)
+    used = re.findall(r'(?:href="#|url\(#)([^")]+)', page[: page.index("<script")])
     assert set(used) <= set(names)
 
 
@@ -74,6 +90,24 @@ def test_three_slices_show_before_after_and_model(page):
         assert page.count(f'class="{layer}"') >= 3 * 2  # prostate and bladder at least, in each of three views
     for view in ("axial", "coronal", "sagittal"):
         assert f">{view}</figcaption>" in page
+
+
+def test_every_later_image_has_its_own_figures(case_result, tmp_path):
+    estimation = case_result.estimation
+    images = dataclasses.replace(case_result.case.images, after=(Path("second.nii.gz"), Path("third.nii.gz")))
+    result = dataclasses.replace(
+        case_result,
+        case=dataclasses.replace(case_result.case, images=images),
+        after=2 * case_result.after,
+        estimation=dataclasses.replace(
+            estimation, fits=2 * estimation.fits, displacements=2 * estimation.displacements
+        ),
+    )
+    page = write_case_report(result, tmp_path).read_text()
+    for title in ("Slices: before, second.nii.gz", "Slices: before, third.nii.gz", "distance to third.nii.gz"):
+        assert title in page
+    names = [attributes["id"] for _, attributes in tags(page) if "id" in attributes]
+    assert len(names) == len(set(names))
 
 
 def with_name(result, name):
@@ -95,20 +129,78 @@ def with_name(result, name):
 
 def test_a_name_can_neither_inject_markup_nor_stop_the_drawing(case_result, tmp_path):
     page = write_case_report(with_name(case_result, EVIL), tmp_path).read_text(encoding="utf-8")
-    assert not [tag for tag, attributes in tags(page) if tag == "script" or "onerror" in attributes]
-    assert "could not be drawn" not in page
+    found = tags(page)
+    assert not [tag for tag, attributes in found if "onerror" in attributes or attributes.get("src") == "x"]
+    assert len([tag for tag, _ in found if tag == "script"]) == 9  # the page's seven, and two of data
+    assert "could not be" not in page[: page.index("<script")]
     assert "&lt;/script&gt;" in page
+    facts = re.search(r'id="facts">(.*?)</script>', page, flags=re.DOTALL).group(1)
+    assert json.loads(facts)["tissues"][0]["name"] == EVIL
 
 
-def test_a_figure_that_fails_leaves_a_sentence(case_result, tmp_path, monkeypatch):
-    def fail(*_, **__):
-        raise RuntimeError("no canvas")
+FIGURES = ("slice_svg", "organs_png", "mesh_png", "residual_svg", "objective_svg", "waterfall_svg", "angle_svg")
+FAILING = 3 + 2 + 2 + 3 + 1 + 1 + 1  # pictures that these draw for one later image of three organs
 
-    monkeypatch.setattr(case_report, "slice_svg", fail)
-    monkeypatch.setattr(case_report, "angle_svg", fail)
-    page = write_case_report(case_result, tmp_path).read_text(encoding="utf-8")
-    assert page.count("could not be drawn (RuntimeError: no canvas)") == 4
+
+def fail(*_, **__):
+    raise RuntimeError("no <canvas>")
+
+
+def test_figures_that_fail_leave_a_sentence_each_and_a_warning(case_result, tmp_path, monkeypatch, caplog):
+    for figure in FIGURES:
+        monkeypatch.setattr(page_module, figure, fail)
+    page = write_case_report(case_result, tmp_path).read_text()
+    assert page.count("could not be drawn (RuntimeError: no &lt;canvas&gt;)") == FAILING
     assert "58.9" in page
+    assert caplog.text.count("could not be drawn") == FAILING
+
+
+def test_data_that_cannot_be_made_leave_sentences(case_result, tmp_path, monkeypatch):
+    for part in ("image_surface", "model_surface", "label_volume", "tet_dihedrals"):
+        monkeypatch.setattr(collect_module, part, fail)
+    page = write_case_report(case_result, tmp_path).read_text()
+    assert page.count("could not be made (RuntimeError: no &lt;canvas&gt;)") >= 3
+    assert "58.9" in page
+
+
+def test_a_page_whose_payload_fails_is_still_a_page(case_result, tmp_path, monkeypatch):
+    monkeypatch.setattr(page_module, "payload", fail)
+    page = write_case_report(case_result, tmp_path).read_text()
+    assert "<script" not in page
+    assert "script-src 'none'" in page
+    assert "data:image/png" in page
+
+
+def test_the_page_is_made_again_from_its_data(case_result, tmp_path):
+    path = write_case_report(case_result, tmp_path)
+    first = path.read_text()
+    path.unlink()
+    assert rewrite_report(tmp_path) == path
+    assert path.read_text() == first
+
+
+def test_a_page_cannot_be_made_from_nothing(tmp_path):
+    with pytest.raises(InputDataError, match="run the estimate"):
+        rewrite_report(tmp_path)
+
+
+def test_every_figure_says_what_good_and_bad_look_like(page):
+    for part in re.findall(r"<section.*?</section>", page, flags=re.DOTALL):
+        if "<figure" in part:
+            assert part.count(">Good:<") >= 1
+            assert part.count(">Good:<") == part.count(">Bad:<")
+
+
+def test_methods_and_provenance_are_there(page):
+    for text in ("Yang S, Lin MC", "Mmg [", "seed of random numbers was 0", "ab" * 32, "total", "gauss-newton"):
+        assert text in page
+
+
+def test_warnings_of_one_code_are_folded(case_result, tmp_path):
+    remarks = tuple(Remark("example", f"warning number {i}") for i in range(5))
+    page = write_case_report(dataclasses.replace(case_result, remarks=remarks), tmp_path).read_text()
+    assert "5 more like this" in page
+    assert all(f"warning number {i}" in page for i in range(5))
 
 
 def test_what_did_not_converge_shows_no_number(case_result, tmp_path):
@@ -118,11 +210,13 @@ def test_what_did_not_converge_shows_no_number(case_result, tmp_path):
     assert "it stopped early" in page
     assert not any(number in table for number in ("58.9", "31.2", "5.89", "3.12"))
     assert "not identified" in table
+    assert page.count("is drawn where it stopped, and is no result") == 2
 
 
 def test_an_estimate_that_failed_has_a_report_too(case_result, tmp_path):
     page = write_failure_report(case_result.case, NotConverged("stopped <here>"), tmp_path).read_text()
     assert "stopped &lt;here&gt;" in page
+    assert "Yang S, Lin MC" not in page
     assert "not-converged" in page
 
 
@@ -132,14 +226,16 @@ def test_a_grey_image_lies_under_the_contours(case_result, tmp_path):
     images = dataclasses.replace(case_result.case.images, intensities_before=tmp_path / "ct.nii.gz")
     result = dataclasses.replace(case_result, case=dataclasses.replace(case_result.case, images=images))
     page = write_case_report(result, tmp_path).read_text()
-    assert page.count("data:image/png") == 3
-    assert "could not be drawn" not in page
+    assert '"kind": "grey"' in page
+    assert "could not be" not in page[: page.index("<script")]
 
 
 def test_a_grey_image_that_cannot_be_read_does_not_stop_the_report(case_result, tmp_path):
     images = dataclasses.replace(case_result.case.images, intensities_before=tmp_path / "nowhere.nii.gz")
     result = dataclasses.replace(case_result, case=dataclasses.replace(case_result.case, images=images))
-    assert "could not be drawn" not in write_case_report(result, tmp_path).read_text()
+    page = write_case_report(result, tmp_path).read_text()
+    assert '"kind": "labels"' in page
+    assert "could not be" not in page[: page.index("<script")]
 
 
 def test_open_intervals_and_ratios_are_shown_as_such(case_result, tmp_path):

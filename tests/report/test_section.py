@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from palpate.images.label_image import VoxelGrid
-from palpate.images.segmentation import Segmentation
-from palpate.images.tissue import Role, Tissue
 from palpate.mesh.surface import tissue_surface
 from palpate.report.rows import number
-from palpate.report.section import VIEWS, Plane, cut_image, cut_surface, cut_tissue
+from palpate.report.section import VIEWS, Plane, cut_image, cut_surface, joined
 
 LOW, HIGH = np.array([0.0, 0.0, 0.0]), np.array([40.0, 40.0, 40.0])
 
@@ -31,17 +29,6 @@ def test_outside_its_grid_an_image_is_nothing():
     assert 0.9 < np.isfinite(cut).sum() * (40 / cut.shape[0]) ** 2 / 100 < 1.1
 
 
-def test_a_ball_is_cut_in_a_circle():
-    grid = VoxelGrid((41, 41, 41), np.eye(4))
-    index = np.stack(np.meshgrid(*[np.arange(41)] * 3, indexing="ij"), axis=-1)
-    ball = (np.linalg.norm(index - 20, axis=-1) < 12).astype(np.int16)
-    segmentation = Segmentation(ball, grid, (Tissue("a", Role.VOID), Tissue("b", Role.VOID, (1,))))
-    plane = Plane(VIEWS[1], 25.0, LOW, HIGH)
-    share = cut_tissue(segmentation, 1, plane, smoothing_mm=0.6)
-    pixel = np.prod([axis[1] - axis[0] for axis in plane.axes])
-    assert (share > 0.5).sum() * pixel == pytest.approx(np.pi * (144 - 25), rel=0.03)
-
-
 @pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.name)
 def test_a_closed_surface_is_cut_in_closed_lines(case_result, view):
     mesh = case_result.space.mesh
@@ -50,6 +37,28 @@ def test_a_closed_surface_is_cut_in_closed_lines(case_result, view):
     assert len(segments) > 8
     _, count = np.unique(np.round(segments.reshape(-1, 2), 6), axis=0, return_counts=True)
     assert (count % 2 == 0).all()
+
+
+@pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.name)
+def test_joined_lines_hold_every_segment_once_and_close(case_result, view):
+    mesh = case_result.space.mesh
+    triangles = tissue_surface(mesh, 0).triangles
+    plane = Plane(view, 14.0, LOW, HIGH)
+    lines = joined(mesh.nodes, triangles, plane)
+    assert sum(len(line) - 1 for line in lines) == len(cut_surface(mesh.nodes, triangles, plane))
+    for line in lines:
+        np.testing.assert_allclose(line[0], line[-1])
+
+
+def test_an_open_surface_is_cut_in_one_line_from_end_to_end():
+    x = np.arange(6.0)
+    points = np.concatenate([np.stack([x, 0 * x, 0 * x - 1], axis=1), np.stack([x, 0 * x, 0 * x + 1], axis=1)])
+    triangles = np.array([t for i in range(5) for t in ((i, i + 1, i + 6), (i + 1, i + 7, i + 6))])[
+        [4, 2, 7, 0, 9, 1, 3, 8, 6, 5]
+    ]
+    (line,) = joined(points, triangles, Plane(VIEWS[0], 0.1, LOW, HIGH))
+    assert sorted((line[0, 0], line[-1, 0])) == [0.0, 5.0]
+    assert len(line) == 11
 
 
 def test_a_plane_through_nodes_is_no_special_case(case_result):

@@ -1,54 +1,109 @@
-"""Charts of a report: convergence of every start, angles of the mesh."""
+"""Charts of a report: residuals, convergence and waterfall of the starts, angles of the mesh."""
 
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from numpy.typing import NDArray
 
-from palpate.inversion.estimation import Estimation, ModulusEstimate
-from palpate.mesh.dihedral import tet_dihedrals
-from palpate.mesh.tet_mesh import TetMesh
 from palpate.report.colours import START_COLOURS
+from palpate.report.report_data import ModelSurface, ReportData
 from palpate.report.svg import INK, draw_svg
 
-__all__ = ["angle_svg", "modulus_svg", "objective_svg"]
+__all__ = ["angle_svg", "modulus_svg", "objective_svg", "residual_svg", "waterfall_svg"]
 
 SIZE = (3.9, 2.5)
+DASHED = (0, (4, 3))
+BINS = 41
 
 
-def objective_svg(estimation: Estimation, *, name: str) -> str:
-    """Misfit (mm^2) of every start against the iteration, as SVG."""
-    paths = [[step.objective_mm2 for step in start.history] for start in estimation.starts]
-    return draw_svg(lambda figure: _paths(figure, paths, "misfit (mm²)"), size=SIZE, name=name)
+def residual_svg(data: ReportData, model: ModelSurface, *, name: str) -> str:
+    """Histogram of one surface's signed distance (mm) at rest and fitted, with a voxel's edge marked, as SVG.
 
-
-def modulus_svg(estimation: Estimation, estimate: ModulusEstimate, *, name: str) -> str:
-    """Modulus of one tissue in every start against the iteration, with the estimate's interval, as SVG."""
-    tissue = estimate.tissue
-    paths = [[step.moduli.get(tissue, np.nan) for step in start.history] for start in estimation.starts]
-    unit = "kPa" if estimate.unit == "kPa" else "ratio"
+    Raises `ValueError` when none of the surface is observed.
+    """
+    tissue, voxel = data.tissues[model.tissue], data.voxel_mm
+    seen = np.isfinite(model.distance_fitted) & np.isfinite(model.distance_rest)
+    rest, fitted, area = (array[seen] for array in (model.distance_rest, model.distance_fitted, model.area))
+    if not len(rest) or not area.sum() > 0.0:
+        raise ValueError("none of this surface is observed")
+    reach = max(1.6 * voxel, float(np.percentile(np.abs(np.concatenate([rest, fitted])), 99.0)))
+    bins = np.linspace(-reach, reach, BINS)
+    share = 100.0 * area / area.sum()
 
     def draw(figure: Figure) -> None:
-        _paths(figure, paths, f"{tissue} ({unit})")
-        interval = estimate.interval95 if estimate.unit == "kPa" else estimate.ratio_interval95
-        if interval is not None and interval[0] is not None and interval[1] is not None:
-            figure.axes[0].axhspan(interval[0], interval[1], color=INK, alpha=0.1, linewidth=0)
-        if estimate.truth is not None:
-            figure.axes[0].axhline(estimate.truth, color=INK, linewidth=1.0, linestyle=(0, (4, 3)))
+        axes = figure.add_axes((0.14, 0.2, 0.83, 0.74))
+        clipped = [np.clip(values, -reach, reach) for values in (fitted, rest)]
+        axes.hist(clipped[0], bins=list(bins), weights=share, color=tissue.colour, alpha=0.85, label="fitted")
+        axes.hist(clipped[1], bins=list(bins), weights=share, histtype="step", color=INK, linewidth=1.1, label="no fit")
+        for place in (-voxel, voxel):
+            axes.axvline(place, color=INK, linewidth=0.9, linestyle=DASHED)
+        axes.text(voxel, 1.0, " one voxel", transform=axes.get_xaxis_transform(), fontsize=7.5, va="top")
+        axes.set_xlim(-reach, reach)
+        axes.set_xlabel("signed distance to the later image (mm)")
+        axes.set_ylabel("surface (%)")
+        axes.yaxis.set_major_locator(MaxNLocator(4))
 
     return draw_svg(draw, size=SIZE, name=name)
 
 
-def angle_svg(mesh: TetMesh, *, name: str) -> str:
-    """Histogram of the mesh's dihedral angles (degrees) as SVG."""
-    angles = tet_dihedrals(mesh.nodes[mesh.tets]).ravel()
+def objective_svg(data: ReportData, *, name: str) -> str:
+    """Misfit (mm^2) of every start against the iteration, as SVG."""
+    paths = [[_finite(value) for value in start["history_mm2"]] for start in data.document["starts"]]
+    return draw_svg(lambda figure: _paths(figure, paths, "misfit (mm²)"), size=SIZE, name=name)
+
+
+def modulus_svg(data: ReportData, estimate: int, *, name: str) -> str:
+    """Modulus of one estimate (its number) in every start against the iteration, with its interval, as SVG."""
+    item = data.document["estimates"][estimate]
+    paths = [list(path.get(item["tissue"], ())) for path in data.moduli_paths]
+    in_kpa = item["unit"] == "kPa"
 
     def draw(figure: Figure) -> None:
-        axes = figure.add_axes((0.15, 0.2, 0.82, 0.7))
-        share = np.full(len(angles), 100.0 / len(angles))
-        axes.hist(angles, bins=list(range(0, 181, 5)), weights=share, color=START_COLOURS[0], alpha=0.85)
-        axes.axvline(5.0, color=INK, linewidth=1.0, linestyle=(0, (4, 3)))
+        _paths(figure, paths, "E (kPa)" if in_kpa else f"E / {item['relative_to'][:24]}")
+        interval = item["interval95"] if in_kpa else item["ratio_interval95"]
+        if interval is not None and None not in interval:
+            figure.axes[0].axhspan(interval[0], interval[1], color=INK, alpha=0.1, linewidth=0)
+        if item["truth"] is not None:
+            figure.axes[0].axhline(item["truth"], color=INK, linewidth=1.0, linestyle=DASHED)
+
+    return draw_svg(draw, size=SIZE, name=name)
+
+
+def waterfall_svg(data: ReportData, *, name: str) -> str:
+    """Final misfits (mm^2) of the starts from the best to the worst, as SVG; hollow where a start did not converge."""
+    starts = data.document["starts"]
+    ends = np.array([_finite(start["objective_mm2"]) for start in starts])
+    order = np.argsort(ends, kind="stable")
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_axes((0.2, 0.2, 0.77, 0.74))
+        axes.plot(range(1, len(order) + 1), ends[order], color=INK, linewidth=0.8, alpha=0.5)
+        for rank, number in enumerate(order, start=1):
+            colour = START_COLOURS[number % len(START_COLOURS)]
+            filled = colour if starts[number]["status"] == "converged" else "none"
+            axes.plot([rank], [ends[number]], "o", color=colour, markerfacecolor=filled, markersize=7)
+        axes.set_xlabel("start, from best to worst")
+        axes.set_ylabel("final misfit (mm²)")
+        axes.set_xlim(0.5, len(order) + 0.5)
+        axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+        _widen(axes, ends)
+        axes.grid(visible=True, axis="y")
+
+    return draw_svg(draw, size=SIZE, name=name)
+
+
+def angle_svg(angles: NDArray[np.float32], *, name: str) -> str:
+    """Histogram of a mesh's dihedral angles (n, 6), degrees, as SVG."""
+    flat = angles.ravel()
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_axes((0.15, 0.2, 0.82, 0.74))
+        share = np.full(len(flat), 100.0 / len(flat))
+        axes.hist(flat, bins=list(range(0, 181, 5)), weights=share, color=START_COLOURS[0], alpha=0.85)
+        axes.axvline(5.0, color=INK, linewidth=1.0, linestyle=DASHED)
         axes.set_xlim(0, 180)
         axes.set_xticks(range(0, 181, 30))
         axes.set_xlabel("dihedral angle (degrees)")
@@ -58,6 +113,21 @@ def angle_svg(mesh: TetMesh, *, name: str) -> str:
     return draw_svg(draw, size=SIZE, name=name)
 
 
+def _finite(value: float | None) -> float:
+    return np.nan if value is None else float(value)
+
+
+def _widen(axes: Axes, values: NDArray[np.float64]) -> None:
+    """An axis that never spans less than a tenth of its values: starts that agree must look as if they did."""
+    finite = values[np.isfinite(values)]
+    if not len(finite):
+        return
+    low, high = float(finite.min()), float(finite.max())
+    room = max(0.12 * (high - low), 0.05 * abs(high), 1e-12)
+    axes.set_ylim(low - room, high + room)
+    axes.yaxis.set_major_locator(MaxNLocator(4))
+
+
 def _paths(figure: Figure, paths: list[list[float]], label: str) -> None:
     """One line a start on a logarithmic axis."""
     axes = figure.add_axes((0.17, 0.2, 0.8, 0.74))
@@ -65,7 +135,7 @@ def _paths(figure: Figure, paths: list[list[float]], label: str) -> None:
         colour = START_COLOURS[number % len(START_COLOURS)]
         axes.plot(range(len(path)), path, color=colour, linewidth=1.6, marker="o", markersize=3.2)
     axes.set_xlabel("iteration")
-    axes.set_ylabel(label[:40])
+    axes.set_ylabel(label)
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
     values = np.array([value for path in paths for value in path])
     if len(values) and (values > 0).all():

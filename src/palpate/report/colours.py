@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 
 from palpate.images.tissue import Role, Tissue
@@ -13,11 +14,15 @@ ORGANS = ("#e69f00", "#56b4e9", "#cc79a7", "#2ba888", "#d55e00", "#8f8ff0", "#c5
 KNOWN = ("#6d7278", "#85786c", "#6c8075", "#7b6f85")
 RIGID = "#cfc8b8"
 VOID = "#303438"
+DARKEST = 64  # of the brightest channel of a tissue's own colour
 START_COLOURS = ("#3b7dd8", "#d9822b", "#3a9d5d", "#b0559b", "#8a6d3b", "#4aa3a3", "#c0504d", "#7f7fd0")
 
 
 def tissue_colours(tissues: tuple[Tissue, ...]) -> tuple[str, ...]:
-    """A colour (#rrggbb) for each tissue: bright for estimated ones and drivers, quiet for the others."""
+    """A colour (#rrggbb) for each tissue: its own, or one of ours, bright for estimated ones and drivers.
+
+    A colour of its own that is almost black, and could not be seen on an image, is replaced by one of ours.
+    """
     fixed = {Role.RIGID: (RIGID,), Role.VOID: (VOID,), Role.KNOWN: KNOWN}
     ranked = sorted(range(len(tissues)), key=lambda i: (tissues[i].role is not Role.ESTIMATE, i))
     colours = [""] * len(tissues)
@@ -25,6 +30,15 @@ def tissue_colours(tissues: tuple[Tissue, ...]) -> tuple[str, ...]:
     for i in ranked:
         role = Role.ESTIMATE if tissues[i].role is Role.DRIVER else tissues[i].role
         palette = fixed.get(role, ORGANS)
-        colours[i] = palette[used[role] % len(palette)]
+        colours[i] = _own(tissues[i]) or palette[used[role] % len(palette)]
         used[role] += 1
     return tuple(colours)
+
+
+def _own(tissue: Tissue) -> str | None:
+    """The tissue's own colour if it has one that can be seen."""
+    colour = tissue.colour
+    if colour is None or not re.fullmatch("#[0-9a-fA-F]{6}", colour):
+        return None
+    brightest = max(int(colour[i : i + 2], 16) for i in (1, 3, 5))
+    return colour.lower() if brightest >= DARKEST else None

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from palpate.inversion.estimation import Interval, ModulusEstimate
-from palpate.report.colours import tissue_colours
-from palpate.study.result import CaseResult
+from palpate.inversion.estimation import Interval
 
-__all__ = ["Bar", "EstimateRow", "estimate_rows", "number"]
+__all__ = ["Bar", "EstimateRow", "estimate_rows", "number", "scale_marks"]
 
 NONE = "–"
 BAR = 200.0  # width of a bar, in its own units
@@ -59,39 +58,54 @@ def number(value: float | None, *, digits: int = 3) -> str:
     return f"{round(value, digits - 1 - magnitude):.{max(digits - 1 - magnitude, 0)}f}"
 
 
-def estimate_rows(result: CaseResult) -> tuple[EstimateRow, ...]:
-    """A row for each estimate; nothing that did not converge shows a number."""
-    colours = {tissue.name: c for tissue, c in zip(result.tissues, tissue_colours(result.tissues), strict=True)}
-    shown = result.estimation.status == "converged"
-    scale = _scale(result.estimation.estimates) if shown else None
-    return tuple(
-        _row(item, colour=colours.get(item.tissue, "#888888"), shown=shown, scale=scale)
-        for item in result.estimation.estimates
-    )
+def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tuple[EstimateRow, ...]:
+    """A row for each estimate of a result document; nothing that did not converge shows a number.
+
+    `colours`: tissue -> #rrggbb.
+    """
+    items: Sequence[Mapping[str, Any]] = document["estimates"]
+    shown = document["status"] == "converged"
+    scale = _scale(items) if shown else None
+    return tuple(_row(item, colour=colours.get(item["tissue"], "#888888"), shown=shown, scale=scale) for item in items)
 
 
-def _row(item: ModulusEstimate, *, colour: str, shown: bool, scale: tuple[float, float] | None) -> EstimateRow:
+def scale_marks(document: Mapping[str, Any]) -> tuple[tuple[float, str], ...]:
+    """Places (0 to BAR) and labels of round numbers on the common scale of the bars."""
+    scale = _scale(document["estimates"]) if document["status"] == "converged" else None
+    if scale is None:
+        return ()
+    decades = range(math.floor(scale[0] / math.log(10.0)), math.ceil(scale[1] / math.log(10.0)) + 1)
+    numbers = [step * 10.0**decade for decade in decades for step in (1.0, 2.0, 5.0)]
+    places = [(BAR * (math.log(n) - scale[0]) / (scale[1] - scale[0]), f"{n:g}") for n in numbers]
+    inside = [mark for mark in places if 0.04 * BAR <= mark[0] <= 0.96 * BAR]
+    return tuple(inside[:: math.ceil(len(inside) / 6) or 1])
+
+
+def _row(item: Mapping[str, Any], *, colour: str, shown: bool, scale: tuple[float, float] | None) -> EstimateRow:
     value, interval = _main(item)
+    truth = item["truth"]
     return EstimateRow(
-        tissue=item.tissue,
+        tissue=item["tissue"],
         colour=colour,
-        value=number(item.value if shown else None),
-        interval=_interval(item.interval95 if shown else None),
-        unit=item.unit,
-        ratio=number(item.ratio if shown else None),
-        ratio_interval=_interval(item.ratio_interval95 if shown else None),
-        relative_to=item.relative_to,
-        verdict=item.verdict if shown else "not identified",
-        why=item.why,
-        truth=number(item.truth),
-        error=f"{100.0 * (value / item.truth - 1.0):+.1f} %" if shown and value and item.truth else NONE,
-        bar=_bar(value, interval, truth=item.truth, scale=scale) if scale and value else None,
+        value=number(item["value"] if shown else None),
+        interval=_interval(item["interval95"] if shown else None),
+        unit=item["unit"],
+        ratio=number(item["ratio"] if shown else None),
+        ratio_interval=_interval(item["ratio_interval95"] if shown else None),
+        relative_to=item["relative_to"],
+        verdict=item["verdict"] if shown else "not identified",
+        why=item["why"],
+        truth=number(truth),
+        error=f"{100.0 * (value / truth - 1.0):+.1f} %" if shown and value and truth else NONE,
+        bar=_bar(value, interval, truth=truth, scale=scale) if scale and value else None,
     )
 
 
-def _main(item: ModulusEstimate) -> tuple[float | None, Interval | None]:
+def _main(item: Mapping[str, Any]) -> tuple[float | None, Interval | None]:
     """The number that the tissue is judged by: kPa, or the ratio where there is no kPa."""
-    return (item.value, item.interval95) if item.value is not None else (item.ratio, item.ratio_interval95)
+    if item["value"] is not None:
+        return item["value"], item["interval95"]
+    return item["ratio"], item["ratio_interval95"]
 
 
 def _interval(interval: Interval | None) -> str:
@@ -105,12 +119,12 @@ def _interval(interval: Interval | None) -> str:
     return f"> {number(low)}" if high is None else f"{number(low)} to {number(high)}"
 
 
-def _scale(items: Iterable[ModulusEstimate]) -> tuple[float, float] | None:
+def _scale(items: Iterable[Mapping[str, Any]]) -> tuple[float, float] | None:
     """Natural logarithms of the smallest and the largest number to be shown, with room on both sides."""
     numbers: list[float] = []
     for item in items:
         value, interval = _main(item)
-        numbers += [n for n in (value, item.truth, *(interval or ())) if n is not None and n > 0.0]
+        numbers += [n for n in (value, item["truth"], *(interval or ())) if n is not None and n > 0.0]
     if not numbers:
         return None
     low, high = math.log(min(numbers)), math.log(max(numbers))

@@ -1,4 +1,4 @@
-"""Plane sections of images, segmentations and deformed surfaces, in world coordinates (RAS mm)."""
+"""Plane sections of images and surfaces, in world coordinates (RAS mm)."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from palpate.images.label_image import VoxelGrid
-from palpate.images.segmentation import Segmentation
 
-__all__ = ["VIEWS", "Plane", "View", "cut_image", "cut_surface", "cut_tissue"]
+__all__ = ["VIEWS", "Plane", "View", "cut_image", "cut_surface", "joined"]
 
 PIXEL_MM = 0.8
 
@@ -79,39 +78,73 @@ def cut_image(values: NDArray[Any], grid: VoxelGrid, plane: Plane, *, order: Lit
     return np.asarray(np.where(outside, np.nan, sampled).reshape(points.shape[:2]))
 
 
-def cut_tissue(segmentation: Segmentation, tissue: int, plane: Plane, *, smoothing_mm: float) -> NDArray[np.float64]:
-    """Share (m, n) of the tissue, blurred by a Gaussian of `smoothing_mm`; its contour at 0.5 is the surface."""
-    grid = segmentation.grid
-    points = plane.points
-    index = grid.index(points.reshape(-1, 3))
-    window, origin = _window(index, grid.shape, margin=int(np.ceil(4 * smoothing_mm / grid.spacing.min())) + 1)
-    mask = (segmentation.index[window] == tissue).astype(np.float32)
-    blurred = ndimage.gaussian_filter(mask, smoothing_mm / grid.spacing, mode="nearest")
-    share = ndimage.map_coordinates(blurred, (index - origin).T, order=1, mode="nearest")
-    outside = ((index < -0.5) | (index > np.array(grid.shape) - 0.5)).any(axis=1)
-    return np.asarray(np.where(outside, 0.0, share).reshape(points.shape[:2]))
-
-
 def cut_surface(points: NDArray[np.float64], triangles: NDArray[np.int64], plane: Plane) -> NDArray[np.float64]:
     """Segments (n, 2, 2) mm, (across, up) of both ends, where triangles (n_faces, 3) of points (n, 3) mm cross it."""
+    return _cut(points, triangles, plane)[0]
+
+
+def joined(points: NDArray[np.float64], triangles: NDArray[np.int64], plane: Plane) -> list[NDArray[np.float64]]:
+    """The same as lines (n, 2) mm, each as long as it goes: closed ones end where they begin."""
+    segments, keys = _cut(points, triangles, plane)
+    neighbours: dict[int, list[int]] = {}
+    for number, ends in enumerate(keys.tolist()):
+        for end in ends:
+            neighbours.setdefault(end, []).append(number)
+    unused = set(range(len(keys)))
+    open_ends = [ends[0] for ends in neighbours.values() if len(ends) == 1]
+    return [
+        _follow(first, keys, segments, neighbours=neighbours, unused=unused)
+        for first in (*open_ends, *range(len(keys)))
+        if first in unused
+    ]
+
+
+def _follow(
+    first: int,
+    keys: NDArray[np.int64],
+    segments: NDArray[np.float64],
+    *,
+    neighbours: dict[int, list[int]],
+    unused: set[int],
+) -> NDArray[np.float64]:
+    """The line that begins with segment `first`, whose segments are taken from `unused`."""
+    unused.discard(first)
+    start = 0 if len(neighbours[int(keys[first, 0])]) == 1 else 1
+    line = [segments[first, start], segments[first, 1 - start]]
+    end = int(keys[first, 1 - start])
+    while following := [number for number in neighbours[end] if number in unused]:
+        number = following[0]
+        unused.discard(number)
+        side = 1 if keys[number, 0] == end else 0
+        line.append(segments[number, side])
+        end = int(keys[number, side])
+    return np.asarray(line)
+
+
+def _cut(
+    points: NDArray[np.float64], triangles: NDArray[np.int64], plane: Plane
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Segments (n, 2, 2) mm of a section, and the numbers (n, 2) of the triangles' edges that their ends lie on."""
     height = points[:, plane.view.normal] - plane.position
     height = np.where(height == 0.0, 1e-9, height)  # a node in the plane counts as just above it
     corner = height[triangles]
     pairs = np.array([[0, 1], [1, 2], [2, 0]])
     crossed = np.sign(corner[:, pairs[:, 0]]) != np.sign(corner[:, pairs[:, 1]])  # (n_faces, 3): none or two of them
     hit = crossed.any(axis=1)
-    a, b = triangles[hit][:, pairs[:, 0]], triangles[hit][:, pairs[:, 1]]
+    ends = np.sort(triangles[hit][:, pairs], axis=2).astype(np.int64)
+    a, b = ends[..., 0], ends[..., 1]
     share = height[a] / np.where(crossed[hit], height[a] - height[b], 1.0)
     flat = points[:, [plane.view.across, plane.view.up]]
-    ends = flat[a] + share[..., None] * (flat[b] - flat[a])
-    return np.asarray(ends[crossed[hit]].reshape(-1, 2, 2))
+    places = flat[a] + share[..., None] * (flat[b] - flat[a])
+    keys = a * len(points) + b
+    return np.asarray(places[crossed[hit]].reshape(-1, 2, 2)), np.asarray(keys[crossed[hit]].reshape(-1, 2))
 
 
 def _window(
-    index: NDArray[np.float64], shape: tuple[int, int, int], *, margin: int = 2
+    index: NDArray[np.float64], shape: tuple[int, int, int]
 ) -> tuple[tuple[slice, slice, slice], NDArray[np.int64]]:
     """The part of an array that voxel indices (n, 3) need, and its first voxel (3,)."""
     last = np.array(shape) - 1
-    low = np.clip(np.floor(index.min(axis=0)).astype(np.int64) - margin, 0, last)
-    high = np.clip(np.ceil(index.max(axis=0)).astype(np.int64) + margin, 0, last)
+    low = np.clip(np.floor(index.min(axis=0)).astype(np.int64) - 2, 0, last)
+    high = np.clip(np.ceil(index.max(axis=0)).astype(np.int64) + 2, 0, last)
     return (slice(low[0], high[0] + 1), slice(low[1], high[1] + 1), slice(low[2], high[2] + 1)), low

@@ -1,0 +1,134 @@
+"""Dataclasses with arrays in one .npz file: arrays as they are, the rest as JSON, nothing pickled."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import math
+import types
+import typing
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import InputDataError
+from palpate.study.outputs import write_bytes
+
+__all__ = ["read_archive", "write_archive"]
+
+T = TypeVar("T")
+
+FORMAT = "palpate.report-data/1"
+MOST_BYTES = 1 << 30  # of all arrays together, unpacked
+MOST_ARRAYS = 4096
+DAMAGED = (KeyError, TypeError, ValueError, OSError, EOFError, RecursionError, zipfile.BadZipFile, NotImplementedError)
+
+
+def write_archive(value: Any, path: Path) -> None:
+    """Write a dataclass instance to `path`, whole or not at all.
+
+    Raises `ResourceError` when the disk refuses, `TypeError` for a value that JSON does not know.
+    """
+    arrays: dict[str, NDArray[Any]] = {}
+    plain = {"format": FORMAT, "value": _encode(value, arrays)}
+    text = json.dumps(plain, ensure_ascii=False, allow_nan=False).encode()
+    memory = io.BytesIO()
+    np.savez_compressed(memory, allow_pickle=False, json=np.frombuffer(text, dtype=np.uint8), **arrays)
+    write_bytes(path, memory.getvalue())
+
+
+def read_archive(kind: type[T], path: Path) -> T:
+    """The instance of dataclass `kind` in `path`; raises `InputDataError` when there is none to be had."""
+    try:
+        arrays = _arrays(path)
+        plain = json.loads(arrays["json"].tobytes())
+        if plain["format"] != FORMAT:
+            raise ValueError(f"its format is {str(plain['format'])[:40]!r}, not '{FORMAT}'")
+        return typing.cast("T", _decode(kind, plain["value"], arrays))
+    except FileNotFoundError as error:
+        raise InputDataError(f"there is no {path}; run the estimate first, which writes it") from error
+    except DAMAGED as error:
+        raise InputDataError(
+            f"{path} does not hold the data of a report ({type(error).__name__}: {str(error)[:200]}); run the estimate"
+            " again"
+        ) from error
+
+
+def _arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of the file, after what it declares was found to fit the file and our limits."""
+    found: dict[str, NDArray[Any]] = {}
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        if len(members) > MOST_ARRAYS or sum(member.file_size for member in members) > MOST_BYTES:
+            raise ValueError("it declares more data than a report has")
+        for member in members:
+            with archive.open(member) as file:
+                _check_header(file, member.file_size)
+            with archive.open(member) as file:
+                found[member.filename.removesuffix(".npy")] = np.lib.format.read_array(file, allow_pickle=False)
+    return found
+
+
+def _check_header(file: typing.IO[bytes], size: int) -> None:
+    """An array's header must not ask for more memory than its file has bytes."""
+    version = np.lib.format.read_magic(file)
+    if version != (1, 0):
+        raise ValueError("an array has an unknown version")
+    shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+    if dtype.hasobject or math.prod(shape) * dtype.itemsize > size or min(shape, default=0) < 0:
+        raise ValueError("an array does not fit its file")
+
+
+def _encode(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
+    """`value` in JSON's types; its arrays go to `arrays` under a number."""
+    if isinstance(value, np.ndarray):
+        name = f"a{len(arrays)}"
+        arrays[name] = value
+        return name
+    if dataclasses.is_dataclass(value):
+        return {f.name: _encode(getattr(value, f.name), arrays) for f in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): _encode(item, arrays) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_encode(item, arrays) for item in value]
+    return (value if math.isfinite(value) else None) if isinstance(value, float) else value
+
+
+def _decode(hint: Any, value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
+    """`value` as the type `hint`."""
+    origin, arms = typing.get_origin(hint), typing.get_args(hint)
+    if origin is types.UnionType:
+        inner = next(arm for arm in arms if arm is not types.NoneType)
+        return None if value is None else _decode(inner, value, arrays)
+    if origin is np.ndarray:
+        return _array(arrays[value], np.dtype(typing.get_args(arms[1])[0]))
+    if origin is tuple:
+        inners = (arms[0],) * len(value) if arms[1:] == (...,) else arms
+        return tuple(_decode(inner, item, arrays) for inner, item in zip(inners, value, strict=True))
+    if dataclasses.is_dataclass(hint):
+        hints = typing.get_type_hints(hint)
+        known = {key: _decode(hints[key], item, arrays) for key, item in value.items()}
+        return typing.cast("type", hint)(**known)
+    if origin is not None:  # a mapping
+        return {key: _decode(arms[1], item, arrays) for key, item in value.items()}
+    return _scalar(hint, value)
+
+
+def _array(array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+    if array.dtype != dtype:
+        raise ValueError(f"an array holds {array.dtype} where {dtype} belongs")
+    array.setflags(write=False)
+    return array
+
+
+def _scalar(hint: Any, value: Any) -> Any:
+    if hint is float:
+        return math.nan if value is None else float(value)
+    if hint in (str, int, bool) and not isinstance(value, hint):
+        raise ValueError(f"{str(value)[:40]!r} is no {hint.__name__}")
+    return value

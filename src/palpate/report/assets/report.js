@@ -1,0 +1,85 @@
+"use strict";
+// What all moving figures share: the report's facts, its arrays, colours, and the page's theme.
+const Palpate = {};
+
+Palpate.inflate = async (base64) => {
+  const letters = atob(base64);
+  const packed = new Uint8Array(letters.length);
+  for (let i = 0; i < letters.length; i++) packed[i] = letters.charCodeAt(i);
+  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
+  return new Response(stream).arrayBuffer();
+};
+
+const TYPES = { uint8: Uint8Array, int16: Int16Array, uint16: Uint16Array, uint32: Uint32Array, float32: Float32Array };
+
+Palpate.load = async () => {
+  const facts = JSON.parse(document.getElementById("facts").textContent);
+  const block = await Palpate.inflate(document.getElementById("block").textContent.trim());
+  const array = (entry) => new TYPES[entry.type](block, entry.offset, entry.length);
+  const points = (entry) => {
+    const steps = array(entry), places = new Float32Array(steps.length);
+    const [x, y, z] = facts.low, step = facts.step;
+    for (let i = 0; i < steps.length; i += 3) {
+      places[i] = x + step * steps[i];
+      places[i + 1] = y + step * steps[i + 1];
+      places[i + 2] = z + step * steps[i + 2];
+    }
+    return places;
+  };
+  const surface = (entry) => ({ tissue: entry.tissue, points: points(entry.points), triangles: array(entry.triangles) });
+  const volume = (entry) => entry && { ...entry, values: array(entry.values) };
+  facts.surfaces = facts.surfaces.map(surface);
+  facts.background = volume(facts.background);
+  for (const later of facts.later) {
+    later.surfaces = later.surfaces.map(surface);
+    later.background = volume(later.background);
+    later.scale = Palpate.scale(later.scale);
+    later.model = later.model.map((m) => ({
+      tissue: m.tissue, triangles: array(m.triangles), rest: points(m.rest), fitted: points(m.fitted),
+      distanceRest: array(m.distanceRest), distanceFitted: array(m.distanceFitted),
+    }));
+  }
+  if (facts.mesh) {
+    const m = facts.mesh;
+    facts.mesh = { nodes: points(m.nodes), tets: array(m.tets), region: array(m.region), worst: array(m.worst) };
+  }
+  facts.angles = Palpate.scale(facts.angles);
+  facts.moduli = facts.moduli && Palpate.scale(facts.moduli);
+  return facts;
+};
+
+// A colour scale: colour(value, into, place) writes three numbers from 0 to 1; grey where there is no value.
+Palpate.scale = (entry) => {
+  const table = Uint8Array.from(entry.table.match(/../g), (pair) => parseInt(pair, 16));
+  const along = entry.logarithmic ? Math.log : (value) => value;
+  const low = along(entry.low), high = along(entry.high);
+  const colour = (value, into, place) => {
+    if (value === null || Number.isNaN(value)) {
+      into[place] = 0.62; into[place + 1] = 0.63; into[place + 2] = 0.66;
+      return;
+    }
+    const share = Math.min(Math.max((along(value) - low) / (high - low), 0), 1);
+    const row = 3 * Math.round(255 * share);
+    for (let k = 0; k < 3; k++) into[place + k] = table[row + k] / 255;
+  };
+  return { ...entry, colour };
+};
+
+Palpate.rgb = (hex) => [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16) / 255);
+
+// Show a moving figure instead of its picture, which stays for paper.
+Palpate.replace = (live, still) => {
+  live.hidden = false;
+  still.classList.add("replaced");
+};
+
+Palpate.theme = () => {
+  const root = document.documentElement, button = document.getElementById("theme");
+  const order = ["auto", "light", "dark"];
+  button.hidden = false;
+  button.addEventListener("click", () => {
+    const next = order[(order.indexOf(root.dataset.theme || "auto") + 1) % order.length];
+    root.dataset.theme = next;
+    button.textContent = `Theme: ${next}`;
+  });
+};

@@ -1,0 +1,35 @@
+"use strict";
+// Start every moving figure when it comes near the window; one that fails leaves its picture where it is.
+(async () => {
+  Palpate.theme();
+  const facts = await Palpate.load();
+  const soon = (section, start) => {
+    const observer = new IntersectionObserver((entries) => {
+      if (!entries.some((entry) => entry.isIntersecting)) return;
+      observer.disconnect();
+      const live = section.querySelector(".live"), still = section.querySelector(".still");
+      try {
+        Palpate.replace(live, still);
+        start();
+        section.dataset.state = "live";
+      } catch (error) {
+        live.hidden = true;
+        still.classList.remove("replaced");
+        section.dataset.state = "still";
+        console.warn("this figure stays a picture:", error);
+      }
+    }, { rootMargin: "300px" });
+    observer.observe(section);
+  };
+  for (const section of document.querySelectorAll("section.slices")) {
+    const number = Number(section.dataset.later);
+    if (facts.box) soon(section, () => new Palpate.Slices(facts, number, section));
+  }
+  if (!Palpate.supportsWebGL()) return;
+  for (const section of document.querySelectorAll("section.organs")) {
+    const number = Number(section.dataset.later);
+    if (facts.later[number].model.length) soon(section, () => new Palpate.Organs(facts, number, section));
+  }
+  const mesh = document.querySelector("section.mesh");
+  if (mesh && facts.mesh) soon(mesh, () => new Palpate.Mesh(facts, mesh));
+})().catch((error) => console.warn("the figures stay pictures:", error));

@@ -1,0 +1,274 @@
+"""From the result of a case to the data of its report; a part that fails becomes a sentence."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import PalpateError
+from palpate.images.label_image import VoxelGrid
+from palpate.images.readers import read_intensities
+from palpate.images.segmentation import Segmentation
+from palpate.images.tissue import Role, Tissue
+from palpate.mesh.dihedral import tet_dihedrals
+from palpate.report.colours import tissue_colours
+from palpate.report.report_data import (
+    LaterImage,
+    MeshPicture,
+    ReportData,
+    ReportTissue,
+    SliceBox,
+    TriangleSurface,
+    Volume,
+)
+from palpate.report.surfaces import MOST_TRIANGLES, contour_width, image_surface, model_surface
+from palpate.report.volume import MOST_VOXELS, grey_volume, label_volume
+from palpate.study.case import Case, Images
+from palpate.study.result import CaseResult, failure_document
+
+__all__ = ["collect", "collect_failure"]
+
+LOGGER = logging.getLogger(__name__)
+T = TypeVar("T")
+
+MOST_LATER = 4  # later images whose slices and surfaces are drawn; a page of more is not read
+MARGIN_MM = 15.0
+ENOUGH_VOXELS = 4_000_000
+MOVING = (Role.ESTIMATE, Role.DRIVER)
+RIGID_TRIANGLES = 12_000
+ALL_TRIANGLES = 300_000  # of all surfaces of the images, so that the page stays small
+NONE: tuple[TriangleSurface, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class _Attempt:
+    """Tries each part of the data and keeps the sentences of those that failed."""
+
+    missing: dict[str, str] = field(default_factory=dict)
+
+    def part(self, name: str, make: Callable[[], T], instead: T) -> T:
+        """What `make` returns, or `instead` when it fails, whatever the reason."""
+        try:
+            return make()
+        except Exception as error:
+            LOGGER.warning("the report has no %s: %s", name, error, exc_info=True)
+            self.missing[name] = f"This part could not be made ({type(error).__name__}: {str(error)[:300]})."
+            return instead
+
+
+def collect(result: CaseResult) -> ReportData:
+    """The report's data of a result; never fails for the sake of a figure."""
+    attempt = _Attempt()
+    box = attempt.part("slices", lambda: _slice_box(result), None)
+    background = None if box is None else attempt.part("background", lambda: _background(result, box), None)
+    surfaces = attempt.part("surfaces", lambda: _surfaces(result, result.before), NONE)
+    numbers = range(min(len(result.after), MOST_LATER))
+    later = tuple(_later(result, after, box, attempt) for after in numbers)
+    mesh = attempt.part("mesh", lambda: _mesh(result), None)
+    return ReportData(
+        document=result.to_dict(),
+        created=_now(),
+        settings=_settings(result.case),
+        tissues=_tissues(result.tissues, result.stiffness),
+        unit=result.unit,
+        voxel_mm=float(max(image.grid.spacing.max() for image in (result.before, *result.after))),
+        moduli_paths=_moduli_paths(result),
+        slices=box,
+        background=background,
+        surfaces=surfaces,
+        later=later,
+        mesh=mesh,
+        missing=attempt.missing,
+    )
+
+
+def collect_failure(case: Case, error: PalpateError) -> ReportData:
+    """The report's data of an estimate that ended in `error`: what was asked, and why there is no answer."""
+    tissues = tuple(tissue.with_labels(()) for tissue in case.tissues)
+    return ReportData(
+        document=failure_document(case, error),
+        created=_now(),
+        settings=_settings(case),
+        tissues=_tissues(tissues, np.full(len(tissues), np.nan)),
+        unit="kPa",
+    )
+
+
+def _now() -> str:
+    return datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+
+
+def _settings(case: Case) -> tuple[tuple[str, str], ...]:
+    """What the case asked for, in words."""
+    mechanics, domain, driver, options = case.mechanics, case.domain, case.driver, case.estimate
+    margin = f", {domain.margin_mm:g} mm around the organs" if domain.extent == "margin" else ""
+    ratios = options.starts_kpa or options.start_ratios
+    return (
+        ("material law", mechanics.law),
+        ("element", mechanics.element),
+        ("edge length at the organs", f"{case.mesh.edge_length_mm:g} mm"),
+        ("outer boundary", f"{domain.outer_boundary}; domain: {domain.extent}{margin}"),
+        ("alignment", case.align),
+        ("driver motion", f"{driver.modes} modes, kernel {driver.kernel_mm:g} mm, prior {driver.prior_mm:g} mm"),
+        ("method", options.method),
+        ("starts", ", ".join(f"{start:g}" for start in ratios) + (" kPa" if options.starts_kpa else " (ratios)")),
+        ("seed", str(case.seed)),
+    )
+
+
+def _tissues(tissues: tuple[Tissue, ...], moduli: NDArray[np.float64]) -> tuple[ReportTissue, ...]:
+    return tuple(
+        ReportTissue(
+            name=tissue.name,
+            role=tissue.role.value,
+            colour=colour,
+            poisson_ratio=tissue.poisson_ratio,
+            given_kpa=tissue.youngs_modulus_kpa if tissue.role is Role.KNOWN else None,
+            modulus=float(modulus) if math.isfinite(modulus) else None,
+        )
+        for tissue, colour, modulus in zip(tissues, tissue_colours(tissues), moduli, strict=True)
+    )
+
+
+def _moduli_paths(result: CaseResult) -> tuple[Mapping[str, tuple[float, ...]], ...]:
+    names = [estimate.tissue for estimate in result.estimation.estimates]
+    return tuple(
+        {name: tuple(float(step.moduli.get(name, math.nan)) for step in start.history) for name in names}
+        for start in result.estimation.starts
+    )
+
+
+def _indices(result: CaseResult, roles: tuple[Role, ...]) -> tuple[int, ...]:
+    return tuple(i for i, tissue in enumerate(result.tissues) if tissue.role in roles)
+
+
+def _surfaces(result: CaseResult, image: Segmentation) -> tuple[TriangleSurface, ...]:
+    """Surfaces of the moving tissues and, coarser, of the rigid ones in an image."""
+    width = contour_width(result)
+    indices = _indices(result, (*MOVING, Role.RIGID))
+    share = ALL_TRIANGLES // ((1 + min(len(result.after), MOST_LATER)) * max(len(indices), 1))
+    found = []
+    for i in sorted(indices, key=lambda i: result.tissues[i].role is Role.RIGID):
+        most = RIGID_TRIANGLES if result.tissues[i].role is Role.RIGID else MOST_TRIANGLES
+        found.append(image_surface(image, i, smoothing_mm=width, most_triangles=min(most, share)))
+    return tuple(surface for surface in found if len(surface.triangles))
+
+
+def _later(result: CaseResult, after: int, box: SliceBox | None, attempt: _Attempt) -> LaterImage:
+    images = result.case.images
+    name = images.after[after].name if images else "after"
+    fitted = after < len(result.estimation.displacements)
+    return LaterImage(
+        name=name,
+        surfaces=attempt.part(f"surfaces of {name}", lambda: _surfaces(result, result.after[after]), NONE),
+        model=attempt.part(
+            f"distances of {name}",
+            lambda: tuple(model_surface(result, i, after) for i in _indices(result, MOVING)) if fitted else (),
+            (),
+        ),
+        background=attempt.part(f"background of {name}", lambda: _later_background(result, after, box), None),
+    )
+
+
+def _background(result: CaseResult, box: SliceBox) -> Volume:
+    """The earlier grey image, or the labels where there is none or it cannot be read."""
+    images = result.case.images
+    if images is not None and images.intensities_before is not None:
+        try:
+            values, grid = read_intensities(images.intensities_before)
+            return grey_volume(values, grid, box, most_voxels=_most_voxels(images))
+        except PalpateError as error:
+            LOGGER.warning("the grey image is left out of the report: %s", error)
+    return label_volume(result.before, box)
+
+
+def _most_voxels(images: Images) -> float:
+    """What one grey image may take of the page, which holds them all."""
+    return MOST_VOXELS / (1 + min(len(images.intensities_after), MOST_LATER))
+
+
+def _later_background(result: CaseResult, after: int, box: SliceBox | None) -> Volume | None:
+    """The later labels or grey values; None where only the earlier grey values are there.
+
+    A later grey image lies where its label image was brought to, which is known when both have one grid.
+    """
+    images, aligned = result.case.images, result.after[after].grid
+    if box is None:
+        return None
+    if images is None or images.intensities_before is None:
+        return label_volume(result.after[after], box)
+    if after >= len(images.intensities_after):
+        return None
+    values, grid = read_intensities(images.intensities_after[after])
+    if values.shape != aligned.shape or not np.allclose(grid.spacing, aligned.spacing, rtol=1e-3):
+        raise ValueError("the later grey image is not on the grid of its label image")
+    return grey_volume(values, aligned, box, most_voxels=_most_voxels(images))
+
+
+def _mesh(result: CaseResult) -> MeshPicture:
+    mesh = result.space.mesh
+    return MeshPicture(
+        nodes=mesh.nodes.astype(np.float32),
+        tets=mesh.tets.astype(np.int32),
+        region=mesh.region.astype(np.int16),
+        angles=tet_dihedrals(mesh.nodes[mesh.tets]).astype(np.float32),
+    )
+
+
+def _slice_box(result: CaseResult) -> SliceBox:
+    """A box around all estimated tissues and drivers, and the planes that show as much of them as possible."""
+    moving = _indices(result, MOVING)
+    boxes = [_extent(_thinned(image), moving) for image in (result.before, *result.after)]
+    border = np.array([_range(result.before.grid, axis) for axis in range(3)])
+    low = np.maximum(np.min([pair[0] for pair in boxes], axis=0) - MARGIN_MM, border[:, 0])
+    high = np.minimum(np.max([pair[1] for pair in boxes], axis=0) + MARGIN_MM, border[:, 1])
+    before = _thinned(result.before)
+    return SliceBox(low, high, np.array([_richest(before, moving, axis) for axis in range(3)]))
+
+
+def _extent(image: Segmentation, tissues: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Corners (3,) mm of the box around the tissues' voxels; the whole image when there are none."""
+    index = np.argwhere(np.isin(image.index, tissues)).astype(np.float64)
+    if not len(index):
+        index = np.array([[0.0, 0.0, 0.0], [*image.grid.shape]])
+    points = image.grid.world(index)
+    return points.min(axis=0), points.max(axis=0)
+
+
+def _thinned(image: Segmentation) -> Segmentation:
+    """Every n-th voxel along each axis of a large image: enough to see where the organs are."""
+    step = int(np.ceil((image.index.size / ENOUGH_VOXELS) ** (1.0 / 3.0)))
+    index = image.index[::step, ::step, ::step]
+    affine = image.grid.affine.copy()
+    affine[:3, :3] *= step
+    nx, ny, nz = index.shape
+    return Segmentation(index, VoxelGrid((nx, ny, nz), affine), image.tissues)
+
+
+def _richest(image: Segmentation, tissues: tuple[int, ...], axis: int) -> float:
+    """Position (mm) along a world axis that shows much of every tissue, each measured by its own largest section."""
+    grid = image.grid
+    low, high = _range(grid, axis)
+    bins = np.linspace(low, high, max(round((high - low) / float(grid.spacing.max())), 1) + 1)
+    score = np.zeros(len(bins) - 1)
+    for tissue in tissues:
+        places = grid.world(np.argwhere(image.index == tissue).astype(np.float64))[:, axis]
+        area = np.histogram(places, bins)[0]
+        weight = 3.0 if image.tissues[tissue].role is Role.ESTIMATE else 1.0
+        score += weight * np.log(0.03 + area / max(area.max(), 1))  # what is absent costs more than what is small
+    best = int(np.argmax(score))
+    return float(0.5 * (bins[best] + bins[best + 1]))
+
+
+def _range(grid: VoxelGrid, axis: int) -> tuple[float, float]:
+    """Outer faces of the grid along a world axis, mm."""
+    corners = np.array(np.meshgrid(*[[-0.5, n - 0.5] for n in grid.shape])).reshape(3, -1).T
+    places = grid.world(corners)[:, axis]
+    return float(places.min()), float(places.max())

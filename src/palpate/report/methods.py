@@ -1,0 +1,129 @@
+"""The methods section that a paper about the result would need, with its sources."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from palpate.report.report_data import ReportData
+
+__all__ = ["Methods", "methods_text"]
+
+SOURCES = {
+    "yang": "Yang S, Lin MC. Simultaneous Estimation of Elasticity for Multiple Deformable Bodies.",
+    "palpate": "The Palpate developers. Palpate: elasticity of several organs at once from segmented images, version"
+    " {}.",
+    "mmg": "Dapogny C, Dobrzynski C, Frey P. Three-dimensional adaptive domain remeshing, implicit domain meshing, and"
+    " applications to free and moving boundary problems. J Comput Phys 262 (2014) 358-378.",
+    "kernel": "Harbrecht H, Peters M, Schneider R. On the low-rank approximation by the pivoted Cholesky decomposition."
+    " Appl Numer Math 62 (2012) 428-440.",
+    "huber": "Huber PJ. Robust Statistics. Wiley, 1981.",
+    "nocedal": "Nocedal J, Wright SJ. Numerical Optimization, 2nd ed. Springer, 2006.",
+    "byrd": "Byrd RH, Lu P, Nocedal J, Zhu C. A limited memory algorithm for bound constrained optimization. SIAM J Sci"
+    " Comput 16 (1995) 1190-1208.",
+    "reduced": "Quarteroni A, Manzoni A, Negri F. Reduced Basis Methods for Partial Differential Equations. Springer,"
+    " 2016.",
+    "white": "White H. A heteroskedasticity-consistent covariance matrix estimator and a direct test for"
+    " heteroskedasticity. Econometrica 48 (1980) 817-838.",
+}
+LAWS = {
+    "linear": "isotropic linear elasticity at small strains",
+    "neo-hookean": "a compressible neo-Hookean law at finite strains",
+    "mooney-rivlin": "a compressible Mooney-Rivlin law at finite strains",
+}
+OPTIMISERS = {"gauss-newton": ("Gauss-Newton steps in a trust region", "nocedal"), "lbfgs": ("L-BFGS-B", "byrd")}
+
+
+@dataclass(frozen=True, slots=True)
+class Methods:
+    """Paragraphs with numbers in brackets, and the sources that they stand for."""
+
+    paragraphs: tuple[str, ...]
+    sources: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Citations:
+    """Numbers the sources in the order in which they are cited."""
+
+    cited: dict[str, int]
+
+    def __call__(self, *keys: str) -> str:
+        numbers = [self.cited.setdefault(key, len(self.cited) + 1) for key in keys]
+        return "[" + ", ".join(str(number) for number in numbers) + "]"
+
+
+def methods_text(data: ReportData) -> Methods:
+    """What was done to the images of this case, in sentences that can be taken over."""
+    cite = _Citations({})
+    paragraphs = (_aim(data, cite), _model(data, cite), _fit(data, cite), _intervals(data, cite))
+    version = str(data.document["versions"].get("palpate", ""))
+    return Methods(paragraphs, tuple(SOURCES[key].format(version) for key in cite.cited))
+
+
+def _aim(data: ReportData, cite: _Citations) -> str:
+    roles: dict[str, list[str]] = {}
+    for tissue in data.tissues:
+        roles.setdefault(tissue.role, []).append(tissue.name)
+    on_bones = dict(data.settings).get("alignment") == "rigid-tissues"
+    aligned = " The later images were brought to the first on the rigid tissues." if on_bones else ""
+    known = [f"{t.name} ({t.given_kpa:g} kPa)" for t in data.tissues if t.given_kpa is not None]
+    moved = f" The motion was driven by {_list(roles['driver'])} (hollow, not meshed)." if "driver" in roles else ""
+    scale = f" The scale was set by {_list(known)}." if known else " No modulus was given, so only ratios were found."
+    return (
+        f"Young's moduli of {_list(roles.get('estimate', []))} were estimated at once from segmented images of the same"
+        f" body in two or more states with Palpate {cite('palpate')}, whose method starts from"
+        f" {cite('yang')}.{moved}{aligned}{scale}"
+    )
+
+
+def _model(data: ReportData, cite: _Citations) -> str:
+    document: Mapping[str, Any] = data.document
+    mesh = document["mesh"]
+    size = f" of {mesh['tets']} tetrahedra with {mesh['dofs']} unknowns" if mesh else ""
+    settings = dict(data.settings)
+    ratios = sorted({f"{t.poisson_ratio:g}" for t in data.tissues if t.role in ("estimate", "known")})
+    return (
+        "The label images were turned into signed distance maps by Gaussian smoothing and the probit of the smoothed"
+        " share."
+        f" A conforming mesh{size} (edge length {settings['edge length at the organs']} at the organs) was cut along"
+        f" their"
+        f" zero levels and improved with Mmg {cite('mmg')}. The tissues followed"
+        f" {LAWS.get(document['law'], 'the law ' + str(document['law']))} in {document['element']} elements, with"
+        f" Poisson's"
+        f" ratios of {_list(ratios)}; the outer boundary: {settings['outer boundary']}. The motion of the drivers'"
+        f" walls was"
+        f" a Gaussian process in its leading modes ({settings['driver motion']}) {cite('kernel')}, estimated together"
+        f" with"
+        " the moduli."
+    )
+
+
+def _fit(data: ReportData, cite: _Citations) -> str:
+    optimiser, source = OPTIMISERS.get(data.document["method"], (str(data.document["method"]), "nocedal"))
+    starts = len(data.document["starts"])
+    return (
+        "The misfit was the symmetric surface distance between model and later image, taken as a difference to the rest"
+        " state, so that what smoothing, voxels and facets do to both images drops out, under Tukey's biweight"
+        f" {cite('huber')}. It was minimised over the logarithms of the moduli from {starts} starts by {optimiser}"
+        f" {cite(source)}, on a reduced basis whose error was bounded at the estimate {cite('reduced')}; faces on"
+        f" drivers,"
+        " bones and the image's border were left out."
+    )
+
+
+def _intervals(data: ReportData, cite: _Citations) -> str:
+    return (
+        "The 95 % intervals come from the sandwich covariance of the parameters under spatially correlated residuals"
+        f" {cite('white')}, with the scatter over the voxel grid's position added. They do not cover the errors of"
+        f" the mesh,"
+        " of the material law, of Poisson's ratios, of the boundary condition and of the given moduli."
+        f" The seed of random numbers was {data.document['seed']}."
+    )
+
+
+def _list(names: list[str]) -> str:
+    if len(names) < 2:
+        return "".join(names)
+    return ", ".join(names[:-1]) + " and " + names[-1]

@@ -1,0 +1,213 @@
+"""The page: every figure tried on its own, everything put into the template."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from importlib import resources
+from typing import Any, TypeVar
+
+import jinja2
+import numpy as np
+from markupsafe import Markup
+
+from palpate.report.charts import angle_svg, modulus_svg, objective_svg, residual_svg, waterfall_svg
+from palpate.report.colours import START_COLOURS
+from palpate.report.methods import Methods, methods_text
+from palpate.report.payload import payload
+from palpate.report.pictures import mesh_png, organs_png
+from palpate.report.report_data import LaterImage, ReportData
+from palpate.report.rows import estimate_rows, number, scale_marks
+from palpate.report.scales import Scale, angle_scale, distance_scale, modulus_scale
+from palpate.report.section import VIEWS
+from palpate.report.slices import contour_names, first_planes, slice_svg
+
+__all__ = ["Picture", "render"]
+
+T = TypeVar("T")
+LOGGER = logging.getLogger(__name__)
+SCRIPTS = ("three.min.js", "report.js", "slices.js", "viewer.js", "organs.js", "mesh.js", "start.js")
+POLICY = (
+    "default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data:; base-uri 'none';"
+    " form-action 'none'"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A figure of the page, or the reason why there is none."""
+
+    title: str
+    body: Markup | None
+    missing: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Later:
+    """The figures of one later image."""
+
+    name: str
+    slices: tuple[Picture, ...]
+    organs: tuple[Picture, ...]
+    residuals: tuple[Picture, ...]
+    scale: Scale
+
+
+def render(data: ReportData) -> str:
+    """The whole page of a report; a figure that cannot be drawn leaves a sentence in its place."""
+    live = _attempt("the moving figures", lambda: payload(data))
+    scripts = _scripts() if live is not None and (data.later or data.mesh) else ()
+    colours = {tissue.name: tissue.colour for tissue in data.tissues}
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("palpate.report"), autoescape=True, undefined=jinja2.StrictUndefined
+    )
+    environment.filters["number"] = number
+    page = environment.get_template("case.html").render(
+        data=data,
+        document=data.document,
+        policy=_policy(scripts),
+        scripts=scripts,
+        live=live if scripts else None,
+        rows=estimate_rows(data.document, colours),
+        marks=scale_marks(data.document),
+        starts=_start_rows(data),
+        warnings=_warnings(data),
+        contours=contour_names(data),
+        later=tuple(_later(data, k, later) for k, later in enumerate(data.later)),
+        mesh_pictures=_mesh_pictures(data),
+        moduli=_attempt("the scale of the moduli", lambda: modulus_scale(data)) if data.mesh else None,
+        curves=_curves(data),
+        angles=_angles(data),
+        methods=_methods(data),
+        angle_scale=angle_scale(),
+        gradient=_gradient,
+        widths=_widths(data),
+    )
+    return str(page)
+
+
+def _scripts() -> tuple[Markup, ...]:
+    """The page's scripts, ours and three.js, as they stand in the package."""
+    folder = resources.files("palpate.report") / "assets"
+    return tuple(Markup((folder / name).read_text(encoding="utf-8")) for name in SCRIPTS)  # noqa: S704 - our own files
+
+
+def _policy(scripts: tuple[Markup, ...]) -> Markup:
+    """The Content-Security-Policy that lets these scripts run and nothing else be loaded or run."""
+    digests = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
+    hashes = " ".join(f"'sha256-{digest}'" for digest in digests) or "'none'"
+    return Markup(POLICY.format(hashes=hashes))  # noqa: S704 - our own words and base64
+
+
+def _start_rows(data: ReportData) -> tuple[dict[str, Any], ...]:
+    return tuple(
+        {"colour": START_COLOURS[i % len(START_COLOURS)], **start} for i, start in enumerate(data.document["starts"])
+    )
+
+
+def _warnings(data: ReportData) -> tuple[tuple[str, tuple[str, ...]], ...]:
+    """Code and messages of the warnings, those of one code together."""
+    groups: dict[str, list[str]] = {}
+    for warning in data.document["warnings"]:
+        groups.setdefault(str(warning["code"]), []).append(str(warning["message"]))
+    return tuple((code, tuple(messages)) for code, messages in groups.items())
+
+
+def _widths(data: ReportData) -> str:
+    """Columns of the three slices, so that all show a millimetre in the same size, as CSS."""
+    box = data.slices
+    return "" if box is None else " ".join(f"{box.high[v.across] - box.low[v.across]:.1f}fr" for v in VIEWS)
+
+
+def _later(data: ReportData, k: int, later: LaterImage) -> _Later:
+    planes = first_planes(data.slices) if data.slices else ()
+    return _Later(
+        name=later.name,
+        slices=tuple(
+            _picture(plane.view.name, partial(slice_svg, data, plane, later, name=f"s{k}{plane.view.name}"))
+            for plane in planes
+        ),
+        organs=(
+            _photograph("before fitting", partial(organs_png, data, later, fitted=False)),
+            _photograph("after fitting", partial(organs_png, data, later, fitted=True)),
+        ),
+        residuals=tuple(
+            _picture(data.tissues[model.tissue].name, partial(residual_svg, data, model, name=f"r{k}t{model.tissue}"))
+            for model in later.model
+        ),
+        scale=distance_scale(data.voxel_mm),
+    )
+
+
+def _mesh_pictures(data: ReportData) -> tuple[Picture, ...]:
+    if data.mesh is None:
+        return ()
+    return (
+        _photograph("coloured by tissue", partial(mesh_png, data, by_modulus=False)),
+        _photograph("coloured by Young's modulus", partial(mesh_png, data, by_modulus=True)),
+    )
+
+
+def _curves(data: ReportData) -> tuple[Picture, ...]:
+    if not data.document["starts"]:
+        return ()
+    moduli = [
+        _picture(f"Stiffness of {item['tissue']}", partial(modulus_svg, data, i, name=f"modulus{i}"))
+        for i, item in enumerate(data.document["estimates"])
+    ]
+    return (
+        _picture("Misfit", partial(objective_svg, data, name="misfit")),
+        _picture("Waterfall of the starts", partial(waterfall_svg, data, name="waterfall")),
+        *moduli,
+    )
+
+
+def _angles(data: ReportData) -> Picture | None:
+    if data.mesh is None:
+        return None
+    return _picture("Dihedral angles of the mesh", partial(angle_svg, data.mesh.angles, name="angles"))
+
+
+def _methods(data: ReportData) -> Methods | None:
+    """None where nothing converged: there is no result whose methods could be told."""
+    if data.document["status"] != "converged":
+        return None
+    return _attempt("the methods text", lambda: methods_text(data))
+
+
+def _gradient(scale: Scale) -> str:
+    """The colours of a scale from left to right, as CSS."""
+    shades = scale.table[np.linspace(0, 255, 17).astype(int)]
+    return "linear-gradient(to right, " + ", ".join(f"rgb({r} {g} {b})" for r, g, b in shades.tolist()) + ")"
+
+
+def _photograph(title: str, draw: Callable[[], bytes]) -> Picture:
+    """The PNG that `draw` makes, as an image of the page."""
+
+    def element() -> str:
+        source = base64.b64encode(draw()).decode()
+        return f'<img alt="{title.replace(chr(39), "&#39;")}" src="data:image/png;base64,{source}">'
+
+    return _picture(title, element)
+
+
+def _picture(title: str, draw: Callable[[], str]) -> Picture:
+    """The figure that `draw` makes, which is our own SVG or image and therefore safe to embed."""
+    try:
+        return Picture(title, Markup(draw()))  # noqa: S704 - drawn by svg.py, where names become outlines
+    except Exception as error:
+        LOGGER.warning("the figure '%s' could not be drawn: %s", title, error, exc_info=True)
+        return Picture(title, None, f"This figure could not be drawn ({type(error).__name__}: {error}).")
+
+
+def _attempt(what: str, make: Callable[[], T]) -> T | None:
+    """What `make` returns, or None with a warning in the log."""
+    try:
+        return make()
+    except Exception as error:
+        LOGGER.warning("the report is without %s: %s", what, error, exc_info=True)
+        return None

@@ -1,0 +1,168 @@
+"""The geometry and the images of a report as the page's scripts read them: JSON and one deflated block of bytes."""
+
+from __future__ import annotations
+
+import base64
+import json
+import zlib
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+from palpate.report.report_data import LaterImage, MeshPicture, ReportData, TriangleSurface, Volume
+from palpate.report.scales import Scale, angle_scale, distance_scale, modulus_scale
+from palpate.report.section import VIEWS
+
+__all__ = ["Payload", "payload"]
+
+MOST_TETS = 120_000  # of a mesh that a page can turn
+LEVELS = 65_535
+
+
+@dataclass(frozen=True, slots=True)
+class Payload:
+    """facts: JSON that can stand in a script element; block: base64 of the deflated arrays."""
+
+    facts: Markup
+    block: Markup
+
+
+@dataclass(frozen=True, slots=True)
+class _Packer:
+    """Collects arrays one behind the other; points are whole multiples of `step` mm from `low` (3,) mm."""
+
+    low: NDArray[np.float64]
+    step: float
+    chunks: list[bytes] = field(default_factory=list)
+
+    def add(self, array: NDArray[Any]) -> dict[str, Any]:
+        """Where and what the array is in the block; each begins at a multiple of four bytes."""
+        raw = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")).tobytes()
+        offset = sum(map(len, self.chunks))
+        self.chunks.append(raw + bytes(-len(raw) % 4))
+        return {"type": array.dtype.name, "offset": offset, "length": array.size}
+
+    def points(self, points: NDArray[np.float32]) -> dict[str, Any]:
+        """Points (n, 3) mm in 16 bits a coordinate."""
+        steps = np.rint((points.astype(np.float64) - self.low) / self.step)
+        return self.add(np.clip(steps, 0, LEVELS).astype(np.uint16))
+
+    def indices(self, indices: NDArray[np.int32]) -> dict[str, Any]:
+        """Numbers of points, in 16 bits where they fit."""
+        small = int(indices.max(initial=0)) <= LEVELS
+        return self.add(indices.astype(np.uint16 if small else np.uint32))
+
+
+def payload(data: ReportData) -> Payload:
+    """Pack what the page draws itself."""
+    low, step = _quantum(data)
+    packer = _Packer(low, step)
+    facts = {
+        "low": low.tolist(),
+        "step": step,
+        "unit": data.unit,
+        "tissues": [{"name": t.name, "role": t.role, "colour": t.colour, "modulus": t.modulus} for t in data.tissues],
+        "views": [
+            {"name": v.name, "normal": v.normal, "across": v.across, "up": v.up, "letters": v.letters} for v in VIEWS
+        ],
+        "box": _box(data),
+        "background": _volume(data.background, packer),
+        "surfaces": [_surface(surface, packer) for surface in data.surfaces],
+        "later": [_later(data, later, packer) for later in data.later],
+        "mesh": _mesh(data.mesh, packer),
+        "angles": _scale(angle_scale()),
+        "moduli": _scale(modulus_scale(data)) if any(t.modulus for t in data.tissues) else None,
+    }
+    block = zlib.compress(b"".join(packer.chunks), 9)
+    return Payload(script_json(facts), Markup(base64.b64encode(block).decode()))  # noqa: S704 - base64's own letters
+
+
+def script_json(value: Any) -> Markup:
+    """JSON in which nothing can end a script element or open a comment."""
+    text = json.dumps(value, ensure_ascii=True, allow_nan=False)
+    for letter in "<>&":
+        text = text.replace(letter, f"\\u{ord(letter):04x}")
+    return Markup(text)  # noqa: S704 - markup's letters are escaped in the line above
+
+
+def _quantum(data: ReportData) -> tuple[NDArray[np.float64], float]:
+    """Corner (3,) mm and step (mm) of a lattice that holds every point."""
+    clouds = [s.points for s in data.surfaces] + [s.points for later in data.later for s in later.surfaces]
+    clouds += [p for later in data.later for m in later.model for p in (m.rest, m.fitted)]
+    clouds += [data.mesh.nodes] if data.mesh else []
+    clouds = [cloud for cloud in clouds if len(cloud)]
+    if not clouds:
+        return np.zeros(3), 1.0
+    low = np.min([cloud.min(axis=0) for cloud in clouds], axis=0).astype(np.float64)
+    high = np.max([cloud.max(axis=0) for cloud in clouds], axis=0).astype(np.float64)
+    return low, max(float((high - low).max()) / LEVELS, 1e-9)
+
+
+def _box(data: ReportData) -> dict[str, Any] | None:
+    box = data.slices
+    if box is None:
+        return None
+    return {"low": box.low.tolist(), "high": box.high.tolist(), "position": box.position.tolist()}
+
+
+def _volume(volume: Volume | None, packer: _Packer) -> dict[str, Any] | None:
+    if volume is None:
+        return None
+    return {
+        "kind": volume.kind,
+        "shape": volume.values.shape,
+        "origin": volume.origin.tolist(),
+        "step": volume.step.tolist(),
+        "values": packer.add(volume.values),
+    }
+
+
+def _surface(surface: TriangleSurface, packer: _Packer) -> dict[str, Any]:
+    return {
+        "tissue": surface.tissue,
+        "points": packer.points(surface.points),
+        "triangles": packer.indices(surface.triangles),
+    }
+
+
+def _later(data: ReportData, later: LaterImage, packer: _Packer) -> dict[str, Any]:
+    return {
+        "name": later.name,
+        "background": _volume(later.background, packer),
+        "surfaces": [_surface(surface, packer) for surface in later.surfaces],
+        "model": [
+            {
+                "tissue": model.tissue,
+                "triangles": packer.indices(model.triangles),
+                "rest": packer.points(model.rest),
+                "fitted": packer.points(model.fitted),
+                "distanceRest": packer.add(model.distance_rest),
+                "distanceFitted": packer.add(model.distance_fitted),
+            }
+            for model in later.model
+        ],
+        "scale": _scale(distance_scale(data.voxel_mm)),
+    }
+
+
+def _mesh(mesh: MeshPicture | None, packer: _Packer) -> dict[str, Any] | None:
+    if mesh is None or len(mesh.tets) > MOST_TETS:
+        return None
+    return {
+        "nodes": packer.points(mesh.nodes),
+        "tets": packer.indices(mesh.tets),
+        "region": packer.add(mesh.region.astype(np.uint8)),
+        "worst": packer.add(np.clip(mesh.angles.min(axis=1), 0.0, 255.0).astype(np.uint8)),
+    }
+
+
+def _scale(scale: Scale) -> dict[str, Any]:
+    return {
+        "low": scale.low,
+        "high": scale.high,
+        "logarithmic": scale.logarithmic,
+        "table": scale.table.tobytes().hex(),
+    }

@@ -1,0 +1,81 @@
+"""Pictures in space that stand where the page cannot turn its bodies: on paper, without WebGL, before it has loaded."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.colors import to_rgb
+from numpy.typing import NDArray
+
+from palpate.report.render import Camera, Triangles, render_png
+from palpate.report.report_data import LaterImage, MeshPicture, ReportData
+from palpate.report.scales import Scale, distance_scale, modulus_scale
+
+__all__ = ["mesh_png", "organs_png", "section_faces", "tissue_shades"]
+
+WIDTH, HEIGHT = 620, 460
+BESIDE = Camera.looking((-1.0, 0.3, 0.15))  # the patient's left side, a little from the front
+AT_THE_SIDE = Camera.looking((-1.0, 0.35, 0.25))  # of the sagittal cut, whose far half is kept
+FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
+
+
+def organs_png(data: ReportData, later: LaterImage, *, fitted: bool) -> bytes:
+    """The model's organs, as fitted to `later` or at rest, coloured by their signed distance to that image; PNG."""
+    if not later.model:
+        raise ValueError("there is no fitted model")
+    scale = distance_scale(data.voxel_mm)
+    corners, colours, normals = [], [], []
+    for model in later.model:
+        points = (model.fitted if fitted else model.rest).astype(np.float64)
+        distance = (model.distance_fitted if fitted else model.distance_rest).astype(np.float64)
+        corners.append(points[model.triangles])
+        colours.append(scale.colours(distance)[model.triangles])
+        normals.append(_smooth_normals(points, model.triangles)[model.triangles])
+    triangles = Triangles(np.concatenate(corners), np.concatenate(colours), np.concatenate(normals))
+    return render_png(triangles, BESIDE, width=WIDTH, height=HEIGHT)
+
+
+def mesh_png(data: ReportData, *, by_modulus: bool) -> bytes:
+    """The mesh cut by the sagittal plane of the slices, coloured by tissue or by Young's modulus; PNG."""
+    mesh = data.mesh
+    if mesh is None:
+        raise ValueError("there is no mesh")
+    middle = float(np.median(mesh.nodes[:, 0])) if data.slices is None else float(data.slices.position[0])
+    faces, region = section_faces(mesh, axis=0, position=middle)
+    shades = tissue_shades(data, modulus_scale(data) if by_modulus else None)
+    corners = mesh.nodes.astype(np.float64)[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    colours = np.repeat(shades[region][:, None], 3, axis=1)
+    triangles = Triangles(corners, colours, np.repeat(normal[:, None], 3, axis=1), edges=True)
+    return render_png(triangles, AT_THE_SIDE, width=WIDTH, height=HEIGHT)
+
+
+def tissue_shades(data: ReportData, scale: Scale | None) -> NDArray[np.float64]:
+    """Colours (n_tissues, 3), 0 to 1: the tissues' own, or those of their moduli on `scale`."""
+    if scale is None:
+        return np.array([to_rgb(tissue.colour) for tissue in data.tissues])
+    moduli = [np.nan if tissue.modulus is None else tissue.modulus for tissue in data.tissues]
+    return scale.colours(np.array(moduli, dtype=np.float64))
+
+
+def section_faces(mesh: MeshPicture, *, axis: int, position: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Outer faces (n, 3), and the tissue (n,) of each, of the tetrahedra whose middle lies beyond `position` (mm)."""
+    kept = mesh.nodes[mesh.tets, axis].mean(axis=1) > position
+    faces = mesh.tets[kept].astype(np.int64)[:, FACES].reshape(-1, 3)
+    region = np.repeat(mesh.region[kept].astype(np.int64), 4)
+    ordered = np.sort(faces, axis=1)
+    n = len(mesh.nodes)
+    keys = (ordered[:, 0] * n + ordered[:, 1]) * n + ordered[:, 2]
+    _, first, count = np.unique(keys, return_index=True, return_counts=True)
+    outside = first[count == 1]
+    return faces[outside], region[outside]
+
+
+def _smooth_normals(points: NDArray[np.float64], triangles: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Unit normals (n, 3) of points, the mean of those of their triangles by area."""
+    corner = points[triangles]
+    face = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    total = np.zeros_like(points)
+    for side in range(3):
+        np.add.at(total, triangles[:, side], face)
+    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12))

@@ -1,0 +1,140 @@
+"""Pictures of triangles in space without a display: every triangle sampled into a depth buffer."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+
+import matplotlib.image as mpimg
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Camera", "Triangles", "render_png"]
+
+FINE = 2  # samples a pixel edge; the picture is averaged down by it
+DENSITIES = np.array([2, 3, 4, 6, 8, 11, 15, 20, 28, 40, 56, 80, 112, 160, 224, 320, 448, 640, 1280])
+DEPTH_STEPS = float(2**38)  # a depth and a colour of 24 bits share an integer, whose largest is the nearest
+EDGE_WIDTH = 1.1  # of drawn edges, in pixels of the finished picture
+MOST_SAMPLES = 60_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """Parallel projection: `right`, `up`, `back` (3,) unit vectors of the picture, `back` towards the viewer."""
+
+    right: NDArray[np.float64]
+    up: NDArray[np.float64]
+    back: NDArray[np.float64]
+
+    @classmethod
+    def looking(cls, back: tuple[float, float, float], up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Camera:
+        """The camera that stands in the direction `back` and holds `up` upright; neither needs unit length."""
+        towards = np.array(back) / np.linalg.norm(back)
+        right = np.cross(np.array(up), towards)
+        right /= np.linalg.norm(right)
+        return cls(right, np.cross(towards, right), towards)
+
+    @property
+    def axes(self) -> NDArray[np.float64]:
+        """World to picture, (3, 3): across, up, towards the viewer."""
+        return np.stack([self.right, self.up, self.back])
+
+
+@dataclass(frozen=True, slots=True)
+class Triangles:
+    """Triangles to be drawn, with their edges if `edges` is set.
+
+    corners (n, 3, 3) mm; colours (n, 3, 3), 0 to 1, and normals (n, 3, 3), dimensionless, one a corner.
+    """
+
+    corners: NDArray[np.float64]
+    colours: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    edges: bool = False
+
+
+def render_png(triangles: Triangles, camera: Camera, *, width: int, height: int, fill: float = 0.94) -> bytes:
+    """A PNG of `width` x `height` pixels, transparent where nothing is; the triangles take up `fill` of it."""
+    flat = triangles.corners @ camera.axes.T  # (n, 3 corners, 3): across, up, depth
+    low, high = flat.reshape(-1, 3).min(axis=0), flat.reshape(-1, 3).max(axis=0)
+    scale = fill * FINE * min(width / max(high[0] - low[0], 1e-9), height / max(high[1] - low[1], 1e-9))
+    shape = (FINE * height, FINE * width)
+    flat = (flat - 0.5 * (low + high)) * scale + [0.5 * shape[1], 0.5 * shape[0], 0.0]
+    light = _light(triangles.normals, camera)
+    depth = flat[..., 2]
+    flat[..., 2] = (depth - depth.min()) / max(float(np.ptp(depth)), 1e-9)
+    buffer = np.full(shape, -1, dtype=np.int64)
+    for group, density in _by_density(flat):
+        _splat(flat[group], (triangles.colours * light)[group], density, edges=triangles.edges, into=buffer)
+    return _png(buffer)
+
+
+def _light(normals: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    """Brightness (n, 3, 1) of corners: a lamp beside the viewer, both sides of a surface lit."""
+    lamp = camera.back + 0.35 * camera.up - 0.3 * camera.right
+    cosine = np.abs(normals @ (lamp / np.linalg.norm(lamp)))
+    return np.asarray(0.5 + 0.55 * cosine)[..., None]
+
+
+def _by_density(flat: NDArray[np.float64]) -> list[tuple[NDArray[np.int64], int]]:
+    """Triangles (n, 3, 3) in pixels by the number of samples along an edge, so that samples lie within a pixel."""
+    edge = np.linalg.norm(flat[:, :, :2] - np.roll(flat[:, :, :2], 1, axis=1), axis=2).max(axis=1)
+    wanted = DENSITIES[np.minimum(np.searchsorted(DENSITIES, 1.2 * edge), len(DENSITIES) - 1)]
+    if float((wanted.astype(float) ** 2).sum()) > 2.0 * MOST_SAMPLES:
+        raise ValueError("the picture has too many triangles to be drawn")
+    return [(np.flatnonzero(wanted == density), int(density)) for density in np.unique(wanted)]
+
+
+def _splat(
+    flat: NDArray[np.float64],
+    colours: NDArray[np.float64],
+    density: int,
+    *,
+    edges: bool,
+    into: NDArray[np.int64],
+) -> None:
+    """Put `density` samples along each edge of the triangles into the picture, where they are nearer than others."""
+    i, j = np.meshgrid(np.arange(density + 1), np.arange(density + 1))
+    inside = i + j <= density
+    weights = np.stack([i[inside], j[inside], (density - i - j)[inside]], axis=1) / density  # (n_samples, 3)
+    batch = max(1_000_000 // len(weights), 1)
+    for start in range(0, len(flat), batch):
+        part = slice(start, start + batch)
+        places = weights @ flat[part]
+        shade = np.clip(weights @ colours[part], 0.0, 1.0)
+        if edges:
+            shade *= _edge_shade(flat[part], weights)[..., None]
+        _keep_nearest(places.reshape(-1, 3), shade.reshape(-1, 3), into)
+
+
+def _edge_shade(flat: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Darkness (n_triangles, n_samples) of samples that lie on an edge."""
+    a, b = flat[:, 1, :2] - flat[:, 0, :2], flat[:, 2, :2] - flat[:, 0, :2]
+    double_area = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    opposite = np.linalg.norm(flat[:, [2, 0, 1], :2] - flat[:, [1, 2, 0], :2], axis=2)
+    heights = double_area[:, None] / np.maximum(opposite, 1e-9)  # (n_triangles, 3)
+    distance = (weights[None] * heights[:, None]).min(axis=2)
+    return np.asarray(np.where(distance < 0.5 * EDGE_WIDTH * FINE, 0.45, 1.0))
+
+
+def _keep_nearest(places: NDArray[np.float64], shade: NDArray[np.float64], buffer: NDArray[np.int64]) -> None:
+    """Put samples at places (n, 3), pixels and depth from 0 to 1, into the buffer of depths and colours."""
+    rows, columns = buffer.shape
+    x, y = np.floor(places[:, 0]).astype(np.int64), rows - 1 - np.floor(places[:, 1]).astype(np.int64)
+    seen = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
+    red, green, blue = np.rint(255.0 * shade[seen]).astype(np.int64).T
+    colour = (red << 16) | (green << 8) | blue
+    near = (places[seen, 2] * DEPTH_STEPS).astype(np.int64)
+    np.maximum.at(buffer.reshape(-1), (y * columns + x)[seen], (near << 24) | colour)
+
+
+def _png(buffer: NDArray[np.int64]) -> bytes:
+    """The mean over FINE x FINE samples of the buffer, as a PNG with straight alpha."""
+    there = (buffer >= 0)[..., None]
+    parts = np.stack([(buffer >> shift) & 255 for shift in (16, 8, 0)], axis=-1) * there
+    fine = np.concatenate([parts / 255.0, there], axis=-1)
+    mean = fine.reshape(buffer.shape[0] // FINE, FINE, buffer.shape[1] // FINE, FINE, 4).mean(axis=(1, 3))
+    mean[..., :3] /= np.maximum(mean[..., 3:], 1e-9)
+    memory = io.BytesIO()
+    mpimg.imsave(memory, np.rint(255.0 * mean).astype(np.uint8), format="png")
+    return memory.getvalue()

@@ -1,0 +1,149 @@
+"""All that a report's page needs, as one value that can be kept in a file and drawn again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.images.label_image import VoxelGrid
+from palpate.report.archive import read_archive, write_archive
+
+__all__ = [
+    "LaterImage",
+    "MeshPicture",
+    "ModelSurface",
+    "ReportData",
+    "ReportTissue",
+    "SliceBox",
+    "TriangleSurface",
+    "Volume",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class ReportTissue:
+    """A tissue as the page shows it: name, role, colour (#rrggbb), Poisson's ratio, and Young's modulus.
+
+    given_kpa: the modulus that the case gives, kPa; modulus: that of the result, in the result's unit; None: neither.
+    """
+
+    name: str
+    role: str
+    colour: str
+    poisson_ratio: float
+    given_kpa: float | None
+    modulus: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class TriangleSurface:
+    """The surface of `tissue` (index): points (n, 3) RAS mm, triangles (m, 3) into them."""
+
+    tissue: int
+    points: NDArray[np.float32]
+    triangles: NDArray[np.int32]
+
+
+@dataclass(frozen=True, slots=True)
+class ModelSurface:
+    """The model's surface of `tissue` (index), earlier and as fitted to one later image.
+
+    rest, fitted (n, 3) RAS mm; triangles (m, 3) into them; distance_rest, distance_fitted (n,) mm: signed distance to
+    the later image less that of the rest state to the earlier one, NaN where the surface is not observed; area (n,)
+    mm^2: the observed surface around each point.
+    """
+
+    tissue: int
+    rest: NDArray[np.float32]
+    fitted: NDArray[np.float32]
+    triangles: NDArray[np.int32]
+    distance_rest: NDArray[np.float32]
+    distance_fitted: NDArray[np.float32]
+    area: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Volume:
+    """Bytes (nx, ny, nz) on a grid along the axes of the world; `origin` (3,) mm and `step` (3,) mm of its voxels.
+
+    kind "grey": 0 black to 255 white; kind "labels": the tissue's index + 1, 0 outside of the image.
+    """
+
+    kind: str
+    values: NDArray[np.uint8]
+    origin: NDArray[np.float64]
+    step: NDArray[np.float64]
+
+    @property
+    def grid(self) -> VoxelGrid:
+        """The place of the voxels in the world."""
+        nx, ny, nz = self.values.shape
+        affine = np.diag([*self.step, 1.0])
+        affine[:3, 3] = self.origin
+        return VoxelGrid((nx, ny, nz), affine)
+
+
+@dataclass(frozen=True, slots=True)
+class SliceBox:
+    """What the slices show: a box `low` to `high` (3,) mm, and where the first three slices lie, `position` (3,) mm."""
+
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    position: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class LaterImage:
+    """One later image: its name, its surfaces, the model fitted to it, its grey values or labels."""
+
+    name: str
+    surfaces: tuple[TriangleSurface, ...] = ()
+    model: tuple[ModelSurface, ...] = ()
+    background: Volume | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class MeshPicture:
+    """The mesh: nodes (n, 3) RAS mm, tets (m, 4), region (m,) tissue index, angles (m, 6) dihedral, degrees."""
+
+    nodes: NDArray[np.float32]
+    tets: NDArray[np.int32]
+    region: NDArray[np.int16]
+    angles: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class ReportData:
+    """One case's report before it is drawn.
+
+    document: that of result.json; unit: of the moduli, "kPa" or "ratio"; voxel_mm: the largest edge of a voxel;
+    moduli_paths: of each start, tissue -> moduli by iteration; missing: part of the page -> why it is not there.
+    """
+
+    document: Mapping[str, Any]
+    created: str
+    settings: tuple[tuple[str, str], ...]
+    tissues: tuple[ReportTissue, ...]
+    unit: str
+    voxel_mm: float = 1.0
+    moduli_paths: tuple[Mapping[str, tuple[float, ...]], ...] = ()
+    slices: SliceBox | None = None
+    background: Volume | None = None
+    surfaces: tuple[TriangleSurface, ...] = ()
+    later: tuple[LaterImage, ...] = ()
+    mesh: MeshPicture | None = None
+    missing: Mapping[str, str] = field(default_factory=dict)
+
+    def save(self, path: Path) -> None:
+        """Write everything to `path` (.npz without pickles), whole or not at all; `ResourceError` when it cannot."""
+        write_archive(self, path)
+
+    @classmethod
+    def load(cls, path: Path) -> ReportData:
+        """Read what `save` wrote; raises `InputDataError` when the file is missing, damaged, too large or another."""
+        return read_archive(cls, path)

@@ -1,0 +1,80 @@
+"""Colour scales of a report: distances about zero, moduli and angles from low to high; and their bars."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import matplotlib as mpl
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.report.report_data import ReportData
+
+__all__ = ["Scale", "angle_scale", "distance_scale", "modulus_scale"]
+
+UNSEEN = (0.62, 0.63, 0.66)  # where there is no value
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """Colours from `low` to `high` by the map `name` of matplotlib, logarithmic or not; `ticks`: place and label."""
+
+    name: str
+    low: float
+    high: float
+    logarithmic: bool
+    label: str
+    ticks: tuple[tuple[float, str], ...]
+
+    @property
+    def table(self) -> NDArray[np.uint8]:
+        """The scale's 256 colours, (256, 3)."""
+        shades = mpl.colormaps[self.name](np.linspace(0.0, 1.0, 256))[:, :3]
+        return np.rint(255.0 * shades).astype(np.uint8)
+
+    def place(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Where values (n,) lie on the scale, 0 to 1; NaN stays."""
+        low, high = (math.log(self.low), math.log(self.high)) if self.logarithmic else (self.low, self.high)
+        scaled = np.log(values) if self.logarithmic else values
+        return np.clip((scaled - low) / (high - low), 0.0, 1.0)
+
+    def colours(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Colours (n, 3), 0 to 1, of values (n,); grey where there is none."""
+        place = self.place(np.asarray(values, dtype=np.float64))
+        known = np.isfinite(place)
+        shades = self.table[np.rint(255.0 * np.where(known, place, 0.0)).astype(int)] / 255.0
+        return np.where(known[:, None], shades, UNSEEN)
+
+
+def distance_scale(voxel_mm: float) -> Scale:
+    """Signed distances (mm) from minus to plus two voxels of edge `voxel_mm`, one voxel marked on both sides.
+
+    A scale that reached to the largest motion would show every misfit of a fraction of a voxel as none.
+    """
+    size = 2.0 * voxel_mm
+    ticks = (
+        (-size, f"≤ −{size:.3g}"),
+        (-voxel_mm, f"−{voxel_mm:.3g} (voxel)"),
+        (0.0, "0"),
+        (voxel_mm, f"+{voxel_mm:.3g} (voxel)"),
+        (size, f"≥ +{size:.3g}"),
+    )
+    return Scale("coolwarm", -size, size, False, "signed distance to the later image (mm)", ticks)
+
+
+def modulus_scale(data: ReportData) -> Scale:
+    """Young's modulus of the meshed tissues, logarithmic, in the result's unit; raises `ValueError` when none is."""
+    values = sorted(tissue.modulus for tissue in data.tissues if tissue.modulus is not None and tissue.modulus > 0)
+    if not values:
+        raise ValueError("no tissue has a modulus")
+    low, high = values[0], values[-1]
+    room = max((high / low) ** 0.12, 1.15)
+    label = "Young's modulus (kPa)" if data.unit == "kPa" else "Young's modulus (ratio)"
+    return Scale("viridis", low / room, high * room, True, label, tuple((v, f"{v:.3g}") for v in dict.fromkeys(values)))
+
+
+def angle_scale() -> Scale:
+    """Smallest dihedral angle of a tetrahedron, degrees; 5 is what the mesh's gate asks for."""
+    ticks = tuple((float(angle), f"{angle}°") for angle in (5, 20, 40, 60))
+    return Scale("RdYlGn", 0.0, 70.0, False, "smallest dihedral angle (degrees)", ticks)

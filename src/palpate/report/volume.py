@@ -1,0 +1,92 @@
+"""The images behind the slices, as bytes on a grid along the axes of the world."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from palpate.images.label_image import VoxelGrid
+from palpate.images.segmentation import Segmentation
+from palpate.images.tissue_distance import cropped
+from palpate.report.report_data import SliceBox, Volume
+
+__all__ = ["MOST_VOXELS", "grey_volume", "label_volume"]
+
+MOST_VOXELS = 2_500_000  # what a page can carry and a telephone can hold
+CT_WINDOW = (-160.0, 240.0)  # Hounsfield units in which soft tissues differ
+MOST_TISSUES = 254
+
+
+def grey_volume(values: NDArray[Any], grid: VoxelGrid, box: SliceBox, *, most_voxels: float = MOST_VOXELS) -> Volume:
+    """The part of a grey image (nx, ny, nz) on `grid` that lies in `box`, its soft tissue spread over the greys.
+
+    It is sampled more coarsely than the image where it had over `most_voxels`.
+    """
+    step = _step(grid, box, most_voxels)
+    cut = _cut(values, grid, box, step=step, order=1)
+    low, high = _window(cut)
+    shade = np.clip((cut - low) / (high - low), 0.0, 1.0)
+    return Volume("grey", np.rint(255.0 * np.nan_to_num(shade)).astype(np.uint8), box.low, step)
+
+
+def label_volume(image: Segmentation, box: SliceBox) -> Volume:
+    """The part of a segmentation that lies in `box`: tissue index + 1, 0 outside."""
+    step = _step(image.grid, box, MOST_VOXELS)
+    cut = _cut(image.index, image.grid, box, step=step, order=0)
+    number = np.where(np.isnan(cut) | (cut >= MOST_TISSUES), -1.0, cut) + 1.0
+    return Volume("labels", number.astype(np.uint8), box.low, step)
+
+
+def _step(grid: VoxelGrid, box: SliceBox, most_voxels: float) -> NDArray[np.float64]:
+    """Voxel edges (3,) mm: the image's finest, or coarser where the box would hold too many; they fill the box."""
+    size = box.high - box.low
+    edge = max(float(grid.spacing.min()), float(np.prod(size) / most_voxels) ** (1.0 / 3.0))
+    return np.asarray(size / (_counts(size, edge) - 1))
+
+
+def _counts(size: NDArray[np.float64], edge: float) -> NDArray[np.int64]:
+    return np.maximum(np.rint(size / edge).astype(np.int64) + 1, 2)
+
+
+def _cut(
+    values: NDArray[Any], grid: VoxelGrid, box: SliceBox, *, step: NDArray[np.float64], order: Literal[0, 1]
+) -> NDArray[np.float32]:
+    """Values on the grid from `box.low` in steps of `step`; NaN outside of the image."""
+    window = _window_of(grid, box)
+    part = cropped(grid, window)
+    inverse = np.linalg.inv(part.affine)
+    counts = np.rint((box.high - box.low) / step).astype(np.int64) + 1
+    cut = ndimage.affine_transform(
+        values[window].astype(np.float32),
+        inverse[:3, :3] * step,
+        inverse[:3, :3] @ box.low + inverse[:3, 3],
+        output_shape=(int(counts[0]), int(counts[1]), int(counts[2])),
+        order=order,
+        mode="constant",
+        cval=np.nan,
+    )
+    return np.asarray(cut)
+
+
+def _window_of(grid: VoxelGrid, box: SliceBox) -> tuple[slice, slice, slice]:
+    """Voxels of the image that the box may need; one of them where it needs none."""
+    corners = np.array(np.meshgrid(*np.stack([box.low, box.high], axis=1))).reshape(3, -1).T
+    index, last = grid.index(corners), np.array(grid.shape) - 1
+    low = np.clip(np.floor(index.min(axis=0)).astype(np.int64) - 1, 0, last)
+    high = np.clip(np.ceil(index.max(axis=0)).astype(np.int64) + 1, 0, last)
+    i, j, k = (slice(int(a), int(b) + 1) for a, b in zip(low, high, strict=True))
+    return (i, j, k)
+
+
+def _window(values: NDArray[np.float32]) -> tuple[float, float]:
+    """Grey values shown black and white: a soft-tissue window for a CT, else the middle 98 percent."""
+    finite = values[np.isfinite(values)]
+    if not len(finite):
+        return 0.0, 1.0
+    if finite.min() < -500.0:
+        return CT_WINDOW
+    low, high = np.percentile(finite, [1.0, 99.0])
+    return float(low), float(max(high, low + 1e-6))

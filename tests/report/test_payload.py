@@ -1,0 +1,58 @@
+"""What the page's scripts are given: the same geometry and images, in fewer bytes."""
+
+from __future__ import annotations
+
+import base64
+import json
+import zlib
+
+import numpy as np
+import pytest
+
+from palpate.report.collect import collect
+from palpate.report.payload import payload, script_json
+
+
+@pytest.fixture(scope="module")
+def data(case_result):
+    return collect(case_result)
+
+
+@pytest.fixture(scope="module")
+def unpacked(data):
+    packed = payload(data)
+    return json.loads(packed.facts), zlib.decompress(base64.b64decode(packed.block))
+
+
+def array(entry, block):
+    dtype = np.dtype(entry["type"]).newbyteorder("<")
+    assert entry["offset"] % 4 == 0
+    return np.frombuffer(block, dtype, entry["length"], entry["offset"])
+
+
+def test_points_keep_their_place_to_a_hundredth_of_a_millimetre(data, unpacked):
+    facts, block = unpacked
+    for packed, surface in zip(facts["surfaces"], data.surfaces, strict=True):
+        points = facts["low"] + facts["step"] * array(packed["points"], block).reshape(-1, 3)
+        np.testing.assert_allclose(points, surface.points, atol=0.01)
+        np.testing.assert_array_equal(array(packed["triangles"], block).reshape(-1, 3), surface.triangles)
+
+
+def test_mesh_and_volume_are_whole(data, unpacked):
+    facts, block = unpacked
+    np.testing.assert_array_equal(array(facts["mesh"]["tets"], block).reshape(-1, 4), data.mesh.tets)
+    np.testing.assert_array_equal(array(facts["mesh"]["region"], block), data.mesh.region)
+    volume = facts["background"]
+    np.testing.assert_array_equal(array(volume["values"], block).reshape(volume["shape"]), data.background.values)
+
+
+def test_unobserved_distances_stay_unknown(data, unpacked):
+    facts, block = unpacked
+    packed, model = facts["later"][0]["model"][0], data.later[0].model[0]
+    np.testing.assert_array_equal(array(packed["distanceFitted"], block), model.distance_fitted)
+
+
+def test_json_in_a_script_cannot_end_it():
+    text = script_json({"a": "</script><!--<script>&", "b": "\u2028"})
+    assert not set("<>&\u2028") & set(text)
+    assert json.loads(text) == {"a": "</script><!--<script>&", "b": "\u2028"}

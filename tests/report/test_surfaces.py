@@ -1,0 +1,57 @@
+"""Surfaces of a report: where the organs are, and how far the model is from the later image."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from palpate.images.distance import observation_width
+from palpate.images.label_image import VoxelGrid
+from palpate.images.segmentation import Segmentation
+from palpate.images.tissue import Role, Tissue
+from palpate.images.tissue_distance import tissue_distance_map
+from palpate.report.surfaces import image_surface, model_surface
+
+TURNED = np.array([[0, 1.5, 0, -5.0], [1.0, 0, 0, -5.0], [0, 0, -2.0, 50.0], [0, 0, 0, 1]])
+
+
+def ball(radius):
+    grid = VoxelGrid((60, 40, 30), TURNED)
+    index = np.stack(np.meshgrid(*[np.arange(n) for n in grid.shape], indexing="ij"), axis=-1)
+    points = grid.world(index.reshape(-1, 3).astype(float))
+    inside = np.linalg.norm(points - points.mean(axis=0), axis=1) < radius
+    tissues = (Tissue("rest", Role.VOID), Tissue("ball", Role.VOID, (1,)))
+    return Segmentation(inside.reshape(grid.shape).astype(np.int16), grid, tissues), points.mean(axis=0)
+
+
+@pytest.mark.parametrize(("most", "tolerance"), [(40_000, 0.4), (600, 1.0)])
+def test_the_surface_of_a_ball_is_a_sphere_at_its_place(most, tolerance):
+    image, centre = ball(18.0)
+    surface = image_surface(image, 1, smoothing_mm=1.2, most_triangles=most)
+    radius = np.linalg.norm(surface.points - centre, axis=1)
+    assert radius.mean() == pytest.approx(18.0, abs=tolerance)
+    assert radius.std() < 2.0 * tolerance
+    assert 0 < len(surface.triangles) < 2.0 * most
+
+
+def test_the_surface_of_a_ball_is_closed():
+    surface = image_surface(ball(15.0)[0], 1, smoothing_mm=1.2)
+    edges = np.sort(surface.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    _, count = np.unique(edges, axis=0, return_counts=True)
+    assert (count == 2).all()
+
+
+def test_a_tissue_without_voxels_has_no_surface():
+    assert len(image_surface(ball(0.0)[0], 1, smoothing_mm=1.2).triangles) == 0
+
+
+def test_the_true_motion_brings_the_model_onto_the_later_image(case_result):
+    model = model_surface(case_result, 0, 0)
+    seen = np.isfinite(model.distance_fitted)
+    np.testing.assert_array_equal(seen, model.area > 0)
+    image, width = case_result.after[0], observation_width(case_result.before.grid, case_result.after[0].grid)
+    whole = tissue_distance_map(image, 0, smoothing_mm=width).at(model.fitted.astype(float))
+    whole -= tissue_distance_map(case_result.before, 0, smoothing_mm=width).at(model.rest.astype(float))
+    np.testing.assert_allclose(model.distance_fitted[seen], whole[seen], atol=1e-3)
+    rest, fitted = (np.sqrt(np.nanmean(d**2)) for d in (model.distance_rest, model.distance_fitted))
+    assert fitted < 0.6 * rest  # the fixture's mesh is a staircase; what moved is 0.6 mm in the mean
