@@ -23,10 +23,11 @@ from palpate.images.segmentation import segment
 from palpate.images.tissue import Role
 from palpate.inversion.conclude import Observed, conclude
 from palpate.inversion.grid_position import FittedState, voxel_errors
-from palpate.inversion.invert import InverseProblem, Inversion, invert
+from palpate.inversion.invert import invert
 from palpate.inversion.modulus_map import modulus_map
 from palpate.inversion.noise import NoiseLaw, fit_noise_law
 from palpate.inversion.posterior import cramer_rao
+from palpate.inversion.problem import InverseProblem, Inversion
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import linear_model
 from palpate.mesh.space import LagrangeSpace, lagrange_space

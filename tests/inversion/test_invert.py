@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from palpate.inversion.gauss_newton import Bounds
-from palpate.inversion.invert import InversionSettings, fit_driver, invert
+from palpate.inversion.invert import fit_driver, invert
 from palpate.inversion.noise import NoiseLaw
+from palpate.inversion.problem import InversionSettings
 
 SHARP = NoiseLaw(np.array([1e-6]), np.array([3.0]))
 

@@ -10,8 +10,8 @@ from palpate.images.segmentation import segment
 from palpate.images.tissue import Role, Tissue
 from palpate.images.tissue_distance import tissue_distance_map
 from palpate.inversion.gauss_newton import Bounds
-from palpate.inversion.invert import InverseProblem, InversionSettings
 from palpate.inversion.modulus_map import modulus_map
+from palpate.inversion.problem import InverseProblem, InversionSettings
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import LinearModel, linear_model
 from palpate.mesh.anatomy import Anatomy, Box

@@ -5,8 +5,10 @@ from __future__ import annotations
 from itertools import permutations
 
 import numpy as np
+from scipy import sparse
 
 from palpate.images.tissue import Role, Tissue
+from palpate.mesh.constraint import Constraint
 from palpate.mesh.surface import triangle_normals
 from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh
 
@@ -147,6 +149,15 @@ def prescribe(space, points, displacement, modes=None):
     if modes is not None:
         columns[points] = modes
     return {"prescribed": prescribed, "offset": offset.ravel(), "modes": columns.reshape(3 * len(columns), n_modes)}
+
+
+def held_components(held, values, modes=None):
+    """Constraint that holds components (n_points, 3) marked in `held` at values (n_points, 3) mm, plus modes."""
+    unknown = np.flatnonzero(~held.ravel())
+    n = held.size
+    free = sparse.csr_matrix((np.ones(len(unknown)), (unknown, np.arange(len(unknown)))), shape=(n, len(unknown)))
+    columns = np.zeros((n, 0)) if modes is None else modes.reshape(n, -1) * held.reshape(n, 1)
+    return Constraint(free=free, modes=columns, offset=np.where(held, values, 0.0).ravel())
 
 
 def pressure_load(space, triangles, pressure):

@@ -11,8 +11,12 @@ import pytest
 
 import palpate.mechanics
 from palpate.mechanics.boundary import outer_constraint
+from palpate.mechanics.dilatation import Dilatation
+from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.forward import Equilibrium, ForwardModel
+from palpate.mechanics.laws.registry import LAWS
 from palpate.mechanics.linear_model import linear_model
+from palpate.mechanics.newton import NewtonSettings
 from palpate.mechanics.reduced import reduce
 from palpate.mesh.space import lagrange_space
 
@@ -35,9 +39,10 @@ def implementations():
     return found
 
 
-def linear(meshes):
+def body(meshes):
+    """Two tissues on a floor that moves by two modes and an offset."""
     mesh = meshes.box_mesh(
-        3,
+        2,
         size=30.0,
         distortion=0.2,
         tissues=[meshes.known("fat", nu=0.45), meshes.unknown("organ", nu=0.45)],
@@ -45,11 +50,20 @@ def linear(meshes):
     )
     space = lagrange_space(mesh, "P2")
     floor = np.flatnonzero(space.points[:, 2] < 1e-9)
-    rng = np.random.default_rng(2)
-    given = meshes.prescribe(
-        space, floor, rng.standard_normal((len(floor), 3)), rng.standard_normal((len(floor), 3, 2))
-    )
-    return linear_model(space, outer_constraint(space, outer="fixed", **given))
+    x, y, _ = (space.points[floor] / 30.0).T
+    bump = np.sin(np.pi * x) * np.sin(np.pi * y)
+    modes = np.stack([np.stack([0.3 * bump, 0 * bump, bump], 1), np.stack([bump * x, bump * y, 0 * bump], 1)], axis=2)
+    given = meshes.prescribe(space, floor, np.outer(bump, [0.5, 1.0, 4.0]), 3.0 * modes)
+    return space, outer_constraint(space, outer="fixed", **given)
+
+
+def linear(meshes):
+    return linear_model(*body(meshes), dilatation=Dilatation.BLENDED)
+
+
+def finite(law):
+    settings = NewtonSettings(tolerance=1e-13)
+    return lambda meshes: finite_strain_model(*body(meshes), law, settings=settings)
 
 
 def reduced(meshes):
@@ -60,10 +74,11 @@ def reduced(meshes):
 
 
 FACTORIES = {"LinearModel": linear, "ReducedModel": reduced}
+FACTORIES |= {f"FiniteStrainModel {name}": finite(law) for name, law in LAWS.items()}
 
 
 def test_every_forward_model_has_a_factory_here():
-    assert implementations() == set(FACTORIES)
+    assert implementations() == {name.split()[0] for name in FACTORIES}
 
 
 @pytest.fixture(scope="module", params=sorted(FACTORIES))

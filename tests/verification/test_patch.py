@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 
 from palpate.mechanics.boundary import outer_constraint
+from palpate.mechanics.dilatation import Dilatation
+from palpate.mechanics.finite_strain import finite_strain_model
+from palpate.mechanics.laws.registry import LAWS
 from palpate.mechanics.linear_model import linear_model
 from palpate.mesh.space import lagrange_space
 
@@ -71,3 +74,36 @@ def test_the_linear_law_takes_a_large_rotation_for_strain(meshes):
     lam, mu = nu / ((1 + nu) * (1 - 2 * nu)), 1 / (2 * (1 + nu))
     density = 0.5 * lam * (2 * strain) ** 2 + mu * 2 * strain**2
     assert 0.5 * u @ model.forces(np.array([1.0]), u[:, None])[:, 0] == pytest.approx(density * 1000.0, rel=1e-10)
+
+
+@pytest.mark.parametrize("law", ["neo-hookean", "mooney-rivlin"])
+@pytest.mark.parametrize("dilatation", Dilatation)
+def test_an_affine_finite_strain_is_reproduced_on_a_distorted_mesh(meshes, law, dilatation):
+    space = lagrange_space(
+        meshes.box_mesh(3, size=30.0, distortion=0.25, tissues=[meshes.known("block", nu=0.49)]), "P2"
+    )
+    exact = 10.0 * space.points @ GRADIENT.T
+    given = meshes.every_node_prescribed(space, lambda x: 10.0 * x @ GRADIENT.T)
+    model = finite_strain_model(space, outer_constraint(space, outer="free", **given), LAWS[law], dilatation=dilatation)
+    found = model.solve(np.array([3.0]), np.zeros(0)).displacement
+    assert abs(found - exact).max() < 1e-8 * abs(exact).max()
+
+
+@pytest.mark.parametrize("law", ["neo-hookean", "mooney-rivlin"])
+@pytest.mark.parametrize("degrees", [30.0, 90.0])
+def test_a_superposed_rotation_adds_no_stress(meshes, law, degrees):
+    """A strained body, then turned as a whole: forces turn with it, energy stays."""
+    space = lagrange_space(meshes.box_mesh(2, size=10.0, distortion=0.2), "P2")
+    model = finite_strain_model(
+        space, outer_constraint(space, outer="fixed", **meshes.every_node_prescribed(space, np.zeros_like)), LAWS[law]
+    )
+    angle = np.deg2rad(degrees)
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    strained = 5.0 * space.points @ GRADIENT.T + 0.05 * np.sin(space.points)
+    turned = (space.points + strained) @ turn.T - space.points
+    balance = model.balance(np.array([3.0]))
+    forces, size = balance.residual(strained.ravel())
+    after, _ = balance.residual(turned.ravel())
+    assert np.allclose(after.reshape(-1, 3), forces.reshape(-1, 3) @ turn.T, atol=1e-11 * size)
+    moduli = model.moduli_of(np.array([3.0]))
+    assert model.elements.energy(turned, moduli) == pytest.approx(model.elements.energy(strained, moduli), rel=1e-11)

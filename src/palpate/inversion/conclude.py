@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from palpate.inversion.estimation import Estimation, Iteration, ModulusEstimate, Remark, Start, SurfaceFit, TissueFit
 from palpate.inversion.gauss_newton import Iterate
 from palpate.inversion.grid_position import FittedState, grid_position_shifts
-from palpate.inversion.invert import Inversion, InversionSettings
 from palpate.inversion.objective import Linearisation
 from palpate.inversion.posterior import sandwich_covariance
+from palpate.inversion.problem import Inversion, InversionSettings
 from palpate.inversion.verdict import log_interval, verdict
 from palpate.mechanics.deformation import deformation_determinants
 from palpate.mesh.space import LagrangeSpace
@@ -28,7 +28,7 @@ STRONG_CORRELATION = 0.99
 
 @dataclass(frozen=True, slots=True)
 class Observed:
-    """The space of the displacements, the fitted later states, and each later image's tissue index (nx, ny, nz)."""
+    """The displacements' space, the fitted later states (some on their own), each image's tissue index (nx, ny, nz)."""
 
     space: LagrangeSpace
     states: tuple[FittedState, ...]
@@ -154,7 +154,8 @@ def _fits(inversion: Inversion, observed: Observed) -> tuple[tuple[TissueFit, ..
     for state, fitted, image in zip(inversion.objective.states, observed.states, observed.images, strict=True):
         still = np.zeros_like(fitted.displacement)
         overlaps = [
-            voxelise(observed.space, motion, fitted.after, crossing=True) for motion in (still, fitted.displacement)
+            voxelise(fitted.space or observed.space, motion, fitted.after, crossing=True)
+            for motion in (still, fitted.displacement)
         ]
         tissues = []
         for target in state.targets:
@@ -172,10 +173,11 @@ def _folds(observed: Observed) -> tuple[Remark, ...]:
     """A warning for each later image in which the fitted model turns elements inside out."""
     remarks = []
     for number, state in enumerate(observed.states, start=1):
-        smallest = deformation_determinants(observed.space, state.displacement).min(axis=1)
+        space = state.space or observed.space
+        smallest = deformation_determinants(space, state.displacement).min(axis=1)
         folded = int(np.count_nonzero(smallest <= 0.0))
         if folded:
-            worst = observed.space.mesh.nodes[observed.space.mesh.tets[int(smallest.argmin())]].mean(axis=0)
+            worst = space.mesh.nodes[space.mesh.tets[int(smallest.argmin())]].mean(axis=0)
             remarks.append(
                 Remark(
                     "fold-over",

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue_distance import tissue_distance_map
-from palpate.inversion.invert import Inversion
 from palpate.inversion.objective import Linearisation
 from palpate.inversion.posterior import gain
+from palpate.inversion.problem import Inversion
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
 
@@ -21,12 +21,16 @@ __all__ = ["FittedState", "grid_position_shifts", "voxel_errors"]
 
 @dataclass(frozen=True, slots=True)
 class FittedState:
-    """A fitted later state: displacement (n_points, 3) mm, the grids of both images, the maps' smoothing (mm)."""
+    """A fitted later state: displacement (n_points, 3) mm, the grids of both images, the maps' smoothing (mm).
+
+    `space`: the state's own, where its reference state is not that of the others (a further pair of images).
+    """
 
     displacement: NDArray[np.float64]
     before: VoxelGrid
     after: VoxelGrid
     smoothing_mm: float
+    space: LagrangeSpace | None = None
 
 
 def grid_position_shifts(
@@ -60,8 +64,9 @@ def voxel_errors(
     lines = iter(inversion.minimum.evaluation.surfaces)
     errors = []
     for state, fitted in zip(inversion.objective.states, states, strict=True):
-        before = _imaged(space, np.zeros_like(fitted.displacement), fitted.before, rng)
-        after = _imaged(space, fitted.displacement, fitted.after, rng)
+        own = fitted.space or space
+        before = _imaged(own, np.zeros_like(fitted.displacement), fitted.before, rng)
+        after = _imaged(own, fitted.displacement, fitted.after, rng)
         errors += [_error(next(lines), before, after, fitted.smoothing_mm) for _ in state.targets]
     return errors
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import LinearModel, LinearSystem
 from palpate.mechanics.reduced import ReducedModel, reduce
+from palpate.mesh.constraint import Constraint
 
-__all__ = ["Surrogate", "enriched", "first_surrogate", "with_modulus_series"]
+__all__ = ["Surrogate", "enriched", "first_surrogate", "with_modulus_series", "with_offset"]
 
 SERIES = 40  # vectors at the most
 
@@ -25,6 +26,11 @@ class Surrogate:
     reduced: ReducedModel
     system: LinearSystem
     counts: SolveCounts
+
+    @property
+    def constraint(self) -> Constraint:
+        """What is prescribed to the model."""
+        return self.model.constraint
 
     def relative_error(self, moduli: NDArray[np.float64], coefficients: NDArray[np.float64]) -> float:
         """Upper bound of the reduced displacement's relative error in energy at moduli (kPa) and coefficients."""
@@ -70,4 +76,13 @@ def enriched(surrogate: Surrogate, moduli: NDArray[np.float64], coefficients: ND
     fresh = np.concatenate([free.T @ responses, free.T @ derivatives], axis=1)
     snapshots = np.concatenate([surrogate.snapshots, fresh], axis=1)
     counts = surrogate.counts + system.response_counts + SolveCounts(tangent=model.n_regions)
+    return Surrogate(model, snapshots, reduce(model, snapshots), system, counts)
+
+
+def with_offset(surrogate: Surrogate, model: LinearModel) -> Surrogate:
+    """The same snapshots for a `model` that differs in the offset of its constraint, and the response to it added."""
+    system = replace(surrogate.system, model=model)
+    fresh = np.asarray(model.constraint.free.T @ system.solve(np.zeros(model.n_modes)).values)[:, None]
+    snapshots = np.concatenate([surrogate.snapshots, fresh], axis=1)
+    counts = surrogate.counts + SolveCounts(forward=1)
     return Surrogate(model, snapshots, reduce(model, snapshots), system, counts)

@@ -10,9 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import roots_jacobi
 
-from palpate.mesh.space import TET_EDGES
+from palpate.mesh.space import TET_EDGES, TRIANGLE_EDGES
 
-__all__ = ["barycentric_gradients", "quadrature", "reference_tensor", "shape_derivatives", "shape_functions"]
+__all__ = [
+    "barycentric_gradients",
+    "mean_reference_tensor",
+    "quadrature",
+    "reference_tensor",
+    "shape_derivatives",
+    "shape_functions",
+    "triangle_quadrature",
+    "triangle_slopes",
+]
 
 
 def quadrature(degree: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -71,6 +80,13 @@ def reference_tensor(order: int) -> NDArray[np.float64]:
     return np.asarray(np.einsum("q,qak,qbl->abkl", weights, derivatives, derivatives))
 
 
+def mean_reference_tensor(order: int) -> NDArray[np.float64]:
+    """Product of means (n_a, n_a, 4, 4), dimensionless: M_ak M_bl with M_ak = (1 / V) int dN_a/dlambda_k dV, exact."""
+    points, weights = quadrature(order)
+    mean = np.einsum("q,qak->ak", weights, shape_derivatives(order, points))
+    return np.asarray(np.einsum("ak,bl->abkl", mean, mean))
+
+
 def barycentric_gradients(
     nodes: NDArray[np.float64], tets: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -84,3 +100,27 @@ def barycentric_gradients(
     inverse = np.linalg.inv(edges)
     gradients = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
     return gradients, np.asarray(np.linalg.det(edges) / 6.0)
+
+
+def triangle_quadrature(degree: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Points (n_q, 3) barycentric on a triangle and positive weights (n_q,), sum 1, exact up to `degree`.
+
+    The conical product of Gauss-Jacobi rules (Stroud 1971), with ceil((degree + 1) / 2) points a direction.
+    """
+    rules = [roots_jacobi(degree // 2 + 1, power, 0.0) for power in (1.0, 0.0)]
+    x, y = np.meshgrid(*[0.5 * (1.0 + points) for points, _ in rules], indexing="ij")
+    weights = np.einsum("i,j->ij", *[w / w.sum() for _, w in rules])
+    points = np.stack([(1.0 - x) * (1.0 - y), x, (1.0 - x) * y], axis=-1)
+    return np.asarray(points.reshape(-1, 3)), np.asarray(weights.ravel())
+
+
+def triangle_slopes(order: int, barycentric: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Slopes (n_q, 3 or 6, 2) of the shape functions along lambda_1 and lambda_2, lambda_0 = 1 - both, (n_q, 3)."""
+    by_place = np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]])  # d lambda_k / d(lambda_1, lambda_2)
+    if order == 1:
+        return np.tile(by_place, (len(barycentric), 1, 1))
+    corners = np.einsum("qa,ad->qad", 4.0 * barycentric - 1.0, by_place)
+    first, second = TRIANGLE_EDGES.T
+    edges = np.einsum("qe,ed->qed", barycentric[:, first], by_place[second])
+    edges += np.einsum("qe,ed->qed", barycentric[:, second], by_place[first])
+    return np.concatenate([corners, 4.0 * edges], axis=1)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from palpate.errors import ConfigurationError
+from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.forward import SolveCounts, checked_coefficients, checked_moduli
 from palpate.mechanics.rigid import rigid_modes
 from palpate.mechanics.solvers.contract import Factorisation
@@ -202,11 +203,18 @@ class LinearEquilibrium:
         return result
 
 
-def linear_model(space: LagrangeSpace, constraint: Constraint, *, solver: str = "auto") -> LinearModel:
+def linear_model(
+    space: LagrangeSpace,
+    constraint: Constraint,
+    *,
+    solver: str = "auto",
+    dilatation: Dilatation = Dilatation.POINTWISE,
+) -> LinearModel:
     """Assemble the linear model of all meshed tissues of `space.mesh`, with their Poisson's ratios.
 
-    solver: a name of `palpate.mechanics.solvers.registry.SOLVERS` or "auto". Raises `ConfigurationError` when the
-    constraint is of another space, `GeometryError` for tetrahedra without positive volume.
+    solver: a name of `palpate.mechanics.solvers.registry.SOLVERS` or "auto"; dilatation: that of the element, as
+    `choose_element` gives it. Raises `ConfigurationError` when the constraint is of another space, `GeometryError` for
+    tetrahedra without positive volume.
     """
     n_dof = 3 * len(space.points)
     if constraint.free.shape[0] != n_dof or len(constraint.modes) != n_dof or len(constraint.offset) != n_dof:
@@ -215,7 +223,9 @@ def linear_model(space: LagrangeSpace, constraint: Constraint, *, solver: str = 
         )
     tissues = space.mesh.tissues
     regions = tuple(number for number, tissue in enumerate(tissues) if tissue.meshed)
-    stiffness = tuple(tissue_stiffness(space, region, tissues[region].poisson_ratio) for region in regions)
+    stiffness = tuple(
+        tissue_stiffness(space, region, tissues[region].poisson_ratio, dilatation=dilatation) for region in regions
+    )
     rows = [sparse.csr_matrix(constraint.free.T @ matrix) for matrix in stiffness]
     free_stiffness = tuple(sparse.csr_matrix(part @ constraint.free) for part in rows)
     model = LinearModel(space, constraint, regions, stiffness, free_stiffness, (), solver)

@@ -7,10 +7,12 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from palpate.errors import ConfigurationError, GeometryError
-from palpate.mechanics.element import barycentric_gradients, reference_tensor
+from palpate.mechanics.dilatation import Dilatation, pointwise_lame
+from palpate.mechanics.element import barycentric_gradients, mean_reference_tensor, reference_tensor
+from palpate.mechanics.pattern import block_pattern
 from palpate.mesh.space import LagrangeSpace
 
-__all__ = ["lame_parameters", "tissue_stiffness"]
+__all__ = ["checked_gradients", "lame_by_poisson", "lame_parameters", "tissue_stiffness"]
 
 CHUNK = 4096  # elements at once: some 30 MB of P2 blocks
 
@@ -26,30 +28,51 @@ def lame_parameters(youngs_modulus: float, poisson_ratio: float) -> tuple[float,
     return 2.0 * mu * poisson_ratio / (1.0 - 2.0 * poisson_ratio), mu
 
 
-def tissue_stiffness(space: LagrangeSpace, tissue: int, poisson_ratio: float) -> sparse.csr_matrix[np.float64]:
+def lame_by_poisson(youngs_modulus: float, poisson_ratio: float) -> tuple[float, float]:
+    """Derivatives of Lame's (lambda, mu) with respect to nu, in the unit of `youngs_modulus` (kPa).
+
+    E (1 + 2 nu^2) / ((1 + nu)(1 - 2 nu))^2 and -E / (2 (1 + nu)^2).
+    """
+    nu = poisson_ratio
+    by_lame = youngs_modulus * (1.0 + 2.0 * nu**2) / ((1.0 + nu) * (1.0 - 2.0 * nu)) ** 2
+    return by_lame, -youngs_modulus / (2.0 * (1.0 + nu) ** 2)
+
+
+def tissue_stiffness(
+    space: LagrangeSpace, tissue: int, poisson_ratio: float, *, dilatation: Dilatation = Dilatation.POINTWISE
+) -> sparse.csr_matrix[np.float64]:
     """Stiffness (n_dof, n_dof), mN/mm, of the tissue's tetrahedra at a Young's modulus of 1 kPa.
 
     tissue: index in `space.mesh.tissues`; the unknown of point p along axis i has the number 3 p + i. With
     H_ab = int grad N_a (x) grad N_b dV the block of points a and b is lambda H_ab + mu H_ab^T + mu tr(H_ab) I
-    (Hughes, The Finite Element Method, 1987, section 2.8). Raises `GeometryError` where a tetrahedron has no
+    (Hughes, The Finite Element Method, 1987, section 2.8); the part of lambda that `dilatation` takes in the mean has
+    the means of grad N_a and grad N_b instead. Raises `GeometryError` where a tetrahedron has no
     positive volume, `ConfigurationError` for an impossible Poisson's ratio.
     """
     inside = space.mesh.region == tissue
     cells = space.cells[inside]
-    gradients, volumes = _checked_gradients(space, inside)
-    lame = lame_parameters(1.0, poisson_ratio)
+    gradients, volumes = checked_gradients(space, inside)
+    lame, mu = lame_parameters(1.0, poisson_ratio)
+    pointwise = pointwise_lame(dilatation, lame, mu)
     tensor = reference_tensor(space.order).reshape(-1, 16)
+    mean = mean_reference_tensor(space.order).reshape(-1, 16)
     blocks = np.empty((len(cells), len(tensor), 9))
     for start in range(0, len(cells), CHUNK):
         part = slice(start, start + CHUNK)
-        np.matmul(tensor, _constant_gradient_blocks(gradients[part], volumes[part], lame), out=blocks[part])
-    return _sum_blocks(cells, blocks.reshape(-1, 9), len(space.points))
+        np.matmul(tensor, _constant_gradient_blocks(gradients[part], volumes[part], (pointwise, mu)), out=blocks[part])
+        if pointwise < lame:
+            rest = (lame - pointwise, 0.0)
+            blocks[part] += mean @ _constant_gradient_blocks(gradients[part], volumes[part], rest)
+    return block_pattern(cells, len(space.points)).assemble(blocks.reshape(-1, 9))
 
 
-def _checked_gradients(
+def checked_gradients(
     space: LagrangeSpace, inside: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Gradients (n, 4, 3) 1/mm and volumes (n,) mm^3 of the marked tetrahedra; `GeometryError` unless all positive."""
+    """Gradients (n, 4, 3) 1/mm and volumes (n,) mm^3 of the tetrahedra marked in `inside` (n_tets,).
+
+    Raises `GeometryError` unless all volumes are positive.
+    """
     mesh = space.mesh
     flat = inside & ~(mesh.volumes > 0.0)
     if flat.any():
@@ -72,20 +95,3 @@ def _constant_gradient_blocks(
     for axis in range(3):
         blocks[..., axis, axis] += trace
     return np.asarray(blocks.reshape(-1, 16, 9))
-
-
-def _sum_blocks(cells: NDArray[np.int64], blocks: NDArray[np.float64], n_points: int) -> sparse.csr_matrix[np.float64]:
-    """Sum the 3 x 3 blocks (n_cells * n_a * n_a, 9) of all cells into one matrix; each block's place is sorted once."""
-    keys = (cells[:, :, None] * n_points + cells[:, None, :]).ravel()
-    order = np.argsort(keys, kind="stable")
-    ordered = keys[order]
-    first = np.flatnonzero(np.diff(ordered, prepend=-1))
-    unique = ordered[first]
-    # A 0/1 matrix times the blocks sums them without a sorted copy of all of them.
-    gather = sparse.csr_matrix(
-        (np.ones(len(order)), order, np.append(first, len(order))), shape=(len(unique), len(order))
-    )
-    data = np.asarray(gather @ blocks).reshape(-1, 3, 3)
-    indptr = np.searchsorted(unique, np.arange(n_points + 1) * n_points)
-    shape = (3 * n_points, 3 * n_points)
-    return sparse.bsr_matrix((data, unique % n_points, indptr), shape=shape).tocsr()

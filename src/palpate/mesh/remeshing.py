@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from palpate.errors import GeometryError
 from palpate.mesh.anatomy import Box
 from palpate.mesh.cutting import Grid
+from palpate.mesh.interrupts import interrupts_held
 from palpate.mesh.tet_mesh import FACES
 
 __all__ = ["compact", "remeshed"]
@@ -38,7 +39,7 @@ def remeshed(grid: Grid, sizes: NDArray[np.float64], *, box: Box, sag_mm: float)
     mesh.set_ridge_edges(np.arange(len(ridges), dtype=np.int32))
     mesh["metric"] = sizes[:, None]
     try:
-        with _silent():
+        with interrupts_held(), _silent():
             mesh.remesh(
                 hmin=0.4 * float(sizes.min()),
                 hmax=1.2 * float(sizes.max()),

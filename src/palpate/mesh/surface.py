@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from palpate.mesh.tet_mesh import FACES, TetMesh
 
-__all__ = ["Surface", "tissue_surface", "triangle_normals"]
+__all__ = ["Surface", "tissue_surface", "triangle_normals", "vertex_normals"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +54,14 @@ def triangle_normals(points: NDArray[np.float64], triangles: NDArray[np.int64]) 
     """Normals (n_faces, 3) of triangles with the length of their area, mm^2; points (n_nodes, 3) mm."""
     corner = points[triangles]
     return np.asarray(0.5 * np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
+
+
+def vertex_normals(points: NDArray[np.float64], triangles: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Unit normals (n_nodes, 3) at nodes (n_nodes, 3) mm, area-weighted over their triangles (n_faces, 3)."""
+    faces = triangle_normals(points, triangles)
+    columns = [np.bincount(triangles.ravel(), np.repeat(faces[:, a], 3), minlength=len(points)) for a in range(3)]
+    summed = np.stack(columns, axis=1).astype(np.float64)
+    return np.asarray(summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-30))
 
 
 MISSING = -9

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from palpate.mesh.surface import triangle_normals
+from palpate.mesh.surface import vertex_normals
 from palpate.observation.target import SurfaceTarget
 
 __all__ = ["SurfaceResiduals", "observed_image_points", "surface_residuals"]
@@ -127,11 +127,7 @@ def _smooth_normals(
     barycentric: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Unit normals (n, 3) interpolated from area-weighted ones at the corners (n, 3) of the places' triangles."""
-    faces = triangle_normals(vertices, triangles)
-    columns = [np.bincount(triangles.ravel(), np.repeat(faces[:, a], 3), minlength=len(vertices)) for a in range(3)]
-    summed = np.stack(columns, axis=1).astype(np.float64)
-    at_vertices = summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-30)
-    normals = np.einsum("nk,nka->na", barycentric, at_vertices[corners])
+    normals = np.einsum("nk,nka->na", barycentric, vertex_normals(vertices, triangles)[corners])
     return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30))
 
 

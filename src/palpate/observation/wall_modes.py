@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["wall_modes"]
+__all__ = ["kernel_factor", "wall_modes"]
 
 RANK_TOLERANCE = 1e-12
 
@@ -19,15 +19,18 @@ def wall_modes(points: NDArray[np.float64], *, n_modes: int, kernel_mm: float, p
     each along x, y and z; the unknown of point p along axis a is row 3 p + a. Fewer columns come back when the kernel
     has no more modes on so small a wall.
     """
-    factor = _pivoted_cholesky(points, kernel_mm, min(len(points), 4 * (n_modes // 3)))
+    factor = kernel_factor(points, kernel_mm, min(len(points), 4 * (n_modes // 3)))
     left, scale, _ = np.linalg.svd(factor, full_matrices=False)
     keep = min(n_modes // 3, int(np.count_nonzero(scale > RANK_TOLERANCE * scale.max(initial=0.0))))
     scalar = prior_mm * left[:, :keep] * scale[:keep]
     return np.asarray(np.kron(scalar, np.eye(3)))
 
 
-def _pivoted_cholesky(points: NDArray[np.float64], kernel_mm: float, rank: int) -> NDArray[np.float64]:
-    """Factor L (n_points, rank) with L L^T close to exp(-|x - y|^2 / (2 kernel^2)); Harbrecht et al. 2012, Alg. 1."""
+def kernel_factor(points: NDArray[np.float64], kernel_mm: float, rank: int) -> NDArray[np.float64]:
+    """Factor L (n_points, rank) with L L^T close to exp(-|x - y|^2 / (2 kernel^2)) at points (n_points, 3) mm.
+
+    Pivoted Cholesky decomposition, stopped at `rank` or at rounding; Harbrecht, Peters & Schneider 2012, Algorithm 1.
+    """
     left = np.ones(len(points))
     factor = np.zeros((len(points), rank))
     for k in range(rank):

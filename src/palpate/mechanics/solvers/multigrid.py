@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from palpate.errors import SolverError
+from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
 from palpate.mechanics.solvers.contract import Factorisation, Solver, always
 from palpate.mechanics.solvers.pattern import twin_rows
 
-__all__ = ["SOLVER", "conjugate_gradients"]
+__all__ = ["SOLVER"]
 
 TOLERANCE = 1e-10  # of the residual, relative; the check of the registry asks for 1e-8
 MAX_ITERATIONS = 2000
@@ -70,56 +71,10 @@ class MultigridFactorisation:
 
     def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
         """Solution X (n, m) of A X = rhs (n, m); raises `SolverError` when the iteration does not converge."""
-        return conjugate_gradients(self.matrix, rhs, self)
-
-    def __call__(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The cycle from the finest level, as a preconditioner."""
-        return self.cycle(rhs)
-
-
-def conjugate_gradients(
-    matrix: sparse.csr_matrix[np.float64], rhs: NDArray[np.float64], precondition: MultigridFactorisation
-) -> NDArray[np.float64]:
-    """Solution X (n, m) of A X = rhs (n, m), one iteration for each column but all products at once.
-
-    Hestenes & Stiefel, J. Res. NBS 49 (1952) 409-436; raises `SolverError` for a direction of no positive energy and
-    when the relative residual is not below 1e-10 after 2000 steps.
-    """
-    norms = np.linalg.norm(rhs, axis=0)
-    solution = np.zeros_like(rhs)
-    active = np.flatnonzero(norms > 0.0)
-    residual = rhs[:, active].copy()
-    direction = precondition(residual)
-    product = np.einsum("ij,ij->j", residual, direction)
-    for _ in range(MAX_ITERATIONS):
-        if len(active) == 0:
-            return solution
-        image = np.asarray(matrix @ direction)
-        energy = np.einsum("ij,ij->j", direction, image)
-        _refuse_no_energy(energy, len(rhs))
-        alpha = product / energy
-        solution[:, active] += alpha * direction
-        residual -= alpha * image
-        running = np.linalg.norm(residual, axis=0) > TOLERANCE * norms[active]
-        active, residual, direction = active[running], residual[:, running], direction[:, running]
-        preconditioned = precondition(residual)
-        following = np.einsum("ij,ij->j", residual, preconditioned)
-        direction = preconditioned + following / product[running] * direction
-        product = following
-    worst = float(np.max(np.linalg.norm(residual, axis=0) / norms[active]))
-    raise SolverError(
-        f"conjugate gradients stopped at a relative residual of {worst:.2g} (tolerance {TOLERANCE:g}) after"
-        f" {MAX_ITERATIONS} steps for {len(rhs)} unknowns: use a direct solver ('pardiso' or 'superlu') or a Poisson's"
-        " ratio further from 0.5"
-    )
-
-
-def _refuse_no_energy(energy: NDArray[np.float64], n: int) -> None:
-    if not np.all(energy > 0.0):
-        raise SolverError(
-            f"the stiffness of {n} unknowns is not positive definite: a direction has the energy {np.min(energy):.3g};"
-            " hold the body somewhere and check for inverted tetrahedra"
+        solution, _ = conjugate_gradients(
+            self.matrix, rhs, self.cycle, tolerance=TOLERANCE, max_iterations=MAX_ITERATIONS
         )
+        return solution
 
 
 def _factorise(matrix: sparse.csr_matrix[np.float64], near_nullspace: NDArray[np.float64] | None) -> Factorisation:

@@ -5,8 +5,12 @@ Schenk & Gaertner, Future Generation Computer Systems 20 (2004) 475-487.
 
 from __future__ import annotations
 
+import functools
 import importlib
+import importlib.metadata
+import os
 import weakref
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +31,7 @@ class PardisoFactorisation:
 
     def __init__(self, matrix: sparse.csr_matrix[np.float64]) -> None:
         pypardiso = importlib.import_module("pypardiso")
+        _tell_where_mkl_is()
         self._upper = sparse.csr_matrix(sparse.triu(matrix, format="csr"))
         self._upper.sort_indices()
         self._solver = pypardiso.PyPardisoSolver(mtype=SYMMETRIC_POSITIVE_DEFINITE, size_limit_storage=np.inf)
@@ -45,6 +50,19 @@ class PardisoFactorisation:
     def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
         """Solution X (n, m) of A X = rhs (n, m), all columns at once."""
         return np.asarray(self._solver.solve(self._upper, np.asfortranarray(rhs)))
+
+
+@functools.cache
+def _tell_where_mkl_is() -> None:
+    """Set pypardiso's own variable, once: without it every factorisation searches the whole environment for MKL."""
+    try:
+        files = importlib.metadata.files("mkl") or []
+    except importlib.metadata.PackageNotFoundError:
+        return
+    found = [Path(str(file.locate())).resolve() for file in files if "mkl_rt" in file.name]
+    existing = [str(path) for path in found if path.exists()]
+    if existing:
+        os.environ.setdefault("PYPARDISO_MKL_RT", min(existing, key=len))
 
 
 def _available() -> bool:

@@ -1,0 +1,208 @@
+"""From the linear estimate to that of a finite-strain law: Gauss-Newton on expansions around true equilibria.
+
+The linear law is off by tens of per cent where a wall moves by half its radius, but near enough to begin. Each round
+minimises the objective on an expansion to first order around the present equilibrium, solves the equilibrium where that
+leads, and expands it anew; where it does not lower the objective the step is halved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import NotConverged
+from palpate.inversion.gauss_newton import Bounds, Minimum, Outcome
+from palpate.inversion.minima import minimised, settled_between, words
+from palpate.inversion.noise import NoiseLaw
+from palpate.inversion.objective import Objective
+from palpate.inversion.problem import InverseProblem, Inversion, InversionSettings
+from palpate.inversion.weighting import objective_of, residual_law, reweighted
+from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
+from palpate.mechanics.first_order import FirstOrderModel, expanded
+from palpate.mechanics.forward import SolveCounts
+from palpate.mesh.constraint import Constraint
+
+__all__ = ["Expansion", "continued_at_finite_strain"]
+
+ROUNDS = 8
+REACH = 0.8  # of ln E, within which an expansion is trusted
+HALVINGS = 3
+NOISE = 0.5  # of the objective, in units of log-likelihood: the noise of re-chosen closest points
+POLISH = 1e-5  # decrement of a round's minimum
+
+
+@dataclass(frozen=True, slots=True)
+class Expansion:
+    """A model to first order around `equilibrium`, and what the full one has cost so far."""
+
+    reduced: FirstOrderModel
+    equilibrium: FiniteStrainEquilibrium = field(repr=False)
+    counts: SolveCounts
+
+    @property
+    def constraint(self) -> Constraint:
+        """What is prescribed to the model."""
+        return self.equilibrium.model.constraint
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """A minimum under the objective made of the expansions around the equilibria where the last round led."""
+
+    objective: Objective
+    minimum: Minimum
+    expansions: tuple[Expansion, ...]
+    law: NoiseLaw
+    settled: bool = False
+
+
+def continued_at_finite_strain(
+    problem: InverseProblem,
+    models: tuple[FiniteStrainModel, ...],
+    linear: Inversion,
+    settings: InversionSettings,
+    *,
+    progress: Callable[[str], None],
+) -> Inversion:
+    """The estimate under the law of `models`, one for each of the problem's, from the minima of the `linear` one.
+
+    Each distinct linear minimum that converged is continued, the best one always. Raises `NotConverged` when its
+    equilibrium is not found, with the element and the share of the motion where it ended.
+    """
+    models = tuple(model.under(s.constraint) for model, s in zip(models, linear.surrogates, strict=True))
+    chosen = linear.groups[linear.best]
+    places = {chosen: _followed(problem, models, linear, linear.minimum, settings, progress)}
+    for minimum, group in zip(linear.minima, linear.groups, strict=True):
+        if group not in places and minimum.outcome.converged:
+            places[group] = _followed(problem, models, linear, minimum, settings, progress)
+    best = min(places, key=lambda group: places[group].minimum.evaluation.value)
+    minima = tuple(
+        _joined(m, places[g].minimum) if g in places else m for m, g in zip(linear.minima, linear.groups, strict=True)
+    )
+    place = places[best]
+    spent = sum((e.counts for p in places.values() for e in p.expansions), SolveCounts())
+    return replace(
+        linear,
+        objective=place.objective,
+        minima=minima,
+        best=linear.groups.index(best),
+        law=place.law,
+        surrogates=place.expansions,
+        settled=place.settled,
+        evaluations=sum(len(minimum.history) for minimum in minima),
+        counts=linear.counts + spent,
+    )
+
+
+def _joined(first: Minimum, second: Minimum) -> Minimum:
+    return replace(second, history=first.history + second.history)
+
+
+def _followed(
+    problem: InverseProblem,
+    models: tuple[FiniteStrainModel, ...],
+    linear: Inversion,
+    start: Minimum,
+    settings: InversionSettings,
+    progress: Callable[[str], None],
+) -> _Place:
+    """Rounds from one linear minimum until the moduli no longer move."""
+    progress("finite strain: the equilibrium at the linear estimate")
+    moduli, amounts = _split(linear.objective, start.unknowns)
+    equilibria = tuple(model.solve(moduli, q) for model, q in zip(models, amounts, strict=True))
+    expansions = tuple(_expansion(equilibrium, SolveCounts()) for equilibrium in equilibria)
+    place = _placed(problem, expansions, replace(start, history=()), linear.law, settings)
+    for number in range(ROUNDS):
+        progress(f"finite strain, round {number + 1}: {words(problem, place.minimum)}")
+        following = _round(problem, place, settings)
+        settled = settled_between(place.minimum, following.minimum, linear.objective.n_parameters)
+        place = replace(following, settled=settled)
+        if settled:
+            break
+    found = minimised(place.objective, place.minimum.unknowns, settings, tolerance=POLISH)
+    end = _joined(place.minimum, found)
+    return replace(place, minimum=end if place.settled else replace(end, outcome=Outcome.STEPS))
+
+
+def _placed(
+    problem: InverseProblem,
+    expansions: tuple[Expansion, ...],
+    at: Minimum,
+    law: NoiseLaw,
+    settings: InversionSettings,
+) -> _Place:
+    """The objective of the expansions, weighted by the residuals at their own equilibria."""
+    models = tuple(expansion.reduced for expansion in expansions)
+    first = objective_of(problem, models, law).with_fresh_correspondence(at.unknowns)
+    here = first(at.unknowns)
+    law = settings.law or residual_law(problem, here)
+    objective = reweighted(objective_of(problem, models, law), replace(at, evaluation=here), law)
+    return _Place(objective, replace(at, evaluation=objective(at.unknowns)), expansions, law)
+
+
+def _round(problem: InverseProblem, place: _Place, settings: InversionSettings) -> _Place:
+    """The minimum on the present expansions, or a part of the way to it, with the equilibria there."""
+    now = place.minimum
+    near = replace(settings, bounds=_near(settings.bounds, now.unknowns[: place.objective.n_parameters]))
+    found = minimised(place.objective, now.unknowns, near)
+    step = found.unknowns - now.unknowns
+    for halving in range(HALVINGS + 1):
+        unknowns = now.unknowns + 0.5**halving * step
+        moduli, amounts = _split(place.objective, unknowns)
+        equilibria = tuple(_solved(e, moduli, q) for e, q in zip(place.expansions, amounts, strict=True))
+        converged = all(equilibrium.converged for equilibrium in equilibria)
+        if converged and _value(place, equilibria, unknowns) < now.evaluation.value + NOISE:
+            break
+    for equilibrium in equilibria:
+        if not equilibrium.converged:
+            raise NotConverged(f"no equilibrium near the estimate: {equilibrium.reason}")
+    pairs = zip(equilibria, place.expansions, strict=True)
+    expansions = tuple(_expansion(equilibrium, before.counts) for equilibrium, before in pairs)
+    history = (*now.history, *found.history)
+    return _placed(problem, expansions, replace(found, unknowns=unknowns, history=history), place.law, settings)
+
+
+def _solved(expansion: Expansion, moduli: NDArray[np.float64], amounts: NDArray[np.float64]) -> FiniteStrainEquilibrium:
+    """The equilibrium at other moduli and coefficients, from where the expansion says that it is."""
+    before = expansion.equilibrium
+    start = expansion.reduced.solve(moduli, amounts).displacement
+    found = before.model.attempt(moduli, amounts, start=start, nearby=before.factorisation)
+    return found if found.converged else before.model.attempt(moduli, amounts, start=before.displacement)
+
+
+def _expansion(equilibrium: FiniteStrainEquilibrium, spent: SolveCounts) -> Expansion:
+    """Expand around an equilibrium with its own factorisation, which then serves the next solve."""
+    exact = equilibrium.refactorised()
+    model = expanded(exact, names=exact.model.names, moduli=exact.moduli, coefficients=exact.coefficients)
+    return Expansion(model, exact, spent + equilibrium.counts + exact.tangent_counts + SolveCounts(factorisations=1))
+
+
+def _value(place: _Place, equilibria: tuple[FiniteStrainEquilibrium, ...], unknowns: NDArray[np.float64]) -> float:
+    """The objective of a place at the true displacements instead of the expansions'."""
+    states = tuple(
+        replace(state, model=_still(equilibrium, np.concatenate([t.surface.dofs for t in state.targets])))
+        for state, equilibrium in zip(place.objective.states, equilibria, strict=True)
+    )
+    return replace(place.objective, states=states).value(unknowns)
+
+
+def _still(equilibrium: FiniteStrainEquilibrium, dofs: NDArray[np.int64]) -> FirstOrderModel:
+    """A model that knows one displacement only."""
+    flat = np.zeros((len(dofs), equilibrium.model.n_regions + equilibrium.model.n_modes))
+    moduli, amounts = equilibrium.moduli, equilibrium.coefficients
+    return FirstOrderModel(equilibrium.model.names, moduli, amounts, equilibrium.values[dofs], flat)
+
+
+def _split(
+    objective: Objective, unknowns: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
+    """Moduli (n_regions,) kPa and each state's coefficients (n_modes,)."""
+    return objective.modulus_map.moduli(unknowns[: objective.n_parameters]), objective.coefficients(unknowns)
+
+
+def _near(bounds: Bounds, theta: NDArray[np.float64]) -> Bounds:
+    """The bounds, no further from theta (n_parameters,) than an expansion is trusted."""
+    return Bounds(np.maximum(bounds.lower, theta - REACH), np.minimum(bounds.upper, theta + REACH))

@@ -1,0 +1,78 @@
+"""Minima of an objective: found, continued under another one, compared with each other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.inversion.gauss_newton import Minimum, gauss_newton
+from palpate.inversion.lbfgs import lbfgs
+from palpate.inversion.objective import Objective
+from palpate.inversion.problem import InverseProblem, InversionSettings
+
+__all__ = ["best_of", "continued", "groups_of", "minimised", "settled_between", "with_driver", "words"]
+
+SAME_MINIMUM = 0.02  # of ln E
+SETTLED = 0.05  # posterior standard deviations by which a round may still move the estimate
+
+
+def minimised(
+    objective: Objective, start: NDArray[np.float64], settings: InversionSettings, *, tolerance: float = 1e-3
+) -> Minimum:
+    """The minimum from `start` (n_unknowns,) by the method of the settings; `tolerance` of the decrement."""
+    if settings.method == "lbfgs":
+        return lbfgs(objective, start, bounds=settings.bounds, tolerance=tolerance)
+    return gauss_newton(objective, start, bounds=settings.bounds, tolerance=tolerance)
+
+
+def continued(
+    objective: Objective, minimum: Minimum, settings: InversionSettings, *, tolerance: float = 1e-3
+) -> Minimum:
+    """Go on from a minimum under a new objective; the history goes on, too."""
+    found = minimised(objective, minimum.unknowns, settings, tolerance=tolerance)
+    return replace(found, history=minimum.history + found.history)
+
+
+def with_driver(minimum: Minimum, best: Minimum, n_parameters: int) -> Minimum:
+    """The moduli of a minimum with the driver's motion of the best one, which the later rounds have refined."""
+    unknowns = np.concatenate([minimum.unknowns[:n_parameters], best.unknowns[n_parameters:]])
+    return replace(minimum, unknowns=unknowns)
+
+
+def best_of(minima: tuple[Minimum, ...]) -> int:
+    """Number of the converged minimum with the smallest value; of them all when none converged."""
+    values = [m.evaluation.value if m.outcome.converged else np.inf for m in minima]
+    if not np.isfinite(values).any():
+        values = [m.evaluation.value for m in minima]
+    return int(np.argmin(values))
+
+
+def groups_of(minima: tuple[Minimum, ...], n_parameters: int) -> tuple[int, ...]:
+    """Number of the distinct minimum each start ended in, in the order of the starts."""
+    distinct: list[NDArray[np.float64]] = []
+    groups = []
+    for minimum in minima:
+        theta = minimum.unknowns[:n_parameters]
+        same = [i for i, other in enumerate(distinct) if np.abs(theta - other).max() < SAME_MINIMUM]
+        if not same:
+            distinct.append(theta)
+        groups.append(same[0] if same else len(distinct) - 1)
+    return tuple(groups)
+
+
+def settled_between(before: Minimum, after: Minimum, n_parameters: int) -> bool:
+    """Whether a round moved the log-moduli by little, in units of their own uncertainty."""
+    inverse = np.linalg.inv(after.evaluation.matrix)[:n_parameters, :n_parameters]
+    moved = np.abs(after.unknowns - before.unknowns)[:n_parameters]
+    return bool(np.all(moved < SETTLED * np.sqrt(np.diag(inverse))))
+
+
+def words(problem: InverseProblem, minimum: Minimum) -> str:
+    """The moduli at a minimum in words, for the progress."""
+    mapping = problem.modulus_map
+    ratios = np.exp(minimum.unknowns[: len(mapping.tissues)])
+    return ", ".join(
+        f"{name} {ratio:.2f} x {mapping.relative_to}" for name, ratio in zip(mapping.tissues, ratios, strict=True)
+    )

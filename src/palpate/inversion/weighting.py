@@ -1,0 +1,73 @@
+"""How much each residual counts: by the law of the residuals, robustly, and only where surfaces face each other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.inversion.gauss_newton import Minimum
+from palpate.inversion.noise import NoiseLaw, fit_noise_law
+from palpate.inversion.objective import Evaluation, Linearisation, Objective, State, Weighting
+from palpate.inversion.problem import InverseProblem, LocalModel
+
+__all__ = ["FIRST_LAW", "objective_of", "residual_law", "reweighted"]
+
+TUKEY = 4.685  # cutoff in standard deviations, 95 % efficient for normal errors (Huber 1981)
+MAD = 1.4826  # standard deviations of a normal law in one median absolute deviation
+LEAST_CUTOFF = 5e-3  # mm
+FIRST_LAW = NoiseLaw(np.array([0.3**2]), np.array([3.0]))  # until the residuals tell
+
+
+def objective_of(problem: InverseProblem, models: tuple[LocalModel, ...], law: NoiseLaw) -> Objective:
+    """The objective of the models, one for each later image; all residuals count, by their `law`."""
+    states = tuple(
+        State(m.at(np.concatenate([t.surface.dofs for t in targets])), targets)
+        for m, targets in zip(models, problem.targets, strict=True)
+    )
+    precision, noise = _precision(problem, law), law.sd**2 * law.correlation_area
+    weighting = tuple(
+        tuple(Weighting(precision, np.inf, np.ones(len(t.image_points), dtype=bool), noise) for t in targets)
+        for targets in problem.targets
+    )
+    return Objective(states, problem.modulus_map, weighting)
+
+
+def _precision(problem: InverseProblem, law: NoiseLaw) -> float:
+    """Weight (mm^-2) of a surface's mean square: independent residuals on a mean surface, by their variance."""
+    areas = [float(target.area.sum()) for targets in problem.targets for target in targets]
+    return max(float(np.mean(areas)) / law.correlation_area, 1.0) / law.sd**2
+
+
+def reweighted(objective: Objective, minimum: Minimum, law: NoiseLaw) -> Objective:
+    """Tukey cutoffs from the residuals at a minimum, and image points chosen anew there.
+
+    A surface that fits worse than the law of the residuals (a driver whose modes cannot follow its wall) counts by its
+    own mean square, so that its misfit is not forced into the other unknowns.
+    """
+    lines = iter(minimum.evaluation.surfaces)
+    weighting = tuple(
+        tuple(_weighting_of(next(lines), weighting, law) for weighting in weightings)
+        for weightings in objective.weighting
+    )
+    return replace(objective, weighting=weighting).with_fresh_correspondence(minimum.unknowns)
+
+
+def _weighting_of(line: Linearisation, weighting: Weighting, law: NoiseLaw) -> Weighting:
+    values = line.residuals.values
+    cutoff = _cutoff(values)
+    inside = np.abs(values) < cutoff
+    mean_square = float(np.average(values[inside] ** 2, weights=line.residuals.weights[inside]))
+    share = min(1.0, law.sd**2 / max(mean_square, 1e-12))
+    return replace(weighting, cutoff=cutoff, precision=weighting.precision * share)
+
+
+def _cutoff(values: NDArray[np.float64]) -> float:
+    return max(TUKEY * MAD * float(np.median(np.abs(values))), LEAST_CUTOFF)
+
+
+def residual_law(problem: InverseProblem, evaluation: Evaluation) -> NoiseLaw:
+    """Law of the residuals of the `estimate` tissues; the driver's own are flattened by its many unknowns."""
+    seen = [s.residuals for s in evaluation.surfaces if s.target.surface.name in problem.estimated]
+    return fit_noise_law([r.values for r in seen], [r.places for r in seen], [r.normals for r in seen])

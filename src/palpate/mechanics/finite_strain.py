@@ -1,0 +1,345 @@
+"""Equilibrium of several tissues under any law, at finite strain, with its exact derivatives.
+
+An admissible u = F z + M q + o is in equilibrium when F^T R(u) = 0 with R = internal - external forces. With the
+tangent K = dR/du and K_ff = F^T K F the derivatives there are du/dp = -F K_ff^-1 F^T dR/dp for a constant p of a
+tissue, and du/dq = M - F K_ff^-1 F^T K M.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from palpate.errors import ConfigurationError, NotConverged
+from palpate.mechanics.balance import TissueBalance
+from palpate.mechanics.dilatation import Dilatation, pointwise_lame, pointwise_lame_slope
+from palpate.mechanics.forward import SolveCounts, checked_coefficients, checked_moduli
+from palpate.mechanics.hyperelastic import Elements, Moduli, elements_of
+from palpate.mechanics.laws.contract import Law
+from palpate.mechanics.linearised import LinearisedSystem
+from palpate.mechanics.loads import Load
+from palpate.mechanics.newton import NewtonPath, NewtonSettings, follow
+from palpate.mechanics.pattern import BlockPattern, Restriction, block_pattern, restriction
+from palpate.mechanics.solvers.contract import Factorisation
+from palpate.mechanics.stiffness import lame_by_poisson, lame_parameters
+from palpate.mesh.constraint import Constraint
+from palpate.mesh.space import LagrangeSpace
+
+__all__ = ["FiniteStrainEquilibrium", "FiniteStrainModel", "finite_strain_model"]
+
+Array = NDArray[np.float64]
+
+FACTORISATION_IN_SOLVES = 30  # right-hand sides that cost as much as a factorisation
+REFINEMENTS = 12  # solutions with an old factorisation that an exact one takes
+
+
+@dataclass(frozen=True, slots=True)
+class FiniteStrainModel:
+    """All meshed tissues of a body under one law, one constraint and given loads; implements `ForwardModel`.
+
+    regions: indices in `space.mesh.tissues` of the meshed ones; element_region (n_tets,): place in `regions` of each
+    tetrahedron; poisson_ratios (n_regions,), dimensionless.
+    """
+
+    space: LagrangeSpace
+    constraint: Constraint
+    elements: Elements
+    regions: tuple[int, ...]
+    element_region: NDArray[np.int64]
+    poisson_ratios: Array
+    loads: tuple[Load, ...]
+    pattern: BlockPattern
+    restriction: Restriction
+    settings: NewtonSettings
+    solver: str
+
+    @property
+    def n_regions(self) -> int:
+        """Number of moduli."""
+        return len(self.regions)
+
+    @property
+    def n_modes(self) -> int:
+        """Number of boundary modes."""
+        return self.constraint.n_modes
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the tissues in the order of the moduli."""
+        return tuple(self.space.mesh.tissues[region].name for region in self.regions)
+
+    def solve(
+        self,
+        moduli: NDArray[np.float64],
+        coefficients: NDArray[np.float64],
+        *,
+        start: Array | None = None,
+        nearby: Factorisation | None = None,
+    ) -> FiniteStrainEquilibrium:
+        """Equilibrium at moduli (n_regions,) kPa and mode coefficients (n_modes,).
+
+        The way begins at `start` (n_points, 3) mm, or at rest; `nearby`, the factorisation of a like stiffness (that of
+        another equilibrium, or of the `LinearModel` with the same dilatation), saves making one. Raises `NotConverged`
+        with the reason; `attempt` gives the state that was reached instead.
+        """
+        equilibrium = self.attempt(moduli, coefficients, start=start, nearby=nearby)
+        if not equilibrium.converged:
+            raise NotConverged(equilibrium.reason)
+        return equilibrium
+
+    def attempt(
+        self,
+        moduli: NDArray[np.float64],
+        coefficients: NDArray[np.float64],
+        *,
+        start: Array | None = None,
+        nearby: Factorisation | None = None,
+    ) -> FiniteStrainEquilibrium:
+        """As `solve`, with moduli (n_regions,) and coefficients (n_modes,), but a failure returns the best state.
+
+        It is then marked `converged` False, with the reason and the share of the motion that was reached.
+        """
+        checked, amounts = checked_moduli(moduli, self.names), checked_coefficients(coefficients, self.n_modes)
+        balance = self.balance(checked)
+        begin = np.zeros(3 * len(self.space.points)) if start is None else self._checked_start(start)
+        free = self.constraint.free
+        given = self.constraint.modes @ amounts + self.constraint.offset
+        now = begin - np.asarray(free @ np.asarray(free.T @ begin))
+        path = follow(balance, begin, given - now, settings=self.settings, nearby=nearby)
+        if path.converged:  # what is prescribed is met to the last digit
+            path = replace(path, displacement=np.asarray(free @ np.asarray(free.T @ path.displacement)) + given)
+        path.displacement.setflags(write=False)
+        return FiniteStrainEquilibrium(self, balance, checked, amounts, path)
+
+    def balance(self, moduli: NDArray[np.float64]) -> TissueBalance:
+        """The forces at Young's moduli (n_regions,) kPa, as functions of the displacement."""
+        return TissueBalance(
+            space=self.space,
+            elements=self.elements,
+            element_region=self.element_region,
+            n_regions=self.n_regions,
+            loads=self.loads,
+            pattern=self.pattern,
+            restriction=self.restriction,
+            solver=self.solver,
+            moduli=self.moduli_of(moduli),
+        )
+
+    def moduli_of(self, moduli: NDArray[np.float64]) -> Moduli:
+        """Lame's constants of every element at Young's moduli (n_regions,) kPa."""
+        return self._spread(moduli, [self._lame(nu) for nu in self.poisson_ratios])
+
+    def moduli_by_poisson(self, moduli: NDArray[np.float64]) -> Moduli:
+        """Derivatives of every element's Lame constants with respect to its nu, at moduli (n_regions,) kPa."""
+        return self._spread(moduli, [self._lame_slope(nu) for nu in self.poisson_ratios])
+
+    def under(self, constraint: Constraint) -> FiniteStrainModel:
+        """The same body with other modes and another offset of the same prescribed points.
+
+        Raises `ConfigurationError` when the constraint leaves other displacements free.
+        """
+        free, other = self.constraint.free, constraint.free
+        if free is not other and (free.shape != other.shape or abs(free - other).max() > 0.0):
+            raise ConfigurationError(
+                f"the constraint frees other displacements ({other.shape[1]}) than the model ({free.shape[1]}):"
+                " make another model with `finite_strain_model`"
+            )
+        return replace(self, constraint=constraint)
+
+    def _lame(self, poisson_ratio: float) -> tuple[float, float, float]:
+        """(mu, lambda at the points, lambda in the mean) at E = 1."""
+        lame, mu = lame_parameters(1.0, poisson_ratio)
+        pointwise = pointwise_lame(self.elements.dilatation, lame, mu)
+        return mu, pointwise, lame - pointwise
+
+    def _lame_slope(self, poisson_ratio: float) -> tuple[float, float, float]:
+        lame, mu = lame_parameters(1.0, poisson_ratio)
+        by_lame, by_mu = lame_by_poisson(1.0, poisson_ratio)
+        pointwise = pointwise_lame_slope(self.elements.dilatation, lame, mu, by=(by_lame, by_mu))
+        return by_mu, pointwise, by_lame - pointwise
+
+    def _spread(self, moduli: NDArray[np.float64], units: list[tuple[float, float, float]]) -> Moduli:
+        mu, pointwise, mean = (moduli[:, None] * np.array(units)).T[:, self.element_region]
+        return Moduli(mu, pointwise, mean)
+
+    def _checked_start(self, start: Array) -> Array:
+        if start.shape != self.space.points.shape or not np.all(np.isfinite(start)):
+            raise ConfigurationError(
+                f"the start has the shape {start.shape}; give a finite displacement {self.space.points.shape} in mm"
+            )
+        return np.array(start, dtype=float).ravel()
+
+
+@dataclass(frozen=True, slots=True)
+class FiniteStrainEquilibrium:
+    """The state at the end of a path; implements `Equilibrium`. Its derivatives exist only when it is `converged`."""
+
+    model: FiniteStrainModel = field(repr=False)
+    balance: TissueBalance = field(repr=False)
+    moduli: NDArray[np.float64]
+    coefficients: NDArray[np.float64]
+    path: NewtonPath = field(repr=False)
+
+    @property
+    def values(self) -> NDArray[np.float64]:
+        """Displacement u (n_dof,) mm."""
+        return self.path.displacement
+
+    @property
+    def displacement(self) -> NDArray[np.float64]:
+        """Displacement u (n_points, 3) mm."""
+        return self.path.displacement.reshape(-1, 3)
+
+    @property
+    def converged(self) -> bool:
+        """Whether the body is in equilibrium under the whole motion and load."""
+        return self.path.converged
+
+    @property
+    def reason(self) -> str:
+        """A sentence: how the iteration ended; of a failure, at which step and with which element."""
+        return self.path.reason
+
+    @property
+    def fraction(self) -> float:
+        """The share of the motion and load that was reached; 1 when converged."""
+        return self.path.fraction
+
+    @property
+    def counts(self) -> SolveCounts:
+        """What the way to this equilibrium cost."""
+        return self.path.counts
+
+    @property
+    def tangent_counts(self) -> SolveCounts:
+        """One right-hand side a modulus and a mode, and a factorisation where they are many."""
+        n = self.model.n_regions + self.model.n_modes
+        return SolveCounts(tangent=n, factorisations=int(self._many(n)))
+
+    @property
+    def adjoint_counts(self) -> SolveCounts:
+        """One right-hand side."""
+        return SolveCounts(adjoint=1, factorisations=int(self._many(1)))
+
+    @property
+    def factorisation(self) -> Factorisation | None:
+        """The last factorisation, of a tangent stiffness near this state's: for `nearby` of another solve."""
+        return self.path.factorisation
+
+    def refactorised(self) -> FiniteStrainEquilibrium:
+        """The same state with the factorisation of its own tangent stiffness; raises `NotConverged`.
+
+        Worth its price before `tangent` when another solve follows that can use it as `nearby`.
+        """
+        path = self.path.with_factorisation(self.balance.factorise(self._stiffness()))
+        return replace(self, path=replace(path, exact=True))
+
+    def tangent(self) -> NDArray[np.float64]:
+        """T (n_dof, n_regions + n_modes), mm: columns du / d ln E_r, then du / dq_k; raises `NotConverged`."""
+        stiffness = self._stiffness()
+        loads = self._parameter_loads(stiffness)
+        result = np.asarray(self.balance.free @ self._system(stiffness, loads.shape[1]).solve(loads))
+        result[:, self.model.n_regions :] += self.model.constraint.modes
+        return result
+
+    def modulus_tangents(self) -> NDArray[np.float64]:
+        """Columns du / d ln E_r (n_dof, n_regions) mm alone; raises `NotConverged`."""
+        stiffness = self._stiffness()
+        forces = self.balance.region_forces(self.values, self.balance.moduli)
+        loads = -np.asarray(self.balance.free.T @ forces)
+        return np.asarray(self.balance.free @ self._system(stiffness, loads.shape[1]).solve(loads))
+
+    def poisson_tangents(self) -> NDArray[np.float64]:
+        """Columns du / d nu_r (n_dof, n_regions) mm; raises `NotConverged`."""
+        stiffness = self._stiffness()
+        loads = -self._poisson_forces()
+        return np.asarray(self.balance.free @ self._system(stiffness, loads.shape[1]).solve(loads))
+
+    def adjoint(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
+        """T^T g (n_regions + n_modes,) for g (n_dof,), by one adjoint solve; raises `NotConverged`."""
+        stiffness = self._stiffness()
+        dual = self._dual(stiffness, gradient)
+        result = np.asarray(self._parameter_loads(stiffness).T @ dual)
+        result[self.model.n_regions :] += self.model.constraint.modes.T @ gradient
+        return result
+
+    def poisson_adjoint(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Products (n_regions,) of the columns du / d nu_r with g (n_dof,), by one adjoint solve; `NotConverged`."""
+        return np.asarray(-self._poisson_forces().T @ self._dual(self._stiffness(), gradient))
+
+    def _stiffness(self) -> sparse.csr_matrix[np.float64]:
+        if not self.converged:
+            raise NotConverged(f"a state out of equilibrium has no derivatives: {self.reason}")
+        return self.balance.stiffness(self.values)
+
+    def _many(self, n: int) -> bool:
+        """Whether a new factorisation costs less than to refine n solutions of the old one."""
+        if self.path.factorisation is None:
+            return True
+        return not self.path.exact and n * (REFINEMENTS - 1) > FACTORISATION_IN_SOLVES
+
+    def _system(self, stiffness: sparse.csr_matrix[np.float64], n: int) -> LinearisedSystem:
+        """The linear system at this state, ready for n right-hand sides."""
+        old = self.path.factorisation
+        ready = self.balance.factorise(stiffness) if old is None or self._many(n) else old
+        if isinstance(ready, LinearisedSystem):
+            ready = ready.nearby
+        return LinearisedSystem(self.balance.restricted(stiffness), ready, symmetric=self.balance.symmetric)
+
+    def _dual(self, stiffness: sparse.csr_matrix[np.float64], gradient: NDArray[np.float64]) -> Array:
+        """K_ff^-T F^T g (n_free,)."""
+        load = np.asarray(self.balance.free.T @ gradient)
+        return self._system(stiffness, 1).transposed().solve(load[:, None])[:, 0]
+
+    def _parameter_loads(self, stiffness: sparse.csr_matrix[np.float64]) -> Array:
+        """-F^T [dR / d ln E_r, K M] (n_free, n_regions + n_modes), mN."""
+        forces = self.balance.region_forces(self.values, self.balance.moduli)
+        moved = np.asarray(stiffness @ self.model.constraint.modes)
+        return -np.asarray(self.balance.free.T @ np.concatenate([forces, moved], axis=1))
+
+    def _poisson_forces(self) -> Array:
+        """F^T dR / d nu_r (n_free, n_regions), mN."""
+        slopes = self.model.moduli_by_poisson(self.moduli)
+        return np.asarray(self.balance.free.T @ self.balance.region_forces(self.values, slopes))
+
+
+def finite_strain_model(
+    space: LagrangeSpace,
+    constraint: Constraint,
+    law: Law,
+    *,
+    dilatation: Dilatation = Dilatation.BLENDED,
+    loads: tuple[Load, ...] = (),
+    settings: NewtonSettings | None = None,
+    solver: str = "auto",
+) -> FiniteStrainModel:
+    """The model of all meshed tissues of `space.mesh` under `law`, with their Poisson's ratios.
+
+    solver: a name of `palpate.mechanics.solvers.registry.SOLVERS` or "auto". Raises `ConfigurationError` when the
+    constraint is of another space, `GeometryError` for tetrahedra without positive volume.
+    """
+    n_dof = 3 * len(space.points)
+    if constraint.free.shape[0] != n_dof or len(constraint.modes) != n_dof or len(constraint.offset) != n_dof:
+        raise ConfigurationError(
+            f"the constraint has {constraint.free.shape[0]} unknowns and the space {n_dof}: make both of the same space"
+        )
+    tissues = space.mesh.tissues
+    regions = tuple(number for number, tissue in enumerate(tissues) if tissue.meshed)
+    pattern = block_pattern(space.cells, len(space.points))
+    blocks = np.ones((space.cells.size * space.cells.shape[1], 9))
+    return FiniteStrainModel(
+        space=space,
+        constraint=constraint,
+        elements=elements_of(space, law, dilatation),
+        regions=regions,
+        element_region=np.searchsorted(regions, space.mesh.region),
+        poisson_ratios=np.array([tissues[region].poisson_ratio for region in regions]),
+        loads=loads,
+        pattern=pattern,
+        restriction=restriction(constraint, pattern.assemble(blocks)),
+        settings=settings or NewtonSettings(),
+        solver=solver,
+    )

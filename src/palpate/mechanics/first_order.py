@@ -1,0 +1,99 @@
+"""A model to first order around one of its equilibria: all that a step of an iteration needs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import ConfigurationError
+from palpate.mechanics.forward import Equilibrium, SolveCounts, checked_coefficients, checked_moduli
+
+__all__ = ["FirstOrderEquilibrium", "FirstOrderModel", "expanded"]
+
+
+@dataclass(frozen=True, slots=True)
+class FirstOrderModel:
+    """u(E, q) = u_0 + T [ln E - ln E_0, q - q_0]; implements `ForwardModel`.
+
+    E_0 `moduli` (n_regions,) kPa of the tissues `names`, q_0 `coefficients` (n_modes,), u_0 `values` (n_outputs,) mm,
+    T `derivatives` (n_outputs, n_regions + n_modes) mm.
+    """
+
+    names: tuple[str, ...]
+    moduli: NDArray[np.float64]
+    coefficients: NDArray[np.float64]
+    values: NDArray[np.float64]
+    derivatives: NDArray[np.float64]
+
+    @property
+    def n_regions(self) -> int:
+        """Number of moduli."""
+        return len(self.moduli)
+
+    @property
+    def n_modes(self) -> int:
+        """Number of boundary modes."""
+        return len(self.coefficients)
+
+    def at(self, dofs: NDArray[np.int64]) -> FirstOrderModel:
+        """The same model with the outputs `dofs` (n,) only, by their place among the present outputs."""
+        return replace(self, values=self.values[dofs], derivatives=self.derivatives[dofs])
+
+    def solve(self, moduli: NDArray[np.float64], coefficients: NDArray[np.float64]) -> FirstOrderEquilibrium:
+        """The expansion at moduli (n_regions,) kPa and mode coefficients (n_modes,)."""
+        change = np.log(checked_moduli(moduli, self.names) / self.moduli)
+        amounts = checked_coefficients(coefficients, self.n_modes) - self.coefficients
+        values = self.values + self.derivatives @ np.concatenate([change, amounts])
+        values.setflags(write=False)
+        return FirstOrderEquilibrium(self, values)
+
+
+@dataclass(frozen=True, slots=True)
+class FirstOrderEquilibrium:
+    """The expansion's displacement `values` (n_outputs,) mm at one place; implements `Equilibrium`."""
+
+    model: FirstOrderModel
+    values: NDArray[np.float64]
+
+    @property
+    def displacement(self) -> NDArray[np.float64]:
+        """Displacement u (n_outputs / 3, 3) mm; raises `ConfigurationError` when the outputs are not whole points."""
+        if len(self.values) % 3:
+            raise ConfigurationError(f"the model has {len(self.values)} outputs, not three a point: use `values`")
+        return self.values.reshape(-1, 3)
+
+    @property
+    def counts(self) -> SolveCounts:
+        """Nothing of the size of the mesh was solved."""
+        return SolveCounts()
+
+    @property
+    def tangent_counts(self) -> SolveCounts:
+        """Nothing of the size of the mesh is solved."""
+        return SolveCounts()
+
+    @property
+    def adjoint_counts(self) -> SolveCounts:
+        """Nothing of the size of the mesh is solved."""
+        return SolveCounts()
+
+    def tangent(self) -> NDArray[np.float64]:
+        """T (n_outputs, n_regions + n_modes), mm: columns du / d ln E_r, then du / dq_k."""
+        return self.model.derivatives.copy()
+
+    def adjoint(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
+        """T^T g (n_regions + n_modes,) for g (n_outputs,)."""
+        return np.asarray(self.model.derivatives.T @ gradient)
+
+
+def expanded(
+    equilibrium: Equilibrium,
+    *,
+    names: tuple[str, ...],
+    moduli: NDArray[np.float64],
+    coefficients: NDArray[np.float64],
+) -> FirstOrderModel:
+    """The expansion around an equilibrium at moduli (n_regions,) kPa and coefficients (n_modes,); one tangent."""
+    return FirstOrderModel(names, moduli, coefficients, equilibrium.values, equilibrium.tangent())

@@ -1,0 +1,166 @@
+"""Forces and stiffness of elements under any law: total Lagrangian, all quadrature points at once.
+
+Energy of an element: V sum_q w_q [mu w(F_q) + lambda_p u(J_q)] + V lambda_m u(J_mean), J_mean = sum_q w_q J_q, with the
+parts lambda_p + lambda_m = lambda that `dilatation` says. Forces and stiffness are its exact derivatives (Bonet & Wood,
+Nonlinear Continuum Mechanics, 2nd ed. 2008, sections 8.6 and 9.4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.mechanics.dilatation import Dilatation
+from palpate.mechanics.element import quadrature, shape_derivatives
+from palpate.mechanics.laws.contract import Law
+from palpate.mechanics.stiffness import checked_gradients
+from palpate.mesh.space import LagrangeSpace
+
+__all__ = ["Elements", "Moduli", "elements_of"]
+
+Array = NDArray[np.float64]
+
+CHUNK = 2048  # elements at once: some 15 MB of tangents at their quadrature points
+
+
+@dataclass(frozen=True, slots=True)
+class Moduli:
+    """Lame's constants of each element, kPa: mu (n_cells,), lambda at the points and in the mean (n_cells,) each."""
+
+    mu: Array
+    pointwise: Array
+    mean: Array
+
+    def part(self, part: slice) -> Moduli:
+        """Those of the elements `part`, (n,) each."""
+        return Moduli(self.mu[part], self.pointwise[part], self.mean[part])
+
+
+@dataclass(frozen=True, slots=True)
+class Elements:
+    """Elements of one law: cells (n_cells, n_a), shape gradients (n_cells, n_q, n_a, 3) 1/mm, volumes (n_cells,) mm^3.
+
+    weights (n_q,) of the quadrature points sum to 1.
+    """
+
+    law: Law
+    dilatation: Dilatation
+    cells: NDArray[np.int64]
+    gradients: Array
+    volumes: Array
+    weights: Array
+
+    def deformation(self, displacement: Array, part: slice = slice(None)) -> Array:
+        """F = I + grad u (n, n_q, 3, 3) of the elements `part`, u (n_points, 3) mm."""
+        nodal = np.swapaxes(displacement[self.cells[part]], 1, 2)
+        return np.asarray(np.eye(3) + nodal[:, None] @ self.gradients[part])
+
+    def smallest_volume(self, displacement: Array) -> tuple[float, int]:
+        """Smallest J at a quadrature point and the number of its element; u (n_points, 3) mm."""
+        F = self.deformation(displacement)
+        volume = self.law.volume(F.reshape(-1, 3, 3)).reshape(F.shape[:2]).min(axis=1)
+        worst = int(np.argmin(volume))
+        return float(volume[worst]), worst
+
+    def energy(self, displacement: Array, moduli: Moduli) -> float:
+        """Stored energy, mN mm, at u (n_points, 3) mm."""
+        F = self.deformation(displacement)
+        flat, shape = F.reshape(-1, 3, 3), F.shape[:2]
+        volume = self.law.volume(flat).reshape(shape)
+        density = moduli.mu[:, None] * self.law.shear_energy(flat).reshape(shape)
+        density += moduli.pointwise[:, None] * self.law.bulk_energy(volume.ravel()).reshape(shape)
+        mean = moduli.mean * self.law.bulk_energy(volume @ self.weights)
+        return float(self.volumes @ (density @ self.weights + mean))
+
+    def forces(self, displacement: Array, moduli: Moduli) -> Array:
+        """Internal forces (n_cells, n_a, 3), mN, of each element at u (n_points, 3) mm: derivatives of its energy."""
+        result = np.empty((len(self.cells), self.cells.shape[1], 3))
+        for part in self._parts():
+            F = self.deformation(displacement, part)
+            flat, (n, n_q) = F.reshape(-1, 3, 3), F.shape[:2]
+            pressure = self._pressure(self.law.volume(flat).reshape(n, n_q), moduli.part(part))
+            stress = np.repeat(moduli.mu[part], n_q)[:, None, None] * self.law.shear_stress(flat)
+            stress += pressure.reshape(-1, 1, 1) * self.law.volume_gradient(flat)
+            weighted = stress.reshape(n, n_q, 3, 3) * (self.volumes[part, None] * self.weights)[:, :, None, None]
+            result[part] = (self._stacked(part) @ np.swapaxes(weighted, 2, 3).reshape(n, -1, 3)).reshape(n, -1, 3)
+        return result
+
+    def pressure_ahead(self, displacement: Array, change: Array, moduli: Moduli) -> Array:
+        """Mean pressures lambda_m (u' + u'' dJ_mean) (n_cells,) kPa, with dJ_mean linear in du (n_points, 3) mm."""
+        F = self.deformation(displacement)
+        flat = F.reshape(-1, 3, 3)
+        mean = self.law.volume(flat).reshape(F.shape[:2]) @ self.weights
+        slope = np.swapaxes(change[self.cells], 1, 2)[:, None] @ self.gradients
+        growth = np.einsum("nij,nij->n", self.law.volume_gradient(flat), slope.reshape(-1, 3, 3)).reshape(F.shape[:2])
+        pressure = self.law.bulk_pressure(mean) + self.law.bulk_stiffness(mean) * (growth @ self.weights)
+        return np.asarray(moduli.mean * pressure)
+
+    def stiffness(self, displacement: Array, moduli: Moduli, *, pressure: Array | None = None) -> Array:
+        """Derivatives of the forces at u (n_points, 3): blocks (n_cells * n_a * n_a, 9), mN/mm, of pairs of points.
+
+        pressure (n_cells,) kPa takes the place of the mean pressures at u.
+        """
+        n_a = self.cells.shape[1]
+        result = np.empty((len(self.cells), n_a, n_a, 3, 3))
+        for part in self._parts():
+            foreseen = None if pressure is None else pressure[part]
+            result[part] = self._stiffness(displacement, part, moduli.part(part), foreseen)
+        return result.reshape(-1, 9)
+
+    def _parts(self) -> Iterator[slice]:
+        return (slice(start, start + CHUNK) for start in range(0, len(self.cells), CHUNK))
+
+    def _stacked(self, part: slice) -> Array:
+        """Shape gradients (n, n_a, n_q * 3), quadrature points side by side."""
+        gradients = np.swapaxes(self.gradients[part], 1, 2)
+        return np.ascontiguousarray(gradients).reshape(len(gradients), gradients.shape[1], -1)
+
+    def _pressure(self, volume: Array, moduli: Moduli, foreseen: Array | None = None) -> Array:
+        """dW/dJ (n, n_q) kPa at J (n, n_q), or with other mean pressures (n,)."""
+        mean = moduli.mean * self.law.bulk_pressure(volume @ self.weights) if foreseen is None else foreseen
+        if not np.any(moduli.pointwise):
+            return np.broadcast_to(mean[:, None], volume.shape)
+        points = self.law.bulk_pressure(volume.ravel()).reshape(volume.shape)
+        return np.asarray(moduli.pointwise[:, None] * points + mean[:, None])
+
+    def _stiffness(self, displacement: Array, part: slice, moduli: Moduli, foreseen: Array | None) -> Array:
+        """Blocks (n, n_a, n_a, 3, 3) of the elements `part`."""
+        F = self.deformation(displacement, part)
+        flat, (n, n_q) = F.reshape(-1, 3, 3), F.shape[:2]
+        volume, gradient = self.law.volume(flat).reshape(n, n_q), self.law.volume_gradient(flat)
+        tangent = self._tangent(flat, gradient, moduli, volume, self._pressure(volume, moduli, foreseen))
+        tangent *= (self.volumes[part, None] * self.weights).reshape(-1, 1)
+        stacked, n_a = self._stacked(part), self.cells.shape[1]
+        by_second = tangent.reshape(n, n_q, 3, 3, 3, 3).transpose(0, 1, 3, 2, 4, 5).reshape(n, n_q, 27, 3)
+        half = by_second @ np.swapaxes(self.gradients[part], 2, 3)
+        blocks = stacked @ half.reshape(n, n_q * 3, 9 * n_a)
+        blocks = blocks.reshape(n, n_a, 3, 3, n_a).transpose(0, 1, 4, 2, 3)
+        if not np.any(moduli.mean):
+            return np.asarray(blocks)
+        slope = stacked @ np.swapaxes(gradient.reshape(n, n_q, 3, 3) * self.weights[:, None, None], 2, 3).reshape(
+            n, -1, 3
+        )
+        size = self.volumes[part] * moduli.mean * self.law.bulk_stiffness(volume @ self.weights)
+        return np.asarray(blocks + np.einsum("n,nai,nbk->nabik", size, slope, slope, optimize=True))
+
+    def _tangent(self, flat: Array, gradient: Array, moduli: Moduli, volume: Array, pressure: Array) -> Array:
+        """dP/dF (n * n_q, 81) kPa but for the part of the mean volume."""
+        n_q = volume.shape[1]
+        tangent = np.repeat(moduli.mu, n_q)[:, None] * self.law.shear_tangent(flat).reshape(-1, 81)
+        tangent += pressure.reshape(-1, 1) * self.law.volume_curvature(flat).reshape(-1, 81)
+        if np.any(moduli.pointwise):
+            stiffness = np.repeat(moduli.pointwise, n_q) * self.law.bulk_stiffness(volume.ravel())
+            rows = gradient.reshape(-1, 9)
+            tangent += ((stiffness[:, None] * rows)[:, :, None] * rows[:, None, :]).reshape(-1, 81)
+        return np.asarray(tangent)
+
+
+def elements_of(space: LagrangeSpace, law: Law, dilatation: Dilatation) -> Elements:
+    """All elements of `space` under one law; raises `GeometryError` where a tetrahedron has no positive volume."""
+    points, weights = quadrature(2 if space.order == 2 else 1)
+    gradients, volumes = checked_gradients(space, np.ones(len(space.cells), dtype=np.bool_))
+    derivatives = shape_derivatives(space.order, points)
+    return Elements(law, dilatation, space.cells, derivatives @ gradients[:, None], volumes, weights)

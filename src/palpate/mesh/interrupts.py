@@ -1,0 +1,32 @@
+"""Interrupts kept for the program while a library works that would end the process on them."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+__all__ = ["interrupts_held"]
+
+
+@contextmanager
+def interrupts_held() -> Iterator[None]:
+    """Hold SIGINT and SIGTERM while the block works, then let them reach the handlers that were there before.
+
+    Mmg installs handlers of its own, which leave the process at once, and leaves them behind. Does nothing in other
+    than the main thread, or where signals cannot be held.
+    """
+    if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    earlier = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    handlers = {number: signal.getsignal(number) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            if handler is not None:  # None: not Python's, and not ours to put back
+                signal.signal(number, handler)
+        signal.pthread_sigmask(signal.SIG_SETMASK, earlier)

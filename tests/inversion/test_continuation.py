@@ -1,0 +1,56 @@
+"""Finite strain from the linear estimate: the moduli of the law that deformed the body."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from palpate.inversion.continuation import continued_at_finite_strain
+from palpate.inversion.invert import invert
+from palpate.mechanics.finite_strain import finite_strain_model
+from palpate.mechanics.laws.registry import law_named
+
+
+@pytest.fixture(scope="module")
+def body(twins):
+    """A twin whose truth is neo-Hookean, its exact problem and its finite-strain model."""
+    twin = twins.make_twin(element="P1", seed=8)
+    space, constraint = twin.model.space, twin.model.constraint
+    model = finite_strain_model(space, constraint, law_named("neo-hookean"))
+    truth = model.solve(twin.moduli, 0.7 * twin.coefficients).displacement
+    scene = replace(twin.scene, displacement=truth)
+    moved = replace(twin, scene=scene, coefficients=0.7 * twin.coefficients)
+    return moved, twins.exact_problem(moved), model
+
+
+@pytest.fixture(scope="module")
+def linear(twins, body):
+    return invert(body[1], twins.settings(0.5, 8.0), progress=twins.silent)
+
+
+@pytest.fixture(scope="module")
+def continued(twins, body, linear):
+    _, problem, model = body
+    return continued_at_finite_strain(problem, (model,), linear, twins.settings(0.5, 8.0), progress=twins.silent)
+
+
+def test_the_law_that_made_the_data_finds_the_moduli(twins, linear, continued):
+    assert np.abs(linear.minimum.unknowns[:2] - twins.TRUTH).max() > 0.03  # or there would be nothing to show
+    assert continued.minimum.outcome.converged
+    assert continued.settled
+    assert np.abs(continued.minimum.unknowns[:2] - twins.TRUTH).max() < 1e-3
+
+
+def test_the_displacement_reported_is_an_equilibrium(body, continued):
+    model = body[2]
+    objective, unknowns = continued.objective, continued.minimum.unknowns
+    moduli = objective.modulus_map.moduli(unknowns[:2])
+    stated = continued.surrogates[0].reduced.solve(moduli, unknowns[2:]).displacement
+    assert stated == pytest.approx(model.solve(moduli, unknowns[2:]).displacement, abs=1e-5)
+
+
+def test_every_start_carries_its_whole_history(linear, continued):
+    for before, after in zip(linear.minima, continued.minima, strict=True):
+        assert after.history[: len(before.history)] == before.history
