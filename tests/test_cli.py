@@ -19,7 +19,12 @@ from palpate import errors
 from palpate.cli import main
 from palpate.images.label_image import LabelImage
 from palpate.report import case_report
+from palpate.study.outputs import strange_files
 from palpate.study.result import MeshResult, Simulation
+
+FILES = {
+    *("result.json", "report.html", "report-data.npz", "mesh.vtu", "stiffness.nii.gz", "labels.csv", "log.txt"),
+}
 
 CASE = """
 [images]
@@ -65,8 +70,13 @@ def runner(monkeypatch, case_result):
 def test_an_estimate_writes_all_its_files(case_file, tmp_path, capfd):
     assert main(["estimate", str(case_file), "--output", str(tmp_path / "out")]) == 0
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert names == {"result.json", "report.html", "mesh.vtu", "stiffness.nii.gz", "log.txt"}
+    assert names == FILES
     out, err = capfd.readouterr()
+    files = json.loads((tmp_path / "out" / "result.json").read_text())["files"]
+    assert set(files) == {"mesh.vtu", "stiffness.nii.gz", "labels.csv"}
+    assert strange_files(tmp_path / "out", files) == []
+    (tmp_path / "out" / "mesh.vtu").write_text("of another run")
+    assert strange_files(tmp_path / "out", files) == ["mesh.vtu"]
     assert "58.9 kPa" in out
     assert "47.1 to 73.6 kPa" in out
     assert "warning: a warning to be shown" in out
@@ -135,8 +145,11 @@ def test_an_estimate_without_result_still_writes_its_file(case_file, tmp_path, r
         raise error("stopped after 40 steps")
 
     runner(estimate=fail)
+    (tmp_path / "mesh.vtu").write_text("earlier")
     assert main(["estimate", str(case_file), "--output", str(tmp_path), "--quiet"]) == 5
     document = json.loads((tmp_path / "result.json").read_text())
+    assert (document["files"], [warning["code"] for warning in document["warnings"]]) == ({}, ["earlier-files"])
+    assert "mesh.vtu" in document["warnings"][0]["message"]
     assert (document["status"], document["reason"]) == (status, "stopped after 40 steps")
     assert [estimate["value"] for estimate in document["estimates"]] == [None]
     assert "stopped after 40 steps" in (tmp_path / "report.html").read_text()
@@ -272,5 +285,5 @@ def test_help_is_quick():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert time.monotonic() - began < 5.0
     assert done.returncode == 0
-    for command in ("demo", "mesh", "simulate", "estimate"):
+    for command in ("demo", "init", "check", "mesh", "simulate", "estimate", "report"):
         assert command in done.stdout

@@ -13,6 +13,7 @@ import pytest
 import palpate.inversion
 from palpate.inversion.objective import Objective, State, Weighting
 from palpate.inversion.surrogate import first_surrogate, with_modulus_series
+from palpate.observation.misfit import ImagePointUse
 
 MEMBERS = ("__call__", "value", "n_parameters", "n_unknowns")
 
@@ -28,8 +29,8 @@ def objective_of(problem, *, cutoff=np.inf, precision=30.0) -> Objective:
     for model, targets in zip(problem.models, problem.targets, strict=True):
         reduced = surrogate_of(model, moduli, problem.modulus_map.columns)
         states.append(State(reduced.at(np.concatenate([t.surface.dofs for t in targets])), targets))
-        kept = [np.ones(len(t.image_points), dtype=bool) for t in targets]
-        weighting.append(tuple(Weighting(precision, cutoff, k) for k in kept))
+        every = [ImagePointUse(np.ones(len(t.image_points), bool), np.zeros(len(t.image_points))) for t in targets]
+        weighting.append(tuple(Weighting(precision, cutoff, use) for use in every))
     return Objective(tuple(states), problem.modulus_map, tuple(weighting))
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from palpate.images.distance import distance_map
 from palpate.images.label_image import VoxelGrid
-from palpate.observation.misfit import observed_image_points, surface_residuals
+from palpate.observation.misfit import image_point_use, surface_residuals
 from palpate.observation.observed_surface import ObservedSurface
 from palpate.observation.target import surface_target, target_from
 from palpate.phantoms.shapes import Ellipsoid, ball, rotation_about
@@ -171,7 +171,7 @@ def test_image_points_that_face_the_hidden_part_are_dropped(sphere, rng):
     points = CENTRE + 10.5 * towards
     shape = ball(CENTRE, 10.5)
     target = target_from(surface, shape, shape, level=0.0, image=(points, np.ones(500)))
-    kept = observed_image_points(target, np.zeros_like(surface.rest))
+    kept = image_point_use(target, np.zeros_like(surface.rest)).kept
     assert np.all(towards[kept, 2] > 0.0)
     assert kept[towards[:, 2] > 0.1].all()  # nearer to the rim, the rim itself is closest
     below = surface_residuals(target, np.zeros_like(surface.rest), kept)

@@ -7,6 +7,8 @@ import pytest
 
 from palpate.images.distance import distance_map
 from palpate.images.label_image import VoxelGrid
+from palpate.images.voxel_noise import terrace_noise
+from palpate.observation.misfit import image_point_use
 from palpate.observation.observed_surface import ObservedSurface
 from palpate.observation.target import surface_target, target_from
 from palpate.phantoms.shapes import ball
@@ -39,6 +41,17 @@ def test_surfaces_along_the_voxels_planes_are_noisier(surface, maps):
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     steepest = np.abs(normals).max(axis=1)
     assert target.terraces[steepest.argmax()] > 20.0 * target.terraces[steepest < 0.8].max()
+
+
+def test_the_rounding_at_image_points_is_judged_by_the_models_smooth_surface(sphere, maps):
+    """The image's own normals are noisy with the rounding itself: weights made of them would go with the errors."""
+    vertices, triangles = sphere(3)
+    everywhere, rim = np.ones(len(triangles), dtype=bool), np.zeros((len(triangles), 3), dtype=bool)
+    whole = ObservedSurface(0, "ball", np.arange(len(vertices)), 9.0 * vertices, triangles, everywhere, rim, 1.0)
+    target = surface_target(whole, maps[0], maps[0])
+    found = image_point_use(target, np.zeros_like(whole.rest)).terraces
+    radial = target.image_points / np.linalg.norm(target.image_points, axis=1, keepdims=True)
+    assert np.corrcoef(found, terrace_noise(maps[0], maps[0], radial))[0, 1] > 0.99
 
 
 def test_quadrature_covers_the_observed_part_only(surface, maps):

@@ -126,7 +126,6 @@ BAD = {
     "estimate.start_ratios=[]": "positive numbers",
     "domain.outer_boundary=open": "did you mean",
     "phantom.kind=pelvis": "not both",
-    "pairs=[{before='a.nii', after=['b.nii']}]": "not offered",
     "id=''": "printable name",
     "edge": "write key.path=value",
     "a b=3": "not valid TOML",

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from palpate.errors import EstimationError
 from palpate.inversion.modulus_map import ModulusMap
 from palpate.mechanics.forward import ForwardModel
-from palpate.observation.misfit import SurfaceResiduals, observed_image_points, surface_residuals
+from palpate.observation.misfit import ImagePointUse, SurfaceResiduals, image_point_use, surface_residuals
 from palpate.observation.target import SurfaceTarget
 
 __all__ = ["Evaluation", "Linearisation", "Objective", "State", "Weighting"]
@@ -36,13 +36,13 @@ class State:
 class Weighting:
     """How the residuals of one surface count: `precision` (mm^-2) of its mean square, Tukey `cutoff` (mm, inf: none).
 
-    kept (n_i,) marks the image points in use; `noise` (mm^4, inf: all count by area) is the residuals' variance times
-    their correlation area, against which the voxels' terraces are held.
+    `image`: the image points in use; `noise` (mm^4, inf: all count by area) is the residuals' variance times their
+    correlation area, against which the voxels' terraces are held.
     """
 
     precision: float
     cutoff: float
-    kept: NDArray[np.bool_]
+    image: ImagePointUse
     noise: float = np.inf
 
 
@@ -110,7 +110,7 @@ class Objective:
         total = 0.5 * float(np.sum(unknowns[self.n_parameters :] ** 2))
         for s, displacement in enumerate(self._displacements(unknowns)):
             for target, motion, weighting in self._surfaces(s, displacement):
-                residuals = _weighted(surface_residuals(target, motion, weighting.kept), weighting)
+                residuals = _weighted(target, motion, weighting)
                 total += 0.5 * weighting.precision * _robust_sum(residuals, weighting.cutoff)
         return total
 
@@ -138,7 +138,7 @@ class Objective:
         """
         fresh = [
             tuple(
-                replace(weighting, kept=observed_image_points(target, motion))
+                replace(weighting, image=image_point_use(target, motion))
                 for target, motion, weighting in self._surfaces(s, displacement)
             )
             for s, displacement in enumerate(self._displacements(unknowns))
@@ -170,7 +170,7 @@ class Objective:
         lines = []
         triples = self._surfaces(s, solution.displacement.ravel())
         for rows, (target, motion, weighting) in zip(state.slices(), triples, strict=True):
-            residuals = _weighted(surface_residuals(target, motion, weighting.kept), weighting)
+            residuals = _weighted(target, motion, weighting)
             jacobian = np.zeros((len(residuals.values), len(unknowns)))
             by_surface = tangent[rows][:, columns]
             jacobian[:, places] = np.asarray(residuals.normal_jacobian @ by_surface)
@@ -189,19 +189,21 @@ class Objective:
         return [weighting for weightings in self.weighting for weighting in weightings]
 
 
-def _weighted(residuals: SurfaceResiduals, weighting: Weighting) -> SurfaceResiduals:
-    """Residuals whose weights fall as noise / (noise + terraces), with the same sum."""
+def _weighted(target: SurfaceTarget, motion: NDArray[np.float64], weighting: Weighting) -> SurfaceResiduals:
+    """Residuals at a motion (n_vertices, 3) mm, weights falling as noise / (noise + terraces) with the same sum."""
+    residuals = surface_residuals(target, motion, weighting.image.kept)
     if not np.isfinite(weighting.noise):
         return residuals
-    weights = residuals.weights * weighting.noise / (weighting.noise + residuals.terraces)
+    terraces = np.concatenate([target.terraces, weighting.image.terraces[weighting.image.kept]])
+    weights = residuals.weights * weighting.noise / (weighting.noise + terraces)
     return replace(residuals, weights=weights * (residuals.weights.sum() / weights.sum()))
 
 
 def _refuse_unseen(target: SurfaceTarget, weighting: Weighting) -> None:
-    if not weighting.kept.any():
+    if not weighting.image.kept.any():
         raise EstimationError(
-            f"'{target.surface.name}': none of the {len(weighting.kept)} points of its surface in the later image faces"
-            " the observed part of the model; is it the same organ, and do the images lie on each other?"
+            f"'{target.surface.name}': none of the {len(weighting.image.kept)} points of its surface in the later image"
+            " faces the observed part of the model; is it the same organ, and do the images lie on each other?"
         )
 
 

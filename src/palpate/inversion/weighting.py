@@ -11,6 +11,8 @@ from palpate.inversion.gauss_newton import Minimum
 from palpate.inversion.noise import NoiseLaw, fit_noise_law
 from palpate.inversion.objective import Evaluation, Linearisation, Objective, State, Weighting
 from palpate.inversion.problem import InverseProblem, LocalModel
+from palpate.observation.misfit import ImagePointUse
+from palpate.observation.target import SurfaceTarget
 
 __all__ = ["FIRST_LAW", "objective_of", "residual_law", "reweighted"]
 
@@ -28,10 +30,15 @@ def objective_of(problem: InverseProblem, models: tuple[LocalModel, ...], law: N
     )
     precision, noise = _precision(problem, law), law.sd**2 * law.correlation_area
     weighting = tuple(
-        tuple(Weighting(precision, np.inf, np.ones(len(t.image_points), dtype=bool), noise) for t in targets)
-        for targets in problem.targets
+        tuple(Weighting(precision, np.inf, _all_of(t), noise) for t in targets) for targets in problem.targets
     )
     return Objective(states, problem.modulus_map, weighting)
+
+
+def _all_of(target: SurfaceTarget) -> ImagePointUse:
+    """Every image point, until the model is near enough to choose."""
+    n = len(target.image_points)
+    return ImagePointUse(np.ones(n, dtype=bool), np.zeros(n))
 
 
 def _precision(problem: InverseProblem, law: NoiseLaw) -> float:

@@ -54,7 +54,6 @@ class FiniteStrainModel:
     pattern: BlockPattern
     restriction: Restriction
     settings: NewtonSettings
-    solver: str
 
     @property
     def n_regions(self) -> int:
@@ -124,7 +123,7 @@ class FiniteStrainModel:
             loads=self.loads,
             pattern=self.pattern,
             restriction=self.restriction,
-            solver=self.solver,
+            solver=self.settings.solver,
             moduli=self.moduli_of(moduli),
         )
 
@@ -314,12 +313,11 @@ def finite_strain_model(
     dilatation: Dilatation = Dilatation.BLENDED,
     loads: tuple[Load, ...] = (),
     settings: NewtonSettings | None = None,
-    solver: str = "auto",
 ) -> FiniteStrainModel:
     """The model of all meshed tissues of `space.mesh` under `law`, with their Poisson's ratios.
 
-    solver: a name of `palpate.mechanics.solvers.registry.SOLVERS` or "auto". Raises `ConfigurationError` when the
-    constraint is of another space, `GeometryError` for tetrahedra without positive volume.
+    Raises `ConfigurationError` when the constraint is of another space, `GeometryError` for tetrahedra without positive
+    volume.
     """
     n_dof = 3 * len(space.points)
     if constraint.free.shape[0] != n_dof or len(constraint.modes) != n_dof or len(constraint.offset) != n_dof:
@@ -341,5 +339,4 @@ def finite_strain_model(
         pattern=pattern,
         restriction=restriction(constraint, pattern.assemble(blocks)),
         settings=settings or NewtonSettings(),
-        solver=solver,
     )

@@ -88,13 +88,17 @@ class Balance(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class NewtonSettings:
-    """When to stop: tolerances of |F^T R| over the largest |internal forces| (final, between steps), counts, step."""
+    """When to stop: tolerances of |F^T R| over the largest |internal forces| (final, between steps), counts, step.
+
+    solver: a name of `palpate.mechanics.solvers.registry.SOLVERS` or "auto".
+    """
 
     tolerance: float = 1e-9
     step_tolerance: float = 1e-3
     max_iterations: int = 25
     max_steps: int = 60
     smallest_step: float = 1.0 / 256.0
+    solver: str = "auto"
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from scipy import sparse
 from palpate.mesh.surface import vertex_normals
 from palpate.observation.target import SurfaceTarget
 
-__all__ = ["SurfaceResiduals", "observed_image_points", "surface_residuals"]
+__all__ = ["ImagePointUse", "SurfaceResiduals", "image_point_use", "surface_residuals"]
 
 ON_EDGE = 1e-9
 
@@ -21,8 +21,8 @@ ON_EDGE = 1e-9
 class SurfaceResiduals:
     """Residuals of one surface, model -> image first, then image -> model.
 
-    values (n,) mm; weights (n,) dimensionless, 1/2 in total for each direction; terraces (n,) mm^4 (see
-    `SurfaceTarget`); places (n, 3) mm and normals (n, 3) of the deformed surface; jacobian (n, 3 n_vertices)
+    values (n,) mm; weights (n,) dimensionless, 1/2 in total for each direction; places (n, 3) mm and normals (n, 3) of
+    the deformed surface; jacobian (n, 3 n_vertices)
     d values / d displacement of the surface's points; normal_jacobian: the same for a smooth surface without noise,
     n . du. The exact one also holds how voxel noise and facets change as the surface slides along itself, which tells
     nothing of how it slides.
@@ -30,11 +30,18 @@ class SurfaceResiduals:
 
     values: NDArray[np.float64]
     weights: NDArray[np.float64]
-    terraces: NDArray[np.float64]
     places: NDArray[np.float64]
     normals: NDArray[np.float64]
     jacobian: sparse.csr_matrix[np.float64]
     normal_jacobian: sparse.csr_matrix[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class ImagePointUse:
+    """Which image points are used, kept (n_i,), and the voxels' terraces (n_i,) mm^4 on the model's surface there."""
+
+    kept: NDArray[np.bool_]
+    terraces: NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,14 +61,13 @@ def surface_residuals(
     model -> image: r = d_after(x + u) - d_before(x) at quadrature points of the observed triangles;
     image -> model: r = s(y) - (d_before(X) - level), where s is the signed distance of the closest model point
     x = X + u(X) from the image point y, positive when the model lies outside. `kept` (n_i,) marks the image points to
-    use, from `observed_image_points`: it is held while one objective is minimised.
+    use, from `image_point_use`: it is held while one objective is minimised.
     """
     forward = _model_to_image(target, displacement)
     backward = _image_to_model(target, displacement, kept)
     return SurfaceResiduals(
         np.concatenate([forward.values, backward.values]),
         np.concatenate([forward.weights, backward.weights]),
-        np.concatenate([forward.terraces, backward.terraces]),
         np.concatenate([forward.places, backward.places]),
         np.concatenate([forward.normals, backward.normals]),
         sparse.vstack([forward.jacobian, backward.jacobian], format="csr"),
@@ -69,12 +75,14 @@ def surface_residuals(
     )
 
 
-def observed_image_points(target: SurfaceTarget, displacement: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which image points (n_i,) face the observed part of the deformed surface, and not its rim."""
+def image_point_use(target: SurfaceTarget, displacement: NDArray[np.float64]) -> ImagePointUse:
+    """Use of the image points that face the observed part of the deformed surface, and not its rim."""
     closest = _closest(target, displacement, target.image_points)
-    on_edge = closest.barycentric < ON_EDGE
-    at_rim = np.any(on_edge & target.surface.rim[closest.triangle], axis=1)
-    return np.asarray(target.surface.observed[closest.triangle] & ~at_rim)
+    surface = target.surface
+    at_rim = np.any((closest.barycentric < ON_EDGE) & surface.rim[closest.triangle], axis=1)
+    corners = surface.triangles[closest.triangle]
+    normals = _smooth_normals(surface.rest + displacement, surface.triangles, corners, closest.barycentric)
+    return ImagePointUse(surface.observed[closest.triangle] & ~at_rim, target.terraces_along(normals))
 
 
 def _model_to_image(target: SurfaceTarget, displacement: NDArray[np.float64]) -> SurfaceResiduals:
@@ -91,7 +99,7 @@ def _model_to_image(target: SurfaceTarget, displacement: NDArray[np.float64]) ->
     weights = 0.5 * target.area / target.area.sum()
     n = len(surface.rest)
     exact, normal = _sparse_rows(rows, corners, n), _sparse_rows(smooth, corners, n)
-    return SurfaceResiduals(values, weights, target.terraces, places, normals, exact, normal)
+    return SurfaceResiduals(values, weights, places, normals, exact, normal)
 
 
 def _image_to_model(
@@ -117,7 +125,7 @@ def _image_to_model(
     weights = 0.5 * target.image_area[kept] / max(target.image_area[kept].sum(), 1e-30)
     n = len(surface.rest)
     exact, plane = _sparse_rows(rows, corners, n), _sparse_rows(smooth, corners, n)
-    return SurfaceResiduals(values, weights, target.image_terraces[kept], closest.places, normals, exact, plane)
+    return SurfaceResiduals(values, weights, closest.places, normals, exact, plane)
 
 
 def _smooth_normals(

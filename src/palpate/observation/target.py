@@ -29,7 +29,8 @@ class SurfaceTarget:
     triangle (n_q,), barycentric (n_q, 3), area (n_q,) mm^2: quadrature on the observed triangles;
     rest_distance (n_q,) mm: the map `before` there, subtracted from the map `after` (difference to the rest state);
     level (mm): its mean; image_points (n_i, 3) mm with areas (n_i,) mm^2: the later surface, taken at `level`;
-    terraces (n_q,) and image_terraces (n_i,) mm^4: coherent rounding noise of the voxels (see `terrace_noise`).
+    terraces (n_q,) mm^4: coherent rounding noise of the voxels (see `terrace_noise`); `voxels`: the two maps where they
+    are made of voxels.
     """
 
     surface: ObservedSurface
@@ -43,7 +44,15 @@ class SurfaceTarget:
     image_points: NDArray[np.float64]
     image_area: NDArray[np.float64]
     terraces: NDArray[np.float64]
-    image_terraces: NDArray[np.float64]
+    voxels: tuple[DistanceMap, DistanceMap] | None = None
+
+    def terraces_along(self, normals: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Coherent rounding noise (n,) mm^4 of the voxels at places with unit normals (n, 3) of a smooth surface.
+
+        The image's own normals would not do: they are noisy with the same rounding, and weights that go with the
+        errors of what they weigh bias it.
+        """
+        return np.zeros(len(normals)) if self.voxels is None else terrace_noise(*self.voxels, normals)
 
 
 def surface_target(surface: ObservedSurface, before: DistanceMap, after: DistanceMap) -> SurfaceTarget:
@@ -64,7 +73,7 @@ def surface_target(surface: ObservedSurface, before: DistanceMap, after: Distanc
         image_points=points.places[::stride],
         image_area=points.area[::stride],
         terraces=terrace_noise(before, after, normals),
-        image_terraces=terrace_noise(before, after, points.normals[::stride]),
+        voxels=(before, after),
     )
 
 
@@ -88,5 +97,5 @@ def target_from(
     area = np.repeat(size / len(rule), len(rule))
     # (n_q, 3 corners) x (n_q, 3 corners, 3 axes) -> (n_q, 3)
     places = np.einsum("qk,qka->qa", barycentric, surface.rest[surface.triangles[triangle]])
-    quiet = np.zeros(len(area)), np.zeros(len(image[1]))
-    return SurfaceTarget(surface, before, after, triangle, barycentric, area, before.at(places), level, *image, *quiet)
+    quiet = np.zeros(len(area))
+    return SurfaceTarget(surface, before, after, triangle, barycentric, area, before.at(places), level, *image, quiet)

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from palpate.errors import ConfigurationError
+from palpate.errors import ConfigurationError, ResourceError
 from palpate.images.alignment import RigidMotion, align, moved
 from palpate.images.checks import Finding, check_images
 from palpate.images.distance import observation_width, smoothing_width
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.images.tissue_distance import tissue_distance_map
-from palpate.inversion.invert import InverseProblem
+from palpate.inversion.problem import InverseProblem
 from palpate.inversion.modulus_map import modulus_map
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import LinearModel, linear_model, with_constraint
@@ -26,10 +26,13 @@ from palpate.observation.observed_surface import ObservedSurface, observed_surfa
 from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.observation.target import SurfaceTarget, surface_target
 from palpate.study.case import Case
+from palpate.study.contacts import every_finding
+from palpate.study.refusals import refuse_lost, refuse_unmeshable
 
-__all__ = ["Body", "ImagedStates", "aligned", "inverse_problem", "make_body"]
+__all__ = ["Body", "ImagedStates", "aligned", "case_domain", "inverse_problem", "joint_problem", "make_body"]
 
 THIN_VOXELS = 4
+STATED = ("motion-below-noise", "sides-exchanged")  # findings on contacts stand in the result as observed shares
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +58,7 @@ class Body:
 def aligned(before: Segmentation, after: tuple[Segmentation, ...], *, method: str) -> ImagedStates:
     """Bring the later images to the first on their rigid tissues (`method` "rigid-tissues") and check them all.
 
-    Raises `InputDataError` as `check_images` and `align` do.
+    Raises `InputDataError` as `check_images`, `align` and `refuse_lost` do, `GeometryError` as `refuse_unmeshable`.
     """
     images, bones, findings = [], [], list[Finding]()
     for number, image in enumerate(after, start=1):
@@ -86,6 +89,12 @@ def aligned(before: Segmentation, after: tuple[Segmentation, ...], *, method: st
             if len(fit.undetermined)
         ]
     findings += check_images(before, images)
+    refuse_unmeshable(before, "before")
+    for number, image in enumerate(images, start=1):
+        name = "after" if len(images) == 1 else f"after[{number}]"
+        refuse_unmeshable(image, name)
+        refuse_lost(before, image, name)
+    findings += [finding for finding in every_finding(before, images) if finding.code in STATED]
     return ImagedStates(before, tuple(images), tuple(bones), tuple(findings))
 
 
@@ -93,10 +102,16 @@ def make_body(states: ImagedStates, case: Case, *, progress: Callable[[str], Non
     """Mesh the reference state of the images; raises `MeshQualityError` when the mesh does not pass its gate."""
     before = states.before
     width = smoothing_width(before.grid, *(image.grid for image in states.after))
-    box = _domain(states, case)
+    box = case_domain(before, states.after, case)
     anatomy = anatomy_of(before, box=box, smoothing_mm=width)
     progress(f"meshing {np.round(box.lengths).astype(int).tolist()} mm at {case.mesh.edge_length_mm:g} mm")
-    mesh = tetrahedralise(anatomy, edge_length_mm=case.mesh.edge_length_mm)
+    try:
+        mesh = tetrahedralise(anatomy, edge_length_mm=case.mesh.edge_length_mm)
+    except RuntimeError as error:  # Mmg's own words, which do not tell a lack of memory from a bad surface
+        raise ResourceError(
+            f"the mesher stopped ({error}), most likely for want of memory; make mesh.edge_length_mm larger, or the"
+            ' domain smaller (domain.extent = "margin")'
+        ) from error
     quality = _gate(states.before, anatomy, mesh_box=box, mesh=lagrange_space(mesh, "P1"))
     space = lagrange_space(mesh, case.mechanics.element)
     progress(
@@ -108,16 +123,29 @@ def make_body(states: ImagedStates, case: Case, *, progress: Callable[[str], Non
 
 def inverse_problem(body: Body, case: Case, *, progress: Callable[[str], None]) -> InverseProblem:
     """Models and targets of every later image; raises `ConfigurationError` when nothing moves the body."""
-    space, states = body.space, body.states
-    tissues = space.mesh.tissues
-    observed = [i for i, tissue in enumerate(tissues) if tissue.role in (Role.ESTIMATE, Role.DRIVER)]
-    surfaces = [observed_surface(space, tissue) for tissue in observed]
-    targets = tuple(tuple(_target(body, surface, image) for surface in surfaces) for image in states.after)
+    return joint_problem((body,), case, progress=progress)
+
+
+def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Callable[[str], None]) -> InverseProblem:
+    """The same of several reference states of one patient: one set of moduli, the bodies' images one after the other.
+
+    All bodies have the same tissues in the same order. Raises as `inverse_problem` does.
+    """
+    targets = tuple(target for body in bodies for target in _targets(body))
     progress("assembling one stiffness matrix a tissue")
-    models = _models(body, case)
+    models = tuple(model for body in bodies for model in _models(body, case))
     _refuse_rest(models)
+    tissues = bodies[0].space.mesh.tissues
     estimated = frozenset(tissue.name for tissue in tissues if tissue.role is Role.ESTIMATE)
     return InverseProblem(models, targets, modulus_map(tissues, models[0].regions), estimated)
+
+
+def _targets(body: Body) -> tuple[tuple[SurfaceTarget, ...], ...]:
+    """The observed surfaces of each later image."""
+    tissues = body.space.mesh.tissues
+    observed = [i for i, tissue in enumerate(tissues) if tissue.role in (Role.ESTIMATE, Role.DRIVER)]
+    surfaces = [observed_surface(body.space, tissue) for tissue in observed]
+    return tuple(tuple(_target(body, surface, image) for surface in surfaces) for image in body.states.after)
 
 
 def _models(body: Body, case: Case) -> tuple[LinearModel, ...]:
@@ -159,14 +187,17 @@ def _target(body: Body, surface: ObservedSurface, image: Segmentation) -> Surfac
     return surface_target(surface, *maps)
 
 
-def _domain(states: ImagedStates, case: Case) -> Box:
-    box = domain_box([states.before.grid, *(image.grid for image in states.after)])
+def case_domain(before: Segmentation, after: Sequence[Segmentation], case: Case) -> Box:
+    """The box that is meshed: what the images share, or with extent "margin" its part around organs and drivers.
+
+    Raises `GeometryError` when the images share no volume.
+    """
+    box = domain_box([before.grid, *(image.grid for image in after)])
     if case.domain.extent == "image":
         return box
-    roles = [tissue.role for tissue in states.before.tissues]
-    shown = [i for i, role in enumerate(roles) if role in (Role.ESTIMATE, Role.DRIVER)]
-    voxels = np.argwhere(np.isin(states.before.index, shown)).astype(float)
-    return margin_box(box, states.before.grid.world(voxels), margin_mm=case.domain.margin_mm)
+    shown = [i for i, tissue in enumerate(before.tissues) if tissue.role in (Role.ESTIMATE, Role.DRIVER)]
+    voxels = np.argwhere(np.isin(before.index, shown)).astype(float)
+    return margin_box(box, before.grid.world(voxels), margin_mm=case.domain.margin_mm)
 
 
 def _gate(before: Segmentation, anatomy: Anatomy, *, mesh_box: Box, mesh: LagrangeSpace) -> MeshQuality:

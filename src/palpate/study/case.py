@@ -63,10 +63,13 @@ def _label(value: object) -> tuple[int, ...] | str:
 
 @dataclass(frozen=True, slots=True)
 class Images:
-    """Label images: `before` the reference state, `after` the later states; `names` a label table; grey images."""
+    """Label images: `before` the reference state, `after` the later states; `names` a label table; grey images.
+
+    `after` may be left out where [motion] says how the driver moves.
+    """
 
     before: Path
-    after: tuple[Path, ...] = field(metadata=NOT_EMPTY)
+    after: tuple[Path, ...] = field(default=(), metadata=NOT_EMPTY)
     names: Path | None = None
     intensities_before: Path | None = None
     intensities_after: tuple[Path, ...] = ()
@@ -184,9 +187,12 @@ class Estimate:
             (self.start_ratios, self.bounds_ratio, "start_ratios"),
             (self.starts_kpa, self.bounds_kpa, "starts_kpa"),
         ):
-            outside = [start for start in starts or () if bounds and not bounds[0] <= start <= bounds[1]]
+            outside = [start for start in starts or () if bounds and not bounds[0] < start < bounds[1]]
             if outside:
-                raise ConfigurationError(f"[estimate] {name}: {outside} lie outside the bounds {list(bounds or ())}")
+                raise ConfigurationError(
+                    f"[estimate] {name}: {outside} do not lie between the bounds {list(bounds or ())}; move the start"
+                    " or widen the bounds"
+                )
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,10 +241,14 @@ class Case:
             raise ConfigurationError(
                 f"case '{self.id}' needs either [images] (with before and after) or [phantom], and not both"
             )
-        if self.pairs:
+        if self.images is not None and not self.images.after and self.motion is None:
             raise ConfigurationError(
-                f"case '{self.id}' has [[pairs]]: further pairs with their own reference state are not offered by this"
-                " version of Palpate yet; list later states of the same reference in [images] after"
+                "the key 'after' is missing in [images]; name one or more later states of the body (only a simulation"
+                " with [motion] goes without)"
+            )
+        if self.pairs and self.images is None:
+            raise ConfigurationError(
+                f"case '{self.id}' has [[pairs]] without [images]: name the first pair there, with the label table"
             )
         self._check_tissues()
 

@@ -9,7 +9,15 @@ from palpate.images.tissue import Role
 from palpate.inversion.estimation import Remark
 from palpate.study.case import Case
 
-__all__ = ["PUBLISHED", "PublishedStiffness", "plausibility_warnings", "published_for", "unit_warnings"]
+__all__ = [
+    "PUBLISHED",
+    "PublishedStiffness",
+    "UsualModulus",
+    "plausibility_warnings",
+    "published_for",
+    "unit_warnings",
+    "usual_modulus",
+]
 
 MARGIN = 3.0  # methods differ by ten to a hundred times: an estimate is doubtful only well outside what was published
 SOFT_TISSUE_KPA = (0.05, 2.0e4)  # from brain-like fat to gut wall under tension, with room on both sides
@@ -27,6 +35,14 @@ class PublishedStiffness:
     low: float
     high: float
     method: str
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
+class UsualModulus:
+    """A Young's modulus (kPa) that a tissue may be given before anything better is known, and where it comes from."""
+
+    kpa: float
     source: str
 
 
@@ -120,6 +136,15 @@ def published_for(name: str) -> tuple[PublishedStiffness, ...]:
     found = [entry for entry in PUBLISHED if any(word in plain for word in entry.words)]
     tumours = [entry for entry in found if entry.tissue == "prostate cancer"]
     return tuple(tumours or found)
+
+
+def usual_modulus(name: str) -> UsualModulus | None:
+    """The geometric mean of the narrowest published range for a tissue's name; None when nothing was published."""
+    entries = published_for(name)
+    if not entries:
+        return None
+    entry = min(entries, key=lambda item: item.high / item.low)
+    return UsualModulus(round((entry.low * entry.high) ** 0.5, 3), f"{entry.method}; {entry.source}")
 
 
 def plausibility_warnings(moduli_kpa: Mapping[str, float]) -> tuple[Remark, ...]:

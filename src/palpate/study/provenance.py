@@ -24,6 +24,9 @@ def input_digests(case: Case) -> dict[str, str]:
     if images is None:
         return {}
     files = {"before": images.before} | {f"after[{i}]": path for i, path in enumerate(images.after)}
+    for number, pair in enumerate(case.pairs):
+        files |= {f"pairs[{number}].before": pair.before}
+        files |= {f"pairs[{number}].after[{i}]": path for i, path in enumerate(pair.after)}
     files |= {"names": images.names} if images.names else {}
     files |= {"intensities_before": images.intensities_before} if images.intensities_before else {}
     files |= {f"intensities_after[{i}]": path for i, path in enumerate(images.intensities_after)}

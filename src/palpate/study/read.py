@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
 from palpate.errors import ConfigurationError
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_label_image
-from palpate.images.segmentation import segment
+from palpate.images.segmentation import Segmentation, segment
+from palpate.images.tissue import Tissue
 from palpate.phantoms.pelvis import PelvisOptions, pelvis
 from palpate.phantoms.scene import Scene
 from palpate.phantoms.spheres import SpheresOptions, spheres
 from palpate.study.body import ImagedStates, aligned
 from palpate.study.case import Case
 
-__all__ = ["phantom_scene", "read_states"]
+__all__ = ["phantom_scene", "read_pairs", "read_segmentation", "read_states"]
 
 FILLING_MM = 7.0
 
@@ -28,11 +33,29 @@ def read_states(case: Case) -> ImagedStates:
         return aligned(segment(scene.before, scene.tissues), after, method=case.align)
     if case.images is None:
         raise ConfigurationError(f"case '{case.id}' has neither [images] nor [phantom]")
-    names = read_label_table(case.images.names) if case.images.names else None
-    before = read_label_image(case.images.before, names=names)
-    tissues = case.resolve_tissues(before.names)
-    later = tuple(segment(read_label_image(path, names=names), tissues) for path in case.images.after)
-    return aligned(segment(before, tissues), later, method=case.align)
+    return _read_pair(case, case.images.before, case.images.after)
+
+
+def read_pairs(case: Case) -> tuple[ImagedStates, ...]:
+    """The same of each of the case's further [[pairs]]; their findings begin with the pair's number, from 2."""
+    found = []
+    for number, pair in enumerate(case.pairs, start=2):
+        states = _read_pair(case, pair.before, pair.after)
+        findings = tuple(replace(f, message=f"pair {number}: {f.message}") for f in states.findings)
+        found.append(replace(states, findings=findings))
+    return tuple(found)
+
+
+def read_segmentation(
+    case: Case, path: Path, names: Mapping[int, str] | None, tissues: tuple[Tissue, ...] | None
+) -> Segmentation:
+    """One image in the tissues of the case.
+
+    `names`: the label table (label -> name), if the case has one; an image that brings its own names is read by those.
+    `tissues`: those of the reference image, for an image without names. Raises as `read_states` does.
+    """
+    image = read_label_image(path, names=names)
+    return segment(image, case.resolve_tissues(image.names) if tissues is None or image.names else tissues)
 
 
 def phantom_scene(case: Case) -> Scene:
@@ -43,3 +66,11 @@ def phantom_scene(case: Case) -> Scene:
     if case.phantom.kind == "spheres":
         return spheres(SpheresOptions(seed=case.phantom.seed))
     return pelvis(PelvisOptions(seed=case.phantom.seed, filling_mm=filling))
+
+
+def _read_pair(case: Case, before: Path, after: tuple[Path, ...]) -> ImagedStates:
+    table = case.images.names if case.images else None
+    names = read_label_table(table) if table else None
+    reference = read_segmentation(case, before, names, None)
+    later = tuple(read_segmentation(case, path, names, reference.tissues) for path in after)
+    return aligned(reference, later, method=case.align)

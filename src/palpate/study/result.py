@@ -19,7 +19,17 @@ from palpate.inversion.estimation import Estimation, ModulusEstimate, Remark, St
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.case import Case
 
-__all__ = ["CaseResult", "MeshResult", "MeshSummary", "Provenance", "Simulation", "failure_document", "json_object"]
+__all__ = [
+    "CaseResult",
+    "MeshResult",
+    "MeshSummary",
+    "PairResult",
+    "Provenance",
+    "Simulation",
+    "failure_document",
+    "image_names",
+    "json_object",
+]
 
 SCHEMA = "palpate.result/1"
 
@@ -46,12 +56,27 @@ class Provenance:
 
 
 @dataclass(frozen=True, slots=True)
+class PairResult:
+    """A further pair of images, which shares the moduli: its own mesh, its segmentations, its displacements.
+
+    displacements: one (n_points, 3) mm on `space.points` a later image; before, after: as in `CaseResult`.
+    """
+
+    space: LagrangeSpace
+    mesh_summary: MeshSummary
+    before: Segmentation
+    after: tuple[Segmentation, ...]
+    displacements: tuple[NDArray[np.float64], ...]
+
+
+@dataclass(frozen=True, slots=True)
 class CaseResult:
     """The whole outcome of one estimate.
 
     space: the displacements' points on the mesh of the reference state; before, after: segmentations, the later ones
     brought to the first (aligned), all in RAS mm; remarks: those of the study, beside the estimation's own;
-    note: a sentence that must stand wherever the numbers are shown (of what a demo simulates, say).
+    note: a sentence that must stand wherever the numbers are shown (of what a demo simulates, say);
+    further: the pairs after the first. The estimation's fits and displacements are those of `after`, then theirs.
     """
 
     case: Case
@@ -63,6 +88,7 @@ class CaseResult:
     provenance: Provenance
     remarks: tuple[Remark, ...] = ()
     note: str = ""
+    further: tuple[PairResult, ...] = ()
 
     @property
     def tissues(self) -> tuple[Tissue, ...]:
@@ -95,11 +121,13 @@ class CaseResult:
         document = _heading(self.case, estimation.status, estimation.reason) | {
             "estimates": [_estimate(item, estimation.status) for item in estimation.estimates],
             "correlation": estimation.correlation.tolist(),
-            "fit": [_fit(name, fits) for name, fits in zip(_after_names(self.case), estimation.fits, strict=False)],
+            "fit": [_fit(name, fits) for name, fits in zip(image_names(self.case), estimation.fits, strict=False)],
             "starts": [_start(start) for start in estimation.starts],
             "counts": dict(estimation.counts),
             "mesh": _plain(self.mesh_summary),
         }
+        if self.further:
+            document |= {"pairs": [{"mesh": _plain(pair.mesh_summary)} for pair in self.further]}
         return json_object(document | _closing(self.case, self.provenance, self.all_remarks) | {"note": self.note})
 
 
@@ -263,8 +291,13 @@ def _start(start: Start) -> dict[str, Any]:
     }
 
 
-def _after_names(case: Case) -> list[str]:
-    return [path.name for path in case.images.after] if case.images else ["after"]
+def image_names(case: Case) -> list[str]:
+    """A name for each later image of the case, pair after pair: its file's, with its folder's where two are alike."""
+    if case.images is None:
+        return ["after"]
+    paths = [path for paths in (case.images.after, *(pair.after for pair in case.pairs)) for path in paths]
+    plain = [path.name for path in paths]
+    return [f"{path.parent.name}/{path.name}" if plain.count(path.name) > 1 else path.name for path in paths]
 
 
 def _stiffness(tissue: Tissue, estimate: ModulusEstimate | None, unit: str) -> float:

@@ -8,24 +8,34 @@ from dataclasses import replace
 
 import numpy as np
 
+from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role
 from palpate.inversion.conclude import Observed, conclude
 from palpate.inversion.estimation import Estimation, Remark
 from palpate.inversion.gauss_newton import Bounds
 from palpate.inversion.grid_position import FittedState
-from palpate.inversion.invert import Inversion, InversionSettings, invert
+from palpate.inversion.invert import invert
 from palpate.inversion.modulus_map import ModulusMap
 from palpate.inversion.noise import NoiseLaw
-from palpate.study.body import Body, ImagedStates, inverse_problem, make_body
+from palpate.inversion.problem import Inversion, InversionSettings
+from palpate.study.body import Body, ImagedStates, joint_problem, make_body
 from palpate.study.case import Case
 from palpate.study.plausibility import plausibility_warnings, unit_warnings
 from palpate.study.provenance import input_digests, software_versions
-from palpate.study.read import read_states
-from palpate.study.result import CaseResult, MeshResult, Provenance
+from palpate.study.read import read_pairs, read_states
+from palpate.study.result import CaseResult, MeshResult, PairResult, Provenance
 from palpate.study.simulate import simulate
 from palpate.study.summary import mesh_summary
 
-__all__ = ["estimate", "estimate_states", "fitted_states", "inversion_settings", "mesh", "simulate"]
+__all__ = [
+    "estimate",
+    "estimate_states",
+    "fitted_states",
+    "inversion_settings",
+    "mesh",
+    "refuse_what_cannot_be_estimated",
+    "simulate",
+]
 
 Progress = Callable[[str], None]
 
@@ -43,11 +53,12 @@ def estimate(case: Case, *, progress: Progress = silent, truth: Mapping[str, flo
     result whose status says so, with no values.
     """
     began = time.perf_counter()
+    refuse_what_cannot_be_estimated(case)
     progress("reading and aligning the images")
-    states = read_states(case)
+    states, further = read_states(case), read_pairs(case)
     truth = _truth(states) if case.phantom else truth
     seconds = time.perf_counter() - began
-    result = estimate_states(states, case, progress=progress, truth=truth, read_seconds=seconds)
+    result = estimate_states(states, case, progress=progress, truth=truth, read_seconds=seconds, further=further)
     provenance = replace(result.provenance, inputs=input_digests(case))
     return replace(result, provenance=provenance)
 
@@ -59,20 +70,24 @@ def estimate_states(
     progress: Progress = silent,
     truth: Mapping[str, float] | None = None,
     read_seconds: float = 0.0,
+    further: tuple[ImagedStates, ...] = (),
 ) -> CaseResult:
     """The same from states that are already read and aligned; the case gives the settings.
 
-    `truth`: true moduli (kPa) by tissue, to stand beside the estimates of a simulation.
+    `truth`: true moduli (kPa) by tissue, to stand beside the estimates of a simulation; `further`: pairs of the same
+    body, each with its own reference state, which are meshed on their own and share the moduli.
     """
     clock = [time.perf_counter()]
-    body = make_body(states, case, progress=progress)
+    bodies = tuple(make_body(pair, case, progress=progress) for pair in (states, *further))
+    body = bodies[0]
     clock.append(time.perf_counter())
-    problem = inverse_problem(body, case, progress=progress)
+    problem = joint_problem(bodies, case, progress=progress)
     clock.append(time.perf_counter())
     settings = inversion_settings(case, problem.modulus_map)
     inversion = invert(problem, settings, progress=progress)
     progress("intervals: residuals' correlation, grid position, driver")
-    observed = Observed(body.space, fitted_states(inversion, body), tuple(image.index for image in states.after))
+    images = tuple(image.index for pair in bodies for image in pair.states.after)
+    observed = Observed(body.space, fitted_states(inversion, *bodies), images)
     estimation = conclude(inversion, settings, observed, truth=truth or {}, seed=case.seed)
     clock.append(time.perf_counter())
     stages = np.diff(clock)
@@ -86,7 +101,8 @@ def estimate_states(
         states.before,
         states.after,
         Provenance({key: round(float(value), 3) for key, value in seconds.items()}, {}, software_versions()),
-        (*_remarks(states, case), *plausibility_warnings(_values(estimation))),
+        (*_remarks(case, states, *further), *plausibility_warnings(_values(estimation))),
+        further=_further(bodies, estimation),
     )
 
 
@@ -98,7 +114,7 @@ def mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
     body = make_body(states, case, progress=progress)
     seconds = {"total": round(time.perf_counter() - began, 3)}
     provenance = Provenance(seconds, input_digests(case), software_versions())
-    return MeshResult(case, body.space, mesh_summary(body), states.before, provenance, _remarks(states, case))
+    return MeshResult(case, body.space, mesh_summary(body), states.before, provenance, _remarks(case, states))
 
 
 def inversion_settings(case: Case, mapping: ModulusMap) -> InversionSettings:
@@ -116,17 +132,42 @@ def inversion_settings(case: Case, mapping: ModulusMap) -> InversionSettings:
     return InversionSettings(tuple(np.full(n, np.log(start)) for start in starts), limits, options.method, law)
 
 
-def fitted_states(inversion: Inversion, body: Body) -> tuple[FittedState, ...]:
-    """Displacements of the whole mesh at the estimate, with the grids that they were seen on."""
+def fitted_states(inversion: Inversion, *bodies: Body) -> tuple[FittedState, ...]:
+    """Displacements of the whole meshes at the estimate, with the grids that they were seen on, body after body."""
     objective, unknowns = inversion.objective, inversion.minimum.unknowns
     moduli = objective.modulus_map.moduli(unknowns[: objective.n_parameters])
+    images = [(body, image) for body in bodies for image in body.states.after]
     fitted = []
-    for surrogate, q, image in zip(
-        inversion.surrogates, objective.coefficients(unknowns), body.states.after, strict=True
-    ):
+    for surrogate, q, (body, image) in zip(inversion.surrogates, objective.coefficients(unknowns), images, strict=True):
         displacement = surrogate.reduced.solve(moduli, q).displacement
-        fitted.append(FittedState(displacement, body.states.before.grid, image.grid, body.smoothing_mm))
+        fitted.append(FittedState(displacement, body.states.before.grid, image.grid, body.smoothing_mm, body.space))
     return tuple(fitted)
+
+
+def _further(bodies: tuple[Body, ...], estimation: Estimation) -> tuple[PairResult, ...]:
+    """The bodies after the first with their displacements."""
+    first = len(bodies[0].states.after)
+    found = []
+    for body in bodies[1:]:
+        states = body.states
+        motions = estimation.displacements[first : first + len(states.after)]
+        found.append(PairResult(body.space, mesh_summary(body), states.before, states.after, motions))
+        first += len(states.after)
+    return tuple(found)
+
+
+def refuse_what_cannot_be_estimated(case: Case) -> None:
+    """Say before any image is read that there is no later state, or that nothing can move: `ConfigurationError`."""
+    if case.images is not None and not case.images.after:
+        raise ConfigurationError(
+            "the key 'after' is missing in [images]; an estimate needs one or more later states of the body"
+        )
+    movers = [tissue for tissue in case.tissues if tissue.role in (Role.DRIVER, Role.RIGID)]
+    if case.tissues and case.phantom is None and not movers:
+        raise ConfigurationError(
+            'nothing moves this body: no tissue has role = "driver" (or "rigid", and moves between the images), so no'
+            " modulus can be estimated; give the role driver to the hollow organ whose wall deforms the others"
+        )
 
 
 def _truth(states: ImagedStates) -> Mapping[str, float]:
@@ -142,5 +183,6 @@ def _values(estimation: Estimation) -> dict[str, float]:
     return {e.tissue: e.value for e in estimation.estimates if e.value is not None}
 
 
-def _remarks(states: ImagedStates, case: Case) -> tuple[Remark, ...]:
-    return (*unit_warnings(case), *(Remark(finding.code, finding.message) for finding in states.findings))
+def _remarks(case: Case, *states: ImagedStates) -> tuple[Remark, ...]:
+    findings = [finding for pair in states for finding in pair.findings]
+    return (*unit_warnings(case), *(Remark(finding.code, finding.message) for finding in findings))

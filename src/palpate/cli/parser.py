@@ -1,0 +1,117 @@
+"""The arguments of `palpate` and its sub-commands."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from palpate.cli import commands, written
+from palpate.cli.outcome import Outcome
+
+__all__ = ["make_parser", "version"]
+
+CASE_HELP = "the case: images, tissues, roles"
+
+
+def version() -> str:
+    """The version of Palpate that is installed."""
+    try:
+        return metadata.version("palpate")
+    except metadata.PackageNotFoundError:
+        return "(not installed)"
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The parser of the whole command line."""
+    parser = argparse.ArgumentParser(
+        prog="palpate",
+        description="How stiff each organ is, from segmented images of the same body in two or more states.",
+        epilog="Exit codes: 0 done, 2 usage or configuration, 3 input data, 4 geometry or meshing, 5 solver or"
+        " estimation, 6 resources, 130 interrupted. For research only; not a medical device.",
+    )
+    parser.add_argument("--version", action="version", version=f"palpate {version()}")
+    subparsers = parser.add_subparsers(metavar="COMMAND", required=True)
+    demo = _command(subparsers, "demo", written.demo, what="the whole way on the pelvis that Palpate brings along")
+    demo.set_defaults(output=Path("palpate-demo"))
+    _add_init(subparsers)
+    _add_check(subparsers)
+    mesh = _command(subparsers, "mesh", commands.mesh, what="make the tetrahedra of a case and write them")
+    _add_case(mesh)
+    what = "deform the organs of a case with given moduli and write the later state"
+    simulate = _command(subparsers, "simulate", commands.simulate, what=what)
+    _add_case(simulate)
+    simulate.add_argument("--steps", type=_count, default=1, metavar="N", help="write N steps to animate")
+    _add_estimate(subparsers)
+    _add_report(subparsers)
+    return parser
+
+
+def _add_init(subparsers: Any) -> None:
+    command = _command(subparsers, "init", commands.init, what="write a case.toml for images, roles guessed from names")
+    command.add_argument("images", type=Path, nargs="+", metavar="IMAGE", help="label images: before, then after ...")
+    command.add_argument("--labels", type=Path, metavar="TABLE", help="label table: which number is which organ")
+    command.set_defaults(logs=False)
+
+
+def _add_check(subparsers: Any) -> None:
+    command = _command(
+        subparsers, "check", commands.check, what="list every problem of a case without computing", writes=False
+    )
+    command.add_argument("case_file", type=Path, metavar="CASE.TOML", help=CASE_HELP)
+    _add_set(command)
+
+
+def _add_estimate(subparsers: Any) -> None:
+    what = "find the Young's modulus of each organ of a case, or of label images before and after"
+    command = _command(subparsers, "estimate", written.estimate, what=what)
+    command.add_argument(
+        "inputs",
+        type=Path,
+        nargs="+",
+        metavar="INPUT",
+        help="CASE.TOML, or label images BEFORE AFTER ... for which a case is written first",
+    )
+    command.add_argument("--labels", type=Path, metavar="TABLE", help="label table, with images")
+    _add_set(command)
+
+
+def _add_report(subparsers: Any) -> None:
+    command = _command(subparsers, "report", written.report, what="draw report.html of an estimate again", writes=False)
+    command.add_argument("folder", type=Path, metavar="DIR", help="the output folder of an estimate")
+
+
+def _add_case(command: argparse.ArgumentParser) -> None:
+    command.add_argument("case", type=Path, metavar="CASE.TOML", help=CASE_HELP)
+    _add_set(command)
+
+
+def _add_set(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--set", action="append", default=[], metavar="KEY.PATH=VALUE", help="replace a value of the case; repeatable"
+    )
+
+
+def _command(
+    subparsers: Any, name: str, function: Callable[..., Outcome], *, what: str, writes: bool = True
+) -> argparse.ArgumentParser:
+    """A sub-command with the common flags; one that `writes` has an output folder, with a log there."""
+    command: argparse.ArgumentParser = subparsers.add_parser(
+        name, help=what, description=what[0].upper() + what[1:] + "."
+    )
+    if writes:
+        folder = Path("palpate-output")
+        command.add_argument("--output", type=Path, default=folder, metavar="DIR", help="default: %(default)s")
+    command.add_argument("--json", action="store_true", help="print one JSON document on stdout, and nothing else")
+    command.add_argument("--quiet", action="store_true", help="no progress, no table")
+    command.set_defaults(command=function, logs=writes)
+    return command
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if not 1 <= value <= 1000:
+        raise argparse.ArgumentTypeError(f"{value} is not between 1 and 1000")
+    return value

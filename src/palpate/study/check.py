@@ -1,0 +1,277 @@
+"""Every problem of a case at once, before anything is computed: files, tissues, organs, expected cost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from palpate.errors import GeometryError, InputDataError, PalpateError, ResourceError
+from palpate.images.checks import Finding, check_pair, check_segmentation
+from palpate.images.label_table import read_label_table
+from palpate.images.readers import read_intensities
+from palpate.images.segmentation import Segmentation
+from palpate.images.tissue import Role
+from palpate.study.body import case_domain
+from palpate.study.case import Case
+from palpate.study.case_file import read_case
+from palpate.study.contacts import every_finding
+from palpate.study.cost import ExpectedCost, expected_cost, free_memory_gb
+from palpate.study.plausibility import unit_warnings
+from palpate.study.read import read_segmentation, read_states
+from palpate.study.refusals import refuse_lost, refuse_unmeshable
+from palpate.study.run import refuse_what_cannot_be_estimated
+
+__all__ = ["CheckReport", "Problem", "check_case", "memory_problems"]
+
+T = TypeVar("T")
+OBSERVED = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
+REFUSED_FINDINGS = {"hardly-observed": GeometryError.exit_code}  # what an estimate refuses, found here as a finding
+MEMORY_FACTOR = 2.0  # how far the prediction may be off
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """Something that an estimate would refuse (`exit_code` > 0) or warn of (0)."""
+
+    code: str
+    message: str
+    exit_code: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class OrganRow:
+    """A tissue in the images: its volume in each of them, mL."""
+
+    tissue: str
+    role: str
+    volumes_ml: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CheckReport:
+    """All problems of a case, its organs and what its estimate would cost (None when that cannot be told)."""
+
+    id: str
+    problems: tuple[Problem, ...]
+    images: tuple[str, ...] = ()
+    organs: tuple[OrganRow, ...] = ()
+    cost: ExpectedCost | None = None
+
+    @property
+    def exit_code(self) -> int:
+        """0, or the exit code of the worst class of problem, which is the highest number."""
+        return max((problem.exit_code for problem in self.problems), default=0)
+
+    def to_dict(self) -> dict[str, Any]:
+        """A JSON document, schema palpate.check/1."""
+        cost = self.cost
+        return {
+            "schema": "palpate.check/1",
+            "id": self.id,
+            "exit_code": self.exit_code,
+            "problems": [
+                {
+                    "severity": "refused" if problem.exit_code else "warning",
+                    "code": problem.code,
+                    "message": problem.message,
+                    "exit_code": problem.exit_code,
+                }
+                for problem in self.problems
+            ],
+            "organs": [
+                {
+                    "tissue": row.tissue,
+                    "role": row.role,
+                    "volume_ml": dict(zip(self.images, row.volumes_ml, strict=False)),
+                }
+                for row in self.organs
+            ],
+            "expected": cost
+            and {
+                "tetrahedra": cost.tets,
+                "unknowns": cost.unknowns,
+                "memory_gb": round(cost.memory_gb, 2),
+                "seconds": round(cost.seconds),
+                "solver": cost.solver,
+                "processors": cost.processors,
+            },
+        }
+
+    def text(self) -> str:
+        """The same for people, worst first."""
+        lines = [f"refused ({p.exit_code}): {p.message}" for p in self.problems if p.exit_code]
+        lines += [f"warning: {p.message}" for p in self.problems if not p.exit_code]
+        if not lines:
+            lines = ["no problem was found"]
+        for row in self.organs:
+            volumes = ", ".join(f"{volume:.4g}" for volume in row.volumes_ml)
+            lines.append(f"{row.tissue} ({row.role}): {volumes} mL")
+        if self.cost is not None:
+            cost = self.cost
+            lines.append(
+                f"expected: {cost.tets} tetrahedra, {cost.unknowns} unknowns, {cost.memory_gb:.1f} GB,"
+                f" {cost.seconds / 60.0:.1f} min with {cost.solver} on {cost.processors} processor(s); each within a"
+                " factor of two"
+            )
+        return "\n".join(lines)
+
+
+class _Problems:
+    """Collects what goes wrong, and goes on."""
+
+    def __init__(self) -> None:
+        self.found: list[Problem] = []
+
+    def attempt(self, make: Callable[[], T]) -> T | None:
+        """What `make` returns; None, and a problem, when it is refused."""
+        try:
+            return make()
+        except PalpateError as error:
+            self.add(Problem(type(error).__name__, str(error), error.exit_code))
+        except MemoryError:
+            self.add(Problem("ResourceError", "memory is short for these images; crop them", ResourceError.exit_code))
+        return None
+
+    def add(self, problem: Problem) -> None:
+        """Keep a problem once."""
+        if problem not in self.found:
+            self.found.append(problem)
+
+    def warn(self, findings: Sequence[Finding], where: str = "") -> None:
+        """Keep findings; `where` names the pair."""
+        for finding in findings:
+            code = REFUSED_FINDINGS.get(finding.code, 0)
+            self.add(Problem(finding.code, where + finding.message, code))
+
+
+def check_case(path: Path, overrides: Sequence[str], *, progress: Callable[[str], None]) -> CheckReport:
+    """All problems of the case file at `path` (with overrides as in `read_case`), its organs and its expected cost.
+
+    Nothing is meshed or solved, and images are not aligned. Raises nothing for a bad case: that is a problem, too.
+    """
+    problems = _Problems()
+    case = problems.attempt(lambda: read_case(path, overrides))
+    if case is None:
+        return CheckReport(path.stem, tuple(problems.found))
+    problems.attempt(lambda: refuse_what_cannot_be_estimated(case))
+    for remark in unit_warnings(case):
+        problems.add(Problem(remark.code, remark.message))
+    progress("reading the images")
+    pairs = _phantom_states(case, problems) if case.phantom else _read_pairs(case, problems)
+    for number, (before, after) in enumerate(pairs, start=1):
+        _check_pair(problems, before, after, where=f"pair {number}: " if number > 1 else "")
+    if not pairs:
+        return CheckReport(case.id, tuple(problems.found))
+    before, after = pairs[0]
+    progress("predicting the cost")
+    cost = problems.attempt(lambda: expected_cost(case, before, after, n_pairs=len(pairs)))
+    if cost is not None:
+        problems.attempt(lambda: _check_edge(case, before, after))
+        problems.found += memory_problems(cost)
+    names = ("before", *(f"after[{i}]" for i in range(len(after))))
+    return CheckReport(case.id, tuple(problems.found), names, _organs(before, after), cost)
+
+
+Pair = tuple[Segmentation, tuple[Segmentation, ...]]
+
+
+def _phantom_states(case: Case, problems: _Problems) -> list[Pair]:
+    states = problems.attempt(lambda: read_states(case))
+    return [] if states is None else [(states.before, states.after)]
+
+
+def _read_pairs(case: Case, problems: _Problems) -> list[Pair]:
+    """Every pair whose reference state can be read, with those later states that can; each file is tried."""
+    images = case.images
+    if images is None:
+        return []
+    table = images.names
+    names = problems.attempt(lambda: read_label_table(table)) if table else None
+    for grey in (images.intensities_before, *images.intensities_after):
+        if grey is not None:
+            problems.attempt(partial(read_intensities, grey))
+    pairs: list[Pair] = []
+    for reference, later in ((images.before, images.after), *((pair.before, pair.after) for pair in case.pairs)):
+        before = problems.attempt(partial(read_segmentation, case, reference, names, None))
+        tissues = before.tissues if before else None
+        after = [problems.attempt(partial(read_segmentation, case, path, names, tissues)) for path in later]
+        if before is not None:
+            pairs.append((before, tuple(image for image in after if image is not None)))
+    return pairs
+
+
+def _check_pair(problems: _Problems, before: Segmentation, after: tuple[Segmentation, ...], *, where: str) -> None:
+    """Every check on the images of one pair; an organ that is absent is named, and left out of the other checks."""
+    names = ["after" if len(after) == 1 else f"after[{i}]" for i in range(1, len(after) + 1)]
+    absent = _absent([("before", before), *zip(names, after, strict=True)])
+    for tissue, images in absent.items():
+        text = (
+            f"{where}tissue '{tissue}' has no voxel in {' and '.join(repr(name) for name in images)}; an organ must be"
+            " seen in both states: check its label in the image, or take the tissue out of the case"
+        )
+        problems.add(Problem(InputDataError.__name__, text, InputDataError.exit_code))
+    before, after = _without(before, absent), tuple(_without(image, absent) for image in after)
+    problems.warn(check_segmentation(before, "before"), where)
+    problems.attempt(lambda: refuse_unmeshable(before, "before"))
+    for name, image in zip(names, after, strict=True):
+        problems.warn(check_segmentation(image, name), where)
+        problems.attempt(partial(refuse_unmeshable, image, name))
+        if not any(tissue.role is Role.RIGID for tissue in image.tissues):  # else only alignment can tell
+            problems.attempt(partial(refuse_lost, before, image, name))
+        if any(tissue.role in OBSERVED for tissue in before.tissues):
+            findings = problems.attempt(partial(check_pair, before, image, name=name))
+            problems.warn(findings or (), where)
+    problems.warn(every_finding(before, after), where)
+
+
+def _absent(images: Sequence[tuple[str, Segmentation]]) -> dict[str, list[str]]:
+    """Tissue -> the images that do not show it, of those that must."""
+    missing: dict[str, list[str]] = {}
+    for name, image in images:
+        present = set(np.unique(image.index).tolist())
+        for i, tissue in enumerate(image.tissues):
+            if tissue.role in OBSERVED and i not in present:
+                missing.setdefault(tissue.name, []).append(name)
+    return missing
+
+
+def _without(image: Segmentation, absent: dict[str, list[str]]) -> Segmentation:
+    """The image with the absent tissues made void, which nobody looks at."""
+    tissues = tuple(replace(t, role=Role.VOID) if t.name in absent else t for t in image.tissues)
+    return Segmentation(image.index, image.grid, tissues)
+
+
+def _check_edge(case: Case, before: Segmentation, after: tuple[Segmentation, ...]) -> None:
+    """As the mesher says it."""
+    lengths = case_domain(before, after, case).lengths
+    edge = case.mesh.edge_length_mm
+    if edge >= float(lengths.min()):
+        raise GeometryError(
+            f"mesh.edge_length_mm is {edge}; it must be positive and less than the smallest side of the domain,"
+            f" {lengths.min():.1f} mm"
+        )
+
+
+def memory_problems(cost: ExpectedCost) -> list[Problem]:
+    """A problem when the memory that is free may not do; it is refused where even half of the need is not there."""
+    free = free_memory_gb()
+    if free is None or cost.memory_gb < free / MEMORY_FACTOR:
+        return []
+    text = (
+        f"about {cost.memory_gb:.1f} GB of memory will be needed and {free:.1f} GB are free; make mesh.edge_length_mm"
+        ' larger, or domain.extent = "margin" with a smaller margin_mm'
+    )
+    beyond = cost.memory_gb > MEMORY_FACTOR * free
+    return [Problem("memory", text, ResourceError.exit_code if beyond else 0)]
+
+
+def _organs(before: Segmentation, after: tuple[Segmentation, ...]) -> tuple[OrganRow, ...]:
+    return tuple(
+        OrganRow(t.name, str(t.role), tuple(round(image.volume(i) / 1000.0, 4) for image in (before, *after)))
+        for i, t in enumerate(before.tissues)
+    )

@@ -1,0 +1,131 @@
+"""What organs do to each other in the images: how much of a surface they share, and how far it moves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.images.checks import Finding
+from palpate.images.segmentation import Segmentation
+from palpate.images.tissue import Role
+
+__all__ = ["contact_findings", "every_finding", "motion_findings", "sides_findings", "wall_motion"]
+
+LEAST_OBSERVED = 0.1  # below, an estimate is refused (see observation.observed_surface)
+LITTLE_OBSERVED = 0.5
+STILL_VOXELS = 0.15  # mean motion of a surface, in voxels, that the voxels' own rounding makes
+
+
+def contact_findings(segmentation: Segmentation) -> tuple[Finding, ...]:
+    """A finding for each `estimate` tissue that touches a driver, a bone, air or the image's border with much of it.
+
+    Such faces are prescribed or cut and are left out of the observation. Code "touching", or "hardly-observed" when
+    less than a tenth of the surface is left, which an estimate refuses.
+    """
+    faces = _shared_faces(segmentation)
+    tissues = segmentation.tissues
+    findings = []
+    for i, tissue in enumerate(tissues):
+        total = float(faces[i].sum() - faces[i, i])
+        if tissue.role is not Role.ESTIMATE or not total:
+            continue
+        held = {tissues[j].name: faces[i, j] / total for j in range(len(tissues)) if not tissues[j].meshed}
+        held["the image's border"] = faces[i, -1] / total
+        shares = {name: share for name, share in held.items() if share >= 0.01}
+        left = 1.0 - sum(held.values())
+        if not shares or left > 1.0 - LITTLE_OBSERVED / 5.0:
+            continue
+        words = ", ".join(f"{name} ({share:.0%})" for name, share in shares.items())
+        text = (
+            f"'{tissue.name}' touches {words}; those faces say nothing about its stiffness, and {left:.0%} of its"
+            " surface is left to observe"
+        )
+        findings.append(Finding("touching" if left >= LEAST_OBSERVED else "hardly-observed", text))
+    return tuple(findings)
+
+
+def motion_findings(before: Segmentation, after: Segmentation, name: str) -> tuple[Finding, ...]:
+    """A finding for the image called `name` when no driver's or bone's surface in it moves by more than the noise."""
+    movers = [i for i, tissue in enumerate(before.tissues) if tissue.role in (Role.DRIVER, Role.RIGID)]
+    voxel = float(max(before.grid.spacing.max(), after.grid.spacing.max()))
+    motions = {before.tissues[i].name: wall_motion(before, after, i) for i in movers}
+    if not motions or max(motions.values()) > STILL_VOXELS * voxel:
+        return ()
+    words = ", ".join(f"{tissue} {motion:.2g} mm" for tissue, motion in motions.items())
+    text = (
+        f"hardly anything moves from 'before' to '{name}' (mean motion of the walls: {words}; voxels of {voxel:.2g}"
+        " mm): the motion is not above the noise of the voxels, and intervals will be wide; use a pair with more"
+        " filling"
+    )
+    return (Finding("motion-below-noise", text),)
+
+
+def wall_motion(before: Segmentation, after: Segmentation, tissue: int) -> float:
+    """Mean normal motion of a tissue's surface, mm: the volume that it gains and loses, by its area.
+
+    The area is that of the voxels' faces times 2/3, its mean over all directions of a plane (Cauchy).
+    """
+    lost = _outside(before, after, tissue) * before.grid.voxel_volume
+    gained = _outside(after, before, tissue) * after.grid.voxel_volume
+    faces = 0.0
+    spacing = before.grid.spacing
+    mask = before.mask(tissue)
+    for axis in range(3):
+        faces += np.count_nonzero(np.diff(mask, axis=axis)) * float(np.prod(spacing) / spacing[axis])
+    return float((lost + gained) / max(2.0 / 3.0 * faces, 1e-9))
+
+
+def sides_findings(segmentation: Segmentation, name: str) -> tuple[Finding, ...]:
+    """A finding when tissues called left lie to the right (+x, RAS) of their namesakes called right."""
+    middles = {
+        tissue.name.lower(): _middle(segmentation, i)
+        for i, tissue in enumerate(segmentation.tissues)
+        if ("left" in tissue.name.lower() or "right" in tissue.name.lower()) and segmentation.mask(i).any()
+    }
+    twins = [(left, left.replace("left", "right")) for left in middles if "left" in left]
+    wrong = [left for left, right in twins if right in middles and middles[left] > middles[right]]
+    if not wrong:
+        return ()
+    text = (
+        f"in '{name}', {', '.join(repr(left) for left in wrong)} lies to the right of its namesake: left and right are"
+        " exchanged in the names or in the header; stiffness does not mind, but check the image's orientation"
+    )
+    return (Finding("sides-exchanged", text),)
+
+
+def _shared_faces(segmentation: Segmentation) -> NDArray[np.float64]:
+    """Area (n, n + 1) mm^2 of voxel faces between tissues; the last column is the image's border."""
+    n = len(segmentation.tissues)
+    index, spacing = segmentation.index, segmentation.grid.spacing
+    faces = np.zeros((n, n + 1))
+    for axis in range(3):
+        area = float(np.prod(spacing) / spacing[axis])
+        low = np.take(index, range(index.shape[axis] - 1), axis).ravel().astype(np.int64)
+        high = np.take(index, range(1, index.shape[axis]), axis).ravel().astype(np.int64)
+        differ = low != high
+        both = np.bincount(low[differ] * n + high[differ], minlength=n * n).reshape(n, n)
+        faces[:, :n] += area * (both + both.T)
+        for end in (0, -1):
+            faces[:, n] += area * np.bincount(np.take(index, end, axis).ravel(), minlength=n)
+    return faces
+
+
+def _outside(one: Segmentation, other: Segmentation, tissue: int) -> int:
+    """Number of the tissue's voxels in one image that are not its own in the other, within that one's field of view."""
+    index = np.rint(other.grid.index(one.grid.world(np.argwhere(one.mask(tissue)).astype(float)))).astype(np.int64)
+    inside = ((index >= 0) & (index < other.grid.shape)).all(axis=1)
+    return int(np.count_nonzero(other.index[tuple(index[inside].T)] != tissue))
+
+
+def _middle(segmentation: Segmentation, tissue: int) -> float:
+    """World x of a tissue's centroid, mm."""
+    return float(segmentation.grid.world(np.argwhere(segmentation.mask(tissue)).mean(axis=0)[None])[0, 0])
+
+
+def every_finding(before: Segmentation, after: Sequence[Segmentation]) -> tuple[Finding, ...]:
+    """Contacts of the reference state and motions of all later ones, named as `check_images` names them."""
+    names = ["after" if len(after) == 1 else f"after[{i}]" for i in range(1, len(after) + 1)]
+    motions = [f for name, image in zip(names, after, strict=True) for f in motion_findings(before, image, name)]
+    return (*contact_findings(before), *sides_findings(before, "before"), *motions)

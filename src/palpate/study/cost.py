@@ -1,0 +1,138 @@
+"""What an estimate will cost, from volumes and edge length alone: tetrahedra, unknowns, memory, time."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from palpate.images.segmentation import Segmentation
+from palpate.images.tissue import Role
+from palpate.mechanics.solvers.registry import SOLVERS
+from palpate.mesh.anatomy import Box
+from palpate.study.body import case_domain
+from palpate.study.case import Case
+
+__all__ = ["ExpectedCost", "expected_cost", "expected_tets", "free_memory_gb", "processors"]
+
+GRADING = 0.45  # the mesher's: growth of the edge length with the distance from a surface, mm per mm
+COARSEST = 4.0  # its longest edge, in edge lengths
+COARSER = 1.5  # its edge length on bones, air and known tissues, in edge lengths
+LATTICE = 96  # points of the lattice along the longest side, on which edge lengths are summed
+# Fitted to the runs in docs/command-line.md, on one core of a 2.1 GHz server.
+TETS_A_CUBE = 22.8  # tetrahedra in a cube of the wanted edge length: 16.3 in smooth phantoms, 33 in a real pelvis
+UNKNOWNS_A_TET = {"P1": 0.62, "P2": 4.4}
+FIXED_S = 14.0  # start, intervals, report
+SECONDS_AN_UNKNOWN = 4.5e-4  # with 90 modes a driver, for each later image
+SECONDS_A_CUT = 1.4e-4  # of meshing, for each tetrahedron and each tissue that is cut out
+SUPERLU = (4.5, 26_000.0, 1.7)  # seconds more than with PARDISO at so many unknowns, and their power
+PARALLEL_SHARE = 0.3  # of the time, that more processors shorten
+FIXED_GB = 0.75
+GB_AN_UNKNOWN = 3.1e-5  # with 90 modes
+SUPERLU_GB_AN_UNKNOWN = 2.0e-5
+USUAL_MODES = 90
+OVERHEAD_MODES = 10  # what an unknown costs without any mode, in modes
+LARGEST_SUPERLU = 250_000  # unknowns, as in the registry
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedCost:
+    """Size of the mesh and of the linear systems, peak memory (GB), time (s), and what they were predicted for."""
+
+    tets: int
+    unknowns: int
+    memory_gb: float
+    seconds: float
+    solver: str
+    processors: int
+
+
+def expected_cost(case: Case, before: Segmentation, after: tuple[Segmentation, ...], *, n_pairs: int) -> ExpectedCost:
+    """The cost of estimating a case on this machine, from its first pair of images; further pairs cost the same each.
+
+    Tetrahedra from the sum of 1 / h^3 over the meshed volume, h the mesher's own edge length there; memory and time
+    from unknowns, modes, images and solver, with measured constants. The report is included, other programs are not.
+    """
+    tets = expected_tets(case, before, after)
+    unknowns = int(tets * UNKNOWNS_A_TET.get(case.mechanics.element, UNKNOWNS_A_TET["P2"]))
+    solver = "pardiso" if SOLVERS["pardiso"].available() else "superlu" if unknowns <= LARGEST_SUPERLU else "multigrid"
+    drivers = max(sum(tissue.role is Role.DRIVER for tissue in before.tissues), 1)
+    modes = (drivers * case.driver.modes + OVERHEAD_MODES) / (USUAL_MODES + OVERHEAD_MODES)
+    work = unknowns * modes * max(len(after), 1)
+    slower = 0.0 if solver == "pardiso" else 1.0
+    seconds = SECONDS_AN_UNKNOWN * work + SECONDS_A_CUT * tets * (len(before.tissues) - 1)
+    seconds += slower * SUPERLU[0] * (unknowns / SUPERLU[1]) ** SUPERLU[2]
+    gigabytes = GB_AN_UNKNOWN * work + slower * SUPERLU_GB_AN_UNKNOWN * unknowns
+    count = processors()
+    shorter = 1.0 - PARALLEL_SHARE + PARALLEL_SHARE / count
+    return ExpectedCost(
+        tets=n_pairs * tets,
+        unknowns=n_pairs * unknowns,
+        memory_gb=FIXED_GB + n_pairs * gigabytes,
+        seconds=(FIXED_S + n_pairs * seconds) * shorter,
+        solver=solver,
+        processors=count,
+    )
+
+
+def expected_tets(case: Case, before: Segmentation, after: tuple[Segmentation, ...]) -> int:
+    """Number of tetrahedra in the mesh of a reference state."""
+    box = case_domain(before, after, case)
+    index, cell = _lattice(before, box)
+    inside = index >= 0
+    edge = case.mesh.edge_length_mm
+    sizes = np.full(index.shape, COARSEST * edge)
+    filler = max(
+        (i for i, tissue in enumerate(before.tissues) if tissue.meshed), key=lambda i: _rank(before, i), default=-1
+    )
+    for i, tissue in enumerate(before.tissues):
+        if i != filler and (index == i).any():
+            start = edge * (1.0 if tissue.role in (Role.ESTIMATE, Role.DRIVER) else COARSER)
+            sizes = np.minimum(sizes, start + GRADING * _distance_to_surface(index == i, cell))
+    meshed = np.array([*(tissue.meshed for tissue in before.tissues), False])[index] & inside
+    return max(int(TETS_A_CUBE * np.prod(cell) * float((sizes[meshed] ** -3.0).sum())), 100)
+
+
+def processors() -> int:
+    """Processors that this process may use, and that the linear algebra's own limit leaves."""
+    seen = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    limits = [os.environ.get(name, "") for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")]
+    return min([seen, *(int(limit) for limit in limits if limit.isdigit() and int(limit) > 0)])
+
+
+def free_memory_gb() -> float | None:
+    """Memory that is free on this machine, GB; None where the system does not tell."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        return next(float(line.split()[1]) for line in lines if line.startswith("MemAvailable:")) / 1e6
+    except (OSError, StopIteration, ValueError):
+        return None
+
+
+def _rank(before: Segmentation, tissue: int) -> tuple[bool, float]:
+    """The mesher's filler: the remaining tissue if it is meshed, else the largest."""
+    return (not before.tissues[tissue].labels, before.volume(tissue))
+
+
+def _lattice(before: Segmentation, box: Box) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Tissue (n1, n2, n3) at the middles of cells that fill the box, -1 outside of the image; the cells' edges, mm."""
+    counts = np.maximum(np.ceil(box.lengths / box.lengths.max() * LATTICE), 4).astype(int)
+    cell = box.lengths / counts
+    ticks = [(np.arange(n) + 0.5) * size for n, size in zip(counts, cell, strict=True)]
+    local = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+    index = np.rint(before.grid.index(box.world(local))).astype(np.int64)
+    inside = ((index >= 0) & (index < before.grid.shape)).all(axis=1)
+    found = np.full(len(index), -1, dtype=np.int64)
+    found[inside] = before.index[tuple(index[inside].T)]
+    return found.reshape(tuple(counts)), cell
+
+
+def _distance_to_surface(mask: NDArray[np.bool_], cell: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distance (n1, n2, n3) mm of cells to the border of `mask`, on either side of it."""
+    outside = ndimage.distance_transform_edt(~mask, sampling=cell)
+    inside = ndimage.distance_transform_edt(mask, sampling=cell) if not mask.all() else np.full(mask.shape, np.inf)
+    return np.asarray(np.maximum(np.where(mask, inside, outside) - 0.5 * float(cell.min()), 0.0))

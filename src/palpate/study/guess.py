@@ -1,0 +1,235 @@
+"""Who is who: the roles of an image's labels, guessed from their names, else from their places."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from palpate.errors import InputDataError
+from palpate.images.label_image import LabelImage
+from palpate.images.tissue import Role
+from palpate.study.plausibility import usual_modulus
+
+__all__ = ["GuessedTissue", "guess_tissues"]
+
+SURROUNDINGS = "surroundings"
+BORDER_SHARE = 0.1  # of the image's border that the body, or the air around it, covers
+STILL_SHARE = 0.005  # of a label's voxels
+HOLLOW_CHANGE = 0.10  # of a volume: no solid organ changes so much between two scans
+
+
+@dataclass(frozen=True, slots=True)
+class GuessedTissue:
+    """A tissue of a case to be: its labels (none: the rest), its role and why; `role` None must be asked for."""
+
+    name: str
+    labels: tuple[int, ...]
+    role: Role | None
+    reason: str
+    youngs_modulus_kpa: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Rule:
+    """Words of a name, a role, and what the words mean; `rest`: the label goes to the surroundings."""
+
+    words: frozenset[str]
+    role: Role | None
+    meaning: str
+    rest: bool = False
+
+
+def _words(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+RULES = (
+    _Rule(_words("background air outside exterior external void"), Role.VOID, "is no part of the body"),
+    _Rule(
+        _words("tumour tumor tumours tumors lesion lesions cancer carcinoma gtv nodule metastasis"),
+        Role.ESTIMATE,
+        "is a tumour",
+    ),
+    _Rule(_words("renal kidney kidneys"), Role.ESTIMATE, "is a solid organ"),  # before the bony pelvis
+    _Rule(
+        _words(
+            "bone bones femur femurs femoral sacrum coccyx pelvis pelvic vertebra vertebrae spine hip hips ilium"
+            " ischium pubis rib ribs skull cranium tibia fibula humerus scapula clavicula clavicle sternum patella"
+            " mandible"
+        ),
+        Role.RIGID,
+        "is bone",
+    ),
+    _Rule(
+        _words("rectum anorectum rectal lumen balloon probe transducer"),
+        Role.DRIVER,
+        "is hollow, and its wall moves the others",
+    ),
+    _Rule(
+        _words("muscle muscles gluteus gluteal iliopsoas psoas autochthon obturator levator fat adipose"),
+        Role.KNOWN,
+        "has a published stiffness",
+    ),
+    _Rule(
+        _words("surroundings surrounding body rest remaining remainder other others soft tissue tissues"),
+        Role.KNOWN,
+        "is what surrounds the organs",
+        rest=True,
+    ),
+    _Rule(
+        _words(
+            "artery arteries vein veins vessel vessels aorta vena cava nerve cord canal bowel colon intestine duodenum"
+            " stomach oesophagus esophagus trachea skin cartilage costal lymph node ureter urethra atrial appendage"
+        ),
+        None,
+        "is neither observed nor held",
+        rest=True,
+    ),
+    _Rule(
+        _words(
+            "prostate prostatic bladder liver spleen pancreas uterus cervix ovary breast brain heart lung lungs lobe"
+            " thyroid gland vesicle vesicles zone organ testis penis gallbladder adrenal"
+        ),
+        Role.ESTIMATE,
+        "is an organ",
+    ),
+)
+
+
+def guess_tissues(before: LabelImage, after: Sequence[LabelImage] = ()) -> tuple[GuessedTissue, ...]:
+    """Tissues for a case on these images, in the order in which a case should list them.
+
+    A tumour stands before the organ around it, the surroundings before other known tissues, for they set the scale.
+    Labels that belong to no organ of interest are left to the surroundings. Raises `InputDataError` when the image
+    shows a single label.
+    """
+    present, counts = np.unique(before.labels, return_counts=True)
+    if len(present) < 2:
+        raise InputDataError(
+            f"the reference image shows the label {int(present[0])} only: there is no organ in it; check the file"
+        )
+    sizes = {int(label): int(count) for label, count in zip(present, counts, strict=True)}
+    border = _border_shares(before)
+    guesses = [_guess(label, before, after, border) for label in sizes]
+    guesses = [_checked(guess, after) for guess in guesses]
+    outside = [g for g in guesses if g.role is Role.VOID]
+    rest = [g for g in guesses if g.name == SURROUNDINGS]
+    organs = [g for g in guesses if g.role is not Role.VOID and g.name != SURROUNDINGS]
+    return tuple(_renamed([*sorted(organs, key=_order), *_surroundings(rest, before), *outside]))
+
+
+def _guess(label: int, before: LabelImage, after: Sequence[LabelImage], border: dict[int, float]) -> GuessedTissue:
+    name = before.names.get(label, "")
+    if not name:
+        return _by_place(label, before, after, border)
+    words = _words(re.sub(r"[^a-z]+", " ", re.sub(r"([a-z])([A-Z])", r"\1 \2", name).lower()))
+    for rule in RULES:
+        found = sorted(words & rule.words)
+        if found:
+            reason = f"'{found[0]}' {rule.meaning}"
+            if rule.rest:
+                return GuessedTissue(SURROUNDINGS, (label,), Role.KNOWN, f"'{name}' {rule.meaning}")
+            usual = usual_modulus(name) if rule.role is Role.KNOWN else None
+            return GuessedTissue(
+                name,
+                (label,),
+                rule.role,
+                reason if usual is None else f"{reason}: {usual.source}",
+                None if usual is None else usual.kpa,
+            )
+    return GuessedTissue(name, (label,), None, f"no rule knows the name '{name}'")
+
+
+def _by_place(label: int, before: LabelImage, after: Sequence[LabelImage], border: dict[int, float]) -> GuessedTissue:
+    """A label without a name: what reaches the border is the body or what is outside it; the others are organs."""
+    bodies = [other for other in border if other != 0 and border[other] > BORDER_SHARE and not before.names.get(other)]
+    named = any(_is_body(name) for other, name in before.names.items() if other in border)
+    if label == 0 and (bodies or named):
+        return GuessedTissue("outside", (0,), Role.VOID, "label 0 lies outside of the body's own label")
+    if label == 0 or label == max(bodies, key=lambda other: border[other], default=0):
+        reason = f"label {label} covers {border.get(label, 0.0):.0%} of the image's border"
+        return GuessedTissue(SURROUNDINGS, (label,), Role.KNOWN, reason)
+    name, change = f"label {label}", _volume_change(label, before, after)
+    if _still(label, before, after):
+        return GuessedTissue(name, (label,), Role.RIGID, "its voxels do not move at all, as only bone's do")
+    if abs(change) > HOLLOW_CHANGE:
+        return GuessedTissue(
+            name, (label,), Role.DRIVER, f"its volume changes by {change:+.0%}, as only a hollow organ's does"
+        )
+    return GuessedTissue(name, (label,), Role.ESTIMATE, f"without a name; its volume changes by {change:+.1%} only")
+
+
+def _is_body(name: str) -> bool:
+    return bool(_words(re.sub(r"[^a-z]+", " ", name.lower())) & _words("body surroundings surrounding other rest soft"))
+
+
+def _checked(guess: GuessedTissue, after: Sequence[LabelImage]) -> GuessedTissue:
+    """An organ that a later image does not show goes to the surroundings."""
+    watched = guess.role in (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
+    if watched and any(not np.isin(image.labels, guess.labels).any() for image in after):
+        reason = f"'{guess.name}' is absent in a later image"
+        return replace(guess, name=SURROUNDINGS, role=Role.KNOWN, reason=reason)
+    return guess
+
+
+def _surroundings(rest: list[GuessedTissue], before: LabelImage) -> list[GuessedTissue]:
+    """One tissue for all that is left, with a modulus between those of fat and muscle."""
+    if not rest:
+        return []
+    fat, muscle = usual_modulus("fat"), usual_modulus("muscle")
+    if fat is None or muscle is None:  # both stand in the table
+        return []
+    value = round(float(np.sqrt(fat.kpa * muscle.kpa)), 2)
+    named = [before.names.get(g.labels[0], f"label {g.labels[0]}") for g in rest]
+    reason = (
+        f"all that no other tissue names ({', '.join(named)}); {value:g} kPa lies between fat and muscle"
+        f" ({muscle.source})"
+    )
+    return [GuessedTissue(SURROUNDINGS, (), Role.KNOWN, reason, value)]
+
+
+def _order(guess: GuessedTissue) -> int:
+    if guess.role is Role.ESTIMATE and "tumour" in guess.reason:
+        return 0
+    roles = (Role.ESTIMATE, Role.DRIVER, Role.RIGID, None, Role.KNOWN)
+    return 1 + roles.index(guess.role)
+
+
+def _renamed(guesses: Sequence[GuessedTissue]) -> list[GuessedTissue]:
+    """Known tissues after the surroundings; every name once, and none that the case file reserves."""
+    known = [g for g in guesses if g.role is Role.KNOWN and g.name != SURROUNDINGS]
+    rest = [g for g in guesses if g.name == SURROUNDINGS]
+    others = [g for g in guesses if g.role not in (Role.KNOWN, Role.VOID)]
+    outside = [g for g in guesses if g.role is Role.VOID]
+    found: list[GuessedTissue] = []
+    taken = {"after"}
+    for guess in [*others, *rest, *known, *outside]:
+        name = guess.name if guess.name not in taken else f"{guess.name} {guess.labels[0] if guess.labels else 'rest'}"
+        taken.add(name)
+        found.append(replace(guess, name=name))
+    return found
+
+
+def _border_shares(image: LabelImage) -> dict[int, float]:
+    """Share of the image's six outer layers of voxels that each label covers."""
+    layers = [np.take(image.labels, end, axis).ravel() for axis in range(3) for end in (0, -1)]
+    labels, counts = np.unique(np.concatenate(layers), return_counts=True)
+    return {int(label): float(n) / counts.sum() for label, n in zip(labels, counts, strict=True)}
+
+
+def _still(label: int, before: LabelImage, after: Sequence[LabelImage]) -> bool:
+    """Whether hardly a voxel of the label changes in any later image; False where grids differ."""
+    mask = before.labels == label
+    alike = [image for image in after if image.labels.shape == mask.shape]
+    changed = [int(np.count_nonzero((image.labels == label) != mask)) for image in alike]
+    return bool(alike) and len(alike) == len(after) and max(changed) < STILL_SHARE * int(np.count_nonzero(mask))
+
+
+def _volume_change(label: int, before: LabelImage, after: Sequence[LabelImage]) -> float:
+    """Largest relative change of a label's volume."""
+    start = np.count_nonzero(before.labels == label) * before.grid.voxel_volume
+    ends = [np.count_nonzero(image.labels == label) * image.grid.voxel_volume for image in after]
+    return max((float(end / start - 1.0) for end in ends), key=abs, default=0.0)

@@ -1,0 +1,72 @@
+"""What no estimate can begin with: organs too small or thin to be meshed, organs that are lost between the images."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from palpate.errors import GeometryError, InputDataError
+from palpate.images.segmentation import Segmentation
+from palpate.images.tissue import Role
+
+__all__ = ["refuse_lost", "refuse_unmeshable"]
+
+SMALLEST_VOXELS = 50
+VOLUME_IMPLAUSIBLE = 0.30  # of an organ: no deformation, and hardly a filling, changes so much
+ORGANS = (Role.ESTIMATE, Role.DRIVER)
+
+
+def refuse_unmeshable(segmentation: Segmentation, name: str) -> None:
+    """Raise `GeometryError` when an organ or driver in the image called `name` has no usable surface.
+
+    That is one of under 50 voxels, or one that is nowhere two voxels thick. An absent organ is not this one's to name.
+    """
+    for i, tissue in enumerate(segmentation.tissues):
+        mask = segmentation.mask(i)
+        if tissue.role not in ORGANS or not mask.any():
+            continue
+        count = int(np.count_nonzero(mask))
+        if count < SMALLEST_VOXELS:
+            raise GeometryError(
+                f"'{tissue.name}' has only {count} voxels in '{name}', and {SMALLEST_VOXELS} are the least that a"
+                " surface can be made of: use finer images, or join it to its neighbour"
+            )
+        box = ndimage.find_objects(mask.astype(np.int8))[0]
+        if not ndimage.binary_erosion(mask[box], np.ones((2, 2, 2), dtype=bool)).any():
+            raise GeometryError(
+                f"'{tissue.name}' is nowhere two voxels thick in '{name}' ({count} voxels); such a sheet has no inside"
+                " to be meshed: use finer images, or join it to its neighbour"
+            )
+
+
+def refuse_lost(before: Segmentation, after: Segmentation, name: str) -> None:
+    """Raise `InputDataError` when an `estimate` tissue cannot be the same organ in the image called `name`.
+
+    Its volume changes by more than 30 %, uncut by the images' borders, or its middle moves by more than its size.
+    """
+    for i, tissue in enumerate(before.tissues):
+        one, other = before.mask(i), after.mask(i)
+        if tissue.role is not Role.ESTIMATE or not one.any() or not other.any():
+            continue
+        change = after.volume(i) / before.volume(i) - 1.0
+        if abs(change) > VOLUME_IMPLAUSIBLE and not (_cut(before, i) or _cut(after, i)):
+            raise InputDataError(
+                f"the volume of '{tissue.name}' changes by {change:+.1%} from 'before' ({before.volume(i) / 1e3:.4g}"
+                f" mL) to '{name}' ({after.volume(i) / 1e3:.4g} mL), which no deformation of one organ does: check"
+                " that the label means the same in both images, or give a hollow organ the role driver"
+            )
+        middles = [s.grid.world(np.argwhere(s.mask(i)).mean(axis=0)[None])[0] for s in (before, after)]
+        shift = float(np.linalg.norm(middles[1] - middles[0]))
+        size = float((6.0 * before.volume(i) / np.pi) ** (1.0 / 3.0))
+        if shift > size:
+            raise InputDataError(
+                f"'{tissue.name}' moves by {shift:.1f} mm from 'before' to '{name}', more than its size of {size:.1f}"
+                " mm, so its surfaces cannot be matched: check that its label means the same organ, and that the images"
+                " are aligned (images.align)"
+            )
+
+
+def _cut(segmentation: Segmentation, tissue: int) -> bool:
+    """Whether the tissue reaches the border of its image."""
+    mask = segmentation.mask(tissue)
+    return any(bool(np.take(mask, end, axis).any()) for axis in range(3) for end in (0, -1))

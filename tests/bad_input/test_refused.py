@@ -1,0 +1,128 @@
+"""What is refused, of docs/bad-input.md: the exit code of its class, one sentence, nothing written."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from bad_inputs import (
+    LAYERS,
+    NRRD,
+    anatomy,
+    as_floats,
+    ball,
+    bomb,
+    both,
+    changed,
+    cut,
+    flipped,
+    header,
+    layers,
+    nrrd,
+    overlapping,
+    replace_after,
+    save,
+    sentence,
+    sheet,
+    speck,
+)
+
+REFUSED = {
+    "1 an empty file": (lambda f: (f / "after.nii.gz").write_bytes(b""), 3, "is empty (0 bytes)"),
+    "1 a file of ten bytes": (lambda f: cut(f / "after.nii.gz", 10), 3, "after.nii.gz"),
+    "2 no gzip inside": (lambda f: (f / "after.nii.gz").write_bytes(b"these are words" * 99), 3, "gzip"),
+    "3 a stream cut short": (lambda f: cut(f / "after.nii.gz", 200), 3, "cut short"),
+    "4 a bomb": (bomb, 3, "goes on for more than"),
+    "5 negative sizes": (lambda f: header(f, dim=[3, -26, 26, 26, 1, 1, 1, 1]), 3, "not positive"),
+    "5 zero sizes": (lambda f: header(f, dim=[3, 26, 0, 26, 1, 1, 1, 1]), 3, "not positive"),
+    "5 sizes beyond all": (lambda f: header(f, dim=[3, 32767, 32767, 32767, 1, 1, 1, 1]), 3, "promises"),
+    "6 no number as offset": (lambda f: header(f, vox_offset=np.nan), 3, "first voxel at byte nan"),
+    "6 an infinite offset": (lambda f: header(f, vox_offset=np.inf), 3, "first voxel at byte inf"),
+    "6 an offset in the header": (lambda f: header(f, vox_offset=16.0), 3, "first voxel at byte 16"),
+    "7 sform against qform": (lambda f: header(f, qform_code=1, pixdim=[1, 3, 3, 3, 1, 1, 1, 1]), 3, "sform and qform"),
+    "7 neither": (lambda f: header(f, sform_code=0, qform_code=0), 3, "neither sform nor qform"),
+    "7 a sheared sform": (lambda f: header(f, qform_code=0, srow_x=[1.5, 0.4, 0, 0]), 3, "not at right angles"),
+    "8 a flat affine": (lambda f: header(f, qform_code=0, srow_x=[0, 0, 0, 0]), 3, "flattens the image"),
+    "8 no number in the affine": (lambda f: header(f, qform_code=0, srow_x=[np.nan, 0, 0, 0]), 3, "not finite"),
+    "9 fractions": (lambda f: as_floats(f, 0.5), 3, "no label image"),
+    "9 no numbers": (lambda f: as_floats(f, np.nan), 3, "NaN or infinite"),
+    "9 negative labels": (lambda f: as_floats(f, -1.0), 3, "run from -1"),
+    "9 labels too large": (lambda f: as_floats(f, 70000.0), 3, "to 70000"),
+    "10 four axes": (lambda f: save(f / "after.nii.gz", np.stack([anatomy()] * 3, axis=-1)), 3, "three axes"),
+    "10 colours": (lambda f: header(f, datatype=[128, 24]), 3, "type"),
+    "10 one slice": (lambda f: save(f / "after.nii.gz", anatomy()[:, :, 5]), 3, "three axes"),
+    "11 data outside the folder": (lambda f: nrrd(f, "a.nhdr", NRRD + "\ndata file: ../../x.raw"), 3, "a.nhdr"),
+    "12 sizes against data": (lambda f: nrrd(f, "a.nrrd", NRRD, bytes(1000)), 3, "a.nrrd"),
+    "13 layers that overlap": (overlapping, 3, "overlap"),
+    "13 one value twice in a layer": (
+        lambda f: nrrd(f, "a.seg.nrrd", LAYERS.replace("Layer:=1", "Layer:=0"), layers(anatomy() == 1, anatomy() == 2)),
+        3,
+        "a.seg.nrrd",
+    ),
+    "18 mirrored": (flipped, 3, "looks mirrored"),
+    "19 a label in one image only": (
+        lambda f: save(f / "after.nii.gz", np.where(anatomy(radius=6.0) == 1, 0, anatomy(radius=6.0))),
+        3,
+        "has no voxel in 'after'",
+    ),
+    "21 a speck": (lambda f: both(f, speck), 4, "has only 27 voxels"),
+    "21 a sheet": (lambda f: both(f, sheet), 4, "nowhere two voxels thick"),
+    "25 elements too coarse": (
+        lambda f: changed(f, "edge_length_mm = 6.0", "edge_length_mm = 38.0"),
+        4,
+        "edge_length_mm",
+    ),
+    "26 identical images": (lambda f: shutil.copy(f / "before.nii.gz", f / "after.nii.gz"), 3, "the same label image"),
+    "27 a volume that cannot be": (lambda f: save(f / "after.nii.gz", anatomy(radius=6.0, organ=8.5)), 3, "volume of"),
+    "27 a motion that cannot be": (
+        lambda f: [
+            save(f / f"{name}.nii.gz", np.where(anatomy(radius=radius) == 2, 2, ball([x, y, 19.0], 5.0)))
+            for name, radius, x, y in (("before", 4.0, 19.0, 25.0), ("after", 6.0, 32.0, 10.0))
+        ],
+        3,
+        "moves by",
+    ),
+    "29 incompressible": (lambda f: changed(f, '"estimate"', '"estimate"\npoisson_ratio = 0.5'), 2, "-1 < nu < 0.5"),
+    "29 beyond all ratios": (
+        lambda f: changed(f, '"estimate"', '"estimate"\npoisson_ratio = -1.0'),
+        2,
+        "-1 < nu < 0.5",
+    ),
+    "30 no stiffness": (lambda f: changed(f, "kpa = 10.0", "kpa = 0.0"), 2, "positive number in kPa"),
+    "30 bounds reversed": (lambda f: changed(f, "[1.0]", "[1.0]\nbounds_ratio = [9.0, 0.1]"), 2, "low < high"),
+    "30 a start at a bound": (
+        lambda f: changed(f, "[1.0]", "[1.0]\nbounds_ratio = [1.0, 9.0]"),
+        2,
+        "between the bounds",
+    ),
+    "36 a mistyped key": (lambda f: changed(f, "edge_length_mm", "edge_lenght_mm"), 2, "did you mean 'edge_length_mm'"),
+    "36 a wrong type": (lambda f: changed(f, "modes = 6", 'modes = "six"'), 2, "whole number"),
+    "36 keys in conflict": (lambda f: changed(f, "[1.0]", "[1.0]\nstarts_kpa = [9.0]"), 2, "say the same thing"),
+    "36 a missing file": (lambda f: (f / "after.nii.gz").unlink(), 3, "there is no file"),
+    "36 a path of 300 characters": (lambda f: replace_after(f, "x" * 300 + ".nii.gz"), 3, "cannot be opened"),
+    "36 a case in another encoding": (lambda f: (f / "case.toml").write_bytes(b"\xff\xfei\x00"), 2, "UTF-8"),
+    "one label for two tissues": (lambda f: changed(f, "label = 2", "label = 1"), 2, "label 1 is claimed"),
+    "nothing that moves": (lambda f: changed(f, '"driver"', '"void"'), 2, "nothing moves this body"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_refused_has_its_code_and_a_sentence_and_leaves_nothing(name, folder, palpate):
+    spoil, code, words = REFUSED[name]
+    spoil(folder)
+    done = palpate("estimate", "case.toml", "--output", "out", "--quiet", cwd=folder)
+    assert words in sentence(done, code)
+    assert code == 4 or not (folder / "out").exists()
+    assert code != 4 or [path.name for path in (folder / "out").iterdir()] == ["log.txt"]
+
+
+@pytest.mark.parametrize("name", ["1 an empty file", "19 a label in one image only", "21 a speck", "29 incompressible"])
+def test_check_finds_what_an_estimate_refuses(name, folder, palpate):
+    spoil, code, words = REFUSED[name]
+    spoil(folder)
+    done = palpate("check", "case.toml", "--json", cwd=folder)
+    problems = json.loads(done["out"])["problems"]
+    assert done["code"] == code
+    assert any(words in problem["message"] for problem in problems if problem["severity"] == "refused")

@@ -1,0 +1,77 @@
+"""`palpate check`: everything at once, and a cost that follows volumes and edge length."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import pytest
+
+from palpate.cli import main
+from palpate.study import check, cost
+from palpate.study.check import check_case
+from palpate.study.cost import expected_cost, expected_tets
+
+
+def silent(_: str) -> None:
+    """Nobody listens."""
+
+
+def test_every_problem_is_listed_and_the_worst_class_is_the_exit_code(tmp_path):
+    for name in ("before.nii.gz", "after.nii.gz"):
+        (tmp_path / name).write_bytes(b"")
+    (tmp_path / "case.toml").write_text(
+        '[images]\nbefore = "before.nii.gz"\nafter = ["after.nii.gz", "none.nii.gz"]\n[tissues.prostate]\nlabel = 1\n'
+        'role = "estimate"\n[tissues.rest]\nlabel = "remaining"\nrole = "known"\nyoungs_modulus_kpa = 1e5\n'
+    )
+    found = check_case(tmp_path / "case.toml", (), progress=silent)
+    words = (
+        "nothing moves this body",
+        "before.nii.gz' is empty",
+        "after.nii.gz' is empty",
+        "there is no file",
+        "Pa, wr",
+    )
+    assert [sum(word in problem.message for problem in found.problems) for word in words] == [1, 1, 1, 1, 1]
+    assert found.exit_code == 3
+    assert found.text().splitlines()[-1].startswith("warning: tissue 'rest'")
+
+
+def test_a_case_that_cannot_be_read_is_a_problem_with_its_code(tmp_path, capsys):
+    (tmp_path / "case.toml").write_text("[images\n")
+    assert main(["check", str(tmp_path / "case.toml"), "--json"]) == 2
+    document = json.loads(capsys.readouterr().out)
+    assert (document["schema"], document["exit_code"]) == ("palpate.check/1", 2)
+    assert [problem["severity"] for problem in document["problems"]] == ["refused"]
+    assert [path.name for path in tmp_path.iterdir()] == ["case.toml"]
+
+
+def test_half_the_edge_length_costs_about_eight_times_the_tetrahedra(case_result):
+    case = case_result.case
+    finer = [dataclasses.replace(case, mesh=dataclasses.replace(case.mesh, edge_length_mm=h)) for h in (4.0, 2.0)]
+    coarse, fine = (expected_tets(one, case_result.before, case_result.after) for one in finer)
+    assert 4.0 < fine / coarse < 10.0
+
+
+def test_cost_grows_with_modes_images_and_pairs_and_shrinks_with_processors(case_result, monkeypatch):
+    case, before, after = case_result.case, case_result.before, case_result.after
+    plain = expected_cost(case, before, after, n_pairs=1)
+    fewer = dataclasses.replace(case, driver=dataclasses.replace(case.driver, modes=10))
+    assert expected_cost(fewer, before, after, n_pairs=1).memory_gb < plain.memory_gb
+    assert expected_cost(case, before, (*after, *after), n_pairs=1).seconds > plain.seconds
+    assert expected_cost(case, before, after, n_pairs=2).unknowns == 2 * plain.unknowns
+    monkeypatch.setattr(cost, "processors", lambda: 2 * plain.processors)
+    assert expected_cost(case, before, after, n_pairs=1).seconds < plain.seconds
+
+
+def test_the_limit_of_the_linear_algebra_counts_as_processors(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    assert cost.processors() == 1
+
+
+@pytest.mark.parametrize(("free", "code"), [(1000.0, None), (1.0, 0), (0.1, 6)])
+def test_memory_that_will_not_do_is_told_before(case_result, monkeypatch, free, code):
+    needed = expected_cost(case_result.case, case_result.before, case_result.after, n_pairs=1)
+    monkeypatch.setattr(check, "free_memory_gb", lambda: free)
+    found = [problem.exit_code for problem in check.memory_problems(needed)]
+    assert found == ([] if code is None else [code])

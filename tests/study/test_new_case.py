@@ -1,0 +1,154 @@
+"""`palpate init`: a case that its own reader takes, roles with their reasons, questions where nothing can be known."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from palpate.cli import main
+from palpate.errors import ConfigurationError, InputDataError
+from palpate.images.label_image import LabelImage, VoxelGrid
+from palpate.images.readers import write_label_image
+from palpate.images.tissue import Role
+from palpate.study.case_file import read_case
+from palpate.study.guess import guess_tissues
+from palpate.study.new_case import CaseImages, new_case
+
+GRID = VoxelGrid((30, 30, 30), np.diag([2.0, 2.0, 2.0, 1.0]))
+NAMES = {1: "Prostate", 2: "urinary_bladder", 3: "rectum", 4: "femur_left", 5: "colon", 6: "prostateTumour", 9: "body"}
+
+
+def labels(*, filled: bool = False) -> np.ndarray:
+    """Seven boxes in a body that air surrounds."""
+    array = np.zeros((30, 30, 30), dtype=np.int32)
+    array[2:28, 2:28, :] = 9
+    array[10:18, 10:18, 10:18] = 1
+    array[12:16, 12:16, 12:16] = 6
+    array[10:18, 10:18, 20:28] = 2
+    array[10 : 18 if filled else 15, 4:8, 5:25] = 3
+    array[22:26, 10:18, 10:18] = 4
+    array[22:26, 4:8, 10:18] = 5
+    return array
+
+
+def image(names=None, **options) -> LabelImage:
+    return LabelImage(labels(**options), GRID, names or {})
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_label_image(tmp_path / "b.nii.gz", image())
+    write_label_image(tmp_path / "a.nii.gz", image(filled=True))
+    (tmp_path / "names.json").write_text(json.dumps({str(k): v for k, v in NAMES.items()}))
+    return tmp_path
+
+
+def test_roles_follow_from_names_in_the_order_that_a_case_needs():
+    guesses = guess_tissues(image(NAMES), [image(NAMES, filled=True)])
+    assert [(g.name, g.role) for g in guesses] == [
+        ("prostateTumour", Role.ESTIMATE),
+        ("Prostate", Role.ESTIMATE),
+        ("urinary_bladder", Role.ESTIMATE),
+        ("rectum", Role.DRIVER),
+        ("femur_left", Role.RIGID),
+        ("surroundings", Role.KNOWN),
+        ("outside", Role.VOID),
+    ]
+    assert all(g.reason for g in guesses)
+    surroundings = guesses[-2]
+    assert "colon" in surroundings.reason
+    assert 2.25 < surroundings.youngs_modulus_kpa < 3.0
+
+
+def test_without_names_places_and_volumes_tell():
+    guesses = {g.labels: g for g in guess_tissues(image(), [image(filled=True)])}
+    assert guesses[(3,)].role is Role.DRIVER
+    assert "+60%" in guesses[(3,)].reason
+    assert guesses[(4,)].role is Role.RIGID
+    assert guesses[()].role is Role.KNOWN
+    assert guesses[(0,)].role is Role.VOID
+
+
+def test_a_body_without_air_is_surrounded_by_its_background():
+    array = labels()
+    array[array == 9] = 0
+    guesses = guess_tissues(
+        LabelImage(array, GRID, {1: "prostate", 3: "rectum", 2: "bladder", 4: "sacrum", 5: "aorta"})
+    )
+    assert [g.role for g in guesses if not g.labels] == [Role.KNOWN]
+    assert Role.VOID not in [g.role for g in guesses]
+
+
+def test_an_organ_that_a_later_image_lacks_is_left_to_the_surroundings():
+    later = labels(filled=True)
+    later[later == 2] = 9
+    guesses = guess_tissues(image(NAMES), [LabelImage(later, GRID, NAMES)])
+    assert "urinary_bladder" not in [g.name for g in guesses]
+
+
+def test_an_image_of_one_label_is_refused():
+    with pytest.raises(InputDataError, match="no organ"):
+        guess_tissues(LabelImage(np.zeros((30, 30, 30), dtype=np.int32), GRID))
+
+
+def test_the_case_is_read_by_its_reader_with_paths_that_lead_to_the_images(folder, capsys):
+    command = ["init", str(folder / "b.nii.gz"), str(folder / "a.nii.gz"), "--labels", str(folder / "names.json")]
+    assert main([*command, "--output", str(folder / "new" / "case 1"), "--json", "--quiet"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["schema"] == "palpate.init/1"
+    assert {row["role"] for row in document["tissues"]} == {"estimate", "driver", "rigid", "known", "void"}
+    assert document["questions"] == []
+    path = folder / "new" / "case 1" / "case.toml"
+    assert [item.name for item in path.parent.iterdir()] == ["case.toml"]
+    case = read_case(path)
+    assert case.images.before.resolve() == (folder / "b.nii.gz").resolve()
+    assert str(folder) not in path.read_text()
+    assert "'rectum' is hollow" in path.read_text()
+    assert main(["check", str(path), "--quiet"]) == 0
+
+
+def test_what_cannot_be_guessed_is_asked_for_and_then_refused_by_its_key(folder):
+    (folder / "names.json").write_text(json.dumps({"1": "prostate", "3": "rectum", "2": "structure x", "9": "body"}))
+    images = CaseImages(folder / "b.nii.gz", (folder / "a.nii.gz",), folder / "names.json")
+    case = new_case(images, folder)
+    assert any('tissues."structure x"' in question for question in case.questions)
+    (folder / "case.toml").write_text(case.text)
+    with pytest.raises(ConfigurationError, match=r"the key 'role' is missing in \[tissues.structure x\]"):
+        read_case(folder / "case.toml")
+
+
+def test_a_case_without_a_driver_asks_for_one(folder):
+    (folder / "names.json").write_text(json.dumps({"1": "prostate", "3": "vein", "2": "bladder", "9": "body"}))
+    images = CaseImages(folder / "b.nii.gz", (folder / "a.nii.gz",), folder / "names.json")
+    assert any("nothing was found that moves" in question for question in new_case(images, folder).questions)
+
+
+def test_another_case_is_never_replaced(folder, capsys):
+    images = [str(folder / "b.nii.gz"), str(folder / "a.nii.gz")]
+    (folder / "case.toml").write_text("# corrected by hand\n")
+    assert main(["init", *images, "--output", str(folder), "--quiet"]) == 2
+    assert "it is not replaced" in capsys.readouterr().err
+    assert (folder / "case.toml").read_text() == "# corrected by hand\n"
+
+
+def test_identical_images_are_refused_before_anything_is_written(folder, capsys):
+    images = [str(folder / "b.nii.gz")] * 2
+    assert main(["estimate", *images, "--output", str(folder / "out"), "--quiet"]) == 3
+    assert "the same label image" in capsys.readouterr().err
+    assert not (folder / "out").exists()
+
+
+def test_one_image_is_not_enough(folder, capsys):
+    assert main(["init", str(folder / "b.nii.gz"), "--output", str(folder), "--quiet"]) == 2
+    assert "one or more after" in capsys.readouterr().err
+
+
+def test_names_that_toml_could_stumble_over_survive(folder):
+    names = {"1": 'prostate "x" # [a]', "3": "rectum\\", "9": "body", "2": "bladder = 3"}
+    (folder / "names.json").write_text(json.dumps(names))
+    images = CaseImages(folder / "b.nii.gz", (folder / "a.nii.gz",), folder / "names.json")
+    (folder / "case.toml").write_text(new_case(images, folder).text)
+    tissues = read_case(folder / "case.toml").tissues
+    assert {tissue.name for tissue in tissues} >= {names["1"], names["2"], names["3"]}

@@ -1,0 +1,122 @@
+"""Several reference states of one patient share one set of moduli; a simulation needs no later image."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from palpate.cli import main
+from palpate.errors import ConfigurationError
+from palpate.images.readers import write_label_image
+from palpate.phantoms.spheres import SpheresOptions, spheres
+from palpate.study.case_file import read_case
+from palpate.study.read import read_pairs
+
+CASE = """
+[images]
+before = "before_2.nii.gz"
+after = ["after.nii.gz"]
+
+[tissues.core]
+label = 1
+role = "estimate"
+youngs_modulus_kpa = 60.0
+
+[tissues.shell]
+label = 2
+role = "estimate"
+youngs_modulus_kpa = 30.0
+
+[tissues.frame]
+label = 3
+role = "driver"
+
+[tissues.surroundings]
+label = "remaining"
+role = "known"
+youngs_modulus_kpa = 10.0
+
+[mechanics]
+element = "P1"
+
+[mesh]
+edge_length_mm = 8.0
+
+[driver]
+modes = 12
+
+[estimate]
+start_ratios = [3.0]
+"""
+PAIR = """
+[[pairs]]
+before = "other/before_3.nii.gz"
+after = ["other/after.nii.gz"]
+"""
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory) -> Path:
+    """Two pairs of images of balls with the same moduli, squeezed in different ways, on different grids."""
+    folder = tmp_path_factory.mktemp("pairs")
+    (folder / "other").mkdir()
+    for seed, place, spacing in ((2, folder, 1.5), (3, folder / "other", 1.4)):
+        scene = spheres(SpheresOptions(seed=seed, spacing_mm=(spacing,) * 3, truth_edge_mm=6.0))
+        write_label_image(place / f"before_{seed}.nii.gz", scene.before)
+        write_label_image(place / "after.nii.gz", scene.after)
+    (folder / "case.toml").write_text(CASE + PAIR)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def outputs(inputs, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("outputs")
+    assert main(["estimate", str(inputs / "case.toml"), "--output", str(folder), "--quiet"]) == 0
+    return folder
+
+
+def test_both_pairs_have_their_fit_mesh_and_digest_under_one_set_of_moduli(outputs):
+    result = json.loads((outputs / "result.json").read_text())
+    assert result["status"] == "converged"
+    assert [item["tissue"] for item in result["estimates"]] == ["core", "shell"]
+    assert result["estimates"][1]["value"] == pytest.approx(30.0, rel=0.4)
+    names = [fit["after"] for fit in result["fit"]]
+    assert [name.rsplit("/")[-1] for name in names] == ["after.nii.gz"] * 2
+    assert names[1] == "other/after.nii.gz"
+    for fit in result["fit"]:
+        assert fit["shell"]["end"]["rms_mm"] < 0.6 * fit["shell"]["start"]["rms_mm"]
+    assert result["pairs"][0]["mesh"]["tets"] != result["mesh"]["tets"]
+    assert {"before", "after[0]", "pairs[0].before", "pairs[0].after[0]"} == set(result["inputs"])
+    assert set(result["files"]) == {"mesh.vtu", "mesh_2.vtu", "stiffness.nii.gz", "labels.csv"}
+
+
+def test_findings_on_a_further_pair_name_it(inputs):
+    case = read_case(inputs / "case.toml", ["pairs=[{before='before_2.nii.gz', after=['other/after.nii.gz']}]"])
+    (states,) = read_pairs(case)
+    assert all(finding.message.startswith("pair 2: ") for finding in states.findings)
+
+
+def test_pairs_without_images_are_refused(tmp_path):
+    path = tmp_path / "case.toml"
+    path.write_text('[phantom]\nkind = "spheres"\n' + PAIR)
+    with pytest.raises(ConfigurationError, match=r"\[\[pairs\]\] without \[images\]"):
+        read_case(path)
+
+
+def test_a_filling_needs_no_later_image(inputs, tmp_path):
+    case = inputs / "filling.toml"
+    case.write_text(CASE.replace('after = ["after.nii.gz"]\n', "") + "[motion]\nfilling_mm = 1.0\n")
+    assert main(["simulate", str(case), "--output", str(tmp_path), "--quiet"]) == 0
+    moved = json.loads((tmp_path / "simulation.json").read_text())["largest_displacement_mm"]
+    assert moved == pytest.approx(1.0, rel=0.5)
+
+
+@pytest.mark.parametrize("motion", ["", "[motion]\nfilling_mm = 1.0\n"])
+def test_an_estimate_without_a_later_image_names_the_key(motion, inputs, tmp_path, capsys):
+    case = inputs / "alone.toml"
+    case.write_text(CASE.replace('after = ["after.nii.gz"]\n', "") + motion)
+    assert main(["estimate", str(case), "--output", str(tmp_path / "out"), "--quiet"]) == 2
+    assert "the key 'after' is missing in [images]" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
