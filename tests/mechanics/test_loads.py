@@ -7,10 +7,13 @@ import pytest
 
 from palpate.errors import ConfigurationError, GeometryError
 from palpate.mechanics.boundary import outer_constraint
+from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.laws.registry import LAWS
+from palpate.mechanics.linear_model import linear_model
 from palpate.mechanics.loads import boundary_named, gravity, pressure, traction
 from palpate.mechanics.newton import NewtonSettings
+from palpate.mechanics.reduced import reduce
 from palpate.mesh.space import lagrange_space
 
 SIZE = 20.0
@@ -171,3 +174,44 @@ def test_a_pressure_must_be_a_number(meshes):
     space = column(meshes)
     with pytest.raises(ConfigurationError, match="pressure of a load"):
         pressure(space, top(space), np.nan)
+
+
+@pytest.fixture(scope="module")
+def loaded(meshes):
+    """A linear model under dead pressure and weight, and the same body in the finite-strain model's linear law."""
+    space = column(meshes, n=3)
+    constraint = standing(meshes, space)
+    loads = (
+        pressure(space, top(space), 0.5, following=False),
+        gravity(space, np.array([900.0, 1100.0, 0.0]), np.array([0.0, -9.81, 0.0])),
+    )
+    law = LAWS["linear"]
+    finite = finite_strain_model(space, constraint, law, dilatation=Dilatation.POINTWISE, loads=loads)
+    return linear_model(space, constraint, loads=loads), finite
+
+
+def test_the_linear_model_bears_loads_as_the_linear_law_does(loaded):
+    linear, finite = loaded
+    moduli, still = np.array([5.0, 12.0]), np.zeros(0)
+    expected = finite.solve(moduli, still).values
+    assert abs(expected).max() > 0.1
+    assert linear.solve(moduli, still).values == pytest.approx(expected, abs=1e-8)
+    assert linear.responses(moduli)[:, -1] == pytest.approx(expected, abs=1e-8)
+
+
+def test_a_load_brings_a_scale(loaded):
+    linear, _ = loaded
+    moduli, still = np.array([5.0, 12.0]), np.zeros(0)
+    once, twice = (linear.solve(factor * moduli, still) for factor in (1.0, 2.0))
+    assert twice.values == pytest.approx(0.5 * once.values, rel=1e-9, abs=1e-12)
+    assert once.tangent().sum(axis=1) == pytest.approx(-once.values, rel=1e-9, abs=1e-12)
+
+
+def test_the_reduced_model_bears_the_loads_of_its_model(loaded):
+    linear, _ = loaded
+    places = [np.array([1.0, r]) for r in (0.5, 2.0, 8.0)]
+    snapshots = np.concatenate([linear.responses(place)[:, -1:] for place in places], axis=1)
+    reduced = reduce(linear, linear.constraint.free.T @ snapshots)
+    still = np.zeros(0)
+    for moduli in (np.array([1.0, 2.0]), np.array([3.0, 6.0])):
+        assert reduced.solve(moduli, still).values == pytest.approx(linear.solve(moduli, still).values, abs=1e-9)

@@ -1,7 +1,7 @@
 """Small-strain equilibrium of several tissues: affine in the moduli, linear in the boundary modes.
 
-K(E) = sum_r E_r K_r; an admissible u = F z + M q + o is in equilibrium when F^T K u = 0, that is
-K_ff z = -F^T K (M q + o) with K_ff = F^T K F.
+K(E) = sum_r E_r K_r; an admissible u = F z + M q + o is in equilibrium when F^T (K u - f) = 0, that is
+K_ff z = F^T f - F^T K (M q + o) with K_ff = F^T K F and dead loads f.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from scipy import sparse
 from palpate.errors import ConfigurationError
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.forward import SolveCounts, checked_coefficients, checked_moduli
+from palpate.mechanics.loads import Load
 from palpate.mechanics.rigid import rigid_modes
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mechanics.solvers.registry import factorise
@@ -31,6 +32,7 @@ class LinearModel:
 
     regions: indices in `space.mesh.tissues` of the meshed ones; per region at 1 kPa: stiffness K_r (n_dof, n_dof),
     free_stiffness F^T K_r F (n_free, n_free), coupling F^T K_r [M, o] (n_free, n_modes + 1), all mN/mm.
+    load (n_dof,) mN: the nodal forces f of all dead loads.
     """
 
     space: LagrangeSpace
@@ -40,6 +42,12 @@ class LinearModel:
     free_stiffness: tuple[sparse.csr_matrix[np.float64], ...]
     coupling: tuple[sparse.csr_matrix[np.float64], ...]
     solver: str
+    load: NDArray[np.float64]
+
+    @property
+    def free_load(self) -> NDArray[np.float64]:
+        """F^T f (n_free,), mN."""
+        return np.asarray(self.constraint.free.T @ self.load)
 
     @property
     def n_regions(self) -> int:
@@ -74,8 +82,8 @@ class LinearModel:
         return self.system(moduli).responses()
 
     def residual(self, moduli: NDArray[np.float64], displacements: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Out-of-balance forces F^T K(E) u (n_free, k), mN, of displacements u (n_dof, k) mm."""
-        return np.asarray(self.constraint.free.T @ self.forces(moduli, displacements))
+        """Out-of-balance forces F^T (K(E) u - f) (n_free, k), mN, of displacements u (n_dof, k) mm."""
+        return np.asarray(self.constraint.free.T @ self.forces(moduli, displacements)) - self.free_load[:, None]
 
     def forces(self, moduli: NDArray[np.float64], displacements: NDArray[np.float64]) -> NDArray[np.float64]:
         """Nodal forces K(E) u (n_dof, k), mN, that hold displacements u (n_dof, k) mm at moduli (n_regions,) kPa."""
@@ -99,9 +107,10 @@ class LinearSystem:
         return SolveCounts(forward=self.model.n_modes + 1, factorisations=1)
 
     def responses(self) -> NDArray[np.float64]:
-        """Displacement (n_dof, n_modes + 1) mm for each unit mode without the offset and, last, for the offset."""
+        """Displacement (n_dof, n_modes + 1) mm for each unit mode alone and, last, for the offset and the loads."""
         constraint = self.model.constraint
         loads = weighted_sum(self.moduli, self.model.coupling).toarray()
+        loads[:, -1] -= self.model.free_load
         given = np.column_stack([constraint.modes, constraint.offset])
         return np.asarray(given - constraint.free @ self.factorisation.solve(loads))
 
@@ -110,8 +119,8 @@ class LinearSystem:
     ) -> NDArray[np.float64]:
         """Derivatives dw / d ln E_r (n, n_dof, k), mm, of equilibria w (n_dof, k) mm at these moduli.
 
-        F K_ff^-1 F^T (-E_r K_r w) for r in `regions` (n,), by default all; over all of them they sum to zero, for no
-        load sets a scale.
+        F K_ff^-1 F^T (-E_r K_r w) for r in `regions` (n,), by default all; without loads they sum to zero over all of
+        them, for nothing sets a scale.
         """
         free = self.model.constraint.free
         chosen = np.arange(self.model.n_regions) if regions is None else regions
@@ -125,7 +134,7 @@ class LinearSystem:
         """Equilibrium at mode coefficients (n_modes,), dimensionless; one right-hand side."""
         checked = checked_coefficients(coefficients, self.model.n_modes)
         constraint = self.model.constraint
-        loads = weighted_sum(self.moduli, self.model.coupling) @ np.append(checked, 1.0)
+        loads = weighted_sum(self.moduli, self.model.coupling) @ np.append(checked, 1.0) - self.model.free_load
         given = constraint.modes @ checked + constraint.offset
         values = given - constraint.free @ self.factorisation.solve(loads[:, None])[:, 0]
         values.setflags(write=False)
@@ -134,8 +143,8 @@ class LinearSystem:
     def error_bound(self, moduli: NDArray[np.float64], displacements: NDArray[np.float64]) -> NDArray[np.float64]:
         """Upper bound (k,) of the relative energy-norm error of admissible displacements (n_dof, k) mm at `moduli`.
 
-        With the residual r = F^T K(E) u the error is exactly |r|_{K(E)^-1}; the system's own K(E0) stands in for K(E),
-        for K(E) >= min_r(E_r / E0_r) K(E0): |e|_K / |u|_K <= sqrt(r^T K(E0)^-1 r / min_r(E_r / E0_r)) / |u|_K.
+        With the residual r = F^T (K(E) u - f) the error is exactly |r|_{K(E)^-1}; the system's own K(E0) stands in for
+        K(E), as K(E) >= min_r(E_r / E0_r) K(E0): |e|_K / |u|_K <= sqrt(r^T K(E0)^-1 r / min_r(E_r / E0_r)) / |u|_K.
         Source: Patera & Rozza, Reduced Basis Approximation (2007), section 4.2 (min-theta approach).
         """
         residual = self.model.residual(moduli, displacements)
@@ -209,8 +218,11 @@ def linear_model(
     *,
     solver: str = "auto",
     dilatation: Dilatation = Dilatation.POINTWISE,
+    loads: tuple[Load, ...] = (),
 ) -> LinearModel:
     """Assemble the linear model of all meshed tissues of `space.mesh`, with their Poisson's ratios.
+
+    A pressure that follows its surface acts as on the surface at rest: to first order the body does not move.
 
     solver: a name of `palpate.mechanics.solvers.registry.SOLVERS` or "auto"; dilatation: that of the element, as
     `choose_element` gives it. Raises `ConfigurationError` when the constraint is of another space, `GeometryError` for
@@ -228,7 +240,9 @@ def linear_model(
     )
     rows = [sparse.csr_matrix(constraint.free.T @ matrix) for matrix in stiffness]
     free_stiffness = tuple(sparse.csr_matrix(part @ constraint.free) for part in rows)
-    model = LinearModel(space, constraint, regions, stiffness, free_stiffness, (), solver)
+    still = np.zeros_like(space.points)
+    load = sum((part.forces(still) for part in loads), np.zeros(n_dof))
+    model = LinearModel(space, constraint, regions, stiffness, free_stiffness, (), solver, load)
     return with_constraint(model, constraint)
 
 

@@ -1,7 +1,7 @@
 """Reduced models: Galerkin projection on a basis of displacements, whose online cost forgets the mesh.
 
-u = F V a + M q + o with V^T K_ff(E) V a = -V^T F^T K(E) (M q + o); all blocks are affine in the moduli and kept
-densely, one for each region. Quarteroni, Manzoni & Negri, Reduced Basis Methods (2016), chapter 3.
+u = F V a + M q + o with V^T K_ff(E) V a = V^T F^T (f - K(E) (M q + o)); all blocks are affine in the moduli and kept
+densely, one for each region, the loads' once. Quarteroni, Manzoni & Negri, Reduced Basis Methods (2016), chapter 3.
 """
 
 from __future__ import annotations
@@ -26,13 +26,15 @@ CHUNK = 64  # basis vectors multiplied with a stiffness at once
 class ReducedModel:
     """A linear model on m basis vectors; implements `ForwardModel`.
 
-    Per region at 1 kPa: stiffness (n_regions, m, m) and coupling (n_regions, m, n_modes + 1), mN/mm. Outputs (rows):
+    Per region at 1 kPa: stiffness (n_regions, m, m) and coupling (n_regions, m, n_modes + 1), mN/mm; load (m,) mN.
+    Outputs (rows):
     output_basis (n_outputs, m), output_given (n_outputs, n_modes + 1) mm: modes and, last, the offset.
     """
 
     names: tuple[str, ...]
     stiffness: NDArray[np.float64]
     coupling: NDArray[np.float64]
+    load: NDArray[np.float64]
     output_basis: NDArray[np.float64]
     output_given: NDArray[np.float64]
 
@@ -74,7 +76,9 @@ class ReducedModel:
                 f"the reduced stiffness of {len(matrix)} basis vectors is not positive definite ({error}): the moduli"
                 f" {checked.tolist()} kPa differ too much, or the basis holds nearly equal displacements"
             ) from error
-        amplitudes = -linalg.cho_solve(factor, np.tensordot(checked, self.coupling, axes=1), check_finite=False)
+        forces = np.tensordot(checked, self.coupling, axes=1)
+        forces[:, -1] -= self.load
+        amplitudes = -linalg.cho_solve(factor, forces, check_finite=False)
         return ReducedSystem(self, checked, factor[0], amplitudes)
 
     def solve(self, moduli: NDArray[np.float64], coefficients: NDArray[np.float64]) -> ReducedEquilibrium:
@@ -82,7 +86,7 @@ class ReducedModel:
         return self.system(moduli).solve(coefficients)
 
     def responses(self, moduli: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Outputs (n_outputs, n_modes + 1) mm for each unit mode and, last, for the offset; raises `SolverError`."""
+        """Outputs (n_outputs, n_modes + 1) mm for each unit mode and, last, for offset and loads; `SolverError`."""
         return self.system(moduli).responses()
 
 
@@ -197,7 +201,8 @@ def reduce(model: LinearModel, basis: NDArray[np.float64]) -> ReducedModel:
     stiffness = np.stack([_project(matrix, vectors) for matrix in model.free_stiffness])
     coupling = np.stack([np.asarray((matrix.T @ vectors).T) for matrix in model.coupling])
     given = np.column_stack([model.constraint.modes, model.constraint.offset])
-    return ReducedModel(model.names, stiffness, coupling, np.asarray(free @ vectors), given)
+    load = np.asarray(vectors.T @ model.free_load)
+    return ReducedModel(model.names, stiffness, coupling, load, np.asarray(free @ vectors), given)
 
 
 def _project(matrix: sparse.csr_matrix[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
