@@ -33,7 +33,9 @@ def linear(twins, body):
 @pytest.fixture(scope="module")
 def continued(twins, body, linear):
     _, problem, model = body
-    return continued_at_finite_strain(problem, (model,), linear, twins.settings(0.5, 8.0), progress=twins.silent)
+    return continued_at_finite_strain(
+        replace(problem, finite_strain=(model,)), linear, twins.settings(0.5, 8.0), progress=twins.silent
+    )
 
 
 def test_the_law_that_made_the_data_finds_the_moduli(twins, linear, continued):

@@ -26,6 +26,7 @@ from palpate.mesh.quality import check_mesh
 from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.tetrahedralise import tetrahedralise
 from palpate.phantoms.scene import imaged
+from palpate.study.case import Mechanics
 from palpate.study.simulate import filled
 
 __all__ = ["DATA", "TISSUES", "SimulatedPelvis", "simulate_pelvis"]
@@ -71,7 +72,9 @@ def simulate_pelvis(progress: Callable[[str], None]) -> SimulatedPelvis:
     check_mesh(mesh, anatomy)
     space = lagrange_space(mesh, "P2")
     progress(f"solving {3 * len(space.points)} unknowns")
-    displacement = filled(space, scan, filling_mm=FILLING_MM, outer="fixed")
+    displacement = filled(
+        space, scan, filling_mm=FILLING_MM, outer="fixed", mechanics=Mechanics(law="linear", element="P2")
+    )
     progress("turning both states into voxels")
     grid = _grid(box)
     still = np.zeros_like(displacement)

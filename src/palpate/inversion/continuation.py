@@ -18,11 +18,12 @@ from palpate.inversion.gauss_newton import Bounds, Minimum, Outcome
 from palpate.inversion.minima import minimised, settled_between, words
 from palpate.inversion.noise import NoiseLaw
 from palpate.inversion.objective import Objective
-from palpate.inversion.problem import InverseProblem, Inversion, InversionSettings
+from palpate.inversion.problem import InverseProblem, Inversion, InversionSettings, StandIn
 from palpate.inversion.weighting import objective_of, residual_law, reweighted
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
 from palpate.mechanics.first_order import FirstOrderModel, expanded
 from palpate.mechanics.forward import SolveCounts
+from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.constraint import Constraint
 
 __all__ = ["Expansion", "continued_at_finite_strain"]
@@ -43,6 +44,11 @@ class Expansion:
     counts: SolveCounts
 
     @property
+    def factorisation(self) -> Factorisation | None:
+        """That of the tangent stiffness there."""
+        return self.equilibrium.factorisation
+
+    @property
     def constraint(self) -> Constraint:
         """What is prescribed to the model."""
         return self.equilibrium.model.constraint
@@ -61,18 +67,18 @@ class _Place:
 
 def continued_at_finite_strain(
     problem: InverseProblem,
-    models: tuple[FiniteStrainModel, ...],
     linear: Inversion,
     settings: InversionSettings,
     *,
     progress: Callable[[str], None],
 ) -> Inversion:
-    """The estimate under the law of `models`, one for each of the problem's, from the minima of the `linear` one.
+    """The estimate under the law of the problem's `finite_strain` models, from the minima of the `linear` one.
 
     Each distinct linear minimum that converged is continued, the best one always. Raises `NotConverged` when its
     equilibrium is not found, with the element and the share of the motion where it ended.
     """
-    models = tuple(model.under(s.constraint) for model, s in zip(models, linear.surrogates, strict=True))
+    pairs = zip(problem.finite_strain, linear.surrogates, strict=True)
+    models = tuple(model.under(surrogate.constraint) for model, surrogate in pairs)
     chosen = linear.groups[linear.best]
     places = {chosen: _followed(problem, models, linear, linear.minimum, settings, progress)}
     for minimum, group in zip(linear.minima, linear.groups, strict=True):
@@ -112,7 +118,8 @@ def _followed(
     """Rounds from one linear minimum until the moduli no longer move."""
     progress("finite strain: the equilibrium at the linear estimate")
     moduli, amounts = _split(linear.objective, start.unknowns)
-    equilibria = tuple(model.solve(moduli, q) for model, q in zip(models, amounts, strict=True))
+    triples = zip(models, linear.surrogates, amounts, strict=True)
+    equilibria = tuple(_from_linear(model, surrogate, moduli, q) for model, surrogate, q in triples)
     expansions = tuple(_expansion(equilibrium, SolveCounts()) for equilibrium in equilibria)
     place = _placed(problem, expansions, replace(start, history=()), linear.law, settings)
     for number in range(ROUNDS):
@@ -125,6 +132,15 @@ def _followed(
     found = minimised(place.objective, place.minimum.unknowns, settings, tolerance=POLISH)
     end = _joined(place.minimum, found)
     return replace(place, minimum=end if place.settled else replace(end, outcome=Outcome.STEPS))
+
+
+def _from_linear(
+    model: FiniteStrainModel, linear: StandIn, moduli: NDArray[np.float64], amounts: NDArray[np.float64]
+) -> FiniteStrainEquilibrium:
+    """The equilibrium from the linear displacement; from rest, where that folds elements. Raises `NotConverged`."""
+    start = linear.reduced.solve(moduli, amounts).displacement
+    found = model.attempt(moduli, amounts, start=start, nearby=linear.factorisation)
+    return found if found.converged else model.solve(moduli, amounts)
 
 
 def _placed(

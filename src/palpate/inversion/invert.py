@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from palpate.errors import NotConverged
-from palpate.inversion.gauss_newton import Bounds, Minimum, gauss_newton
+from palpate.inversion.continuation import continued_at_finite_strain
+from palpate.inversion.gauss_newton import Minimum, gauss_newton
 from palpate.inversion.minima import best_of, continued, groups_of, minimised, settled_between, with_driver, words
 from palpate.inversion.noise import NoiseLaw
 from palpate.inversion.objective import Objective
@@ -20,7 +18,7 @@ from palpate.inversion.weighting import FIRST_LAW, objective_of, residual_law, r
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.reduced import ReducedModel
 
-__all__ = ["fit_driver", "invert", "invert_with"]
+__all__ = ["invert", "invert_with"]
 
 ROUNDS = 9
 EXACT = 3e-3  # standard deviations of a residual, per mm of motion: a smaller model error needs no further snapshot
@@ -28,7 +26,7 @@ POLISH = 1e-5  # decrement of the reported minimum
 
 
 def invert(problem: InverseProblem, settings: InversionSettings, *, progress: Callable[[str], None]) -> Inversion:
-    """Estimate log-moduli and driver motion together, from all starts.
+    """Estimate log-moduli and driver motion together, from all starts, with the linear law first.
 
     The reduced models are made at the middle start and enriched at the estimate until it no longer moves.
     """
@@ -42,7 +40,10 @@ def invert(problem: InverseProblem, settings: InversionSettings, *, progress: Ca
     driven = gauss_newton(objective, held, bounds=settings.bounds, hold_theta=True, tolerance=1e-2)
     pairs = zip(surrogates, objective.coefficients(driven.unknowns), strict=True)
     surrogates = tuple(with_modulus_series(s, q, problem.modulus_map.columns) for s, q in pairs)
-    return invert_with(problem, settings, surrogates, progress=progress)
+    linear = invert_with(problem, settings, surrogates, progress=progress)
+    if not problem.finite_strain:
+        return linear
+    return continued_at_finite_strain(problem, linear, settings, progress=progress)
 
 
 def invert_with(
@@ -52,7 +53,7 @@ def invert_with(
     *,
     progress: Callable[[str], None],
 ) -> Inversion:
-    """The same from reduced models that are already there."""
+    """The linear estimate from reduced models that are already there."""
     law = settings.law or FIRST_LAW
     objective = objective_of(problem, _reduced(surrogates), law)
     still = np.zeros(objective.n_unknowns)
@@ -120,27 +121,6 @@ def _enriched(
     moduli = problem.modulus_map.moduli(minimum.unknowns[: objective.n_parameters])
     pairs = zip(surrogates, objective.coefficients(minimum.unknowns), strict=True)
     return tuple(s if s.relative_error(moduli, q) < exact else enriched(s, moduli, q) for s, q in pairs)
-
-
-def fit_driver(problem: InverseProblem, moduli: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """Displacements (n_points, 3) mm of each later image at given moduli (n_regions,) kPa, the driver fitted to it.
-
-    Raises `NotConverged` when the driver's wall cannot be brought to the images.
-    """
-    surrogates = tuple(first_surrogate(model, moduli) for model in problem.models)
-    held = replace(problem, modulus_map=replace(problem.modulus_map, base=moduli))
-    n = len(held.modulus_map.tissues)
-    bounds = Bounds(np.full(n, -1.0), np.full(n, 1.0))
-    objective = objective_of(held, _reduced(surrogates), FIRST_LAW)
-    unknowns = np.zeros(objective.n_unknowns)
-    for _ in range(2):
-        objective = objective.with_fresh_correspondence(unknowns)
-        found = gauss_newton(objective, unknowns, bounds=bounds, hold_theta=True, tolerance=1e-2)
-        unknowns = found.unknowns
-    if not found.outcome.converged:
-        raise NotConverged(f"the driver's wall could not be fitted to the later image: {found.outcome.value}")
-    parts = zip(surrogates, objective.coefficients(unknowns), strict=True)
-    return tuple(surrogate.reduced.solve(moduli, q).displacement for surrogate, q in parts)
 
 
 def _from_starts(

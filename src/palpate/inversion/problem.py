@@ -12,8 +12,10 @@ from palpate.inversion.gauss_newton import Bounds, Minimum
 from palpate.inversion.modulus_map import ModulusMap
 from palpate.inversion.noise import NoiseLaw
 from palpate.inversion.objective import Evaluation, Objective
+from palpate.mechanics.finite_strain import FiniteStrainModel
 from palpate.mechanics.forward import ForwardModel, SolveCounts
 from palpate.mechanics.linear_model import LinearModel
+from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.constraint import Constraint
 from palpate.observation.target import SurfaceTarget
 
@@ -42,6 +44,11 @@ class StandIn(Protocol):
         ...
 
     @property
+    def factorisation(self) -> Factorisation | None:
+        """A factorisation of the full model's stiffness near the estimate."""
+        ...
+
+    @property
     def counts(self) -> SolveCounts:
         """What the full model has cost so far."""
         ...
@@ -51,14 +58,16 @@ class StandIn(Protocol):
 class InverseProblem:
     """One model and the surfaces of one later image, for each later image; unknown moduli by `modulus_map`.
 
-    `estimated`: the tissues whose moduli are sought; the other surfaces are drivers'. `fine_kernel_mm`: correlation
-    length of what a wall does beyond its modes (see `refined_walls`).
+    `estimated`: the tissues whose moduli are sought; the other surfaces are drivers'. `finite_strain`: the same bodies
+    under the law that the estimate is continued to; empty where the linear one is the case's. `fine_kernel_mm`:
+    correlation length of what a wall does beyond its modes (see `refined_walls`).
     """
 
     models: tuple[LinearModel, ...]
     targets: tuple[tuple[SurfaceTarget, ...], ...]
     modulus_map: ModulusMap
     estimated: frozenset[str]
+    finite_strain: tuple[FiniteStrainModel, ...] = ()
     fine_kernel_mm: float = 8.0
 
     @property

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import LinearModel, LinearSystem
 from palpate.mechanics.reduced import ReducedModel, reduce
+from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.constraint import Constraint
 
 __all__ = ["Surrogate", "enriched", "first_surrogate", "with_modulus_series", "with_offset"]
@@ -31,6 +32,11 @@ class Surrogate:
     def constraint(self) -> Constraint:
         """What is prescribed to the model."""
         return self.model.constraint
+
+    @property
+    def factorisation(self) -> Factorisation:
+        """That of the system that was factorised first."""
+        return self.system.factorisation
 
     def relative_error(self, moduli: NDArray[np.float64], coefficients: NDArray[np.float64]) -> float:
         """Upper bound of the reduced displacement's relative error in energy at moduli (kPa) and coefficients."""

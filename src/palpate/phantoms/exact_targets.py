@@ -8,12 +8,14 @@ import igl
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.surface import triangle_normals
+from palpate.mesh.voxelise import Warp
 from palpate.observation.observed_surface import ObservedSurface, observed_surface
 from palpate.observation.target import SurfaceTarget, target_from
 from palpate.phantoms.scene import Scene
 
-__all__ = ["TriangulatedDistance", "exact_target"]
+__all__ = ["TriangulatedDistance", "exact_target", "target_of_truth"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,11 +47,27 @@ class TriangulatedDistance:
 
 def exact_target(scene: Scene, surface: ObservedSurface) -> SurfaceTarget:
     """Target of a model's `surface` made from the surface of the same tissue in the truth, at rest and deformed."""
-    truth = observed_surface(scene.space, surface.tissue)
-    deformed = truth.rest + scene.displacement[truth.points]
+    return target_of_truth(scene.space, scene.displacement, surface)
+
+
+def target_of_truth(
+    space: LagrangeSpace,
+    displacement: NDArray[np.float64],
+    surface: ObservedSurface,
+    *,
+    warps: tuple[Warp, Warp] | None = None,
+) -> SurfaceTarget:
+    """The same from a truth's `space` and displacement (n_points, 3) mm.
+
+    warps: how boundary noise moves the surface at rest and the deformed one, (n, 3) mm -> (n, 3) mm.
+    """
+    truth = observed_surface(space, surface.tissue)
+    rest, deformed = truth.rest, truth.rest + displacement[truth.points]
+    if warps is not None:
+        rest, deformed = warps[0](rest), warps[1](deformed)
     before, after = (
         TriangulatedDistance(np.ascontiguousarray(vertices), np.ascontiguousarray(truth.triangles))
-        for vertices in (truth.rest, deformed)
+        for vertices in (rest, deformed)
     )
     seen = truth.triangles[truth.observed]
     area = np.linalg.norm(triangle_normals(deformed, seen), axis=1)

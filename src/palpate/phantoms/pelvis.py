@@ -30,7 +30,8 @@ class PelvisOptions:
 
     `filling_mm`: the rectum's wall moves so far where it moves most; `moduli_kpa` by tissue (default: prostate and
     bladder 15 to 60 kPa, a tumour 2 to 3 times its gland; the surroundings have 10 kPa); `poisson_ratio` of all
-    tissues (default 0.40 to 0.45 each); `bone_motion_mm` and as many degrees move each bone as a rigid body.
+    tissues (default 0.40 to 0.45 each); `bone_motion_mm` and as many degrees move each bone as a rigid body;
+    `law`: the tissues' (see `make_scene`).
     """
 
     seed: int
@@ -44,6 +45,7 @@ class PelvisOptions:
     bones: bool = False
     bone_motion_mm: float = 0.0
     tumour: bool = False
+    law: str = "linear"
 
 
 def pelvis(options: PelvisOptions) -> Scene:
@@ -59,7 +61,13 @@ def pelvis(options: PelvisOptions) -> Scene:
     motions = _motions(_body(options), options, motion_rng)
     anatomy = pelvis_anatomy(options)
     return make_scene(
-        anatomy, motions, grid, edge_length_mm=options.truth_edge_mm, noise=options.noise, seed=options.seed
+        anatomy,
+        motions,
+        grid,
+        edge_length_mm=options.truth_edge_mm,
+        noise=options.noise,
+        seed=options.seed,
+        law=options.law,
     )
 
 

@@ -13,7 +13,10 @@ from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.tissue import Role, Tissue
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.deformation import deformation_determinants
-from palpate.mechanics.linear_model import linear_model
+from palpate.mechanics.dilatation import Dilatation
+from palpate.mechanics.equilibrium import equilibrium
+from palpate.mechanics.laws.contract import Law
+from palpate.mechanics.laws.registry import law_named
 from palpate.mesh.anatomy import Anatomy, Box
 from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.tet_mesh import TetMesh
@@ -83,14 +86,16 @@ def make_scene(
     edge_length_mm: float,
     noise: Noise | None,
     seed: int,
+    law: str = "linear",
 ) -> Scene:
-    """Mesh the anatomy, move the walls of its hollow tissues (linear elasticity, outer border held), image both states.
+    """Mesh the anatomy, move the walls of its hollow tissues (outer border held), image both states.
 
+    `law`: the tissues', by its name in `case.toml`; finite strain on elements that do not lock.
     Every meshed tissue of the anatomy needs its `youngs_modulus_kpa`. `edge_length_mm` is the mesh's at the surfaces;
     `seed` only draws the noise. Raises `GeometryError` where the truth folds over or cannot be meshed.
     """
     space = lagrange_space(tetrahedralise(anatomy, edge_length_mm=edge_length_mm), "P2")
-    displacement = _equilibrium(space, motions)
+    displacement = _equilibrium(space, motions, law_named(law))
     smallest = float(deformation_determinants(space, displacement).min())
     if smallest <= 0.0:
         raise GeometryError(
@@ -108,7 +113,7 @@ def reimaged(scene: Scene, grid: VoxelGrid, *, noise: Noise | None) -> Scene:
 
 
 def rescaled(scene: Scene, factor: float) -> Scene:
-    """The scene with `factor` times the motion everywhere, which is again in equilibrium for the linear law.
+    """The scene of the linear law with `factor` times the motion everywhere, which is again in equilibrium.
 
     The images stay those of the full motion until the scene is `reimaged`.
     """
@@ -148,13 +153,14 @@ def grid_box(grid: VoxelGrid) -> Box:
     return Box(grid.world(np.full((1, 3), -0.5))[0], np.eye(3), lengths)
 
 
-def _equilibrium(space: LagrangeSpace, motions: Mapping[str, WallMotion]) -> NDArray[np.float64]:
+def _equilibrium(space: LagrangeSpace, motions: Mapping[str, WallMotion], law: Law) -> NDArray[np.float64]:
     """Displacement (n_points, 3) mm of the body whose hollow tissues move as `motions` say."""
     walls, offset = _walls(space, motions)
     no_modes = np.zeros((offset.size, 0))
     constraint = outer_constraint(space, outer="fixed", modes=no_modes, offset=offset.ravel(), prescribed=walls)
     moduli = [tissue.youngs_modulus_kpa or np.nan for tissue in space.mesh.tissues if tissue.meshed]
-    return np.asarray(linear_model(space, constraint).solve(np.array(moduli), np.zeros(0)).displacement)
+    dilatation = Dilatation.POINTWISE if law.name == "linear" else Dilatation.BLENDED
+    return equilibrium(space, constraint, np.array(moduli), law=law, dilatation=dilatation).displacement
 
 
 def _walls(space: LagrangeSpace, motions: Mapping[str, WallMotion]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:

@@ -34,7 +34,7 @@ class SpheresOptions:
     is squeezed by a random stretch; "tumour", the same with a tumour out of the organ's centre; "pushed", a hollow
     core, the driver `cavity`, that grows in the shell, in a box of surroundings that is held. `push_mm`: the wall
     moves so far where it moves most. `moduli_kpa` by tissue (default: core 60, shell or organ 30, tumour 75,
-    surroundings 10).
+    surroundings 10); `law`: the tissues' (see `make_scene`).
     """
 
     seed: int
@@ -45,6 +45,7 @@ class SpheresOptions:
     moduli_kpa: Mapping[str, float] | None = None
     poisson_ratio: float = 0.45
     noise: Noise | None = None
+    law: str = "linear"
 
 
 def spheres(options: SpheresOptions) -> Scene:
@@ -60,7 +61,13 @@ def spheres(options: SpheresOptions) -> Scene:
     parts, motions = (_pushed if options.kind == "pushed" else _squeezed)(options, centre, rng)
     anatomy = Anatomy(_tissues(tuple(parts), options), tuple(parts.values()), grid_box(grid))
     return make_scene(
-        anatomy, motions, grid, edge_length_mm=options.truth_edge_mm, noise=options.noise, seed=options.seed
+        anatomy,
+        motions,
+        grid,
+        edge_length_mm=options.truth_edge_mm,
+        noise=options.noise,
+        seed=options.seed,
+        law=options.law,
     )
 
 

@@ -14,10 +14,16 @@ from palpate.images.distance import observation_width, smoothing_width
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.images.tissue_distance import tissue_distance_map
-from palpate.inversion.problem import InverseProblem
 from palpate.inversion.modulus_map import modulus_map
+from palpate.inversion.problem import InverseProblem
 from palpate.mechanics.boundary import outer_constraint
+from palpate.mechanics.dilatation import choose_element
+from palpate.mechanics.equilibrium import ACCURACY
+from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_model
+from palpate.mechanics.laws.contract import Law
+from palpate.mechanics.laws.registry import law_named
 from palpate.mechanics.linear_model import LinearModel, linear_model, with_constraint
+from palpate.mechanics.newton import NewtonSettings
 from palpate.mesh.anatomy import Anatomy, Box, anatomy_of, domain_box, margin_box
 from palpate.mesh.quality import MeshQuality, check_mesh
 from palpate.mesh.space import LagrangeSpace, lagrange_space
@@ -25,7 +31,7 @@ from palpate.mesh.tetrahedralise import tetrahedralise
 from palpate.observation.observed_surface import ObservedSurface, observed_surface
 from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.observation.target import SurfaceTarget, surface_target
-from palpate.study.case import Case
+from palpate.study.case import Case, Mechanics
 from palpate.study.contacts import every_finding
 from palpate.study.refusals import refuse_lost, refuse_unmeshable
 
@@ -113,7 +119,7 @@ def make_body(states: ImagedStates, case: Case, *, progress: Callable[[str], Non
             ' domain smaller (domain.extent = "margin")'
         ) from error
     quality = _gate(states.before, anatomy, mesh_box=box, mesh=lagrange_space(mesh, "P1"))
-    space = lagrange_space(mesh, case.mechanics.element)
+    space = lagrange_space(mesh, choose_element(case.mechanics.element).space)
     progress(
         f"{quality.tets} tetrahedra, {3 * len(space.points)} unknowns, smallest dihedral angle"
         f" {quality.min_dihedral_deg:.1f} degrees"
@@ -135,9 +141,10 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Callable[[str
     progress("assembling one stiffness matrix a tissue")
     models = tuple(model for body in bodies for model in _models(body, case))
     _refuse_rest(models)
+    finite = _finite_strain(models, case)
     tissues = bodies[0].space.mesh.tissues
     estimated = frozenset(tissue.name for tissue in tissues if tissue.role is Role.ESTIMATE)
-    return InverseProblem(models, targets, modulus_map(tissues, models[0].regions), estimated)
+    return InverseProblem(models, targets, modulus_map(tissues, models[0].regions), estimated, finite)
 
 
 def _targets(body: Body) -> tuple[tuple[SurfaceTarget, ...], ...]:
@@ -151,6 +158,7 @@ def _targets(body: Body) -> tuple[tuple[SurfaceTarget, ...], ...]:
 def _models(body: Body, case: Case) -> tuple[LinearModel, ...]:
     """One model a later image; they share the stiffness and differ in the motion of the bones."""
     models: list[LinearModel] = []
+    dilatation = choose_element(case.mechanics.element).dilatation
     for bones in body.states.bones:
         motion = prescribed_motion(
             body.space,
@@ -166,8 +174,32 @@ def _models(body: Body, case: Case) -> tuple[LinearModel, ...]:
             offset=motion.offset,
             prescribed=motion.prescribed,
         )
-        models.append(with_constraint(models[0], constraint) if models else linear_model(body.space, constraint))
+        first = models[0] if models else linear_model(body.space, constraint, dilatation=dilatation)
+        models.append(with_constraint(first, constraint) if models else first)
     return tuple(models)
+
+
+def _finite_strain(models: tuple[LinearModel, ...], case: Case) -> tuple[FiniteStrainModel, ...]:
+    """The same bodies under the case's law; none where that is the linear one."""
+    law = law_of(case.mechanics)
+    if law.name == "linear":
+        return ()
+    found: list[FiniteStrainModel] = []
+    for model in models:
+        like = next((other for other in found if other.space is model.space), None)
+        found.append(like.under(model.constraint) if like else _finite_strain_model(model, law, case))
+    return tuple(found)
+
+
+def law_of(mechanics: Mechanics) -> Law:
+    """The material law that a case names."""
+    return law_named(mechanics.law, c01_over_c10=mechanics.c01_over_c10)
+
+
+def _finite_strain_model(model: LinearModel, law: Law, case: Case) -> FiniteStrainModel:
+    dilatation = choose_element(case.mechanics.element).dilatation
+    settings = NewtonSettings(tolerance=ACCURACY)
+    return finite_strain_model(model.space, model.constraint, law, dilatation=dilatation, settings=settings)
 
 
 def _refuse_rest(models: tuple[LinearModel, ...]) -> None:

@@ -27,6 +27,7 @@ __all__ = [
 ]
 
 REMAINING = "remaining"
+LAW_NAMES = ("linear", "neo-hookean", "mooney-rivlin")
 
 ALL_POSITIVE = "a list of positive numbers"
 LOW_HIGH = "[low, high] with 0 < low < high"
@@ -132,10 +133,10 @@ class CaseTissue:
 
 @dataclass(frozen=True, slots=True)
 class Mechanics:
-    """Material law and finite element."""
+    """Material law and finite element (`palpate.mechanics.laws`, `palpate.mechanics.dilatation`)."""
 
-    law: str = field(default="linear", metadata=rule(choices=("linear",), later=("neo-hookean", "mooney-rivlin")))
-    element: str = field(default="P2", metadata=rule(choices=("P1", "P2"), later=("auto",)))
+    law: str = field(default="neo-hookean", metadata=rule(choices=LAW_NAMES))
+    element: str = field(default="auto", metadata=rule(choices=("P1", "P2", "P2-P0", "auto")))
     c01_over_c10: float = field(default=0.25, metadata=rule(test=lambda value: value >= 0, wanted="zero or more"))
 
 
@@ -197,10 +198,11 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class Phantom:
-    """A scene with a known truth instead of images."""
+    """A scene with a known truth instead of images; `law`: that of the truth (default: the case's)."""
 
     kind: str = field(metadata=rule(choices=("pelvis", "spheres")))
     seed: int = 1
+    law: str | None = field(default=None, metadata=rule(choices=LAW_NAMES))
 
 
 @dataclass(frozen=True, slots=True)

@@ -63,9 +63,10 @@ def phantom_scene(case: Case) -> Scene:
     if case.phantom is None:
         raise ConfigurationError(f"case '{case.id}' has no [phantom]")
     filling = case.motion.filling_mm if case.motion else FILLING_MM
+    law = case.phantom.law or case.mechanics.law
     if case.phantom.kind == "spheres":
-        return spheres(SpheresOptions(seed=case.phantom.seed))
-    return pelvis(PelvisOptions(seed=case.phantom.seed, filling_mm=filling))
+        return spheres(SpheresOptions(seed=case.phantom.seed, law=law))
+    return pelvis(PelvisOptions(seed=case.phantom.seed, filling_mm=filling, law=law))
 
 
 def _read_pair(case: Case, before: Path, after: tuple[Path, ...]) -> ImagedStates:

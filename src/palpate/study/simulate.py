@@ -12,17 +12,18 @@ from palpate.errors import ConfigurationError
 from palpate.images.label_image import LabelImage
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
+from palpate.inversion.driver_fit import fit_driver
 from palpate.inversion.estimation import Remark
-from palpate.inversion.invert import fit_driver
 from palpate.mechanics.boundary import outer_constraint
-from palpate.mechanics.linear_model import linear_model
+from palpate.mechanics.dilatation import choose_element
+from palpate.mechanics.equilibrium import equilibrium
 from palpate.mesh.dihedral import tet_dihedrals
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.phantoms.wall_filling import wall_filling
-from palpate.study.body import Body, inverse_problem, make_body
-from palpate.study.case import Case
+from palpate.study.body import Body, inverse_problem, law_of, make_body
+from palpate.study.case import Case, Mechanics
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.read import phantom_scene, read_states
 from palpate.study.result import MeshSummary, Provenance, Simulation
@@ -34,17 +35,19 @@ Progress = Callable[[str], None]
 
 
 def simulate(case: Case, *, progress: Progress, steps: int = 1) -> Simulation:
-    """Deform the reference state of a case under the moduli that its tissues state (`youngs_modulus_kpa`).
+    """Deform the reference state of a case under the moduli that its tissues state (`youngs_modulus_kpa`) and its law.
 
     The driver moves as in the later image (its wall is fitted together with the organs' surfaces, the moduli held),
-    by [motion] filling_mm, or as in the [phantom]. `steps`: how many displacements to give, the last one the whole.
-    Raises `ConfigurationError` when an `estimate` tissue has no modulus.
+    by [motion] filling_mm, or as in the [phantom]. `steps`: how many states to give, each in equilibrium at its share
+    of the motion, the last one the whole (of a phantom, shares of its displacement). Raises `ConfigurationError` when
+    an `estimate` tissue has no modulus, `NotConverged` where a finite-strain path ends early.
     """
     began = time.perf_counter()
     if case.phantom is not None:
         scene = phantom_scene(case)
-        space, last, tissues = scene.space, scene.displacement, scene.tissues
+        space, tissues = scene.space, scene.tissues
         before, after, summary, remarks = scene.before, scene.after, _plain_summary(space), tuple[Remark, ...]()
+        displacements = tuple(scene.displacement * (step / steps) for step in range(1, steps + 1))
     else:
         progress("reading and aligning the images")
         states = read_states(case)
@@ -53,21 +56,23 @@ def simulate(case: Case, *, progress: Progress, steps: int = 1) -> Simulation:
         body = make_body(states, case, progress=progress)
         space, summary = body.space, mesh_summary(body)
         progress("solving for the displacement")
-        last = _displacement(body, case, progress)
+        displacements = _steps(body, case, steps, progress)
+        last = displacements[-1]
         before, after = (_labels(states.before, space, motion) for motion in (np.zeros_like(last), last))
         remarks = tuple(Remark(finding.code, finding.message) for finding in states.findings)
     moduli = {t.name: t.youngs_modulus_kpa for t in tissues if t.meshed and t.youngs_modulus_kpa is not None}
     seconds = {"total": round(time.perf_counter() - began, 3)}
     provenance = Provenance(seconds, input_digests(case), software_versions())
-    displacements = tuple(last * (step / steps) for step in range(1, steps + 1))
     return Simulation(case, space, summary, displacements, before, after, moduli, provenance, remarks)
 
 
-def filled(space: LagrangeSpace, segmentation: Segmentation, *, filling_mm: float, outer: str) -> NDArray[np.float64]:
+def filled(
+    space: LagrangeSpace, segmentation: Segmentation, *, filling_mm: float, outer: str, mechanics: Mechanics
+) -> NDArray[np.float64]:
     """Displacement (n_points, 3) mm of a body whose drivers fill by `filling_mm`, whose bones are held.
 
     segmentation: the labels that the drivers' walls come from; outer: see `outer_constraint`. The tissues of the
-    space's mesh state their moduli.
+    space's mesh state their moduli. Raises `NotConverged` as `equilibrium` does.
     """
     tissues = space.mesh.tissues
     _refuse_unknown(tissues)
@@ -84,22 +89,30 @@ def filled(space: LagrangeSpace, segmentation: Segmentation, *, filling_mm: floa
     constraint = outer_constraint(
         space, outer=outer, modes=no_modes, offset=offset.ravel(), prescribed=motion.prescribed
     )
-    moduli = np.array([tissue.youngs_modulus_kpa for tissue in tissues if tissue.meshed], dtype=float)
-    return np.asarray(linear_model(space, constraint).solve(moduli, np.zeros(0)).displacement)
+    dilatation = choose_element(mechanics.element).dilatation
+    return equilibrium(space, constraint, _moduli(tissues), law=law_of(mechanics), dilatation=dilatation).displacement
 
 
-def _displacement(body: Body, case: Case, progress: Progress) -> NDArray[np.float64]:
-    if case.motion is not None:
-        return filled(
-            body.space,
-            body.states.before,
-            filling_mm=case.motion.filling_mm,
-            outer=case.domain.outer_boundary,
-        )
-    problem = inverse_problem(body, case, progress=progress)
-    tissues = [t for t in body.space.mesh.tissues if t.meshed]
-    moduli = np.array([tissue.youngs_modulus_kpa for tissue in tissues], dtype=float)
-    return fit_driver(problem, moduli)[-1]
+def _steps(body: Body, case: Case, steps: int, progress: Progress) -> tuple[NDArray[np.float64], ...]:
+    """Displacements (n_points, 3) mm at equal shares of the motion, each in equilibrium, the last one the whole."""
+    shares = [step / steps for step in range(1, steps + 1)]
+    if case.motion is None:
+        problem = inverse_problem(body, case, progress=progress)
+        return fit_driver(problem, _moduli(body.space.mesh.tissues), shares=shares)[-1]
+    if case.mechanics.law == "linear":
+        whole = _filled(body, case, case.motion.filling_mm)
+        return tuple(whole * share for share in shares)
+    return tuple(_filled(body, case, case.motion.filling_mm * share) for share in shares)
+
+
+def _filled(body: Body, case: Case, filling_mm: float) -> NDArray[np.float64]:
+    outer, mechanics = case.domain.outer_boundary, case.mechanics
+    return filled(body.space, body.states.before, filling_mm=filling_mm, outer=outer, mechanics=mechanics)
+
+
+def _moduli(tissues: tuple[Tissue, ...]) -> NDArray[np.float64]:
+    """Young's moduli (n_regions,) kPa of the meshed tissues."""
+    return np.array([tissue.youngs_modulus_kpa for tissue in tissues if tissue.meshed], dtype=float)
 
 
 def _refuse_unknown(tissues: tuple[Tissue, ...]) -> None:

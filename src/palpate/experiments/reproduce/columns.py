@@ -1,0 +1,99 @@
+"""The columns of a table: inverse problems from the truth's own surfaces or from its voxels, and what they say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.experiments.reproduce.table import Entry
+from palpate.images.label_image import VoxelGrid
+from palpate.images.segmentation import segment
+from palpate.images.tissue import Tissue
+from palpate.images.tissue_distance import tissue_distance_map
+from palpate.inversion.conclude import Observed, conclude
+from palpate.inversion.gauss_newton import Bounds
+from palpate.inversion.modulus_map import ModulusMap
+from palpate.inversion.posterior import sandwich_covariance
+from palpate.inversion.problem import Inversion, InversionSettings
+from palpate.inversion.verdict import log_interval, verdict
+from palpate.mesh.space import LagrangeSpace
+from palpate.observation.observed_surface import ObservedSurface
+from palpate.observation.target import SurfaceTarget, surface_target
+from palpate.phantoms.scene import imaged
+from palpate.study.body import Body, ImagedStates, aligned
+from palpate.study.run import fitted_states
+
+__all__ = ["entries_from_surfaces", "entries_from_voxels", "from_half", "imaged_states", "voxel_targets"]
+
+Progress = Callable[[str], None]
+
+SEARCHED = (0.02, 200.0)  # bounds of the moduli, relative to the scale
+
+
+def from_half(mapping: ModulusMap, truth: Mapping[str, float]) -> InversionSettings:
+    """One start, at half of every true modulus (kPa), as in the paper."""
+    start = np.array([np.log(0.5 * truth[name] / mapping.scale_kpa) for name in mapping.tissues])
+    n = len(start)
+    return InversionSettings((start,), Bounds(np.full(n, np.log(SEARCHED[0])), np.full(n, np.log(SEARCHED[1]))))
+
+
+def imaged_states(
+    space: LagrangeSpace, displacement: NDArray[np.float64], grid: VoxelGrid
+) -> ImagedStates:
+    """Both states of a truth, u (n_points, 3) mm, as label images on `grid`."""
+    tissues = tuple(_numbered(tissue, label) for label, tissue in enumerate(space.mesh.tissues, start=1))
+    still = np.zeros_like(displacement)
+    before, after = (segment(imaged(space, motion, grid), tissues) for motion in (still, displacement))
+    return aligned(before, (after,), method="none")
+
+
+def voxel_targets(body: Body, surfaces: tuple[ObservedSurface, ...]) -> tuple[SurfaceTarget, ...]:
+    """The surfaces of a body in its two images."""
+    pair = (body.states.before, body.states.after[0])
+    return tuple(
+        surface_target(s, *(tissue_distance_map(image, s.tissue, smoothing_mm=body.smoothing_mm) for image in pair))
+        for s in surfaces
+    )
+
+
+def entries_from_surfaces(
+    inversion: Inversion, settings: InversionSettings, truth: Mapping[str, float]
+) -> dict[str, Entry]:
+    """What an inversion of exact surfaces says of each body; its interval knows of no voxels."""
+    mapping, minimum = inversion.objective.modulus_map, inversion.minimum
+    n = len(mapping.tissues)
+    spread = np.sqrt(np.diag(sandwich_covariance(minimum.evaluation, inversion.law, n)))
+    found = {}
+    for i, name in enumerate(mapping.tissues):
+        steps = len(minimum.history)
+        if not minimum.outcome.converged:
+            found[name] = Entry.of(None, truth[name], verdict="not identified", iterations=steps)
+            continue
+        low, high, value = (
+            mapping.scale_kpa * float(np.exp(logs[i]))
+            for logs in (settings.bounds.lower, settings.bounds.upper, minimum.unknowns)
+        )
+        interval = log_interval(value, float(spread[i]), lower=low, upper=high)
+        word, _ = verdict(interval, at_bound=False, absolute=mapping.absolute)
+        found[name] = Entry.of(value, truth[name], interval95=interval, verdict=word, iterations=steps)
+    return found
+
+
+def entries_from_voxels(
+    inversion: Inversion, settings: InversionSettings, body: Body, truth: Mapping[str, float], *, seed: int
+) -> dict[str, Entry]:
+    """What an inversion of voxels says of each body, with the interval that a case's result would state."""
+    images = tuple(image.index for image in body.states.after)
+    observed = Observed(body.space, fitted_states(inversion, body), images)
+    estimation = conclude(inversion, settings, observed, truth=truth, seed=seed)
+    steps = len(inversion.minimum.history)
+    return {
+        e.tissue: Entry.of(e.value, truth[e.tissue], interval95=e.interval95, verdict=e.verdict, iterations=steps)
+        for e in estimation.estimates
+    }
+
+
+def _numbered(tissue: Tissue, label: int) -> Tissue:
+    return Tissue(tissue.name, tissue.role, (label,), tissue.poisson_ratio, tissue.youngs_modulus_kpa)

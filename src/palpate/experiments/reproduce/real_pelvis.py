@@ -1,0 +1,82 @@
+"""The real pelvis that Palpate brings along, with other moduli and on other meshes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.experiments.simulated_pelvis import DATA, MARGIN_MM, TISSUES
+from palpate.images.distance import smoothing_width
+from palpate.images.label_image import VoxelGrid
+from palpate.images.label_table import read_label_table
+from palpate.images.readers import read_label_image
+from palpate.images.segmentation import Segmentation, segment
+from palpate.images.tissue import Role
+from palpate.mesh.anatomy import Anatomy, Box, anatomy_of, domain_box, margin_box
+from palpate.mesh.space import LagrangeSpace, lagrange_space
+from palpate.mesh.tetrahedralise import tetrahedralise
+from palpate.phantoms.wall_filling import wall_filling
+
+__all__ = ["ORGANS", "RealPelvis", "grid_over", "real_pelvis"]
+
+ORGANS = ("prostate", "bladder")
+SHIFT = 0.5  # of a voxel: a random grid's place
+
+
+@dataclass(frozen=True, slots=True)
+class RealPelvis:
+    """The labelled scan (3 mm voxels), the box around its organs and the smooth surfaces in it."""
+
+    scan: Segmentation
+    anatomy: Anatomy
+
+    @property
+    def box(self) -> Box:
+        """The domain."""
+        return self.anatomy.box
+
+    def space(self, edge_mm: float, *, element: str = "P2") -> LagrangeSpace:
+        """The space of `element` on a mesh with that edge (mm) at the organs."""
+        return lagrange_space(tetrahedralise(self.anatomy, edge_length_mm=edge_mm), element)
+
+    def filling(self, space: LagrangeSpace, filling_mm: float) -> NDArray[np.float64]:
+        """Displacement (n_points, 3) mm of the rectum's wall that fills by `filling_mm`; zero elsewhere.
+
+        Bones hold still, and what they share with the wall.
+        """
+        offset, mesh = np.zeros_like(space.points), space.mesh
+        walls = {role: np.zeros(0, dtype=np.int64) for role in (Role.DRIVER, Role.RIGID)}
+        for number, tissue in enumerate(mesh.tissues):
+            if tissue.role in walls:
+                points = np.unique(space.facets(mesh.boundary[mesh.beyond == number]))
+                walls[tissue.role] = np.union1d(walls[tissue.role], points)
+            if tissue.role is Role.DRIVER:
+                offset[points] = wall_filling(self.scan, number, filling_mm=filling_mm).at(space.points[points])
+        offset[walls[Role.RIGID]] = 0.0
+        return offset
+
+
+def real_pelvis(surroundings_kpa: float) -> RealPelvis:
+    """The scan with surroundings of that known modulus (kPa); the organs' are to be set by who computes with it."""
+    tissues = tuple(
+        replace(tissue, youngs_modulus_kpa=surroundings_kpa) if tissue.role is Role.KNOWN else tissue
+        for tissue in TISSUES
+    )
+    names = read_label_table(DATA / "labels.json")
+    scan = segment(read_label_image(DATA / "labels.nii.gz", names=names), tissues)
+    observed = [i for i, t in enumerate(scan.tissues) if t.role in (Role.ESTIMATE, Role.DRIVER)]
+    voxels = np.argwhere(np.isin(scan.index, observed)).astype(float)
+    box = margin_box(domain_box([scan.grid]), scan.grid.world(voxels), margin_mm=MARGIN_MM)
+    return RealPelvis(scan, anatomy_of(scan, box=box, smoothing_mm=smoothing_width(scan.grid)))
+
+
+def grid_over(box: Box, voxel_mm: float, rng: np.random.Generator) -> VoxelGrid:
+    """A grid of cubic voxels along a box's axes that covers it, with a voxel to spare, shifted at random."""
+    shape = np.ceil(box.lengths / voxel_mm).astype(int) + 2
+    first = 0.5 * (box.lengths - (shape - 1) * voxel_mm) + voxel_mm * rng.uniform(-SHIFT, SHIFT, 3)
+    affine = np.eye(4)
+    affine[:3, :3] = box.axes.T * voxel_mm
+    affine[:3, 3] = box.origin + first @ box.axes
+    return VoxelGrid((int(shape[0]), int(shape[1]), int(shape[2])), affine)

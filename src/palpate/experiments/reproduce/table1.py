@@ -1,0 +1,219 @@
+"""Table 1: three concentric spheres of one modulus, and of three, from half of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.experiments.reproduce.balls import (
+    BODIES,
+    Balls,
+    balls_space,
+    balls_tissues,
+    floating,
+    mean_deformations,
+    pulled,
+    random_grid,
+)
+from palpate.experiments.reproduce.columns import (
+    Progress,
+    entries_from_surfaces,
+    entries_from_voxels,
+    from_half,
+    imaged_states,
+    voxel_targets,
+)
+from palpate.experiments.reproduce.ledger import Ledger
+from palpate.experiments.reproduce.paper import PAPER_TABLE1
+from palpate.experiments.reproduce.paper_method import paper_estimate, paper_target
+from palpate.experiments.reproduce.table import Entry, Table, TableRow
+from palpate.inversion.invert import invert
+from palpate.inversion.modulus_map import ModulusMap
+from palpate.inversion.problem import InverseProblem, Inversion, InversionSettings
+from palpate.mechanics.linear_model import LinearModel, linear_model, with_constraint
+from palpate.mesh.space import LagrangeSpace
+from palpate.observation.observed_surface import observed_surface
+from palpate.observation.target import SurfaceTarget
+from palpate.phantoms.exact_targets import target_of_truth
+from palpate.study.body import make_body
+from palpate.study.case import Case, Mechanics, MeshSettings, Phantom
+
+__all__ = ["Table1Settings", "table1"]
+
+Array = NDArray[np.float64]
+Moduli = tuple[float, float, float]
+
+DEFORMATION = 0.095  # of the region that is deformed most: "slightly less than 10 %"
+SCALE_KPA = 100.0  # unit of the unknowns, ln(E / 100 kPa); the load sets the scale, not this
+NEAREST = 40  # points of the truth that give its displacement at a place
+
+NOTES = (
+    "The scale comes from a known load: the traction S n of a uniaxial stress S on the outside. Displacements alone give"
+    " ratios only, and with one modulus in all three bodies (the paper's rows) no information on it at all.",
+    "The load is such that the region that is deformed most is deformed by 9.5 %. It is then proportional to the"
+    " modulus, and the six rows of one modulus are the same problem in other units; each has voxels of its own.",
+    "voxels: 1 mm, a grid turned and shifted at random for every row, the body meshed from its labels.",
+    "paper_method: its Eq. 4 on linear tetrahedra with L-BFGS, on data made with its own mesh, as in the paper;"
+    " paper_method_other_mesh: the same on the data of the column other_mesh.",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Table1Settings:
+    """Meshes and cases: moduli of the rows in which all three bodies have the same, and of those with three, kPa."""
+
+    balls: Balls = Balls(radii_mm=(12.0, 24.0, 36.0), edge_mm=6.5, truth_edge_mm=5.0)
+    equal_kpa: tuple[float, ...] = tuple(PAPER_TABLE1)
+    different_kpa: tuple[Moduli, ...] = ((50.0, 100.0, 150.0), (150.0, 100.0, 50.0), (70.0, 130.0, 90.0))
+    seed: int = 1
+
+    @property
+    def cases(self) -> tuple[Moduli, ...]:
+        """Moduli (kPa) of the three bodies, case after case."""
+        return tuple((modulus,) * 3 for modulus in self.equal_kpa) + self.different_kpa
+
+
+def table1(settings: Table1Settings, ledger: Ledger, *, progress: Progress) -> Table:
+    """All rows; raises `PalpateError`s of meshing and solving."""
+    bench = _Bench(settings.balls)
+    rows: list[TableRow] = []
+    for number, moduli in enumerate(settings.cases):
+        parts = _Case(moduli, bench, settings.seed + number)
+        name = _name(moduli)
+        columns: dict[str, dict[str, Entry]] = {}
+        for column, make in parts.columns(progress).items():
+            progress(f"table 1, case {number + 1} of {len(settings.cases)} ({name}): {column}")
+            columns[column] = ledger.entries(f"{name} {column}", make)
+        for body, truth in zip(BODIES, moduli, strict=True):
+            paper = PAPER_TABLE1.get(truth, {}).get(body) if len(set(moduli)) == 1 else None
+            rows.append(TableRow(name, body, truth, paper, {c: entries[body] for c, entries in columns.items()}))
+    return Table("table1", tuple(rows), NOTES)
+
+
+def _name(moduli: Moduli) -> str:
+    return f"{moduli[0]:g}" if len(set(moduli)) == 1 else "/".join(f"{modulus:g}" for modulus in moduli)
+
+
+@dataclass(frozen=True)
+class _Bench:
+    """Models that all cases share, made when they are first needed; their load is a pull of 1 kPa."""
+
+    balls: Balls
+
+    @cached_property
+    def coarse(self) -> LinearModel:
+        return _model(balls_space(self.balls, self.balls.edge_mm))
+
+    @cached_property
+    def fine(self) -> LinearModel:
+        return _model(balls_space(self.balls, self.balls.truth_edge_mm))
+
+    @cached_property
+    def linear_tetrahedra(self) -> LinearModel:
+        return _model(balls_space(self.balls, self.balls.edge_mm, element="P1"))
+
+
+@dataclass(frozen=True, slots=True)
+class _Case:
+    """Three moduli (kPa) and the columns that they give."""
+
+    moduli: Moduli
+    bench: _Bench
+    seed: int
+
+    def columns(self, progress: Progress) -> dict[str, Callable[[], dict[str, Entry]]]:
+        return {
+            "same_mesh": lambda: self.from_surfaces(self.bench.coarse, progress),
+            "other_mesh": lambda: self.from_surfaces(self.bench.fine, progress),
+            "voxels": lambda: self.from_voxels(progress),
+            "paper_method": lambda: self.by_the_paper(self.bench.linear_tetrahedra),
+            "paper_method_other_mesh": lambda: self.by_the_paper(self.bench.fine),
+        }
+
+    @property
+    def truth(self) -> dict[str, float]:
+        return dict(zip(BODIES, self.moduli, strict=True))
+
+    def stress_kpa(self) -> float:
+        """The pull under which the region that is deformed most is deformed by 9.5 %."""
+        model = self.bench.coarse
+        unit = model.solve(np.array(self.moduli), np.zeros(model.n_modes)).displacement
+        return float(DEFORMATION / mean_deformations(model.space, unit).max())
+
+    def displacement(self, model: LinearModel) -> Array:
+        """Displacement (n_points, 3) mm of the truth on a model's mesh."""
+        loaded = _pulled_by(model, self.stress_kpa())
+        return loaded.solve(np.array(self.moduli), np.zeros(model.n_modes)).displacement
+
+    def from_surfaces(self, truth: LinearModel, progress: Progress) -> dict[str, Entry]:
+        model = _pulled_by(self.bench.coarse, self.stress_kpa())
+        u = self.displacement(truth)
+        surfaces = [observed_surface(model.space, body) for body in range(len(BODIES))]
+        targets = tuple(target_of_truth(truth.space, u, surface) for surface in surfaces)
+        inversion, settings = self.inverted(model, targets, progress)
+        return entries_from_surfaces(inversion, settings, self.truth)
+
+    def from_voxels(self, progress: Progress) -> dict[str, Entry]:
+        balls, fine = self.bench.balls, self.bench.fine
+        grid = random_grid(balls, np.random.default_rng(self.seed))
+        space = _renamed(fine.space, self.moduli)
+        states = imaged_states(space, self.displacement(fine), grid)
+        mechanics = Mechanics(law="linear", element="P2")
+        case = Case("table1", phantom=Phantom("spheres"), mesh=MeshSettings(balls.edge_mm), mechanics=mechanics)
+        body = make_body(states, case, progress=progress)
+        model = _pulled_by(_model(body.space), self.stress_kpa())
+        surfaces = tuple(observed_surface(body.space, number) for number in range(len(BODIES)))
+        inversion, settings = self.inverted(model, voxel_targets(body, surfaces), progress)
+        return entries_from_voxels(inversion, settings, body, self.truth, seed=self.seed)
+
+    def inverted(
+        self, model: LinearModel, targets: tuple[SurfaceTarget, ...], progress: Progress
+    ) -> tuple[Inversion, InversionSettings]:
+        mapping = ModulusMap(np.full(len(BODIES), SCALE_KPA), np.arange(len(BODIES)), BODIES, "load", absolute=True)
+        settings = from_half(mapping, self.truth)
+        problem = InverseProblem((model,), (targets,), mapping, frozenset(BODIES))
+        return invert(problem, settings, progress=progress), settings
+
+    def by_the_paper(self, truth: LinearModel) -> dict[str, Entry]:
+        """The paper's method; a few nodes hold the rigid motion, with the displacement that the truth has there."""
+        own, u = self.bench.linear_tetrahedra, self.displacement(truth)
+        model = _held_as(_pulled_by(own, self.stress_kpa()), truth.space, u)
+        targets = [paper_target(truth.space, u, observed_surface(own.space, body)) for body in range(len(BODIES))]
+        fit = paper_estimate(model, targets, moduli=0.5 * np.array(self.moduli), columns=np.arange(len(BODIES)))
+        values = fit.moduli if fit.converged else [None] * len(BODIES)
+        return {
+            body: Entry.of(value, self.truth[body], iterations=fit.iterations)
+            for body, value in zip(BODIES, values, strict=True)
+        }
+
+
+def _model(space: LagrangeSpace) -> LinearModel:
+    return linear_model(space, floating(space), loads=(pulled(space, 1.0),))
+
+
+def _pulled_by(model: LinearModel, stress_kpa: float) -> LinearModel:
+    """The model with a pull of `stress_kpa` instead of 1 kPa."""
+    return replace(model, load=stress_kpa * model.load)
+
+
+def _renamed(space: LagrangeSpace, moduli: Moduli) -> LagrangeSpace:
+    """The space with the true moduli in its tissues."""
+    return replace(space, mesh=replace(space.mesh, tissues=balls_tissues(moduli)))
+
+
+def _held_as(model: LinearModel, space: LagrangeSpace, u: Array) -> LinearModel:
+    """The model whose pinned nodes move as a truth u (n_points, 3) mm on `space` does there, without modes."""
+    constraint = model.constraint
+    pins = np.flatnonzero(constraint.modes.any(axis=1))
+    offset = np.zeros(len(constraint.offset))
+    for dof in pins:
+        place = model.space.points[dof // 3]
+        near = np.argsort(np.linalg.norm(space.points - place, axis=1))[:NEAREST]
+        terms = np.column_stack([np.ones(NEAREST), space.points[near] - place])
+        offset[dof] = np.linalg.lstsq(terms, u[near, dof % 3], rcond=None)[0][0]
+    held = replace(constraint, modes=np.zeros((len(offset), 0)), offset=offset)
+    return with_constraint(model, held)

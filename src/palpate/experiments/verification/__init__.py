@@ -1,0 +1,1 @@
+"""Problems with known answers: what the mechanics and the estimator are checked against."""

@@ -1,0 +1,174 @@
+"""B16: observed orders of convergence on manufactured solutions, linear and neo-Hookean.
+
+u_i = c_i s with s = sin(pi x) sin(pi y) sin(pi z) vanishes on the unit box's border. Linear: the body force is
+f = -mu lap u - (lambda + mu) grad div u; neo-Hookean: f = -Div P, by differences of the exact stress.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.experiments.verification.conditions import held_components, loaded
+from palpate.experiments.verification.problem import Check, Problem
+from palpate.experiments.verification.structured_meshes import box_mesh, known
+from palpate.mechanics.dilatation import Dilatation
+from palpate.mechanics.element import barycentric_gradients, quadrature, shape_derivatives, shape_functions
+from palpate.mechanics.finite_strain import finite_strain_model
+from palpate.mechanics.laws.contract import stress
+from palpate.mechanics.laws.registry import LAWS
+from palpate.mechanics.loads import DeadLoad
+from palpate.mechanics.stiffness import lame_parameters
+from palpate.mesh.constraint import Constraint
+from palpate.mesh.space import LagrangeSpace, lagrange_space
+
+__all__ = ["MANUFACTURED_PROBLEMS", "linear_errors", "neo_hookean_errors", "observed_orders"]
+
+Array = NDArray[np.float64]
+
+DIRECTION = np.array([1.0, -0.5, 0.7])
+SMALL, LARGE = 1.0, 0.15  # amplitude of the linear and of the finite solution
+NU = 0.3
+LAW = LAWS["neo-hookean"]
+TOLERANCE = 0.2  # of the observed order
+
+
+def solution(x: Array, amplitude: float) -> tuple[Array, Array]:
+    """u (..., 3) mm and grad u (..., 3, 3) at places x (..., 3)."""
+    sine, cosine = np.sin(np.pi * x), np.cos(np.pi * x)
+    c = amplitude * DIRECTION
+    gradient = np.empty_like(x)
+    for i in range(3):
+        factors = sine.copy()
+        factors[..., i] = np.pi * cosine[..., i]
+        gradient[..., i] = factors.prod(axis=-1)
+    return sine.prod(axis=-1)[..., None] * c, c[:, None] * gradient[..., None, :]
+
+
+def linear_force(x: Array) -> Array:
+    """Body force (..., 3) of the linear solution at E = 1."""
+    sine, cosine = np.sin(np.pi * x), np.cos(np.pi * x)
+    hessian = np.empty((*x.shape, 3))
+    for i in range(3):
+        for j in range(3):
+            factors = sine.copy()
+            factors[..., i] = cosine[..., i]
+            factors[..., j] = cosine[..., j] if i != j else -sine[..., i]
+            hessian[..., i, j] = np.pi**2 * factors.prod(axis=-1)
+    lame, mu = lame_parameters(1.0, NU)
+    laplacian = np.einsum("...ii->...", hessian)[..., None] * DIRECTION
+    return np.asarray(SMALL * (-mu * laplacian - (lame + mu) * hessian @ DIRECTION))
+
+
+def finite_force(x: Array) -> Array:
+    """Body force (..., 3) of the neo-Hookean solution at E = 1, by central differences."""
+    lame, mu = lame_parameters(1.0, NU)
+    force, step = np.zeros_like(x), 1e-5
+    for axis in range(3):
+        ahead, behind = (
+            stress(LAW, (np.eye(3) + solution(x + shift, LARGE)[1]).reshape(-1, 3, 3), mu=mu, lame=lame)
+            for shift in (step * np.eye(3)[axis], -step * np.eye(3)[axis])
+        )
+        force -= ((ahead - behind)[:, :, axis] / (2.0 * step)).reshape(x.shape)
+    return force
+
+
+@dataclass(frozen=True, slots=True)
+class _Box:
+    """The unit box with n cells a side, and the quadrature on it: places (n_tets, n_q, 3), measure (n_tets, n_q)."""
+
+    space: LagrangeSpace
+    constraint: Constraint
+    places: Array
+    measure: Array
+    shape: Array
+    by_lambda: Array
+    gradients: Array
+
+    def load(self, force: Array) -> Array:
+        """Nodal forces (n_dof,) of a body force (n_tets, n_q, 3)."""
+        result = np.zeros_like(self.space.points)
+        nodal = np.einsum("eq,qa,eqi->eai", self.measure, self.shape, force, optimize=True)
+        np.add.at(result, self.space.cells, nodal)
+        return result.ravel()
+
+    def errors(self, displacement: Array, amplitude: float) -> Array:
+        """Errors (2,) of u and of grad u in L2 of a displacement (n_points, 3)."""
+        nodal = displacement[self.space.cells]
+        u, grad_u = solution(self.places, amplitude)
+        off = np.einsum("qa,eai->eqi", self.shape, nodal) - u
+        slope = np.einsum("qak,ekj,eai->eqij", self.by_lambda, self.gradients, nodal, optimize=True) - grad_u
+        squares = [np.sum(off**2, axis=2), np.sum(slope**2, axis=(2, 3))]
+        return np.sqrt([np.sum(self.measure * square) for square in squares])
+
+
+def _box(element: str, n: int) -> _Box:
+    space = lagrange_space(box_mesh(n, tissues=[known("block", nu=NU)]), element)
+    barycentric, weights = quadrature(5)
+    gradients, volumes = barycentric_gradients(space.mesh.nodes, space.mesh.tets)
+    held = np.repeat((np.abs(space.points - 0.5).max(axis=1) > 0.5 - 1e-9)[:, None], 3, axis=1)
+    return _Box(
+        space,
+        held_components(held, 0.0 * space.points),
+        np.einsum("qk,eki->eqi", barycentric, space.mesh.nodes[space.mesh.tets]),
+        volumes[:, None] * weights,
+        shape_functions(space.order, barycentric),
+        shape_derivatives(space.order, barycentric),
+        gradients,
+    )
+
+
+def linear_errors(element: str, dilatation: Dilatation, n: int) -> Array:
+    """Errors (2,) of u and of grad u in L2 on n cells a side, linear law."""
+    box = _box(element, n)
+    load = box.load(linear_force(box.places))
+    u = loaded(box.space, box.constraint, load, moduli=[1.0], dilatation=dilatation)
+    return box.errors(u.reshape(-1, 3), SMALL)
+
+
+def neo_hookean_errors(element: str, dilatation: Dilatation, n: int) -> Array:
+    """Errors (2,) of u and of grad u in L2 on n cells a side, neo-Hookean law."""
+    box = _box(element, n)
+    loads = (DeadLoad(box.load(finite_force(box.places))),)
+    model = finite_strain_model(box.space, box.constraint, LAW, dilatation=dilatation, loads=loads)
+    return box.errors(model.solve(np.ones(1), np.zeros(0)).displacement, LARGE)
+
+
+def observed_orders(coarse: Array, fine: Array, ratio: float) -> Array:
+    """Orders ln(e_coarse / e_fine) / ln(h_coarse / h_fine) of errors (n,)."""
+    return np.asarray(np.log(coarse / fine) / np.log(ratio))
+
+
+def _order_checks(
+    name: str, orders: tuple[float, float], observed: Array, tolerance: float = TOLERANCE
+) -> tuple[Check, ...]:
+    return tuple(
+        Check(f"order of {what}, {name}", expected, float(value), 100.0 * tolerance, order=float(value), scale=1.0)
+        for what, expected, value in zip(("u", "grad u"), orders, observed, strict=True)
+    )
+
+
+def _linear_checks() -> tuple[Check, ...]:
+    first = observed_orders(*(linear_errors("P1", Dilatation.POINTWISE, n) for n in (8, 16)), 2.0)
+    second = observed_orders(*(linear_errors("P2", Dilatation.POINTWISE, n) for n in (4, 8)), 2.0)
+    return (*_order_checks("P1", (2.0, 1.0), first), *_order_checks("P2", (3.0, 2.0), second))
+
+
+def _finite_checks() -> tuple[Check, ...]:
+    first = observed_orders(*(neo_hookean_errors("P1", Dilatation.POINTWISE, n) for n in (8, 16)), 2.0)
+    second = observed_orders(*(neo_hookean_errors("P2", Dilatation.POINTWISE, n) for n in (5, 10)), 2.0)
+    return (*_order_checks("P1", (2.0, 1.0), first), *_order_checks("P2", (3.0, 2.0), second))
+
+
+MANUFACTURED_PROBLEMS = (
+    Problem("B16a", "Manufactured solution, linear law: observed orders", "theory of finite elements", _linear_checks),
+    Problem(
+        "B16b",
+        "Manufactured solution, neo-Hookean law: observed orders",
+        "theory of finite elements",
+        _finite_checks,
+        quick=False,
+    ),
+)

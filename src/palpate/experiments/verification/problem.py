@@ -1,0 +1,68 @@
+"""A problem with a known answer, and what a computation says of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+__all__ = ["Check", "Problem", "RowDict", "as_row"]
+
+RowDict = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One quantity of a problem: its `reference`, the computed value `ours`, the largest error allowed in per cent.
+
+    `order`: observed order of convergence, where the mesh was refined; `scale`: what 100 % is (default: the reference).
+    """
+
+    quantity: str
+    reference: float
+    ours: float
+    tolerance_percent: float
+    order: float | None = None
+    scale: float | None = None
+
+    @property
+    def error_percent(self) -> float:
+        """100 |ours - reference| / scale."""
+        return 100.0 * abs(self.ours - self.reference) / (self.scale or abs(self.reference))
+
+    @property
+    def passed(self) -> bool:
+        """Whether the error is a number within the tolerance."""
+        return math.isfinite(self.error_percent) and self.error_percent <= self.tolerance_percent
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """A problem: its id in the list of problems, its title, where the reference comes from, and how it is computed.
+
+    `quick`: one of those that continuous integration runs.
+    """
+
+    id: str
+    title: str
+    source: str
+    measure: Callable[[], tuple[Check, ...]]
+    quick: bool = True
+
+
+def as_row(problem: Problem, check: Check) -> RowDict:
+    """The check as an object of `palpate verify --json`; a value that is no number becomes null."""
+    finite = math.isfinite(check.ours)
+    return {
+        "id": problem.id,
+        "title": problem.title,
+        "quantity": check.quantity,
+        "reference": check.reference,
+        "source": problem.source,
+        "value": check.ours if finite else None,
+        "error_percent": check.error_percent if finite else None,
+        "tolerance_percent": check.tolerance_percent,
+        "order": check.order,
+        "pass": check.passed,
+    }

@@ -1,0 +1,54 @@
+"""Equilibrium of a body under any law when all is given: a finite-strain path begins at the linear displacement."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.mechanics.dilatation import Dilatation
+from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel, finite_strain_model
+from palpate.mechanics.forward import Equilibrium
+from palpate.mechanics.laws.contract import Law
+from palpate.mechanics.linear_model import LinearSystem, linear_model
+from palpate.mechanics.loads import Load
+from palpate.mechanics.newton import NewtonSettings
+from palpate.mesh.constraint import Constraint
+from palpate.mesh.space import LagrangeSpace
+
+__all__ = ["ACCURACY", "equilibrium", "from_linear"]
+
+ACCURACY = 1e-7  # of the forces: the displacement's error is some nanometres
+
+
+def equilibrium(
+    space: LagrangeSpace,
+    constraint: Constraint,
+    moduli: NDArray[np.float64],
+    *,
+    law: Law,
+    dilatation: Dilatation,
+    loads: tuple[Load, ...] = (),
+) -> Equilibrium:
+    """Equilibrium of all meshed tissues at moduli (n_regions,) kPa; the constraint's modes do not move.
+
+    Raises `NotConverged` with the element and the share of the motion where a finite-strain path ended.
+    """
+    still = np.zeros(constraint.n_modes)
+    system = linear_model(space, constraint, dilatation=dilatation, loads=loads).system(moduli)
+    if law.name == "linear":
+        return system.solve(still)
+    settings = NewtonSettings(tolerance=ACCURACY)
+    model = finite_strain_model(space, constraint, law, dilatation=dilatation, loads=loads, settings=settings)
+    return from_linear(model, system, still)
+
+
+def from_linear(
+    model: FiniteStrainModel, system: LinearSystem, coefficients: NDArray[np.float64]
+) -> FiniteStrainEquilibrium:
+    """Equilibrium at the moduli of the linear `system` and mode coefficients (n_modes,), from its displacement.
+
+    Where that folds elements, the path begins at rest instead. Raises `NotConverged`.
+    """
+    start = system.solve(coefficients).displacement
+    found = model.attempt(system.moduli, coefficients, start=start, nearby=system.factorisation)
+    return found if found.converged else model.solve(system.moduli, coefficients)
