@@ -22,12 +22,13 @@ from numpy.typing import NDArray
 from palpate.images.segmentation import segment
 from palpate.images.tissue import Role
 from palpate.inversion.conclude import Observed, conclude
+from palpate.inversion.continuation import continued_at_finite_strain
 from palpate.inversion.grid_position import FittedState, voxel_errors
 from palpate.inversion.invert import invert
 from palpate.inversion.modulus_map import modulus_map
 from palpate.inversion.noise import NoiseLaw, fit_noise_law
 from palpate.inversion.posterior import cramer_rao
-from palpate.inversion.problem import InverseProblem, Inversion
+from palpate.inversion.problem import InverseProblem, Inversion, InversionSettings
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import linear_model
 from palpate.mesh.space import LagrangeSpace, lagrange_space
@@ -39,7 +40,7 @@ from palpate.phantoms.exact_targets import exact_target
 from palpate.phantoms.pelvis import PelvisOptions, pelvis, pelvis_anatomy, pelvis_grid
 from palpate.phantoms.scene import Noise, Scene, reimaged, rescaled
 from palpate.study.body import aligned, inverse_problem, make_body
-from palpate.study.case import Case, MeshSettings, Phantom
+from palpate.study.case import Case, Mechanics, MeshSettings, Phantom
 from palpate.study.run import fitted_states, inversion_settings
 
 NOISE = Noise(surface_sd_mm=0.3, correlation_length_mm=6.0)
@@ -57,6 +58,8 @@ class Row:
     data: str = "voxels"
     edge_mm: float = 4.0
     draws: int = 1  # of the noise, for each pelvis
+    law: str = "linear"  # of the truth and of the estimate
+    poisson_ratio: float | None = None  # None: 0.40 to 0.45 at random
 
 
 ROWS = {
@@ -67,7 +70,12 @@ ROWS = {
     "clean-3mm": Row(4, filling_mm=3.0),
     "noise": Row(8, spacing_mm=(1.0, 1.0, 2.5), noise=NOISE, edge_mm=6.0, draws=3),
     "tumour": Row(3, tumour=True),
+    "nu-0.49": Row(4, poisson_ratio=0.49),
+    "finite-clean": Row(6, law="neo-hookean", edge_mm=5.0),
+    "finite-clean-3mm": Row(3, law="neo-hookean", edge_mm=5.0, filling_mm=3.0),
+    "finite-noise": Row(6, law="neo-hookean", edge_mm=6.0, spacing_mm=(1.0, 1.0, 2.5), noise=NOISE, draws=2),
 }
+FAR_OFF = np.log([3.0, 1.0 / 3.0, 3.0])  # from the linear estimate: another start of the continuation
 
 
 def main() -> int:
@@ -87,7 +95,7 @@ def main() -> int:
     for seed in range(arguments.first_seed, arguments.first_seed + (arguments.cases or max_cases(names))):
         if (seed - arguments.first_seed) % share[1] != share[0]:
             continue
-        truths: dict[bool, tuple[Scene, float]] = {}
+        truths: Truths = {}
         for name in names:
             if seed - arguments.first_seed >= (arguments.cases or ROWS[name].cases):
                 continue
@@ -111,36 +119,54 @@ def max_cases(names: list[str]) -> int:
     return max(ROWS[name].cases for name in names)
 
 
-def _truth(row: Row, seed: int, draw: int, truths: dict[bool, tuple[Scene, float]]) -> tuple[Scene, PelvisOptions]:
-    """The scene of a row; rows of one seed share the truth, which is linear in the filling, but not the images."""
+Truths = dict[tuple[object, ...], tuple[Scene, float]]
+
+
+def _truth(row: Row, seed: int, draw: int, truths: Truths) -> tuple[Scene, PelvisOptions]:
+    """The scene of a row; rows of one seed share the truth where they can, but not the images.
+
+    A linear truth is linear in the filling; a finite-strain one is made anew.
+    """
     filling = float(np.random.default_rng([seed, 7]).uniform(6.0, 8.0))
-    if row.tumour not in truths:
-        truths[row.tumour] = pelvis(PelvisOptions(seed=seed, filling_mm=filling, tumour=row.tumour)), filling
-    scene, made = truths[row.tumour]
-    if row.filling_mm is not None:
+    if row.law != "linear" and row.filling_mm is not None:
+        filling = row.filling_mm
+    given = {"tumour": row.tumour, "law": row.law, "poisson_ratio": row.poisson_ratio}
+    key = (*given.values(), filling)
+    if key not in truths:
+        truths.clear()  # a truth is large
+        truths[key] = pelvis(PelvisOptions(seed=seed, filling_mm=filling, **given)), filling
+    scene, made = truths[key]
+    if row.filling_mm is not None and row.law == "linear":
         scene = rescaled(scene, row.filling_mm / made)
         filling = row.filling_mm
-    options = PelvisOptions(
-        seed=seed, filling_mm=filling, spacing_mm=row.spacing_mm, noise=row.noise, tumour=row.tumour
-    )
+    options = PelvisOptions(seed=seed, filling_mm=filling, spacing_mm=row.spacing_mm, noise=row.noise, **given)
     return reimaged(replace(scene, seed=seed + 1000 * draw), pelvis_grid(options), noise=row.noise), options
 
 
-def _case(key: tuple[str, int, int], row: Row, truths: dict[bool, tuple[Scene, float]]) -> dict[str, object]:
+def _case(key: tuple[str, int, int], row: Row, truths: Truths) -> dict[str, object]:
     """Make one scene, estimate it, and hold the estimate beside the truth."""
     name, seed, draw = key
     began = time.perf_counter()
     scene, options = _truth(row, seed, draw, truths)
     filling = options.filling_mm
     scene_seconds = time.perf_counter() - began
-    case = Case(f"{name}-{seed}", phantom=Phantom("pelvis", seed), mesh=MeshSettings(row.edge_mm))
+    case = Case(
+        f"{name}-{seed}",
+        phantom=Phantom("pelvis", seed),
+        mesh=MeshSettings(row.edge_mm),
+        mechanics=Mechanics(row.law, "P2" if row.law == "linear" and row.poisson_ratio is None else "auto"),
+    )
     if row.data == "voxels":
         space, problem, states = _from_voxels(scene, case)
     else:
         space, problem, states = _from_surfaces(scene, case, options, same_mesh=row.data == "same mesh")
     settings = inversion_settings(case, problem.modulus_map)
     estimated = time.perf_counter()
-    inversion = invert(problem, settings, progress=lambda _: None)
+    linear = invert(replace(problem, finite_strain=()), settings, progress=_silent)
+    linear_seconds = time.perf_counter() - estimated
+    inversion = (
+        continued_at_finite_strain(problem, linear, settings, progress=_silent) if row.law != "linear" else linear
+    )
     seconds = time.perf_counter() - estimated
     result = {
         "row": name,
@@ -155,10 +181,28 @@ def _case(key: tuple[str, int, int], row: Row, truths: dict[bool, tuple[Scene, f
         "starts": [int(group) for group in inversion.groups],
     }
     result |= _errors(inversion, scene)
+    if row.law != "linear":
+        result["linear_ln_error"] = _errors(linear, scene)["ln_error"]
+        result["linear_seconds"] = linear_seconds
+        if seed % 5 == 1 and draw == 0 and row.noise is None:
+            result["far_off_ln_error"] = _errors(_from_far_off(problem, linear, settings), scene)["ln_error"]
     if states:
         result |= _uncertainty(inversion, space, states, scene, settings, row)
         result |= _driver_error(inversion, space, scene)
     return result
+
+
+def _silent(message: str) -> None:
+    del message
+
+
+def _from_far_off(problem: InverseProblem, linear: Inversion, settings: InversionSettings) -> Inversion:
+    """The continuation from moduli that are three times too high and too low instead of the linear estimate's."""
+    n = linear.objective.n_parameters
+    unknowns = linear.minimum.unknowns.copy()
+    unknowns[:n] += FAR_OFF[:n]
+    moved = replace(linear, minima=(replace(linear.minimum, unknowns=unknowns),), groups=(0,), best=0)
+    return continued_at_finite_strain(problem, moved, settings, progress=_silent)
 
 
 def _from_voxels(scene: Scene, case: Case) -> tuple[LagrangeSpace, InverseProblem, tuple[object, ...]]:
@@ -278,6 +322,9 @@ def _summary(results: list[dict]) -> dict[str, object]:
         "estimate_seconds": float(np.mean([r["estimate_seconds"] for r in results])),
         "dofs": int(np.mean([r["dofs"] for r in results])),
     }
+    if "linear_ln_error" in results[0]:
+        off = np.concatenate([r["linear_ln_error"] for r in results])
+        found |= {"linear_rms_ln_error": _rms(off), "linear_worst_ln_error": float(np.abs(off).max())}
     if "sd" in results[0]:
         truth = np.concatenate([r["truth_ratio"] for r in results])
         ends = [end for r in results for end in r["interval95"]]

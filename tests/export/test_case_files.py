@@ -63,6 +63,14 @@ def test_the_mesh_carries_label_modulus_and_poissons_ratio(tmp_path, case_result
     np.testing.assert_array_equal(mesh.point_data["displacement_mm"], case_result.estimation.displacements[0])
 
 
+def test_the_mesh_carries_the_strain_of_its_displacement(tmp_path, case_result):
+    stretch = case_result.space.points * [0.0, 0.0, 0.2]
+    estimation = dataclasses.replace(case_result.estimation, displacements=(stretch,))
+    write_estimate_files(dataclasses.replace(case_result, estimation=estimation), tmp_path)
+    written = meshio.read(tmp_path / "mesh.vtu").cell_data["largest_strain"][0]
+    np.testing.assert_allclose(written, (1.2**2 - 1.0) / 2.0, rtol=1e-5)
+
+
 def test_ratios_are_not_passed_off_as_kilopascals(tmp_path, case_result):
     estimation = case_result.estimation
     ratios = tuple(dataclasses.replace(e, unit="ratio", value=None, interval95=None) for e in estimation.estimates)
@@ -110,7 +118,12 @@ def test_a_simulation_is_written_with_its_steps(tmp_path, case_result, steps):
     assert all(path.is_file() for path in paths)
     assert {"before.nii.gz", "after.nii.gz", "mesh.vtu", "surfaces"} <= {path.name for path in tmp_path.iterdir()}
     assert (tmp_path / "mesh.pvd").exists() == (steps > 1)
-    assert len(list((tmp_path).glob("steps/*.vtu"))) == (steps + 1 if steps > 1 else 0)
+    written = sorted(tmp_path.glob("steps/*.vtu"))
+    assert len(written) == (steps + 1 if steps > 1 else 0)
+    strains = [meshio.read(path).cell_data["largest_strain"][0].max() for path in [*written, tmp_path / "mesh.vtu"]]
+    assert strains == sorted(strains)  # grows with the motion, from none
+    assert strains[-1] > 0.0
+    assert steps == 1 or strains[0] == 0.0
 
 
 @pytest.mark.parametrize("name", ["../../etc/passwd", "a/b", "x" * 300, "CON:", "", "\n"])

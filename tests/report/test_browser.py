@@ -128,9 +128,15 @@ def test_the_cut_moves_and_the_mesh_changes_its_colours(opened):
     page.wait_for_timeout(300)
     modulus = pixels(canvas)
     assert changed(tissue, modulus) > 0.02
+    figure.locator(".segments label", has_text="strain").click()
+    page.wait_for_timeout(300)
+    strain = pixels(canvas)
+    assert changed(modulus, strain) > 0.02
+    assert figure.locator(".live [data-bar=strain]").is_visible()
+    assert not figure.locator(".live [data-bar=modulus]").is_visible()
     figure.locator(".cut-position").fill("30")
     page.wait_for_timeout(300)
-    assert changed(modulus, pixels(canvas)) > 0.02
+    assert changed(strain, pixels(canvas)) > 0.02
     assert figure.locator(".cut-value").inner_text() == "x = 30.0 mm"
 
 
@@ -192,7 +198,7 @@ def test_a_telephone_shows_it_without_scrolling_sideways(opened):
 
 
 def pictures_stand(page):
-    for section, count in (("slices", 3), ("organs", 2), ("mesh", 2)):
+    for section, count in (("slices", 3), ("organs", 2), ("mesh", 3)):
         still = page.locator(f"section.{section} .still")
         assert still.locator("img:visible, figure > svg:visible").count() == count
         assert page.locator(f"section.{section} canvas:visible").count() == 0
@@ -220,7 +226,7 @@ def test_without_webgl_the_bodies_stand_as_pictures(engine, address):
     alive(page, "slices")
     page.locator("section.mesh").scroll_into_view_if_needed()
     page.wait_for_timeout(300)
-    assert page.locator("section.mesh .still img:visible").count() == 2
+    assert page.locator("section.mesh .still img:visible").count() == 3
     assert page.locator("section.organs canvas:visible").count() == 0
     browser.close()
     assert not complaints

@@ -7,6 +7,7 @@ import re
 
 from palpate.report.collect import collect
 from palpate.report.methods import methods_text
+from palpate.study.case import Mechanics
 
 
 def test_citations_and_sources_belong_together(case_result):
@@ -17,8 +18,30 @@ def test_citations_and_sources_belong_together(case_result):
 
 def test_the_text_says_what_was_set(case_result):
     text = " ".join(methods_text(collect(case_result)).paragraphs)
-    for words in ("prostate and bladder", "driven by rectum", "surroundings (10 kPa)", "P2 elements", "3 starts"):
+    for words in (
+        "prostate and bladder",
+        "driven by rectum",
+        "surroundings (10 kPa)",
+        "quadratic tetrahedra",
+        "3 starts",
+    ):
         assert words in text
+
+
+def test_the_finite_strain_law_is_told_with_its_start(case_result):
+    for law, told in (("linear", False), ("neo-hookean", True)):
+        case = dataclasses.replace(case_result.case, mechanics=Mechanics(law=law))
+        text = " ".join(methods_text(collect(dataclasses.replace(case_result, case=case))).paragraphs)
+        assert ("The linear law gave the start" in text) is told
+
+
+def test_a_known_load_sets_the_scale(case_result):
+    data = collect(case_result)
+    unknown = tuple(dataclasses.replace(tissue, given_kpa=None) for tissue in data.tissues)
+    text = " ".join(methods_text(dataclasses.replace(data, tissues=unknown)).paragraphs)
+    assert "The scale was set by the known loads" in text
+    ratios = " ".join(methods_text(dataclasses.replace(data, tissues=unknown, unit="ratio")).paragraphs)
+    assert "only ratios were found" in ratios
 
 
 def test_another_optimiser_is_another_source(case_result):

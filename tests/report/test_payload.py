@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import json
 import zlib
 
 import numpy as np
 import pytest
 
+from palpate.mechanics.deformation import largest_strains
 from palpate.report.collect import collect
 from palpate.report.payload import payload, script_json
 
@@ -44,6 +46,21 @@ def test_mesh_and_volume_are_whole(data, unpacked):
     np.testing.assert_array_equal(array(facts["mesh"]["region"], block), data.mesh.region)
     volume = facts["background"]
     np.testing.assert_array_equal(array(volume["values"], block).reshape(volume["shape"]), data.background.values)
+
+
+def test_strains_keep_their_value_to_a_fifth_of_a_per_cent(case_result, data, unpacked):
+    facts, block = unpacked
+    expected = largest_strains(case_result.space, case_result.estimation.displacements[0])
+    assert 0.1 < expected.max() < 0.5
+    np.testing.assert_allclose(data.mesh.strains, expected, rtol=1e-6)
+    packed = facts["mesh"]["strainStep"] * array(facts["mesh"]["strain"], block)
+    np.testing.assert_allclose(packed, 100.0 * expected, atol=0.5 * facts["mesh"]["strainStep"] + 1e-9)
+
+
+def test_a_mesh_without_a_fit_has_no_strains(case_result):
+    nothing = dataclasses.replace(case_result.estimation, displacements=())
+    facts = json.loads(payload(collect(dataclasses.replace(case_result, estimation=nothing))).facts)
+    assert facts["mesh"]["strain"]["length"] == 0
 
 
 def test_unobserved_distances_stay_unknown(data, unpacked):

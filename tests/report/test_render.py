@@ -56,18 +56,19 @@ def test_a_camera_sees_the_patients_left_on_its_right_from_the_front():
 
 def test_the_cut_mesh_is_bounded_by_closed_faces(case_result):
     data = collect(case_result)
-    faces, region = section_faces(data.mesh, axis=0, position=20.0)
+    faces, tets = section_faces(data.mesh, axis=0, position=20.0)
     edges, count = np.unique(
         np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0, return_counts=True
     )
     assert (count % 2 == 0).all()
     assert len(edges)
-    assert set(region) == {0, 1, 3}
+    assert set(data.mesh.region[tets]) == {0, 1, 3}
+    assert all(set(face) <= set(data.mesh.tets[tet]) for face, tet in zip(faces, tets, strict=True))
 
 
 def test_the_reports_pictures_are_drawn(case_result):
     data = collect(case_result)
     rest, fitted = (organs_png(data, data.later[0], fitted=fitted) for fitted in (False, True))
-    tissue, modulus = (mesh_png(data, by_modulus=by_modulus) for by_modulus in (False, True))
-    assert len({rest, fitted, tissue, modulus}) == 4
-    assert all(content.startswith(b"\x89PNG") for content in (rest, fitted, tissue, modulus))
+    pictures = [rest, fitted, *(mesh_png(data, by=by) for by in ("tissue", "modulus", "strain"))]
+    assert len(set(pictures)) == 5
+    assert all(content.startswith(b"\x89PNG") for content in pictures)

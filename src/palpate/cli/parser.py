@@ -8,7 +8,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from palpate.cli import commands, written
+from palpate.cli import commands, studies, written
 from palpate.cli.outcome import Outcome
 
 __all__ = ["make_parser", "version"]
@@ -46,6 +46,7 @@ def make_parser() -> argparse.ArgumentParser:
     simulate.add_argument("--steps", type=_count, default=1, metavar="N", help="write N steps to animate")
     _add_estimate(subparsers)
     _add_report(subparsers)
+    _add_reproduce(subparsers)
     return parser
 
 
@@ -81,6 +82,13 @@ def _add_estimate(subparsers: Any) -> None:
 def _add_report(subparsers: Any) -> None:
     command = _command(subparsers, "report", written.report, what="draw report.html of an estimate again", writes=False)
     command.add_argument("folder", type=Path, metavar="DIR", help="the output folder of an estimate")
+
+
+def _add_reproduce(subparsers: Any) -> None:
+    what = "compute one of the paper's experiments, its numbers beside ours; goes on where it was interrupted"
+    command = _command(subparsers, "reproduce", studies.reproduce, what=what)
+    command.add_argument("experiment", choices=("table1", "table2", "figure4", "staging"))
+    command.set_defaults(output=Path("palpate-reproduce"))
 
 
 def _add_case(command: argparse.ArgumentParser) -> None:

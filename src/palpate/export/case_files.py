@@ -13,6 +13,7 @@ from palpate.export.label_table import first_labels, write_label_table
 from palpate.export.rasterise import region_image
 from palpate.export.vtk_xml import write_pvd, write_vtp, write_vtu
 from palpate.images.readers import write_label_image, write_scalar_image
+from palpate.mechanics.deformation import largest_strains
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.surface import tissue_surface
 from palpate.mesh.tet_mesh import TetMesh
@@ -47,7 +48,16 @@ def _write_fitted(
     kilopascals = result.stiffness if result.unit == "kPa" else np.full(len(mesh.tissues), np.nan)
     extra = {} if result.unit == "kPa" else {"youngs_modulus_ratio": result.stiffness[mesh.region]}
     last = displacements[-1] if displacements else np.zeros_like(space.points)
-    write_vtu(path, space, point_data={"displacement_mm": last}, cell_data=_cell_data(mesh, kilopascals) | extra)
+    cells = _cell_data(mesh, kilopascals) | extra
+    _write_moved(path, space, last, cells)
+
+
+def _write_moved(
+    path: Path, space: LagrangeSpace, displacement: NDArray[np.float64], cells: Mapping[str, NDArray[Any]]
+) -> None:
+    """A mesh with a displacement (n_points, 3) mm and the strain that it makes of each tetrahedron."""
+    strained = {**cells, "largest_strain": largest_strains(space, displacement)}
+    write_vtu(path, space, point_data={"displacement_mm": displacement}, cell_data=strained)
 
 
 def write_mesh_files(result: MeshResult, folder: Path) -> tuple[Path, ...]:
@@ -71,7 +81,7 @@ def write_simulation_files(result: Simulation, folder: Path) -> tuple[Path, ...]
     space, last = result.space, result.displacements[-1]
     moduli = np.array([result.moduli_kpa.get(tissue.name, np.nan) for tissue in space.mesh.tissues])
     cells = _cell_data(space.mesh, moduli)
-    write_vtu(folder / "mesh.vtu", space, point_data={"displacement_mm": last}, cell_data=cells)
+    _write_moved(folder / "mesh.vtu", space, last, cells)
     surfaces = folder / "surfaces"
     return (
         *images,
@@ -97,7 +107,7 @@ def _write_series(result: Simulation, cells: Mapping[str, NDArray[Any]], folder:
     paths = []
     for number, displacement in enumerate((still, *result.displacements)):
         paths.append(steps / f"step_{number:03d}.vtu")
-        write_vtu(paths[-1], result.space, point_data={"displacement_mm": displacement}, cell_data=cells)
+        _write_moved(paths[-1], result.space, displacement, cells)
     times = np.linspace(0.0, 1.0, len(paths))
     write_pvd(folder / "mesh.pvd", [(float(t), f"steps/{path.name}") for t, path in zip(times, paths, strict=True)])
     return (folder / "mesh.pvd", *paths)

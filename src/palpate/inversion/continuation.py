@@ -29,6 +29,7 @@ from palpate.mesh.constraint import Constraint
 __all__ = ["Expansion", "continued_at_finite_strain"]
 
 ROUNDS = 8
+WEIGHED = 2  # rounds that weigh the residuals anew; then the objective stays, so that the iteration can settle
 REACH = 0.8  # of ln E, within which an expansion is trusted
 HALVINGS = 3
 NOISE = 0.5  # of the objective, in units of log-likelihood: the noise of re-chosen closest points
@@ -124,7 +125,7 @@ def _followed(
     place = _placed(problem, expansions, replace(start, history=()), linear.law, settings)
     for number in range(ROUNDS):
         progress(f"finite strain, round {number + 1}: {words(problem, place.minimum)}")
-        following = _round(problem, place, settings)
+        following = _round(problem, place, settings, weigh=number < WEIGHED)
         settled = settled_between(place.minimum, following.minimum, linear.objective.n_parameters)
         place = replace(following, settled=settled)
         if settled:
@@ -159,8 +160,11 @@ def _placed(
     return _Place(objective, replace(at, evaluation=objective(at.unknowns)), expansions, law)
 
 
-def _round(problem: InverseProblem, place: _Place, settings: InversionSettings) -> _Place:
-    """The minimum on the present expansions, or a part of the way to it, with the equilibria there."""
+def _round(problem: InverseProblem, place: _Place, settings: InversionSettings, *, weigh: bool) -> _Place:
+    """The minimum on the present expansions, or a part of the way to it, with the equilibria there.
+
+    `weigh`: the residuals there give new weights.
+    """
     now = place.minimum
     near = replace(settings, bounds=_near(settings.bounds, now.unknowns[: place.objective.n_parameters]))
     found = minimised(place.objective, now.unknowns, near)
@@ -177,8 +181,12 @@ def _round(problem: InverseProblem, place: _Place, settings: InversionSettings) 
             raise NotConverged(f"no equilibrium near the estimate: {equilibrium.reason}")
     pairs = zip(equilibria, place.expansions, strict=True)
     expansions = tuple(_expansion(equilibrium, before.counts) for equilibrium, before in pairs)
-    history = (*now.history, *found.history)
-    return _placed(problem, expansions, replace(found, unknowns=unknowns, history=history), place.law, settings)
+    there = replace(found, unknowns=unknowns, history=(*now.history, *found.history))
+    if weigh:
+        return _placed(problem, expansions, there, place.law, settings)
+    states = objective_of(problem, tuple(e.reduced for e in expansions), place.law).states
+    objective = replace(place.objective, states=states)
+    return _Place(objective, replace(there, evaluation=objective(unknowns)), expansions, place.law)
 
 
 def _solved(expansion: Expansion, moduli: NDArray[np.float64], amounts: NDArray[np.float64]) -> FiniteStrainEquilibrium:

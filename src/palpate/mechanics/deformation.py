@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 from palpate.mechanics.element import barycentric_gradients, shape_derivatives
 from palpate.mesh.space import LagrangeSpace
 
-__all__ = ["deformation_determinants"]
+__all__ = ["deformation_determinants", "largest_strains"]
+
+CENTRE = np.full((1, 4), 0.25)
 
 
 def deformation_determinants(space: LagrangeSpace, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -16,7 +18,26 @@ def deformation_determinants(space: LagrangeSpace, displacement: NDArray[np.floa
 
     displacement (n_points, 3) mm. Positive at all of them: no element is turned inside out.
     """
-    places = np.vstack([np.eye(4), np.full((1, 4), 0.25)])
+    return np.asarray(np.linalg.det(_gradients(space, displacement, np.vstack([np.eye(4), CENTRE]))))
+
+
+def largest_strains(space: LagrangeSpace, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Largest absolute principal Green-Lagrange strain (n_tets,), dimensionless, at the tetrahedra's centres.
+
+    displacement (n_points, 3) mm. E = (F^T F - I) / 2 with F = I + grad u: no rotation counts as strain (Bonet & Wood,
+    Nonlinear Continuum Mechanics, 2nd ed. 2008, section 4.5). NaN where a displacement is not finite.
+    """
+    deformation = _gradients(space, displacement, CENTRE)[:, 0]
+    strains = 0.5 * (np.swapaxes(deformation, 1, 2) @ deformation - np.eye(3))
+    finite = np.isfinite(strains).all(axis=(1, 2))
+    principal = np.linalg.eigvalsh(np.where(finite[:, None, None], strains, 0.0))
+    return np.where(finite, np.abs(principal).max(axis=1), np.nan)
+
+
+def _gradients(
+    space: LagrangeSpace, displacement: NDArray[np.float64], places: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """F = I + grad u (n_tets, n_places, 3, 3), dimensionless, at barycentric places (n_places, 4)."""
     gradients, _ = barycentric_gradients(space.mesh.nodes, space.mesh.tets)
     by_barycentric = np.einsum("qak,nai->nqik", shape_derivatives(space.order, places), displacement[space.cells])
-    return np.asarray(np.linalg.det(np.eye(3) + by_barycentric @ gradients[:, None]))
+    return np.asarray(np.eye(3) + by_barycentric @ gradients[:, None])

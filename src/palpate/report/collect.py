@@ -17,6 +17,7 @@ from palpate.images.label_image import VoxelGrid
 from palpate.images.readers import read_intensities
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
+from palpate.mechanics.deformation import largest_strains
 from palpate.mesh.dihedral import tet_dihedrals
 from palpate.report.colours import tissue_colours
 from palpate.report.report_data import (
@@ -213,12 +214,16 @@ def _later_background(result: CaseResult, after: int, box: SliceBox | None) -> V
 
 
 def _mesh(result: CaseResult) -> MeshPicture:
+    """The mesh with its largest strain in any of the later images that are drawn."""
     mesh = result.space.mesh
+    motions = result.estimation.displacements[: min(len(result.after), MOST_LATER)]
+    strains = [largest_strains(result.space, motion) for motion in motions]
     return MeshPicture(
         nodes=mesh.nodes.astype(np.float32),
         tets=mesh.tets.astype(np.int32),
         region=mesh.region.astype(np.int16),
         angles=tet_dihedrals(mesh.nodes[mesh.tets]).astype(np.float32),
+        strains=np.max(strains, axis=0).astype(np.float32) if strains else np.zeros(0, np.float32),
     )
 
 

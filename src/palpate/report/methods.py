@@ -32,6 +32,12 @@ LAWS = {
     "neo-hookean": "a compressible neo-Hookean law at finite strains",
     "mooney-rivlin": "a compressible Mooney-Rivlin law at finite strains",
 }
+ELEMENTS = {
+    "P1": "linear tetrahedra",
+    "P2": "quadratic tetrahedra",
+    "P2-P0": "quadratic tetrahedra with the mean dilatation of each",
+    "auto": "quadratic tetrahedra whose volumetric stiffness is partly that of their mean dilatation, against locking",
+}
 OPTIMISERS = {"gauss-newton": ("Gauss-Newton steps in a trust region", "nocedal"), "lbfgs": ("L-BFGS-B", "byrd")}
 
 
@@ -70,7 +76,9 @@ def _aim(data: ReportData, cite: _Citations) -> str:
     aligned = " The later images were brought to the first on the rigid tissues." if on_bones else ""
     known = [f"{t.name} ({t.given_kpa:g} kPa)" for t in data.tissues if t.given_kpa is not None]
     moved = f" The motion was driven by {_list(roles['driver'])} (hollow, not meshed)." if "driver" in roles else ""
-    scale = f" The scale was set by {_list(known)}." if known else " No modulus was given, so only ratios were found."
+    scale = " No modulus was given, so only ratios were found."
+    if known or data.unit == "kPa":
+        scale = f" The scale was set by {_list(known or ['the known loads'])}."
     return (
         f"Young's moduli of {_list(roles.get('estimate', []))} were estimated at once from segmented images of the same"
         f" body in two or more states with Palpate {cite('palpate')}, whose method starts from"
@@ -90,7 +98,8 @@ def _model(data: ReportData, cite: _Citations) -> str:
         f" A conforming mesh{size} (edge length {settings['edge length at the organs']} at the organs) was cut along"
         f" their"
         f" zero levels and improved with Mmg {cite('mmg')}. The tissues followed"
-        f" {LAWS.get(document['law'], 'the law ' + str(document['law']))} in {document['element']} elements, with"
+        f" {LAWS.get(document['law'], 'the law ' + str(document['law']))} in"
+        f" {ELEMENTS.get(document['element'], str(document['element']))}, with"
         f" Poisson's"
         f" ratios of {_list(ratios)}; the outer boundary: {settings['outer boundary']}. The motion of the drivers'"
         f" walls was"
@@ -103,13 +112,15 @@ def _model(data: ReportData, cite: _Citations) -> str:
 def _fit(data: ReportData, cite: _Citations) -> str:
     optimiser, source = OPTIMISERS.get(data.document["method"], (str(data.document["method"]), "nocedal"))
     starts = len(data.document["starts"])
+    finite = data.document["law"] != "linear"
+    onwards = " The linear law gave the start; the fit then went on over expansions around finite-strain equilibria."
     return (
         "The misfit was the symmetric surface distance between model and later image, taken as a difference to the rest"
         " state, so that what smoothing, voxels and facets do to both images drops out, under Tukey's biweight"
         f" {cite('huber')}. It was minimised over the logarithms of the moduli from {starts} starts by {optimiser}"
         f" {cite(source)}, on a reduced basis whose error was bounded at the estimate {cite('reduced')}; faces on"
         f" drivers,"
-        " bones and the image's border were left out."
+        f" bones and the image's border were left out.{onwards if finite else ''}"
     )
 
 

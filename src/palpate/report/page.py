@@ -22,7 +22,7 @@ from palpate.report.payload import payload
 from palpate.report.pictures import mesh_png, organs_png
 from palpate.report.report_data import LaterImage, ReportData
 from palpate.report.rows import estimate_rows, number, scale_marks
-from palpate.report.scales import Scale, angle_scale, distance_scale, modulus_scale
+from palpate.report.scales import Scale, angle_scale, distance_scale, modulus_scale, strain_scale
 from palpate.report.section import VIEWS
 from palpate.report.slices import contour_names, first_planes, slice_svg
 
@@ -84,6 +84,7 @@ def render(data: ReportData) -> str:
         angles=_angles(data),
         methods=_methods(data),
         angle_scale=angle_scale(),
+        strain_scale=strain_scale() if data.mesh and len(data.mesh.strains) else None,
         gradient=_gradient,
         widths=_widths(data),
     )
@@ -146,9 +147,11 @@ def _later(data: ReportData, k: int, later: LaterImage) -> _Later:
 def _mesh_pictures(data: ReportData) -> tuple[Picture, ...]:
     if data.mesh is None:
         return ()
+    strain = _photograph("coloured by the largest strain", partial(mesh_png, data, by="strain"))
     return (
-        _photograph("coloured by tissue", partial(mesh_png, data, by_modulus=False)),
-        _photograph("coloured by Young's modulus", partial(mesh_png, data, by_modulus=True)),
+        _photograph("coloured by tissue", partial(mesh_png, data, by="tissue")),
+        _photograph("coloured by Young's modulus", partial(mesh_png, data, by="modulus")),
+        *([strain] if len(data.mesh.strains) else []),
     )
 
 

@@ -13,13 +13,14 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from palpate.report.report_data import LaterImage, MeshPicture, ReportData, TriangleSurface, Volume
-from palpate.report.scales import Scale, angle_scale, distance_scale, modulus_scale
+from palpate.report.scales import Scale, angle_scale, distance_scale, modulus_scale, strain_scale
 from palpate.report.section import VIEWS
 
 __all__ = ["Payload", "payload"]
 
 MOST_TETS = 120_000  # of a mesh that a page can turn
 LEVELS = 65_535
+STRAIN_STEP = 0.2  # per cent, in a byte: up to 51 %
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +75,7 @@ def payload(data: ReportData) -> Payload:
         "later": [_later(data, later, packer) for later in data.later],
         "mesh": _mesh(data.mesh, packer),
         "angles": _scale(angle_scale()),
+        "strains": _scale(strain_scale()),
         "moduli": _scale(modulus_scale(data)) if any(t.modulus for t in data.tissues) else None,
     }
     block = zlib.compress(b"".join(packer.chunks), 9)
@@ -156,6 +158,8 @@ def _mesh(mesh: MeshPicture | None, packer: _Packer) -> dict[str, Any] | None:
         "tets": packer.indices(mesh.tets),
         "region": packer.add(mesh.region.astype(np.uint8)),
         "worst": packer.add(np.clip(mesh.angles.min(axis=1), 0.0, 255.0).astype(np.uint8)),
+        "strain": packer.add(np.clip(np.rint(100.0 * mesh.strains / STRAIN_STEP), 0.0, 255.0).astype(np.uint8)),
+        "strainStep": STRAIN_STEP,
     }
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
 from palpate.report.render import Camera, Triangles, render_png
 from palpate.report.report_data import LaterImage, MeshPicture, ReportData
-from palpate.report.scales import Scale, distance_scale, modulus_scale
+from palpate.report.scales import Scale, distance_scale, modulus_scale, strain_scale
 
 __all__ = ["mesh_png", "organs_png", "section_faces", "tissue_shades"]
 
@@ -34,18 +36,21 @@ def organs_png(data: ReportData, later: LaterImage, *, fitted: bool) -> bytes:
     return render_png(triangles, BESIDE, width=WIDTH, height=HEIGHT)
 
 
-def mesh_png(data: ReportData, *, by_modulus: bool) -> bytes:
-    """The mesh cut by the sagittal plane of the slices, coloured by tissue or by Young's modulus; PNG."""
+def mesh_png(data: ReportData, *, by: Literal["tissue", "modulus", "strain"]) -> bytes:
+    """The mesh cut by the sagittal plane of the slices, coloured by tissue, Young's modulus or strain; PNG."""
     mesh = data.mesh
     if mesh is None:
         raise ValueError("there is no mesh")
     middle = float(np.median(mesh.nodes[:, 0])) if data.slices is None else float(data.slices.position[0])
-    faces, region = section_faces(mesh, axis=0, position=middle)
-    shades = tissue_shades(data, modulus_scale(data) if by_modulus else None)
+    faces, tets = section_faces(mesh, axis=0, position=middle)
+    if by == "strain":
+        shades = strain_scale().colours(100.0 * mesh.strains[tets].astype(np.float64))
+    else:
+        shades = tissue_shades(data, modulus_scale(data) if by == "modulus" else None)[mesh.region[tets]]
     corners = mesh.nodes.astype(np.float64)[faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    colours = np.repeat(shades[region][:, None], 3, axis=1)
+    colours = np.repeat(shades[:, None], 3, axis=1)
     triangles = Triangles(corners, colours, np.repeat(normal[:, None], 3, axis=1), edges=True)
     return render_png(triangles, AT_THE_SIDE, width=WIDTH, height=HEIGHT)
 
@@ -59,16 +64,16 @@ def tissue_shades(data: ReportData, scale: Scale | None) -> NDArray[np.float64]:
 
 
 def section_faces(mesh: MeshPicture, *, axis: int, position: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Outer faces (n, 3), and the tissue (n,) of each, of the tetrahedra whose middle lies beyond `position` (mm)."""
-    kept = mesh.nodes[mesh.tets, axis].mean(axis=1) > position
+    """Outer faces (n, 3), and the tetrahedron (n,) of each, of those whose middle lies beyond `position` (mm)."""
+    kept = np.flatnonzero(mesh.nodes[mesh.tets, axis].mean(axis=1) > position)
     faces = mesh.tets[kept].astype(np.int64)[:, FACES].reshape(-1, 3)
-    region = np.repeat(mesh.region[kept].astype(np.int64), 4)
+    owner = np.repeat(kept, 4)
     ordered = np.sort(faces, axis=1)
     n = len(mesh.nodes)
     keys = (ordered[:, 0] * n + ordered[:, 1]) * n + ordered[:, 2]
     _, first, count = np.unique(keys, return_index=True, return_counts=True)
     outside = first[count == 1]
-    return faces[outside], region[outside]
+    return faces[outside], owner[outside]
 
 
 def _smooth_normals(points: NDArray[np.float64], triangles: NDArray[np.int32]) -> NDArray[np.float64]:

@@ -109,12 +109,16 @@ class LaterImage:
 
 @dataclass(frozen=True, slots=True)
 class MeshPicture:
-    """The mesh: nodes (n, 3) RAS mm, tets (m, 4), region (m,) tissue index, angles (m, 6) dihedral, degrees."""
+    """The mesh: nodes (n, 3) RAS mm, tets (m, 4), region (m,) tissue index, angles (m, 6) dihedral, degrees.
+
+    strains (m,): the largest principal strain of the fitted states, dimensionless; (0,) where nothing was fitted.
+    """
 
     nodes: NDArray[np.float32]
     tets: NDArray[np.int32]
     region: NDArray[np.int16]
     angles: NDArray[np.float32]
+    strains: NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Colour scales of a report: distances about zero, moduli and angles from low to high; and their bars."""
+"""Colour scales of a report: distances about zero; moduli, angles and strains from low to high; and their bars."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.report.report_data import ReportData
+from palpate.study.strain_range import LINEAR_RANGE
 
-__all__ = ["Scale", "angle_scale", "distance_scale", "modulus_scale"]
+__all__ = ["Scale", "angle_scale", "distance_scale", "modulus_scale", "strain_scale"]
 
 UNSEEN = (0.62, 0.63, 0.66)  # where there is no value
 
@@ -78,3 +79,10 @@ def angle_scale() -> Scale:
     """Smallest dihedral angle of a tetrahedron, degrees; 5 is what the mesh's gate asks for."""
     ticks = tuple((float(angle), f"{angle}°") for angle in (5, 20, 40, 60))
     return Scale("RdYlGn", 0.0, 70.0, False, "smallest dihedral angle (degrees)", ticks)
+
+
+def strain_scale() -> Scale:
+    """Largest principal strain of a tetrahedron, per cent, with the end of the linear law's range marked."""
+    marked = round(100 * LINEAR_RANGE)
+    ticks = ((0.0, "0"), (float(marked), f"{marked} % (linear law)"), (20.0, "20 %"), (30.0, "≥ 30 %"))
+    return Scale("YlOrRd", 0.0, 30.0, False, "largest principal strain of the fitted state (%)", ticks)

@@ -32,6 +32,7 @@ from palpate.observation.observed_surface import ObservedSurface, observed_surfa
 from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.observation.target import SurfaceTarget, surface_target
 from palpate.study.case import Case, Mechanics
+from palpate.study.case_loads import case_loads
 from palpate.study.contacts import every_finding
 from palpate.study.refusals import refuse_lost, refuse_unmeshable
 
@@ -140,11 +141,12 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Callable[[str
     targets = tuple(target for body in bodies for target in _targets(body))
     progress("assembling one stiffness matrix a tissue")
     models = tuple(model for body in bodies for model in _models(body, case))
-    _refuse_rest(models)
+    _refuse_rest(models, case)
     finite = _finite_strain(models, case)
     tissues = bodies[0].space.mesh.tissues
     estimated = frozenset(tissue.name for tissue in tissues if tissue.role is Role.ESTIMATE)
-    return InverseProblem(models, targets, modulus_map(tissues, models[0].regions), estimated, finite)
+    mapping = modulus_map(tissues, models[0].regions, loaded=bool(case.loads))
+    return InverseProblem(models, targets, mapping, estimated, finite)
 
 
 def _targets(body: Body) -> tuple[tuple[SurfaceTarget, ...], ...]:
@@ -158,7 +160,7 @@ def _targets(body: Body) -> tuple[tuple[SurfaceTarget, ...], ...]:
 def _models(body: Body, case: Case) -> tuple[LinearModel, ...]:
     """One model a later image; they share the stiffness and differ in the motion of the bones."""
     models: list[LinearModel] = []
-    dilatation = choose_element(case.mechanics.element).dilatation
+    dilatation, loads = choose_element(case.mechanics.element).dilatation, case_loads(case, body.space)
     for bones in body.states.bones:
         motion = prescribed_motion(
             body.space,
@@ -174,7 +176,7 @@ def _models(body: Body, case: Case) -> tuple[LinearModel, ...]:
             offset=motion.offset,
             prescribed=motion.prescribed,
         )
-        first = models[0] if models else linear_model(body.space, constraint, dilatation=dilatation)
+        first = models[0] if models else linear_model(body.space, constraint, dilatation=dilatation, loads=loads)
         models.append(with_constraint(first, constraint) if models else first)
     return tuple(models)
 
@@ -199,12 +201,19 @@ def law_of(mechanics: Mechanics) -> Law:
 def _finite_strain_model(model: LinearModel, law: Law, case: Case) -> FiniteStrainModel:
     dilatation = choose_element(case.mechanics.element).dilatation
     settings = NewtonSettings(tolerance=ACCURACY)
-    return finite_strain_model(model.space, model.constraint, law, dilatation=dilatation, settings=settings)
+    return finite_strain_model(
+        model.space,
+        model.constraint,
+        law,
+        dilatation=dilatation,
+        loads=case_loads(case, model.space),
+        settings=settings,
+    )
 
 
-def _refuse_rest(models: tuple[LinearModel, ...]) -> None:
-    """Without a motion to start from, every modulus explains the images equally badly."""
-    if not any(model.n_modes or model.constraint.offset.any() for model in models):
+def _refuse_rest(models: tuple[LinearModel, ...], case: Case) -> None:
+    """Without a motion or a load, every modulus explains the images equally badly."""
+    if not case.loads and not any(model.n_modes or model.constraint.offset.any() for model in models):
         raise ConfigurationError(
             'nothing moves this body: no tissue has role = "driver" and no `rigid` tissue moves between the images, so'
             " no modulus can be estimated; give the role driver to the hollow organ whose wall deforms the others"

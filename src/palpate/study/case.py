@@ -13,6 +13,7 @@ from palpate.study.schema import nearest, rule
 __all__ = [
     "REMAINING",
     "Case",
+    "CaseLoad",
     "CaseTissue",
     "Domain",
     "DriverMotion",
@@ -66,7 +67,7 @@ def _label(value: object) -> tuple[int, ...] | str:
 class Images:
     """Label images: `before` the reference state, `after` the later states; `names` a label table; grey images.
 
-    `after` may be left out where [motion] says how the driver moves.
+    `after` may be left out where [motion] says how the driver moves, or [[loads]] act.
     """
 
     before: Path
@@ -103,6 +104,7 @@ class CaseTissue:
     role: Role
     poisson_ratio: float = 0.45
     youngs_modulus_kpa: float | None = None
+    density_kg_m3: float = field(default=1000.0, metadata=POSITIVE)
 
     def __post_init__(self) -> None:
         if self.name == "after" or not self.name.isprintable() or not self.name.strip():
@@ -138,6 +140,38 @@ class Mechanics:
     law: str = field(default="neo-hookean", metadata=rule(choices=LAW_NAMES))
     element: str = field(default="auto", metadata=rule(choices=("P1", "P2", "P2-P0", "auto")))
     c01_over_c10: float = field(default=0.25, metadata=rule(test=lambda value: value >= 0, wanted="zero or more"))
+
+
+@dataclass(frozen=True, slots=True)
+class CaseLoad:
+    """A known load on the later states: a pressure or traction on a surface, or gravity; kPa, RAS directions.
+
+    `surface`: a hollow tissue whose wall moves freely (role `void`), or "outer", the cut of the image; a pressure of
+    `pressure_kpa` pushes into the body, on the surface as it moves or (`following` false) as it was; `traction_kpa`
+    (3,) is per area at rest; `acceleration_m_s2` (3,) acts on the tissues' `density_kg_m3`.
+    """
+
+    kind: str = field(metadata=rule(choices=("pressure", "traction", "gravity")))
+    surface: str | None = None
+    pressure_kpa: float | None = None
+    following: bool = True
+    traction_kpa: tuple[float, float, float] | None = None
+    acceleration_m_s2: tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        needed = {
+            "pressure": ("surface", "pressure_kpa"),
+            "traction": ("surface", "traction_kpa"),
+            "gravity": ("acceleration_m_s2",),
+        }[self.kind]
+        keys = ("surface", "pressure_kpa", "traction_kpa", "acceleration_m_s2")
+        given = [key for key in keys if getattr(self, key) is not None]
+        for key in needed:
+            if key not in given:
+                raise ConfigurationError(f"[[loads]]: a {self.kind} needs the key '{key}'")
+        for key in given:
+            if key not in needed:
+                raise ConfigurationError(f"[[loads]]: a {self.kind} has no '{key}'; it has {' and '.join(needed)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,6 +264,7 @@ class Case:
     tissues: tuple[CaseTissue, ...] = ()
     domain: Domain = Domain()
     mechanics: Mechanics = Mechanics()
+    loads: tuple[CaseLoad, ...] = ()
     mesh: MeshSettings = MeshSettings()
     driver: DriverMotion = DriverMotion()
     noise: Noise = Noise()
@@ -243,10 +278,10 @@ class Case:
             raise ConfigurationError(
                 f"case '{self.id}' needs either [images] (with before and after) or [phantom], and not both"
             )
-        if self.images is not None and not self.images.after and self.motion is None:
+        if self.images is not None and not self.images.after and self.motion is None and not self.loads:
             raise ConfigurationError(
                 "the key 'after' is missing in [images]; name one or more later states of the body (only a simulation"
-                " with [motion] goes without)"
+                " with [motion] or [[loads]] goes without)"
             )
         if self.pairs and self.images is None:
             raise ConfigurationError(

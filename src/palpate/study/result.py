@@ -102,8 +102,9 @@ class CaseResult:
 
     @property
     def unit(self) -> str:
-        """Unit of `stiffness`: "kPa", or "ratio" when no tissue's modulus is known."""
-        return "kPa" if any(tissue.role is Role.KNOWN for tissue in self.tissues) else "ratio"
+        """Unit of `stiffness`: "kPa", or "ratio" when neither a modulus nor a load is known."""
+        known = any(tissue.role is Role.KNOWN for tissue in self.tissues)
+        return "kPa" if known or self.case.loads else "ratio"
 
     @property
     def stiffness(self) -> NDArray[np.float64]:

@@ -23,8 +23,9 @@ from palpate.study.case import Case
 from palpate.study.plausibility import plausibility_warnings, unit_warnings
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.read import read_pairs, read_states
-from palpate.study.result import CaseResult, MeshResult, PairResult, Provenance
+from palpate.study.result import CaseResult, MeshResult, PairResult, Provenance, image_names
 from palpate.study.simulate import simulate
+from palpate.study.strain_range import linear_strain_warnings
 from palpate.study.summary import mesh_summary
 
 __all__ = [
@@ -101,7 +102,11 @@ def estimate_states(
         states.before,
         states.after,
         Provenance({key: round(float(value), 3) for key, value in seconds.items()}, {}, software_versions()),
-        (*_remarks(case, states, *further), *plausibility_warnings(_values(estimation))),
+        (
+            *_remarks(case, states, *further),
+            *_strain_warnings(case, bodies, estimation),
+            *plausibility_warnings(_values(estimation)),
+        ),
         further=_further(bodies, estimation),
     )
 
@@ -156,6 +161,13 @@ def _further(bodies: tuple[Body, ...], estimation: Estimation) -> tuple[PairResu
     return tuple(found)
 
 
+def _strain_warnings(case: Case, bodies: tuple[Body, ...], estimation: Estimation) -> tuple[Remark, ...]:
+    """What `linear_strain_warnings` says of the fitted displacements of all bodies."""
+    motions = iter(estimation.displacements)
+    moved = [(body.space, [next(motions) for _ in body.states.after]) for body in bodies]
+    return linear_strain_warnings(case.mechanics.law, *moved, images=image_names(case))
+
+
 def refuse_what_cannot_be_estimated(case: Case) -> None:
     """Say before any image is read that there is no later state, or that nothing can move: `ConfigurationError`."""
     if case.images is not None and not case.images.after:
@@ -163,7 +175,7 @@ def refuse_what_cannot_be_estimated(case: Case) -> None:
             "the key 'after' is missing in [images]; an estimate needs one or more later states of the body"
         )
     movers = [tissue for tissue in case.tissues if tissue.role in (Role.DRIVER, Role.RIGID)]
-    if case.tissues and case.phantom is None and not movers:
+    if case.tissues and case.phantom is None and not movers and not case.loads:
         raise ConfigurationError(
             'nothing moves this body: no tissue has role = "driver" (or "rigid", and moves between the images), so no'
             " modulus can be estimated; give the role driver to the hollow organ whose wall deforms the others"

@@ -17,6 +17,7 @@ from palpate.inversion.estimation import Remark
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.equilibrium import equilibrium
+from palpate.mechanics.loads import Load
 from palpate.mesh.dihedral import tet_dihedrals
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
@@ -24,6 +25,7 @@ from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.phantoms.wall_filling import wall_filling
 from palpate.study.body import Body, inverse_problem, law_of, make_body
 from palpate.study.case import Case, Mechanics
+from palpate.study.case_loads import case_loads
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.read import phantom_scene, read_states
 from palpate.study.result import MeshSummary, Provenance, Simulation
@@ -67,12 +69,18 @@ def simulate(case: Case, *, progress: Progress, steps: int = 1) -> Simulation:
 
 
 def filled(
-    space: LagrangeSpace, segmentation: Segmentation, *, filling_mm: float, outer: str, mechanics: Mechanics
+    space: LagrangeSpace,
+    segmentation: Segmentation,
+    *,
+    filling_mm: float,
+    outer: str,
+    mechanics: Mechanics,
+    loads: tuple[Load, ...] = (),
 ) -> NDArray[np.float64]:
     """Displacement (n_points, 3) mm of a body whose drivers fill by `filling_mm`, whose bones are held.
 
-    segmentation: the labels that the drivers' walls come from; outer: see `outer_constraint`. The tissues of the
-    space's mesh state their moduli. Raises `NotConverged` as `equilibrium` does.
+    segmentation: the labels that the drivers' walls come from; outer: see `outer_constraint`; loads: those that act,
+    too. The tissues of the space's mesh state their moduli. Raises `NotConverged` as `equilibrium` does.
     """
     tissues = space.mesh.tissues
     _refuse_unknown(tissues)
@@ -89,25 +97,39 @@ def filled(
     constraint = outer_constraint(
         space, outer=outer, modes=no_modes, offset=offset.ravel(), prescribed=motion.prescribed
     )
-    dilatation = choose_element(mechanics.element).dilatation
-    return equilibrium(space, constraint, _moduli(tissues), law=law_of(mechanics), dilatation=dilatation).displacement
+    found = equilibrium(
+        space,
+        constraint,
+        _moduli(tissues),
+        law=law_of(mechanics),
+        dilatation=choose_element(mechanics.element).dilatation,
+        loads=loads,
+    )
+    return found.displacement
 
 
 def _steps(body: Body, case: Case, steps: int, progress: Progress) -> tuple[NDArray[np.float64], ...]:
     """Displacements (n_points, 3) mm at equal shares of the motion, each in equilibrium, the last one the whole."""
     shares = [step / steps for step in range(1, steps + 1)]
-    if case.motion is None:
+    if case.motion is None and body.states.after:
         problem = inverse_problem(body, case, progress=progress)
         return fit_driver(problem, _moduli(body.space.mesh.tissues), shares=shares)[-1]
     if case.mechanics.law == "linear":
-        whole = _filled(body, case, case.motion.filling_mm)
+        whole = _moved(body, case, 1.0)
         return tuple(whole * share for share in shares)
-    return tuple(_filled(body, case, case.motion.filling_mm * share) for share in shares)
+    return tuple(_moved(body, case, share) for share in shares)
 
 
-def _filled(body: Body, case: Case, filling_mm: float) -> NDArray[np.float64]:
-    outer, mechanics = case.domain.outer_boundary, case.mechanics
-    return filled(body.space, body.states.before, filling_mm=filling_mm, outer=outer, mechanics=mechanics)
+def _moved(body: Body, case: Case, share: float) -> NDArray[np.float64]:
+    """Displacement (n_points, 3) mm by a share of the filling and of the loads."""
+    return filled(
+        body.space,
+        body.states.before,
+        filling_mm=share * case.motion.filling_mm if case.motion else 0.0,
+        outer=case.domain.outer_boundary,
+        mechanics=case.mechanics,
+        loads=case_loads(case, body.space, share=share),
+    )
 
 
 def _moduli(tissues: tuple[Tissue, ...]) -> NDArray[np.float64]:
@@ -124,13 +146,19 @@ def _refuse_unknown(tissues: tuple[Tissue, ...]) -> None:
 
 
 def _labels(segmentation: Segmentation, space: LagrangeSpace, displacement: NDArray[np.float64]) -> LabelImage:
-    """Label image of the deformed mesh on the segmentation's grid, with the first label of each tissue."""
+    """Label image of the deformed mesh on the segmentation's grid, with the first label of each tissue.
+
+    The mesh does not know where one hollow tissue ends and another begins, as air on bone: there the labels stay.
+    """
     tissues = space.mesh.tissues
     used = {label for tissue in tissues for label in tissue.labels}
     rest = next(label for label in range(len(used) + 1) if label not in used)
     table = np.array([tissue.labels[0] if tissue.labels else rest for tissue in tissues], dtype=np.int32)
     names = {int(label): tissue.name for label, tissue in zip(table, tissues, strict=True)}
-    return LabelImage(table[voxelise(space, displacement, segmentation.grid)], segmentation.grid, names)
+    index = voxelise(space, displacement, segmentation.grid)
+    hollow = np.array([not tissue.meshed for tissue in tissues])
+    index = np.where(hollow[index] & hollow[segmentation.index], segmentation.index, index)
+    return LabelImage(table[index], segmentation.grid, names)
 
 
 def _plain_summary(space: LagrangeSpace) -> MeshSummary:

@@ -53,8 +53,8 @@ class Balls:
     `edge_mm` is the edge of the mesh that inverts, `truth_edge_mm` that of the finer one which makes the data.
     """
 
-    radii_mm: tuple[float, float, float] = (15.0, 30.0, 45.0)
-    edge_mm: float = 7.0
+    radii_mm: tuple[float, float, float] = (12.0, 24.0, 36.0)
+    edge_mm: float = 6.5
     truth_edge_mm: float = 5.0
     voxel_mm: float = 1.0
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,6 @@ from numpy.typing import NDArray
 from palpate.experiments.reproduce.table import Entry
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import segment
-from palpate.images.tissue import Tissue
 from palpate.images.tissue_distance import tissue_distance_map
 from palpate.inversion.conclude import Observed, conclude
 from palpate.inversion.gauss_newton import Bounds
@@ -29,23 +29,24 @@ __all__ = ["entries_from_surfaces", "entries_from_voxels", "from_half", "imaged_
 
 Progress = Callable[[str], None]
 
-SEARCHED = (0.02, 200.0)  # bounds of the moduli, relative to the scale
+SEARCHED = 100.0  # the moduli are sought within this factor of the start
 
 
 def from_half(mapping: ModulusMap, truth: Mapping[str, float]) -> InversionSettings:
     """One start, at half of every true modulus (kPa), as in the paper."""
-    start = np.array([np.log(0.5 * truth[name] / mapping.scale_kpa) for name in mapping.tissues])
-    n = len(start)
-    return InversionSettings((start,), Bounds(np.full(n, np.log(SEARCHED[0])), np.full(n, np.log(SEARCHED[1]))))
+    start = np.log([0.5 * truth[name] / mapping.scale_kpa for name in mapping.tissues])
+    reach = np.log(SEARCHED)
+    return InversionSettings((start,), Bounds(start - reach, start + reach))
 
 
-def imaged_states(
-    space: LagrangeSpace, displacement: NDArray[np.float64], grid: VoxelGrid
-) -> ImagedStates:
-    """Both states of a truth, u (n_points, 3) mm, as label images on `grid`."""
-    tissues = tuple(_numbered(tissue, label) for label, tissue in enumerate(space.mesh.tissues, start=1))
+def imaged_states(space: LagrangeSpace, displacement: NDArray[np.float64], grid: VoxelGrid) -> ImagedStates:
+    """Both states of a truth, u (n_points, 3) mm, as label images; tissues that `grid` does not show fall away."""
     still = np.zeros_like(displacement)
-    before, after = (segment(imaged(space, motion, grid), tissues) for motion in (still, displacement))
+    images = tuple(imaged(space, motion, grid) for motion in (still, displacement))
+    shown = set(np.unique(images[0].labels)) & set(np.unique(images[1].labels))
+    numbered = enumerate(space.mesh.tissues, start=1)
+    tissues = tuple(replace(tissue, labels=(label,)) for label, tissue in numbered if label in shown)
+    before, after = (segment(image, tissues) for image in images)
     return aligned(before, (after,), method="none")
 
 
@@ -93,7 +94,3 @@ def entries_from_voxels(
         e.tissue: Entry.of(e.value, truth[e.tissue], interval95=e.interval95, verdict=e.verdict, iterations=steps)
         for e in estimation.estimates
     }
-
-
-def _numbered(tissue: Tissue, label: int) -> Tissue:
-    return Tissue(tissue.name, tissue.role, (label,), tissue.poisson_ratio, tissue.youngs_modulus_kpa)

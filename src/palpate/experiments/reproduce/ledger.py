@@ -36,9 +36,10 @@ class Ledger:
         if self.path is not None:
             line = json.dumps({"settings": self.settings, "key": key, "value": value}, allow_nan=False)
             make_folder(self.path.parent)
+            cut = self.path.exists() and not self.path.read_bytes().endswith(b"\n")  # an earlier run was killed here
             try:
                 with self.path.open("a", encoding="utf-8") as file:
-                    file.write(line + "\n")
+                    file.write(("\n" if cut else "") + line + "\n")
             except OSError as error:
                 raise ResourceError(
                     f"cannot write {self.path}: {error.strerror}; choose another --output folder"

@@ -48,7 +48,7 @@ class PaperFit:
 
 
 def paper_target(space: LagrangeSpace, displacement: Array, surface: ObservedSurface) -> PaperTarget:
-    """The deformed surface of a truth, u (n_points, 3) mm on its `space`, for the same tissue's surface in the model."""
+    """The deformed surface of a truth, u (n_points, 3) mm on its `space`, for the model's surface of that tissue."""
     truth = observed_surface(space, surface.tissue)
     return PaperTarget(surface, truth.rest + displacement[truth.points], truth.triangles, truth.observed)
 

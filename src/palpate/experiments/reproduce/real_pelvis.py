@@ -47,14 +47,15 @@ class RealPelvis:
         Bones hold still, and what they share with the wall.
         """
         offset, mesh = np.zeros_like(space.points), space.mesh
-        walls = {role: np.zeros(0, dtype=np.int64) for role in (Role.DRIVER, Role.RIGID)}
+        names = [tissue.name for tissue in self.scan.tissues]
+        walls = {n: np.unique(space.facets(mesh.boundary[mesh.beyond == n])) for n in range(len(mesh.tissues))}
         for number, tissue in enumerate(mesh.tissues):
-            if tissue.role in walls:
-                points = np.unique(space.facets(mesh.boundary[mesh.beyond == number]))
-                walls[tissue.role] = np.union1d(walls[tissue.role], points)
             if tissue.role is Role.DRIVER:
-                offset[points] = wall_filling(self.scan, number, filling_mm=filling_mm).at(space.points[points])
-        offset[walls[Role.RIGID]] = 0.0
+                motion = wall_filling(self.scan, names.index(tissue.name), filling_mm=filling_mm)
+                offset[walls[number]] = motion.at(space.points[walls[number]])
+        for number, tissue in enumerate(mesh.tissues):
+            if tissue.role is Role.RIGID:
+                offset[walls[number]] = 0.0
         return offset
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -32,7 +32,7 @@ from palpate.experiments.reproduce.paper import PAPER_TABLE1
 from palpate.experiments.reproduce.paper_method import paper_estimate, paper_target
 from palpate.experiments.reproduce.table import Entry, Table, TableRow
 from palpate.inversion.invert import invert
-from palpate.inversion.modulus_map import ModulusMap
+from palpate.inversion.modulus_map import modulus_map
 from palpate.inversion.problem import InverseProblem, Inversion, InversionSettings
 from palpate.mechanics.linear_model import LinearModel, linear_model, with_constraint
 from palpate.mesh.space import LagrangeSpace
@@ -48,17 +48,16 @@ Array = NDArray[np.float64]
 Moduli = tuple[float, float, float]
 
 DEFORMATION = 0.095  # of the region that is deformed most: "slightly less than 10 %"
-SCALE_KPA = 100.0  # unit of the unknowns, ln(E / 100 kPa); the load sets the scale, not this
 NEAREST = 40  # points of the truth that give its displacement at a place
 
 NOTES = (
-    "The scale comes from a known load: the traction S n of a uniaxial stress S on the outside. Displacements alone give"
-    " ratios only, and with one modulus in all three bodies (the paper's rows) no information on it at all.",
-    "The load is such that the region that is deformed most is deformed by 9.5 %. It is then proportional to the"
-    " modulus, and the six rows of one modulus are the same problem in other units; each has voxels of its own.",
+    "The scale comes from a known load: the traction S n of a uniaxial stress S on the outside.",
+    "Displacements alone give ratios; of one modulus in all bodies, as in the paper's rows, they say nothing at all.",
+    "The load is such that the body which is deformed most is deformed by 9.5 %: it is proportional to the modulus.",
+    "So the six rows of one modulus are one problem in different units; each has voxels of its own.",
     "voxels: 1 mm, a grid turned and shifted at random for every row, the body meshed from its labels.",
-    "paper_method: its Eq. 4 on linear tetrahedra with L-BFGS, on data made with its own mesh, as in the paper;"
-    " paper_method_other_mesh: the same on the data of the column other_mesh.",
+    "paper_method: its Eq. 4 on linear tetrahedra with L-BFGS, on data made with its own mesh, as in the paper.",
+    "paper_method_other_mesh: the same on the data of the column other_mesh.",
 )
 
 
@@ -66,7 +65,7 @@ NOTES = (
 class Table1Settings:
     """Meshes and cases: moduli of the rows in which all three bodies have the same, and of those with three, kPa."""
 
-    balls: Balls = Balls(radii_mm=(12.0, 24.0, 36.0), edge_mm=6.5, truth_edge_mm=5.0)
+    balls: Balls = field(default_factory=Balls)
     equal_kpa: tuple[float, ...] = tuple(PAPER_TABLE1)
     different_kpa: tuple[Moduli, ...] = ((50.0, 100.0, 150.0), (150.0, 100.0, 50.0), (70.0, 130.0, 90.0))
     seed: int = 1
@@ -173,7 +172,7 @@ class _Case:
     def inverted(
         self, model: LinearModel, targets: tuple[SurfaceTarget, ...], progress: Progress
     ) -> tuple[Inversion, InversionSettings]:
-        mapping = ModulusMap(np.full(len(BODIES), SCALE_KPA), np.arange(len(BODIES)), BODIES, "load", absolute=True)
+        mapping = modulus_map(balls_tissues(self.moduli), model.regions, loaded=True)
         settings = from_half(mapping, self.truth)
         problem = InverseProblem((model,), (targets,), mapping, frozenset(BODIES))
         return invert(problem, settings, progress=progress), settings

@@ -1,5 +1,5 @@
 "use strict";
-// The cut tetrahedral mesh: whole tetrahedra on one side of a plane, coloured by tissue, modulus or smallest angle.
+// The cut tetrahedral mesh: whole tetrahedra on one side of a plane, coloured by tissue, modulus, smallest angle or strain.
 const CUTS = {
   sagittal: { axis: 0, back: [-1, 0.3, 0.22], up: [0, 0, 1], keep: 1 },
   coronal: { axis: 1, back: [-0.25, 1, 0.25], up: [0, 0, 1], keep: -1 },
@@ -82,17 +82,18 @@ Palpate.Mesh = class {
   }
 
   palette() {
-    const by = this.chosen("colouring"), { tissues, moduli, angles } = this.facts, { region, worst } = this.mesh;
+    const by = this.chosen("colouring"), { tissues, moduli, angles, strains } = this.facts, { region, worst, strain } = this.mesh;
     const colours = tissues.map((tissue) => {
       const colour = by === "modulus" ? [0, 0, 0] : Palpate.rgb(tissue.colour);
       if (by === "modulus") moduli.colour(tissue.modulus, colour, 0);
       return colour;
     });
-    const angle = [0, 0, 0];
+    const own = { angle: [angles, worst], strain: [strains, strain] }[by]; // scale and values of each tetrahedron
+    if (!own) return (tet) => colours[region[tet]];
+    const [scale, values] = own, shade = [0, 0, 0];
     return (tet) => {
-      if (by !== "angle") return colours[region[tet]];
-      angles.colour(worst[tet], angle, 0);
-      return angle;
+      scale.colour(values[tet], shade, 0);
+      return shade;
     };
   }
 
@@ -120,7 +121,7 @@ Palpate.Mesh = class {
     });
     const edges = new THREE.LineBasicMaterial({ color: 0x0b0e12, transparent: true, opacity: 0.55 });
     this.group.add(new THREE.Mesh(geometry, material), new THREE.LineSegments(Palpate.geometry(new Float32Array(lines)), edges));
-    for (const bar of this.section.querySelectorAll("[data-bar]")) bar.hidden = bar.dataset.bar !== this.chosen("colouring");
+    for (const bar of this.section.querySelectorAll(".live [data-bar]")) bar.hidden = bar.dataset.bar !== this.chosen("colouring");
     this.viewer.draw();
   }
 };

@@ -41,9 +41,13 @@ Palpate.load = async () => {
   }
   if (facts.mesh) {
     const m = facts.mesh;
-    facts.mesh = { nodes: points(m.nodes), tets: array(m.tets), region: array(m.region), worst: array(m.worst) };
+    facts.mesh = {
+      nodes: points(m.nodes), tets: array(m.tets), region: array(m.region), worst: array(m.worst),
+      strain: Float32Array.from(array(m.strain), (steps) => m.strainStep * steps), // per cent
+    };
   }
   facts.angles = Palpate.scale(facts.angles);
+  facts.strains = Palpate.scale(facts.strains);
   facts.moduli = facts.moduli && Palpate.scale(facts.moduli);
   return facts;
 };

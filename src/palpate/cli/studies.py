@@ -1,0 +1,20 @@
+"""The sub-commands that compute whole experiments: reproduce."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+
+from palpate.cli.outcome import Outcome, columns
+
+__all__ = ["reproduce"]
+
+
+def reproduce(arguments: argparse.Namespace, _: None, progress: Callable[[str], None]) -> Outcome:
+    """One of the paper's experiments, our numbers beside its own."""
+    from palpate.experiments.reproduce.run import reproduce as run
+
+    result = run(arguments.experiment, arguments.output, progress=progress)
+    notes = "\n".join(result.document["notes"])
+    files = ", ".join((f"{arguments.experiment}.json", result.figure.name))
+    return Outcome(result.document, f"{columns(result.rows)}\n{notes}\nwritten to {arguments.output}: {files}")

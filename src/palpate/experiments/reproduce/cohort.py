@@ -1,0 +1,219 @@
+"""A synthetic cohort in the shape of the paper's: 8 patients with a T stage each, 180 pairs of images between them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.images.tissue import Role, Tissue
+from palpate.inversion.gauss_newton import Bounds, gauss_newton
+from palpate.inversion.modulus_map import modulus_map
+from palpate.inversion.noise import NoiseLaw
+from palpate.inversion.problem import InverseProblem
+from palpate.inversion.surrogate import Surrogate, enriched, first_surrogate
+from palpate.inversion.weighting import objective_of, reweighted
+from palpate.mechanics.boundary import outer_constraint
+from palpate.mechanics.linear_model import LinearModel, LinearSystem, linear_model, with_constraint
+from palpate.mesh.anatomy import Anatomy, Box
+from palpate.mesh.space import LagrangeSpace, lagrange_space
+from palpate.mesh.tetrahedralise import tetrahedralise
+from palpate.observation.observed_surface import observed_surface
+from palpate.observation.prescribed_motion import prescribed_motion
+from palpate.phantoms.boundary_noise import smooth_field
+from palpate.phantoms.exact_targets import target_of_truth
+from palpate.phantoms.motion import filling_of
+from palpate.phantoms.pelvis_shapes import PelvisShapes, draw_pelvis
+from palpate.phantoms.scene import Noise, centred_grid, grid_box
+from palpate.study.case import DriverMotion
+
+__all__ = ["ORGANS", "CohortSettings", "PatientResult", "estimate_patient", "true_moduli"]
+
+Array = NDArray[np.float64]
+
+ORGANS = ("prostate", "bladder")
+SURROUNDINGS_KPA = 10.0
+FIELD_MM = (110.0, 120.0, 120.0)
+POISSON_RATIO = 0.45
+SPREAD = 3.0  # the reduced model is made at the middle modulus, and at it times and over this factor
+SEARCHED = (0.1, 100.0)  # bounds of the moduli, relative to the surroundings
+
+
+@dataclass(frozen=True, slots=True)
+class CohortSettings:
+    """The cohort: its stages and numbers of pairs, a patient each, and how the truth depends on the stage.
+
+    moduli (kPa) at stage 1 and their growth a stage, with the patients' own scatter (sd of ln E) on top.
+    """
+
+    stages: tuple[int, ...] = (1, 1, 2, 2, 3, 3, 3, 4)
+    pairs: tuple[int, ...] = (15, 18, 20, 22, 24, 25, 27, 29)
+    first_kpa: tuple[float, float] = (20.0, 18.0)
+    growth: tuple[float, float] = (1.35, 1.12)
+    scatter: tuple[float, float] = (0.15, 0.20)
+    edge_mm: float = 8.0
+    filling_mm: tuple[float, float] = (5.0, 9.0)
+    noise: Noise = field(default_factory=lambda: Noise(0.3, 6.0))
+    driver: DriverMotion = field(default_factory=lambda: DriverMotion(modes=60))
+    seed: int = 11
+
+
+@dataclass(frozen=True, slots=True)
+class PatientResult:
+    """One patient: true moduli and those of every pair (kPa) by organ; the model's size and certified error."""
+
+    patient: str
+    stage: int
+    true_kpa: dict[str, float]
+    kpa: dict[str, list[float]]
+    not_converged: int
+    dofs: int
+    largest_error_bound: float
+
+
+def true_moduli(settings: CohortSettings, patient: int) -> dict[str, float]:
+    """True moduli (kPa) of a patient's organs."""
+    rng = np.random.default_rng([settings.seed, patient])
+    stage = settings.stages[patient]
+    return {
+        organ: float(first * growth ** (stage - 1) * np.exp(scatter * rng.standard_normal()))
+        for organ, first, growth, scatter in zip(
+            ORGANS, settings.first_kpa, settings.growth, settings.scatter, strict=True
+        )
+    }
+
+
+def estimate_patient(settings: CohortSettings, patient: int, progress: Callable[[str], None]) -> PatientResult:
+    """All pairs of a patient, with one mesh and one reduced model; raises `PalpateError`s of meshing and solving."""
+    truth = true_moduli(settings, patient)
+    seed = settings.seed + patient
+    shapes = draw_pelvis(np.random.default_rng(seed), _box(), bones=False)
+    space = lagrange_space(tetrahedralise(_anatomy(shapes), edge_length_mm=settings.edge_mm), "P2")
+    model = _model(space, settings.driver)
+    progress(f"patient {patient + 1}: {3 * len(space.points)} unknowns")
+    surrogate = _surrogate(model)
+    held = replace(model.constraint, modes=np.zeros((3 * len(space.points), 0)))
+    system = with_constraint(model, held).system(_moduli(model, truth))
+    pairs = [
+        _Pair(settings, shapes, surrogate, system, np.random.default_rng([seed, number]))
+        for number in range(settings.pairs[patient])
+    ]
+    found = [pair.estimate() for pair in pairs]
+    kept = [estimate for estimate in found if estimate.converged]
+    return PatientResult(
+        f"P{patient + 1}",
+        settings.stages[patient],
+        truth,
+        {organ: [float(e.kpa[i]) for e in kept] for i, organ in enumerate(ORGANS)},
+        len(found) - len(kept),
+        3 * len(space.points),
+        max((e.error_bound for e in found), default=0.0),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Estimate:
+    kpa: Array
+    converged: bool
+    error_bound: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Pair:
+    """One pair of images of a patient: its own filling of the rectum, its own noise of both surfaces."""
+
+    settings: CohortSettings
+    shapes: PelvisShapes
+    surrogate: Surrogate
+    system: LinearSystem
+    rng: np.random.Generator
+
+    def estimate(self) -> _Estimate:
+        """Moduli (kPa) of both organs from the noisy surfaces of the pair, by the reduced model alone."""
+        noise = self.settings.noise
+        law = NoiseLaw(np.array([2.0 * noise.surface_sd_mm**2]), np.array([noise.correlation_length_mm]))
+        problem = self.problem()
+        objective = objective_of(problem, (self.surrogate.reduced,), law)
+        bounds = Bounds(*np.log(np.outer(SEARCHED, np.ones(len(ORGANS)))))
+        start = np.concatenate([np.log(np.full(len(ORGANS), 2.0)), np.zeros(self.surrogate.model.n_modes)])
+        objective = objective.with_fresh_correspondence(start)
+        first = gauss_newton(objective, start, bounds=bounds, hold_theta=True, tolerance=1e-1)
+        found = gauss_newton(objective.with_fresh_correspondence(first.unknowns), first.unknowns, bounds=bounds)
+        found = gauss_newton(reweighted(objective, found, law), found.unknowns, bounds=bounds)
+        theta, q = found.unknowns[: len(ORGANS)], found.unknowns[len(ORGANS) :]
+        bound = self.surrogate.relative_error(problem.modulus_map.moduli(theta), q)
+        return _Estimate(SURROUNDINGS_KPA * np.exp(theta), found.outcome.converged, bound)
+
+    def problem(self) -> InverseProblem:
+        """The patient's model and the surfaces of this pair."""
+        noise, space = self.settings.noise, self.system.model.space
+        draws = [
+            smooth_field(r, sd_mm=noise.surface_sd_mm, correlation_mm=noise.correlation_length_mm, features=500)
+            for r in self.rng.spawn(2)
+        ]
+        u = self.displacement()
+        tissues = space.mesh.tissues
+        observed = [i for i, t in enumerate(tissues) if t.role in (Role.ESTIMATE, Role.DRIVER)]
+        warps = (draws[0].warp, draws[1].warp)
+        targets = tuple(target_of_truth(space, u, observed_surface(space, i), warps=warps) for i in observed)
+        mapping = modulus_map(tissues, self.system.model.regions)
+        return InverseProblem((self.surrogate.model,), (targets,), mapping, frozenset(ORGANS))
+
+    def displacement(self) -> Array:
+        """Displacement (n_points, 3) mm of the truth under a filling of its own."""
+        model = self.system.model
+        mesh = model.space.mesh
+        motion = filling_of(
+            self.shapes.rectum,
+            filling_mm=float(self.rng.uniform(*self.settings.filling_mm)),
+            fullest_mm=float(self.rng.uniform(-6.0, 6.0)),
+            length_mm=float(self.rng.uniform(18.0, 24.0)),
+            towards=self.shapes.forwards,
+            lean=float(self.rng.uniform(0.0, 0.2)),
+            stray=smooth_field(self.rng, sd_mm=0.0, correlation_mm=20.0, features=1),
+        )
+        offset = np.zeros_like(model.space.points)
+        wall = np.unique(model.space.facets(mesh.boundary[mesh.beyond == mesh.tissue_index("rectum")]))
+        offset[wall] = motion.at(model.space.points[wall])
+        filled = with_constraint(model, replace(model.constraint, offset=offset.ravel()))
+        return replace(self.system, model=filled).solve(np.zeros(0)).displacement
+
+
+def _box() -> Box:
+    return grid_box(centred_grid(FIELD_MM, (1.0, 1.0, 1.0)))
+
+
+def _anatomy(shapes: PelvisShapes) -> Anatomy:
+    tissues = (
+        Tissue("prostate", Role.ESTIMATE, (1,), POISSON_RATIO),
+        Tissue("bladder", Role.ESTIMATE, (2,), POISSON_RATIO),
+        Tissue("rectum", Role.DRIVER, (3,)),
+        Tissue("surroundings", Role.KNOWN, (4,), POISSON_RATIO, SURROUNDINGS_KPA),
+    )
+    return Anatomy(tissues, (shapes.prostate, shapes.bladder, shapes.rectum, None), _box())
+
+
+def _model(space: LagrangeSpace, driver: DriverMotion) -> LinearModel:
+    motion = prescribed_motion(space, {}, n_modes=driver.modes, kernel_mm=driver.kernel_mm, prior_mm=driver.prior_mm)
+    constraint = outer_constraint(
+        space, outer="fixed", modes=motion.modes, offset=motion.offset, prescribed=motion.prescribed
+    )
+    return linear_model(space, constraint)
+
+
+def _surrogate(model: LinearModel) -> Surrogate:
+    """One reduced model for all pairs: responses at five places of the two moduli."""
+    middle = 2.5 * SURROUNDINGS_KPA
+    surrogate = first_surrogate(model, _moduli(model, dict.fromkeys(ORGANS, middle)))
+    none = np.zeros(model.n_modes)
+    for first in (middle / SPREAD, middle * SPREAD):
+        for second in (middle / SPREAD, middle * SPREAD):
+            surrogate = enriched(surrogate, _moduli(model, dict(zip(ORGANS, (first, second), strict=True))), none)
+    return surrogate
+
+
+def _moduli(model: LinearModel, organs: dict[str, float]) -> Array:
+    """Moduli (n_regions,) kPa, the surroundings' beside the organs'."""
+    return np.array([organs.get(name, SURROUNDINGS_KPA) for name in model.names])

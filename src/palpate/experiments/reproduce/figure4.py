@@ -1,0 +1,226 @@
+"""Figure 4: how the error grows with the deformation when the truth is of finite strain, and where linear must end."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property, partial
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from palpate.errors import NotConverged
+from palpate.experiments.reproduce.balls import (
+    BODIES,
+    POISSON_RATIO,
+    Balls,
+    balls_space,
+    balls_tissues,
+    floating,
+    mean_deformations,
+    pulled,
+)
+from palpate.experiments.reproduce.columns import Progress, from_half
+from palpate.experiments.reproduce.ledger import Ledger
+from palpate.inversion.continuation import continued_at_finite_strain
+from palpate.inversion.invert import invert
+from palpate.inversion.modulus_map import modulus_map
+from palpate.inversion.problem import InverseProblem, Inversion
+from palpate.mechanics.dilatation import Dilatation
+from palpate.mechanics.equilibrium import ACCURACY, equilibrium
+from palpate.mechanics.finite_strain import finite_strain_model
+from palpate.mechanics.laws.registry import law_named
+from palpate.mechanics.linear_model import LinearModel, linear_model
+from palpate.mechanics.newton import NewtonSettings
+from palpate.mechanics.stiffness import lame_parameters
+from palpate.mesh.constraint import Constraint
+from palpate.mesh.space import LagrangeSpace
+from palpate.observation.observed_surface import observed_surface
+from palpate.phantoms.exact_targets import target_of_truth
+
+__all__ = ["Figure4", "Figure4Settings", "Point", "figure4", "nominal_stress"]
+
+Array = NDArray[np.float64]
+Moduli = tuple[float, float, float]
+
+LAW = "neo-hookean"
+LEAVE_PERCENT = 5.0  # error at which the linear law is said to end
+
+NOTES = (
+    "Truth: neo-Hookean, on the mesh that inverts it: the law alone makes the error. A known dead pull, as in table 1.",
+    "The deformation is the mean of the largest |stretch - 1| over the body itself.",
+    "With one modulus in all bodies the curve is the same for every modulus: the load scales with it.",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Figure4Settings:
+    """The balls, the moduli (kPa) of each line, and the deformations of the body that is deformed most."""
+
+    balls: Balls = field(default_factory=lambda: Balls(edge_mm=10.0))
+    moduli_kpa: tuple[Moduli, ...] = ((100.0, 100.0, 100.0), (50.0, 100.0, 150.0), (150.0, 100.0, 50.0))
+    deformations: tuple[float, ...] = (0.01, 0.05, 0.10, 0.15, 0.20, 0.30)
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One point of the figure; `error_percent` is None where an iteration did not converge."""
+
+    body: str
+    true_kpa: float
+    deformation_percent: float
+    law: str
+    error_percent: float | None
+    case: str
+
+
+@dataclass(frozen=True, slots=True)
+class Figure4:
+    """All points."""
+
+    points: tuple[Point, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON."""
+        return {
+            "schema": "palpate.reproduce/1",
+            "experiment": "figure4",
+            "points": [asdict(point) for point in self.points],
+            "linear_law_ends_percent": self.ends(),
+            "notes": list(NOTES),
+        }
+
+    def lines(self, law: str) -> dict[tuple[str, str], list[Point]]:
+        """Points of a law by body and case, in the order of the deformation."""
+        found: dict[tuple[str, str], list[Point]] = {}
+        for point in sorted(self.points, key=lambda p: p.deformation_percent):
+            if point.law == law:
+                found.setdefault((point.body, point.case), []).append(point)
+        return found
+
+    def ends(self) -> list[dict[str, Any]]:
+        """For each body and case: the deformation (%) where the linear law's error passes 5 %, None if it never does.
+
+        Between two points of the figure it is interpolated linearly.
+        """
+        found = []
+        for (body, case), points in self.lines("linear").items():
+            stated = [(p.deformation_percent, abs(p.error_percent)) for p in points if p.error_percent is not None]
+            found.append({"body": body, "case": case, "deformation_percent": _passes([(0.0, 0.0), *stated])})
+        return found
+
+    def text(self) -> list[list[str]]:
+        """Rows of cells for a terminal."""
+        rows = [["case", "body", "deformation", "linear", LAW]]
+        finite = {(p.case, p.body, p.deformation_percent): p.error_percent for p in self.points if p.law == LAW}
+        for p in self.points:
+            if p.law == "linear":
+                other = finite.get((p.case, p.body, p.deformation_percent))
+                rows.append([p.case, p.body, f"{p.deformation_percent:.1f} %", _cell(p.error_percent), _cell(other)])
+        return rows
+
+
+def figure4(settings: Figure4Settings, ledger: Ledger, *, progress: Progress) -> Figure4:
+    """All points; raises `PalpateError`s of meshing and solving, `NotConverged` where a truth has no equilibrium."""
+    bench = _Bench(settings.balls)
+    points = list[Point]()
+    for moduli in settings.moduli_kpa:
+        case = "/".join(f"{modulus:g}" for modulus in moduli)
+        for deformation in settings.deformations:
+            progress(f"figure 4, {case} kPa, deformed by {100.0 * deformation:g} %")
+            key = f"{case} {deformation:g}"
+            part = ledger.part(key, partial(bench.errors, moduli, deformation, progress))
+            points += [
+                Point(body, modulus, part["deformation_percent"][i], law, part[law][i], case)
+                for law in ("linear", LAW)
+                for i, (body, modulus) in enumerate(zip(BODIES, moduli, strict=True))
+            ]
+    return Figure4(tuple(points))
+
+
+def nominal_stress(stretch: float) -> float:
+    """Uniaxial nominal stress over Young's modulus of a neo-Hookean bar, free at its sides, at a stretch.
+
+    P = mu (s - 1 / s) + lambda ln(J) / s with mu (t^2 - 1) + lambda ln(J) = 0 across it and J = s t^2.
+    """
+    lame, mu = lame_parameters(1.0, POISSON_RATIO)
+
+    def side(t: float) -> float:
+        return float(mu * (t**2 - 1.0) + lame * np.log(stretch * t**2))
+
+    across = float(brentq(side, 0.2, 2.0))
+    return float(mu * (stretch - 1.0 / stretch) + lame * np.log(stretch * across**2) / stretch)
+
+
+@dataclass(frozen=True)
+class _Bench:
+    """What all points share."""
+
+    balls: Balls
+
+    @cached_property
+    def space(self) -> LagrangeSpace:
+        return balls_space(self.balls, self.balls.edge_mm)
+
+    @cached_property
+    def constraint(self) -> Constraint:
+        return floating(self.space)
+
+    @cached_property
+    def linear(self) -> LinearModel:
+        """Pulled by 1 kPa."""
+        return linear_model(
+            self.space, self.constraint, dilatation=Dilatation.BLENDED, loads=(pulled(self.space, 1.0),)
+        )
+
+    def errors(self, moduli: Moduli, deformation: float, progress: Progress) -> dict[str, Any]:
+        """Errors (%) of the three bodies under both laws, and their deformations (%)."""
+        stress = self.stress_kpa(moduli, deformation)
+        law, load = law_named(LAW), pulled(self.space, stress)
+        truth = equilibrium(
+            self.space, self.constraint, np.array(moduli), law=law, dilatation=Dilatation.BLENDED, loads=(load,)
+        ).displacement
+        surfaces = [observed_surface(self.space, body) for body in range(len(BODIES))]
+        targets = tuple(target_of_truth(self.space, truth, surface) for surface in surfaces)
+        mapping = modulus_map(balls_tissues(moduli), self.linear.regions, loaded=True)
+        settings = from_half(mapping, dict(zip(BODIES, moduli, strict=True)))
+        model = replace(self.linear, load=load.nodal)
+        problem = InverseProblem((model,), (targets,), mapping, frozenset(BODIES))
+        linear = invert(problem, settings, progress=progress)
+        finite = finite_strain_model(
+            self.space, self.constraint, law, loads=(load,), settings=NewtonSettings(tolerance=ACCURACY)
+        )
+        try:
+            problem = replace(problem, finite_strain=(finite,))
+            continued = _errors(continued_at_finite_strain(problem, linear, settings, progress=progress), moduli)
+        except NotConverged as error:
+            progress(f"not converged: {error}")
+            continued = [None] * len(BODIES)
+        deformations = 100.0 * mean_deformations(self.space, truth)
+        return {"deformation_percent": deformations.tolist(), "linear": _errors(linear, moduli), LAW: continued}
+
+    def stress_kpa(self, moduli: Moduli, deformation: float) -> float:
+        """The pull that deforms the body which is deformed most by about `deformation`, at finite strain."""
+        unit = self.linear.solve(np.array(moduli), np.zeros(self.linear.n_modes)).displacement
+        small = float(1.0 / mean_deformations(self.space, unit).max())
+        return small * nominal_stress(1.0 + deformation)
+
+
+def _errors(inversion: Inversion, moduli: Moduli) -> list[float | None]:
+    if not inversion.minimum.outcome.converged:
+        return [None] * len(moduli)
+    found = inversion.objective.modulus_map.moduli(inversion.minimum.unknowns[: len(moduli)])
+    return [float(100.0 * (value / truth - 1.0)) for value, truth in zip(found, moduli, strict=True)]
+
+
+def _passes(points: list[tuple[float, float]]) -> float | None:
+    for (before, low), (after, high) in pairwise(points):
+        if low < LEAVE_PERCENT <= high:
+            return before + (after - before) * (LEAVE_PERCENT - low) / (high - low)
+    return None
+
+
+def _cell(error: float | None) -> str:
+    return "not converged" if error is None else f"{error:+.2g} %"

@@ -1,0 +1,40 @@
+"""The known loads of a case, on the mesh that they act on."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from palpate.errors import ConfigurationError
+from palpate.images.tissue import Role
+from palpate.mechanics.loads import Load, boundary_named, gravity, pressure, traction
+from palpate.mesh.space import LagrangeSpace
+from palpate.study.case import Case, CaseLoad
+
+__all__ = ["case_loads"]
+
+
+def case_loads(case: Case, space: LagrangeSpace, *, share: float = 1.0) -> tuple[Load, ...]:
+    """The loads of `case` on `space`, or a `share` of them.
+
+    Raises `ConfigurationError` for a surface that the mesh has not, or whose motion is prescribed.
+    """
+    return tuple(_load(load, case, space, share) for load in case.loads)
+
+
+def _load(load: CaseLoad, case: Case, space: LagrangeSpace, share: float) -> Load:
+    tissues = space.mesh.tissues
+    if load.acceleration_m_s2 is not None:
+        density = {tissue.name: tissue.density_kg_m3 for tissue in case.tissues}
+        heavy = np.array([density.get(tissue.name, 1000.0) for tissue in tissues])
+        return gravity(space, heavy, share * np.array(load.acceleration_m_s2))
+    surface = load.surface or ""
+    prescribed = [t.name for t in tissues if t.role in (Role.DRIVER, Role.RIGID)]
+    if surface in prescribed:
+        raise ConfigurationError(
+            f"[[loads]]: the motion of '{surface}' is prescribed, so a {load.kind} on it does nothing; give it the role"
+            " void if the load is to move it"
+        )
+    triangles = boundary_named(space.mesh, surface)
+    if load.traction_kpa is not None:
+        return traction(space, triangles, share * np.array(load.traction_kpa))
+    return pressure(space, triangles, share * (load.pressure_kpa or 0.0), following=load.following)
