@@ -355,17 +355,19 @@ def _line(result: dict) -> str:
 
 
 def _table(summaries: dict[str, dict]) -> str:
-    lines = ["row | moduli | RMS ln-error | worst | grid spread | Cramer-Rao | inside 95 % | converged"]
+    """The rows as they stand in the docs."""
+    lines = [
+        "| row | cases, moduli | RMS ln-error | worst | mean | grid spread | Cramer-Rao | inside 95 % | linear law |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
     for name, row in summaries.items():
-        cells = [
-            name,
-            str(row["moduli"]),
-            f"{row['rms_ln_error']:.4f}",
-            f"{row['worst_ln_error']:.4f}",
-            *(f"{row[key]:.3f}" if key in row else "-" for key in ("grid_spread_rms", "cramer_rao_rms", "inside_95")),
-            str(row["all_converged"]),
-        ]
-        lines.append(" | ".join(cells))
+        keys = ("rms_ln_error", "worst_ln_error", "mean_ln_error", "grid_spread_rms", "cramer_rao_rms")
+        digits = 5 if row["worst_ln_error"] < 0.005 else 3
+        cells = [f"`{name}`", f"{row['cases']}, {row['moduli']}"]
+        cells += [f"{row[key]:.{digits}f}" if key in row else "-" for key in keys]
+        cells.append(f"{100 * row['inside_95']:.0f} %" if "inside_95" in row else "-")
+        cells.append(f"{row['linear_rms_ln_error']:.2f}" if "linear_rms_ln_error" in row else "-")
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 

@@ -13,7 +13,7 @@ from palpate.study.case_file import read_case
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
-EXAMPLE = (ROOT / "docs" / "case-file.md").read_text().split("```toml\n")[1].split("```")[0]
+EXAMPLE, LOADS, *_ = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "case-file.md").read_text(), flags=re.DOTALL)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -35,7 +35,13 @@ def test_the_schema_in_the_docs_shows_the_defaults(tmp_path):
     case = read_case(path)
     assert (case.domain, case.mechanics, case.mesh) == (Domain(), Mechanics(), MeshSettings())
     assert (case.driver, case.estimate, case.seed) == (DriverMotion(), Estimate(), 0)
-    assert case.tissues[0].poisson_ratio == 0.45
+    assert (case.tissues[0].poisson_ratio, case.tissues[1].density_kg_m3) == (0.45, 1000.0)
+
+
+def test_the_loads_in_the_docs_can_be_read(tmp_path):
+    path = tmp_path / "case.toml"
+    path.write_text(f"{EXAMPLE}\n{LOADS}")
+    assert [load.kind for load in read_case(path).loads] == ["pressure", "traction", "gravity"]
 
 
 def test_every_code_of_a_warning_is_explained():

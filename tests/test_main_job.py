@@ -244,7 +244,8 @@ BAD_SETTINGS = {
     "tissues.surroundings.youngs_modulus_kpa=-10": (2, ["'surroundings'", "-10", "give a positive number in kPa"]),
     "tissues.surroundings.youngs_modulus_kpa=0": (2, ["'surroundings'", "give a positive number in kPa"]),
     "mesh.edge_length_mm=500": (4, ["edge_length_mm is 500", "smallest side"]),
-    "mechanics.law=neo-hookean": (2, ["'neo-hookean'", "does not offer yet", "'linear'"]),
+    "mechanics.law=neo-hooke": (2, ["'neo-hooke'", "did you mean 'neo-hookean'?"]),
+    "estimate.parameters=['poisson_ratio']": (2, ["'poisson_ratio'", "does not offer yet", "'youngs_modulus'"]),
 }
 
 

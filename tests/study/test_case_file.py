@@ -40,7 +40,7 @@ def case_file(tmp_path) -> Path:
 def test_defaults_are_those_of_the_schema(case_file):
     case = read_case(case_file)
     assert (case.id, case.patient, case.stage, case.seed) == ("sub-01", "sub-01", None, 0)
-    assert (case.mechanics.law, case.mechanics.element) == ("linear", "P2")
+    assert (case.mechanics.law, case.mechanics.element) == ("neo-hookean", "auto")
     assert (case.domain.extent, case.domain.margin_mm, case.domain.outer_boundary) == ("image", 40.0, "fixed")
     assert (case.driver.modes, case.driver.kernel_mm, case.driver.prior_mm) == (90, 20.0, 5.0)
     assert case.mesh.edge_length_mm == 4.0
@@ -115,17 +115,17 @@ BAD = {
     "mesh.edge_length_mm=nan": "finite",
     "seed=true": "whole number",
     "seed=1.5": "whole number",
-    "mechanics.law=neo-hookean": "does not offer yet; use 'linear'",
     "mechanics.law=hooke": "did you mean",
-    "mechanics.element=auto": "does not offer yet",
+    "mechanics.element=P3": "did you mean",
     "estimate.method=newton": "did you mean 'gauss-newton'",
     "estimate.parameters=['poisson_ratio']": "does not offer yet",
     "estimate.bounds_ratio=[2.0, 1.0]": "low < high",
     "estimate.bounds_ratio=[1.0]": "must hold 2 values",
-    "estimate.start_ratios=[0.001]": "outside the bounds",
+    "estimate.start_ratios=[0.001]": "do not lie between the bounds",
     "estimate.start_ratios=[]": "positive numbers",
     "domain.outer_boundary=open": "did you mean",
     "phantom.kind=pelvis": "not both",
+    "phantom={kind='pelvis', law='hooke'}": "did you mean",
     "id=''": "printable name",
     "edge": "write key.path=value",
     "a b=3": "not valid TOML",

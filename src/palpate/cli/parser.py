@@ -8,7 +8,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from palpate.cli import commands, studies, written
+from palpate.cli import commands, studies, verification, written
 from palpate.cli.outcome import Outcome
 
 __all__ = ["make_parser", "version"]
@@ -47,6 +47,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_estimate(subparsers)
     _add_report(subparsers)
     _add_reproduce(subparsers)
+    _add_verify(subparsers)
     return parser
 
 
@@ -89,6 +90,13 @@ def _add_reproduce(subparsers: Any) -> None:
     command = _command(subparsers, "reproduce", studies.reproduce, what=what)
     command.add_argument("experiment", choices=("table1", "table2", "figure4", "staging"))
     command.set_defaults(output=Path("palpate-reproduce"))
+
+
+def _add_verify(subparsers: Any) -> None:
+    what = "compute the problems with known answers and hold our numbers beside them"
+    command = _command(subparsers, "verify", verification.verify, what=what)
+    command.add_argument("--quick", action="store_true", help="leave out the slow problems")
+    command.set_defaults(output=Path("palpate-verification"))
 
 
 def _add_case(command: argparse.ArgumentParser) -> None:

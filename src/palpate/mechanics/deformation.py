@@ -29,7 +29,7 @@ def largest_strains(space: LagrangeSpace, displacement: NDArray[np.float64]) -> 
     """
     deformation = _gradients(space, displacement, CENTRE)[:, 0]
     strains = 0.5 * (np.swapaxes(deformation, 1, 2) @ deformation - np.eye(3))
-    finite = np.isfinite(strains).all(axis=(1, 2))
+    finite = np.isfinite(strains.sum(axis=(1, 2)))
     principal = np.linalg.eigvalsh(np.where(finite[:, None, None], strains, 0.0))
     return np.where(finite, np.abs(principal).max(axis=1), np.nan)
 

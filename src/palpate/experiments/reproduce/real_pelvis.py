@@ -22,6 +22,7 @@ from palpate.phantoms.wall_filling import wall_filling
 __all__ = ["ORGANS", "RealPelvis", "grid_over", "real_pelvis"]
 
 ORGANS = ("prostate", "bladder")
+DRIVER = "rectum"
 SHIFT = 0.5  # of a voxel: a random grid's place
 
 
@@ -42,29 +43,22 @@ class RealPelvis:
         return lagrange_space(tetrahedralise(self.anatomy, edge_length_mm=edge_mm), element)
 
     def filling(self, space: LagrangeSpace, filling_mm: float) -> NDArray[np.float64]:
-        """Displacement (n_points, 3) mm of the rectum's wall that fills by `filling_mm`; zero elsewhere.
-
-        Bones hold still, and what they share with the wall.
-        """
+        """Displacement (n_points, 3) mm of the rectum's wall that fills by `filling_mm`; zero elsewhere."""
         offset, mesh = np.zeros_like(space.points), space.mesh
-        names = [tissue.name for tissue in self.scan.tissues]
-        walls = {n: np.unique(space.facets(mesh.boundary[mesh.beyond == n])) for n in range(len(mesh.tissues))}
-        for number, tissue in enumerate(mesh.tissues):
-            if tissue.role is Role.DRIVER:
-                motion = wall_filling(self.scan, names.index(tissue.name), filling_mm=filling_mm)
-                offset[walls[number]] = motion.at(space.points[walls[number]])
-        for number, tissue in enumerate(mesh.tissues):
-            if tissue.role is Role.RIGID:
-                offset[walls[number]] = 0.0
+        wall = np.unique(space.facets(mesh.boundary[mesh.beyond == mesh.tissue_index(DRIVER)]))
+        number = [tissue.name for tissue in self.scan.tissues].index(DRIVER)
+        offset[wall] = wall_filling(self.scan, number, filling_mm=filling_mm).at(space.points[wall])
         return offset
 
 
 def real_pelvis(surroundings_kpa: float) -> RealPelvis:
-    """The scan with surroundings of that known modulus (kPa); the organs' are to be set by who computes with it."""
-    tissues = tuple(
-        replace(tissue, youngs_modulus_kpa=surroundings_kpa) if tissue.role is Role.KNOWN else tissue
-        for tissue in TISSUES
-    )
+    """The scan with surroundings of that known modulus (kPa); whoever computes with it sets the organs'.
+
+    As in the paper's scene there are organs and a box around them: bones are part of the surroundings.
+    """
+    shown = [tissue for tissue in TISSUES if tissue.role in (Role.ESTIMATE, Role.DRIVER)]
+    rest = next(tissue for tissue in TISSUES if tissue.role is Role.KNOWN)
+    tissues = (*shown, replace(rest, youngs_modulus_kpa=surroundings_kpa))
     names = read_label_table(DATA / "labels.json")
     scan = segment(read_label_image(DATA / "labels.nii.gz", names=names), tissues)
     observed = [i for i, t in enumerate(scan.tissues) if t.role in (Role.ESTIMATE, Role.DRIVER)]

@@ -50,39 +50,43 @@ def reproduce(experiment: str, folder: Path, *, progress: Progress, settings: Se
     for another name, `PalpateError`s of meshing, solving and writing.
     """
     chosen = settings or Settings()
-    makers: dict[str, Callable[[Ledger, Path], Reproduction]] = {
-        "table1": lambda ledger, path: _table1(chosen.table1, ledger, path, progress),
-        "table2": lambda ledger, path: _table2(chosen.table2, ledger, path, progress),
-        "figure4": lambda ledger, path: _figure4(chosen.figure4, ledger, path, progress),
-        "staging": lambda ledger, path: _staging(chosen.staging, ledger, path, progress),
+    makers: dict[str, Callable[[], Reproduction]] = {
+        "table1": lambda: _table1(chosen.table1, folder, progress),
+        "table2": lambda: _table2(chosen.table2, folder, progress),
+        "figure4": lambda: _figure4(chosen.figure4, folder, progress),
+        "staging": lambda: _staging(chosen.staging, folder, progress),
     }
     if experiment not in makers:
         raise ConfigurationError(f"the experiment is '{experiment}'; it must be one of {list(EXPERIMENTS)}")
-    ledger = Ledger(folder / f"{experiment}.parts.jsonl", sha256(repr(chosen).encode()).hexdigest()[:16])
-    result = makers[experiment](ledger, folder / f"{experiment}.svg")
+    result = makers[experiment]()
     write_json(folder / f"{experiment}.json", result.document)
     return result
 
 
-def _table1(settings: Table1Settings, ledger: Ledger, path: Path, progress: Progress) -> Reproduction:
-    table = table1(settings, ledger, progress=progress)
-    draw_table(table, path)
-    return Reproduction(table.to_dict(), table.text(), path)
+def _ledger(folder: Path, experiment: str, settings: object) -> Ledger:
+    """The finished parts under exactly these settings."""
+    return Ledger(folder / f"{experiment}.parts.jsonl", sha256(repr(settings).encode()).hexdigest()[:16])
 
 
-def _table2(settings: Table2Settings, ledger: Ledger, path: Path, progress: Progress) -> Reproduction:
-    table = table2(settings, ledger, progress=progress)
-    draw_table(table, path)
-    return Reproduction(table.to_dict(), table.text(), path)
+def _table1(settings: Table1Settings, folder: Path, progress: Progress) -> Reproduction:
+    table = table1(settings, _ledger(folder, "table1", settings), progress=progress)
+    draw_table(table, folder / "table1.svg")
+    return Reproduction(table.to_dict(), table.text(), folder / "table1.svg")
 
 
-def _figure4(settings: Figure4Settings, ledger: Ledger, path: Path, progress: Progress) -> Reproduction:
-    result = figure4(settings, ledger, progress=progress)
-    draw_figure4(result, path)
-    return Reproduction(result.to_dict(), result.text(), path)
+def _table2(settings: Table2Settings, folder: Path, progress: Progress) -> Reproduction:
+    table = table2(settings, _ledger(folder, "table2", settings), progress=progress)
+    draw_table(table, folder / "table2.svg")
+    return Reproduction(table.to_dict(), table.text(), folder / "table2.svg")
 
 
-def _staging(settings: CohortSettings, ledger: Ledger, path: Path, progress: Progress) -> Reproduction:
-    result = staging(settings, ledger, progress=progress)
-    draw_staging(result, path)
-    return Reproduction(result.to_dict(), result.text(), path)
+def _figure4(settings: Figure4Settings, folder: Path, progress: Progress) -> Reproduction:
+    result = figure4(settings, _ledger(folder, "figure4", settings), progress=progress)
+    draw_figure4(result, folder / "figure4.svg")
+    return Reproduction(result.to_dict(), result.text(), folder / "figure4.svg")
+
+
+def _staging(settings: CohortSettings, folder: Path, progress: Progress) -> Reproduction:
+    result = staging(settings, _ledger(folder, "staging", settings), progress=progress)
+    draw_staging(result, folder / "staging.svg")
+    return Reproduction(result.to_dict(), result.text(), folder / "staging.svg")

@@ -50,6 +50,7 @@ SURROUNDINGS_KPA = 50.0  # the paper states none; stiffer organs than some ten t
 NOTES = (
     f"The surroundings are known ({SURROUNDINGS_KPA:g} kPa) and set the scale; the paper does not state theirs.",
     "The pelvis is a real CT with automatic labels of 3 mm voxels; its later state is simulated with the linear law.",
+    "As in the paper the scene is prostate, bladder, a hollow rectum and a box; bones are part of the surroundings.",
     "same_mesh: the wall moves as the driver's modes can; all other columns: as the filling makes it.",
     "voxels: 1 mm, on one of several grids shifted at random; everything is made from the labels.",
     "paper_method: its Eq. 4 on linear tetrahedra, L-BFGS, the wall's true motion given, data of its own mesh.",
@@ -61,8 +62,8 @@ NOTES = (
 class Table2Settings:
     """Edges of the inverting and of the truth's mesh (mm), moduli (kPa), random grids, modes of the wall."""
 
-    edge_mm: float = 7.0
-    truth_edge_mm: float = 5.5
+    edge_mm: float = 6.0
+    truth_edge_mm: float = 4.5
     voxel_mm: float = 1.0
     filling_mm: float = 6.5
     moduli_kpa: tuple[float, ...] = tuple(PAPER_TABLE2)

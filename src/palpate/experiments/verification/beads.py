@@ -34,9 +34,9 @@ LOW, HIGH = np.array([60.0, 60.0, 16.0]), np.array([350.0, 350.0, 68.0])  # the 
 CELLS = (14, 14, 4)
 SHELL = 8.0  # beads nearer to the box's surface prescribe, the others are predicted
 NEIGHBOURS = 24  # in the local fit
-SCATTER = 0.13  # median scatter of the beads about a local affine fit
+SCATTER, WIDE_SCATTER = 0.13, 0.43  # of the beads about a local affine fit: median and 95th percentile
 RATIOS = (0.44, 0.46, 0.47, 0.48, 0.49)
-TOLERANCE = 200.0  # per cent of the scatter: our own, for no law promises more of a gel than its beads show
+TOLERANCE = 100.0 * (WIDE_SCATTER / SCATTER - 1.0)  # our own: a typical error is no more than what a bead may scatter
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,9 +67,10 @@ def boundary_motion(space: LagrangeSpace, beads: Beads) -> Array:
     rest, motion = beads.rest[~beads.inside], beads.motion[~beads.inside]
     points = np.unique(space.facets(space.mesh.boundary))
     result = np.zeros_like(space.points)
-    distances, near = cKDTree(rest).query(space.points[points], k=NEIGHBOURS)
-    for point, distance, chosen in zip(points, distances, near, strict=True):
+    near = np.asarray(cKDTree(rest).query(space.points[points], k=NEIGHBOURS)[1])
+    for point, chosen in zip(points, near, strict=True):
         a = rest[chosen] - space.points[point]
+        distance = np.linalg.norm(a, axis=1)
         products = [a[:, i] * a[:, j] for i in range(3) for j in range(i + 1)]
         basis = np.column_stack([np.ones(NEIGHBOURS), a, *products])
         weight = np.exp(-0.5 * (distance / (0.6 * distance.max())) ** 2)[:, None]

@@ -2,8 +2,8 @@
 
 Corners (0, 0), (48, 44), (48, 60), (0, 44) mm. Plane stress, E = 1, nu = 1/3, force 1: 23.96 is the deflection of the
 free side's middle (48, 52). Some pages ascribe it to the corner (48, 60), which moves by 25.1 on the finest mesh that
-we tried. Plane strain, E = 70, nu = 1/3, traction 6.25: the corner moves by 32.27 (CalculiX), 32.20 (Code_Aster), 32.28 mm
-(Elmer), all from the CoFEA benchmark's table. At nu = 0.4999 no number is published; the reference is our own.
+we tried. Plane strain, E = 70, nu = 1/3, traction 6.25: the corner moves by 32.27 (CalculiX), 32.20 (Code_Aster),
+32.28 mm (Elmer), all from the CoFEA benchmark's table. At nu = 0.4999 no number is published; the reference is our own.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ INCOMPRESSIBLE = 27.73  # mm, plane strain at nu = 0.4999, extrapolated from thr
 
 
 def panel(n: int, nu: float) -> TetMesh:
-    """n x n x 1 cells, as thick as a cell is wide."""
+    """A panel of n x n x 1 cells, as thick as a cell is wide."""
     places, tets = kuhn_tets((n, n, 1))
     x, y = places[:, 0] / n, places[:, 1] / n
     low, high = 44.0 * x, 44.0 + 16.0 * x
@@ -80,9 +80,17 @@ def _incompressible_checks() -> tuple[Check, ...]:
 
 
 COOK_PROBLEMS = (
-    Problem("B7a", "Cook's membrane in plane stress", "Cook 1974; Belytschko et al. 2014 (by femorph-solver)", _plane_stress_checks),
     Problem(
-        "B7b", "Cook's membrane in plane strain", "CoFEA: CalculiX 32.27, Code_Aster 32.20, Elmer 32.28", _plane_strain_checks
+        "B7a",
+        "Cook's membrane in plane stress",
+        "Cook 1974; Belytschko et al. 2014 (by femorph-solver)",
+        _plane_stress_checks,
+    ),
+    Problem(
+        "B7b",
+        "Cook's membrane in plane strain",
+        "CoFEA: CalculiX 32.27, Code_Aster 32.20, Elmer 32.28",
+        _plane_strain_checks,
     ),
     Problem(
         "B7c",

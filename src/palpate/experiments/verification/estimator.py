@@ -108,7 +108,13 @@ def _scale_checks() -> tuple[Check, ...]:
 def _coverage_checks() -> tuple[Check, ...]:
     found = coverage(REPEATS, seed=3)
     return tuple(
-        Check(f"95 % intervals of {name} that hold the truth, of {REPEATS} (%)", 94.0, 100.0 * float(share), 4.0, scale=100.0)
+        Check(
+            f"95 % intervals of {name} that hold the truth, of {REPEATS} (%)",
+            94.0,
+            100.0 * float(share),
+            4.0,
+            scale=100.0,
+        )
         for name, share in zip(("core", "middle"), found, strict=True)
     )
 

@@ -53,9 +53,7 @@ def bore_of(mesh: TetMesh, radius: float, axes: int = 3) -> NDArray[np.int64]:
     return mesh.boundary[np.all(distance[mesh.boundary] < 1.03 * radius, axis=1)]
 
 
-def inflated_model(
-    space: LagrangeSpace, bore: NDArray[np.int64], law: Law, *, axes: int = 3
-) -> FiniteStrainModel:
+def inflated_model(space: LagrangeSpace, bore: NDArray[np.int64], law: Law, *, axes: int = 3) -> FiniteStrainModel:
     """The flat sides slide; a unit of the one mode moves the bore outwards by its own radius."""
     points = np.unique(space.facets(bore))
     outwards = space.points[points].copy()
@@ -113,10 +111,10 @@ def _limit_checks() -> tuple[Check, ...]:
     stretches = np.arange(1.04, 1.49, 0.04)
     found = wall_pressures(mesh, NEO, moduli=[1.0], stretches=stretches.tolist(), radius=0.95)
     cubic = np.polynomial.Polynomial.fit(stretches[-5:], found[-5:], 3)
-    tops = [t.real for t in cubic.deriv().roots() if abs(t.imag) < 1e-9 and 1.3 < t.real < 1.5]
-    top = float(tops[0]) if tops else float("nan")
+    fine = np.linspace(stretches[-5], stretches[-1], 2001)
+    top = float(fine[cubic(fine).argmax()])
     return (
-        Check("largest pressure (kPa)", LIMIT[0], float(cubic(top)), TOLERANCE),
+        Check("largest pressure (kPa)", LIMIT[0], float(cubic(fine).max()), TOLERANCE),
         Check("stretch there", LIMIT[1], top, TOLERANCE),
     )
 

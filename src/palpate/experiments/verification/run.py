@@ -1,0 +1,66 @@
+"""Compute the problems, one after the other; an interrupted run goes on where it was."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from palpate.errors import PalpateError
+from palpate.experiments.verification.page import page
+from palpate.experiments.verification.problem import Check, Problem, RowDict, as_row
+from palpate.study.outputs import write_json, write_text
+from palpate.study.provenance import software_versions
+
+__all__ = ["document_of", "rows_of", "verify"]
+
+SCHEMA = "palpate.verification/1"
+UNFINISHED = "verification-unfinished.json"
+
+
+def verify(problems: Sequence[Problem], folder: Path, *, progress: Callable[[str], None]) -> dict[str, Any]:
+    """Compute all problems, write verification.json and verification.md to `folder`, and return the document.
+
+    What is done is kept there after each problem, until all are: a run that was interrupted is taken up again, by the
+    same versions of the software only.
+    """
+    versions = software_versions()
+    done = _earlier(folder, versions)
+    for number, problem in enumerate(problems, start=1):
+        if problem.id in done:
+            progress(f"{problem.id} ({number} of {len(problems)}): already done")
+            continue
+        progress(f"{problem.id} ({number} of {len(problems)}): {problem.title}")
+        done[problem.id] = rows_of(problem)
+        write_json(folder / UNFINISHED, {"versions": versions, "done": done})
+    document = document_of([row for problem in problems for row in done[problem.id]])
+    write_json(folder / "verification.json", document)
+    slow = [problem.id for problem in problems if not problem.quick]
+    write_text(folder / "verification.md", page(document["problems"], slow))
+    (folder / UNFINISHED).unlink(missing_ok=True)
+    return document
+
+
+def rows_of(problem: Problem) -> list[RowDict]:
+    """The rows of one problem; one that cannot be computed gives a row that has failed, with the reason."""
+    try:
+        return [as_row(problem, check) for check in problem.measure()]
+    except PalpateError as error:
+        return [as_row(problem, Check(f"not computed: {error}", 0.0, float("nan"), 0.0, scale=1.0))]
+
+
+def document_of(rows: list[RowDict]) -> dict[str, Any]:
+    """The document of `palpate verify --json`."""
+    passed = sum(bool(row["pass"]) for row in rows)
+    return {"schema": SCHEMA, "problems": rows, "passed": passed, "failed": len(rows) - passed}
+
+
+def _earlier(folder: Path, versions: dict[str, str]) -> dict[str, list[RowDict]]:
+    """What an interrupted run of the same software has left; nothing when there is none, or its file is spoilt."""
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        kept = json.loads((folder / UNFINISHED).read_text(encoding="utf-8"))
+        if kept["versions"] == versions:
+            return dict(kept["done"])
+    return {}

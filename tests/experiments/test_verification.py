@@ -1,0 +1,130 @@
+"""The problems with known answers: the quick ones are met, all are told, and a failure is a failure."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.cli import main
+from palpate.errors import NotConverged
+from palpate.experiments.verification import registry
+from palpate.experiments.verification.beads import prediction_errors, read_beads
+from palpate.experiments.verification.page import page
+from palpate.experiments.verification.problem import Check, Problem, as_row
+from palpate.experiments.verification.registry import PROBLEMS
+from palpate.experiments.verification.run import UNFINISHED, document_of, rows_of, verify
+
+PAGE = (Path(__file__).parents[2] / "docs" / "verification.md").read_text()
+KEYS = {
+    *("id", "title", "quantity", "reference", "source", "value"),
+    *("error_percent", "tolerance_percent", "order", "pass"),
+}
+
+
+@pytest.mark.parametrize("problem", [p for p in PROBLEMS if p.quick], ids=lambda problem: problem.id)
+def test_every_quick_problem_is_met(problem):
+    failed = [row for row in rows_of(problem) if not row["pass"]]
+    assert not failed
+
+
+def test_the_page_tells_of_every_problem_and_no_other():
+    told = re.findall(r"^\| ([BEM]\d+[a-z]?)\*? \|", PAGE.split("## All checks")[0], flags=re.MULTILINE)
+    assert told == [problem.id for problem in PROBLEMS]
+    slow = re.findall(r"^\| ([BEM]\d+[a-z]?)\* \|", PAGE, flags=re.MULTILINE)
+    assert slow == [problem.id for problem in PROBLEMS if not problem.quick]
+    assert "all within their tolerance" in PAGE
+
+
+def test_there_are_at_least_twenty_problems_of_each_family():
+    ids = [problem.id for problem in PROBLEMS]
+    assert len(set(ids)) == len(ids) >= 20
+    families = {re.match(r"[BEM]\d+", name).group() for name in ids}
+    assert {f"B{i}" for i in range(14)} | {"B16", "M1"} | {f"E{i}" for i in range(1, 7)} <= families
+
+
+def made(name, *values, reference=1.0):
+    """A problem whose values are given; each may err by one per cent."""
+    checks = tuple(Check("length (mm)", reference, value, 1.0) for value in values)
+    return Problem(name, "A rod", "a ruler", lambda: checks)
+
+
+def test_the_error_is_that_of_the_scale():
+    assert Check("x", -2.0, -2.1, 5.0).error_percent == pytest.approx(5.0)
+    assert Check("x", 0.0, 0.1, 5.0, scale=2.0).passed
+    assert not Check("x", 0.0, 0.11, 5.0, scale=2.0).passed
+    assert not Check("x", 1.0, float("nan"), 5.0).passed
+
+
+def test_a_row_is_json_even_without_a_value():
+    row = as_row(made("B1"), Check("x", 1.0, float("nan"), 1.0))
+    assert set(row) == KEYS
+    assert json.loads(json.dumps(row, allow_nan=False))["value"] is None
+    assert row["pass"] is False
+
+
+def test_a_problem_that_cannot_be_computed_has_failed():
+    def fail():
+        raise NotConverged("no equilibrium beyond 30 %")
+
+    (row,) = rows_of(replace(made("B1"), measure=fail))
+    assert "no equilibrium" in row["quantity"]
+    assert (row["pass"], row["value"]) == (False, None)
+    assert "failed: B1" in page([row])
+
+
+def test_an_interrupted_run_goes_on_where_it_was(tmp_path):
+    computed = []
+
+    def counted(name):
+        def measure():
+            computed.append(name)
+            if name == "B2" and len(computed) == 2:
+                raise KeyboardInterrupt
+            return (Check("x", 1.0, 1.0, 1.0),)
+
+        return replace(made(name), measure=measure)
+
+    problems = [counted("B1"), counted("B2")]
+    with pytest.raises(KeyboardInterrupt):
+        verify(problems, tmp_path, progress=lambda _: None)
+    document = verify(problems, tmp_path, progress=lambda _: None)
+    assert computed == ["B1", "B2", "B2"]
+    assert (document["passed"], document["failed"]) == (2, 0)
+    assert not (tmp_path / UNFINISHED).exists()
+    verify(problems, tmp_path, progress=lambda _: None)
+    assert computed[3:] == ["B1", "B2"]
+
+
+@pytest.mark.parametrize(("value", "code"), [(1.005, 0), (1.02, 5)])
+def test_the_command_says_by_its_exit_code_whether_all_is_well(tmp_path, monkeypatch, capfd, value, code):
+    monkeypatch.setattr(registry, "PROBLEMS", (made("B1", value), replace(made("B2", 1.0), quick=False)))
+    assert main(["verify", "--json", "--quick", "--output", str(tmp_path)]) == code
+    document = json.loads(capfd.readouterr().out)
+    assert [row["id"] for row in document["problems"]] == ["B1"]
+    assert (document["passed"], document["failed"]) == (int(code == 0), int(code == 5))
+    assert json.loads((tmp_path / "verification.json").read_text()) == document
+    assert "B1" in (tmp_path / "verification.md").read_text()
+    assert main(["verify", "--output", str(tmp_path)]) == code
+    out, err = capfd.readouterr()
+    assert "B2" in out
+    assert ("outside of their tolerance: B1" in err) == (code == 5)
+
+
+def test_the_document_counts_its_checks():
+    rows = rows_of(made("B1", 1.0, 1.005, 2.0))
+    document = document_of(rows)
+    assert (document["passed"], document["failed"]) == (2, 1)
+
+
+def test_the_beads_inside_move_as_those_around_them_say():
+    """Better than a gel that shrinks: at nu = 0.3 the linear law errs by half as much again."""
+    beads = read_beads()
+    good, poor = (np.median(prediction_errors(beads, "linear", nu)) for nu in (0.48, 0.3))
+    assert good < 0.38
+    assert poor > 1.3 * good
+    assert np.median(np.linalg.norm(beads.motion[beads.inside], axis=1)) > 3.0 * good
