@@ -54,8 +54,8 @@ class Balls:
     """
 
     radii_mm: tuple[float, float, float] = (12.0, 24.0, 36.0)
-    edge_mm: float = 5.0
-    truth_edge_mm: float = 4.0
+    edge_mm: float = 6.0
+    truth_edge_mm: float = 4.8
     voxel_mm: float = 1.0
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -44,6 +44,12 @@ class Entry:
         """The entry that `asdict` has made a dictionary of, by way of JSON."""
         interval = stored["interval95"]
         return Entry(**{**stored, "interval95": None if interval is None else (interval[0], interval[1])})
+
+    def scaled(self, factor: float) -> Entry:
+        """The same problem in other units: moduli times `factor`, errors as they are."""
+        ends = self.interval95
+        scaled = None if ends is None else (ends[0] and factor * ends[0], ends[1] and factor * ends[1])
+        return replace(self, kpa=None if self.kpa is None else factor * self.kpa, interval95=scaled)
 
     @property
     def counts(self) -> bool:

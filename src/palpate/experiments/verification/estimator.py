@@ -160,6 +160,12 @@ ESTIMATOR_PROBLEMS = (
     Problem("E2", "Scale invariance is detected and reported", "exact: K(cE) = c K(E)", _scale_checks),
     Problem("E3", "Coverage of the 95 % intervals", "90 to 98 % of the repeats", _coverage_checks, quick=False),
     Problem("E4", "Gradients against central differences", "exact: adjoint identity", _gradient_checks),
-    Problem("E5", "Information of the displacements", "singular values of B4's closed form", _information_checks),
+    Problem(
+        "E5",
+        "Information of the displacements",
+        "singular values of B4's closed form",
+        _information_checks,
+        quick=False,
+    ),
     Problem("E6", "A parameter at its bound is refused an interval", SOURCE, _bound_checks),
 )
