@@ -25,6 +25,8 @@ shell = { label = 2, role = "estimate" }
 frame = { label = 3, role = "driver" }
 surroundings = { label = "remaining", role = "known", youngs_modulus_kpa = 10.0 }
 
+[mechanics]
+law = "linear"  # as this phantom; leave it out for real images
 [mesh]
 edge_length_mm = 8.0
 [driver]

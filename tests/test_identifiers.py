@@ -42,6 +42,7 @@ youngs_modulus_kpa = 10.0
 [mesh]
 edge_length_mm = 9.0
 [mechanics]
+law = "linear"
 element = "P1"
 [noise]
 surface_sd_mm = 0.5

@@ -39,6 +39,7 @@ role = "known"
 youngs_modulus_kpa = 10.0
 
 [mechanics]
+law = "linear"
 element = "P1"
 
 [mesh]

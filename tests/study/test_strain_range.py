@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
+from palpate.study.body import Body, ImagedStates
+from palpate.study.case import Mechanics
+from palpate.study.run import strain_warnings
 from palpate.study.strain_range import linear_strain_warnings
 
 
@@ -54,3 +59,17 @@ def test_the_image_that_strains_most_is_named(space):
 
 def test_nothing_fitted_is_nothing_strained(space):
     assert linear_strain_warnings("linear", (space, []), images=["a"]) == ()
+
+
+def test_every_pair_of_images_meets_its_own_mesh_and_displacements(case_result):
+    r = case_result
+    case = dataclasses.replace(r.case, mechanics=Mechanics(law="linear"))
+    body = Body(ImagedStates(r.before, r.after, ({},), ()), r.space, None, 1.0)
+    small = dataclasses.replace(r.space, mesh=dataclasses.replace(r.space.mesh, nodes=0.5 * r.space.mesh.nodes))
+    half = dataclasses.replace(body, space=small)
+    motion = stretched(r.space, 0.08)  # on the mesh of half the size it strains twice as much
+    estimation = dataclasses.replace(r.estimation, displacements=(motion, motion))
+    (remark,) = strain_warnings(case, (body, half), estimation)
+    assert "100.0 %" in remark.message
+    assert "99th percentile 17 %" in remark.message  # (1.16^2 - 1) / 2
+    assert strain_warnings(r.case, (body, half), estimation) == ()

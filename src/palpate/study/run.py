@@ -36,6 +36,7 @@ __all__ = [
     "mesh",
     "refuse_what_cannot_be_estimated",
     "simulate",
+    "strain_warnings",
 ]
 
 Progress = Callable[[str], None]
@@ -104,7 +105,7 @@ def estimate_states(
         Provenance({key: round(float(value), 3) for key, value in seconds.items()}, {}, software_versions()),
         (
             *_remarks(case, states, *further),
-            *_strain_warnings(case, bodies, estimation),
+            *strain_warnings(case, bodies, estimation),
             *plausibility_warnings(_values(estimation)),
         ),
         further=_further(bodies, estimation),
@@ -161,8 +162,8 @@ def _further(bodies: tuple[Body, ...], estimation: Estimation) -> tuple[PairResu
     return tuple(found)
 
 
-def _strain_warnings(case: Case, bodies: tuple[Body, ...], estimation: Estimation) -> tuple[Remark, ...]:
-    """What `linear_strain_warnings` says of the fitted displacements of all bodies."""
+def strain_warnings(case: Case, bodies: tuple[Body, ...], estimation: Estimation) -> tuple[Remark, ...]:
+    """What `linear_strain_warnings` says of the fitted displacements, those of the first body's images first."""
     motions = iter(estimation.displacements)
     moved = [(body.space, [next(motions) for _ in body.states.after]) for body in bodies]
     return linear_strain_warnings(case.mechanics.law, *moved, images=image_names(case))

@@ -50,7 +50,7 @@ def draw_figure4(result: Figure4, path: Path) -> None:
             axes.set_title(body)
             axes.set_xlabel("deformation, %")
         panels[0].set_ylabel("error of the modulus, %")
-        panels[0].legend(fontsize=7.5, frameon=False)
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
 
     _save(draw, path, width=10.0)
 
@@ -84,13 +84,14 @@ def _errors(axes: Axes, rows: list[TableRow]) -> None:
 
 
 def _lines(axes: Axes, result: Figure4, body: str) -> None:
+    cases = list(dict.fromkeys(point.case for point in result.points))
     for law, style in LINESTYLES.items():
-        lines = [(key, points) for key, points in result.lines(law).items() if key[0] == body]
-        for colour, ((_, case), points) in zip(COLOURS, lines, strict=False):
+        lines = result.lines(law)
+        for colour, case in zip(COLOURS, cases, strict=False):
+            points = lines.get((body, case), [])
             errors = [np.nan if p.error_percent is None else p.error_percent for p in points]
             deformations = [p.deformation_percent for p in points]
-            label = f"{points[0].true_kpa:g} kPa ({case}), {law}"
-            axes.plot(deformations, errors, style, color=colour, marker=".", label=label)
+            axes.plot(deformations, errors, style, color=colour, marker=".", label=f"{case} kPa, {law}")
     axes.axhspan(-LEAVE_PERCENT, LEAVE_PERCENT, color="0.9", zorder=0)
 
 
