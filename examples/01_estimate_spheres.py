@@ -15,6 +15,7 @@ from palpate.phantoms.spheres import SpheresOptions, spheres
 
 TRUTH_KPA = {"core": 60.0, "shell": 30.0}
 CASE = """
+mechanics.law = "linear"  # as this phantom; leave it out for real images
 [images]
 before = "before.nii.gz"
 after = ["after.nii.gz"]
@@ -25,8 +26,6 @@ shell = { label = 2, role = "estimate" }
 frame = { label = 3, role = "driver" }
 surroundings = { label = "remaining", role = "known", youngs_modulus_kpa = 10.0 }
 
-[mechanics]
-law = "linear"  # as this phantom; leave it out for real images
 [mesh]
 edge_length_mm = 8.0
 [driver]

@@ -53,9 +53,9 @@ class Balls:
     `edge_mm` is the edge of the mesh that inverts, `truth_edge_mm` that of the finer one which makes the data.
     """
 
-    radii_mm: tuple[float, float, float] = (12.0, 24.0, 36.0)
-    edge_mm: float = 6.0
-    truth_edge_mm: float = 4.8
+    radii_mm: tuple[float, float, float] = (16.0, 32.0, 48.0)
+    edge_mm: float = 8.0
+    truth_edge_mm: float = 6.4
     voxel_mm: float = 1.0
 
 

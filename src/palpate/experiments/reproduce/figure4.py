@@ -59,7 +59,7 @@ NOTES = (
 class Figure4Settings:
     """The balls, the moduli (kPa) of each line, and the deformations of the body that is deformed most."""
 
-    balls: Balls = field(default_factory=lambda: Balls(edge_mm=10.0))
+    balls: Balls = field(default_factory=lambda: Balls(edge_mm=13.0))
     moduli_kpa: tuple[Moduli, ...] = ((100.0, 100.0, 100.0), (50.0, 100.0, 150.0), (150.0, 100.0, 50.0))
     deformations: tuple[float, ...] = (0.01, 0.05, 0.10, 0.15, 0.20, 0.30)
 

@@ -67,7 +67,7 @@ class Table1Settings:
 
     balls: Balls = field(default_factory=Balls)
     equal_kpa: tuple[float, ...] = tuple(PAPER_TABLE1)
-    different_kpa: tuple[Moduli, ...] = ((50.0, 100.0, 150.0), (150.0, 100.0, 50.0), (70.0, 130.0, 90.0))
+    different_kpa: tuple[Moduli, ...] = ((50.0, 100.0, 150.0), (150.0, 100.0, 50.0))
     seed: int = 1
 
     @property
