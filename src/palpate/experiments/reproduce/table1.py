@@ -190,7 +190,7 @@ class _Case:
         model = _held_as(_pulled_by(own, self.stress_kpa()), truth.space, u)
         targets = [paper_target(truth.space, u, observed_surface(own.space, body)) for body in range(len(BODIES))]
         fit = paper_estimate(model, targets, moduli=0.5 * np.array(self.moduli), columns=np.arange(len(BODIES)))
-        values = fit.moduli if fit.converged else [None] * len(BODIES)
+        values = fit.moduli.tolist() if fit.converged else [None] * len(BODIES)
         return {
             body: Entry.of(value, self.truth[body], iterations=fit.iterations)
             for body, value in zip(BODIES, values, strict=True)

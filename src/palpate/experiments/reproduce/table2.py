@@ -210,7 +210,7 @@ class _Bench:
         targets = [paper_target(truth, u, observed_surface(own.space, organ)) for organ in organs]
         columns = np.array([own.names.index(organ) for organ in ORGANS])
         fit = paper_estimate(own, targets, moduli=moduli_of(own, 0.5 * kpa), columns=columns)
-        values = fit.moduli if fit.converged else [None] * len(ORGANS)
+        values = fit.moduli.tolist() if fit.converged else [None] * len(ORGANS)
         return {
             organ: Entry.of(value, kpa, iterations=fit.iterations) for organ, value in zip(ORGANS, values, strict=True)
         }
