@@ -57,14 +57,14 @@ class Row:
     tumour: bool = False
     data: str = "voxels"
     edge_mm: float = 4.0
+    truth_edge_mm: float = 2.7
     draws: int = 1  # of the noise, for each pelvis
     law: str = "linear"  # of the truth and of the estimate
     poisson_ratio: float | None = None  # None: 0.40 to 0.45 at random
 
 
 ROWS = {
-    "same-mesh": Row(2, data="same mesh"),
-    "other-mesh-fine": Row(2, data="surfaces", edge_mm=2.7),
+    "same-mesh": Row(2, data="same mesh", truth_edge_mm=4.0),
     "other-mesh": Row(4, data="surfaces"),
     "clean": Row(8),
     "clean-3mm": Row(4, filling_mm=3.0),
@@ -131,6 +131,7 @@ def _truth(row: Row, seed: int, draw: int, truths: Truths) -> tuple[Scene, Pelvi
     if row.law != "linear" and row.filling_mm is not None:
         filling = row.filling_mm
     given = {"tumour": row.tumour, "law": row.law, "poisson_ratio": row.poisson_ratio}
+    given["truth_edge_mm"] = row.truth_edge_mm
     key = (*given.values(), filling)
     if key not in truths:
         truths.clear()  # a truth is large

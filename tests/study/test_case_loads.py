@@ -77,7 +77,6 @@ def test_a_known_load_gives_kilopascals_without_a_known_tissue(result):
     for estimated, truth in zip(result.estimation.estimates, (8.0, 16.0), strict=True):
         assert estimated.interval95[0] < truth < estimated.interval95[1]
 
-
     gland = result.estimation.estimates[0]
     assert gland.value == pytest.approx(8.0, rel=0.4)
     assert gland.verdict == "identified"
