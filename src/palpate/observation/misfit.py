@@ -76,7 +76,7 @@ def surface_residuals(
 
 
 def image_point_use(target: SurfaceTarget, displacement: NDArray[np.float64]) -> ImagePointUse:
-    """Use of the image points that face the observed part of the deformed surface, and not its rim."""
+    """Use of the image points at a displacement (n_vertices, 3) mm: those that face the observed part, not its rim."""
     closest = _closest(target, displacement, target.image_points)
     surface = target.surface
     at_rim = np.any((closest.barycentric < ON_EDGE) & surface.rim[closest.triangle], axis=1)

@@ -230,9 +230,8 @@ class _Imaged:
 
     @cached_property
     def body(self) -> Body:
-        """Meshed from the labels at rest, in the truth's own domain."""
-        fine = self.bench.fine
-        states = imaged_states(fine.space, np.zeros_like(fine.space.points), self.grid)
+        """Meshed from the labels at rest, in the truth's own domain; its later state is that of the middle modulus."""
+        states = imaged_states(self.bench.fine.space, self.bench.truth(self.bench.middle_kpa), self.grid)
         width = smoothing_width(self.grid)
         anatomy = anatomy_of(states.before, box=self.bench.pelvis.box, smoothing_mm=width)
         mesh = tetrahedralise(anatomy, edge_length_mm=self.bench.settings.edge_mm)
@@ -251,20 +250,20 @@ class _Imaged:
         )
 
     @cached_property
-    def rest(self) -> InverseProblem:
-        """The inverse problem of the rest state with itself: its models serve all rows."""
+    def problem(self) -> InverseProblem:
+        """The inverse problem of the middle modulus: its models and surfaces serve all rows."""
         return inverse_problem(self.body, self.case, progress=self.bench.progress)
 
     @cached_property
     def surrogates(self) -> tuple[Surrogate, ...]:
-        return tuple(self.bench.surrogate_of(model) for model in self.rest.models)
+        return tuple(self.bench.surrogate_of(model) for model in self.problem.models)
 
     def voxels(self, kpa: float) -> dict[str, Entry]:
         fine = self.bench.fine
         states = imaged_states(fine.space, self.bench.truth(kpa), self.grid)
         body = replace(self.body, states=states)
-        surfaces = tuple(target.surface for target in self.rest.targets[0])
-        problem = replace(self.rest, targets=(voxel_targets(body, surfaces),))
+        surfaces = tuple(target.surface for target in self.problem.targets[0])
+        problem = replace(self.problem, targets=(voxel_targets(body, surfaces),))
         truth = dict.fromkeys(ORGANS, kpa)
         settings = from_half(problem.modulus_map, truth)
         inversion = invert_with(problem, settings, self.surrogates, progress=self.bench.progress)
