@@ -27,7 +27,7 @@ def sphere(n, radius):
 def surface(places, normals, jacobian, *, precision, state=0):
     n = len(places)
     weights = np.full(n, 1.0 / n)
-    residuals = SurfaceResiduals(np.zeros(n), weights, np.zeros(n), places, normals, None, None)
+    residuals = SurfaceResiduals(np.zeros(n), weights, places, normals, None, None)
     return Linearisation(residuals, jacobian, weights, precision, SimpleNamespace(area=np.ones(n)), None, state)
 
 

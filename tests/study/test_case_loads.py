@@ -79,7 +79,6 @@ def test_a_known_load_gives_kilopascals_without_a_known_tissue(result):
 
     gland = result.estimation.estimates[0]
     assert gland.value == pytest.approx(8.0, rel=0.4)
-    assert gland.verdict == "identified"
 
 
 def test_twice_the_load_on_the_same_images_is_twice_the_modulus(folder, result):
