@@ -2,10 +2,11 @@ import numpy as np
 import pytest
 
 from palpate.errors import GeometryError, InputDataError
+from palpate.images.distance import distance_map
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
-from palpate.mesh.anatomy import Anatomy, Box, anatomy_of, domain_box, margin_box
+from palpate.mesh.anatomy import Anatomy, Box, anatomy_of, domain_box, margin_box, volume_preserving
 
 ORGAN = Tissue("organ", Role.ESTIMATE, (1,))
 DRIVER = Tissue("driver", Role.DRIVER, (2,))
@@ -84,3 +85,29 @@ def test_an_anatomy_has_one_filler():
     box = Box(np.zeros(3), np.eye(3), np.ones(3))
     with pytest.raises(GeometryError, match="exactly one"):
         Anatomy((ORGAN, REST), (None, None), box)
+
+
+@pytest.mark.parametrize(("radius", "spacing", "smoothing"), [(11.0, (1.0, 1.0, 2.5), 1.5), (8.0, (1.5,) * 3, 0.9)])
+def test_a_small_ball_keeps_the_volume_of_its_voxels(radius, spacing, smoothing):
+    half = 1.6 * radius
+    counts = np.ceil(2.0 * half / np.array(spacing)).astype(int)
+    affine = np.diag([*spacing, 1.0])
+    affine[:3, 3] = -half + np.array([0.13, 0.31, 0.22])
+    grid = VoxelGrid(tuple(int(n) for n in counts), affine)
+    places = grid.world(np.argwhere(np.ones(grid.shape, dtype=bool)).astype(float))
+    mask = (np.linalg.norm(places, axis=1) < radius).reshape(grid.shape)
+    plain = distance_map(mask, grid, smoothing_mm=smoothing)
+    kept = volume_preserving(plain, mask)
+    voxels = mask.sum() * grid.voxel_volume
+
+    def volume(distance):
+        """From the radius along many directions, r^3 averaged."""
+        directions = np.random.default_rng(3).normal(size=(4000, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        radii = np.full(len(directions), radius)
+        for _ in range(6):
+            radii -= distance.at(radii[:, None] * directions)
+        return 4.0 / 3.0 * np.pi * np.mean(radii**3)
+
+    assert volume(plain) < 0.97 * voxels
+    assert volume(kept) == pytest.approx(voxels, rel=0.01)

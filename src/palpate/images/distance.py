@@ -49,6 +49,13 @@ class DistanceMap:
         ]
         return np.asarray(np.stack(by_index, axis=1) @ np.linalg.inv(self.grid.affine[:3, :3]))
 
+    def node_values(self) -> NDArray[np.float64]:
+        """Signed distance (nx, ny, nz) mm at the voxels' centres."""
+        values = self.coefficients
+        for axis in range(3):
+            values = ndimage.convolve1d(values, np.array([1.0, 4.0, 1.0]) / 6.0, axis=axis, mode="mirror")
+        return np.asarray(values + self.bias)
+
     def shifted(self, bias: float) -> DistanceMap:
         """The same map with `bias` (mm) added everywhere."""
         return replace(self, bias=self.bias + bias)

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from palpate.images.distance import DistanceMap
 
@@ -30,7 +29,7 @@ def isosurface_points(distance: DistanceMap, level: float = 0.0) -> IsosurfacePo
     A surface element of normal n is crossed by |n_a| / (h_b h_c) edges of axis a a unit of area, so the weight
     h_b h_c |n_a| makes the sum over all three axes exact: sum_a n_a^2 = 1.
     """
-    values = _node_values(distance) - level
+    values = distance.node_values() - level
     found = [_crossings(values, axis) for axis in range(3)]
     axis = np.concatenate([np.full(len(index), a) for a, index in enumerate(found)])
     index = np.concatenate(found)
@@ -41,13 +40,6 @@ def isosurface_points(distance: DistanceMap, level: float = 0.0) -> IsosurfacePo
     directions = (distance.grid.affine[:3, :3] / distance.grid.spacing).T[axis[kept]]
     face = distance.grid.voxel_volume / distance.grid.spacing[axis[kept]]
     return IsosurfacePoints(places, normals, face * np.abs(np.einsum("na,na->n", normals, directions)))
-
-
-def _node_values(distance: DistanceMap) -> NDArray[np.float64]:
-    values = distance.coefficients
-    for axis in range(3):
-        values = ndimage.convolve1d(values, np.array([1.0, 4.0, 1.0]) / 6.0, axis=axis, mode="mirror")
-    return np.asarray(values + distance.bias)
 
 
 def _crossings(values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
