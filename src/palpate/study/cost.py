@@ -30,6 +30,8 @@ FIXED_S = 14.0  # start, intervals, report
 SECONDS_AN_UNKNOWN = 4.5e-4  # with 90 modes a driver, for each later image
 SECONDS_A_CUT = 1.4e-4  # of meshing, for each tetrahedron and each tissue that is cut out
 SUPERLU = (4.5, 26_000.0, 1.7)  # seconds more than with PARDISO at so many unknowns, and their power
+FINITE_STRAIN = 2.8  # times the linear estimate's time: the continuation's rounds
+FINITE_STRAIN_GB = 1.6  # times its memory: an expansion and a tangent factorisation at once
 PARALLEL_SHARE = 0.3  # of the time, that more processors shorten
 FIXED_GB = 0.75
 GB_AN_UNKNOWN = 3.1e-5  # with 90 modes
@@ -64,9 +66,11 @@ def expected_cost(case: Case, before: Segmentation, after: tuple[Segmentation, .
     modes = (drivers * case.driver.modes + OVERHEAD_MODES) / (USUAL_MODES + OVERHEAD_MODES)
     work = unknowns * modes * max(len(after), 1)
     slower = 0.0 if solver == "pardiso" else 1.0
-    seconds = SECONDS_AN_UNKNOWN * work + SECONDS_A_CUT * tets * (len(before.tissues) - 1)
-    seconds += slower * SUPERLU[0] * (unknowns / SUPERLU[1]) ** SUPERLU[2]
+    finite = case.mechanics.law != "linear"
+    solving = SECONDS_AN_UNKNOWN * work + slower * SUPERLU[0] * (unknowns / SUPERLU[1]) ** SUPERLU[2]
+    seconds = (FINITE_STRAIN if finite else 1.0) * solving + SECONDS_A_CUT * tets * (len(before.tissues) - 1)
     gigabytes = GB_AN_UNKNOWN * work + slower * SUPERLU_GB_AN_UNKNOWN * unknowns
+    gigabytes *= FINITE_STRAIN_GB if finite else 1.0
     count = processors()
     shorter = 1.0 - PARALLEL_SHARE + PARALLEL_SHARE / count
     return ExpectedCost(
