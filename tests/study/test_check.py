@@ -69,9 +69,9 @@ def test_the_limit_of_the_linear_algebra_counts_as_processors(monkeypatch):
     assert cost.processors() == 1
 
 
-@pytest.mark.parametrize(("free", "code"), [(1000.0, None), (1.0, 0), (0.1, 6)])
-def test_memory_that_will_not_do_is_told_before(case_result, monkeypatch, free, code):
+@pytest.mark.parametrize(("share", "code"), [(100.0, None), (1.0, 0), (0.1, 6)])
+def test_memory_that_will_not_do_is_told_before(case_result, monkeypatch, share, code):
     needed = expected_cost(case_result.case, case_result.before, case_result.after, n_pairs=1)
-    monkeypatch.setattr(check, "free_memory_gb", lambda: free)
+    monkeypatch.setattr(check, "free_memory_gb", lambda: share * needed.memory_gb)
     found = [problem.exit_code for problem in check.memory_problems(needed)]
     assert found == ([] if code is None else [code])
