@@ -21,6 +21,7 @@ from palpate.mechanics.reduced import ReducedModel
 __all__ = ["invert", "invert_with"]
 
 ROUNDS = 9
+REFINEMENTS = 2  # of the drivers' walls; what is left then is no motion that they could follow
 EXACT = 3e-3  # standard deviations of a residual, per mm of motion: a smaller model error needs no further snapshot
 POLISH = 1e-5  # decrement of the reported minimum
 
@@ -62,7 +63,7 @@ def invert_with(
     minima = _from_starts(objective, settings, progress)
     chosen = best_of(minima)
     best = minima[chosen]
-    settled = False
+    settled, refinements = False, 0
     for round_ in range(ROUNDS):
         progress(f"round {round_ + 1}: {words(problem, best)}; the full model is solved there")
         law = settings.law or residual_law(problem, best.evaluation)
@@ -71,10 +72,11 @@ def invert_with(
         before, best = best, continued(objective, best, settings)
         settled = settled_between(before, best, objective.n_parameters)
         if settled:
-            finer = _refined(problem, surrogates, best, law)
-            if round_ == ROUNDS - 1 or all(a is b for a, b in zip(finer, surrogates, strict=True)):
+            done = refinements == REFINEMENTS or round_ == ROUNDS - 1
+            finer = surrogates if done else _refined(problem, surrogates, best, law)
+            if all(a is b for a, b in zip(finer, surrogates, strict=True)):
                 break
-            surrogates, settled = finer, False
+            surrogates, settled, refinements = finer, False, refinements + 1
     best = continued(objective, best, settings, tolerance=POLISH)
     driven = [with_driver(m, best, objective.n_parameters) for m in minima]
     minima = tuple(best if i == chosen else continued(objective, m, settings) for i, m in enumerate(driven))
