@@ -131,7 +131,8 @@ def _followed(
         if settled:
             break
     found = minimised(place.objective, place.minimum.unknowns, settings, tolerance=POLISH)
-    end = _joined(place.minimum, found)
+    # a polish that finds no better point leaves the last round's, which is an equilibrium with its own outcome
+    end = _joined(place.minimum, found) if found.outcome.converged else place.minimum
     return replace(place, minimum=end if place.settled else replace(end, outcome=Outcome.STEPS))
 
 
