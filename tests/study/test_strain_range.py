@@ -72,4 +72,5 @@ def test_every_pair_of_images_meets_its_own_mesh_and_displacements(case_result):
     (remark,) = strain_warnings(case, (body, half), estimation)
     assert "100.0 %" in remark.message
     assert "99th percentile 17 %" in remark.message  # (1.16^2 - 1) / 2
-    assert strain_warnings(r.case, (body, half), estimation) == ()
+    finite = dataclasses.replace(r.case, mechanics=Mechanics(law="neo-hookean"))
+    assert strain_warnings(finite, (body, half), estimation) == ()
