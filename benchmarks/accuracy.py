@@ -71,9 +71,11 @@ ROWS = {
     "noise": Row(8, spacing_mm=(1.0, 1.0, 2.5), noise=NOISE, edge_mm=6.0, draws=3),
     "tumour": Row(3, tumour=True),
     "nu-0.49": Row(4, poisson_ratio=0.49),
-    "finite-clean": Row(6, law="neo-hookean", edge_mm=5.0),
-    "finite-clean-3mm": Row(3, law="neo-hookean", edge_mm=5.0, filling_mm=3.0),
-    "finite-noise": Row(6, law="neo-hookean", edge_mm=6.0, spacing_mm=(1.0, 1.0, 2.5), noise=NOISE, draws=2),
+    "finite-clean": Row(6, law="neo-hookean", edge_mm=5.0, truth_edge_mm=3.4),
+    "finite-clean-3mm": Row(3, law="neo-hookean", edge_mm=5.0, truth_edge_mm=3.4, filling_mm=3.0),
+    "finite-noise": Row(
+        6, law="neo-hookean", edge_mm=6.0, truth_edge_mm=3.4, spacing_mm=(1.0, 1.0, 2.5), noise=NOISE, draws=2
+    ),
 }
 FAR_OFF = np.log([3.0, 1.0 / 3.0, 3.0])  # from the linear estimate: another start of the continuation
 
@@ -235,7 +237,8 @@ def _from_surfaces(
     observed = [i for i, t in enumerate(scene.tissues) if t.role in (Role.ESTIMATE, Role.DRIVER)]
     targets = tuple(exact_target(scene, observed_surface(space, i)) for i in observed)
     estimated = frozenset(t.name for t in scene.tissues if t.role is Role.ESTIMATE)
-    return space, InverseProblem((model,), (targets,), modulus_map(scene.tissues, model.regions), estimated), ()
+    mapping = modulus_map(scene.tissues, model.regions)
+    return space, InverseProblem((model,), (targets,), mapping, estimated, walls=(motion.walls,)), ()
 
 
 def _errors(inversion: Inversion, scene: Scene) -> dict[str, object]:

@@ -28,8 +28,6 @@ surroundings = { label = "remaining", role = "known", youngs_modulus_kpa = 10.0 
 
 [mesh]
 edge_length_mm = 8.0
-[driver]
-modes = 30
 [estimate]
 start_ratios = [1.0, 4.0]
 """

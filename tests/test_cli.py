@@ -84,6 +84,33 @@ def test_an_estimate_writes_all_its_files(case_file, tmp_path, capfd):
     assert "working" in (tmp_path / "out" / "log.txt").read_text()
 
 
+def test_files_of_an_earlier_run_are_named(case_file, tmp_path, runner):
+    runner()
+    (tmp_path / "mesh_7.vtu").write_text("of a run with seven pairs")
+    assert main(["estimate", str(case_file), "--output", str(tmp_path), "--quiet"]) == 0
+    (warning,) = [w for w in json.loads((tmp_path / "result.json").read_text())["warnings"] if w["code"] != "example"]
+    assert warning["code"] == "earlier-files"
+    assert "mesh_7.vtu in the output folder" in warning["message"]
+
+
+def test_open_ends_and_ratios_stand_in_the_table(case_file, tmp_path, runner, case_result, capfd):
+    first, second = case_result.estimation.estimates
+    open_end = dataclasses.replace(first, interval95=(47.1, None))
+    ratio = dataclasses.replace(second, value=None, interval95=None, ratio=3.12, ratio_interval95=(2.0, 5.0))
+    estimation = dataclasses.replace(case_result.estimation, estimates=(open_end, ratio))
+    runner(estimate=lambda *_, **__: dataclasses.replace(case_result, estimation=estimation))
+    assert main(["estimate", str(case_file), "--output", str(tmp_path)]) == 0
+    out = capfd.readouterr().out
+    assert "> 47.1 kPa" in out
+    assert "2.00 to 5.00 (ratio)" in out
+
+
+def test_a_label_table_beside_a_case_is_refused_not_ignored(case_file, tmp_path, capfd):
+    arguments = ["estimate", str(case_file), "--labels", "names.json", "--output", str(tmp_path / "out")]
+    assert main(arguments) == 2
+    assert "--labels goes with images" in capfd.readouterr().err
+
+
 def test_with_json_stdout_is_result_json_and_nothing_else(case_file, tmp_path, runner, capfd, case_result):
     def noisy(*_, **__):
         os.write(1, b"a C library talks\n")

@@ -159,3 +159,16 @@ def test_finer_voxels_leave_less_to_the_place_of_the_grid(twins, twin, inversion
 def test_the_same_seed_gives_the_same_statement(inversion, settings, observed, estimation):
     again = conclude(inversion, settings, observed, truth={"gland": 30.0}, seed=1)
     assert np.array_equal(again.covariance, estimation.covariance)
+
+
+@pytest.mark.parametrize(("worse_by", "counts"), [(0.01, True), (0.5, False)])
+def test_another_minimum_that_fits_as_well_is_within_the_interval(inversion, settings, observed, worse_by, counts):
+    best = inversion.minimum
+    far = best.unknowns.copy()
+    far[0] += 1.0
+    value = (1.0 + worse_by) * best.evaluation.value
+    other = replace(best, unknowns=far, evaluation=replace(best.evaluation, value=value))
+    both = replace(inversion, minima=(best, other), groups=(0, 1), best=0)
+    low, high = conclude(both, settings, observed, truth={}, seed=1).estimates[0].interval95
+    assert low < 30.0
+    assert (high > 30.0 * np.e) == counts

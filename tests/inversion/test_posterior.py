@@ -34,10 +34,11 @@ def surface(places, normals, jacobian, *, precision, state=0):
 def evaluation(surfaces, n_parameters):
     """The evaluation of surfaces with a prior of unit variance on all unknowns after the first ones."""
     n = surfaces[0].jacobian.shape[1]
-    matrix = np.diag(np.where(np.arange(n) < n_parameters, 0.0, 1.0))
+    prior = np.diag(np.where(np.arange(n) < n_parameters, 0.0, 1.0))
+    matrix = prior.copy()
     for line in surfaces:
         matrix += line.precision * line.jacobian.T @ (line.weights[:, None] * line.jacobian)
-    return Evaluation(0.0, 0.0, np.zeros(n), np.zeros(n), matrix, tuple(surfaces))
+    return Evaluation(0.0, 0.0, np.zeros(n), np.zeros(n), matrix, tuple(surfaces), prior)
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.inversion.verdict import log_interval, verdict
+from palpate.inversion.verdict import hull, log_interval, verdict
 
 
 def test_the_interval_is_symmetric_in_the_logarithm():
@@ -50,3 +50,9 @@ def test_an_estimate_at_its_bound_is_not_identified_however_narrow():
 def test_every_verdict_states_its_figure():
     for interval in ((1.0, 1.5), (1.0, 4.0), (1.0, 20.0)):
         assert f"{interval[1]:.1f}" in verdict(interval, at_bound=False, absolute=True)[1]
+
+
+def test_the_hull_holds_every_interval_and_an_open_end_stays_open():
+    assert hull([(2.0, 4.0), (1.0, 3.0)]) == (1.0, 4.0)
+    assert hull([(2.0, 4.0), (None, 3.0)]) == (None, 4.0)
+    assert hull([(2.0, None)]) == (2.0, None)

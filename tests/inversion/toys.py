@@ -25,7 +25,7 @@ class Quadratic:
     def __call__(self, unknowns):
         slope = self.curvature @ (unknowns - self.centre)
         value = self.value(unknowns)
-        return Evaluation(value, value, slope, self.pull * slope, self.curvature.copy(), ())
+        return Evaluation(value, value, slope, self.pull * slope, self.curvature.copy(), (), 0.0 * self.curvature)
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,8 @@ class Saturating:
     def __call__(self, unknowns):
         slope = np.exp(unknowns)
         score = slope * (slope - np.exp(self.truth))
-        return Evaluation(self.value(unknowns), self.value(unknowns), score, score, np.diag(slope**2), ())
+        matrix = np.diag(slope**2)
+        return Evaluation(self.value(unknowns), self.value(unknowns), score, score, matrix, (), 0.0 * matrix)
 
 
 def coupled(rng, n=5, centre=None):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import shutil
 from pathlib import Path
@@ -77,6 +78,12 @@ def alive(page, section):
 
 def pixels(locator):
     return mpimg.imread(io.BytesIO(locator.screenshot()))[..., :3]
+
+
+def drawn(canvas):
+    """The canvas's own pixels, wherever on the page it stands."""
+    data = canvas.evaluate("canvas => canvas.toDataURL('image/png')")
+    return mpimg.imread(io.BytesIO(base64.b64decode(data.split(",")[1])))[..., :3]
 
 
 def changed(before, after):
@@ -165,6 +172,25 @@ def test_layers_and_states_can_be_told_apart(opened):
     assert changed(both, before) > 0.005
     figure.locator(".t-model").uncheck()
     assert changed(before, pixels(canvas)) > 0.002
+
+
+def test_the_slices_of_a_second_pair_lie_in_its_own_body(browser, two_pairs, tmp_path):
+    complaints = []
+    page = browser.new_page()
+    page.on("console", lambda message: complaints.append(message.text))
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.goto(write_case_report(two_pairs, tmp_path).as_uri())
+    found = page.locator("section.slices").nth(1)
+    found.scroll_into_view_if_needed()
+    page.wait_for_selector("section.slices[data-later='1'][data-state=live]")
+    axial = [float(page.locator("section.slices input[type=range]").nth(3 * k).input_value()) for k in (0, 1)]
+    assert axial[1] - axial[0] == pytest.approx(50.0, abs=1.0)
+    first = page.locator("section.slices").first
+    coronal = [drawn(section.locator("canvas").nth(1)) for section in (first, found)]
+    assert changed(*coronal) < 0.03  # the same body: nothing but the millimetres in the corner may differ
+    assert changed(coronal[1], np.zeros_like(coronal[1])) > 0.2
+    page.close()
+    assert not complaints
 
 
 def test_flicker_shows_both_states_in_turn(opened):

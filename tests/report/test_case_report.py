@@ -19,6 +19,7 @@ from palpate.inversion.estimation import Remark
 from palpate.report import collect as collect_module
 from palpate.report import page as page_module
 from palpate.report.case_report import rewrite_report, write_case_report, write_failure_report
+from palpate.report.pairs import drawn_images
 from palpate.study.case import Mechanics
 
 EVIL = '</script><img src=x onerror=alert(1)>$\\frac{"&'
@@ -109,6 +110,42 @@ def test_every_later_image_has_its_own_figures(case_result, tmp_path):
         assert title in page
     names = [attributes["id"] for _, attributes in tags(page) if "id" in attributes]
     assert len(names) == len(set(names))
+
+
+def test_every_pair_has_its_own_figures_from_its_own_images(two_pairs, tmp_path):
+    page = write_case_report(two_pairs, tmp_path).read_text()
+    assert "Slices: one/before.nii.gz, first.nii.gz, model" in page
+    assert "Slices: two/before.nii.gz, second.nii.gz, model" in page
+    assert page.count("distance to first.nii.gz") == page.count("distance to second.nii.gz") == 1
+    assert "the mesh of the first pair" in page
+    facts = json.loads(re.search(r'id="facts">(.*?)</script>', page, flags=re.DOTALL).group(1))
+    assert [later["reference"] for later in facts["later"]] == [0, 1]
+    lows = [np.array(reference["box"]["low"]) for reference in facts["references"]]
+    np.testing.assert_allclose(lows[1] - lows[0], [0.0, 0.0, 50.0], atol=1e-9)
+    assert "could not be" not in page[: page.index("<script")]
+
+
+def test_of_many_later_images_the_first_of_each_pair_is_drawn():
+    assert drawn_images([3, 1, 2], 4) == ((0, 0), (0, 1), (1, 0), (2, 0))
+    assert drawn_images([2], 4) == ((0, 0), (0, 1))
+    assert drawn_images([1, 1, 1, 1, 1], 4) == ((0, 0), (1, 0), (2, 0), (3, 0))
+
+
+def test_what_is_not_drawn_is_told_of(case_result, tmp_path, monkeypatch):
+    fits = 2 * case_result.estimation.fits
+    images = dataclasses.replace(case_result.case.images, after=(Path("second.nii.gz"), Path("third.nii.gz")))
+    result = dataclasses.replace(
+        case_result,
+        case=dataclasses.replace(case_result.case, images=images),
+        after=2 * case_result.after,
+        estimation=dataclasses.replace(
+            case_result.estimation, fits=fits, displacements=2 * case_result.estimation.displacements
+        ),
+    )
+    monkeypatch.setattr(collect_module, "MOST_LATER", 1)
+    page = write_case_report(result, tmp_path).read_text()
+    assert "1 of 2 later images are drawn" in page
+    assert "Slices: before, third.nii.gz" not in page
 
 
 def with_name(result, name):
@@ -226,6 +263,7 @@ def test_what_did_not_converge_shows_no_number(case_result, tmp_path):
     assert "it stopped early" in page
     assert not any(number in table for number in ("58.9", "31.2", "5.89", "3.12"))
     assert "not identified" in table
+    assert "There is no result; these were noticed" in page
     assert page.count("is drawn where it stopped, and is no result") == 2
 
 
@@ -251,6 +289,7 @@ def test_a_grey_image_that_cannot_be_read_does_not_stop_the_report(case_result, 
     result = dataclasses.replace(case_result, case=dataclasses.replace(case_result.case, images=images))
     page = write_case_report(result, tmp_path).read_text()
     assert '"kind": "labels"' in page
+    assert "The labels stand in place of the grey image: " in page
     assert "could not be" not in page[: page.index("<script")]
 
 

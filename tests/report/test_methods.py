@@ -7,7 +7,7 @@ import re
 
 from palpate.report.collect import collect
 from palpate.report.methods import methods_text
-from palpate.study.case import Mechanics
+from palpate.study.case import CaseLoad, Mechanics
 
 
 def test_citations_and_sources_belong_together(case_result):
@@ -42,6 +42,21 @@ def test_a_known_load_sets_the_scale(case_result):
     assert "The scale was set by the known loads" in text
     ratios = " ".join(methods_text(dataclasses.replace(data, tissues=unknown, unit="ratio")).paragraphs)
     assert "only ratios were found" in ratios
+
+
+def test_known_loads_are_told_in_words_and_in_numbers(case_result):
+    loads = (
+        CaseLoad("gravity", acceleration_m_s2=(3.0, 0.0, -9.81)),
+        CaseLoad("pressure", surface="air", pressure_kpa=1.5),
+    )
+    data = collect(dataclasses.replace(case_result, case=dataclasses.replace(case_result.case, loads=loads)))
+    text = " ".join(methods_text(data).paragraphs)
+    assert "gravity (3, 0, -9.81) m/s^2; following pressure 1.5 kPa on air" in text
+    assert ("starts", "0.5, 2, 8 (ratios)") in data.settings
+
+
+def test_a_further_pair_has_a_mesh_that_is_told_of(two_pairs):
+    assert "Each of 2 pairs of images had a mesh of its own" in " ".join(methods_text(collect(two_pairs)).paragraphs)
 
 
 def test_another_optimiser_is_another_source(case_result):

@@ -34,7 +34,7 @@ def array(entry, block):
 
 def test_points_keep_their_place_to_a_hundredth_of_a_millimetre(data, unpacked):
     facts, block = unpacked
-    for packed, surface in zip(facts["surfaces"], data.surfaces, strict=True):
+    for packed, surface in zip(facts["references"][0]["surfaces"], data.references[0].surfaces, strict=True):
         points = facts["low"] + facts["step"] * array(packed["points"], block).reshape(-1, 3)
         np.testing.assert_allclose(points, surface.points, atol=0.01)
         np.testing.assert_array_equal(array(packed["triangles"], block).reshape(-1, 3), surface.triangles)
@@ -44,8 +44,8 @@ def test_mesh_and_volume_are_whole(data, unpacked):
     facts, block = unpacked
     np.testing.assert_array_equal(array(facts["mesh"]["tets"], block).reshape(-1, 4), data.mesh.tets)
     np.testing.assert_array_equal(array(facts["mesh"]["region"], block), data.mesh.region)
-    volume = facts["background"]
-    np.testing.assert_array_equal(array(volume["values"], block).reshape(volume["shape"]), data.background.values)
+    volume, expected = facts["references"][0]["background"], data.references[0].background.values
+    np.testing.assert_array_equal(array(volume["values"], block).reshape(volume["shape"]), expected)
 
 
 def test_strains_keep_their_value_to_a_fifth_of_a_per_cent(case_result, data, unpacked):

@@ -64,6 +64,14 @@ def test_a_wall_that_stands_still_is_below_the_noise():
     assert "after[2]" in finding.message
 
 
+def test_a_load_moves_organs_so_that_nothing_else_has_to():
+    before, after = scene(ORGAN, TUBE), scene((0, (7, 17), (6, 16), (6, 16)), TUBE)
+    assert [finding.code for finding in motion_findings(before, after, "after")] == ["motion-below-noise"]
+    assert motion_findings(before, after, "after", loaded=True) == ()
+    (finding,) = motion_findings(before, before, "after", loaded=True)
+    assert "organ 0 mm" in finding.message
+
+
 def test_sides_that_are_exchanged_are_named():
     bones = (Tissue("left hip", Role.RIGID, (1,)), Tissue("right hip", Role.RIGID, (2,)), TISSUES[2])
     apart = [((2, 6), (18, 22)), ((18, 22), (2, 6))]  # +x is the patient's right

@@ -37,20 +37,8 @@ role = "driver"
 label = "remaining"
 role = "known"
 youngs_modulus_kpa = 10.0
-
-[mechanics]
-law = "linear"
-element = "P1"
-
-[mesh]
-edge_length_mm = 8.0
-
-[driver]
-modes = 12
-
-[estimate]
-start_ratios = [3.0]
 """
+COARSE = ["mesh.edge_length_mm=8", "mechanics.element=P1", "driver.modes=12", "estimate.start_ratios=[3.0]"]
 PAIR = """
 [[pairs]]
 before = "other/before_3.nii.gz"
@@ -74,8 +62,13 @@ def inputs(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def outputs(inputs, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("outputs")
-    assert main(["estimate", str(inputs / "case.toml"), "--output", str(folder), "--quiet"]) == 0
+    assert run("estimate", inputs / "case.toml", folder) == 0
     return folder
+
+
+def run(command: str, case: Path, output: Path) -> int:
+    settings = [word for setting in COARSE for word in ("--set", setting)]
+    return main([command, str(case), "--output", str(output), "--quiet", *settings])
 
 
 def test_both_pairs_have_their_fit_mesh_and_digest_under_one_set_of_moduli(outputs):
@@ -91,6 +84,9 @@ def test_both_pairs_have_their_fit_mesh_and_digest_under_one_set_of_moduli(outpu
     assert result["pairs"][0]["mesh"]["tets"] != result["mesh"]["tets"]
     assert {"before", "after[0]", "pairs[0].before", "pairs[0].after[0]"} == set(result["inputs"])
     assert set(result["files"]) == {"mesh.vtu", "mesh_2.vtu", "stiffness.nii.gz", "labels.csv"}
+    page = (outputs / "report.html").read_text()
+    assert "Slices: before_2.nii.gz" in page
+    assert "Slices: before_3.nii.gz" in page
 
 
 def test_findings_on_a_further_pair_name_it(inputs):
@@ -109,7 +105,7 @@ def test_pairs_without_images_are_refused(tmp_path):
 def test_a_filling_needs_no_later_image(inputs, tmp_path):
     case = inputs / "filling.toml"
     case.write_text(CASE.replace('after = ["after.nii.gz"]\n', "") + "[motion]\nfilling_mm = 1.0\n")
-    assert main(["simulate", str(case), "--output", str(tmp_path), "--quiet"]) == 0
+    assert run("simulate", case, tmp_path) == 0
     moved = json.loads((tmp_path / "simulation.json").read_text())["largest_displacement_mm"]
     assert moved == pytest.approx(1.0, rel=0.5)
 
@@ -118,6 +114,6 @@ def test_a_filling_needs_no_later_image(inputs, tmp_path):
 def test_an_estimate_without_a_later_image_names_the_key(motion, inputs, tmp_path, capsys):
     case = inputs / "alone.toml"
     case.write_text(CASE.replace('after = ["after.nii.gz"]\n', "") + motion)
-    assert main(["estimate", str(case), "--output", str(tmp_path / "out"), "--quiet"]) == 2
+    assert run("estimate", case, tmp_path / "out") == 2
     assert "the key 'after' is missing in [images]" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

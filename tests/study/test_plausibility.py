@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 
 from palpate.study.case import Case
-from palpate.study.plausibility import PUBLISHED, plausibility_warnings, published_for, unit_warnings
+from palpate.study.plausibility import PUBLISHED, estimate_warnings, plausibility_warnings, published_for, unit_warnings
 
 
 def test_every_published_value_has_range_method_and_source():
@@ -27,6 +27,12 @@ def test_names_find_their_tissue(name, tissue):
 
 def test_an_unknown_tissue_is_not_judged():
     assert plausibility_warnings({"spleen": 1e6}) == ()
+
+
+@pytest.mark.parametrize("name", ["gallbladder", "gall bladder", "Gall-Bladder"])
+def test_a_gallbladder_is_no_bladder(name):
+    assert published_for(name) == ()
+    assert plausibility_warnings({name: 1e6}) == ()
 
 
 def test_a_value_within_the_published_range_is_not_warned_of():
@@ -54,3 +60,11 @@ def test_units_that_slipped_are_noticed(case_result, value, hint):
 
 def test_usual_units_pass(case_result):
     assert unit_warnings(case_result.case) == ()
+
+
+def test_what_did_not_converge_is_not_told_by_a_warning(case_result):
+    assert [warning.code for warning in estimate_warnings(case_result.estimation)] == [
+        "implausible-stiffness",
+        "effective-modulus",
+    ]
+    assert estimate_warnings(dataclasses.replace(case_result.estimation, status="not converged")) == ()

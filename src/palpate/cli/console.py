@@ -16,6 +16,7 @@ from pathlib import Path
 from types import FrameType
 
 from palpate.errors import ConfigurationError, InputDataError, ResourceError
+from palpate.images.named_labels import printable
 
 __all__ = ["LOGGER", "Console", "close_log", "interruptible", "output_folder"]
 
@@ -34,7 +35,7 @@ class Console:
         """Tell what happens now, with the seconds since the start."""
         LOGGER.info(message)
         if not self.quiet:
-            print(f"[{time.monotonic() - self.began:6.1f} s] {message}", file=sys.stderr, flush=True)
+            print(f"[{time.monotonic() - self.began:6.1f} s] {printable(message)}", file=sys.stderr, flush=True)
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from palpate.cli.console import LOGGER, Console, close_log, interruptible, output_folder
-from palpate.cli.outcome import Outcome, printable
+from palpate.cli.outcome import Outcome, printable_lines
 from palpate.cli.parser import make_parser, version
 from palpate.errors import PalpateError, ResourceError
 
@@ -81,12 +81,12 @@ def _failure(kind: str, message: str, exit_code: int) -> Outcome:
 def _speak(outcome: Outcome, arguments: argparse.Namespace) -> None:
     """The last words of a run; with --json, the document is all that stdout ever sees."""
     if outcome.complaint:
-        print(f"palpate: {printable(outcome.complaint)}", file=sys.stderr)
+        print(f"palpate: {printable_lines(outcome.complaint)}", file=sys.stderr)
     if arguments.json:
         text = json.dumps(outcome.document, indent=1, ensure_ascii=False, allow_nan=False)
         print(text.encode("utf-8", errors="replace").decode("utf-8"))
     elif outcome.text and not arguments.quiet:
-        print(printable(outcome.text))
+        print(printable_lines(outcome.text))
 
 
 def _log_hint(arguments: argparse.Namespace) -> str:

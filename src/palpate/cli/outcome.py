@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["Outcome", "columns", "estimates_table", "printable", "warning_lines"]
+from palpate.images.named_labels import printable
+
+__all__ = ["Outcome", "columns", "estimates_table", "printable_lines", "warning_lines"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,16 +23,19 @@ class Outcome:
 
 def estimates_table(document: Mapping[str, Any]) -> str:
     """The estimates of a result as aligned columns, with its note."""
-    from palpate.report.rows import number
+    from palpate.report.rows import interval_text, number
 
     rows = [["tissue", "Young's modulus", "95 % interval", "ratio", "verdict", "truth"]]
     for item in document["estimates"]:
         interval, ratio = item["interval95"], number(item["ratio"])
+        unit = " kPa"
+        if interval is None and item["ratio_interval95"] is not None:
+            interval, unit = item["ratio_interval95"], " (ratio)"
         rows.append(
             [
                 item["tissue"],
                 number(item["value"]) + (" kPa" if item["value"] is not None else ""),
-                f"{number(interval[0])} to {number(interval[1])} kPa" if interval else "–",
+                interval_text(interval) + (unit if interval else ""),
                 f"{ratio} to {item['relative_to']}" if item["ratio"] is not None else "–",
                 item["verdict"],
                 number(item["truth"]),
@@ -54,6 +59,6 @@ def warning_lines(document: Mapping[str, Any]) -> str:
     return "".join(f"warning: {warning['message']}\n" for warning in document["warnings"])
 
 
-def printable(text: str) -> str:
-    """`text` without control characters, which names in files could use to command a terminal."""
-    return "".join(letter if letter.isprintable() or letter == "\n" else "?" for letter in text)
+def printable_lines(text: str) -> str:
+    """`text`, each of its lines made `printable`: names in files could command a terminal."""
+    return "\n".join(printable(line) for line in text.split("\n"))

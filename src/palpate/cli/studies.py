@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Callable
 
 from palpate.cli.outcome import Outcome, columns
 
 __all__ = ["reproduce"]
 
+PROCESSES = 2  # more would need the memory of as many meshes
+
 
 def reproduce(arguments: argparse.Namespace, _: None, progress: Callable[[str], None]) -> Outcome:
     """One of the paper's experiments, our numbers beside its own."""
     from palpate.experiments.reproduce.run import reproduce as run
 
-    result = run(arguments.experiment, arguments.output, progress=progress)
+    workers = min(os.cpu_count() or 1, PROCESSES)
+    result = run(arguments.experiment, arguments.output, progress=progress, workers=workers)
     notes = "\n".join(result.document["notes"])
     files = ", ".join((f"{arguments.experiment}.json", result.figure.name))
     return Outcome(result.document, f"{columns(result.rows)}\n{notes}\nwritten to {arguments.output}: {files}")

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from palpate.cli.console import LOGGER
 from palpate.cli.outcome import Outcome, estimates_table, warning_lines
-from palpate.errors import EstimationError
+from palpate.errors import ConfigurationError, EstimationError
 
 if TYPE_CHECKING:
     from palpate.study.case import Case
@@ -24,6 +24,8 @@ def estimate(arguments: argparse.Namespace, case: Case | None, progress: Progres
     """Estimate a case, or images for which a case is written first."""
     from palpate.study import run
 
+    if case is not None and arguments.labels is not None:
+        raise ConfigurationError("--labels goes with images; a case names its label table itself, as [images] names")
     case = case or _case_of_images(arguments, progress)
     try:
         result = run.estimate(case, progress=progress)
@@ -75,6 +77,7 @@ def _write_estimate(result: CaseResult, folder: Path, progress: Progress) -> Out
     document = result.to_dict()
     document["files"] = digests(write_estimate_files(result, folder))
     progress("drawing the report")
+    document["warnings"] += _earlier_files(folder, document["files"])
     document["warnings"] += _write_report(lambda: _case_report(result, folder))
     write_json(folder / "result.json", document)
     converged = document["status"] == "converged"
@@ -86,19 +89,25 @@ def _write_estimate(result: CaseResult, folder: Path, progress: Progress) -> Out
 
 def _estimation_failed(case: Case, error: EstimationError, folder: Path) -> Outcome:
     """A result file that says that there is no result, and which files in the folder are not of this run."""
-    from palpate.study.outputs import strange_files, write_json
+    from palpate.study.outputs import write_json
     from palpate.study.result import failure_document
 
     LOGGER.error("%s", error, exc_info=error)
     document = failure_document(case, error)
     document["files"] = {}
-    stale = strange_files(folder, {})
-    if stale:
-        message = f"{', '.join(stale)} in the output folder are of an earlier run and do not belong to this result"
-        document["warnings"].append({"code": "earlier-files", "message": message})
+    document["warnings"] += _earlier_files(folder, {})
     document["warnings"] += _write_report(lambda: _failure_report(case, error, folder))
     write_json(folder / "result.json", document)
     return Outcome(document, "", error.exit_code, str(error))
+
+
+def _earlier_files(folder: Path, files: Mapping[str, Mapping[str, str]]) -> list[dict[str, str]]:
+    """A warning on what other programs could take for a file of this run, whose own are `files`."""
+    from palpate.study.outputs import strange_files
+
+    stale = strange_files(folder, files)
+    message = f"{', '.join(stale)} in the output folder are of an earlier run and do not belong to this result"
+    return [{"code": "earlier-files", "message": message}] if stale else []
 
 
 def _case_report(result: CaseResult, folder: Path) -> Path:

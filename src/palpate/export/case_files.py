@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.export.label_table import first_labels, write_label_table
+from palpate.export.label_table import write_label_table
 from palpate.export.rasterise import region_image
 from palpate.export.vtk_xml import write_pvd, write_vtp, write_vtu
 from palpate.images.readers import write_label_image, write_scalar_image
+from palpate.images.segmentation import first_labels
 from palpate.mechanics.deformation import largest_strains
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.surface import tissue_surface

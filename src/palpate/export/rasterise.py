@@ -15,7 +15,7 @@ TOLERANCE = 1e-9  # in barycentric coordinates: a centre on a face belongs to bo
 
 
 def region_image(mesh: TetMesh, grid: VoxelGrid) -> NDArray[np.int16]:
-    """Region (nx, ny, nz) of the tetrahedron at each voxel centre of `grid`, an index into `mesh.tissues`; -1: none."""
+    """Region (n_x, n_y, n_z) of the tetrahedron at each voxel centre of `grid`: index into `mesh.tissues`; -1: none."""
     image = np.full(grid.shape, -1, dtype=np.int16)
     corners = grid.index(mesh.nodes)[mesh.tets]
     low = np.maximum(np.ceil(corners.min(axis=1) - TOLERANCE), 0).astype(np.int64)

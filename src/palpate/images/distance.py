@@ -19,7 +19,7 @@ PROBIT_LIMIT = 2.5  # beyond so many sigma the smoothed indicator has lost the d
 class DistanceMap:
     """Signed distance (mm, negative inside) to a tissue's surface, interpolated by cubic B-splines.
 
-    `coefficients` (nx, ny, nz) are the spline's; outside the grid the map continues the value on its border.
+    `coefficients` (n_x, n_y, n_z) are the spline's; outside the grid the map continues the value on its border.
     `smoothing_mm`: width of the Gaussian that the map was made with; `bias` (mm) is added everywhere.
     """
 
@@ -50,7 +50,7 @@ class DistanceMap:
         return np.asarray(np.stack(by_index, axis=1) @ np.linalg.inv(self.grid.affine[:3, :3]))
 
     def node_values(self) -> NDArray[np.float64]:
-        """Signed distance (nx, ny, nz) mm at the voxels' centres."""
+        """Signed distance (n_x, n_y, n_z) mm at the voxels' centres."""
         values = self.coefficients
         for axis in range(3):
             values = ndimage.convolve1d(values, np.array([1.0, 4.0, 1.0]) / 6.0, axis=axis, mode="mirror")
@@ -84,7 +84,7 @@ def observation_width(*grids: VoxelGrid) -> float:
 
 
 def distance_map(mask: NDArray[np.bool_], grid: VoxelGrid, *, smoothing_mm: float) -> DistanceMap:
-    """Signed distance map of the voxels in `mask` (nx, ny, nz).
+    """Signed distance map of the voxels in `mask` (n_x, n_y, n_z).
 
     Near the surface the probit of the smoothed indicator, d = -sigma Phi^-1(G_sigma * 1_mask), which is exact for a
     plane; far from it the Euclidean distance transform, blended over one sigma. `smoothing_mm` is sigma, mm.

@@ -52,7 +52,7 @@ class VoxelGrid:
 
 @dataclass(frozen=True, slots=True)
 class LabelImage:
-    """Labels (nx, ny, nz) int on `grid`; `names`: label -> name and `colours`: label -> #rrggbb, where given."""
+    """Labels (n_x, n_y, n_z) int on `grid`; `names`: label -> name and `colours`: label -> #rrggbb, where given."""
 
     labels: NDArray[np.int32]
     grid: VoxelGrid

@@ -11,12 +11,12 @@ from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.tissue import Tissue
 
-__all__ = ["Segmentation", "segment"]
+__all__ = ["Segmentation", "first_labels", "segment"]
 
 
 @dataclass(frozen=True, slots=True)
 class Segmentation:
-    """`index` (nx, ny, nz) int16: which of `tissues` a voxel of `grid` belongs to."""
+    """`index` (n_x, n_y, n_z) int16: which of `tissues` a voxel of `grid` belongs to."""
 
     index: NDArray[np.int16]
     grid: VoxelGrid
@@ -28,12 +28,22 @@ class Segmentation:
         object.__setattr__(self, "index", index)
 
     def mask(self, tissue: int) -> NDArray[np.bool_]:
-        """Which voxels (nx, ny, nz) belong to the tissue of that index."""
+        """Which voxels (n_x, n_y, n_z) belong to the tissue of that index."""
         return np.asarray(self.index == tissue)
 
     def volume(self, tissue: int) -> float:
         """Volume of the tissue by counting voxels, mm^3."""
         return float(np.count_nonzero(self.index == tissue)) * self.grid.voxel_volume
+
+
+def first_labels(tissues: tuple[Tissue, ...]) -> NDArray[np.int32]:
+    """Smallest label of each tissue (n_tissues,), by which our files know it.
+
+    The remaining tissue gets the smallest number that no other claims.
+    """
+    claimed = {label for tissue in tissues for label in tissue.labels}
+    free = next(number for number in range(len(claimed) + 1) if number not in claimed)
+    return np.array([min(tissue.labels, default=free) for tissue in tissues], dtype=np.int32)
 
 
 def segment(image: LabelImage, tissues: tuple[Tissue, ...]) -> Segmentation:

@@ -29,7 +29,7 @@ def tissue_distance_map(segmentation: Segmentation, tissue: int, *, smoothing_mm
 
 
 def window_around(mask: NDArray[np.bool_], grid: VoxelGrid, *, reach_mm: float) -> tuple[slice, slice, slice]:
-    """Index ranges of the voxels within `reach_mm` of the bounding box of `mask` (nx, ny, nz), which is not empty."""
+    """Index ranges of the voxels within `reach_mm` of the box around `mask` (n_x, n_y, n_z), which is not empty."""
     found = ndimage.find_objects(mask.astype(np.int8))[0]
     margin = np.ceil(reach_mm / grid.spacing).astype(int)
     i, j, k = (

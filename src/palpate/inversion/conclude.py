@@ -14,7 +14,7 @@ from palpate.inversion.grid_position import FittedState, grid_position_shifts
 from palpate.inversion.objective import Linearisation
 from palpate.inversion.posterior import sandwich_covariance
 from palpate.inversion.problem import Inversion, InversionSettings
-from palpate.inversion.verdict import log_interval, verdict
+from palpate.inversion.verdict import hull, log_interval, verdict
 from palpate.mechanics.deformation import deformation_determinants
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
@@ -24,6 +24,7 @@ __all__ = ["Observed", "conclude"]
 GRID_DRAWS = 8
 AT_BOUND = 1e-6
 STRONG_CORRELATION = 0.99
+AS_GOOD = 0.05  # of the objective: another minimum that is worse by less cannot be excluded
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +87,8 @@ def _estimates(
     for i, name in enumerate(mapping.tissues):
         ratio = float(np.exp(theta[i]))
         limits = {"lower": float(np.exp(bounds.lower[i])), "upper": float(np.exp(bounds.upper[i]))}
-        interval = log_interval(ratio, float(np.sqrt(covariance[i, i])), **limits)
+        sd = float(np.sqrt(covariance[i, i]))
+        interval = hull([log_interval(float(np.exp(t[i])), sd, **limits) for t in _as_good(inversion)])
         at_bound = bool(np.min(np.abs([theta[i] - bounds.lower[i], theta[i] - bounds.upper[i]])) < AT_BOUND)
         word, why = verdict(interval, at_bound=at_bound, absolute=mapping.absolute)
         low, high = interval
@@ -106,6 +108,18 @@ def _estimates(
             )
         )
     return tuple(found)
+
+
+def _as_good(inversion: Inversion) -> list[NDArray[np.float64]]:
+    """Log-moduli (n_parameters,) of the best minimum and of every other that explains the images nearly as well.
+
+    Voxels make the objective rough by some hundredths of it, so that its value alone cannot choose between them.
+    """
+    n, best = inversion.objective.n_parameters, inversion.minimum
+    limit = (1.0 + AS_GOOD) * best.evaluation.value
+    pairs = zip(inversion.groups, inversion.minima, strict=True)
+    distinct = {g: m for g, m in pairs if m.outcome.converged and m.evaluation.value <= limit}
+    return [m.unknowns[:n] for m in (distinct | {inversion.groups[inversion.best]: best}).values()]
 
 
 def _no_estimate(inversion: Inversion, tissue: str, truth: float | None) -> ModulusEstimate:
@@ -238,7 +252,13 @@ def _remarks(inversion: Inversion, covariance: NDArray[np.float64]) -> tuple[Rem
             )
         )
     if len(set(inversion.groups)) > 1:
-        remarks.append(Remark("several-minima", "the starts ended in different minima; the best fit is reported"))
+        remarks.append(
+            Remark(
+                "several-minima",
+                "the starts ended in different minima; the best fit is reported, and the intervals reach over all that"
+                " fit nearly as well",
+            )
+        )
     sd = np.sqrt(np.diag(covariance))
     for i in range(len(sd)):
         for j in range(i):

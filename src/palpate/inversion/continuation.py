@@ -14,12 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
+from palpate.inversion.driver_prior import learned_prior
 from palpate.inversion.gauss_newton import Bounds, Minimum, Outcome
-from palpate.inversion.minima import minimised, settled_between, words
+from palpate.inversion.minima import SETTLED, minimised, moved_between, words
 from palpate.inversion.noise import NoiseLaw
 from palpate.inversion.objective import Objective
 from palpate.inversion.problem import InverseProblem, Inversion, InversionSettings, StandIn
 from palpate.inversion.weighting import objective_of, residual_law, reweighted
+from palpate.mechanics.equilibrium import from_start
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
 from palpate.mechanics.first_order import FirstOrderModel, expanded
 from palpate.mechanics.forward import SolveCounts
@@ -28,8 +30,9 @@ from palpate.mesh.constraint import Constraint
 
 __all__ = ["Expansion", "continued_at_finite_strain"]
 
-ROUNDS = 8
-WEIGHED = 2  # rounds that weigh the residuals anew; then the objective stays, so that the iteration can settle
+ROUNDS = 12
+WEIGHED = (2, 7)  # least and largest number of rounds that weigh the residuals anew
+NEAR = 0.5  # posterior standard deviations: a round that moves less leaves the weights, so that the iteration settles
 REACH = 0.8  # of ln E, within which an expansion is trusted
 HALVINGS = 3
 NOISE = 0.5  # of the objective, in units of log-likelihood: the noise of re-chosen closest points
@@ -57,13 +60,21 @@ class Expansion:
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """A minimum under the objective made of the expansions around the equilibria where the last round led."""
+    """A minimum under the objective made of the expansions around the equilibria where the last round led.
+
+    moved: by so many posterior standard deviations.
+    """
 
     objective: Objective
     minimum: Minimum
     expansions: tuple[Expansion, ...]
     law: NoiseLaw
-    settled: bool = False
+    moved: float = np.inf
+
+    @property
+    def settled(self) -> bool:
+        """Whether the last round would have moved the log-moduli by little."""
+        return self.moved < SETTLED
 
 
 def continued_at_finite_strain(
@@ -85,7 +96,7 @@ def continued_at_finite_strain(
     for minimum, group in zip(linear.minima, linear.groups, strict=True):
         if group not in places and minimum.outcome.converged:
             places[group] = _followed(problem, models, linear, minimum, settings, progress)
-    best = min(places, key=lambda group: places[group].minimum.evaluation.value)
+    best = min(places, key=lambda g: (not places[g].minimum.outcome.converged, places[g].minimum.evaluation.value))
     minima = tuple(
         _joined(m, places[g].minimum) if g in places else m for m, g in zip(linear.minima, linear.groups, strict=True)
     )
@@ -120,74 +131,86 @@ def _followed(
     progress("finite strain: the equilibrium at the linear estimate")
     moduli, amounts = _split(linear.objective, start.unknowns)
     triples = zip(models, linear.surrogates, amounts, strict=True)
-    equilibria = tuple(_from_linear(model, surrogate, moduli, q) for model, surrogate, q in triples)
+    equilibria = tuple(_near_linear(model, surrogate, moduli, q) for model, surrogate, q in triples)
     expansions = tuple(_expansion(equilibrium, SolveCounts()) for equilibrium in equilibria)
-    place = _placed(problem, expansions, replace(start, history=()), linear.law, settings)
+    first = _Place(linear.objective, replace(start, history=()), expansions, linear.law)
+    place = _weighed(problem, first, settings)
     for number in range(ROUNDS):
         progress(f"finite strain, round {number + 1}: {words(problem, place.minimum)}")
-        following = _round(problem, place, settings, weigh=number < WEIGHED)
-        settled = settled_between(place.minimum, following.minimum, linear.objective.n_parameters)
-        place = replace(following, settled=settled)
-        if settled:
+        weigh = number < WEIGHED[0] or (number < WEIGHED[1] and place.moved > NEAR)
+        before, place = place, _round(problem, place, settings, weigh=weigh)
+        if place.settled or place.expansions is before.expansions:
             break
     found = minimised(place.objective, place.minimum.unknowns, settings, tolerance=POLISH)
     # a polish that finds no better point leaves the last round's, which is an equilibrium with its own outcome
     end = _joined(place.minimum, found) if found.outcome.converged else place.minimum
-    return replace(place, minimum=end if place.settled else replace(end, outcome=Outcome.STEPS))
+    if place.settled:
+        return replace(place, minimum=end)
+    left = place.minimum.outcome
+    return replace(place, minimum=replace(end, outcome=Outcome.STEPS if left.converged else left))
 
 
-def _from_linear(
+def _near_linear(
     model: FiniteStrainModel, linear: StandIn, moduli: NDArray[np.float64], amounts: NDArray[np.float64]
 ) -> FiniteStrainEquilibrium:
-    """The equilibrium from the linear displacement; from rest, where that folds elements. Raises `NotConverged`."""
     start = linear.reduced.solve(moduli, amounts).displacement
-    found = model.attempt(moduli, amounts, start=start, nearby=linear.factorisation)
-    return found if found.converged else model.solve(moduli, amounts)
+    return from_start(model, moduli, amounts, start=start, nearby=linear.factorisation)
 
 
-def _placed(
-    problem: InverseProblem,
-    expansions: tuple[Expansion, ...],
-    at: Minimum,
-    law: NoiseLaw,
-    settings: InversionSettings,
-) -> _Place:
-    """The objective of the expansions, weighted by the residuals at their own equilibria."""
-    models = tuple(expansion.reduced for expansion in expansions)
-    first = objective_of(problem, models, law).with_fresh_correspondence(at.unknowns)
+def _weighed(problem: InverseProblem, place: _Place, settings: InversionSettings) -> _Place:
+    """The place with the residuals at its own equilibria weighed by their law, and the drivers' prior learned there."""
+    at, models = place.minimum, tuple(expansion.reduced for expansion in place.expansions)
+    prior = place.objective.prior
+    first = objective_of(problem, models, place.law, prior).with_fresh_correspondence(at.unknowns)
     here = first(at.unknowns)
     law = settings.law or residual_law(problem, here)
-    objective = reweighted(objective_of(problem, models, law), replace(at, evaluation=here), law)
-    return _Place(objective, replace(at, evaluation=objective(at.unknowns)), expansions, law)
+    learned = learned_prior(problem, here, at.unknowns)
+    objective = reweighted(objective_of(problem, models, law, learned), replace(at, evaluation=here), law)
+    return replace(place, objective=objective, minimum=replace(at, evaluation=objective(at.unknowns)), law=law)
 
 
 def _round(problem: InverseProblem, place: _Place, settings: InversionSettings, *, weigh: bool) -> _Place:
     """The minimum on the present expansions, or a part of the way to it, with the equilibria there.
 
-    `weigh`: the residuals there give new weights.
+    `weigh`: the residuals there give new weights. Where no part of the way lowers the objective the place stays, its
+    minimum `STALLED` when the whole way is within the estimate's own noise and `STUCK` when not.
     """
     now = place.minimum
     near = replace(settings, bounds=_near(settings.bounds, now.unknowns[: place.objective.n_parameters]))
     found = minimised(place.objective, now.unknowns, near)
-    step = found.unknowns - now.unknowns
+    moved = moved_between(now, found, place.objective.n_parameters)
+    lower = _lower(place, found.unknowns - now.unknowns)
+    if lower is None:
+        outcome = Outcome.STALLED if moved < SETTLED else Outcome.STUCK
+        return replace(place, minimum=replace(now, outcome=outcome), moved=moved)
+    unknowns, equilibria = lower
+    pairs = zip(equilibria, place.expansions, strict=True)
+    expansions = tuple(_expansion(equilibrium, before.counts) for equilibrium, before in pairs)
+    there = replace(found, unknowns=unknowns, history=(*now.history, *found.history))
+    states = objective_of(problem, tuple(e.reduced for e in expansions), place.law).states
+    objective = replace(place.objective, states=states)
+    arrived = _Place(objective, replace(there, evaluation=objective(unknowns)), expansions, place.law, moved)
+    return _weighed(problem, arrived, settings) if weigh else arrived
+
+
+def _lower(
+    place: _Place, step: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], tuple[FiniteStrainEquilibrium, ...]] | None:
+    """The first of step, step / 2, step / 4 ... that lowers the objective, with the equilibria there; None: none does.
+
+    Raises `NotConverged` when the last of them has no equilibrium.
+    """
+    now = place.minimum
     for halving in range(HALVINGS + 1):
         unknowns = now.unknowns + 0.5**halving * step
         moduli, amounts = _split(place.objective, unknowns)
         equilibria = tuple(_solved(e, moduli, q) for e, q in zip(place.expansions, amounts, strict=True))
-        converged = all(equilibrium.converged for equilibrium in equilibria)
-        if converged and _value(place, equilibria, unknowns) < now.evaluation.value + NOISE:
-            break
+        if all(e.converged for e in equilibria) and _lowers(place, equilibria, unknowns):
+            return unknowns, equilibria
     for equilibrium in equilibria:
         if not equilibrium.converged:
             raise NotConverged(f"no equilibrium near the estimate: {equilibrium.reason}")
-    pairs = zip(equilibria, place.expansions, strict=True)
-    expansions = tuple(_expansion(equilibrium, before.counts) for equilibrium, before in pairs)
-    there = replace(found, unknowns=unknowns, history=(*now.history, *found.history))
-    if weigh:
-        return _placed(problem, expansions, there, place.law, settings)
-    states = objective_of(problem, tuple(e.reduced for e in expansions), place.law).states
-    objective = replace(place.objective, states=states)
-    return _Place(objective, replace(there, evaluation=objective(unknowns)), expansions, place.law)
+    return None
 
 
 def _solved(expansion: Expansion, moduli: NDArray[np.float64], amounts: NDArray[np.float64]) -> FiniteStrainEquilibrium:
@@ -205,20 +228,26 @@ def _expansion(equilibrium: FiniteStrainEquilibrium, spent: SolveCounts) -> Expa
     return Expansion(model, exact, spent + equilibrium.counts + exact.tangent_counts + SolveCounts(factorisations=1))
 
 
-def _value(place: _Place, equilibria: tuple[FiniteStrainEquilibrium, ...], unknowns: NDArray[np.float64]) -> float:
-    """The objective of a place at the true displacements instead of the expansions'."""
+def _lowers(place: _Place, equilibria: tuple[FiniteStrainEquilibrium, ...], unknowns: NDArray[np.float64]) -> bool:
+    """Whether the objective at the true displacements, not the expansions', is lower than at the place.
+
+    By its value, or by the work of its score along the way (the trapezoidal rule, 1/2 (s_0 + s_1) . step): the value
+    has the noise of closest points that slide over voxels, the score has not.
+    """
     states = tuple(
-        replace(state, model=_still(equilibrium, np.concatenate([t.surface.dofs for t in state.targets])))
-        for state, equilibrium in zip(place.objective.states, equilibria, strict=True)
+        replace(state, model=_moved(expansion, e, np.concatenate([t.surface.dofs for t in state.targets])))
+        for state, expansion, e in zip(place.objective.states, place.expansions, equilibria, strict=True)
     )
-    return replace(place.objective, states=states).value(unknowns)
+    there, now = replace(place.objective, states=states)(unknowns), place.minimum
+    work = 0.5 * (there.score + now.evaluation.score) @ (unknowns - now.unknowns)
+    return bool(there.value < now.evaluation.value + NOISE or work < 0.0)
 
 
-def _still(equilibrium: FiniteStrainEquilibrium, dofs: NDArray[np.int64]) -> FirstOrderModel:
-    """A model that knows one displacement only."""
-    flat = np.zeros((len(dofs), equilibrium.model.n_regions + equilibrium.model.n_modes))
+def _moved(expansion: Expansion, equilibrium: FiniteStrainEquilibrium, dofs: NDArray[np.int64]) -> FirstOrderModel:
+    """The expansion with the displacement of another equilibrium, its derivatives still those of its own."""
+    near = expansion.reduced.at(dofs)
     moduli, amounts = equilibrium.moduli, equilibrium.coefficients
-    return FirstOrderModel(equilibrium.model.names, moduli, amounts, equilibrium.values[dofs], flat)
+    return replace(near, moduli=moduli, coefficients=amounts, values=equilibrium.values[dofs])
 
 
 def _split(

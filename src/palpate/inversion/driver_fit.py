@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
+from palpate.inversion.driver_prior import learned_prior
 from palpate.inversion.gauss_newton import Bounds, gauss_newton
 from palpate.inversion.problem import InverseProblem, LocalModel
 from palpate.inversion.surrogate import first_surrogate
@@ -60,6 +61,7 @@ def _fitted(
         objective = objective.with_fresh_correspondence(unknowns)
         found = gauss_newton(objective, unknowns, bounds=bounds, hold_theta=True, tolerance=1e-2)
         unknowns = found.unknowns
+        objective = replace(objective, prior=learned_prior(held, found.evaluation, unknowns))
     if not found.outcome.converged:
         raise NotConverged(f"the driver's wall could not be fitted to the later image: {found.outcome.value}")
     return objective.coefficients(unknowns)

@@ -68,9 +68,11 @@ class _Region:
     damping: float = 0.0
 
     def smaller(self) -> _Region:
+        """After a step that was refused."""
         return _Region(self.radius / 3.0, max(10.0 * self.damping, 1e-4))
 
     def larger(self) -> _Region:
+        """After a step that brought what it promised."""
         return _Region(min(2.0 * self.radius, MAX_RADIUS), self.damping / 10.0 if self.damping > 1e-6 else 0.0)
 
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate.inversion.continuation import continued_at_finite_strain
+from palpate.inversion.driver_prior import learned_prior
 from palpate.inversion.gauss_newton import Minimum, gauss_newton
 from palpate.inversion.minima import best_of, continued, groups_of, minimised, settled_between, with_driver, words
 from palpate.inversion.noise import NoiseLaw
@@ -21,6 +24,7 @@ from palpate.mechanics.reduced import ReducedModel
 __all__ = ["invert", "invert_with"]
 
 ROUNDS = 9
+WEIGHINGS = 4  # within a round
 REFINEMENTS = 2  # of the drivers' walls; what is left then is no motion that they could follow
 EXACT = 3e-3  # standard deviations of a residual, per mm of motion: a smaller model error needs no further snapshot
 POLISH = 1e-5  # decrement of the reported minimum
@@ -36,9 +40,8 @@ def invert(problem: InverseProblem, settings: InversionSettings, *, progress: Ca
     progress("responses of the full model at the middle start")
     surrogates = tuple(first_surrogate(model, moduli) for model in problem.models)
     objective = objective_of(problem, _reduced(surrogates), settings.law or FIRST_LAW)
-    held = np.concatenate([middle, np.zeros(objective.n_unknowns - len(middle))])
-    objective = objective.with_fresh_correspondence(held)
-    driven = gauss_newton(objective, held, bounds=settings.bounds, hold_theta=True, tolerance=1e-2)
+    still = np.concatenate([middle, np.zeros(objective.n_unknowns - len(middle))])
+    driven = _driven(objective.with_fresh_correspondence(still), middle, settings)
     pairs = zip(surrogates, objective.coefficients(driven.unknowns), strict=True)
     surrogates = tuple(with_modulus_series(s, q, problem.modulus_map.columns) for s, q in pairs)
     linear = invert_with(problem, settings, surrogates, progress=progress)
@@ -60,6 +63,7 @@ def invert_with(
     still = np.zeros(objective.n_unknowns)
     objective = objective.with_fresh_correspondence(still)
     rest = objective(still)
+    objective = _with_prior(problem, objective, _driven(objective, settings.starts[0], settings))
     minima = _from_starts(objective, settings, progress)
     chosen = best_of(minima)
     best = minima[chosen]
@@ -68,8 +72,8 @@ def invert_with(
         progress(f"round {round_ + 1}: {words(problem, best)}; the full model is solved there")
         law = settings.law or residual_law(problem, best.evaluation)
         surrogates = _enriched(problem, surrogates, objective, best, exact=min(EXACT * law.sd, 1e-3))
-        objective = reweighted(objective_of(problem, _reduced(surrogates), law), best, law)
-        before, best = best, continued(objective, best, settings)
+        before = best
+        law, objective, best = _weighed(problem, _reduced(surrogates), best, settings)
         settled = settled_between(before, best, objective.n_parameters)
         if settled:
             done = refinements == REFINEMENTS or round_ == ROUNDS - 1
@@ -93,6 +97,20 @@ def invert_with(
         evaluations=sum(len(minimum.history) for minimum in minima),
         counts=counts,
     )
+
+
+def _weighed(
+    problem: InverseProblem, models: tuple[ReducedModel, ...], best: Minimum, settings: InversionSettings
+) -> tuple[NoiseLaw, Objective, Minimum]:
+    """Law of the residuals, drivers' prior, weights and estimate in turn until they agree, on the same models."""
+    for _ in range(WEIGHINGS):
+        law = settings.law or residual_law(problem, best.evaluation)
+        prior = learned_prior(problem, best.evaluation, best.unknowns)
+        objective = reweighted(objective_of(problem, models, law, prior), best, law)
+        before, best = best, continued(objective, best, settings)
+        if settled_between(before, best, objective.n_parameters):
+            break
+    return law, objective, best
 
 
 def _refined(
@@ -137,6 +155,16 @@ def _from_starts(
         minima.append(minimised(fresh, first.unknowns, settings, tolerance=1e-2))
         progress(f"start {number + 1} of {len(settings.starts)}: {len(minima[-1].history)} steps")
     return tuple(minima)
+
+
+def _driven(objective: Objective, theta: NDArray[np.float64], settings: InversionSettings) -> Minimum:
+    """The driver's motion alone, at log-moduli theta (n_parameters,)."""
+    held = np.concatenate([theta, np.zeros(objective.n_unknowns - len(theta))])
+    return gauss_newton(objective, held, bounds=settings.bounds, hold_theta=True, tolerance=1e-2)
+
+
+def _with_prior(problem: InverseProblem, objective: Objective, minimum: Minimum) -> Objective:
+    return replace(objective, prior=learned_prior(problem, minimum.evaluation, minimum.unknowns))
 
 
 def _reduced(surrogates: tuple[Surrogate, ...]) -> tuple[ReducedModel, ...]:

@@ -26,6 +26,7 @@ def lbfgs(
     best, history = inner, list[Iterate]()
 
     def reduced(scaled: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """min_q J and its slope (n_parameters,) by the scaled log-moduli (n_parameters,)."""
         nonlocal best
         unknowns = np.concatenate([scaled * scale, best.unknowns[n:]])
         best = gauss_newton(objective, unknowns, bounds=bounds, hold_theta=True, tolerance=tolerance)

@@ -12,7 +12,17 @@ from palpate.inversion.lbfgs import lbfgs
 from palpate.inversion.objective import Objective
 from palpate.inversion.problem import InverseProblem, InversionSettings
 
-__all__ = ["best_of", "continued", "groups_of", "minimised", "settled_between", "with_driver", "words"]
+__all__ = [
+    "SETTLED",
+    "best_of",
+    "continued",
+    "groups_of",
+    "minimised",
+    "moved_between",
+    "settled_between",
+    "with_driver",
+    "words",
+]
 
 SAME_MINIMUM = 0.02  # of ln E
 SETTLED = 0.05  # posterior standard deviations by which a round may still move the estimate
@@ -64,9 +74,14 @@ def groups_of(minima: tuple[Minimum, ...], n_parameters: int) -> tuple[int, ...]
 
 def settled_between(before: Minimum, after: Minimum, n_parameters: int) -> bool:
     """Whether a round moved the log-moduli by little, in units of their own uncertainty."""
+    return moved_between(before, after, n_parameters) < SETTLED
+
+
+def moved_between(before: Minimum, after: Minimum, n_parameters: int) -> float:
+    """Largest change of a log-modulus in posterior standard deviations."""
     inverse = np.linalg.inv(after.evaluation.matrix)[:n_parameters, :n_parameters]
     moved = np.abs(after.unknowns - before.unknowns)[:n_parameters]
-    return bool(np.all(moved < SETTLED * np.sqrt(np.diag(inverse))))
+    return float(np.max(moved / np.sqrt(np.diag(inverse)), initial=0.0))
 
 
 def words(problem: InverseProblem, minimum: Minimum) -> str:

@@ -9,12 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 __all__ = ["NoiseLaw", "fit_noise_law"]
 
 LENGTHS = (0.5, 0.8, 1.2, 2.0, 3.0, 4.5, 6.5, 9.5, 14.0)  # mm
 CELL = 1.0  # mm: residuals nearer than that are averaged before they are compared
 MAX_CELLS = 2500
+ROWS = 256  # of the pairs' table at once: it stays in the cache
 REACH = 28.0  # mm
 FLOOR = 1e-3  # mm: no surface in an image is known better
 
@@ -85,13 +87,20 @@ def _binned_products(
     mean: NDArray[np.float64], centre: NDArray[np.float64], normal: NDArray[np.float64], edges: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Sums (4, n_bins) over pairs of cells: r_i r_j n_i.n_j, (n_i.n_j)^2, distance (mm), 1."""
-    distance = np.linalg.norm(centre[:, None] - centre[None], axis=2)
-    bins = (np.digitize(distance, edges) - 1).ravel()
-    inside = bins < len(edges) - 1
-    cosine = normal @ normal.T
-    terms = (np.outer(mean, mean) * cosine, cosine**2, distance, np.ones_like(distance))
     size = len(edges) - 1
-    return np.stack([np.bincount(bins[inside], term.ravel()[inside], minlength=size) for term in terms])
+    sums = np.zeros((4, size))
+    for start in range(0, len(mean), ROWS):  # a pair of different cells once, then counted twice
+        rows, others = slice(start, start + ROWS), slice(start, None)
+        distance = cdist(centre[rows], centre[others])
+        bins = np.searchsorted(edges, distance.ravel(), side="right") - 1
+        times = 2.0 * np.triu(np.ones_like(distance), 1)
+        np.fill_diagonal(times, 1.0)
+        inside = (bins < size) & (times.ravel() > 0.0)
+        cosine = normal[rows] @ normal[others].T
+        terms = (np.outer(mean[rows], mean[others]) * cosine, cosine**2, distance, np.ones_like(distance))
+        weights = ((times * term).ravel()[inside] for term in terms)
+        sums += np.stack([np.bincount(bins[inside], weight, minlength=size) for weight in weights])
+    return sums
 
 
 def _cells(

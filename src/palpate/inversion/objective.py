@@ -68,7 +68,7 @@ class Evaluation:
     """Value (dimensionless, minus log-posterior) with its exact gradient (n,), and the Gauss-Newton system.
 
     matrix (n, n) = J^T W J + P and score (n,) = J^T W r + P q with the smooth surface's J: the estimate is where the
-    score vanishes.
+    score vanishes. prior (n, n): P, the precision of the driver's coefficients before the images are seen.
     """
 
     value: float
@@ -77,19 +77,22 @@ class Evaluation:
     score: NDArray[np.float64]
     matrix: NDArray[np.float64]
     surfaces: tuple[Linearisation, ...]
+    prior: NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class Objective:
-    """J(theta, q) = 1/2 sum_s precision_s sum_j w_j rho(r_j) + 1/2 |q|^2 over all surfaces s of all states.
+    """J(theta, q) = 1/2 sum_s precision_s sum_j w_j rho(r_j) + 1/2 q^T P q over all surfaces s of all states.
 
-    The unknowns are theta (n_parameters,), then the mode coefficients q of each state. rho is Tukey's biweight,
+    The unknowns are theta (n_parameters,), then the mode coefficients q of each state; P is `prior`
+    (n_coefficients, n_coefficients), the identity where None. rho is Tukey's biweight,
     rho(r) = c^2/3 (1 - (1 - (r/c)^2)^3), with the slope of r^2 at 0 (Huber 1981, section 4.8).
     """
 
     states: tuple[State, ...]
     modulus_map: ModulusMap
     weighting: tuple[tuple[Weighting, ...], ...]
+    prior: NDArray[np.float64] | None = None
 
     @property
     def n_parameters(self) -> int:
@@ -107,7 +110,7 @@ class Objective:
 
     def value(self, unknowns: NDArray[np.float64]) -> float:
         """J alone, for trial steps."""
-        total = 0.5 * float(np.sum(unknowns[self.n_parameters :] ** 2))
+        total = 0.5 * float(unknowns @ self.prior_precision() @ unknowns)
         for s, displacement in enumerate(self._displacements(unknowns)):
             for target, motion, weighting in self._surfaces(s, displacement):
                 residuals = _weighted(target, motion, weighting)
@@ -116,9 +119,9 @@ class Objective:
 
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
         """J with gradient, Gauss-Newton matrix and residuals at `unknowns` (n_unknowns,)."""
-        prior = np.concatenate([np.zeros(self.n_parameters), unknowns[self.n_parameters :]])
-        value, gradient, score = 0.5 * float(prior @ prior), prior.copy(), prior.copy()
-        matrix = np.diag(np.concatenate([np.zeros(self.n_parameters), np.ones(len(prior) - self.n_parameters)]))
+        prior = self.prior_precision()
+        pull = prior @ unknowns
+        value, gradient, score, matrix = 0.5 * float(unknowns @ pull), pull.copy(), pull.copy(), prior.copy()
         surfaces = [line for s in range(len(self.states)) for line in self._linearise(s, unknowns)]
         misfit = 0.0
         for line, weighting in zip(surfaces, self._flat_weighting(), strict=True):
@@ -129,7 +132,13 @@ class Objective:
             mean = _robust_sum(line.residuals, weighting.cutoff)
             misfit += mean / len(surfaces)
             value += 0.5 * line.precision * mean
-        return Evaluation(value, misfit, gradient, score, matrix, tuple(surfaces))
+        return Evaluation(value, misfit, gradient, score, matrix, tuple(surfaces), prior)
+
+    def prior_precision(self) -> NDArray[np.float64]:
+        """Precision (n_unknowns, n_unknowns) of all unknowns before the images are seen; none of the log-moduli."""
+        n = self.n_unknowns - self.n_parameters
+        prior = np.eye(n) if self.prior is None else self.prior
+        return np.pad(prior, ((self.n_parameters, 0), (self.n_parameters, 0)))
 
     def with_fresh_correspondence(self, unknowns: NDArray[np.float64]) -> Objective:
         """Choose anew which image points face the observed part of each surface.

@@ -39,8 +39,7 @@ def sandwich_covariance(evaluation: Evaluation, law: NoiseLaw, n_parameters: int
         data += law.covariance(
             rows, np.concatenate([places[i] for i in group]), np.concatenate([normals[i] for i in group])
         )
-    prior = inverse[n_parameters:]
-    return np.asarray(data + prior.T @ prior)
+    return np.asarray(data + inverse.T @ evaluation.prior @ inverse)
 
 
 def cramer_rao(evaluation: Evaluation, law: NoiseLaw, n_parameters: int) -> NDArray[np.float64]:
@@ -49,7 +48,7 @@ def cramer_rao(evaluation: Evaluation, law: NoiseLaw, n_parameters: int) -> NDAr
     Inverse of the Fisher information F = sum_states J^T C^-1 J + P over the model's faces (model -> image residuals),
     each face once, with the prior of the driver's motion.
     """
-    information = np.diag(np.concatenate([np.zeros(n_parameters), np.ones(len(evaluation.matrix) - n_parameters)]))
+    information = evaluation.prior.copy()
     for group in _states(evaluation):
         parts = [_face_means(evaluation, i) for i in group]
         jacobian, places, normals = (np.concatenate([part[k] for part in parts]) for k in range(3))

@@ -18,6 +18,7 @@ from palpate.mechanics.linear_model import LinearModel
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.constraint import Constraint
 from palpate.observation.target import SurfaceTarget
+from palpate.observation.wall_modes import Wall
 
 __all__ = ["InverseProblem", "Inversion", "InversionSettings", "LocalModel", "StandIn"]
 
@@ -60,7 +61,8 @@ class InverseProblem:
 
     `estimated`: the tissues whose moduli are sought; the other surfaces are drivers'. `finite_strain`: the same bodies
     under the law that the estimate is continued to; empty where the linear one is the case's. `fine_kernel_mm`:
-    correlation length of what a wall does beyond its modes (see `refined_walls`).
+    correlation length of what a wall does beyond its modes (see `refined_walls`). `walls`: the drivers' walls of each
+    model, whose prior is learned from the images (see `learned_prior`); empty: the modes' own prior holds.
     """
 
     models: tuple[LinearModel, ...]
@@ -69,6 +71,7 @@ class InverseProblem:
     estimated: frozenset[str]
     finite_strain: tuple[FiniteStrainModel, ...] = ()
     fine_kernel_mm: float = 8.0
+    walls: tuple[tuple[Wall, ...], ...] = ()
 
     @property
     def drivers(self) -> frozenset[str]:

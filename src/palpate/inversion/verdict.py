@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from palpate.inversion.estimation import Interval
 
-__all__ = ["NORMAL_95", "log_interval", "verdict"]
+__all__ = ["NORMAL_95", "hull", "log_interval", "verdict"]
 
 NORMAL_95 = 1.959964
 IDENTIFIED, WEAK = 2.0, 10.0  # largest ratio of an interval's ends
@@ -16,6 +18,14 @@ def log_interval(centre: float, sd: float, *, lower: float, upper: float) -> Int
     """95 % interval exp(ln centre +- 1.96 sd); an end beyond the bounds (lower, upper), in `centre`'s unit, is open."""
     low, high = centre * np.exp(-NORMAL_95 * sd), centre * np.exp(NORMAL_95 * sd)
     return (float(low) if low > lower else None, float(high) if high < upper else None)
+
+
+def hull(intervals: Sequence[Interval]) -> Interval:
+    """Smallest interval that holds all of one or more; an end that is open in one of them is open."""
+    lows, highs = [low for low, _ in intervals], [high for _, high in intervals]
+    low = None if None in lows else min(end for end in lows if end is not None)
+    high = None if None in highs else max(end for end in highs if end is not None)
+    return low, high
 
 
 def verdict(interval: Interval, *, at_bound: bool, absolute: bool) -> tuple[str, str]:

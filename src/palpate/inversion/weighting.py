@@ -22,8 +22,16 @@ LEAST_CUTOFF = 5e-3  # mm
 FIRST_LAW = NoiseLaw(np.array([0.3**2]), np.array([3.0]))  # until the residuals tell
 
 
-def objective_of(problem: InverseProblem, models: tuple[LocalModel, ...], law: NoiseLaw) -> Objective:
-    """The objective of the models, one for each later image; all residuals count, by their `law`."""
+def objective_of(
+    problem: InverseProblem,
+    models: tuple[LocalModel, ...],
+    law: NoiseLaw,
+    prior: NDArray[np.float64] | None = None,
+) -> Objective:
+    """The objective of the models, one for each later image; all residuals count, by their `law`.
+
+    prior (n_coefficients, n_coefficients): precision of all the drivers' coefficients; None: the modes' own.
+    """
     states = tuple(
         State(m.at(np.concatenate([t.surface.dofs for t in targets])), targets)
         for m, targets in zip(models, problem.targets, strict=True)
@@ -32,7 +40,7 @@ def objective_of(problem: InverseProblem, models: tuple[LocalModel, ...], law: N
     weighting = tuple(
         tuple(Weighting(precision, np.inf, _all_of(t), noise) for t in targets) for targets in problem.targets
     )
-    return Objective(states, problem.modulus_map, weighting)
+    return Objective(states, problem.modulus_map, weighting, prior)
 
 
 def _all_of(target: SurfaceTarget) -> ImagePointUse:

@@ -12,10 +12,11 @@ from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.linear_model import LinearSystem, linear_model
 from palpate.mechanics.loads import Load
 from palpate.mechanics.newton import NewtonSettings
+from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.constraint import Constraint
 from palpate.mesh.space import LagrangeSpace
 
-__all__ = ["ACCURACY", "equilibrium", "from_linear"]
+__all__ = ["ACCURACY", "equilibrium", "from_linear", "from_start"]
 
 ACCURACY = 1e-7  # of the forces: the displacement's error is some nanometres
 
@@ -47,8 +48,24 @@ def from_linear(
 ) -> FiniteStrainEquilibrium:
     """Equilibrium at the moduli of the linear `system` and mode coefficients (n_modes,), from its displacement.
 
-    Where that folds elements, the path begins at rest instead. Raises `NotConverged`.
+    Raises `NotConverged` as `from_start` does.
     """
     start = system.solve(coefficients).displacement
-    found = model.attempt(system.moduli, coefficients, start=start, nearby=system.factorisation)
-    return found if found.converged else model.solve(system.moduli, coefficients)
+    return from_start(model, system.moduli, coefficients, start=start, nearby=system.factorisation)
+
+
+def from_start(
+    model: FiniteStrainModel,
+    moduli: NDArray[np.float64],
+    coefficients: NDArray[np.float64],
+    *,
+    start: NDArray[np.float64],
+    nearby: Factorisation | None,
+) -> FiniteStrainEquilibrium:
+    """Equilibrium at moduli (n_regions,) kPa and coefficients (n_modes,), from a displacement (n_points, 3) mm near it.
+
+    Where that folds elements or leads nowhere, the path begins at rest instead. `nearby`: see `attempt`. Raises
+    `NotConverged` with the element and the share of the motion where that path ended.
+    """
+    found = model.attempt(moduli, coefficients, start=start, nearby=nearby)
+    return found if found.converged else model.solve(moduli, coefficients)

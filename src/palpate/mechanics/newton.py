@@ -177,7 +177,7 @@ def follow(
         length, failure = 1.0, ""
         while path.fraction < 1.0:
             if length < settings.smallest_step or path.steps >= settings.max_steps:
-                return replace(path, reason=_ended(path, failure))
+                return replace(path, reason=_ended(path, failure or f"{path.steps} steps were not enough"))
             before = path
             try:
                 path = _step(way, path, min(length, 1.0 - path.fraction))

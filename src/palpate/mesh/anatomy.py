@@ -192,7 +192,7 @@ def _extended_map(
 
 
 def volume_preserving(distance: DistanceMap, mask: NDArray[np.bool_]) -> DistanceMap:
-    """The map shifted so that as much lies inside as the voxels of `mask` (nx, ny, nz) fill.
+    """The map shifted so that as much lies inside as the voxels of `mask` (n_x, n_y, n_z) fill.
 
     Smoothing with a Gaussian of width sigma moves a surface of mean curvature H inwards by sigma^2 H: a ball of 11 mm
     radius loses 5 % with sigma = 1.5 mm. The shift is at most half of sigma.

@@ -37,10 +37,12 @@ class _Outside:
     box: Box
 
     def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Signed distance (n,) mm to the nearest side at points (n, 3) mm: positive inside the box."""
         local = self.box.local(points)
         return np.asarray(np.minimum(local, self.box.lengths - local).min(axis=1))
 
     def gradient_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Unit vectors (n, 3), dimensionless, away from the nearest side at points (n, 3) mm."""
         local = self.box.local(points)
         nearest = np.concatenate([local, self.box.lengths - local], axis=1).argmin(axis=1)
         return np.asarray(np.concatenate([self.box.axes, -self.box.axes])[nearest])
@@ -55,6 +57,7 @@ class _Closed:
     gap_mm: float
 
     def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The changed level set (n,) mm at points (n, 3) mm."""
         values = self.phi.at(points)
         near = np.flatnonzero(np.abs(values) < self.gap_mm)
         shift = np.zeros(len(points))
@@ -63,6 +66,7 @@ class _Closed:
         return np.asarray(values + STEEPNESS * shift)
 
     def gradient_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Gradient (n, 3), dimensionless, of the changed level set at points (n, 3) mm."""
         gradient = self.phi.gradient_at(points)
         values = self.phi.at(points)
         near = np.flatnonzero(np.abs(values) < self.gap_mm)

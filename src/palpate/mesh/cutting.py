@@ -54,8 +54,8 @@ def cut(
 ) -> Grid:
     """Give the part of the `splittable` (n_tets,) tetrahedra where `phi` is negative to the region `inside`.
 
-    Nodes within `touch_mm` (n_nodes,) of the surface are moved onto it, or if they lie on an earlier surface count as
-    lying on both; edges that cross it are divided where phi, along them, is zero.
+    Nodes within `touch_mm` (n_nodes,) mm of the surface are moved onto it, or if they lie on an earlier surface count
+    as lying on both; edges that cross it are divided where phi, along them, is zero.
     """
     active = np.unique(grid.tets[splittable])
     values = np.zeros(len(grid.nodes))

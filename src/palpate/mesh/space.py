@@ -43,7 +43,7 @@ class LagrangeSpace:
     def interpolation(
         self, triangles: NDArray[np.int64], barycentric: NDArray[np.float64]
     ) -> sparse.csr_matrix[np.float64]:
-        """Matrix (n_faces, n_points): values at the `barycentric` (n_faces, 3) place of each triangle (n_faces, 3)."""
+        """Matrix (n_faces, n_points), dimensionless: values at `barycentric` (n_faces, 3) of triangles (n_faces, 3)."""
         facets = self.facets(triangles)
         weights = triangle_shape(self.order, barycentric)
         rows = np.repeat(np.arange(len(facets)), facets.shape[1])

@@ -107,6 +107,7 @@ def _fitted(grid: Grid, anatomy: Anatomy, edge_length_mm: float) -> Grid:
 
 def _cut_grid(anatomy: Anatomy, edge_length_mm: float) -> Grid:
     def longest_edge(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Longest edge (n,) mm that the grid may have at points (n, 3) mm."""
         return GRID_FACTOR * _sizes(anatomy, points, edge_length_mm)
 
     grid = graded_grid(anatomy.box, longest_edge, coarsest_mm=COARSEST * edge_length_mm, region=anatomy.filler)

@@ -35,7 +35,7 @@ def voxelise(
     warp: Warp | None = None,
     crossing: bool = False,
 ) -> NDArray[np.int16]:
-    """Tissue (nx, ny, nz), an index into `space.mesh.tissues`, at each voxel centre of the deformed mesh.
+    """Tissue (n_x, n_y, n_z), an index into `space.mesh.tissues`, at each voxel centre of the deformed mesh.
 
     `displacement` (n_points, 3) mm belongs to `space.points`. Every face between two regions is split into
     4^subdivisions plane triangles whose corners lie on the deformed (for P2 curved) face, then moved by `warp`
@@ -126,7 +126,7 @@ def _subdivision(n: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 
 
 def _accumulate(pieces: NDArray[np.float64], step: NDArray[np.int64], grid: VoxelGrid) -> NDArray[np.int64]:
-    """Sum (nx, ny, nz) of the steps (n,) of all faces crossed on the way up the voxel's column."""
+    """Sum (n_x, n_y, n_z) of the steps (n,) of all faces crossed on the way up the voxel's column."""
     nx, ny, nz = grid.shape
     corners = np.round(grid.index(pieces.reshape(-1, 3)) * LATTICE).reshape(-1, 3, 3) / LATTICE
     turn = np.sign(np.linalg.det(grid.affine[:3, :3]))

@@ -40,7 +40,7 @@ class ObservedSurface:
 
     @property
     def dofs(self) -> NDArray[np.int64]:
-        """Numbers (3 n_vertices,) of its unknowns in the space, 3 point + axis."""
+        """Numbers (n_dofs,) of its 3 n_vertices unknowns in the space, 3 point + axis."""
         return np.asarray((3 * self.points[:, None] + np.arange(3)).ravel())
 
 

@@ -12,7 +12,7 @@ from palpate.images.alignment import RigidMotion
 from palpate.images.tissue import Role
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.surface import tissue_surface
-from palpate.observation.wall_modes import wall_modes
+from palpate.observation.wall_modes import Wall, wall_modes
 
 __all__ = ["PrescribedMotion", "prescribed_motion"]
 
@@ -21,12 +21,13 @@ __all__ = ["PrescribedMotion", "prescribed_motion"]
 class PrescribedMotion:
     """Displacement `modes q + offset` of the marked points.
 
-    modes (3 n_points, n_modes) mm, offset (3 n_points,) mm, prescribed (n_points,).
+    modes (3 n_points, n_modes) mm, offset (3 n_points,) mm, prescribed (n_points,); `walls`: what the modes move.
     """
 
     modes: NDArray[np.float64]
     offset: NDArray[np.float64]
     prescribed: NDArray[np.bool_]
+    walls: tuple[Wall, ...] = ()
 
 
 def prescribed_motion(
@@ -38,7 +39,8 @@ def prescribed_motion(
     `wall_modes` for kernel_mm and prior_mm, mm).
     """
     n = len(space.points)
-    offset, prescribed, blocks = np.zeros((n, 3)), np.zeros(n, dtype=bool), []
+    offset, prescribed = np.zeros((n, 3)), np.zeros(n, dtype=bool)
+    blocks, walls = list[NDArray[np.float64]](), list[Wall]()
     roles = [tissue.role for tissue in space.mesh.tissues]
     for tissue in (i for i, role in enumerate(roles) if role is Role.RIGID):
         points = _points(space, tissue)
@@ -52,10 +54,13 @@ def prescribed_motion(
         local = wall_modes(space.points[points], n_modes=n_modes, kernel_mm=kernel_mm, prior_mm=prior_mm)
         block = np.zeros((n, 3, local.shape[1]))
         block[points] = local.reshape(len(points), 3, -1)
+        first = sum(b.shape[1] for b in blocks)
         blocks.append(block.reshape(3 * n, -1))
+        columns = np.arange(first, first + local.shape[1])
+        walls.append(Wall(space.points[points], columns, local[::3, ::3], kernel_mm, prior_mm))
         prescribed[points] = True
     modes = np.concatenate(blocks, axis=1) if blocks else np.zeros((3 * n, 0))
-    return PrescribedMotion(modes, offset.ravel(), prescribed)
+    return PrescribedMotion(modes, offset.ravel(), prescribed, tuple(walls))
 
 
 def _points(space: LagrangeSpace, tissue: int) -> NDArray[np.int64]:

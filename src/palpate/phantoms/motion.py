@@ -49,7 +49,7 @@ class Filling:
         middle = self.origin + np.outer(along, self.axis) + np.outer((along / self.length_mm) ** 2, self.bend)
         spoke = (points - middle) / self.radius_mm
         spoke = spoke - np.outer(spoke @ self.axis, self.axis)
-        around = (1.0 + self.lean * spoke @ self.towards[:, None]) / (1.0 + self.lean)
+        around = _around(spoke, self.towards, self.lean)
         amplitude = np.exp(-((along - self.fullest_mm) ** 2) / (2.0 * self.length_mm**2))[:, None]
         return np.asarray(amplitude * (self.filling_mm * around * spoke + self.stray.at(points)))
 
@@ -108,7 +108,7 @@ class Swelling:
     def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Displacement (n, 3) mm at wall points (n, 3) in RAS mm."""
         spoke = (points - self.centre) / self.radius_mm
-        around = (1.0 + self.lean * spoke @ self.towards[:, None]) / (1.0 + self.lean)
+        around = _around(spoke, self.towards, self.lean)
         return np.asarray(self.push_mm * around * spoke + self.stray.at(points))
 
 
@@ -126,3 +126,8 @@ class AffineMotion:
     def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Displacement (n, 3) mm at points (n, 3) in RAS mm."""
         return np.asarray((points - self.centre) @ self.gradient.T + self.translation)
+
+
+def _around(spokes: NDArray[np.float64], towards: NDArray[np.float64], lean: float) -> NDArray[np.float64]:
+    """Share (n, 1), dimensionless, of the motion along spokes (n, 3): 1 `towards` (3,), less on the other side."""
+    return np.asarray((1.0 + lean * spokes @ towards[:, None]) / (1.0 + lean))

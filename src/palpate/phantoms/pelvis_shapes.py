@@ -116,6 +116,7 @@ def _placed(body: PelvisShapes, rng: np.random.Generator, box: Box) -> PelvisSha
     shift = target - middle
 
     def moved(shape: Ellipsoid) -> Ellipsoid:
+        """The ellipsoid turned and shifted with the body."""
         return Ellipsoid(shape.centre @ turn.T + shift, shape.semi_axes, turn @ shape.rotation)
 
     bones = (moved(body.bones[0]), moved(body.bones[1]))

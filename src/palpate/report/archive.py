@@ -23,7 +23,7 @@ __all__ = ["read_archive", "write_archive"]
 
 T = TypeVar("T")
 
-FORMAT = "palpate.report-data/2"
+FORMAT = "palpate.report-data/3"
 MOST_BYTES = 1 << 30  # of all arrays together, unpacked
 MOST_ARRAYS = 4096
 DAMAGED = (KeyError, TypeError, ValueError, OSError, EOFError, RecursionError, zipfile.BadZipFile, NotImplementedError)

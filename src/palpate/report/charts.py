@@ -19,12 +19,12 @@ DASHED = (0, (4, 3))
 BINS = 41
 
 
-def residual_svg(data: ReportData, model: ModelSurface, *, name: str) -> str:
+def residual_svg(data: ReportData, model: ModelSurface, *, voxel_mm: float, name: str) -> str:
     """Histogram of one surface's signed distance (mm) at rest and fitted, with a voxel's edge marked, as SVG.
 
     Raises `ValueError` when none of the surface is observed.
     """
-    tissue, voxel = data.tissues[model.tissue], data.voxel_mm
+    tissue, voxel = data.tissues[model.tissue], voxel_mm
     seen = np.isfinite(model.distance_fitted) & np.isfinite(model.distance_rest)
     rest, fitted, area = (array[seen] for array in (model.distance_rest, model.distance_fitted, model.area))
     if not len(rest) or not area.sum() > 0.0:
@@ -34,6 +34,7 @@ def residual_svg(data: ReportData, model: ModelSurface, *, name: str) -> str:
     share = 100.0 * area / area.sum()
 
     def draw(figure: Figure) -> None:
+        """The two histograms over each other, values beyond the axis in its outer bins."""
         axes = figure.add_axes((0.14, 0.2, 0.83, 0.74))
         clipped = [np.clip(values, -reach, reach) for values in (fitted, rest)]
         axes.hist(clipped[0], bins=list(bins), weights=share, color=tissue.colour, alpha=0.85, label="fitted")
@@ -62,6 +63,7 @@ def modulus_svg(data: ReportData, estimate: int, *, name: str) -> str:
     in_kpa = item["unit"] == "kPa"
 
     def draw(figure: Figure) -> None:
+        """The paths, the 95 % interval as a band and the truth as a dashed line, where they are known."""
         _paths(figure, paths, "E (kPa)" if in_kpa else f"E / {item['relative_to'][:24]}")
         interval = item["interval95"] if in_kpa else item["ratio_interval95"]
         if interval is not None and None not in interval:
@@ -79,6 +81,7 @@ def waterfall_svg(data: ReportData, *, name: str) -> str:
     order = np.argsort(ends, kind="stable")
 
     def draw(figure: Figure) -> None:
+        """The starts as dots on a line."""
         axes = figure.add_axes((0.2, 0.2, 0.77, 0.74))
         axes.plot(range(1, len(order) + 1), ends[order], color=INK, linewidth=0.8, alpha=0.5)
         for rank, number in enumerate(order, start=1):
@@ -100,6 +103,7 @@ def angle_svg(angles: NDArray[np.float32], *, name: str) -> str:
     flat = angles.ravel()
 
     def draw(figure: Figure) -> None:
+        """The histogram and the angle that the gate asks for."""
         axes = figure.add_axes((0.15, 0.2, 0.82, 0.74))
         share = np.full(len(flat), 100.0 / len(flat))
         axes.hist(flat, bins=list(range(0, 181, 5)), weights=share, color=START_COLOURS[0], alpha=0.85)

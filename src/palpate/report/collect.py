@@ -20,9 +20,11 @@ from palpate.images.tissue import Role, Tissue
 from palpate.mechanics.deformation import largest_strains
 from palpate.mesh.dihedral import tet_dihedrals
 from palpate.report.colours import tissue_colours
+from palpate.report.pairs import ImagePair, drawn_images, image_pairs
 from palpate.report.report_data import (
     LaterImage,
     MeshPicture,
+    Reference,
     ReportData,
     ReportTissue,
     SliceBox,
@@ -31,7 +33,7 @@ from palpate.report.report_data import (
 )
 from palpate.report.surfaces import MOST_TRIANGLES, contour_width, image_surface, model_surface
 from palpate.report.volume import MOST_VOXELS, grey_volume, label_volume
-from palpate.study.case import Case, Images
+from palpate.study.case import Case, CaseLoad, Images
 from palpate.study.result import CaseResult, failure_document
 
 __all__ = ["collect", "collect_failure"]
@@ -43,6 +45,7 @@ MOST_LATER = 4  # later images whose slices and surfaces are drawn; a page of mo
 MARGIN_MM = 15.0
 ENOUGH_VOXELS = 4_000_000
 MOVING = (Role.ESTIMATE, Role.DRIVER)
+SHOWN = (*MOVING, Role.RIGID)
 RIGID_TRIANGLES = 12_000
 ALL_TRIANGLES = 300_000  # of all surfaces of the images, so that the page stays small
 NONE: tuple[TriangleSurface, ...] = ()
@@ -64,14 +67,26 @@ class _Attempt:
             return instead
 
 
+@dataclass(frozen=True, slots=True)
+class _Drawing:
+    """A pair of images to be drawn, its number, the triangles that one surface may have, and where failures go."""
+
+    pair: ImagePair
+    number: int
+    most_triangles: int
+    attempt: _Attempt
+
+
 def collect(result: CaseResult) -> ReportData:
     """The report's data of a result; never fails for the sake of a figure."""
     attempt = _Attempt()
-    box = attempt.part("slices", lambda: _slice_box(result), None)
-    background = None if box is None else attempt.part("background", lambda: _background(result, box), None)
-    surfaces = attempt.part("surfaces", lambda: _surfaces(result, result.before), NONE)
-    numbers = range(min(len(result.after), MOST_LATER))
-    later = tuple(_later(result, after, box, attempt) for after in numbers)
+    pairs = image_pairs(result)
+    drawn = drawn_images([len(pair.after) for pair in pairs], MOST_LATER)
+    pairs = pairs[: max(len({number for number, _ in drawn}), 1)]
+    surfaces = max((len(pairs) + len(drawn)) * len(_indices(result, SHOWN)), 1)
+    drawings = [_Drawing(pair, number, ALL_TRIANGLES // surfaces, attempt) for number, pair in enumerate(pairs)]
+    references = tuple(_reference(drawing) for drawing in drawings)
+    later = tuple(_later(drawings[number], after, references[number].slices) for number, after in drawn)
     mesh = attempt.part("mesh", lambda: _mesh(result), None)
     return ReportData(
         document=result.to_dict(),
@@ -79,11 +94,8 @@ def collect(result: CaseResult) -> ReportData:
         settings=_settings(result.case),
         tissues=_tissues(result.tissues, result.stiffness),
         unit=result.unit,
-        voxel_mm=float(max(image.grid.spacing.max() for image in (result.before, *result.after))),
         moduli_paths=_moduli_paths(result),
-        slices=box,
-        background=background,
-        surfaces=surfaces,
+        references=references,
         later=later,
         mesh=mesh,
         missing=attempt.missing,
@@ -110,18 +122,47 @@ def _settings(case: Case) -> tuple[tuple[str, str], ...]:
     """What the case asked for, in words."""
     mechanics, domain, driver, options = case.mechanics, case.domain, case.driver, case.estimate
     margin = f", {domain.margin_mm:g} mm around the organs" if domain.extent == "margin" else ""
-    ratios = options.starts_kpa or options.start_ratios
+    by_load = bool(case.loads) and not any(tissue.role is Role.KNOWN for tissue in case.tissues)
+    in_kpa = " kPa" if by_load else " (ratios)"
+    starts, bounds = options.starts_kpa or options.start_ratios, options.bounds_kpa or options.bounds_ratio
+    loads = tuple(("known load", _load(load)) for load in case.loads)
+    noise = case.noise
     return (
+        *loads,
         ("material law", mechanics.law),
         ("element", mechanics.element),
         ("edge length at the organs", f"{case.mesh.edge_length_mm:g} mm"),
         ("outer boundary", f"{domain.outer_boundary}; domain: {domain.extent}{margin}"),
         ("alignment", case.align),
-        ("driver motion", f"{driver.modes} modes, kernel {driver.kernel_mm:g} mm, prior {driver.prior_mm:g} mm"),
+        (
+            "driver motion",
+            f"{driver.modes} modes, kernel {driver.kernel_mm:g} mm, prior {driver.prior_mm:g} mm"
+            + (", both learned from the images from there on" if driver.learn_prior else ""),
+        ),
         ("method", options.method),
-        ("starts", ", ".join(f"{start:g}" for start in ratios) + (" kPa" if options.starts_kpa else " (ratios)")),
+        ("starts", ", ".join(f"{start:g}" for start in starts) + (" kPa" if options.starts_kpa else in_kpa)),
+        ("bounds", " to ".join(f"{bound:g}" for bound in bounds) + (" kPa" if options.bounds_kpa else in_kpa)),
+        (
+            "surface noise",
+            "from the residuals" if noise.surface_sd_mm is None else f"{noise.surface_sd_mm:g} mm, given",
+        ),
         ("seed", str(case.seed)),
     )
+
+
+def _load(load: CaseLoad) -> str:
+    """A known load in words."""
+    where = f" on {load.surface}" if load.surface else ""
+    if load.acceleration_m_s2 is not None:
+        return f"gravity {_vector(load.acceleration_m_s2)} m/s^2"
+    if load.traction_kpa is not None:
+        return f"traction {_vector(load.traction_kpa)} kPa{where}"
+    kind = "following pressure" if load.following else "dead pressure"
+    return f"{kind} {load.pressure_kpa or 0.0:g} kPa{where}"
+
+
+def _vector(parts: tuple[float, float, float]) -> str:
+    return "(" + ", ".join(f"{part:g}" for part in parts) + ")"
 
 
 def _tissues(tissues: tuple[Tissue, ...], moduli: NDArray[np.float64]) -> tuple[ReportTissue, ...]:
@@ -150,25 +191,38 @@ def _indices(result: CaseResult, roles: tuple[Role, ...]) -> tuple[int, ...]:
     return tuple(i for i, tissue in enumerate(result.tissues) if tissue.role in roles)
 
 
-def _surfaces(result: CaseResult, image: Segmentation) -> tuple[TriangleSurface, ...]:
+def _reference(drawing: _Drawing) -> Reference:
+    pair, attempt = drawing.pair, drawing.attempt
+    result, name = pair.result, pair.before
+    box = attempt.part(f"slices of {name}", lambda: _slice_box(result), None)
+    background = None if box is None else attempt.part(f"background of {name}", lambda: _background(drawing, box), None)
+    return Reference(
+        name=name,
+        voxel_mm=float(max(image.grid.spacing.max() for image in (result.before, *result.after))),
+        slices=box,
+        background=background,
+        surfaces=attempt.part(f"surfaces of {name}", lambda: _surfaces(drawing, result.before), NONE),
+    )
+
+
+def _surfaces(drawing: _Drawing, image: Segmentation) -> tuple[TriangleSurface, ...]:
     """Surfaces of the moving tissues and, coarser, of the rigid ones in an image."""
+    result = drawing.pair.result
     width = contour_width(result)
-    indices = _indices(result, (*MOVING, Role.RIGID))
-    share = ALL_TRIANGLES // ((1 + min(len(result.after), MOST_LATER)) * max(len(indices), 1))
     found = []
-    for i in sorted(indices, key=lambda i: result.tissues[i].role is Role.RIGID):
+    for i in sorted(_indices(result, SHOWN), key=lambda i: result.tissues[i].role is Role.RIGID):
         most = RIGID_TRIANGLES if result.tissues[i].role is Role.RIGID else MOST_TRIANGLES
-        found.append(image_surface(image, i, smoothing_mm=width, most_triangles=min(most, share)))
+        found.append(image_surface(image, i, smoothing_mm=width, most_triangles=min(most, drawing.most_triangles)))
     return tuple(surface for surface in found if len(surface.triangles))
 
 
-def _later(result: CaseResult, after: int, box: SliceBox | None, attempt: _Attempt) -> LaterImage:
-    images = result.case.images
-    name = images.after[after].name if images else "after"
+def _later(drawing: _Drawing, after: int, box: SliceBox | None) -> LaterImage:
+    result, attempt, name = drawing.pair.result, drawing.attempt, drawing.pair.after[after]
     fitted = after < len(result.estimation.displacements)
     return LaterImage(
         name=name,
-        surfaces=attempt.part(f"surfaces of {name}", lambda: _surfaces(result, result.after[after]), NONE),
+        reference=drawing.number,
+        surfaces=attempt.part(f"surfaces of {name}", lambda: _surfaces(drawing, result.after[after]), NONE),
         model=attempt.part(
             f"distances of {name}",
             lambda: tuple(model_surface(result, i, after) for i in _indices(result, MOVING)) if fitted else (),
@@ -178,16 +232,18 @@ def _later(result: CaseResult, after: int, box: SliceBox | None, attempt: _Attem
     )
 
 
-def _background(result: CaseResult, box: SliceBox) -> Volume:
-    """The earlier grey image, or the labels where there is none or it cannot be read."""
-    images = result.case.images
+def _background(drawing: _Drawing, box: SliceBox) -> Volume:
+    """The earlier grey image, or the labels where there is none or it cannot be read, which the page then says."""
+    images, before = drawing.pair.result.case.images, drawing.pair.result.before
     if images is not None and images.intensities_before is not None:
         try:
             values, grid = read_intensities(images.intensities_before)
             return grey_volume(values, grid, box, most_voxels=_most_voxels(images))
         except PalpateError as error:
             LOGGER.warning("the grey image is left out of the report: %s", error)
-    return label_volume(result.before, box)
+            words = f"The labels stand in place of the grey image: {error}"
+            drawing.attempt.missing[f"background of {drawing.pair.before}"] = words
+    return label_volume(before, box)
 
 
 def _most_voxels(images: Images) -> float:
@@ -214,9 +270,9 @@ def _later_background(result: CaseResult, after: int, box: SliceBox | None) -> V
 
 
 def _mesh(result: CaseResult) -> MeshPicture:
-    """The mesh with its largest strain in any of the later images that are drawn."""
+    """The mesh of the first reference state with its largest strain in any of its later images."""
     mesh = result.space.mesh
-    motions = result.estimation.displacements[: min(len(result.after), MOST_LATER)]
+    motions = result.estimation.displacements[: len(result.after)]
     strains = [largest_strains(result.space, motion) for motion in motions]
     return MeshPicture(
         nodes=mesh.nodes.astype(np.float32),

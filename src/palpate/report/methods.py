@@ -90,6 +90,12 @@ def _model(data: ReportData, cite: _Citations) -> str:
     document: Mapping[str, Any] = data.document
     mesh = document["mesh"]
     size = f" of {mesh['tets']} tetrahedra with {mesh['dofs']} unknowns" if mesh else ""
+    pairs = len(document.get("pairs", ()))
+    more = (
+        f" Each of {pairs + 1} pairs of images had a mesh of its own, of which the first is told of." if pairs else ""
+    )
+    loads = [words for key, words in data.settings if key == "known load"]
+    acted = f" Known loads acted on the later states: {'; '.join(loads)}." if loads else ""
     settings = dict(data.settings)
     ratios = sorted({f"{t.poisson_ratio:g}" for t in data.tissues if t.role in ("estimate", "known")})
     return (
@@ -97,7 +103,7 @@ def _model(data: ReportData, cite: _Citations) -> str:
         " share."
         f" A conforming mesh{size} (edge length {settings['edge length at the organs']} at the organs) was cut along"
         f" their"
-        f" zero levels and improved with Mmg {cite('mmg')}. The tissues followed"
+        f" zero levels and improved with Mmg {cite('mmg')}.{more} The tissues followed"
         f" {LAWS.get(document['law'], 'the law ' + str(document['law']))} in"
         f" {ELEMENTS.get(document['element'], str(document['element']))}, with"
         f" Poisson's"
@@ -105,7 +111,7 @@ def _model(data: ReportData, cite: _Citations) -> str:
         f" walls was"
         f" a Gaussian process in its leading modes ({settings['driver motion']}) {cite('kernel')}, estimated together"
         f" with"
-        " the moduli."
+        f" the moduli.{acted}"
     )
 
 

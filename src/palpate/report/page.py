@@ -13,14 +13,14 @@ from typing import Any, TypeVar
 
 import jinja2
 import numpy as np
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from palpate.report.charts import angle_svg, modulus_svg, objective_svg, residual_svg, waterfall_svg
 from palpate.report.colours import START_COLOURS
 from palpate.report.methods import Methods, methods_text
 from palpate.report.payload import payload
 from palpate.report.pictures import mesh_png, organs_png
-from palpate.report.report_data import LaterImage, ReportData
+from palpate.report.report_data import LaterImage, Reference, ReportData, SliceBox
 from palpate.report.rows import estimate_rows, number, scale_marks
 from palpate.report.scales import Scale, angle_scale, distance_scale, modulus_scale, strain_scale
 from palpate.report.section import VIEWS
@@ -55,6 +55,8 @@ class _Later:
     organs: tuple[Picture, ...]
     residuals: tuple[Picture, ...]
     scale: Scale
+    reference: Reference
+    widths: str
 
 
 def render(data: ReportData) -> str:
@@ -86,7 +88,6 @@ def render(data: ReportData) -> str:
         angle_scale=angle_scale(),
         strain_scale=strain_scale() if data.mesh and len(data.mesh.strains) else None,
         gradient=_gradient,
-        widths=_widths(data),
     )
     return str(page)
 
@@ -118,14 +119,14 @@ def _warnings(data: ReportData) -> tuple[tuple[str, tuple[str, ...]], ...]:
     return tuple((code, tuple(messages)) for code, messages in groups.items())
 
 
-def _widths(data: ReportData) -> str:
+def _widths(box: SliceBox | None) -> str:
     """Columns of the three slices, so that all show a millimetre in the same size, as CSS."""
-    box = data.slices
     return "" if box is None else " ".join(f"{box.high[v.across] - box.low[v.across]:.1f}fr" for v in VIEWS)
 
 
 def _later(data: ReportData, k: int, later: LaterImage) -> _Later:
-    planes = first_planes(data.slices) if data.slices else ()
+    reference = data.references[later.reference]
+    planes = first_planes(reference.slices) if reference.slices else ()
     return _Later(
         name=later.name,
         slices=tuple(
@@ -137,10 +138,15 @@ def _later(data: ReportData, k: int, later: LaterImage) -> _Later:
             _photograph("after fitting", partial(organs_png, data, later, fitted=True)),
         ),
         residuals=tuple(
-            _picture(data.tissues[model.tissue].name, partial(residual_svg, data, model, name=f"r{k}t{model.tissue}"))
+            _picture(
+                data.tissues[model.tissue].name,
+                partial(residual_svg, data, model, voxel_mm=reference.voxel_mm, name=f"r{k}t{model.tissue}"),
+            )
             for model in later.model
         ),
-        scale=distance_scale(data.voxel_mm),
+        scale=distance_scale(reference.voxel_mm),
+        reference=reference,
+        widths=_widths(reference.slices),
     )
 
 
@@ -192,8 +198,9 @@ def _photograph(title: str, draw: Callable[[], bytes]) -> Picture:
     """The PNG that `draw` makes, as an image of the page."""
 
     def element() -> str:
+        """The image as an HTML element that holds its own data."""
         source = base64.b64encode(draw()).decode()
-        return f'<img alt="{title.replace(chr(39), "&#39;")}" src="data:image/png;base64,{source}">'
+        return f'<img alt="{escape(title)}" src="data:image/png;base64,{source}">'
 
     return _picture(title, element)
 

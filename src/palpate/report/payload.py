@@ -12,7 +12,15 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from palpate.report.report_data import LaterImage, MeshPicture, ReportData, TriangleSurface, Volume
+from palpate.report.report_data import (
+    LaterImage,
+    MeshPicture,
+    Reference,
+    ReportData,
+    SliceBox,
+    TriangleSurface,
+    Volume,
+)
 from palpate.report.scales import Scale, angle_scale, distance_scale, modulus_scale, strain_scale
 from palpate.report.section import VIEWS
 
@@ -40,7 +48,7 @@ class _Packer:
     chunks: list[bytes] = field(default_factory=list)
 
     def add(self, array: NDArray[Any]) -> dict[str, Any]:
-        """Where and what the array is in the block; each begins at a multiple of four bytes."""
+        """Where and what the array, as (n, 3) mm or (n,), is in the block; it begins at a multiple of four bytes."""
         raw = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")).tobytes()
         offset = sum(map(len, self.chunks))
         self.chunks.append(raw + bytes(-len(raw) % 4))
@@ -52,7 +60,7 @@ class _Packer:
         return self.add(np.clip(steps, 0, LEVELS).astype(np.uint16))
 
     def indices(self, indices: NDArray[np.int32]) -> dict[str, Any]:
-        """Numbers of points, in 16 bits where they fit."""
+        """Where the numbers of points, (n, 3) or (n,), are in the block; in 16 bits where they fit."""
         small = int(indices.max(initial=0)) <= LEVELS
         return self.add(indices.astype(np.uint16 if small else np.uint32))
 
@@ -69,9 +77,7 @@ def payload(data: ReportData) -> Payload:
         "views": [
             {"name": v.name, "normal": v.normal, "across": v.across, "up": v.up, "letters": v.letters} for v in VIEWS
         ],
-        "box": _box(data),
-        "background": _volume(data.background, packer),
-        "surfaces": [_surface(surface, packer) for surface in data.surfaces],
+        "references": [_reference(reference, packer) for reference in data.references],
         "later": [_later(data, later, packer) for later in data.later],
         "mesh": _mesh(data.mesh, packer),
         "angles": _scale(angle_scale()),
@@ -92,7 +98,8 @@ def script_json(value: Any) -> Markup:
 
 def _quantum(data: ReportData) -> tuple[NDArray[np.float64], float]:
     """Corner (3,) mm and step (mm) of a lattice that holds every point."""
-    clouds = [s.points for s in data.surfaces] + [s.points for later in data.later for s in later.surfaces]
+    images: list[Reference | LaterImage] = [*data.references, *data.later]
+    clouds = [surface.points for image in images for surface in image.surfaces]
     clouds += [p for later in data.later for m in later.model for p in (m.rest, m.fitted)]
     clouds += [data.mesh.nodes] if data.mesh else []
     clouds = [cloud for cloud in clouds if len(cloud)]
@@ -103,8 +110,15 @@ def _quantum(data: ReportData) -> tuple[NDArray[np.float64], float]:
     return low, max(float((high - low).max()) / LEVELS, 1e-9)
 
 
-def _box(data: ReportData) -> dict[str, Any] | None:
-    box = data.slices
+def _reference(reference: Reference, packer: _Packer) -> dict[str, Any]:
+    return {
+        "box": _box(reference.slices),
+        "background": _volume(reference.background, packer),
+        "surfaces": [_surface(surface, packer) for surface in reference.surfaces],
+    }
+
+
+def _box(box: SliceBox | None) -> dict[str, Any] | None:
     if box is None:
         return None
     return {"low": box.low.tolist(), "high": box.high.tolist(), "position": box.position.tolist()}
@@ -133,6 +147,7 @@ def _surface(surface: TriangleSurface, packer: _Packer) -> dict[str, Any]:
 def _later(data: ReportData, later: LaterImage, packer: _Packer) -> dict[str, Any]:
     return {
         "name": later.name,
+        "reference": later.reference,
         "background": _volume(later.background, packer),
         "surfaces": [_surface(surface, packer) for surface in later.surfaces],
         "model": [
@@ -146,7 +161,7 @@ def _later(data: ReportData, later: LaterImage, packer: _Packer) -> dict[str, An
             }
             for model in later.model
         ],
-        "scale": _scale(distance_scale(data.voxel_mm)),
+        "scale": _scale(distance_scale(data.references[later.reference].voxel_mm)),
     }
 
 

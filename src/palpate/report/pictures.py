@@ -24,7 +24,7 @@ def organs_png(data: ReportData, later: LaterImage, *, fitted: bool) -> bytes:
     """The model's organs, as fitted to `later` or at rest, coloured by their signed distance to that image; PNG."""
     if not later.model:
         raise ValueError("there is no fitted model")
-    scale = distance_scale(data.voxel_mm)
+    scale = distance_scale(data.references[later.reference].voxel_mm)
     corners, colours, normals = [], [], []
     for model in later.model:
         points = (model.fitted if fitted else model.rest).astype(np.float64)
@@ -41,7 +41,8 @@ def mesh_png(data: ReportData, *, by: Literal["tissue", "modulus", "strain"]) ->
     mesh = data.mesh
     if mesh is None:
         raise ValueError("there is no mesh")
-    middle = float(np.median(mesh.nodes[:, 0])) if data.slices is None else float(data.slices.position[0])
+    box = data.references[0].slices if data.references else None
+    middle = float(np.median(mesh.nodes[:, 0])) if box is None else float(box.position[0])
     faces, tets = section_faces(mesh, axis=0, position=middle)
     if by == "strain":
         shades = strain_scale().colours(100.0 * mesh.strains[tets].astype(np.float64))
@@ -56,7 +57,7 @@ def mesh_png(data: ReportData, *, by: Literal["tissue", "modulus", "strain"]) ->
 
 
 def tissue_shades(data: ReportData, scale: Scale | None) -> NDArray[np.float64]:
-    """Colours (n_tissues, 3), 0 to 1: the tissues' own, or those of their moduli on `scale`."""
+    """Colours (n_tissues, 3), dimensionless, 0 to 1: the tissues' own, or those of their moduli on `scale`."""
     if scale is None:
         return np.array([to_rgb(tissue.colour) for tissue in data.tissues])
     moduli = [np.nan if tissue.modulus is None else tissue.modulus for tissue in data.tissues]

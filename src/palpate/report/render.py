@@ -36,7 +36,7 @@ class Camera:
 
     @property
     def axes(self) -> NDArray[np.float64]:
-        """World to picture, (3, 3): across, up, towards the viewer."""
+        """World to picture, (3, 3), dimensionless: rows across, up and towards the viewer."""
         return np.stack([self.right, self.up, self.back])
 
 

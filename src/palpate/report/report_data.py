@@ -17,6 +17,7 @@ __all__ = [
     "LaterImage",
     "MeshPicture",
     "ModelSurface",
+    "Reference",
     "ReportData",
     "ReportTissue",
     "SliceBox",
@@ -69,7 +70,7 @@ class ModelSurface:
 
 @dataclass(frozen=True, slots=True)
 class Volume:
-    """Bytes (nx, ny, nz) on a grid along the axes of the world; `origin` (3,) mm and `step` (3,) mm of its voxels.
+    """Bytes (n_x, n_y, n_z) on a grid along the axes of the world; `origin` (3,) mm and `step` (3,) mm of its voxels.
 
     kind "grey": 0 black to 255 white; kind "labels": the tissue's index + 1, 0 outside of the image.
     """
@@ -98,10 +99,28 @@ class SliceBox:
 
 
 @dataclass(frozen=True, slots=True)
-class LaterImage:
-    """One later image: its name, its surfaces, the model fitted to it, its grey values or labels."""
+class Reference:
+    """The reference state of a pair of images: what its slices show, its grey values or labels, its surfaces.
+
+    voxel_mm: the largest edge of a voxel in it and its later images.
+    """
 
     name: str
+    voxel_mm: float
+    slices: SliceBox | None = None
+    background: Volume | None = None
+    surfaces: tuple[TriangleSurface, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class LaterImage:
+    """One later image: its name, its surfaces, the model fitted to it, its grey values or labels.
+
+    reference: number of its reference state.
+    """
+
+    name: str
+    reference: int = 0
     surfaces: tuple[TriangleSurface, ...] = ()
     model: tuple[ModelSurface, ...] = ()
     background: Volume | None = None
@@ -109,9 +128,10 @@ class LaterImage:
 
 @dataclass(frozen=True, slots=True)
 class MeshPicture:
-    """The mesh: nodes (n, 3) RAS mm, tets (m, 4), region (m,) tissue index, angles (m, 6) dihedral, degrees.
+    """The mesh of the first reference state: nodes (n, 3) RAS mm, tets (m, 4), region (m,) tissue index.
 
-    strains (m,): the largest principal strain of the fitted states, dimensionless; (0,) where nothing was fitted.
+    angles (m, 6): dihedral, degrees; strains (m,): the largest principal strain of its fitted states, dimensionless;
+    (0,) where nothing was fitted.
     """
 
     nodes: NDArray[np.float32]
@@ -125,8 +145,9 @@ class MeshPicture:
 class ReportData:
     """One case's report before it is drawn.
 
-    document: that of result.json; unit: of the moduli, "kPa" or "ratio"; voxel_mm: the largest edge of a voxel;
-    moduli_paths: of each start, tissue -> moduli by iteration; missing: part of the page -> why it is not there.
+    document: that of result.json; unit: of the moduli, "kPa" or "ratio"; moduli_paths: of each start, tissue -> moduli
+    by iteration; references: the reference states, that of the mesh first; later: their later images; missing: part of
+    the page ("mesh", or "slices", "surfaces", "background", "distances" of an image) -> why it is not there.
     """
 
     document: Mapping[str, Any]
@@ -134,11 +155,8 @@ class ReportData:
     settings: tuple[tuple[str, str], ...]
     tissues: tuple[ReportTissue, ...]
     unit: str
-    voxel_mm: float = 1.0
     moduli_paths: tuple[Mapping[str, tuple[float, ...]], ...] = ()
-    slices: SliceBox | None = None
-    background: Volume | None = None
-    surfaces: tuple[TriangleSurface, ...] = ()
+    references: tuple[Reference, ...] = ()
     later: tuple[LaterImage, ...] = ()
     mesh: MeshPicture | None = None
     missing: Mapping[str, str] = field(default_factory=dict)

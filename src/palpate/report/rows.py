@@ -9,7 +9,7 @@ from typing import Any
 
 from palpate.inversion.estimation import Interval
 
-__all__ = ["Bar", "EstimateRow", "estimate_rows", "number", "scale_marks"]
+__all__ = ["Bar", "EstimateRow", "estimate_rows", "interval_text", "number", "scale_marks"]
 
 NONE = "–"
 BAR = 200.0  # width of a bar, in its own units
@@ -88,10 +88,10 @@ def _row(item: Mapping[str, Any], *, colour: str, shown: bool, scale: tuple[floa
         tissue=item["tissue"],
         colour=colour,
         value=number(item["value"] if shown else None),
-        interval=_interval(item["interval95"] if shown else None),
+        interval=interval_text(item["interval95"] if shown else None),
         unit=item["unit"],
         ratio=number(item["ratio"] if shown else None),
-        ratio_interval=_interval(item["ratio_interval95"] if shown else None),
+        ratio_interval=interval_text(item["ratio_interval95"] if shown else None),
         relative_to=item["relative_to"],
         verdict=item["verdict"] if shown else "not identified",
         why=item["why"],
@@ -108,7 +108,8 @@ def _main(item: Mapping[str, Any]) -> tuple[float | None, Interval | None]:
     return item["ratio"], item["ratio_interval95"]
 
 
-def _interval(interval: Interval | None) -> str:
+def interval_text(interval: Interval | None) -> str:
+    """As "2.00 to 5.00"; "> 2.00" or "< 5.00" with one end open, "any" with both; a dash for nothing."""
     if interval is None:
         return NONE
     low, high = interval
@@ -134,6 +135,7 @@ def _scale(items: Iterable[Mapping[str, Any]]) -> tuple[float, float] | None:
 
 def _bar(value: float, interval: Interval | None, *, truth: float | None, scale: tuple[float, float]) -> Bar:
     def place(number: float | None, otherwise: float) -> float:
+        """Where a number lies along the bar; `otherwise` for an open end or a value that has no logarithm."""
         return BAR * (math.log(number) - scale[0]) / (scale[1] - scale[0]) if number and number > 0 else otherwise
 
     low, high = interval if interval is not None else (value, value)

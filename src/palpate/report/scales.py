@@ -30,18 +30,18 @@ class Scale:
 
     @property
     def table(self) -> NDArray[np.uint8]:
-        """The scale's 256 colours, (256, 3)."""
+        """The scale's 256 colours, (256, 3), 0 to 255."""
         shades = mpl.colormaps[self.name](np.linspace(0.0, 1.0, 256))[:, :3]
         return np.rint(255.0 * shades).astype(np.uint8)
 
     def place(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where values (n,) lie on the scale, 0 to 1; NaN stays."""
+        """Where values (n,), in the unit of the scale, lie on it, 0 to 1, dimensionless; NaN stays."""
         low, high = (math.log(self.low), math.log(self.high)) if self.logarithmic else (self.low, self.high)
         scaled = np.log(values) if self.logarithmic else values
         return np.clip((scaled - low) / (high - low), 0.0, 1.0)
 
     def colours(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Colours (n, 3), 0 to 1, of values (n,); grey where there is none."""
+        """Colours (n, 3), dimensionless, 0 to 1, of values (n,) in the unit of the scale; grey where there is none."""
         place = self.place(np.asarray(values, dtype=np.float64))
         known = np.isfinite(place)
         shades = self.table[np.rint(255.0 * np.where(known, place, 0.0)).astype(int)] / 255.0

@@ -53,7 +53,7 @@ class Plane:
 
     @property
     def points(self) -> NDArray[np.float64]:
-        """World points (m, n, 3) mm of the pixels' centres."""
+        """World points (n_up, n_across, 3) mm of the pixels' centres."""
         across, up = self.axes
         points = np.empty((len(up), len(across), 3))
         points[..., self.view.normal] = self.position
@@ -67,7 +67,10 @@ class Plane:
 
 
 def cut_image(values: NDArray[Any], grid: VoxelGrid, plane: Plane, *, order: Literal[0, 1] = 1) -> NDArray[np.float64]:
-    """Values (m, n) of a field (nx, ny, nz) on the plane's pixels; NaN outside its grid. order 0: nearest voxel."""
+    """Values (n_up, n_across) of a field (n_x, n_y, n_z) on the plane's pixels; NaN outside its grid.
+
+    order 0: nearest voxel.
+    """
     points = plane.points
     index = grid.index(points.reshape(-1, 3))
     window, origin = _window(index, grid.shape)

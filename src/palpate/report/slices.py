@@ -29,7 +29,7 @@ def first_planes(box: SliceBox) -> tuple[Plane, ...]:
 
 def contour_names(data: ReportData) -> tuple[tuple[str, str], ...]:
     """(name, colour) of every tissue whose contour is drawn."""
-    drawn = dict.fromkeys(surface.tissue for surface in data.surfaces)
+    drawn = dict.fromkeys(surface.tissue for reference in data.references for surface in reference.surfaces)
     return tuple((data.tissues[i].name, data.tissues[i].colour) for i in drawn)
 
 
@@ -38,18 +38,20 @@ def slice_svg(data: ReportData, plane: Plane, later: LaterImage, *, name: str) -
     across, up = (float(plane.high[axis] - plane.low[axis]) for axis in (plane.view.across, plane.view.up))
 
     def draw(figure: Figure) -> None:
+        """Grey values, contours and furniture, one over the other."""
         axes = figure.add_axes((0, 0, 1, 1))
-        _background(axes, data, plane)
+        _background(axes, data, plane, number=later.reference)
         _contours(axes, data, plane, later)
         _furniture(axes, plane)
 
     return draw_svg(draw, size=(WIDTH_INCHES, WIDTH_INCHES * up / across), name=name)
 
 
-def _background(axes: Axes, data: ReportData, plane: Plane) -> None:
+def _background(axes: Axes, data: ReportData, plane: Plane, *, number: int) -> None:
+    """The earlier image of reference state `number`."""
     across, up = plane.axes
     extent = (across[0], across[-1], up[0], up[-1])
-    volume = data.background
+    volume = data.references[number].background
     if volume is None:
         axes.imshow(np.zeros((2, 2)), cmap="gray", extent=extent, origin="lower")
         return
@@ -64,7 +66,7 @@ def _background(axes: Axes, data: ReportData, plane: Plane) -> None:
 def _contours(axes: Axes, data: ReportData, plane: Plane, later: LaterImage) -> None:
     for surface in later.surfaces:
         _lines(axes, data, plane, surface, gid="layer-after", linewidth=4.0, alpha=0.5)
-    for surface in data.surfaces:
+    for surface in data.references[later.reference].surfaces:
         _lines(axes, data, plane, surface, gid="layer-before", linewidth=1.0, linestyle=(0, (1, 1.6)))
     for model in later.model:
         lines = joined(model.fitted.astype(np.float64), model.triangles.astype(np.int64), plane)

@@ -86,7 +86,7 @@ def _distances(image: Segmentation, tissue: int, smoothing_mm: float, *, reach_m
 
 
 def _half(share: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Points (n, 3) in voxels and triangles (m, 3) of the level 1/2 in `share` (nx, ny, nz)."""
+    """Points (n, 3) in voxels and triangles (m, 3) of the level 1/2 in `share` (n_x, n_y, n_z)."""
     nx, ny, nz = share.shape
     places = np.indices(share.shape, dtype=np.float64).reshape(3, -1, order="F").T
     flat = share.astype(np.float64).ravel(order="F")

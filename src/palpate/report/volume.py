@@ -21,7 +21,7 @@ MOST_TISSUES = 254
 
 
 def grey_volume(values: NDArray[Any], grid: VoxelGrid, box: SliceBox, *, most_voxels: float = MOST_VOXELS) -> Volume:
-    """The part of a grey image (nx, ny, nz) on `grid` that lies in `box`, its soft tissue spread over the greys.
+    """The part of a grey image (n_x, n_y, n_z) on `grid` that lies in `box`, its soft tissue spread over the greys.
 
     It is sampled more coarsely than the image where it had over `most_voxels`.
     """

@@ -31,6 +31,7 @@ from palpate.mesh.tetrahedralise import tetrahedralise
 from palpate.observation.observed_surface import ObservedSurface, observed_surface
 from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.observation.target import SurfaceTarget, surface_target
+from palpate.observation.wall_modes import Wall
 from palpate.study.case import Case, Mechanics
 from palpate.study.case_loads import case_loads
 from palpate.study.contacts import every_finding
@@ -62,9 +63,12 @@ class Body:
     smoothing_mm: float
 
 
-def aligned(before: Segmentation, after: tuple[Segmentation, ...], *, method: str) -> ImagedStates:
+def aligned(
+    before: Segmentation, after: tuple[Segmentation, ...], *, method: str, loaded: bool = False
+) -> ImagedStates:
     """Bring the later images to the first on their rigid tissues (`method` "rigid-tissues") and check them all.
 
+    `loaded`: whether known loads act on the body, for what is found of its motion.
     Raises `InputDataError` as `check_images`, `align` and `refuse_lost` do, `GeometryError` as `refuse_unmeshable`.
     """
     images, bones, findings = [], [], list[Finding]()
@@ -101,7 +105,7 @@ def aligned(before: Segmentation, after: tuple[Segmentation, ...], *, method: st
         name = "after" if len(images) == 1 else f"after[{number}]"
         refuse_unmeshable(image, name)
         refuse_lost(before, image, name)
-    findings += [finding for finding in every_finding(before, images) if finding.code in STATED]
+    findings += [finding for finding in every_finding(before, images, loaded=loaded) if finding.code in STATED]
     return ImagedStates(before, tuple(images), tuple(bones), tuple(findings))
 
 
@@ -140,13 +144,15 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Callable[[str
     """
     targets = tuple(target for body in bodies for target in _targets(body))
     progress("assembling one stiffness matrix a tissue")
-    models = tuple(model for body in bodies for model in _models(body, case))
+    pairs = [pair for body in bodies for pair in _models(body, case)]
+    models = tuple(model for model, _ in pairs)
     _refuse_rest(models, case)
     finite = _finite_strain(models, case)
     tissues = bodies[0].space.mesh.tissues
     estimated = frozenset(tissue.name for tissue in tissues if tissue.role is Role.ESTIMATE)
     mapping = modulus_map(tissues, models[0].regions, loaded=bool(case.loads))
-    return InverseProblem(models, targets, mapping, estimated, finite)
+    walls = tuple(walls for _, walls in pairs) if case.driver.learn_prior else ()
+    return InverseProblem(models, targets, mapping, estimated, finite, walls=walls)
 
 
 def _targets(body: Body) -> tuple[tuple[SurfaceTarget, ...], ...]:
@@ -157,9 +163,9 @@ def _targets(body: Body) -> tuple[tuple[SurfaceTarget, ...], ...]:
     return tuple(tuple(_target(body, surface, image) for surface in surfaces) for image in body.states.after)
 
 
-def _models(body: Body, case: Case) -> tuple[LinearModel, ...]:
-    """One model a later image; they share the stiffness and differ in the motion of the bones."""
-    models: list[LinearModel] = []
+def _models(body: Body, case: Case) -> list[tuple[LinearModel, tuple[Wall, ...]]]:
+    """One model a later image, and its drivers' walls; they share the stiffness and differ in the bones' motion."""
+    models: list[tuple[LinearModel, tuple[Wall, ...]]] = []
     dilatation, loads = choose_element(case.mechanics.element).dilatation, case_loads(case, body.space)
     for bones in body.states.bones:
         motion = prescribed_motion(
@@ -176,9 +182,13 @@ def _models(body: Body, case: Case) -> tuple[LinearModel, ...]:
             offset=motion.offset,
             prescribed=motion.prescribed,
         )
-        first = models[0] if models else linear_model(body.space, constraint, dilatation=dilatation, loads=loads)
-        models.append(with_constraint(first, constraint) if models else first)
-    return tuple(models)
+        made = (
+            with_constraint(models[0][0], constraint)
+            if models
+            else linear_model(body.space, constraint, dilatation=dilatation, loads=loads)
+        )
+        models.append((made, motion.walls))
+    return models
 
 
 def _finite_strain(models: tuple[LinearModel, ...], case: Case) -> tuple[FiniteStrainModel, ...]:

@@ -183,11 +183,15 @@ class MeshSettings:
 
 @dataclass(frozen=True, slots=True)
 class DriverMotion:
-    """Smooth modes of the driver's wall: how many, Gaussian kernel's length and prior amplitude, mm."""
+    """Smooth modes of the driver's wall: how many, Gaussian kernel's length and prior amplitude, mm.
+
+    `learn_prior`: the images say how far and how smoothly the wall moves; kernel and amplitude are the first guess.
+    """
 
     modes: int = field(default=90, metadata=POSITIVE)
     kernel_mm: float = field(default=20.0, metadata=POSITIVE)
     prior_mm: float = field(default=5.0, metadata=POSITIVE)
+    learn_prior: bool = True
 
 
 @dataclass(frozen=True, slots=True)

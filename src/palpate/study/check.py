@@ -115,8 +115,8 @@ class CheckReport:
             cost = self.cost
             lines.append(
                 f"expected: {cost.tets} tetrahedra, {cost.unknowns} unknowns, {cost.memory_gb:.1f} GB,"
-                f" {cost.seconds / 60.0:.1f} min with {cost.solver} on {cost.processors} processor(s); each within a"
-                " factor of two"
+                f" {cost.seconds / 60.0:.1f} min with {cost.solver} on {cost.processors} processor(s); each a rough"
+                " guess, often within a factor of two"
             )
         return "\n".join(lines)
 
@@ -164,7 +164,8 @@ def check_case(path: Path, overrides: Sequence[str], *, progress: Callable[[str]
     progress("reading the images")
     pairs = _phantom_states(case, problems) if case.phantom else _read_pairs(case, problems)
     for number, (before, after) in enumerate(pairs, start=1):
-        _check_pair(problems, before, after, where=f"pair {number}: " if number > 1 else "")
+        where = f"pair {number}: " if number > 1 else ""
+        _check_pair(problems, before, after, where=where, loaded=bool(case.loads))
     if not pairs:
         return CheckReport(case.id, tuple(problems.found))
     before, after = pairs[0]
@@ -205,7 +206,9 @@ def _read_pairs(case: Case, problems: _Problems) -> list[Pair]:
     return pairs
 
 
-def _check_pair(problems: _Problems, before: Segmentation, after: tuple[Segmentation, ...], *, where: str) -> None:
+def _check_pair(
+    problems: _Problems, before: Segmentation, after: tuple[Segmentation, ...], *, where: str, loaded: bool
+) -> None:
     """Every check on the images of one pair; an organ that is absent is named, and left out of the other checks."""
     names = ["after" if len(after) == 1 else f"after[{i}]" for i in range(1, len(after) + 1)]
     absent = _absent([("before", before), *zip(names, after, strict=True)])
@@ -226,7 +229,7 @@ def _check_pair(problems: _Problems, before: Segmentation, after: tuple[Segmenta
         if any(tissue.role in OBSERVED for tissue in before.tissues):
             findings = problems.attempt(partial(check_pair, before, image, name=name))
             problems.warn(findings or (), where)
-    problems.warn(every_finding(before, after), where)
+    problems.warn(every_finding(before, after, loaded=loaded), where)
 
 
 def _absent(images: Sequence[tuple[str, Segmentation]]) -> dict[str, list[str]]:

@@ -46,9 +46,15 @@ def contact_findings(segmentation: Segmentation) -> tuple[Finding, ...]:
     return tuple(findings)
 
 
-def motion_findings(before: Segmentation, after: Segmentation, name: str) -> tuple[Finding, ...]:
-    """A finding for the image called `name` when no driver's or bone's surface in it moves by more than the noise."""
-    movers = [i for i, tissue in enumerate(before.tissues) if tissue.role in (Role.DRIVER, Role.RIGID)]
+def motion_findings(
+    before: Segmentation, after: Segmentation, name: str, *, loaded: bool = False
+) -> tuple[Finding, ...]:
+    """A finding for the image called `name` when no driver's or bone's surface in it moves by more than the noise.
+
+    `loaded`: known loads act, which move the organs themselves, so theirs count, too.
+    """
+    moving = (Role.DRIVER, Role.RIGID, Role.ESTIMATE) if loaded else (Role.DRIVER, Role.RIGID)
+    movers = [i for i, tissue in enumerate(before.tissues) if tissue.role in moving]
     voxel = float(max(before.grid.spacing.max(), after.grid.spacing.max()))
     motions = {before.tissues[i].name: wall_motion(before, after, i) for i in movers}
     if not motions or max(motions.values()) > STILL_VOXELS * voxel:
@@ -57,7 +63,7 @@ def motion_findings(before: Segmentation, after: Segmentation, name: str) -> tup
     text = (
         f"hardly anything moves from 'before' to '{name}' (mean motion of the walls: {words}; voxels of {voxel:.2g}"
         " mm): the motion is not above the noise of the voxels, and intervals will be wide; use a pair with more"
-        " filling"
+        f" {'load' if loaded else 'filling'}"
     )
     return (Finding("motion-below-noise", text),)
 
@@ -124,8 +130,15 @@ def _middle(segmentation: Segmentation, tissue: int) -> float:
     return float(segmentation.grid.world(np.argwhere(segmentation.mask(tissue)).mean(axis=0)[None])[0, 0])
 
 
-def every_finding(before: Segmentation, after: Sequence[Segmentation]) -> tuple[Finding, ...]:
-    """Contacts of the reference state and motions of all later ones, named as `check_images` names them."""
+def every_finding(before: Segmentation, after: Sequence[Segmentation], *, loaded: bool = False) -> tuple[Finding, ...]:
+    """Contacts of the reference state and motions of all later ones, named as `check_images` names them.
+
+    `loaded`: as of `motion_findings`.
+    """
     names = ["after" if len(after) == 1 else f"after[{i}]" for i in range(1, len(after) + 1)]
-    motions = [f for name, image in zip(names, after, strict=True) for f in motion_findings(before, image, name)]
+    motions = [
+        finding
+        for name, image in zip(names, after, strict=True)
+        for finding in motion_findings(before, image, name, loaded=loaded)
+    ]
     return (*contact_findings(before), *sides_findings(before, "before"), *motions)

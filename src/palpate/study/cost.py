@@ -23,15 +23,15 @@ GRADING = 0.45  # the mesher's: growth of the edge length with the distance from
 COARSEST = 4.0  # its longest edge, in edge lengths
 COARSER = 1.5  # its edge length on bones, air and known tissues, in edge lengths
 LATTICE = 96  # points of the lattice along the longest side, on which edge lengths are summed
-# Fitted to the runs in docs/command-line.md, on one core of a 2.1 GHz server.
+# Fitted to the runs in docs/command-line.md, on one core of a 2.1 GHz server; mesher and inversion have changed since.
 TETS_A_CUBE = 22.8  # tetrahedra in a cube of the wanted edge length: 16.3 in smooth phantoms, 33 in a real pelvis
 UNKNOWNS_A_TET = {"P1": 0.62, "P2": 4.4}
 FIXED_S = 14.0  # start, intervals, report
 SECONDS_AN_UNKNOWN = 4.5e-4  # with 90 modes a driver, for each later image
 SECONDS_A_CUT = 1.4e-4  # of meshing, for each tetrahedron and each tissue that is cut out
 SUPERLU = (4.5, 26_000.0, 1.7)  # seconds more than with PARDISO at so many unknowns, and their power
-FINITE_STRAIN = 2.8  # times the linear estimate's time: the continuation's rounds
-FINITE_STRAIN_GB = 1.6  # times its memory: an expansion and a tangent factorisation at once
+FINITE_STRAIN = 2.8  # times the linear estimate's time: the continuation's rounds, in a single run
+FINITE_STRAIN_GB = 1.6  # times its memory in that run: an expansion and a tangent factorisation at once
 PARALLEL_SHARE = 0.3  # of the time, that more processors shorten
 FIXED_GB = 0.75
 GB_AN_UNKNOWN = 3.1e-5  # with 90 modes
@@ -123,7 +123,7 @@ def _rank(before: Segmentation, tissue: int) -> tuple[bool, float]:
 
 
 def _lattice(before: Segmentation, box: Box) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Tissue (n1, n2, n3) at the middles of cells that fill the box, -1 outside of the image; the cells' edges, mm."""
+    """Tissue (n_1, n_2, n_3) at the middles of cells that fill the box, -1 outside the image; their edges (3,) mm."""
     counts = np.maximum(np.ceil(box.lengths / box.lengths.max() * LATTICE), 4).astype(int)
     cell = box.lengths / counts
     ticks = [(np.arange(n) + 0.5) * size for n, size in zip(counts, cell, strict=True)]
@@ -136,7 +136,7 @@ def _lattice(before: Segmentation, box: Box) -> tuple[NDArray[np.int64], NDArray
 
 
 def _distance_to_surface(mask: NDArray[np.bool_], cell: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distance (n1, n2, n3) mm of cells to the border of `mask`, on either side of it."""
+    """Distance (n_1, n_2, n_3) mm of cells to the border of `mask`, on either side of it."""
     outside = ndimage.distance_transform_edt(~mask, sampling=cell)
     inside = ndimage.distance_transform_edt(mask, sampling=cell) if not mask.all() else np.full(mask.shape, np.inf)
     return np.asarray(np.maximum(np.where(mask, inside, outside) - 0.5 * float(cell.min()), 0.0))

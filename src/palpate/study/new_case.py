@@ -14,6 +14,7 @@ import numpy as np
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.label_image import LabelImage
 from palpate.images.label_table import read_label_table
+from palpate.images.named_labels import printable
 from palpate.images.readers import read_label_image
 from palpate.images.tissue import Role
 from palpate.study.case import REMAINING
@@ -212,4 +213,4 @@ def _key(name: str) -> str:
 
 
 def _comment(text: str) -> str:
-    return "# " + "".join(letter if letter.isprintable() else "?" for letter in text)
+    return f"# {printable(text)}"

@@ -6,13 +6,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from palpate.images.tissue import Role
-from palpate.inversion.estimation import Remark
+from palpate.inversion.estimation import Estimation, Remark
 from palpate.study.case import Case
 
 __all__ = [
     "PUBLISHED",
     "PublishedStiffness",
     "UsualModulus",
+    "estimate_warnings",
     "plausibility_warnings",
     "published_for",
     "unit_warnings",
@@ -131,8 +132,11 @@ PUBLISHED = (
 
 
 def published_for(name: str) -> tuple[PublishedStiffness, ...]:
-    """The published values whose words occur in a tissue's `name`, whatever its case, blanks and hyphens."""
-    plain = name.lower().replace(" ", "_").replace("-", "_")
+    """The published values whose words occur in a tissue's `name`, whatever its case, blanks and hyphens.
+
+    A gallbladder is no bladder.
+    """
+    plain = name.lower().replace(" ", "_").replace("-", "_").replace("gallbladder", "").replace("gall_bladder", "")
     found = [entry for entry in PUBLISHED if any(word in plain for word in entry.words)]
     tumours = [entry for entry in found if entry.tissue == "prostate cancer"]
     return tuple(tumours or found)
@@ -157,6 +161,13 @@ def plausibility_warnings(moduli_kpa: Mapping[str, float]) -> tuple[Remark, ...]
         for name, value in moduli_kpa.items()
         for warning in (*_out_of_range(name, value), *_effective_modulus(name))
     )
+
+
+def estimate_warnings(estimation: Estimation) -> tuple[Remark, ...]:
+    """`plausibility_warnings` on what was estimated; none where the search did not converge: they would tell moduli."""
+    if estimation.status != "converged":
+        return ()
+    return plausibility_warnings({e.tissue: e.value for e in estimation.estimates if e.value is not None})
 
 
 def unit_warnings(case: Case) -> tuple[Remark, ...]:

@@ -30,7 +30,7 @@ def read_states(case: Case) -> ImagedStates:
     if case.phantom is not None:
         scene = phantom_scene(case)
         after = (segment(scene.after, scene.tissues),)
-        return aligned(segment(scene.before, scene.tissues), after, method=case.align)
+        return aligned(segment(scene.before, scene.tissues), after, method=case.align, loaded=bool(case.loads))
     if case.images is None:
         raise ConfigurationError(f"case '{case.id}' has neither [images] nor [phantom]")
     return _read_pair(case, case.images.before, case.images.after)
@@ -74,4 +74,4 @@ def _read_pair(case: Case, before: Path, after: tuple[Path, ...]) -> ImagedState
     names = read_label_table(table) if table else None
     reference = read_segmentation(case, before, names, None)
     later = tuple(read_segmentation(case, path, names, reference.tissues) for path in after)
-    return aligned(reference, later, method=case.align)
+    return aligned(reference, later, method=case.align, loaded=bool(case.loads))

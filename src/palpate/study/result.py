@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ __all__ = [
     "PairResult",
     "Provenance",
     "Simulation",
+    "distinct_names",
     "failure_document",
     "image_names",
     "json_object",
@@ -296,7 +297,13 @@ def image_names(case: Case) -> list[str]:
     """A name for each later image of the case, pair after pair: its file's, with its folder's where two are alike."""
     if case.images is None:
         return ["after"]
-    paths = [path for paths in (case.images.after, *(pair.after for pair in case.pairs)) for path in paths]
+    return distinct_names(
+        [path for paths in (case.images.after, *(pair.after for pair in case.pairs)) for path in paths]
+    )
+
+
+def distinct_names(paths: Sequence[Path]) -> list[str]:
+    """Names of files, with their folder's where two are alike."""
     plain = [path.name for path in paths]
     return [f"{path.parent.name}/{path.name}" if plain.count(path.name) > 1 else path.name for path in paths]
 

@@ -20,7 +20,7 @@ from palpate.inversion.noise import NoiseLaw
 from palpate.inversion.problem import Inversion, InversionSettings
 from palpate.study.body import Body, ImagedStates, joint_problem, make_body
 from palpate.study.case import Case
-from palpate.study.plausibility import plausibility_warnings, unit_warnings
+from palpate.study.plausibility import estimate_warnings, unit_warnings
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.read import read_pairs, read_states
 from palpate.study.result import CaseResult, MeshResult, PairResult, Provenance, image_names
@@ -59,10 +59,10 @@ def estimate(case: Case, *, progress: Progress = silent, truth: Mapping[str, flo
     progress("reading and aligning the images")
     states, further = read_states(case), read_pairs(case)
     truth = _truth(states) if case.phantom else truth
+    inputs = input_digests(case)  # now, of the files as they were read: an estimate takes minutes
     seconds = time.perf_counter() - began
     result = estimate_states(states, case, progress=progress, truth=truth, read_seconds=seconds, further=further)
-    provenance = replace(result.provenance, inputs=input_digests(case))
-    return replace(result, provenance=provenance)
+    return replace(result, provenance=replace(result.provenance, inputs=inputs))
 
 
 def estimate_states(
@@ -106,7 +106,7 @@ def estimate_states(
         (
             *_remarks(case, states, *further),
             *strain_warnings(case, bodies, estimation),
-            *plausibility_warnings(_values(estimation)),
+            *estimate_warnings(estimation),
         ),
         further=_further(bodies, estimation),
     )
@@ -116,10 +116,10 @@ def mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
     """Mesh the reference state of a case and pass it through the gate."""
     began = time.perf_counter()
     progress("reading and aligning the images")
-    states = read_states(case)
+    states, inputs = read_states(case), input_digests(case)
     body = make_body(states, case, progress=progress)
     seconds = {"total": round(time.perf_counter() - began, 3)}
-    provenance = Provenance(seconds, input_digests(case), software_versions())
+    provenance = Provenance(seconds, inputs, software_versions())
     return MeshResult(case, body.space, mesh_summary(body), states.before, provenance, _remarks(case, states))
 
 
@@ -190,10 +190,6 @@ def _truth(states: ImagedStates) -> Mapping[str, float]:
         for tissue in states.before.tissues
         if tissue.role is Role.ESTIMATE and tissue.youngs_modulus_kpa is not None
     }
-
-
-def _values(estimation: Estimation) -> dict[str, float]:
-    return {e.tissue: e.value for e in estimation.estimates if e.value is not None}
 
 
 def _remarks(case: Case, *states: ImagedStates) -> tuple[Remark, ...]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError
 from palpate.images.label_image import LabelImage
-from palpate.images.segmentation import Segmentation
+from palpate.images.segmentation import Segmentation, first_labels
 from palpate.images.tissue import Role, Tissue
 from palpate.inversion.driver_fit import fit_driver
 from palpate.inversion.estimation import Remark
@@ -45,6 +45,7 @@ def simulate(case: Case, *, progress: Progress, steps: int = 1) -> Simulation:
     an `estimate` tissue has no modulus, `NotConverged` where a finite-strain path ends early.
     """
     began = time.perf_counter()
+    inputs = input_digests(case)
     if case.phantom is not None:
         scene = phantom_scene(case)
         space, tissues = scene.space, scene.tissues
@@ -64,7 +65,7 @@ def simulate(case: Case, *, progress: Progress, steps: int = 1) -> Simulation:
         remarks = tuple(Remark(finding.code, finding.message) for finding in states.findings)
     moduli = {t.name: t.youngs_modulus_kpa for t in tissues if t.meshed and t.youngs_modulus_kpa is not None}
     seconds = {"total": round(time.perf_counter() - began, 3)}
-    provenance = Provenance(seconds, input_digests(case), software_versions())
+    provenance = Provenance(seconds, inputs, software_versions())
     return Simulation(case, space, summary, displacements, before, after, moduli, provenance, remarks)
 
 
@@ -146,14 +147,12 @@ def _refuse_unknown(tissues: tuple[Tissue, ...]) -> None:
 
 
 def _labels(segmentation: Segmentation, space: LagrangeSpace, displacement: NDArray[np.float64]) -> LabelImage:
-    """Label image of the deformed mesh on the segmentation's grid, with the first label of each tissue.
+    """Label image of the deformed mesh on the segmentation's grid, with the smallest label of each tissue.
 
     The mesh does not know where one hollow tissue ends and another begins, as air on bone: there the labels stay.
     """
     tissues = space.mesh.tissues
-    used = {label for tissue in tissues for label in tissue.labels}
-    rest = next(label for label in range(len(used) + 1) if label not in used)
-    table = np.array([tissue.labels[0] if tissue.labels else rest for tissue in tissues], dtype=np.int32)
+    table = first_labels(tissues)
     names = {int(label): tissue.name for label, tissue in zip(table, tissues, strict=True)}
     index = voxelise(space, displacement, segmentation.grid)
     hollow = np.array([not tissue.meshed for tissue in tissues])

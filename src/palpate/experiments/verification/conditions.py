@@ -123,7 +123,7 @@ def mean_radial(space: LagrangeSpace, radius: float) -> Array:
 
 
 def nodal_gradients(space: LagrangeSpace, displacement: Array, nodes: Integers) -> Array:
-    """Mean over the cells at each of `nodes` (n,) of the gradient there (n, 3, 3) of a displacement (n_points, 3)."""
+    """Gradient (n, 3, 3) of a displacement (n_points, 3) mm at `nodes` (n,): the mean over the cells at each."""
     by_lambda = shape_derivatives(space.order, np.eye(4))
     gradients, _ = barycentric_gradients(space.mesh.nodes, space.mesh.tets)
     slopes = np.einsum("qak,ekj,eai->eqij", by_lambda, gradients, displacement[space.cells], optimize=True)

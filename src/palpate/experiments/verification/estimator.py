@@ -49,7 +49,7 @@ def recovered(n_surface: int, start: float) -> Array:
 
 
 def coverage(repeats: int, seed: int) -> Array:
-    """Share (2,) of noisy repeats whose 95 % interval holds the truth of core and middle.
+    """Share (2,), dimensionless, of noisy repeats whose 95 % interval holds the truth of core and middle.
 
     Each repeat moves the later surfaces by a smooth random field, minimises anew and makes its own interval.
     """

@@ -63,7 +63,7 @@ def ball_in_matrix(nu: float) -> LinearModel:
 
 
 def strain_factors(model: LinearModel, contrast: float) -> Array:
-    """Strain of the inclusion along x over the far strain (2,), for the two modes, at E_i / E_m = `contrast`."""
+    """Strain of the inclusion along x over the far strain (2,), dimensionless, of both modes; contrast: E_i / E_m."""
     responses = model.responses(np.array([contrast, 1.0]))
     points = model.space.points
     inside = np.flatnonzero((np.linalg.norm(points, axis=1) < 0.9) & (points[:, 0] > 0.1))

@@ -54,7 +54,7 @@ def bore_of(mesh: TetMesh, radius: float, axes: int = 3) -> NDArray[np.int64]:
 
 
 def inflated_model(space: LagrangeSpace, bore: NDArray[np.int64], law: Law, *, axes: int = 3) -> FiniteStrainModel:
-    """The flat sides slide; a unit of the one mode moves the bore (n_faces, 3) outwards by its own radius."""
+    """The flat sides slide; a unit of the one mode moves the bore (n_faces, 3) outwards by its own radius, mm."""
     points = np.unique(space.facets(bore))
     outwards = space.points[points].copy()
     outwards[:, axes:] = 0.0

@@ -36,7 +36,7 @@ TOLERANCE = 0.2  # of the observed order
 
 
 def solution(x: Array, amplitude: float) -> tuple[Array, Array]:
-    """Displacement u (..., 3) mm and grad u (..., 3, 3) at places x (..., 3)."""
+    """Displacement u (..., 3) mm and grad u (..., 3, 3), dimensionless, at places x (..., 3) mm."""
     sine, cosine = np.sin(np.pi * x), np.cos(np.pi * x)
     c = amplitude * DIRECTION
     gradient = np.empty_like(x)
@@ -48,7 +48,7 @@ def solution(x: Array, amplitude: float) -> tuple[Array, Array]:
 
 
 def linear_force(x: Array) -> Array:
-    """Body force (..., 3) of the linear solution at E = 1."""
+    """Body force (..., 3) mN/mm^3 of the linear solution at E = 1 kPa and places x (..., 3) mm."""
     sine, cosine = np.sin(np.pi * x), np.cos(np.pi * x)
     hessian = np.empty((*x.shape, 3))
     for i in range(3):
@@ -63,7 +63,7 @@ def linear_force(x: Array) -> Array:
 
 
 def finite_force(x: Array) -> Array:
-    """Body force (..., 3) of the neo-Hookean solution at E = 1, by central differences."""
+    """Body force (..., 3) mN/mm^3 of the neo-Hookean solution at E = 1 kPa, x (..., 3) mm; by central differences."""
     lame, mu = lame_parameters(1.0, NU)
     force, step = np.zeros_like(x), 1e-5
     for axis in range(3):
@@ -88,14 +88,14 @@ class _Box:
     gradients: Array
 
     def load(self, force: Array) -> Array:
-        """Nodal forces (n_dof,) of a body force (n_tets, n_q, 3)."""
+        """Nodal forces (n_dof,) mN of a body force (n_tets, n_q, 3) mN/mm^3."""
         result = np.zeros_like(self.space.points)
         nodal = np.einsum("eq,qa,eqi->eai", self.measure, self.shape, force, optimize=True)
         np.add.at(result, self.space.cells, nodal)
         return result.ravel()
 
     def errors(self, displacement: Array, amplitude: float) -> Array:
-        """Errors (2,) of u and of grad u in L2 of a displacement (n_points, 3)."""
+        """Errors (2,) of u (mm) and of grad u (dimensionless) in the L2 norm, of a displacement (n_points, 3) mm."""
         nodal = displacement[self.space.cells]
         u, grad_u = solution(self.places, amplitude)
         off = np.einsum("qa,eai->eqi", self.shape, nodal) - u
@@ -121,7 +121,7 @@ def _box(element: str, n: int) -> _Box:
 
 
 def linear_errors(element: str, dilatation: Dilatation, n: int) -> Array:
-    """Errors (2,) of u and of grad u in L2 on n cells a side, linear law."""
+    """Errors (2,) of u (mm) and of grad u (dimensionless) in the L2 norm on n cells a side, linear law."""
     box = _box(element, n)
     load = box.load(linear_force(box.places))
     u = loaded(box.space, box.constraint, load, moduli=[1.0], dilatation=dilatation)
@@ -129,7 +129,7 @@ def linear_errors(element: str, dilatation: Dilatation, n: int) -> Array:
 
 
 def neo_hookean_errors(element: str, dilatation: Dilatation, n: int) -> Array:
-    """Errors (2,) of u and of grad u in L2 on n cells a side, neo-Hookean law."""
+    """Errors (2,) of u (mm) and of grad u (dimensionless) in the L2 norm on n cells a side, neo-Hookean law."""
     box = _box(element, n)
     loads = (DeadLoad(box.load(finite_force(box.places))),)
     model = finite_strain_model(box.space, box.constraint, LAW, dilatation=dilatation, loads=loads)
@@ -137,7 +137,7 @@ def neo_hookean_errors(element: str, dilatation: Dilatation, n: int) -> Array:
 
 
 def observed_orders(coarse: Array, fine: Array) -> Array:
-    """Orders log2(e_coarse / e_fine) of errors (n,) on a mesh and on one with edges half as long."""
+    """Orders log2(e_coarse / e_fine) (n,), dimensionless, of errors (n,) on a mesh and one of half the edge length."""
     return np.asarray(np.log2(coarse / fine))
 
 

@@ -37,7 +37,7 @@ def moved(space: LagrangeSpace, displacement: Array) -> LinearModel:
 
 
 def rotation(degrees: float) -> Array:
-    """Rotation (3, 3) about y."""
+    """Rotation (3, 3), dimensionless, about y."""
     angle = np.deg2rad(degrees)
     return np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
 

@@ -108,7 +108,7 @@ def box_mesh(
 def octant_mesh(
     radii: Array, n_radial: Sequence[int], n_surface: int, tissues: Sequence[Tissue], *, solid: bool = False
 ) -> TetMesh:
-    """Layers between `radii` (n_layers + 1,) mm, > 0, of an eighth of a ball; its flat sides are OUTER.
+    """Layers of an eighth of a ball between `radii` (n_radii,) mm, > 0; its flat sides are OUTER.
 
     n_radial: cells across each layer; n_surface: along each edge of the spherical triangle, a regular grid of
     barycentric places lifted to the sphere. The spheres' facets enclose the volume of the true spheres: their corners
@@ -129,6 +129,7 @@ def octant_mesh(
     nodes[np.abs(nodes) < 1e-12] = 0.0
 
     def beyond(faces: Array) -> Integers:
+        """What is behind faces with centroids (n, 3) mm: OUTER (n,) on the flat sides, `VOID` on the round ones."""
         return np.where(np.any(np.abs(faces) < 1e-9, axis=1), OUTER, len(tissues))
 
     return make_mesh(nodes, tets, region, [*tissues, VOID], beyond)
@@ -170,6 +171,7 @@ def quarter_ring_mesh(inner: float, outer: float, n_radial: int, n_turn: int, ti
     nodes[np.abs(nodes) < 1e-12] = 0.0
 
     def beyond(faces: Array) -> Integers:
+        """What is behind faces with centroids (n, 3) mm: OUTER (n,) on the flat sides, `VOID` on the round ones."""
         flat = np.any(np.abs(faces) < 1e-9, axis=1) | (np.abs(faces[:, 2] - thick) < 1e-9)
         return np.where(flat, OUTER, 1)
 

@@ -121,7 +121,7 @@ def _target(
 
 
 def settings_from(start: Array, *, lower: float = 0.01, upper: float = 10.0) -> InversionSettings:
-    """One start (n,) of the moduli over the known one, between the bounds."""
+    """One start (n,) of the moduli over the known one, dimensionless, between the bounds."""
     n = len(start)
     return InversionSettings((np.log(start),), Bounds(np.full(n, np.log(lower)), np.full(n, np.log(upper))))
 

@@ -12,7 +12,7 @@ __all__ = ["to_canonical"]
 
 
 def to_canonical(values: NDArray[Any], affine: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[np.float64]]:
-    """Re-order and flip the axes of `values` (n1, n2, n3) so that they run to the right, front and head.
+    """Re-order and flip the axes of `values` (n_1, n_2, n_3) so that they run to the right, front and head.
 
     `affine` (4, 4) index -> RAS mm. Of the six axis orders the one with the largest sum of direction cosines wins; a
     tie (a grid turned by 45 degrees) is broken by the resulting matrix, so that the way of storing never matters.

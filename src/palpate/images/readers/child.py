@@ -77,7 +77,7 @@ def _send(pipe: BinaryIO, answer: dict[str, Any]) -> None:
 
 
 def _send_image(pipe: BinaryIO, values: NDArray[Any], stored: StoredImage) -> None:
-    """`values` (n1, n2, n3), in the order of Fortran, with place and names as stored."""
+    """`values` (n_1, n_2, n_3), in the order of Fortran, with place and names as stored."""
     names = [[row.label, row.name, row.colour] for row in stored.names]
     answer = {"shape": values.shape, "dtype": values.dtype.str, "affine": stored.affine.tolist(), "names": names}
     _send(pipe, answer)

@@ -74,10 +74,12 @@ def _reader(
     with _started(command, path) as process:
 
         def stop() -> None:
+            """The time is over: end the process, and remember why."""
             overdue.set()
             process.kill()
 
         def verdict() -> PalpateError:
+            """Why the process ended; waits for its end."""
             return _verdict(process.wait(), path, limits, overdue=overdue.is_set())
 
         timer = threading.Timer(limits.wall_seconds, stop)

@@ -199,7 +199,7 @@ def write_label_image(path: Path | str, image: LabelImage) -> None:
 
 
 def write_scalar_image(path: Path | str, array: NDArray[np.floating[Any]], grid: VoxelGrid) -> None:
-    """Write a scalar field (nx, ny, nz), any unit, as float32 NIfTI on `grid`; NaN stays NaN.
+    """Write a scalar field (n_x, n_y, n_z), in kPa, mm or any other unit, as float32 NIfTI on `grid`; NaN stays NaN.
 
     Raises `InputDataError` when shape and grid disagree, else as `write_label_image` does.
     """

@@ -40,7 +40,7 @@ def read_label_image(
 
 
 def read_intensities(path: Path | str, *, limits: ReadLimits | None = LIMITS) -> tuple[NDArray[np.float32], VoxelGrid]:
-    """Read a grey image: intensities (nx, ny, nz) float32 as the header scales them, and their grid (RAS mm).
+    """Read a grey image: intensities (n_x, n_y, n_z) float32 as the header scales them, and their grid (RAS mm).
 
     Raises as `read_label_image` does.
     """

@@ -18,7 +18,7 @@ __all__ = ["ImageFormat", "StoredImage", "format_of", "register"]
 
 @dataclass(frozen=True, slots=True)
 class StoredImage:
-    """A file's voxels as they are stored: `values` (n1, n2, n3) integers or floats, `affine` (4, 4) index -> RAS mm.
+    """A file's voxels as they are stored: `values` (n_1, n_2, n_3) integers or floats, `affine` (4, 4) index -> RAS mm.
 
     `names`: what the file itself says of its labels.
     """

@@ -83,7 +83,7 @@ def _colour(text: str) -> str | None:
 def flattened(
     layers: NDArray[Any], segments: tuple[Segment, ...], path: Path
 ) -> tuple[NDArray[Any], tuple[NamedLabel, ...]]:
-    """Labels (n1, n2, n3) of `layers` (n_layers, n1, n2, n3), and the names of the labels.
+    """Labels (n_1, n_2, n_3) of `layers` (n_layers, n_1, n_2, n_3), and the names of the labels.
 
     Values that are unique stay; where two layers use the same one, segments are numbered from 1 as the file has them.
     Raises `InputDataError` when segments overlap or are in no layer, or a voxel of several layers is in no segment.

@@ -5,38 +5,25 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from palpate.errors import InputDataError
-from palpate.images.named_labels import NamedLabel, hex_colour
+from palpate.images.named_labels import NamedLabel
+from palpate.images.readers.pattern_rows import COLOURS, begins_with, pattern_rows
 from palpate.images.readers.table_registry import TableFormat, register_table
 
 __all__ = ["read_itksnap_table"]
 
-ROW = re.compile(r'\s*(\d{1,9})\s+(\d{1,3})\s+(\d{1,3})\s+(\d{1,3})\s+[\d.eE+-]{1,20}\s+\d\s+\d\s+"([^"]*)"\s*')
+ROW = re.compile(
+    r"\s*(?P<label>\d{1,9})\s+" + COLOURS + r'\s+[\d.eE+-]{1,20}\s+\d\s+\d\s+"(?P<name>[^"]*)"\s*',
+)
+QUOTED = re.compile(r'.*".*')
 
 
 def read_itksnap_table(text: str, path: Path) -> list[NamedLabel]:
     """Rows of a label description; `#` begins a comment. Raises `InputDataError` for a line of another form."""
-    rows = []
-    for number, line in _lines(text):
-        found = ROW.fullmatch(line)
-        if found is None:
-            raise InputDataError(
-                f"line {number} of the label table '{path}' is {line[:60]!r}, not of ITK-SNAP's form"
-                ' `1 255 0 0 1 1 1 "prostate"`; correct it'
-            )
-        red, green, blue = (int(found[k]) for k in (2, 3, 4))
-        rows.append(NamedLabel(int(found[1]), found[5], hex_colour(red, green, blue, top=255)))
-    return rows
-
-
-def _lines(text: str) -> list[tuple[int, str]]:
-    lines = enumerate(text.splitlines(), start=1)
-    return [(number, line) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
+    return pattern_rows(text, path, ROW, form='ITK-SNAP\'s form `1 255 0 0 1 1 1 "prostate"`')
 
 
 def _recognised(text: str) -> bool:
-    lines = _lines(text)
-    return bool(lines) and '"' in lines[0][1]
+    return begins_with(text, QUOTED)
 
 
 register_table(TableFormat("ITK-SNAP's label description", (".txt", ".label"), _recognised, read_itksnap_table))

@@ -33,7 +33,10 @@ def header_line(file: BinaryIO, path: Path) -> str | None:
 
 
 def numbers(text: str, n: int, path: Path, *, field: str) -> NDArray[np.float64]:
-    """The `n` numbers (n,) in `text`, separated by blanks; raises `InputDataError` when it holds anything else."""
+    """The `n` numbers (n,) in `text`, separated by blanks, in the unit of its field.
+
+    Raises `InputDataError` when it holds anything else.
+    """
     try:
         values = np.array([float(word) for word in text.split()])
     except ValueError:

@@ -18,14 +18,14 @@ INTEGRAL_TOLERANCE = 1e-3  # resampling and 32-bit scaling leave 0.9999; more is
 
 
 def intensity_values(values: NDArray[Any], path: Path) -> NDArray[Any]:
-    """Intensities (n1, n2, n3) as float32."""
+    """Intensities (n_1, n_2, n_3) as float32, in the image's own unit (HU in a CT)."""
     del path
     with np.errstate(over="ignore"):
         return values.astype(np.float32, copy=False)
 
 
 def label_values(values: NDArray[Any], path: Path) -> NDArray[Any]:
-    """Labels (n1, n2, n3) in the smallest unsigned type that holds them, from what the file `path` stores.
+    """Labels (n_1, n_2, n_3) in the smallest unsigned type that holds them, from what the file `path` stores.
 
     Floats are rounded when they are within 1e-3 of an integer. Raises `InputDataError` for what is no label image.
     """

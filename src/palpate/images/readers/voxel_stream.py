@@ -45,7 +45,7 @@ class VoxelBlock:
 
 
 def read_block(file: BinaryIO, block: VoxelBlock, path: Path) -> NDArray[Any]:
-    """The voxels (n1, n2, n3), or with more axes, in the machine's byte order, from where `file` stands.
+    """The voxels (n_1, n_2, n_3), or with more axes, in the machine's byte order, from where `file` stands.
 
     `path` is for messages, for voxels may lie in a file beside the header.
     Raises `InputDataError` when the file cannot hold them or goes on for long after them.
@@ -116,9 +116,14 @@ class _Inflated(io.RawIOBase):
         self._inflate = zlib.decompressobj(47)  # 32 + 15: either head
 
     def readable(self) -> bool:
+        """Always: `io.BufferedReader` asks before it reads."""
         return True
 
     def readinto(self, buffer: Any) -> int:
+        """Fill `buffer` from its start with unpacked bytes and return their number, 0 after the stream's end mark.
+
+        Raises `EOFError` when the file ends before that mark.
+        """
         target = memoryview(buffer).cast("B")
         while not self._inflate.eof:
             packed = self._inflate.unconsumed_tail or self._file.read(CHUNK)

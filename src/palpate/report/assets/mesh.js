@@ -61,7 +61,8 @@ Palpate.Mesh = class {
     for (let i = cut.axis; i < this.mesh.nodes.length; i += 3) {
       low = Math.min(low, this.mesh.nodes[i]); high = Math.max(high, this.mesh.nodes[i]);
     }
-    const start = this.facts.box ? this.facts.box.position[cut.axis] : centre[cut.axis];
+    const box = this.facts.references.length ? this.facts.references[0].box : null;
+    const start = box ? box.position[cut.axis] : centre[cut.axis];
     Object.assign(this.slider, { min: low, max: high, step: 0.5, value: start });
     this.build();
     this.viewer.look([this.mesh.nodes], cut.back, cut.up);

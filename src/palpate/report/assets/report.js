@@ -28,8 +28,10 @@ Palpate.load = async () => {
   };
   const surface = (entry) => ({ tissue: entry.tissue, points: points(entry.points), triangles: array(entry.triangles) });
   const volume = (entry) => entry && { ...entry, values: array(entry.values) };
-  facts.surfaces = facts.surfaces.map(surface);
-  facts.background = volume(facts.background);
+  for (const reference of facts.references) {
+    reference.surfaces = reference.surfaces.map(surface);
+    reference.background = volume(reference.background);
+  }
   for (const later of facts.later) {
     later.surfaces = later.surfaces.map(surface);
     later.background = volume(later.background);

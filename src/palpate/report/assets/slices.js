@@ -86,8 +86,9 @@ Palpate.Slices = class {
   constructor(facts, number, section) {
     this.facts = facts;
     this.later = facts.later[number];
+    this.reference = facts.references[this.later.reference];
     this.section = section;
-    this.position = [...facts.box.position];
+    this.position = [...this.reference.box.position];
     this.phase = "after";
     this.figures = [...section.querySelectorAll(".slice-live")].map((figure, i) => this.prepare(figure, facts.views[i]));
     for (const input of section.querySelectorAll(".legend input")) input.addEventListener("change", () => this.draw());
@@ -97,7 +98,7 @@ Palpate.Slices = class {
   }
 
   prepare(figure, view) {
-    const { box } = this.facts, axis = view.normal;
+    const { box } = this.reference, axis = view.normal;
     const canvas = figure.querySelector("canvas"), slider = figure.querySelector("input");
     Object.assign(slider, { min: box.low[axis], max: box.high[axis], step: 0.5, value: this.position[axis] });
     slider.addEventListener("input", () => { this.position[axis] = Number(slider.value); this.draw(); });
@@ -109,7 +110,7 @@ Palpate.Slices = class {
 
   // A click takes the two other planes through the point.
   point(event, view, canvas) {
-    const { low, high } = this.facts.box, frame = canvas.getBoundingClientRect();
+    const { low, high } = this.reference.box, frame = canvas.getBoundingClientRect();
     const x = Math.min(Math.max((event.clientX - frame.left) / frame.width, 0), 1);
     const y = Math.min(Math.max((event.clientY - frame.top) / frame.height, 0), 1);
     this.position[view.across] = high[view.across] - x * (high[view.across] - low[view.across]);
@@ -139,7 +140,7 @@ Palpate.Slices = class {
   }
 
   drawFigure({ canvas, view, layers }, shown) {
-    const { low, high } = this.facts.box;
+    const { low, high } = this.reference.box;
     const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
     if (!width) return;
     canvas.width = Math.round(width * ratio); canvas.height = Math.round(height * ratio);
@@ -153,11 +154,11 @@ Palpate.Slices = class {
   }
 
   drawImage(context, view, frame, shown, layers) {
-    const volume = (shown === "after" && this.later.background) || this.facts.background;
+    const volume = (shown === "after" && this.later.background) || this.reference.background;
     context.fillStyle = "#000";
     context.fillRect(0, 0, frame.width, frame.height);
     if (!volume) return;
-    const key = `${volume === this.facts.background} ${this.position[view.normal]}`;
+    const key = `${volume === this.reference.background} ${this.position[view.normal]}`;
     if (layers.get("key") !== key) {
       layers.set("key", key);
       layers.set("picture", Palpate.layer(volume, view, this.position[view.normal], this.facts.tissues));
@@ -185,7 +186,7 @@ Palpate.Slices = class {
       for (const s of this.later.surfaces) stroke(s.points, s.triangles, { strokeStyle: colour(s), lineWidth: 5.5, globalAlpha: 0.5 });
     }
     if (this.shows("before") && shown !== "after") {
-      for (const s of this.facts.surfaces) stroke(s.points, s.triangles, { strokeStyle: colour(s), lineWidth: 2.1, dash: [0.1, 3.9] });
+      for (const s of this.reference.surfaces) stroke(s.points, s.triangles, { strokeStyle: colour(s), lineWidth: 2.1, dash: [0.1, 3.9] });
     }
     if (this.shows("model") && this.later.model.length) {
       for (const m of this.later.model) {

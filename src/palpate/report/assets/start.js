@@ -23,7 +23,7 @@
   };
   for (const section of document.querySelectorAll("section.slices")) {
     const number = Number(section.dataset.later);
-    if (facts.box) soon(section, () => new Palpate.Slices(facts, number, section));
+    if (facts.references[facts.later[number].reference].box) soon(section, () => new Palpate.Slices(facts, number, section));
   }
   if (!Palpate.supportsWebGL()) return;
   for (const section of document.querySelectorAll("section.organs")) {

@@ -1,0 +1,56 @@
+"""The pairs of images of a result, each as if the result were of it alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from palpate.study.case import Images, Pair
+from palpate.study.result import CaseResult, PairResult, distinct_names, image_names
+
+__all__ = ["ImagePair", "drawn_images", "image_pairs"]
+
+
+@dataclass(frozen=True, slots=True)
+class ImagePair:
+    """A reference state with its later images: `result` shows it as the first and only pair; names of its images."""
+
+    result: CaseResult
+    before: str
+    after: tuple[str, ...]
+
+
+def image_pairs(result: CaseResult) -> tuple[ImagePair, ...]:
+    """The first pair of the result, then its further ones."""
+    images = result.case.images
+    befores = distinct_names([images.before, *(pair.before for pair in result.case.pairs)]) if images else ["before"]
+    names = iter(image_names(result.case))
+    sources = result.case.pairs if images else ()
+    results = [result, *(_alone(result, *both) for both in zip(result.further, sources, strict=False))]
+    return tuple(
+        ImagePair(one, before, tuple(next(names, f"after {k + 1}") for k in range(len(one.after))))
+        for one, before in zip(results, befores, strict=False)
+    )
+
+
+def drawn_images(counts: Sequence[int], most: int) -> tuple[tuple[int, int], ...]:
+    """(pair, later image) of those to be drawn, at the most `most`, of pairs with so many later images.
+
+    The first of every pair comes before the second of any.
+    """
+    every = [(pair, after) for pair, count in enumerate(counts) for after in range(count)]
+    return tuple(sorted(sorted(every, key=lambda item: item[1])[:most]))
+
+
+def _alone(result: CaseResult, pair: PairResult, source: Pair) -> CaseResult:
+    """The result with a further pair, read from `source`, in place of its first; only labels are known of it."""
+    return replace(
+        result,
+        case=replace(result.case, images=Images(source.before, source.after), pairs=()),
+        estimation=replace(result.estimation, displacements=pair.displacements),
+        space=pair.space,
+        mesh_summary=pair.mesh_summary,
+        before=pair.before,
+        after=pair.after,
+        further=(),
+    )
