@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo test lint check clean pardiso
+.PHONY: install demo test lint check clean pardiso benchmark-setup
 
 install: $(VENV)/.installed
 
@@ -14,6 +14,13 @@ $(VENV)/.installed: pyproject.toml
 
 pardiso: install
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[pardiso]"
+
+# The peers that benchmarks/speed.py compares with, and PARDISO. A torch for processors alone is a tenth of the size:
+# make benchmark-setup TORCH=torch==2.13.0+cpu, where the package index has one.
+TORCH ?= torch
+benchmark-setup: install
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check "$(TORCH)"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[pardiso,benchmark]"
 
 demo: install
 	$(BIN)/palpate demo --output demo-output

@@ -42,6 +42,9 @@ label = "remaining"
 role = "known"
 youngs_modulus_kpa = 10.0
 
+[mechanics]
+law = "linear"  # as the truth
+
 [mesh]
 edge_length_mm = 8.0
 

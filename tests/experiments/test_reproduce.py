@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import json
+import sys
 
 import numpy as np
 import pytest
 from scipy import stats
 
 from palpate.cli import main
-from palpate.errors import ConfigurationError
+from palpate.errors import ConfigurationError, GeometryError, ResourceError
 from palpate.experiments.reproduce.cohort import ORGANS, PatientResult
 from palpate.experiments.reproduce.figure4 import LAW, Figure4, Point
 from palpate.experiments.reproduce.figures import draw_figure4, draw_staging, draw_table
+from palpate.experiments.reproduce.jobs import Job, compute
 from palpate.experiments.reproduce.ledger import Ledger
 from palpate.experiments.reproduce.paper import PAPER_STAGING, PAPER_TABLE1, PAPER_TABLE2
 from palpate.experiments.reproduce.real_pelvis import grid_over
@@ -85,36 +88,75 @@ def test_a_row_that_did_not_converge_has_no_value(table):
     assert "none" in table.text()[3]
 
 
-def test_finished_parts_are_not_computed_again(tmp_path):
-    made = []
+DOUBLED = """
+import os
+from palpate.errors import GeometryError
 
-    def make():
-        made.append(1)
-        return {"sphere1": entry(50.0, 51.0)}
+def doubled(key, progress):
+    progress(f"doubling {key}")
+    if key == "bad":
+        raise GeometryError("this one cannot be doubled")
+    if key == "dead":
+        os._exit(3)
+    return {"x": 2 * int(key)}
+"""
 
+
+@pytest.fixture
+def doubled(tmp_path, monkeypatch):
+    """A function of a module that a new process can import."""
+    (tmp_path / "doubled_parts.py").write_text(DOUBLED)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield importlib.import_module("doubled_parts").doubled
+    del sys.modules["doubled_parts"]
+
+
+def computed(make, ledger, keys, workers=1):
+    said = []
+    return compute([Job((key,), make) for key in keys], ledger, workers=workers, progress=said.append), said
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_finished_parts_are_not_computed_again(tmp_path, doubled, workers):
     ledger = Ledger(tmp_path / "parts.jsonl", "a")
-    first = ledger.entries("one", make)
-    assert ledger.entries("one", make) == first == {"sphere1": entry(50.0, 51.0)}
-    assert len(made) == 1
-    Ledger(tmp_path / "parts.jsonl", "other settings").entries("one", make)
-    assert len(made) == 2
+    first, said = computed(doubled, ledger, ("1", "2", "3"), workers)
+    assert first == {"1": {"x": 2}, "2": {"x": 4}, "3": {"x": 6}}
+    assert "doubling 2" in said
+    again, said = computed(doubled, ledger, ("1", "2", "3", "4"), workers)
+    assert again == first | {"4": {"x": 8}}
+    assert [text for text in said if text.startswith("doubling")] == ["doubling 4"]
+    others, said = computed(doubled, Ledger(tmp_path / "parts.jsonl", "other settings"), ("1",))
+    assert others == {"1": {"x": 2}}
+    assert "doubling 1" in said
 
 
-def test_a_line_cut_by_an_interruption_is_computed_again(tmp_path):
+def test_what_a_process_raises_is_raised_and_what_was_finished_stays(tmp_path, doubled):
+    ledger = Ledger(tmp_path / "parts.jsonl", "a")
+    jobs = [Job(("1", "bad"), doubled), Job(("2",), doubled)]
+    with pytest.raises(GeometryError, match="cannot be doubled"):
+        compute(jobs, ledger, workers=2, progress=lambda _: None)
+    assert ledger.finished()["1"] == {"x": 2}
+
+
+def test_a_process_that_dies_is_an_error(doubled):
+    with pytest.raises(ResourceError, match="ended before its part was done"):
+        computed(doubled, Ledger(None, "a"), ("1", "dead"), workers=2)
+
+
+def test_a_line_cut_by_an_interruption_is_computed_again(tmp_path, doubled):
     path = tmp_path / "parts.jsonl"
     ledger = Ledger(path, "a")
-    ledger.part("one", lambda: {"x": 1})
-    path.write_text(path.read_text() + '{"settings": "a", "key": "two", "va')
-    assert ledger.part("two", lambda: {"x": 2}) == {"x": 2}
-    assert ledger.part("one", lambda: {"x": 3}) == {"x": 1}
+    ledger.keep("1", {"x": 1})
+    path.write_text(path.read_text() + '{"settings": "a", "key": "2", "va')
+    assert computed(doubled, ledger, ("1", "2"))[0] == {"1": {"x": 1}, "2": {"x": 4}}
 
 
 def test_parts_after_a_cut_line_are_found_again(tmp_path):
     path = tmp_path / "parts.jsonl"
-    path.write_text('{"settings": "a", "key": "one", "va')
+    path.write_text('{"settings": "a", "key": "1", "va')
     ledger = Ledger(path, "a")
-    ledger.part("two", lambda: {"x": 2})
-    assert ledger.part("two", lambda: {"x": 3}) == {"x": 2}
+    ledger.keep("2", {"x": 2})
+    assert ledger.finished() == {"2": {"x": 2}}
 
 
 @pytest.mark.parametrize(("organ", "for_eight"), [("prostate", 0.076), ("bladder", 0.23)])

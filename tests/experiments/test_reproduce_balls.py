@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from palpate.experiments.reproduce import cohort
 from palpate.experiments.reproduce.balls import (
     BODIES,
     Balls,
@@ -24,7 +25,10 @@ from palpate.experiments.reproduce.paper_method import paper_estimate, paper_tar
 from palpate.experiments.reproduce.table1 import Table1Settings, table1
 from palpate.inversion.modulus_map import modulus_map
 from palpate.mechanics.linear_model import linear_model
+from palpate.mesh.space import lagrange_space
+from palpate.mesh.tetrahedralise import tetrahedralise
 from palpate.observation.observed_surface import observed_surface
+from palpate.phantoms.pelvis_shapes import draw_pelvis
 
 TINY = Balls(radii_mm=(8.0, 14.0, 20.0), edge_mm=8.0, truth_edge_mm=6.0)
 MODULI = np.array([50.0, 100.0, 150.0])
@@ -90,7 +94,7 @@ def test_same_mesh_gives_the_moduli_back_and_finished_columns_are_kept(tmp_path)
     others = ("other_mesh", "voxels", "paper_method", "paper_method_other_mesh")
     stand_in = {"kpa": 50.0, "error_percent": 0.0, "interval95": None, "verdict": None, "iterations": 1}
     for column in others:
-        kept.part(f"50/100/150 {column}", lambda: dict.fromkeys(BODIES, stand_in))
+        kept.keep(f"50/100/150 {column}", dict.fromkeys(BODIES, stand_in))
     document = table1(settings, kept, progress=lambda _: None).to_dict()
     assert [row["body"] for row in document["rows"]] == list(BODIES)
     assert document["worst_error_percent"]["same_mesh"] < 0.01
@@ -121,3 +125,13 @@ def test_a_patients_pairs_share_one_reduced_model():
     for organ in ORGANS:
         assert len(found.kpa[organ]) + found.not_converged == 2
         assert len(set(found.kpa[organ])) == len(found.kpa[organ])  # each pair has its own motion and noise
+
+
+def test_the_default_cohort_keeps_to_its_limit_of_unknowns():
+    settings = CohortSettings()
+    assert len(settings.stages) == len(settings.pairs) == 8
+    assert sum(settings.pairs) == 180
+    box = cohort.grid_box(cohort.centred_grid(cohort.FIELD_MM, (1.0, 1.0, 1.0)))
+    shapes = draw_pelvis(np.random.default_rng(settings.seed + 2), box, bones=False)  # the largest of the eight
+    mesh = tetrahedralise(cohort._anatomy(shapes), edge_length_mm=settings.edge_mm)
+    assert 3 * len(lagrange_space(mesh, "P2").points) <= 30_000

@@ -11,7 +11,7 @@ from scipy import sparse
 from palpate.errors import ConfigurationError, SolverError
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import linear_model
-from palpate.mechanics.reduced import orthonormal_basis, reduce
+from palpate.mechanics.reduced import orthonormal_basis, projection, reduce
 from palpate.mesh.space import lagrange_space
 
 RATIOS = (0.2, 1.0, 5.0, 25.0)
@@ -104,6 +104,34 @@ def test_repeated_and_empty_snapshots_add_no_basis_vector(rng):
     vectors = orthonormal_basis(np.column_stack([snapshots, 1e6 * snapshots, np.zeros(50)]))
     assert vectors.shape == (50, 3)
     assert np.allclose(vectors.T @ vectors, np.eye(3), atol=1e-12)
+
+
+def test_an_extended_projection_is_that_on_all_vectors(model):
+    snapshots = basis(model)
+    whole, grown = reduce(model, snapshots), projection(model, snapshots[:, :4])
+    for start in range(4, snapshots.shape[1], 3):
+        grown = grown.extended(snapshots[:, start : start + 3])
+    vectors = grown.vectors
+    assert np.allclose(vectors.T @ vectors, np.eye(vectors.shape[1]), atol=1e-12)
+    assert vectors.shape[1] == whole.n_basis
+    moduli, q = np.array([1.0, 3.0]), np.array([0.4, -1.0])
+    small, full = grown.reduced.solve(moduli, q), whole.solve(moduli, q)
+    assert relative(small.values, full.values) < 1e-9
+    assert relative(small.tangent(), full.tangent()) < 1e-8
+
+
+def test_what_is_there_already_extends_nothing(model):
+    snapshots = basis(model)
+    small = projection(model, snapshots)
+    assert small.extended(snapshots @ np.ones((snapshots.shape[1], 2))) is small
+
+
+def test_a_badly_conditioned_basis_is_orthonormal_all_the_same(rng):
+    u, v = (np.linalg.qr(rng.standard_normal((n, 8)))[0] for n in (60, 8))
+    for smallest in (1e-3, 1e-8):
+        vectors = orthonormal_basis(u * np.geomspace(1.0, smallest, 8) @ v.T)
+        assert np.allclose(vectors.T @ vectors, np.eye(8), atol=1e-11)
+        assert np.allclose(vectors @ (vectors.T @ u), u, atol=1e-6)
 
 
 def test_a_basis_of_another_mesh_is_refused(model):

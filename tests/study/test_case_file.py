@@ -40,7 +40,7 @@ def case_file(tmp_path) -> Path:
 def test_defaults_are_those_of_the_schema(case_file):
     case = read_case(case_file)
     assert (case.id, case.patient, case.stage, case.seed) == ("sub-01", "sub-01", None, 0)
-    assert (case.mechanics.law, case.mechanics.element) == ("linear", "P2")
+    assert (case.mechanics.law, case.mechanics.element) == ("neo-hookean", "auto")
     assert (case.domain.extent, case.domain.margin_mm, case.domain.outer_boundary) == ("image", 40.0, "fixed")
     assert (case.driver.modes, case.driver.kernel_mm, case.driver.prior_mm) == (90, 20.0, 5.0)
     assert case.mesh.edge_length_mm == 4.0

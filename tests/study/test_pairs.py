@@ -38,7 +38,10 @@ label = "remaining"
 role = "known"
 youngs_modulus_kpa = 10.0
 """
-COARSE = ["mesh.edge_length_mm=8", "mechanics.element=P1", "driver.modes=12", "estimate.start_ratios=[3.0]"]
+COARSE = [
+    *("mechanics.law=linear", "mechanics.element=P1", "mesh.edge_length_mm=8", "driver.modes=12"),
+    "estimate.start_ratios=[3.0]",
+]
 PAIR = """
 [[pairs]]
 before = "other/before_3.nii.gz"

@@ -1,10 +1,14 @@
 """What is believed of the drivers' motion before the organs are asked: learned from the images by its evidence.
 
 A wall that moves by 3 mm as one piece must not be allowed to slide by 5 mm on its own: nothing in the images holds it
-back along itself, and the moduli then pay for it.
+back along itself, and the moduli then pay for it. Nor must one that swells be taken for one that drifts.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +20,37 @@ from palpate.observation.wall_modes import Wall
 
 __all__ = ["learned_prior"]
 
-LENGTHS = (1.0, 1.4, 2.0, 2.8, 4.0)  # times the modes' own kernel, which they cannot go below
-AMPLITUDES = (0.02, 4.0)  # times the modes' own standard deviation
+DRIFT_LENGTHS = (1.0, 2.0, 4.0)  # times the modes' own kernel, which they cannot go below
+SWELLING_LENGTHS = (1.0, 2.0)
+AMPLITUDES = (0.005, 2.0)  # times the modes' own standard deviation
+FIRST_AMPLITUDES = ((0.3, 0.05), (0.05, 0.3))  # of drift and swelling; one may hide the other
+LEAST_VARIANCE = 1e-3  # of a coefficient, times its variance under the modes' own kernel: no mode is forbidden
+ALIKE = 2.0  # of the log-evidence
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """What the data say of one wall when all else follows: information A (n, n) and pull b = A x - J^T W r (n,)."""
+
+    information: NDArray[np.float64]
+    pull: NDArray[np.float64]
+
+    def log_evidence(self, covariance: NDArray[np.float64]) -> float:
+        """1/2 (b^T (A + C^-1)^-1 b - ln det(1 + C A)) for a prior covariance C (n, n)."""
+        root = linalg.cholesky(covariance, lower=True, check_finite=False)
+        inner = root.T @ self.information @ root
+        inner[np.diag_indices_from(inner)] += 1.0
+        factor = linalg.cholesky(inner, lower=True, check_finite=False)
+        explained = linalg.solve_triangular(factor, root.T @ self.pull, lower=True, check_finite=False)
+        return 0.5 * float(explained @ explained) - float(np.sum(np.log(np.diag(factor))))
+
+
+@dataclass(frozen=True, slots=True)
+class _Belief:
+    """A prior covariance (n_modes, n_modes) of one wall's coefficients, and its log-evidence."""
+
+    covariance: NDArray[np.float64]
+    evidence: float
 
 
 def learned_prior(
@@ -25,10 +58,11 @@ def learned_prior(
 ) -> NDArray[np.float64] | None:
     """Precision P (n_coefficients, n_coefficients) with the largest evidence; None where the walls are not given.
 
-    Each wall's motion is a Gaussian process, kernel length and standard deviation of its own. With the residuals
-    linear around `unknowns` (n_unknowns,), A = J^T W J and b = A x - J^T W r, the log-evidence is
-    1/2 (b^T (A + P)^-1 b - ln det(A + P) + ln det P) up to a constant (MacKay 1992, Neural Computation 4, eq. 2.4; the
-    log-moduli have no prior).
+    Each wall's motion is the sum of two Gaussian processes, a drift and a swelling (see `Wall`), with kernel lengths
+    and standard deviations of their own. With the residuals linear around `unknowns` x (n_unknowns,), A = J^T W J and
+    b = A x - J^T W r, the log-evidence of P is 1/2 (b^T (A + P)^-1 b - ln det(A + P) + ln det P) up to a constant
+    (MacKay 1992, Neural Computation 4, 415-447, section 4; the log-moduli have no prior). Of kernels whose evidence is
+    as good as equal, those that leave the log-moduli the widest posterior.
     """
     if not any(problem.walls):
         return None
@@ -38,43 +72,71 @@ def learned_prior(
     prior, start = evaluation.prior.copy(), n_parameters
     for model, walls in zip(problem.models, problem.walls, strict=True):
         for wall in walls:
-            block = np.ix_(start + wall.columns, start + wall.columns)
-            prior[block] = _most_evident(wall, data, pull, prior, block)
+            places = start + wall.columns
+            beliefs = _beliefs(wall, _seen(data + prior, data, pull, places))
+            best = max(belief.evidence for belief in beliefs)
+            alike = [(b.evidence, _with(prior, places, b.covariance)) for b in beliefs if b.evidence > best - ALIKE]
+            prior = max(alike, key=lambda pair: (_width(data + pair[1], n_parameters), pair[0]))[1]
         start += model.n_modes
     return prior[n_parameters:, n_parameters:]
 
 
-def _most_evident(
-    wall: Wall,
-    data: NDArray[np.float64],
-    pull: NDArray[np.float64],
-    prior: NDArray[np.float64],
-    block: tuple[NDArray[np.intp], ...],
+def _seen(
+    matrix: NDArray[np.float64], data: NDArray[np.float64], pull: NDArray[np.float64], places: NDArray[np.int64]
+) -> _Seen:
+    """The Schur complement of the information `data` on the unknowns `places`, the others under their prior."""
+    rest = np.setdiff1d(np.arange(len(pull)), places)
+    across = data[np.ix_(rest, places)]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix)[rest], 1e-30))
+    scaled = scale[:, None] * matrix[np.ix_(rest, rest)] * scale
+    scaled[np.diag_indices_from(scaled)] += 1e-10  # a modulus that moves nothing
+    right = scale[:, None] * np.column_stack([across, pull[rest]])
+    followed = across.T @ (scale[:, None] * linalg.solve(scaled, right, assume_a="pos", check_finite=False))
+    information = data[np.ix_(places, places)] - followed[:, :-1]
+    return _Seen(0.5 * (information + information.T), pull[places] - followed[:, -1])
+
+
+def _beliefs(wall: Wall, seen: _Seen) -> list[_Belief]:
+    """For each pair of kernel lengths the standard deviations with the largest evidence."""
+    drifts = [wall.drift(length * wall.kernel_mm) for length in DRIFT_LENGTHS]
+    swellings = [wall.swelling(length * wall.kernel_mm) for length in SWELLING_LENGTHS]
+    return [_most_evident(pair, seen) for pair in product(drifts, swellings)]
+
+
+def _most_evident(parts: Sequence[NDArray[np.float64]], seen: _Seen) -> _Belief:
+    """The best weights of drift and swelling, covariances (n_modes, n_modes) at the modes' own standard deviation."""
+
+    def covariance(amplitudes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The sum at ln(standard deviation / the modes' own) of both parts (2,)."""
+        drift, swelling = np.exp(2.0 * np.clip(amplitudes, *np.log(AMPLITUDES)))
+        least = LEAST_VARIANCE * (drift + swelling) * np.eye(len(parts[0]))
+        return np.asarray(drift * parts[0] + swelling * parts[1] + least)
+
+    def worse(amplitudes: NDArray[np.float64]) -> float:
+        """Minus the log-evidence."""
+        return -seen.log_evidence(covariance(amplitudes))
+
+    found = [
+        optimize.minimize(
+            worse, np.log(start), method="Nelder-Mead", options={"xatol": 0.03, "fatol": 0.03, "maxfev": 120}
+        )
+        for start in FIRST_AMPLITUDES
+    ]
+    best = min(found, key=lambda trial: float(trial.fun))
+    return _Belief(covariance(best.x), -float(best.fun))
+
+
+def _with(
+    prior: NDArray[np.float64], places: NDArray[np.int64], covariance: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The wall's precision (n_modes, n_modes) with the largest evidence, the other walls' as in `prior`."""
-    limits = np.log(AMPLITUDES)
-    found: list[tuple[float, NDArray[np.float64]]] = []
-    for length in LENGTHS:
-        unit = np.kron(np.linalg.inv(wall.covariance(length * wall.kernel_mm)), np.eye(3))
-
-        def worse(amplitude: float, unit: NDArray[np.float64] = unit) -> float:
-            """Minus the log-evidence at ln(standard deviation / the modes' own)."""
-            trial = prior.copy()
-            trial[block] = unit * np.exp(-2.0 * amplitude)
-            return -_log_evidence(data, pull, trial)
-
-        best = optimize.minimize_scalar(worse, bounds=(limits[0], limits[1]), method="bounded", options={"xatol": 0.01})
-        found.append((float(best.fun), unit * np.exp(-2.0 * float(best.x))))
-    return min(found, key=lambda pair: pair[0])[1]
+    """The precision of all unknowns (n, n) with that of one wall's coefficients from their covariance."""
+    changed = prior.copy()
+    changed[np.ix_(places, places)] = np.linalg.inv(covariance)
+    return changed
 
 
-def _log_evidence(data: NDArray[np.float64], pull: NDArray[np.float64], prior: NDArray[np.float64]) -> float:
-    scale = np.sqrt(np.maximum(np.diag(data + prior), 1e-30))
-    matrix = (data + prior) / np.outer(scale, scale)
-    matrix[np.diag_indices_from(matrix)] += 1e-10  # a modulus that moves nothing
-    factor = linalg.cholesky(matrix, lower=True, check_finite=False)
-    inner = linalg.solve_triangular(factor, pull / scale, lower=True, check_finite=False)
-    held = np.diag(prior) > 0.0
-    before = np.linalg.slogdet(prior[np.ix_(held, held)])[1]
-    after = 2.0 * float(np.sum(np.log(np.diag(factor)))) + 2.0 * float(np.sum(np.log(scale)))
-    return 0.5 * (float(inner @ inner) - after + float(before))
+def _width(matrix: NDArray[np.float64], n_parameters: int) -> float:
+    """Sum of the log-moduli's posterior variances under a Gauss-Newton matrix (n, n)."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))
+    inverse = np.linalg.pinv(scale[:, None] * matrix * scale, hermitian=True)
+    return float(np.sum(np.diag(inverse)[:n_parameters] * scale[:n_parameters] ** 2))

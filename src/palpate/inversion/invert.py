@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.inversion.continuation import continued_at_finite_strain
+from palpate.inversion.directions import deciding_directions
 from palpate.inversion.driver_prior import learned_prior
 from palpate.inversion.gauss_newton import Minimum, gauss_newton
 from palpate.inversion.minima import best_of, continued, groups_of, minimised, settled_between, with_driver, words
 from palpate.inversion.noise import NoiseLaw
 from palpate.inversion.objective import Objective
 from palpate.inversion.problem import InverseProblem, Inversion, InversionSettings
-from palpate.inversion.surrogate import Surrogate, enriched, first_surrogate, with_modulus_series, with_offset
+from palpate.inversion.surrogate import Surrogate, first_surrogate, sharpened, with_modulus_series, with_offset
 from palpate.inversion.wall_refinement import refined_walls
 from palpate.inversion.weighting import FIRST_LAW, objective_of, residual_law, reweighted
 from palpate.mechanics.forward import SolveCounts
@@ -28,6 +29,7 @@ WEIGHINGS = 4  # within a round
 REFINEMENTS = 2  # of the drivers' walls; what is left then is no motion that they could follow
 EXACT = 3e-3  # standard deviations of a residual, per mm of motion: a smaller model error needs no further snapshot
 POLISH = 1e-5  # decrement of the reported minimum
+OTHERS = 1e-4  # of the other starts'
 
 
 def invert(problem: InverseProblem, settings: InversionSettings, *, progress: Callable[[str], None]) -> Inversion:
@@ -83,7 +85,9 @@ def invert_with(
             surrogates, settled, refinements = finer, False, refinements + 1
     best = continued(objective, best, settings, tolerance=POLISH)
     driven = [with_driver(m, best, objective.n_parameters) for m in minima]
-    minima = tuple(best if i == chosen else continued(objective, m, settings) for i, m in enumerate(driven))
+    minima = tuple(
+        best if i == chosen else continued(objective, m, settings, tolerance=OTHERS) for i, m in enumerate(driven)
+    )
     counts = sum((s.counts for s in surrogates), SolveCounts())
     return Inversion(
         objective,
@@ -139,8 +143,9 @@ def _enriched(
 ) -> tuple[Surrogate, ...]:
     """Solve the full models at a minimum where the reduced ones' relative error is above `exact`."""
     moduli = problem.modulus_map.moduli(minimum.unknowns[: objective.n_parameters])
-    pairs = zip(surrogates, objective.coefficients(minimum.unknowns), strict=True)
-    return tuple(s if s.relative_error(moduli, q) < exact else enriched(s, moduli, q) for s, q in pairs)
+    amounts = objective.coefficients(minimum.unknowns)
+    triples = zip(surrogates, amounts, deciding_directions(objective, minimum.evaluation), strict=True)
+    return tuple(s if s.relative_error(moduli, q) < exact else sharpened(s, moduli, q, d) for s, q, d in triples)
 
 
 def _from_starts(

@@ -1,4 +1,4 @@
-"""A reduced model that is exact where it matters: built at one place, enriched where the optimiser goes."""
+"""A reduced model that is exact where it matters: built at one place, extended where the optimiser goes."""
 
 from __future__ import annotations
 
@@ -6,27 +6,41 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from palpate.mechanics.forward import SolveCounts
-from palpate.mechanics.linear_model import LinearModel, LinearSystem
-from palpate.mechanics.reduced import ReducedModel, reduce
+from palpate.mechanics.linear_model import LinearModel, LinearSystem, weighted_sum
+from palpate.mechanics.reduced import Projection, ReducedModel, projection
+from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
 from palpate.mechanics.solvers.contract import Factorisation
+from palpate.mechanics.solvers.registry import SOLVERS, CheckedFactorisation
 from palpate.mesh.constraint import Constraint
 
-__all__ = ["Surrogate", "enriched", "first_surrogate", "with_modulus_series", "with_offset"]
+__all__ = ["Surrogate", "enriched", "first_surrogate", "sharpened", "with_modulus_series", "with_offset"]
 
 SERIES = 40  # vectors at the most
+FAR = 30.0  # spread of the moduli's ratios to the factorised ones, beyond which a new factorisation costs less
+DISPLACEMENT, TANGENT = 1e-4, 1e-2  # of the reduced model's error, that a correction may leave
+MAX_ITERATIONS = 60
 
 
 @dataclass(frozen=True, slots=True)
 class Surrogate:
-    """`reduced` spans the snapshots (n_free, k) of `model`; `system` is the last factorised one; `counts` the cost."""
+    """A model projected on m vectors (n_free, m); `system`: the last factorised one; `counts`: what it cost."""
 
-    model: LinearModel
-    snapshots: NDArray[np.float64]
-    reduced: ReducedModel
+    projection: Projection
     system: LinearSystem
     counts: SolveCounts
+
+    @property
+    def model(self) -> LinearModel:
+        """The full model."""
+        return self.projection.model
+
+    @property
+    def reduced(self) -> ReducedModel:
+        """The reduced model."""
+        return self.projection.reduced
 
     @property
     def constraint(self) -> Constraint:
@@ -35,11 +49,11 @@ class Surrogate:
 
     @property
     def factorisation(self) -> Factorisation:
-        """That of the system that was factorised first."""
+        """That of the system that was factorised last."""
         return self.system.factorisation
 
     def relative_error(self, moduli: NDArray[np.float64], coefficients: NDArray[np.float64]) -> float:
-        """Upper bound of the reduced displacement's relative error in energy at moduli (kPa) and coefficients."""
+        """Upper bound of the displacement's relative error in energy at moduli (n_regions,) kPa, amounts (n_modes,)."""
         displacement = self.reduced.solve(moduli, coefficients).values
         return float(self.system.error_bound(moduli, displacement[:, None])[0])
 
@@ -48,7 +62,7 @@ def first_surrogate(model: LinearModel, moduli: NDArray[np.float64]) -> Surrogat
     """Responses to every boundary mode at moduli (n_regions,) kPa."""
     system = model.system(moduli)
     snapshots = np.asarray(model.constraint.free.T @ system.responses())
-    return Surrogate(model, snapshots, reduce(model, snapshots), system, system.response_counts)
+    return Surrogate(projection(model, snapshots), system, system.response_counts)
 
 
 def with_modulus_series(
@@ -65,14 +79,41 @@ def with_modulus_series(
     while level.shape[1] * len(columns) + sum(v.shape[1] for v in vectors) <= SERIES:
         level = np.concatenate(list(system.modulus_responses(level, regions=columns)), axis=1)
         vectors.append(level)
+    if not vectors:
+        return surrogate
     fresh = np.asarray(model.constraint.free.T @ np.concatenate(vectors, axis=1))
-    snapshots = np.concatenate([surrogate.snapshots, fresh], axis=1)
-    counts = surrogate.counts + SolveCounts(tangent=fresh.shape[1])
-    return Surrogate(model, snapshots, reduce(model, snapshots), system, counts)
+    return _extended(surrogate, fresh, SolveCounts(tangent=fresh.shape[1]))
+
+
+def sharpened(
+    surrogate: Surrogate,
+    moduli: NDArray[np.float64],
+    coefficients: NDArray[np.float64],
+    directions: NDArray[np.float64],
+) -> Surrogate:
+    """Add what the reduced model misses at moduli (n_regions,) kPa: of the displacement there, and of its derivatives.
+
+    The derivatives are those along `directions` (n_regions + n_modes, k) of (ln E, q). Both are corrections by
+    conjugate gradients with the factorisation that is there, from the reduced answers on; where it is none, or the
+    moduli are far from its own, with a new one.
+    """
+    model, near = surrogate.model, _near(surrogate, moduli)
+    displacement = surrogate.reduced.solve(moduli, coefficients).values
+    missing = -near.solve(model.residual(moduli, displacement[:, None]), DISPLACEMENT)
+    sharper = _extended(replace(surrogate, system=near.system), missing, near.counts + SolveCounts(forward=1))
+    values = displacement + np.asarray(model.constraint.free @ missing)[:, 0]
+    loads = _loads_along(directions, model, moduli, values)
+    vectors = sharper.projection.vectors
+    known = vectors @ sharper.reduced.system(moduli).backward(vectors.T @ loads)
+    rest = near.solve(loads - near.matrix @ known, TANGENT)
+    return _extended(sharper, rest, SolveCounts(tangent=rest.shape[1]))
 
 
 def enriched(surrogate: Surrogate, moduli: NDArray[np.float64], coefficients: NDArray[np.float64]) -> Surrogate:
-    """Add the responses at moduli (n_regions,) kPa and the modulus derivatives of the displacement there."""
+    """Add all responses at moduli (n_regions,) kPa and the modulus derivatives of the displacement there.
+
+    A factorisation and a right-hand side a mode: `sharpened` costs a fraction, but serves the given place only.
+    """
     model = surrogate.model
     system = model.system(moduli)
     responses = system.responses()
@@ -80,15 +121,61 @@ def enriched(surrogate: Surrogate, moduli: NDArray[np.float64], coefficients: ND
     derivatives = system.modulus_responses(solution[:, None])[:, :, 0].T
     free = model.constraint.free
     fresh = np.concatenate([free.T @ responses, free.T @ derivatives], axis=1)
-    snapshots = np.concatenate([surrogate.snapshots, fresh], axis=1)
-    counts = surrogate.counts + system.response_counts + SolveCounts(tangent=model.n_regions)
-    return Surrogate(model, snapshots, reduce(model, snapshots), system, counts)
+    cost = system.response_counts + SolveCounts(tangent=model.n_regions)
+    return _extended(replace(surrogate, system=system), fresh, cost)
 
 
 def with_offset(surrogate: Surrogate, model: LinearModel) -> Surrogate:
-    """The same snapshots for a `model` that differs in the offset of its constraint, and the response to it added."""
+    """The same vectors for a `model` that differs in the offset of its constraint, and the response to it added."""
     system = replace(surrogate.system, model=model)
     fresh = np.asarray(model.constraint.free.T @ system.solve(np.zeros(model.n_modes)).values)[:, None]
-    snapshots = np.concatenate([surrogate.snapshots, fresh], axis=1)
-    counts = surrogate.counts + SolveCounts(forward=1)
-    return Surrogate(model, snapshots, reduce(model, snapshots), system, counts)
+    moved = replace(surrogate, projection=surrogate.projection.under(model), system=system)
+    return _extended(moved, fresh, SolveCounts(forward=1))
+
+
+def _extended(surrogate: Surrogate, snapshots: NDArray[np.float64], cost: SolveCounts) -> Surrogate:
+    extended = surrogate.projection.extended(snapshots)
+    return replace(surrogate, projection=extended, counts=surrogate.counts + cost)
+
+
+def _loads_along(
+    directions: NDArray[np.float64], model: LinearModel, moduli: NDArray[np.float64], values: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Loads (n_free, k), mN, whose responses are the free part of the derivatives of u (n_dof,) along directions."""
+    by_modulus, by_mode = directions[: model.n_regions], directions[model.n_regions :]
+    loads = -np.asarray(weighted_sum(moduli, model.coupling)[:, :-1] @ by_mode)
+    for modulus, matrix, share in zip(moduli, model.stiffness, by_modulus, strict=True):
+        loads -= np.outer(model.constraint.free.T @ (modulus * (matrix @ values)), share)
+    return loads
+
+
+@dataclass(frozen=True, slots=True)
+class _Near:
+    """The stiffness `matrix` (n_free, n_free), mN/mm, at some moduli; `system`: that of the factors at hand."""
+
+    matrix: sparse.csr_matrix[np.float64]
+    system: LinearSystem
+    counts: SolveCounts
+
+    def solve(self, rhs: NDArray[np.float64], tolerance: float) -> NDArray[np.float64]:
+        """Solution (n_free, k) mm to a relative residual; raises `SolverError`."""
+        solution, _ = conjugate_gradients(
+            self.matrix, rhs, self.system.factorisation.solve, tolerance=tolerance, max_iterations=MAX_ITERATIONS
+        )
+        return solution
+
+
+def _near(surrogate: Surrogate, moduli: NDArray[np.float64]) -> _Near:
+    """The stiffness at moduli (n_regions,) kPa with the factors at hand, or with its own where those are no help."""
+    system = surrogate.system
+    ratios = moduli / system.moduli
+    if ratios.max() < FAR * ratios.min() and _direct(system.factorisation):
+        return _Near(weighted_sum(moduli, surrogate.model.free_stiffness), system, SolveCounts())
+    fresh = surrogate.model.system(moduli)
+    matrix = weighted_sum(moduli, surrogate.model.free_stiffness)
+    return _Near(matrix, fresh, SolveCounts(factorisations=1))
+
+
+def _direct(factorisation: Factorisation) -> bool:
+    """Whether a solution costs little beside the factorisation: not where it iterates itself."""
+    return isinstance(factorisation, CheckedFactorisation) and SOLVERS[factorisation.solver].direct

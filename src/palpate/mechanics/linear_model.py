@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from palpate.errors import ConfigurationError
+from palpate.mechanics.coarser import linear_displacements
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.forward import SolveCounts, checked_coefficients, checked_moduli
 from palpate.mechanics.loads import Load
@@ -70,7 +71,14 @@ class LinearModel:
         near_nullspace = self.constraint.free.T @ rigid_modes(self.space.points)
         matrix = weighted_sum(checked, self.free_stiffness)
         return LinearSystem(
-            self, checked, factorise(matrix, solver=self.solver, near_nullspace=np.asarray(near_nullspace))
+            self,
+            checked,
+            factorise(
+                matrix,
+                solver=self.solver,
+                near_nullspace=np.asarray(near_nullspace),
+                coarser=linear_displacements(self.space, self.constraint),
+            ),
         )
 
     def solve(self, moduli: NDArray[np.float64], coefficients: NDArray[np.float64]) -> LinearEquilibrium:
@@ -124,11 +132,9 @@ class LinearSystem:
         """
         free = self.model.constraint.free
         chosen = np.arange(self.model.n_regions) if regions is None else regions
-        derivatives = np.empty((len(chosen), *displacements.shape))
-        for number, region in enumerate(chosen):
-            forces = free.T @ (self.model.stiffness[region] @ displacements)
-            derivatives[number] = free @ self.factorisation.solve(-self.moduli[region] * np.asarray(forces))
-        return derivatives
+        forces = [self.moduli[r] * np.asarray(free.T @ (self.model.stiffness[r] @ displacements)) for r in chosen]
+        solution = free @ self.factorisation.solve(-np.concatenate(forces, axis=1))
+        return np.stack(np.split(np.asarray(solution), len(chosen), axis=1))
 
     def solve(self, coefficients: NDArray[np.float64]) -> LinearEquilibrium:
         """Equilibrium at mode coefficients (n_modes,), dimensionless; one right-hand side."""

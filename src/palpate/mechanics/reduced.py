@@ -16,9 +16,18 @@ from palpate.errors import ConfigurationError, SolverError
 from palpate.mechanics.forward import SolveCounts, checked_coefficients, checked_moduli
 from palpate.mechanics.linear_model import LinearModel
 
-__all__ = ["ReducedEquilibrium", "ReducedModel", "ReducedSystem", "orthonormal_basis", "reduce"]
+__all__ = [
+    "Projection",
+    "ReducedEquilibrium",
+    "ReducedModel",
+    "ReducedSystem",
+    "orthonormal_basis",
+    "projection",
+    "reduce",
+]
 
 RANK_TOLERANCE = 1e-10  # of the largest singular value of the normalised snapshots
+WELL_CONDITIONED = 1e-12  # of the Gram matrix' largest eigenvalue: above it Cholesky's factor orthogonalises safely
 CHUNK = 64  # basis vectors multiplied with a stiffness at once
 
 
@@ -176,41 +185,126 @@ class ReducedEquilibrium:
         return np.asarray((self.system.moduli[:, None] * forces).T)
 
 
+@dataclass(frozen=True, slots=True)
+class Projection:
+    """A linear model on the span of orthonormal `vectors` (n_free, m): the reduced model, and what extends it."""
+
+    model: LinearModel
+    vectors: NDArray[np.float64]
+    reduced: ReducedModel
+
+    def extended(self, snapshots: NDArray[np.float64]) -> Projection:
+        """The projection on the span of the present vectors and of snapshots (n_free, k) mm.
+
+        Only what the snapshots add is multiplied with the stiffness. Raises `ConfigurationError` for other rows.
+        """
+        fresh = _complement(self.vectors, _checked(self.model, snapshots))
+        if not fresh.shape[1]:
+            return self
+        model, old = self.model, self.reduced
+        images = [_product(matrix, fresh) for matrix in model.free_stiffness]
+        stiffness = np.stack(
+            [_bordered(a, self.vectors.T @ y, fresh.T @ y) for a, y in zip(old.stiffness, images, strict=True)]
+        )
+        reduced = replace(
+            old,
+            stiffness=stiffness,
+            coupling=np.concatenate([old.coupling, _coupling(model, fresh)], axis=1),
+            load=np.concatenate([old.load, fresh.T @ model.free_load]),
+            output_basis=np.concatenate([old.output_basis, model.constraint.free @ fresh], axis=1),
+        )
+        return Projection(model, np.concatenate([self.vectors, fresh], axis=1), reduced)
+
+    def under(self, model: LinearModel) -> Projection:
+        """The same vectors for a `model` of the same body with other modes or another offset."""
+        given = np.column_stack([model.constraint.modes, model.constraint.offset])
+        reduced = replace(self.reduced, coupling=_coupling(model, self.vectors), output_given=given)
+        return Projection(model, self.vectors, reduced)
+
+
+def projection(model: LinearModel, snapshots: NDArray[np.float64]) -> Projection:
+    """Project `model` on the span of `snapshots` (n_free, k), free coordinates F^T u of displacements u, mm.
+
+    They are made orthonormal and their rank cut; raises `ConfigurationError` when their rows are not n_free.
+    """
+    vectors = orthonormal_basis(_checked(model, snapshots))
+    products = [vectors.T @ _product(matrix, vectors) for matrix in model.free_stiffness]
+    stiffness = np.stack([0.5 * (product + product.T) for product in products])
+    given = np.column_stack([model.constraint.modes, model.constraint.offset])
+    load = np.asarray(vectors.T @ model.free_load)
+    outputs = np.asarray(model.constraint.free @ vectors)
+    reduced = ReducedModel(model.names, stiffness, _coupling(model, vectors), load, outputs, given)
+    return Projection(model, vectors, reduced)
+
+
+def reduce(model: LinearModel, basis: NDArray[np.float64]) -> ReducedModel:
+    """Project `model` on the span of `basis` (n_free, k) mm: the reduced model alone, as of `projection`."""
+    return projection(model, basis).reduced
+
+
 def orthonormal_basis(snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
     """Orthonormal columns (n, m) that span the snapshots (n, k), each first scaled to length 1.
 
     Directions below 1e-10 of the largest singular value are dropped; raises `ConfigurationError` when none is left.
+    Cholesky factors of the Gram matrix, taken twice, where it is well conditioned (Yamamoto et al., Electron. Trans.
+    Numer. Anal. 44 (2015) 306-326), else Householder's QR.
     """
     lengths = np.linalg.norm(snapshots, axis=0)
     if snapshots.ndim != 2 or not np.all(np.isfinite(lengths)) or not np.any(lengths > 0.0):
         raise ConfigurationError(f"a reduced basis needs finite, non-zero snapshots (n, k); got {snapshots.shape}")
-    q, r = np.linalg.qr(snapshots[:, lengths > 0.0] / lengths[lengths > 0.0])
-    rotation, sizes, _ = np.linalg.svd(r)
-    return np.asarray(q @ rotation[:, : int(np.sum(sizes > RANK_TOLERANCE * sizes[0]))])
+    scaled = snapshots[:, lengths > 0.0] / lengths[lengths > 0.0]
+    sizes = np.linalg.eigvalsh(scaled.T @ scaled)
+    if sizes[0] > WELL_CONDITIONED * sizes[-1]:
+        return _through_gram(_through_gram(scaled))
+    q, r = np.linalg.qr(scaled)
+    rotation, values, _ = np.linalg.svd(r)
+    return np.asarray(q @ rotation[:, : int(np.sum(values > RANK_TOLERANCE * values[0]))])
 
 
-def reduce(model: LinearModel, basis: NDArray[np.float64]) -> ReducedModel:
-    """Project `model` on the span of `basis` (n_free, k), free coordinates F^T u of displacements u, mm.
-
-    The basis is made orthonormal and its rank cut; raises `ConfigurationError` when its rows are not n_free.
-    """
-    free = model.constraint.free
-    if basis.ndim != 2 or len(basis) != free.shape[1]:
-        raise ConfigurationError(f"the basis has the shape {basis.shape}; it must have {free.shape[1]} rows (n_free)")
-    vectors = orthonormal_basis(basis)
-    stiffness = np.stack([_project(matrix, vectors) for matrix in model.free_stiffness])
-    coupling = np.stack([np.asarray((matrix.T @ vectors).T) for matrix in model.coupling])
-    given = np.column_stack([model.constraint.modes, model.constraint.offset])
-    load = np.asarray(vectors.T @ model.free_load)
-    return ReducedModel(model.names, stiffness, coupling, load, np.asarray(free @ vectors), given)
+def _through_gram(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """V R^-1 (n, k) with V^T V = R^T R."""
+    factor = linalg.cholesky(vectors.T @ vectors, check_finite=False)
+    return np.asarray(vectors @ linalg.solve_triangular(factor, np.eye(len(factor)), check_finite=False))
 
 
-def _project(matrix: sparse.csr_matrix[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """V^T A V (m, m), symmetric to the last digit; only the rows that a tissue's stiffness touches take part."""
+def _complement(vectors: NDArray[np.float64], snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Orthonormal columns (n, m) that span what the snapshots (n, k) add to orthonormal `vectors` (n, m_0)."""
+    lengths = np.linalg.norm(snapshots, axis=0)
+    rest = snapshots[:, lengths > 0.0] / lengths[lengths > 0.0]
+    for _ in range(2):  # once leaves the rounding of what it takes away
+        rest = rest - vectors @ (vectors.T @ rest)
+    rest = rest[:, np.linalg.norm(rest, axis=0) > RANK_TOLERANCE]
+    if not rest.shape[1]:
+        return np.asarray(rest)
+    fresh = orthonormal_basis(rest)
+    return orthonormal_basis(fresh - vectors @ (vectors.T @ fresh))
+
+
+def _checked(model: LinearModel, snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
+    n_free = model.constraint.free.shape[1]
+    if snapshots.ndim != 2 or len(snapshots) != n_free:
+        raise ConfigurationError(f"the basis has the shape {snapshots.shape}; it must have {n_free} rows (n_free)")
+    return snapshots
+
+
+def _coupling(model: LinearModel, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """V^T C_r (n_regions, m, n_modes + 1)."""
+    return np.stack([np.asarray((matrix.T @ vectors).T) for matrix in model.coupling])
+
+
+def _bordered(
+    block: NDArray[np.float64], side: NDArray[np.float64], corner: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The symmetric matrix [[block, side], [side^T, corner]]."""
+    return np.block([[block, side], [side.T, 0.5 * (corner + corner.T)]])
+
+
+def _product(matrix: sparse.csr_matrix[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A V (n, k); a tissue's stiffness is empty but for its own rows, which alone are touched."""
     touched = np.flatnonzero(np.diff(matrix.indptr))
     inner, rows = sparse.csr_matrix(matrix[touched][:, touched]), vectors[touched]
-    result = np.empty((vectors.shape[1], vectors.shape[1]))
+    result = np.zeros_like(vectors)
     for start in range(0, vectors.shape[1], CHUNK):
         part = np.ascontiguousarray(rows[:, start : start + CHUNK])
-        result[:, start : start + CHUNK] = rows.T @ np.asarray(inner @ part)
-    return np.asarray(0.5 * (result + result.T))
+        result[touched, start : start + CHUNK] = np.asarray(inner @ part)
+    return result

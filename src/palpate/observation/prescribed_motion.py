@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from palpate.images.alignment import RigidMotion
 from palpate.images.tissue import Role
 from palpate.mesh.space import LagrangeSpace
-from palpate.mesh.surface import tissue_surface
+from palpate.mesh.surface import tissue_surface, triangle_normals
 from palpate.observation.wall_modes import Wall, wall_modes
 
 __all__ = ["PrescribedMotion", "prescribed_motion"]
@@ -49,18 +49,29 @@ def prescribed_motion(
             offset[points] = bones[tissue].apply(space.points[points]) - space.points[points]
     held = prescribed.copy()
     for tissue in (i for i, role in enumerate(roles) if role is Role.DRIVER):
-        points = _points(space, tissue)
-        points = points[~held[points]]
+        points, normals = _wall(space, tissue, held)
         local = wall_modes(space.points[points], n_modes=n_modes, kernel_mm=kernel_mm, prior_mm=prior_mm)
         block = np.zeros((n, 3, local.shape[1]))
         block[points] = local.reshape(len(points), 3, -1)
         first = sum(b.shape[1] for b in blocks)
         blocks.append(block.reshape(3 * n, -1))
         columns = np.arange(first, first + local.shape[1])
-        walls.append(Wall(space.points[points], columns, local[::3, ::3], kernel_mm, prior_mm))
+        walls.append(Wall(space.points[points], normals, columns, local[::3, ::3], kernel_mm, prior_mm))
         prescribed[points] = True
     modes = np.concatenate(blocks, axis=1) if blocks else np.zeros((3 * n, 0))
     return PrescribedMotion(modes, offset.ravel(), prescribed, tuple(walls))
+
+
+def _wall(space: LagrangeSpace, tissue: int, held: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Points (n,) of a tissue's surface that are not held, and the surface's unit normals there (n, 3)."""
+    triangles = tissue_surface(space.mesh, tissue).triangles
+    facets = space.facets(triangles)
+    sums = np.zeros((len(space.points), 3))
+    np.add.at(sums, facets, triangle_normals(space.mesh.nodes, triangles)[:, None])
+    points = np.unique(facets)
+    points = points[~held[points]]
+    lengths = np.linalg.norm(sums[points], axis=1, keepdims=True)
+    return points, sums[points] / np.maximum(lengths, np.finfo(float).tiny)
 
 
 def _points(space: LagrangeSpace, tissue: int) -> NDArray[np.int64]:

@@ -10,33 +10,45 @@ from numpy.typing import NDArray
 __all__ = ["Wall", "kernel_factor", "wall_modes"]
 
 RANK_TOLERANCE = 1e-12
-LEAST_VARIANCE = 1e-3  # of a coefficient, times its variance under the modes' own kernel: no mode is forbidden
 
 
 @dataclass(frozen=True, slots=True)
 class Wall:
     """One driver's wall and the modes of its motion.
 
-    points (n_points, 3) mm; columns (n_modes,) of the constraint's modes that move it, three a scalar mode;
-    scalar (n_points, n_modes / 3) mm: the scalar modes, whose coefficients are N(0, 1) under a kernel of `kernel_mm`
-    and a standard deviation of `prior_mm`.
+    points (n_points, 3) mm with unit normals (n_points, 3); columns (n_modes,) of the constraint's modes that move it,
+    three a scalar mode; scalar (n_points, n_modes / 3) mm: the scalar modes, whose coefficients are N(0, 1) under a
+    kernel of `kernel_mm` and a standard deviation of `prior_mm`.
     """
 
     points: NDArray[np.float64]
+    normals: NDArray[np.float64]
     columns: NDArray[np.int64]
     scalar: NDArray[np.float64]
     kernel_mm: float
     prior_mm: float
 
-    def covariance(self, kernel_mm: float) -> NDArray[np.float64]:
-        """Covariance (n_modes / 3, n_modes / 3) of the scalar coefficients under a kernel of another length, mm.
+    def drift(self, kernel_mm: float) -> NDArray[np.float64]:
+        """Covariance (n_modes, n_modes) of the coefficients of a motion whose components are alike, `prior_mm` each.
 
-        B^+ K B^+^T for the modes B and the covariance K of the wall's points, with `LEAST_VARIANCE` on the diagonal.
+        B^+ K B^+^T for the modes B and a Gaussian kernel K of length `kernel_mm`.
         """
+        amounts = np.linalg.lstsq(self.scalar, self._factor(kernel_mm), rcond=None)[0]
+        return np.asarray(np.kron(amounts @ amounts.T, np.eye(3)))
+
+    def swelling(self, kernel_mm: float) -> NDArray[np.float64]:
+        """Covariance (n_modes, n_modes) of the coefficients of a motion along the normals, of `prior_mm`.
+
+        As `drift` with the kernel n(x) . k(x, y) n(y)^T, what a hollow organ does that fills.
+        """
+        factor = self._factor(kernel_mm)
+        along = [np.linalg.lstsq(self.scalar, self.normals[:, [a]] * factor, rcond=None)[0] for a in range(3)]
+        amounts = np.stack(along, axis=1).reshape(len(self.columns), -1)
+        return np.asarray(amounts @ amounts.T)
+
+    def _factor(self, kernel_mm: float) -> NDArray[np.float64]:
         rank = min(len(self.points), 4 * self.scalar.shape[1])
-        factor = self.prior_mm * kernel_factor(self.points, kernel_mm, rank)
-        amounts = np.linalg.lstsq(self.scalar, factor, rcond=None)[0]
-        return np.asarray(amounts @ amounts.T + LEAST_VARIANCE * np.eye(len(amounts)))
+        return self.prior_mm * kernel_factor(self.points, kernel_mm, rank)
 
 
 def wall_modes(points: NDArray[np.float64], *, n_modes: int, kernel_mm: float, prior_mm: float) -> NDArray[np.float64]:

@@ -137,7 +137,7 @@ def _settings(case: Case) -> tuple[tuple[str, str], ...]:
         (
             "driver motion",
             f"{driver.modes} modes, kernel {driver.kernel_mm:g} mm, prior {driver.prior_mm:g} mm"
-            + (", both learned from the images from there on" if driver.learn_prior else ""),
+            + (", learned from the images from there on" if driver.learn_prior else ""),
         ),
         ("method", options.method),
         ("starts", ", ".join(f"{start:g}" for start in starts) + (" kPa" if options.starts_kpa else in_kpa)),

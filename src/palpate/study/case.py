@@ -137,8 +137,8 @@ class CaseTissue:
 class Mechanics:
     """Material law and finite element (`palpate.mechanics.laws`, `palpate.mechanics.dilatation`)."""
 
-    law: str = field(default="linear", metadata=rule(choices=LAW_NAMES))
-    element: str = field(default="P2", metadata=rule(choices=("P1", "P2", "P2-P0", "auto")))
+    law: str = field(default="neo-hookean", metadata=rule(choices=LAW_NAMES))
+    element: str = field(default="auto", metadata=rule(choices=("P1", "P2", "P2-P0", "auto")))
     c01_over_c10: float = field(default=0.25, metadata=rule(test=lambda value: value >= 0, wanted="zero or more"))
 
 

@@ -7,14 +7,17 @@ import gc
 import numpy as np
 import pytest
 from scipy import sparse
+from scipy.sparse.linalg import splu
 
 from palpate.errors import ConfigurationError, ResourceError, SolverError
 from palpate.mechanics.boundary import outer_constraint
+from palpate.mechanics.coarser import linear_displacements
 from palpate.mechanics.linear_model import linear_model, weighted_sum
 from palpate.mechanics.rigid import rigid_modes
 from palpate.mechanics.solvers import registry
+from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
 from palpate.mechanics.solvers.contract import Solver, always
-from palpate.mechanics.solvers.pattern import twin_rows
+from palpate.mechanics.solvers.pattern import nested_dissection, twin_rows
 from palpate.mechanics.solvers.registry import SOLVERS, factorise
 from palpate.mechanics.stiffness import tissue_stiffness
 from palpate.mesh.space import lagrange_space
@@ -24,7 +27,7 @@ AVAILABLE = [name for name, solver in SOLVERS.items() if solver.available()]
 
 @pytest.fixture(params=["fixed", "sliding"])
 def problem(request, meshes):
-    """Matrix of a stiff ball in a soft block, its rigid motions, and loads."""
+    """Matrix of a stiff ball in a soft block, its rigid motions, loads, and its linear displacements."""
     mesh = meshes.box_mesh(
         6,
         size=50.0,
@@ -36,7 +39,7 @@ def problem(request, meshes):
     constraint = outer_constraint(space, outer=request.param, **nothing)
     matrix = weighted_sum(np.array([1.0, 20.0]), linear_model(space, constraint).free_stiffness)
     loads = np.random.default_rng(3).standard_normal((matrix.shape[0], 4))
-    return matrix, constraint.free.T @ rigid_modes(space.points), loads
+    return matrix, constraint.free.T @ rigid_modes(space.points), loads, linear_displacements(space, constraint)
 
 
 def laplacian(n):
@@ -48,7 +51,7 @@ def laplacian(n):
 
 @pytest.mark.parametrize("solver", AVAILABLE)
 def test_every_solver_inverts_the_stiffness(problem, solver):
-    matrix, motions, loads = problem
+    matrix, motions, loads, _ = problem
     solution = factorise(matrix, solver=solver, near_nullspace=motions).solve(matrix @ loads)
     assert np.linalg.norm(solution - loads) < 1e-7 * np.linalg.norm(loads)
 
@@ -128,3 +131,46 @@ def test_twin_rows_are_the_unknowns_of_one_node(problem, meshes):
     space = lagrange_space(meshes.box_mesh(2), "P2")
     assert np.array_equal(twin_rows(tissue_stiffness(space, 0, 0.3)), np.repeat(np.arange(len(space.points)), 3))
     assert np.all(np.bincount(twin_rows(problem[0])) <= 3)
+
+
+def test_nested_dissection_orders_every_unknown_once_and_spares_fill(problem):
+    matrix = problem[0]
+    order = nested_dissection(matrix)
+    assert np.array_equal(np.sort(order), np.arange(matrix.shape[0]))
+    options = {"permc_spec": "NATURAL", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+    natural, dissected = (splu(sparse.csc_matrix(m), **options).L.nnz for m in (matrix, matrix[order][:, order]))
+    assert dissected < 0.7 * natural
+
+
+def test_a_pattern_that_lost_an_entry_on_one_side_is_ordered_all_the_same(problem):
+    matrix = problem[0].copy()
+    row = matrix.indices[matrix.indptr[7] : matrix.indptr[8]]
+    matrix.data[matrix.indptr[7] + int(np.flatnonzero(row > 7)[0])] = 0.0
+    matrix.eliminate_zeros()
+    assert np.array_equal(np.sort(nested_dissection(matrix)), np.arange(matrix.shape[0]))
+
+
+def test_linear_displacements_are_linear_between_the_corners(meshes):
+    space = lagrange_space(meshes.box_mesh(3), "P2")
+    nothing = meshes.prescribe(space, np.zeros(0, int), np.zeros((0, 3)))
+    constraint = outer_constraint(space, outer="sliding", **nothing)
+    coarser = linear_displacements(space, constraint)
+    assert np.array_equal(coarser.prolongation[coarser.kept].toarray(), np.eye(len(coarser.kept)))
+    inner = np.all((space.points > 1e-6) & (space.points < space.points.max() - 1e-6), axis=1)
+    bent = space.points**3 * np.where(inner, 1.0, 0.0)[:, None]
+    ends = bent.ravel()[: 3 * len(space.mesh.nodes)]
+    made = constraint.free @ coarser.prolongation @ (constraint.free[: len(ends)][:, coarser.kept].T @ ends)
+    middles = bent[space.edges].mean(axis=1)
+    free = np.asarray(abs(constraint.free).sum(axis=1)).ravel()[len(ends) :].reshape(-1, 3) > 0
+    assert np.allclose(made.reshape(-1, 3)[len(space.mesh.nodes) :][free], middles[free])
+    assert linear_displacements(lagrange_space(space.mesh, "P1"), constraint) is None
+
+
+def test_multigrid_through_linear_elements_takes_fewer_steps_to_the_same_answer(problem):
+    matrix, motions, loads, coarser = problem
+    steps = []
+    for through in (None, coarser):
+        found = factorise(matrix, solver="multigrid", near_nullspace=motions, coarser=through)
+        assert np.allclose(found.solve(matrix @ loads), loads, atol=1e-6 * np.abs(loads).max())
+        steps.append(conjugate_gradients(matrix, loads, found.inner.cycle, tolerance=1e-8, max_iterations=200)[1])
+    assert steps[1] < steps[0]

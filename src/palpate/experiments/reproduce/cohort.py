@@ -53,7 +53,7 @@ class CohortSettings:
     first_kpa: tuple[float, float] = (20.0, 18.0)
     growth: tuple[float, float] = (1.35, 1.12)
     scatter: tuple[float, float] = (0.15, 0.20)
-    edge_mm: float = 8.0
+    edge_mm: float = 9.5
     filling_mm: tuple[float, float] = (5.0, 9.0)
     noise: Noise = field(default_factory=lambda: Noise(0.3, 6.0))
     driver: DriverMotion = field(default_factory=lambda: DriverMotion(modes=60))

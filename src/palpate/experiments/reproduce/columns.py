@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -25,9 +25,7 @@ from palpate.phantoms.scene import imaged
 from palpate.study.body import Body, ImagedStates, aligned
 from palpate.study.run import fitted_states
 
-__all__ = ["entries_from_surfaces", "entries_from_voxels", "from_half", "imaged_states", "voxel_targets"]
-
-Progress = Callable[[str], None]
+__all__ = ["entries_from_surfaces", "entries_from_voxels", "from_half", "imaged_states", "voxel_targets", "with_motion"]
 
 SEARCHED = 100.0  # the moduli are sought within this factor of the start
 
@@ -39,15 +37,21 @@ def from_half(mapping: ModulusMap, truth: Mapping[str, float]) -> InversionSetti
     return InversionSettings((start,), Bounds(start - reach, start + reach))
 
 
-def imaged_states(space: LagrangeSpace, displacement: NDArray[np.float64], grid: VoxelGrid) -> ImagedStates:
+def imaged_states(space: LagrangeSpace, motion: NDArray[np.float64], grid: VoxelGrid) -> ImagedStates:
     """Both states of a truth, u (n_points, 3) mm, as label images; tissues that `grid` does not show fall away."""
-    still = np.zeros_like(displacement)
-    images = tuple(imaged(space, motion, grid) for motion in (still, displacement))
+    still = np.zeros_like(space.points)
+    images = tuple(imaged(space, displacement, grid) for displacement in (still, motion))
     shown = set(np.unique(images[0].labels)) & set(np.unique(images[1].labels))
     numbered = enumerate(space.mesh.tissues, start=1)
     tissues = tuple(replace(tissue, labels=(label,)) for label, tissue in numbered if label in shown)
     before, after = (segment(image, tissues) for image in images)
     return aligned(before, (after,), method="none")
+
+
+def with_motion(states: ImagedStates, space: LagrangeSpace, motion: NDArray[np.float64]) -> ImagedStates:
+    """The same rest state with the later state of another u (n_points, 3) mm."""
+    before = states.before
+    return replace(states, after=(segment(imaged(space, motion, before.grid), before.tissues),))
 
 
 def voxel_targets(body: Body, surfaces: tuple[ObservedSurface, ...]) -> tuple[SurfaceTarget, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from itertools import pairwise
 from typing import Any
 
@@ -22,7 +22,8 @@ from palpate.experiments.reproduce.balls import (
     mean_deformations,
     pulled,
 )
-from palpate.experiments.reproduce.columns import Progress, from_half
+from palpate.experiments.reproduce.columns import from_half
+from palpate.experiments.reproduce.jobs import Job, Progress, compute
 from palpate.experiments.reproduce.ledger import Ledger
 from palpate.inversion.continuation import continued_at_finite_strain
 from palpate.inversion.invert import invert
@@ -122,22 +123,39 @@ class Figure4:
         return rows
 
 
-def figure4(settings: Figure4Settings, ledger: Ledger, *, progress: Progress) -> Figure4:
-    """All points; raises `PalpateError`s of meshing and solving, `NotConverged` where a truth has no equilibrium."""
-    bench = _Bench(settings.balls)
-    points = list[Point]()
-    for moduli in settings.moduli_kpa:
-        case = "/".join(f"{modulus:g}" for modulus in moduli)
-        for deformation in settings.deformations:
-            progress(f"figure 4, {case} kPa, deformed by {100.0 * deformation:g} %")
-            key = f"{case} {deformation:g}"
-            part = ledger.part(key, partial(bench.errors, moduli, deformation, progress))
-            points += [
-                Point(body, modulus, part["deformation_percent"][i], law, part[law][i], case)
-                for law in ("linear", LAW)
-                for i, (body, modulus) in enumerate(zip(BODIES, moduli, strict=True))
-            ]
+def figure4(settings: Figure4Settings, ledger: Ledger, *, progress: Progress, workers: int = 1) -> Figure4:
+    """All points, by that many processes.
+
+    Raises `PalpateError`s of meshing and solving, `NotConverged` where a truth has no equilibrium.
+    """
+    keys = {
+        f"{_name(moduli)} {deformation:g}": (moduli, deformation)
+        for moduli in settings.moduli_kpa
+        for deformation in settings.deformations
+    }
+    jobs = [Job((key,), partial(_part, settings.balls, *of)) for key, of in keys.items()]
+    parts = compute(jobs, ledger, workers=workers, progress=progress)
+    points = [
+        Point(body, modulus, parts[key]["deformation_percent"][i], law, parts[key][law][i], _name(moduli))
+        for key, (moduli, _) in keys.items()
+        for law in ("linear", LAW)
+        for i, (body, modulus) in enumerate(zip(BODIES, moduli, strict=True))
+    ]
     return Figure4(tuple(points))
+
+
+def _part(balls: Balls, moduli: Moduli, deformation: float, key: str, progress: Progress) -> dict[str, Any]:
+    progress(f"figure 4, kPa and deformation: {key}")
+    return _bench(balls).errors(moduli, deformation, progress)
+
+
+def _name(moduli: Moduli) -> str:
+    return "/".join(f"{modulus:g}" for modulus in moduli)
+
+
+@lru_cache(maxsize=1)
+def _bench(balls: Balls) -> _Bench:
+    return _Bench(balls)
 
 
 def nominal_stress(stretch: float) -> float:

@@ -18,7 +18,14 @@ from palpate.study.outputs import whole_file
 
 __all__ = ["draw_figure4", "draw_staging", "draw_table"]
 
-STYLE = {"svg.fonttype": "path", "svg.hashsalt": "palpate", "font.size": 9.0, "axes.grid": True, "grid.alpha": 0.3}
+STYLE = {
+    "svg.fonttype": "none",
+    "font.family": "sans-serif",
+    "svg.hashsalt": "palpate",
+    "font.size": 9.0,
+    "axes.grid": True,
+    "grid.alpha": 0.3,
+}
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe & Ito 2008: safe for colour-blind
 MARKERS = ("o", "s", "^", "D", "v")
 SMALLEST = 1e-6  # per cent: what is smaller is drawn there
@@ -79,6 +86,7 @@ def _errors(axes: Axes, rows: list[TableRow]) -> None:
         sizes = [np.nan if error is None else max(abs(error), SMALLEST) for error in errors]
         axes.plot(places, sizes, linestyle="none", marker=marker, color=colour, markersize=4.5, label=name)
     axes.set_yscale("log")
+    axes.minorticks_off()
     axes.set_xticks(places, [row.case for row in rows], rotation=60, ha="right", fontsize=7.5)
     axes.set_xlabel("true modulus, kPa")
 

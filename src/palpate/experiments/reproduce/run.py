@@ -10,9 +10,9 @@ from typing import Any
 
 from palpate.errors import ConfigurationError
 from palpate.experiments.reproduce.cohort import CohortSettings
-from palpate.experiments.reproduce.columns import Progress
 from palpate.experiments.reproduce.figure4 import Figure4Settings, figure4
 from palpate.experiments.reproduce.figures import draw_figure4, draw_staging, draw_table
+from palpate.experiments.reproduce.jobs import Progress
 from palpate.experiments.reproduce.ledger import Ledger
 from palpate.experiments.reproduce.staging import staging
 from palpate.experiments.reproduce.table1 import Table1Settings, table1
@@ -43,18 +43,21 @@ class Reproduction:
     figure: Path
 
 
-def reproduce(experiment: str, folder: Path, *, progress: Progress, settings: Settings | None = None) -> Reproduction:
+def reproduce(
+    experiment: str, folder: Path, *, progress: Progress, settings: Settings | None = None, workers: int = 1
+) -> Reproduction:
     """Compute an experiment of `EXPERIMENTS`, or what is left of it, and write EXPERIMENT.json and EXPERIMENT.svg.
 
-    Finished parts stand in EXPERIMENT.parts.jsonl of `folder` and are not computed again. Raises `ConfigurationError`
-    for another name, `PalpateError`s of meshing, solving and writing.
+    Finished parts stand in EXPERIMENT.parts.jsonl of `folder` and are not computed again. `workers`: processes that
+    share the parts; a script that asks for more than one needs the guard `if __name__ == "__main__"`: they import it.
+    Raises `ConfigurationError` for another name, `PalpateError`s of meshing, solving and writing.
     """
-    chosen = settings or Settings()
+    chosen, run = settings or Settings(), _Run(experiment, folder, workers, progress)
     makers: dict[str, Callable[[], Reproduction]] = {
-        "table1": lambda: _table1(chosen.table1, folder, progress),
-        "table2": lambda: _table2(chosen.table2, folder, progress),
-        "figure4": lambda: _figure4(chosen.figure4, folder, progress),
-        "staging": lambda: _staging(chosen.staging, folder, progress),
+        "table1": lambda: _table1(chosen.table1, run),
+        "table2": lambda: _table2(chosen.table2, run),
+        "figure4": lambda: _figure4(chosen.figure4, run),
+        "staging": lambda: _staging(chosen.staging, run),
     }
     if experiment not in makers:
         raise ConfigurationError(f"the experiment is '{experiment}'; it must be one of {list(EXPERIMENTS)}")
@@ -63,30 +66,44 @@ def reproduce(experiment: str, folder: Path, *, progress: Progress, settings: Se
     return result
 
 
-def _ledger(folder: Path, experiment: str, settings: object) -> Ledger:
-    """The finished parts under exactly these settings."""
-    return Ledger(folder / f"{experiment}.parts.jsonl", sha256(repr(settings).encode()).hexdigest()[:16])
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """Where an experiment is written and who computes it."""
+
+    experiment: str
+    folder: Path
+    workers: int
+    progress: Progress
+
+    @property
+    def figure(self) -> Path:
+        return self.folder / f"{self.experiment}.svg"
+
+    def ledger(self, settings: object) -> Ledger:
+        """The finished parts under exactly these settings."""
+        path = self.folder / f"{self.experiment}.parts.jsonl"
+        return Ledger(path, sha256(repr(settings).encode()).hexdigest()[:16])
 
 
-def _table1(settings: Table1Settings, folder: Path, progress: Progress) -> Reproduction:
-    table = table1(settings, _ledger(folder, "table1", settings), progress=progress)
-    draw_table(table, folder / "table1.svg")
-    return Reproduction(table.to_dict(), table.text(), folder / "table1.svg")
+def _table1(settings: Table1Settings, run: _Run) -> Reproduction:
+    table = table1(settings, run.ledger(settings), progress=run.progress, workers=run.workers)
+    draw_table(table, run.figure)
+    return Reproduction(table.to_dict(), table.text(), run.figure)
 
 
-def _table2(settings: Table2Settings, folder: Path, progress: Progress) -> Reproduction:
-    table = table2(settings, _ledger(folder, "table2", settings), progress=progress)
-    draw_table(table, folder / "table2.svg")
-    return Reproduction(table.to_dict(), table.text(), folder / "table2.svg")
+def _table2(settings: Table2Settings, run: _Run) -> Reproduction:
+    table = table2(settings, run.ledger(settings), progress=run.progress, workers=run.workers)
+    draw_table(table, run.figure)
+    return Reproduction(table.to_dict(), table.text(), run.figure)
 
 
-def _figure4(settings: Figure4Settings, folder: Path, progress: Progress) -> Reproduction:
-    result = figure4(settings, _ledger(folder, "figure4", settings), progress=progress)
-    draw_figure4(result, folder / "figure4.svg")
-    return Reproduction(result.to_dict(), result.text(), folder / "figure4.svg")
+def _figure4(settings: Figure4Settings, run: _Run) -> Reproduction:
+    result = figure4(settings, run.ledger(settings), progress=run.progress, workers=run.workers)
+    draw_figure4(result, run.figure)
+    return Reproduction(result.to_dict(), result.text(), run.figure)
 
 
-def _staging(settings: CohortSettings, folder: Path, progress: Progress) -> Reproduction:
-    result = staging(settings, _ledger(folder, "staging", settings), progress=progress)
-    draw_staging(result, folder / "staging.svg")
-    return Reproduction(result.to_dict(), result.text(), folder / "staging.svg")
+def _staging(settings: CohortSettings, run: _Run) -> Reproduction:
+    result = staging(settings, run.ledger(settings), progress=run.progress, workers=run.workers)
+    draw_staging(result, run.figure)
+    return Reproduction(result.to_dict(), result.text(), run.figure)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from palpate.experiments.reproduce.cohort import ORGANS, CohortSettings, PatientResult, estimate_patient
-from palpate.experiments.reproduce.columns import Progress
+from palpate.experiments.reproduce.jobs import Job, Progress, compute
 from palpate.experiments.reproduce.ledger import Ledger
 from palpate.experiments.reproduce.paper import PAPER_STAGING
 from palpate.experiments.reproduce.statistics import Association, association, pearson_p, points_behind
@@ -57,9 +57,15 @@ class Staging:
         return rows
 
 
-def staging(settings: CohortSettings, ledger: Ledger, *, progress: Progress) -> Staging:
-    """Estimate all patients, then ask how their moduli go with the stage; raises `PalpateError`s of solving."""
-    patients = tuple(_patient(settings, number, ledger, progress) for number in range(len(settings.stages)))
+def staging(settings: CohortSettings, ledger: Ledger, *, progress: Progress, workers: int = 1) -> Staging:
+    """Estimate all patients by that many processes, then ask how their moduli go with the stage.
+
+    Raises `PalpateError`s of meshing and solving.
+    """
+    keys = [f"patient {number + 1}" for number in range(len(settings.stages))]
+    jobs = [Job((key,), partial(_part, settings, number)) for number, key in enumerate(keys)]
+    parts = compute(jobs[::-1], ledger, workers=workers, progress=progress)  # the patients with most pairs first
+    patients = tuple(PatientResult(**parts[key]) for key in keys)
     stages = np.array([patient.stage for patient in patients], dtype=float)
     organs = {
         organ: association([np.array(p.kpa[organ]) for p in patients], stages, seed=settings.seed) for organ in ORGANS
@@ -79,13 +85,8 @@ def paper_remark() -> str:
     )
 
 
-def _patient(settings: CohortSettings, number: int, ledger: Ledger, progress: Progress) -> PatientResult:
-    progress(f"staging: patient {number + 1} of {len(settings.stages)}, {settings.pairs[number]} pairs of images")
-    make = partial(_stored, settings, number, progress)
-    return PatientResult(**ledger.part(f"patient {number + 1}", make))
-
-
-def _stored(settings: CohortSettings, number: int, progress: Progress) -> dict[str, Any]:
+def _part(settings: CohortSettings, number: int, key: str, progress: Progress) -> dict[str, Any]:
+    progress(f"staging: {key} of {len(settings.stages)}, {settings.pairs[number]} pairs of images")
     return asdict(estimate_patient(settings, number, progress))
 
 

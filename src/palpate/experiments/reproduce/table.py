@@ -10,7 +10,7 @@ import numpy as np
 
 from palpate.experiments.reproduce.paper import PAPER_ITERATIONS
 
-__all__ = ["COLUMNS", "Entry", "Table", "TableRow"]
+__all__ = ["COLUMNS", "Entry", "Table", "TableRow", "as_part", "entries_of"]
 
 COLUMNS = ("same_mesh", "other_mesh", "voxels", "paper_method", "paper_method_other_mesh")
 IDENTIFIED = "identified"
@@ -55,6 +55,16 @@ class Entry:
     def counts(self) -> bool:
         """Whether its error is one of a stated result: not of a `weak` or `not identified` one."""
         return self.error_percent is not None and self.verdict in (None, IDENTIFIED)
+
+
+def as_part(entries: Mapping[str, Entry]) -> dict[str, Any]:
+    """Entries by body as a part of the ledger."""
+    return {body: asdict(entry) for body, entry in entries.items()}
+
+
+def entries_of(part: Mapping[str, Any]) -> dict[str, Entry]:
+    """Entries by body of a part of the ledger."""
+    return {body: Entry.from_dict(stored) for body, stored in part.items()}
 
 
 @dataclass(frozen=True, slots=True)

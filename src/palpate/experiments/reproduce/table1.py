@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,17 +21,17 @@ from palpate.experiments.reproduce.balls import (
     random_grid,
 )
 from palpate.experiments.reproduce.columns import (
-    Progress,
     entries_from_surfaces,
     entries_from_voxels,
     from_half,
     imaged_states,
     voxel_targets,
 )
+from palpate.experiments.reproduce.jobs import Job, Progress, compute
 from palpate.experiments.reproduce.ledger import Ledger
 from palpate.experiments.reproduce.paper import PAPER_TABLE1
 from palpate.experiments.reproduce.paper_method import paper_estimate, paper_target
-from palpate.experiments.reproduce.table import Entry, Table, TableRow
+from palpate.experiments.reproduce.table import COLUMNS, Entry, Table, TableRow, as_part, entries_of
 from palpate.inversion.invert import invert
 from palpate.inversion.modulus_map import modulus_map
 from palpate.inversion.problem import InverseProblem, Inversion, InversionSettings
@@ -48,6 +49,7 @@ Array = NDArray[np.float64]
 Moduli = tuple[float, float, float]
 
 DEFORMATION = 0.095  # of the region that is deformed most: "slightly less than 10 %"
+SURFACE_COLUMNS = tuple(name for name in COLUMNS if name != "voxels")
 NEAREST = 40  # points of the truth that give its displacement at a place
 
 NOTES = (
@@ -76,24 +78,39 @@ class Table1Settings:
         return tuple((modulus,) * 3 for modulus in self.equal_kpa) + self.different_kpa
 
 
-def table1(settings: Table1Settings, ledger: Ledger, *, progress: Progress) -> Table:
-    """All rows; raises `PalpateError`s of meshing and solving."""
-    bench = _Bench(settings.balls)
+def table1(settings: Table1Settings, ledger: Ledger, *, progress: Progress, workers: int = 1) -> Table:
+    """All rows, by that many processes; raises `PalpateError`s of meshing and solving."""
+    units = list(dict.fromkeys(_first_like(moduli, settings.cases) for moduli in settings.cases))
+    make = partial(_part, settings)
+    jobs = [Job((f"{_name(moduli)} voxels",), make) for moduli in settings.cases]
+    jobs += [Job(tuple(f"{_name(unit)} {column}" for column in SURFACE_COLUMNS), make) for unit in units]
+    parts = compute(jobs, ledger, workers=workers, progress=progress)
     rows: list[TableRow] = []
-    for number, moduli in enumerate(settings.cases):
-        parts = _Case(moduli, bench, settings.seed + number)
-        name = _name(moduli)
-        progress(f"table 1, case {number + 1} of {len(settings.cases)}: {name} kPa")
-        columns: dict[str, dict[str, Entry]] = {}
-        columns["voxels"] = ledger.entries(f"{name} voxels", partial(parts.from_voxels, progress))
+    for moduli in settings.cases:
         unit = _first_like(moduli, settings.cases)
-        for column, make in _Case(unit, bench, settings.seed).columns(progress).items():
-            found = ledger.entries(f"{_name(unit)} {column}", make)
+        columns = {"voxels": entries_of(parts[f"{_name(moduli)} voxels"])}
+        for column in SURFACE_COLUMNS:
+            found = entries_of(parts[f"{_name(unit)} {column}"])
             columns[column] = {body: entry.scaled(moduli[0] / unit[0]) for body, entry in found.items()}
         for body, truth in zip(BODIES, moduli, strict=True):
             paper = PAPER_TABLE1.get(truth, {}).get(body) if len(set(moduli)) == 1 else None
-            rows.append(TableRow(name, body, truth, paper, {c: entries[body] for c, entries in columns.items()}))
+            entries = {column: columns[column][body] for column in COLUMNS}
+            rows.append(TableRow(_name(moduli), body, truth, paper, entries))
     return Table("table1", tuple(rows), NOTES)
+
+
+def _part(settings: Table1Settings, key: str, progress: Progress) -> dict[str, Any]:
+    """The part of a key "case column"."""
+    name, column = key.rsplit(" ", 1)
+    number = [_name(moduli) for moduli in settings.cases].index(name)
+    case = _Case(settings.cases[number], _bench(settings.balls), settings.seed + number)
+    progress(f"table 1, {name} kPa: {column}")
+    return as_part(case.column(column, progress))
+
+
+@lru_cache(maxsize=1)
+def _bench(balls: Balls) -> _Bench:
+    return _Bench(balls)
 
 
 def _first_like(moduli: Moduli, cases: tuple[Moduli, ...]) -> Moduli:
@@ -124,26 +141,30 @@ class _Bench:
         return _model(balls_space(self.balls, self.balls.edge_mm, element="P1"))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class _Case:
-    """Three moduli (kPa) and the columns that they give; `columns`: those that see no voxels."""
+    """Three moduli (kPa) and the columns that they give."""
 
     moduli: Moduli
     bench: _Bench
     seed: int
 
-    def columns(self, progress: Progress) -> dict[str, Callable[[], dict[str, Entry]]]:
-        return {
+    def column(self, name: str, progress: Progress) -> dict[str, Entry]:
+        """What a column says of each body."""
+        makers: dict[str, Callable[[], dict[str, Entry]]] = {
             "same_mesh": lambda: self.from_surfaces(self.bench.coarse, progress),
             "other_mesh": lambda: self.from_surfaces(self.bench.fine, progress),
+            "voxels": lambda: self.from_voxels(progress),
             "paper_method": lambda: self.by_the_paper(self.bench.linear_tetrahedra),
             "paper_method_other_mesh": lambda: self.by_the_paper(self.bench.fine),
         }
+        return makers[name]()
 
     @property
     def truth(self) -> dict[str, float]:
         return dict(zip(BODIES, self.moduli, strict=True))
 
+    @cached_property
     def stress_kpa(self) -> float:
         """The pull under which the region that is deformed most is deformed by 9.5 %."""
         model = self.bench.coarse
@@ -152,11 +173,11 @@ class _Case:
 
     def displacement(self, model: LinearModel) -> Array:
         """Displacement (n_points, 3) mm of the truth on a model's mesh."""
-        loaded = _pulled_by(model, self.stress_kpa())
+        loaded = _pulled_by(model, self.stress_kpa)
         return loaded.solve(np.array(self.moduli), np.zeros(model.n_modes)).displacement
 
     def from_surfaces(self, truth: LinearModel, progress: Progress) -> dict[str, Entry]:
-        model = _pulled_by(self.bench.coarse, self.stress_kpa())
+        model = _pulled_by(self.bench.coarse, self.stress_kpa)
         u = self.displacement(truth)
         surfaces = [observed_surface(model.space, body) for body in range(len(BODIES))]
         targets = tuple(target_of_truth(truth.space, u, surface) for surface in surfaces)
@@ -171,7 +192,7 @@ class _Case:
         mechanics = Mechanics(law="linear", element="P2")
         case = Case("table1", phantom=Phantom("spheres"), mesh=MeshSettings(balls.edge_mm), mechanics=mechanics)
         body = make_body(states, case, progress=progress)
-        model = _pulled_by(_model(body.space), self.stress_kpa())
+        model = _pulled_by(_model(body.space), self.stress_kpa)
         surfaces = tuple(observed_surface(body.space, number) for number in range(len(BODIES)))
         inversion, settings = self.inverted(model, voxel_targets(body, surfaces), progress)
         return entries_from_voxels(inversion, settings, body, self.truth, seed=self.seed)
@@ -187,7 +208,7 @@ class _Case:
     def by_the_paper(self, truth: LinearModel) -> dict[str, Entry]:
         """The paper's method; a few nodes hold the rigid motion, with the displacement that the truth has there."""
         own, u = self.bench.linear_tetrahedra, self.displacement(truth)
-        model = _held_as(_pulled_by(own, self.stress_kpa()), truth.space, u)
+        model = _held_as(_pulled_by(own, self.stress_kpa), truth.space, u)
         targets = [paper_target(truth.space, u, observed_surface(own.space, body)) for body in range(len(BODIES))]
         fit = paper_estimate(model, targets, moduli=0.5 * np.array(self.moduli), columns=np.arange(len(BODIES)))
         values = fit.moduli.tolist() if fit.converged else [None] * len(BODIES)

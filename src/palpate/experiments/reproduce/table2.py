@@ -4,32 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.experiments.reproduce.columns import (
-    Progress,
     entries_from_surfaces,
     entries_from_voxels,
     from_half,
     imaged_states,
     voxel_targets,
+    with_motion,
 )
+from palpate.experiments.reproduce.jobs import Job, Progress, compute
 from palpate.experiments.reproduce.ledger import Ledger
 from palpate.experiments.reproduce.paper import PAPER_TABLE2
 from palpate.experiments.reproduce.paper_method import paper_estimate, paper_target
 from palpate.experiments.reproduce.real_pelvis import ORGANS, RealPelvis, grid_over, real_pelvis
-from palpate.experiments.reproduce.table import Entry, Table, TableRow
+from palpate.experiments.reproduce.table import COLUMNS, Entry, Table, TableRow, as_part, entries_of
 from palpate.images.distance import observation_width, smoothing_width
 from palpate.images.label_image import VoxelGrid
 from palpate.images.tissue import Role
 from palpate.inversion.invert import invert_with
 from palpate.inversion.modulus_map import modulus_map
 from palpate.inversion.problem import InverseProblem
-from palpate.inversion.surrogate import Surrogate, first_surrogate, with_modulus_series
+from palpate.inversion.surrogate import Surrogate, enriched, first_surrogate, with_modulus_series
 from palpate.mechanics.boundary import outer_constraint
+from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.linear_model import LinearModel, linear_model, weighted_sum
 from palpate.mechanics.linearised import LinearisedSystem
 from palpate.mechanics.solvers.contract import Factorisation
@@ -41,21 +44,23 @@ from palpate.observation.observed_surface import observed_surface
 from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.phantoms.exact_targets import target_of_truth
 from palpate.study.body import Body, inverse_problem
-from palpate.study.case import Case, DriverMotion, Mechanics, MeshSettings, Phantom
+from palpate.study.case import Case, Domain, DriverMotion, Mechanics, MeshSettings, Phantom
 
 __all__ = ["SURROUNDINGS_KPA", "Table2Settings", "table2"]
 
 Array = NDArray[np.float64]
 
 SURROUNDINGS_KPA = 50.0  # the paper states none; stiffer organs than some ten times it would say nothing of themselves
+ELEMENT = "auto"  # of the truth, too
+OUTER = "sliding"  # the scan ends in the prostate: a border that held it would leave the rectum little to move
 
 NOTES = (
     f"The surroundings are known ({SURROUNDINGS_KPA:g} kPa) and set the scale; the paper does not state theirs.",
     "The pelvis is a real CT with automatic labels of 3 mm voxels; its later state is simulated with the linear law.",
     "As in the paper the scene is prostate, bladder, a hollow rectum and a box; bones are part of the surroundings.",
-    "same_mesh: the wall moves as the driver's modes can; all other columns: as the filling makes it.",
-    "voxels: 1 mm, on one of several grids shifted at random; everything is made from the labels.",
-    "paper_method: its Eq. 4 on linear tetrahedra, L-BFGS, the wall's true motion given, data of its own mesh.",
+    "The wall's motion is given in all columns but the voxels', as in the paper.",
+    "voxels: 1 mm, on one of several grids shifted at random; all is made from the labels, the wall's motion too.",
+    "paper_method: its Eq. 4 on linear tetrahedra, L-BFGS, data of its own mesh.",
     "paper_method_other_mesh: the same on the data of the column other_mesh.",
 )
 
@@ -64,42 +69,58 @@ NOTES = (
 class Table2Settings:
     """Edges of the inverting and of the truth's mesh (mm), moduli (kPa), random grids, modes of the wall."""
 
-    edge_mm: float = 5.0
-    truth_edge_mm: float = 4.0
+    edge_mm: float = 7.5
+    truth_edge_mm: float = 6.0
     voxel_mm: float = 1.0
-    filling_mm: float = 6.5
+    filling_mm: float = 7.5
     moduli_kpa: tuple[float, ...] = tuple(PAPER_TABLE2)
     positions: int = 4
     driver: DriverMotion = field(default_factory=DriverMotion)
     seed: int = 2
 
 
-def table2(settings: Table2Settings, ledger: Ledger, *, progress: Progress) -> Table:
-    """All rows; raises `PalpateError`s of meshing and solving."""
-    bench = _Bench(settings, progress)
-    imaged = [_Imaged(bench, position) for position in range(settings.positions)]
+def table2(settings: Table2Settings, ledger: Ledger, *, progress: Progress, workers: int = 1) -> Table:
+    """All rows, by that many processes; raises `PalpateError`s of meshing and solving."""
+    parts = compute(_jobs(settings), ledger, workers=workers, progress=progress)
     rows = list[TableRow]()
-    for number, kpa in enumerate(settings.moduli_kpa):
-        columns: dict[str, dict[str, Entry]] = {}
-        for column, make in _columns(bench, imaged[number % settings.positions]).items():
-            progress(f"table 2, {kpa:g} kPa: {column}")
-            columns[column] = ledger.entries(f"{kpa:g} {column}", partial(make, kpa))
+    for kpa in settings.moduli_kpa:
+        columns = {column: entries_of(parts[f"{kpa:g} {column}"]) for column in COLUMNS}
         papers = PAPER_TABLE2.get(kpa, {})
         rows += [
-            TableRow(f"{kpa:g}", organ, kpa, papers.get(organ), {c: entries[organ] for c, entries in columns.items()})
+            TableRow(f"{kpa:g}", organ, kpa, papers.get(organ), {c: columns[c][organ] for c in COLUMNS})
             for organ in ORGANS
         ]
     return Table("table2", tuple(rows), NOTES)
 
 
-def _columns(bench: _Bench, imaged: _Imaged) -> dict[str, Callable[[float], dict[str, Entry]]]:
-    return {
-        "same_mesh": bench.same_mesh,
-        "other_mesh": bench.other_mesh,
-        "voxels": imaged.voxels,
-        "paper_method": bench.by_the_paper,
-        "paper_method_other_mesh": bench.by_the_paper_on_other_mesh,
-    }
+def _jobs(settings: Table2Settings) -> list[Job]:
+    """All columns that see no voxels share their meshes, and so do the rows of one voxel grid."""
+    names = [f"{kpa:g}" for kpa in settings.moduli_kpa]
+    make = partial(_part, settings)
+    surfaces = Job(tuple(f"{name} {column}" for column in COLUMNS if column != "voxels" for name in names), make)
+    positions = [names[position :: settings.positions] for position in range(settings.positions)]
+    return [surfaces, *(Job(tuple(f"{name} voxels" for name in used), make) for used in positions if used)]
+
+
+def _part(settings: Table2Settings, key: str, progress: Progress) -> dict[str, Any]:
+    """The part of a key "modulus column"."""
+    name, column = key.rsplit(" ", 1)
+    progress(f"table 2, {name} kPa: {column}")
+    number = [f"{kpa:g}" for kpa in settings.moduli_kpa].index(name)
+    kpa, bench = settings.moduli_kpa[number], _bench(settings)
+    if column == "voxels":
+        return as_part(_imaged(settings, number % settings.positions).voxels(kpa, progress))
+    return as_part(bench.column(column, kpa, progress))
+
+
+@lru_cache(maxsize=1)
+def _bench(settings: Table2Settings) -> _Bench:
+    return _Bench(settings)
+
+
+@lru_cache(maxsize=1)
+def _imaged(settings: Table2Settings, position: int) -> _Imaged:
+    return _Imaged(_bench(settings), position)
 
 
 @dataclass(frozen=True)
@@ -107,7 +128,6 @@ class _Bench:
     """Models that all rows share, made when they are first needed."""
 
     settings: Table2Settings
-    progress: Progress
 
     @cached_property
     def pelvis(self) -> RealPelvis:
@@ -115,16 +135,8 @@ class _Bench:
 
     @cached_property
     def coarse(self) -> LinearModel:
-        """The model that inverts, with modes of the wall."""
-        space = self.pelvis.space(self.settings.edge_mm)
-        driver = self.settings.driver
-        motion = prescribed_motion(
-            space, {}, n_modes=driver.modes, kernel_mm=driver.kernel_mm, prior_mm=driver.prior_mm
-        )
-        constraint = outer_constraint(
-            space, outer="fixed", modes=motion.modes, offset=motion.offset, prescribed=motion.prescribed
-        )
-        return linear_model(space, constraint)
+        """The model that inverts surfaces, the wall filled."""
+        return self.filled(self.pelvis.space(self.settings.edge_mm))
 
     @cached_property
     def fine(self) -> LinearModel:
@@ -145,17 +157,21 @@ class _Bench:
         motion = prescribed_motion(space, {}, n_modes=3, kernel_mm=1.0, prior_mm=1.0)
         offset = self.pelvis.filling(space, self.settings.filling_mm).ravel()
         none = np.zeros((offset.size, 0))
-        constraint = outer_constraint(space, outer="fixed", modes=none, offset=offset, prescribed=motion.prescribed)
-        return linear_model(space, constraint)
+        constraint = outer_constraint(space, outer=OUTER, modes=none, offset=offset, prescribed=motion.prescribed)
+        dilatation = choose_element(ELEMENT if space.order > 1 else "P1").dilatation
+        return linear_model(space, constraint, dilatation=dilatation)
 
     def surrogate_of(self, model: LinearModel) -> Surrogate:
-        """A reduced model for all rows: the filling at the middle of the table's moduli, and to high order around it.
+        """A reduced model for all rows: all responses at the ends and the middle of the table's moduli.
 
-        What it is made of cannot bias an estimate: its error is bounded at every estimate, and it is enriched there.
+        At the middle also to high order in the moduli, at the filling. What it is made of cannot bias an estimate: its
+        error is bounded at every estimate, and it is enriched there.
         """
-        columns = np.flatnonzero([name in ORGANS for name in model.names])
-        first = first_surrogate(model, moduli_of(model, self.middle_kpa))
-        return with_modulus_series(first, self.filling_modes(model), columns)
+        columns, filling = np.flatnonzero([name in ORGANS for name in model.names]), self.filling_modes(model)
+        surrogate = first_surrogate(model, moduli_of(model, min(self.settings.moduli_kpa)))
+        for kpa in (max(self.settings.moduli_kpa), self.middle_kpa):
+            surrogate = enriched(surrogate, moduli_of(model, kpa), filling)
+        return with_modulus_series(surrogate, filling, columns)
 
     @property
     def middle_kpa(self) -> float:
@@ -164,36 +180,43 @@ class _Bench:
 
     def filling_modes(self, model: LinearModel) -> Array:
         """Coefficients (n_modes,) of a model's modes that come nearest to the filling of the wall."""
+        if not model.n_modes:
+            return np.zeros(0)
         offset = self.pelvis.filling(model.space, self.settings.filling_mm).ravel()
         rows = np.flatnonzero(model.constraint.modes.any(axis=1))
         return np.asarray(np.linalg.lstsq(model.constraint.modes[rows], offset[rows], rcond=None)[0])
 
-    def same_mesh(self, kpa: float) -> dict[str, Entry]:
-        nearby = self.surrogates[0].system.factorisation
-        u = _solved(self.coarse, kpa, self.filling_modes(self.coarse), nearby)
-        return self.from_surfaces(kpa, self.coarse, u)
+    def column(self, name: str, kpa: float, progress: Progress) -> dict[str, Entry]:
+        """What a column that sees no voxels says of both organs."""
+        makers: dict[str, Callable[[], dict[str, Entry]]] = {
+            "same_mesh": lambda: self.from_surfaces(kpa, self.coarse, self.coarse_truth(kpa), progress),
+            "other_mesh": lambda: self.from_surfaces(kpa, self.fine, self.truth(kpa), progress),
+            "paper_method": lambda: self.by_the_paper(kpa),
+            "paper_method_other_mesh": lambda: self.by_the_paper_on_other_mesh(kpa),
+        }
+        return makers[name]()
 
-    def other_mesh(self, kpa: float) -> dict[str, Entry]:
-        return self.from_surfaces(kpa, self.fine, self.truth(kpa))
+    def coarse_truth(self, kpa: float) -> Array:
+        """Displacement (n_points, 3) mm of the inverting mesh."""
+        return _solved(self.coarse, kpa, self.surrogates[0].factorisation)
 
     def truth(self, kpa: float) -> Array:
         """Displacement (n_points, 3) mm of the finer mesh."""
-        return _solved(self.fine, kpa, np.zeros(0), self.fine_factorisation)
+        return _solved(self.fine, kpa, self.fine_factorisation)
 
     @cached_property
     def fine_factorisation(self) -> Factorisation:
         """One for all moduli: that of the middle one leaves some twenty steps of conjugate gradients to the others."""
         return self.fine.system(moduli_of(self.fine, self.middle_kpa)).factorisation
 
-    def from_surfaces(self, kpa: float, truth: LinearModel, u: Array) -> dict[str, Entry]:
+    def from_surfaces(self, kpa: float, truth: LinearModel, u: Array, progress: Progress) -> dict[str, Entry]:
         tissues = truth.space.mesh.tissues
-        observed = [i for i, t in enumerate(tissues) if t.role in (Role.ESTIMATE, Role.DRIVER)]
-        surfaces = [observed_surface(self.coarse.space, i) for i in observed]
+        surfaces = [observed_surface(self.coarse.space, i) for i, t in enumerate(tissues) if t.role is Role.ESTIMATE]
         targets = tuple(target_of_truth(truth.space, u, surface) for surface in surfaces)
         mapping = modulus_map(tissues, self.coarse.regions)
         problem = InverseProblem((self.coarse,), (targets,), mapping, frozenset(ORGANS))
         settings = from_half(mapping, dict.fromkeys(ORGANS, kpa))
-        inversion = invert_with(problem, settings, self.surrogates, progress=self.progress)
+        inversion = invert_with(problem, settings, self.surrogates, progress=progress)
         return entries_from_surfaces(inversion, settings, dict.fromkeys(ORGANS, kpa))
 
     def by_the_paper(self, kpa: float) -> dict[str, Entry]:
@@ -230,7 +253,7 @@ class _Imaged:
 
     @cached_property
     def body(self) -> Body:
-        """Meshed from the labels at rest, in the truth's own domain; its later state is that of the middle modulus."""
+        """Meshed from the labels at rest, in the truth's own domain; its later state is of the middle modulus."""
         states = imaged_states(self.bench.fine.space, self.bench.truth(self.bench.middle_kpa), self.grid)
         width = smoothing_width(self.grid)
         anatomy = anatomy_of(states.before, box=self.bench.pelvis.box, smoothing_mm=width)
@@ -246,39 +269,37 @@ class _Imaged:
             phantom=Phantom("pelvis"),
             mesh=MeshSettings(settings.edge_mm),
             driver=settings.driver,
-            mechanics=Mechanics(law="linear", element="P2"),
+            domain=Domain(outer_boundary=OUTER),
+            mechanics=Mechanics(law="linear", element=ELEMENT),
         )
 
     @cached_property
     def problem(self) -> InverseProblem:
-        """The inverse problem of the middle modulus: its models and surfaces serve all rows."""
-        return inverse_problem(self.body, self.case, progress=self.bench.progress)
+        """The inverse problem of the middle modulus: its model and surfaces serve all rows."""
+        return inverse_problem(self.body, self.case, progress=lambda _: None)
 
     @cached_property
     def surrogates(self) -> tuple[Surrogate, ...]:
-        return tuple(self.bench.surrogate_of(model) for model in self.problem.models)
+        return (self.bench.surrogate_of(self.problem.models[0]),)
 
-    def voxels(self, kpa: float) -> dict[str, Entry]:
-        fine = self.bench.fine
-        states = imaged_states(fine.space, self.bench.truth(kpa), self.grid)
+    def voxels(self, kpa: float, progress: Progress) -> dict[str, Entry]:
+        states = with_motion(self.body.states, self.bench.fine.space, self.bench.truth(kpa))
         body = replace(self.body, states=states)
         surfaces = tuple(target.surface for target in self.problem.targets[0])
         problem = replace(self.problem, targets=(voxel_targets(body, surfaces),))
         truth = dict.fromkeys(ORGANS, kpa)
         settings = from_half(problem.modulus_map, truth)
-        inversion = invert_with(problem, settings, self.surrogates, progress=self.bench.progress)
+        inversion = invert_with(problem, settings, self.surrogates, progress=progress)
         return entries_from_voxels(inversion, settings, body, truth, seed=self.bench.settings.seed)
 
 
-def _solved(model: LinearModel, kpa: float, coefficients: Array, nearby: Factorisation) -> Array:
-    """Equilibrium (n_points, 3) mm at mode coefficients (n_modes,), with the factorisation of like moduli."""
+def _solved(model: LinearModel, kpa: float, nearby: Factorisation) -> Array:
+    """Equilibrium (n_points, 3) mm of a model without modes, with the factorisation of like moduli."""
     moduli, constraint = moduli_of(model, kpa), model.constraint
-    amounts = np.append(coefficients, 1.0)
-    loads = weighted_sum(moduli, model.coupling) @ amounts
+    loads = weighted_sum(moduli, model.coupling).toarray()
     system = LinearisedSystem(weighted_sum(moduli, model.free_stiffness), nearby, symmetric=True)
-    free = constraint.free @ system.solve(-np.asarray(loads)[:, None])[:, 0]
-    given = constraint.modes @ coefficients + constraint.offset
-    return np.asarray(given + free).reshape(-1, 3)
+    free = constraint.free @ system.solve(-loads)[:, 0]
+    return np.asarray(constraint.offset + free).reshape(-1, 3)
 
 
 def moduli_of(model: LinearModel, kpa: float) -> Array:

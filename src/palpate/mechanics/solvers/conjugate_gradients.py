@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from palpate.errors import SolverError
+from palpate.mechanics.solvers.products import times
 
 __all__ = ["conjugate_gradients"]
 
@@ -36,7 +37,7 @@ def conjugate_gradients(
     direction = precondition(residual)
     product = np.einsum("ij,ij->j", residual, direction)
     for number in range(1, max_iterations + 1):
-        image = np.asarray(matrix @ direction)
+        image = times(matrix, direction)
         energy = np.einsum("ij,ij->j", direction, image)
         _refuse_no_energy(energy, len(rhs))
         alpha = product / energy

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-__all__ = ["Factorisation", "Factoriser", "Solver", "always"]
+__all__ = ["Coarser", "Factorisation", "Factoriser", "Hints", "Solver", "always"]
 
 
 class Factorisation(Protocol):
@@ -21,14 +21,37 @@ class Factorisation(Protocol):
         ...
 
 
-Factoriser = Callable[[sparse.csr_matrix[np.float64], NDArray[np.float64] | None], Factorisation]
+@dataclass(frozen=True, slots=True)
+class Coarser:
+    """A smaller space inside that of the unknowns: `prolongation` (n, n_coarse), dimensionless, from it.
+
+    kept (n_coarse,): the unknowns that it keeps; the prolongation's rows there are those of the identity.
+    """
+
+    prolongation: sparse.csr_matrix[np.float64]
+    kept: NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Hints:
+    """What is known of a matrix beside its entries, for solvers that can use it.
+
+    near_nullspace (n, k), mm: displacements of little energy (the rigid motions); coarser: linear displacements among
+    quadratic ones.
+    """
+
+    near_nullspace: NDArray[np.float64] | None = None
+    coarser: Coarser | None = None
+
+
+Factoriser = Callable[[sparse.csr_matrix[np.float64], Hints], Factorisation]
 
 
 @dataclass(frozen=True, slots=True)
 class Solver:
     """A registered solver.
 
-    factorise(matrix (n, n), near_nullspace (n, k) or None) makes the factorisation and raises `SolverError`;
+    factorise(matrix (n, n), hints) makes the factorisation and raises `SolverError`;
     `direct`: whether it eliminates (its result is then probed for singularity);
     `available()`: whether its library is installed; `missing`: what to do when it is not.
     """

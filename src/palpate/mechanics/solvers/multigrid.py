@@ -1,4 +1,6 @@
-"""Conjugate gradients with smoothed-aggregation multigrid: memory grows linearly, for meshes too large to factorise.
+"""Conjugate gradients with multigrid: memory grows linearly, for meshes too large to factorise.
+
+Quadratic elements come first down to the linear ones on the same mesh, those by smoothed aggregation.
 
 Vanek, Mandel & Brezina, Computing 56 (1996) 179-196; the hierarchy is built by PyAMG, the cycle and the iteration
 work on all right-hand sides at once so that each level's matrix is read once for all of them.
@@ -16,8 +18,9 @@ from scipy import linalg, sparse
 
 from palpate.errors import SolverError
 from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
-from palpate.mechanics.solvers.contract import Factorisation, Solver, always
+from palpate.mechanics.solvers.contract import Factorisation, Hints, Solver, always
 from palpate.mechanics.solvers.pattern import twin_rows
+from palpate.mechanics.solvers.products import times
 
 __all__ = ["SOLVER"]
 
@@ -29,24 +32,26 @@ SMOOTHED_SHARE = 20.0  # the smoother damps the eigenvalues between their larges
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """One grid: its matrix (n, n), 1 / its diagonal (n, 1), the largest eigenvalue of their product, the way down."""
+    """One grid: its matrix (n, n), 1 / its diagonal (n, 1), the largest eigenvalue of their product, the ways."""
 
     matrix: sparse.csr_matrix[np.float64]
     inverse_diagonal: NDArray[np.float64]
     largest: float
     prolongation: sparse.csr_matrix[np.float64]
+    restriction: sparse.csr_matrix[np.float64]
 
-    def smooth(self, rhs: NDArray[np.float64], start: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Chebyshev iteration for A X = rhs from `start` (n, m): Saad, Iterative Methods (2003), algorithm 12.1."""
+    def smooth(self, rhs: NDArray[np.float64], start: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+        """Chebyshev iteration for A X = rhs from `start` (n, m), or from zero: Saad 2003, algorithm 12.1."""
         upper, lower = 1.1 * self.largest, self.largest / SMOOTHED_SHARE
         centre, half = 0.5 * (upper + lower), 0.5 * (upper - lower)
         rho = half / centre
-        solution = start
-        step = self.inverse_diagonal * (rhs - self.matrix @ solution) / centre
+        solution = np.zeros_like(rhs) if start is None else start
+        residual = rhs if start is None else rhs - times(self.matrix, solution)
+        step = self.inverse_diagonal * residual / centre
         for _ in range(SMOOTHER_DEGREE - 1):
             solution = solution + step
             following = 1.0 / (2.0 * centre / half - rho)
-            residual = self.inverse_diagonal * (rhs - self.matrix @ solution)
+            residual = self.inverse_diagonal * (rhs - times(self.matrix, solution))
             step = following * rho * step + 2.0 * following / half * residual
             rho = following
         return np.asarray(solution + step)
@@ -65,9 +70,9 @@ class MultigridFactorisation:
         if level == len(self.levels):
             return np.asarray(linalg.cho_solve(self.coarsest, rhs))
         here = self.levels[level]
-        solution = here.smooth(rhs, np.zeros_like(rhs))
-        residual = np.asarray(here.prolongation.T @ np.asarray(rhs - here.matrix @ solution))
-        return here.smooth(rhs, solution + here.prolongation @ self.cycle(residual, level + 1))
+        solution = here.smooth(rhs)
+        residual = times(here.restriction, rhs - times(here.matrix, solution))
+        return here.smooth(rhs, solution + times(here.prolongation, self.cycle(residual, level + 1)))
 
     def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
         """Solution X (n, m) of A X = rhs (n, m); raises `SolverError` when the iteration does not converge."""
@@ -77,7 +82,21 @@ class MultigridFactorisation:
         return solution
 
 
-def _factorise(matrix: sparse.csr_matrix[np.float64], near_nullspace: NDArray[np.float64] | None) -> Factorisation:
+def _factorise(matrix: sparse.csr_matrix[np.float64], hints: Hints) -> Factorisation:
+    if hints.coarser is None:
+        return _aggregated(matrix, hints.near_nullspace)
+    down = hints.coarser.prolongation
+    inner = sparse.csr_matrix(down.T @ sparse.csr_matrix(matrix @ down))
+    inner.sort_indices()
+    near_nullspace = None if hints.near_nullspace is None else hints.near_nullspace[hints.coarser.kept]
+    below = _aggregated(inner, near_nullspace)
+    return MultigridFactorisation(matrix, (_level(matrix, down), *below.levels), below.coarsest)
+
+
+def _aggregated(
+    matrix: sparse.csr_matrix[np.float64], near_nullspace: NDArray[np.float64] | None
+) -> MultigridFactorisation:
+    """The levels by smoothed aggregation."""
     n = matrix.shape[0]
     twins = np.bincount(twin_rows(matrix))
     whole_nodes = n % 3 == 0 and bool(np.all(twins == 3))
@@ -110,9 +129,10 @@ def _level(matrix: sparse.csr_matrix[np.float64], prolongation: sparse.csr_matri
     vector = np.random.default_rng(0).standard_normal((rows.shape[0], 1))
     largest = 0.0
     for _ in range(20):  # power iteration; the smoother's margin of a tenth covers what is missing
-        vector = inverse * (rows @ (vector / np.linalg.norm(vector)))
+        vector = inverse * times(rows, vector / np.linalg.norm(vector))
         largest = float(np.linalg.norm(vector))
-    return Level(rows, inverse, largest, sparse.csr_matrix(prolongation))
+    up = sparse.csr_matrix(prolongation)
+    return Level(rows, inverse, largest, up, sparse.csr_matrix(up.T))
 
 
 SOLVER = Solver("multigrid", _factorise, False, always)

@@ -10,7 +10,8 @@ from scipy import sparse
 
 from palpate.errors import ConfigurationError, ResourceError, SolverError
 from palpate.mechanics.solvers import multigrid, pardiso, superlu
-from palpate.mechanics.solvers.contract import Factorisation, Solver
+from palpate.mechanics.solvers.contract import Coarser, Factorisation, Hints, Solver
+from palpate.mechanics.solvers.products import times
 
 __all__ = ["SOLVERS", "factorise"]
 
@@ -46,7 +47,7 @@ class CheckedFactorisation:
         return solution
 
     def _residual(self, rhs: NDArray[np.float64], solution: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        residual = rhs - self.matrix @ solution
+        residual = rhs - times(self.matrix, solution)
         norms = np.linalg.norm(rhs, axis=0)
         shares = np.linalg.norm(residual, axis=0) / np.where(norms > 0.0, norms, 1.0)
         largest = float(np.max(shares, initial=0.0))
@@ -58,20 +59,22 @@ def factorise(
     *,
     solver: str = "auto",
     near_nullspace: NDArray[np.float64] | None = None,
+    coarser: Coarser | None = None,
 ) -> Factorisation:
     """Make the symmetric positive definite `matrix` (n, n), mN/mm, ready to be solved with.
 
     solver: a name of `SOLVERS`, or "auto": PARDISO where it is installed, else SuperLU up to 250 000 unknowns, else
     multigrid. near_nullspace (n, k), mm: displacements of little energy (the rigid motions), which multigrid needs to
-    converge fast. Raises `SolverError` for a singular or indefinite matrix, `ConfigurationError` for an unknown name,
-    `ResourceError` for a solver that is not installed.
+    converge fast; coarser: the linear displacements among quadratic ones, which halve its iterations. Raises
+    `SolverError` for a singular or indefinite matrix, `ConfigurationError` for an unknown name, `ResourceError` for a
+    solver that is not installed.
     """
     chosen = _choose(solver, matrix.shape[0])
     if matrix.shape[0] == 0:
         raise SolverError("no displacement is free: every point of the mesh is prescribed, nothing is left to solve")
     if not np.all(np.isfinite(matrix.data)):
         raise SolverError("the stiffness is not finite: check the moduli and the mesh's volumes")
-    checked = CheckedFactorisation(matrix, chosen.factorise(matrix, near_nullspace), chosen.name)
+    checked = CheckedFactorisation(matrix, chosen.factorise(matrix, Hints(near_nullspace, coarser)), chosen.name)
     if chosen.direct:
         _refuse_singular(checked)
     return checked

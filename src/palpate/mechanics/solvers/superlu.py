@@ -1,6 +1,6 @@
 """SuperLU in its symmetric mode on a nested dissection by METIS: the direct solver that every wheel carries.
 
-Li, ACM TOMS 31 (2005) 302-325; Karypis & Kumar, SIAM J. Sci. Comput. 20 (1998) 359-392.
+Li, ACM TOMS 31 (2005) 302-325.
 """
 
 from __future__ import annotations
@@ -10,16 +10,15 @@ import warnings
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-import pymetis
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import MatrixRankWarning, splu
 
 from palpate.errors import SolverError
-from palpate.mechanics.solvers.contract import Factorisation, Solver, always
-from palpate.mechanics.solvers.pattern import twin_rows
+from palpate.mechanics.solvers.contract import Factorisation, Hints, Solver, always
+from palpate.mechanics.solvers.pattern import nested_dissection
 
-__all__ = ["SOLVER", "nested_dissection"]
+__all__ = ["SOLVER"]
 
 BLOCK = 16  # columns a thread solves at once: more of them fall out of the cache
 MAX_THREADS = 8
@@ -70,24 +69,8 @@ class SuperluFactorisation:
         return solution
 
 
-def nested_dissection(matrix: sparse.csr_matrix[np.float64]) -> NDArray[np.int64]:
-    """Fill-reducing order (n,) of the unknowns; those of one node, which have one pattern, stay together."""
-    group = twin_rows(matrix)
-    n_groups = int(group[-1]) + 1
-    one_each = matrix[np.flatnonzero(np.diff(group, prepend=-1))].tocoo()
-    pairs = np.unique(one_each.row.astype(np.int64) * n_groups + group[one_each.col])
-    first, second = pairs // n_groups, pairs % n_groups
-    keep = first != second
-    starts = np.searchsorted(first[keep], np.arange(n_groups + 1))
-    adjacency = pymetis.CSRAdjacency(adj_starts=starts.astype(np.int32), adjacent=second[keep].astype(np.int32))
-    order, _ = pymetis.nested_dissection(adjacency)
-    place = np.empty(n_groups, dtype=np.int64)
-    place[np.asarray(order)] = np.arange(n_groups)
-    return np.asarray(np.argsort(place[group], kind="stable"))
-
-
-def _factorise(matrix: sparse.csr_matrix[np.float64], near_nullspace: NDArray[np.float64] | None) -> Factorisation:
-    del near_nullspace  # elimination has no use for it
+def _factorise(matrix: sparse.csr_matrix[np.float64], hints: Hints) -> Factorisation:
+    del hints  # elimination has no use for it
     return SuperluFactorisation(matrix, nested_dissection(matrix))
 
 

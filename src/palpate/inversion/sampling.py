@@ -1,0 +1,206 @@
+"""The posterior of the unknowns by sampling, on reduced models with frozen closest points.
+
+With the closest points, their normals and the robust weights held, every residual is linear in the displacement, and
+the misfit is a quadratic form in the reduced model's amplitudes: an evaluation forgets mesh and surfaces.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from palpate.errors import ConfigurationError, EstimationError
+from palpate.inversion.gauss_newton import Bounds
+from palpate.inversion.objective import Evaluation, Objective
+from palpate.mechanics.reduced import ReducedModel
+
+__all__ = ["FrozenPosterior", "PosteriorSamples", "frozen_posterior", "sample_posterior"]
+
+STEP = 0.35  # of a proposal, in standard deviations of the posterior
+BETWEEN_CHECKS = 4000  # evaluations
+GAP = 1.0  # of log-likelihood, that the frozen posterior may be off; re-chosen closest points alone make some tenths
+
+
+@dataclass(frozen=True, slots=True)
+class FrozenPosterior:
+    """Minus log-posterior 1/2 sum_s z_s^T Q_s z_s + 1/2 x^T P x, dimensionless, of unknowns x (n,).
+
+    z_s = [a, q, 1] of each state s: amplitudes a (m,) of its reduced model `models[s]` and mode coefficients q;
+    forms: Q_s (m + n_modes + 1, m + n_modes + 1); prior: P (n, n).
+    """
+
+    objective: Objective
+    models: tuple[ReducedModel, ...]
+    forms: tuple[NDArray[np.float64], ...]
+    prior: NDArray[np.float64]
+
+    def __call__(self, unknowns: NDArray[np.float64]) -> float:
+        """Its value at unknowns (n,); raises `EstimationError` where a reduced stiffness is not positive definite."""
+        moduli = self.objective.modulus_map.moduli(unknowns[: self.objective.n_parameters])
+        total = 0.5 * float(unknowns @ self.prior @ unknowns)
+        parts = zip(self.models, self.forms, self.objective.coefficients(unknowns), strict=True)
+        for model, form, coefficients in parts:
+            given = np.append(coefficients, 1.0)
+            state = np.concatenate([_amplitudes(model, moduli, given), given])
+            total += 0.5 * float(state @ form @ state)
+        return total
+
+
+@dataclass(frozen=True, slots=True)
+class PosteriorSamples:
+    """A Markov chain: log-moduli theta (n_evaluations, n_parameters) and the share of its proposals that it accepted.
+
+    refreshed: how often closest points were chosen anew; gap: the largest error (log-likelihood) of the frozen
+    posterior that a check found.
+    """
+
+    theta: NDArray[np.float64]
+    accepted: float
+    refreshed: int
+    gap: float
+
+    def interval(self, share: float = 0.95) -> NDArray[np.float64]:
+        """Equal-tailed credible interval (n_parameters, 2) of the log-moduli that holds `share` of the samples."""
+        tail = 0.5 * (1.0 - share)
+        return np.asarray(np.quantile(self.theta, [tail, 1.0 - tail], axis=0).T)
+
+
+def frozen_posterior(objective: Objective, unknowns: NDArray[np.float64]) -> FrozenPosterior:
+    """The posterior with the closest points and weights at `unknowns` (n,); the moduli's own prior is flat.
+
+    Residuals are point-to-plane, r + n.(u - u_0), as in the Gauss-Newton matrix. Raises `ConfigurationError` for
+    models that are not reduced ones.
+    """
+    return _frozen(objective, objective(unknowns), unknowns)
+
+
+def _frozen(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> FrozenPosterior:
+    moduli = objective.modulus_map.moduli(unknowns[: objective.n_parameters])
+    models, forms = [], []
+    for number, coefficients in enumerate(objective.coefficients(unknowns)):
+        state = objective.states[number]
+        if not isinstance(state.model, ReducedModel):
+            raise ConfigurationError(
+                f"the posterior is sampled on reduced models; state {number} has a {type(state.model).__name__}"
+            )
+        lines = [line for line in evaluation.surfaces if line.state == number]
+        answer = np.concatenate([state.model.output_basis, state.model.output_given], axis=1)
+        values = state.model.solve(moduli, coefficients).values
+        form = np.zeros((answer.shape[1],) * 2)
+        for rows, line in zip(state.slices(), lines, strict=True):
+            normal = line.residuals.normal_jacobian
+            design = np.asarray(normal @ answer[rows])
+            design[:, -1] += line.residuals.values - normal @ values[rows]
+            design *= np.sqrt(line.precision * line.weights)[:, None]
+            form += design.T @ design
+        models.append(state.model)
+        forms.append(form)
+    return FrozenPosterior(objective, tuple(models), tuple(forms), evaluation.prior)
+
+
+def _amplitudes(model: ReducedModel, moduli: NDArray[np.float64], given: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Basis coefficients (m,) at moduli (n_regions,) kPa and [q, 1] (n_modes + 1,): one small Cholesky solve."""
+    matrix = np.tensordot(moduli, model.stiffness, axes=1)
+    force = moduli @ (model.coupling @ given) - model.load
+    _, solution, failed = linalg.lapack.dposv(matrix, force, lower=1, overwrite_a=1)
+    if failed:
+        raise EstimationError(f"the reduced stiffness is not positive definite at the moduli {moduli.tolist()} kPa")
+    return np.asarray(-solution)
+
+
+def sample_posterior(
+    objective: Objective,
+    start: NDArray[np.float64],
+    *,
+    bounds: Bounds,
+    evaluations: int,
+    rng: np.random.Generator,
+) -> PosteriorSamples:
+    """Sample the posterior around a minimum `start` (n,) with so many evaluations.
+
+    Preconditioned Crank-Nicolson steps x' = c + sqrt(1 - b^2) (x - c) + b L xi with L L^T = H^-1, which a posterior
+    that is exactly normal always accepts (Cotter, Roberts, Stuart & White, Stat. Sci. 28 (2013) 424-446). Every 4000
+    evaluations the objective itself is asked; where the frozen one is off by more than 1, it is frozen anew. Raises
+    `EstimationError` where a modulus moves nothing, `ConfigurationError` for models that are not reduced ones.
+    """
+    evaluation = objective(start)
+    frozen = _frozen(objective, evaluation, start)
+    laplace = _laplace(start, evaluation)
+    anchor = evaluation.value - frozen(start)
+    now, chain, counts, gap, refreshed = start, [], 0, 0.0, 0
+    for done in range(0, evaluations, BETWEEN_CHECKS):
+        part = _chain(frozen, laplace, now, bounds=bounds, steps=min(BETWEEN_CHECKS, evaluations - done), rng=rng)
+        now, counts = part.end, counts + part.accepted
+        chain.append(part.theta)
+        off = abs(objective.value(now) - frozen(now) - anchor)
+        gap = max(gap, off)
+        if off > GAP:
+            frozen = frozen_posterior(objective, now)
+            anchor, refreshed = objective.value(now) - frozen(now), refreshed + 1
+    return PosteriorSamples(np.concatenate(chain), counts / evaluations, refreshed, gap)
+
+
+@dataclass(frozen=True, slots=True)
+class _Laplace:
+    """The normal law N(centre, H^-1) of the proposals, H = factor factor^T."""
+
+    centre: NDArray[np.float64]
+    factor: NDArray[np.float64]
+
+    def energy(self, unknowns: NDArray[np.float64]) -> float:
+        scaled = self.factor.T @ (unknowns - self.centre)
+        return 0.5 * float(scaled @ scaled)
+
+    def draws(self, n: int, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Samples (n, n_unknowns) of N(0, H^-1)."""
+        normal = rng.standard_normal((len(self.centre), n))
+        return np.asarray(linalg.solve_triangular(self.factor.T, normal, lower=False).T)
+
+
+def _laplace(centre: NDArray[np.float64], evaluation: Evaluation) -> _Laplace:
+    try:
+        return _Laplace(centre, linalg.cholesky(evaluation.matrix, lower=True))
+    except linalg.LinAlgError as error:
+        raise EstimationError(
+            f"the Gauss-Newton matrix is not positive definite ({error}): some modulus moves nothing at this place, so"
+            " its posterior cannot be sampled; start at a minimum"
+        ) from error
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """A stretch of the chain: its log-moduli, where it ended, how many proposals it accepted."""
+
+    theta: NDArray[np.float64]
+    end: NDArray[np.float64]
+    accepted: int
+
+
+def _chain(
+    frozen: FrozenPosterior,
+    laplace: _Laplace,
+    start: NDArray[np.float64],
+    *,
+    bounds: Bounds,
+    steps: int,
+    rng: np.random.Generator,
+) -> _Part:
+    n = frozen.objective.n_parameters
+    theta, accepted = np.empty((steps, n)), 0
+    now, level = start, frozen(start) - laplace.energy(start)
+    draws, thresholds = laplace.draws(steps, rng), np.log(rng.random(steps))
+    for k in range(steps):
+        trial = laplace.centre + np.sqrt(1.0 - STEP**2) * (now - laplace.centre) + STEP * draws[k]
+        if _inside(trial[:n], bounds):
+            there = frozen(trial) - laplace.energy(trial)
+            if thresholds[k] < level - there:
+                now, level, accepted = trial, there, accepted + 1
+        theta[k] = now[:n]
+    return _Part(theta, now, accepted)
+
+
+def _inside(theta: NDArray[np.float64], bounds: Bounds) -> bool:
+    return bool(np.all(theta >= bounds.lower) and np.all(theta <= bounds.upper))

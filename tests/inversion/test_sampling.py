@@ -1,0 +1,82 @@
+"""Sampling the posterior: the frozen form is the objective near by, and its chain has the law it should."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from palpate.errors import ConfigurationError
+from palpate.inversion.gauss_newton import Bounds, gauss_newton
+from palpate.inversion.noise import NoiseLaw
+from palpate.inversion.sampling import frozen_posterior, sample_posterior
+from palpate.inversion.surrogate import first_surrogate, with_modulus_series
+from palpate.inversion.weighting import objective_of
+
+WIDE = Bounds(np.full(2, np.log(0.02)), np.full(2, np.log(200.0)))
+LAW = NoiseLaw(np.array([0.05**2]), np.array([3.0]))
+
+
+@pytest.fixture(scope="module")
+def objective(twin, exact):
+    moduli = exact.modulus_map.moduli(np.zeros(2))
+    surrogate = with_modulus_series(first_surrogate(twin.model, moduli), twin.coefficients, exact.modulus_map.columns)
+    return objective_of(exact, (surrogate.reduced,), LAW).with_fresh_correspondence(twin.unknowns)
+
+
+@pytest.fixture(scope="module")
+def minimum(objective, twin):
+    return gauss_newton(objective, twin.unknowns, bounds=WIDE).unknowns
+
+
+def test_the_frozen_posterior_has_the_value_and_score_of_the_objective_where_it_is_frozen(objective, minimum, rng):
+    place = minimum + 0.05 * rng.standard_normal(len(minimum))
+    frozen, evaluation = frozen_posterior(objective, place), objective(place)
+    assert frozen(place) == pytest.approx(evaluation.value, rel=1e-9)
+    for _ in range(3):
+        step = 1e-4 * rng.standard_normal(len(minimum))
+        slope = 0.5 * (frozen(place + step) - frozen(place - step))
+        assert slope == pytest.approx(float(evaluation.score @ step), rel=1e-4, abs=1e-9)
+
+
+def test_in_the_driver_the_frozen_posterior_is_the_quadratic_of_gauss_newton(objective, minimum, rng):
+    frozen, evaluation = frozen_posterior(objective, minimum), objective(minimum)
+    step = np.concatenate([np.zeros(2), 0.1 * rng.standard_normal(len(minimum) - 2)])
+    expected = evaluation.value + evaluation.score @ step + 0.5 * step @ evaluation.matrix @ step
+    assert frozen(minimum + step) == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_narrow_posterior_is_sampled_with_the_covariance_of_laplace(objective, minimum, rng):
+    inverse = np.linalg.inv(objective(minimum).matrix)[:2, :2]
+    samples = sample_posterior(objective, minimum, bounds=WIDE, evaluations=6000, rng=rng)
+    assert samples.accepted > 0.5
+    assert samples.theta.mean(axis=0) == pytest.approx(minimum[:2], abs=0.3 * np.sqrt(inverse[0, 0]))
+    assert np.std(samples.theta, axis=0) == pytest.approx(np.sqrt(np.diag(inverse)), rel=0.25)
+    low, high = samples.interval().T
+    assert np.all((low < minimum[:2]) & (minimum[:2] < high))
+
+
+def test_no_sample_leaves_the_bounds_and_a_seed_repeats_the_chain(objective, minimum):
+    sd = np.sqrt(np.diag(np.linalg.inv(objective(minimum).matrix))[:2])
+    tight = Bounds(minimum[:2] - 0.5 * sd, minimum[:2] + 0.5 * sd)
+    first, second = (
+        sample_posterior(objective, minimum, bounds=tight, evaluations=300, rng=np.random.default_rng(4))
+        for _ in range(2)
+    )
+    assert np.all((first.theta >= tight.lower) & (first.theta <= tight.upper))
+    assert len(np.unique(first.theta[:, 0])) > 10
+    assert np.array_equal(first.theta, second.theta)
+
+
+def test_where_the_frozen_posterior_is_off_the_closest_points_are_chosen_anew(objective, minimum, rng, monkeypatch):
+    monkeypatch.setattr("palpate.inversion.sampling.GAP", -1.0)
+    monkeypatch.setattr("palpate.inversion.sampling.BETWEEN_CHECKS", 20)
+    samples = sample_posterior(objective, minimum, bounds=WIDE, evaluations=100, rng=rng)
+    assert samples.refreshed == 5
+
+
+def test_a_full_model_is_refused(objective, minimum, twin):
+    states = (replace(objective.states[0], model=twin.model),)
+    with pytest.raises(ConfigurationError, match="LinearModel"):
+        frozen_posterior(replace(objective, states=states), minimum)

@@ -1,0 +1,58 @@
+"""A body at finite strain through the main job: the default law finds its moduli, the linear one warns of its range."""
+
+from __future__ import annotations
+
+import pytest
+
+from palpate.images.readers import write_label_image
+from palpate.phantoms.spheres import SpheresOptions, spheres
+from palpate.study.case_file import read_case
+from palpate.study.run import estimate
+
+TRUTH_KPA = {"core": 60.0, "shell": 30.0}
+CASE = """
+[images]
+before = "before.nii.gz"
+after = ["after.nii.gz"]
+
+[tissues]
+core = { label = 1, role = "estimate" }
+shell = { label = 2, role = "estimate" }
+frame = { label = 3, role = "driver" }
+surroundings = { label = "remaining", role = "known", youngs_modulus_kpa = 10.0 }
+
+[mesh]
+edge_length_mm = 8.0
+[driver]
+modes = 30
+[estimate]
+start_ratios = [3.0]
+"""
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory):
+    """Neo-Hookean balls in a frame of 30 mm radius that squeezes and stretches them by up to 7 mm."""
+    folder = tmp_path_factory.mktemp("balls")
+    options = SpheresOptions(seed=4, spacing_mm=(1.5,) * 3, truth_edge_mm=6.0, push_mm=7.0, law="neo-hookean")
+    scene = spheres(options)
+    write_label_image(folder / "before.nii.gz", scene.before)
+    write_label_image(folder / "after.nii.gz", scene.after)
+    (folder / "case.toml").write_text(CASE)
+    return folder / "case.toml"
+
+
+def test_the_default_law_finds_the_moduli_of_a_body_at_finite_strain(case):
+    result = estimate(read_case(case))
+    assert (result.case.mechanics.law, result.case.mechanics.element) == ("neo-hookean", "auto")
+    assert result.estimation.status == "converged"
+    for found in result.estimation.estimates:
+        truth = TRUTH_KPA[found.tissue]
+        assert found.interval95[0] < truth < found.interval95[1]
+        assert found.value == pytest.approx(truth, rel=0.15)
+    assert "linear-strains" not in {remark.code for remark in result.remarks}
+
+
+def test_the_linear_law_is_warned_of_beyond_its_range(case):
+    result = estimate(read_case(case, ["mechanics.law='linear'", "driver.modes=12"]))
+    assert "linear-strains" in {remark.code for remark in result.remarks}
