@@ -270,8 +270,12 @@ def _uncertainty(
         "grid_sd": np.sqrt(np.diag(estimation.grid_covariance)).tolist(),
     }
     if row.noise is not None:
-        limit = cramer_rao(inversion.minimum.evaluation, _true_law(inversion, space, fitted, row.noise, rng), n)
-        found["cramer_rao_sd"] = np.sqrt(np.diag(limit)).tolist()
+        law = _true_law(inversion, space, fitted, row.noise, rng)
+        # what is known before the images are seen: the prior that the case states, and beside it the learned one
+        stated = replace(inversion.objective, prior=None).prior_precision()
+        for name, prior in (("", stated), ("_learned_prior", inversion.objective.prior_precision())):
+            limit = cramer_rao(replace(inversion.minimum.evaluation, prior=prior), law, n)
+            found[f"cramer_rao{name}_sd"] = np.sqrt(np.diag(limit)).tolist()
     return found
 
 
@@ -343,6 +347,8 @@ def _summary(results: list[dict]) -> dict[str, object]:
         limit = np.concatenate([r["cramer_rao_sd"] for r in results])
         sd = np.concatenate([r["sd"] for r in results])
         found |= {"cramer_rao_rms": _rms(limit), "median_width_over_cramer_rao": float(np.median(sd / limit))}
+        learned = np.concatenate([r.get("cramer_rao_learned_prior_sd", r["cramer_rao_sd"]) for r in results])
+        found["cramer_rao_learned_prior_rms"] = _rms(learned)
     return found
 
 
