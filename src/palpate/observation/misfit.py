@@ -88,14 +88,14 @@ def image_point_use(target: SurfaceTarget, displacement: NDArray[np.float64]) ->
 def _model_to_image(target: SurfaceTarget, displacement: NDArray[np.float64]) -> SurfaceResiduals:
     surface = target.surface
     corners = surface.triangles[target.triangle]
-    # (n_q, 3 corners) x (n_q, 3 corners, 3 axes) -> (n_q, 3 axes)
-    places = np.einsum("qk,qka->qa", target.barycentric, (surface.rest + displacement)[corners])
+    # (n_q, 1, 3 corners) x (n_q, 3 corners, 3 axes) -> (n_q, 1, 3 axes)
+    places = (target.barycentric[:, None] @ (surface.rest + displacement)[corners])[:, 0]
     gradient = target.after.gradient_at(places)
     values = target.after.at(places) - target.rest_distance
-    rows = np.einsum("qk,qa->qka", target.barycentric, gradient)
+    rows = target.barycentric[:, :, None] * gradient[:, None]
     normals = _smooth_normals(surface.rest + displacement, surface.triangles, corners, target.barycentric)
     slope = np.einsum("qa,qa->q", gradient, normals)
-    smooth = np.einsum("qk,qa->qka", target.barycentric, slope[:, None] * normals)
+    smooth = target.barycentric[:, :, None] * (slope[:, None] * normals)[:, None]
     weights = 0.5 * target.area / target.area.sum()
     n = len(surface.rest)
     exact, normal = _sparse_rows(rows, corners, n), _sparse_rows(smooth, corners, n)
@@ -116,12 +116,13 @@ def _image_to_model(
     length = np.linalg.norm(offset, axis=1)
     side = np.where(np.einsum("na,na->n", offset, normal) < 0.0, -1.0, 1.0)
     direction = np.where(length[:, None] > 1e-9, side[:, None] * offset / np.maximum(length, 1e-30)[:, None], normal)
-    material = np.einsum("nk,nka->na", closest.barycentric, surface.rest[corners])
+    rest = surface.rest[corners]
+    material = (closest.barycentric[:, None] @ rest)[:, 0]
     values = side * length - (target.before.at(material) - target.level)
-    rows = np.einsum("nk,na->nka", closest.barycentric, direction)
-    rows += _slide(closest, deformed, offset, target.before.gradient_at(material), surface.rest[corners])
+    rows = closest.barycentric[:, :, None] * direction[:, None]
+    rows += _slide(closest, deformed, offset, target.before.gradient_at(material), rest)
     normals = _smooth_normals(surface.rest + displacement, surface.triangles, corners, closest.barycentric)
-    smooth = np.einsum("nk,na->nka", closest.barycentric, normals)
+    smooth = closest.barycentric[:, :, None] * normals[:, None]
     weights = 0.5 * target.image_area[kept] / max(target.image_area[kept].sum(), 1e-30)
     n = len(surface.rest)
     exact, plane = _sparse_rows(rows, corners, n), _sparse_rows(smooth, corners, n)
@@ -135,7 +136,7 @@ def _smooth_normals(
     barycentric: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Unit normals (n, 3) interpolated from area-weighted ones at the corners (n, 3) of the places' triangles."""
-    normals = np.einsum("nk,nka->na", barycentric, vertex_normals(vertices, triangles)[corners])
+    normals = (barycentric[:, None] @ vertex_normals(vertices, triangles)[corners])[:, 0]
     return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30))
 
 
@@ -152,15 +153,14 @@ def _slide(
     G_ij d xi_j = -(t_i . sum_a N_a du_a + (x - y) . d t_i), on an edge with its one tangent, at a corner not at all.
     """
     along = _free_directions(closest.barycentric)
-    # (n, 2, 3 corners) x (n, 3 corners, 3 axes) -> (n, 2, 3 axes)
-    tangent = np.einsum("nik,nka->nia", along, deformed)
-    gram = np.einsum("nia,nja->nij", tangent, tangent)
+    tangent = along @ deformed  # (n, 2, 3 corners) x (n, 3 corners, 3 axes) -> (n, 2, 3 axes)
+    gram = tangent @ tangent.transpose(0, 2, 1)
     still = ~np.any(along != 0.0, axis=2)
     gram[:, [0, 1], [0, 1]] += still
-    change = np.einsum("na,nik,nka->ni", slope, along, rest)
-    rate = np.linalg.solve(gram, change[..., None])[..., 0]
-    rows = np.einsum("ni,nia,nk->nka", rate, tangent, closest.barycentric)
-    return np.asarray(rows + np.einsum("ni,nik,na->nka", rate, along, offset))
+    change = along @ (rest @ slope[:, :, None])
+    rate = np.linalg.solve(gram, change).transpose(0, 2, 1)  # (n, 1, 2)
+    rows = closest.barycentric[:, :, None] * (rate @ tangent)
+    return np.asarray(rows + (rate @ along).transpose(0, 2, 1) * offset[:, None])
 
 
 def _free_directions(barycentric: NDArray[np.float64]) -> NDArray[np.float64]:
