@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.errors import ConfigurationError
-from palpate.mechanics.forward import Equilibrium, SolveCounts, checked_coefficients, checked_moduli
+from palpate.mechanics.dense_equilibrium import DenseEquilibrium
+from palpate.mechanics.forward import Equilibrium, checked_coefficients, checked_moduli
 
 __all__ = ["FirstOrderEquilibrium", "FirstOrderModel", "expanded"]
 
@@ -51,33 +51,11 @@ class FirstOrderModel:
 
 
 @dataclass(frozen=True, slots=True)
-class FirstOrderEquilibrium:
+class FirstOrderEquilibrium(DenseEquilibrium):
     """The expansion's displacement `values` (n_outputs,) mm at one place; implements `Equilibrium`."""
 
     model: FirstOrderModel
     values: NDArray[np.float64]
-
-    @property
-    def displacement(self) -> NDArray[np.float64]:
-        """Displacement u (n_outputs / 3, 3) mm; raises `ConfigurationError` when the outputs are not whole points."""
-        if len(self.values) % 3:
-            raise ConfigurationError(f"the model has {len(self.values)} outputs, not three a point: use `values`")
-        return self.values.reshape(-1, 3)
-
-    @property
-    def counts(self) -> SolveCounts:
-        """Nothing of the size of the mesh was solved."""
-        return SolveCounts()
-
-    @property
-    def tangent_counts(self) -> SolveCounts:
-        """Nothing of the size of the mesh is solved."""
-        return SolveCounts()
-
-    @property
-    def adjoint_counts(self) -> SolveCounts:
-        """Nothing of the size of the mesh is solved."""
-        return SolveCounts()
 
     def tangent(self) -> NDArray[np.float64]:
         """T (n_outputs, n_regions + n_modes), mm: columns du / d ln E_r, then du / dq_k."""

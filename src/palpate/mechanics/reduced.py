@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from palpate.errors import ConfigurationError, SolverError
-from palpate.mechanics.forward import SolveCounts, checked_coefficients, checked_moduli
+from palpate.mechanics.dense_equilibrium import DenseEquilibrium
+from palpate.mechanics.forward import checked_coefficients, checked_moduli
 from palpate.mechanics.linear_model import LinearModel
 
 __all__ = [
@@ -130,35 +131,13 @@ class ReducedSystem:
 
 
 @dataclass(frozen=True, slots=True)
-class ReducedEquilibrium:
+class ReducedEquilibrium(DenseEquilibrium):
     """Outputs (n_outputs,) mm and basis coefficients (m,) at one system; implements `Equilibrium`."""
 
     system: ReducedSystem
     coefficients: NDArray[np.float64]
     amplitude: NDArray[np.float64]
     values: NDArray[np.float64]
-
-    @property
-    def displacement(self) -> NDArray[np.float64]:
-        """Displacement u (n_outputs / 3, 3) mm; raises `ConfigurationError` when the outputs are not whole points."""
-        if len(self.values) % 3:
-            raise ConfigurationError(f"the model has {len(self.values)} outputs, not three a point: use `values`")
-        return self.values.reshape(-1, 3)
-
-    @property
-    def counts(self) -> SolveCounts:
-        """Nothing of the size of the mesh was solved."""
-        return SolveCounts()
-
-    @property
-    def tangent_counts(self) -> SolveCounts:
-        """Nothing of the size of the mesh is solved."""
-        return SolveCounts()
-
-    @property
-    def adjoint_counts(self) -> SolveCounts:
-        """Nothing of the size of the mesh is solved."""
-        return SolveCounts()
 
     def tangent(self) -> NDArray[np.float64]:
         """T (n_outputs, n_regions + n_modes), mm: columns du / d ln E_r, then du / dq_k."""
