@@ -32,7 +32,7 @@ __all__ = ["Expansion", "continued_at_finite_strain"]
 
 ROUNDS = 12
 WEIGHED = (2, 7)  # least and largest number of rounds that weigh the residuals anew
-NEAR = 0.5  # posterior standard deviations: a round that moves less leaves the weights, so that the iteration settles
+NEAR = 0.5  # posterior standard deviations: a round that moves less leaves weights and derivatives, and can settle
 REACH = 0.8  # of ln E, within which an expansion is trusted
 HALVINGS = 3
 NOISE = 0.5  # of the objective, in units of log-likelihood: the noise of re-chosen closest points
@@ -185,7 +185,10 @@ def _round(problem: InverseProblem, place: _Place, settings: InversionSettings, 
         return replace(place, minimum=replace(now, outcome=outcome), moved=moved)
     unknowns, equilibria = lower
     pairs = zip(equilibria, place.expansions, strict=True)
-    expansions = tuple(_expansion(equilibrium, before.counts) for equilibrium, before in pairs)
+    if moved < NEAR:
+        expansions = tuple(_recentred(before, equilibrium) for equilibrium, before in pairs)
+    else:
+        expansions = tuple(_expansion(equilibrium, before.counts) for equilibrium, before in pairs)
     there = replace(found, unknowns=unknowns, history=(*now.history, *found.history))
     states = objective_of(problem, tuple(e.reduced for e in expansions), place.law).states
     objective = replace(place.objective, states=states)
@@ -228,6 +231,13 @@ def _expansion(equilibrium: FiniteStrainEquilibrium, spent: SolveCounts) -> Expa
     return Expansion(model, exact, spent + equilibrium.counts + exact.tangent_counts + SolveCounts(factorisations=1))
 
 
+def _recentred(expansion: Expansion, equilibrium: FiniteStrainEquilibrium) -> Expansion:
+    """The expansion around an equilibrium so near that its derivatives still hold there: a third of the price."""
+    moduli, amounts = equilibrium.moduli, equilibrium.coefficients
+    model = replace(expansion.reduced, moduli=moduli, coefficients=amounts, values=equilibrium.values)
+    return Expansion(model, equilibrium, expansion.counts + equilibrium.counts)
+
+
 def _lowers(place: _Place, equilibria: tuple[FiniteStrainEquilibrium, ...], unknowns: NDArray[np.float64]) -> bool:
     """Whether the objective at the true displacements, not the expansions', is lower than at the place.
 
@@ -244,10 +254,8 @@ def _lowers(place: _Place, equilibria: tuple[FiniteStrainEquilibrium, ...], unkn
 
 
 def _moved(expansion: Expansion, equilibrium: FiniteStrainEquilibrium, dofs: NDArray[np.int64]) -> FirstOrderModel:
-    """The expansion with the displacement of another equilibrium, its derivatives still those of its own."""
-    near = expansion.reduced.at(dofs)
-    moduli, amounts = equilibrium.moduli, equilibrium.coefficients
-    return replace(near, moduli=moduli, coefficients=amounts, values=equilibrium.values[dofs])
+    """The observed part of the expansion, with the displacement of another equilibrium."""
+    return _recentred(expansion, equilibrium).reduced.at(dofs)
 
 
 def _split(
