@@ -116,8 +116,8 @@ def test_a_body_that_a_load_moves_is_not_said_to_stand_still(result):
 def test_twice_the_load_on_the_same_images_is_twice_the_modulus(case, result):
     """Exact under the linear law. The search starts and ends at bounds twice as stiff, too: K u = f, all of it doubled.
 
-    From other starts it stops elsewhere within its tolerance, some hundredths of a standard deviation away; from these a
-    difference in the last digit can still end it one step earlier, at a decrement of 1e-5 at most: 2e-4 of a modulus.
+    From other starts it stops elsewhere within its tolerance, some hundredths of a standard deviation away; from these
+    a difference in the last digit can still end it one step earlier, at a decrement of 1e-5: 2e-4 of a modulus.
     """
     search = case.estimate
     doubled = replace(
