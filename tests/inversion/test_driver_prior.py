@@ -3,33 +3,44 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 from palpate.inversion.driver_prior import learned_prior
-from palpate.observation.wall_modes import Wall, wall_modes
+from palpate.observation.wall_modes import Wall, wall_modes, wall_of
 
 N_MODES = 90
 
 
-def wall(*, prior_mm=5.0, kernel_mm=20.0):
+class Ball(NamedTuple):
+    """A ball's wall with its modes (3 n_points, n_modes) mm."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    modes: np.ndarray
+    wall: Wall
+
+
+def ball(*, prior_mm=5.0, kernel_mm=20.0):
     points = np.random.default_rng(0).normal(size=(400, 3))
     points *= 30.0 / np.linalg.norm(points, axis=1, keepdims=True)
-    modes = wall_modes(points, n_modes=N_MODES, kernel_mm=kernel_mm, prior_mm=prior_mm)
-    return Wall(points, points / 30.0, np.arange(modes.shape[1]), modes[::3, ::3], kernel_mm, prior_mm)
+    own = {"kernel_mm": kernel_mm, "prior_mm": prior_mm}
+    modes = wall_modes(points, n_modes=N_MODES, **own)
+    wall = wall_of(points, points / 30.0, modes, np.arange(modes.shape[1]), **own)
+    return Ball(points, points / 30.0, modes, wall)
 
 
-def learned(wall, motion, *, sd_mm, axis=0):
-    """Prior covariance (n_points, n_points) mm^2 of a component, after a motion (n_points, 3) mm was seen."""
-    modes = np.kron(wall.scalar, np.eye(3))
-    precision = learned_precision(wall, motion, sd_mm=sd_mm)
-    return modes[axis::3] @ np.linalg.solve(precision, modes[axis::3].T)
+def learned(ball, motion, *, sd_mm):
+    """Prior covariance (n_points, n_points) mm^2 of the x component, after a motion (n_points, 3) mm was seen."""
+    precision = learned_precision(ball, motion, sd_mm=sd_mm)
+    return ball.modes[::3] @ np.linalg.solve(precision, ball.modes[::3].T)
 
 
-def learned_precision(wall, motion, *, sd_mm, seen=None):
+def learned_precision(ball, motion, *, sd_mm, seen=None):
     """Prior precision (n_modes, n_modes), all of the motion or its part along the unit vectors `seen` shown."""
-    modes = np.kron(wall.scalar, np.eye(3))
+    modes = ball.modes
     if seen is not None:
         rows = modes.reshape(len(seen), 3, -1)
         modes, motion = np.einsum("pa,pam->pm", seen, rows), np.einsum("pa,pa->p", seen, motion)
@@ -38,20 +49,20 @@ def learned_precision(wall, motion, *, sd_mm, seen=None):
     prior = np.eye(len(data))
     evaluation = SimpleNamespace(matrix=data + prior, prior=prior, score=score)
     problem = SimpleNamespace(
-        walls=((wall,),), models=(SimpleNamespace(n_modes=len(data)),), modulus_map=SimpleNamespace(tissues=())
+        walls=((ball.wall,),), models=(SimpleNamespace(n_modes=len(data)),), modulus_map=SimpleNamespace(tissues=())
     )
     return learned_prior(problem, evaluation, np.zeros(len(data)))
 
 
-def drawn(wall, *, sd_mm, kernel_mm, seed):
-    distance2 = np.sum((wall.points[:, None] - wall.points[None]) ** 2, axis=2)
+def drawn(ball, *, sd_mm, kernel_mm, seed):
+    distance2 = np.sum((ball.points[:, None] - ball.points[None]) ** 2, axis=2)
     covariance = np.exp(-distance2 / (2.0 * kernel_mm**2)) + 1e-9 * np.eye(len(distance2))
     return sd_mm * np.linalg.cholesky(covariance) @ np.random.default_rng(seed).normal(size=(len(distance2), 3))
 
 
 @pytest.mark.parametrize("sd_mm", [0.4, 2.0, 8.0])
 def test_the_amplitude_is_that_of_the_motion(sd_mm):
-    here = wall()
+    here = ball()
     found = [
         np.sqrt(learned(here, drawn(here, sd_mm=sd_mm, kernel_mm=20.0, seed=seed), sd_mm=0.05).diagonal().mean())
         for seed in range(6)
@@ -60,7 +71,7 @@ def test_the_amplitude_is_that_of_the_motion(sd_mm):
 
 
 def test_a_wall_that_moves_as_one_may_not_slide_in_parts():
-    here = wall()
+    here = ball()
     gradient = np.array([[0.06, 0.02, 0.0], [0.02, -0.09, 0.01], [0.0, 0.01, 0.03]])
     stiff = learned(here, here.points @ gradient, sd_mm=0.05)
     rough = learned(here, drawn(here, sd_mm=1.5, kernel_mm=20.0, seed=1), sd_mm=0.05)
@@ -69,39 +80,40 @@ def test_a_wall_that_moves_as_one_may_not_slide_in_parts():
     assert correlation[0] > 0.9 > correlation[1] + 0.1
 
 
-def expected_sliding(wall, motion):
+def expected_sliding(ball, motion):
     """Mean tangential motion, mm, that the prior expects of a wall whose normal motion alone was seen."""
-    precision = learned_precision(wall, motion, sd_mm=0.05, seen=wall.normals)
-    modes = np.kron(wall.scalar, np.eye(3))
-    normal = np.einsum("pa,pam->pm", wall.normals, modes.reshape(len(wall.normals), 3, -1))
-    shown = np.einsum("pa,pa->p", wall.normals, motion)
+    precision = learned_precision(ball, motion, sd_mm=0.05, seen=ball.normals)
+    normal = np.einsum("pa,pam->pm", ball.normals, ball.modes.reshape(len(ball.normals), 3, -1))
+    shown = np.einsum("pa,pa->p", ball.normals, motion)
     q = np.linalg.solve(normal.T @ normal / 0.05**2 + precision, normal.T @ shown / 0.05**2)
-    moved = (modes @ q).reshape(-1, 3)
-    along = np.einsum("pa,pa->p", wall.normals, moved)
-    return float(np.linalg.norm(moved - along[:, None] * wall.normals, axis=1).mean())
+    moved = (ball.modes @ q).reshape(-1, 3)
+    along = np.einsum("pa,pa->p", ball.normals, moved)
+    return float(np.linalg.norm(moved - along[:, None] * ball.normals, axis=1).mean())
 
 
 def test_a_wall_that_swells_is_not_taken_for_one_that_slides():
-    here = wall()
+    """Where its modes can follow: the swelling varies over more than their kernel's 20 mm."""
+    here = ball()
     waves = 3.0 * (1.0 + 0.6 * np.cos(here.points @ np.array([0.03, 0.04, 0.02])))
     assert expected_sliding(here, waves[:, None] * here.normals) < 0.3
 
 
 def test_a_wall_that_shifts_as_one_is_not_taken_for_one_that_swells():
-    here = wall()
+    here = ball()
     shift = np.tile([2.0, -1.0, 0.5], (len(here.points), 1))
     across = shift - np.einsum("pa,pa->p", here.normals, shift)[:, None] * here.normals
     assert expected_sliding(here, shift) == pytest.approx(np.linalg.norm(across, axis=1).mean(), rel=0.1)
 
 
 def test_the_first_guess_of_the_amplitude_does_not_matter():
-    motion = drawn(wall(), sd_mm=2.0, kernel_mm=25.0, seed=3)
-    first, second = (learned(wall(prior_mm=prior), motion, sd_mm=0.2) for prior in (4.0, 8.0))
+    """As long as it is no limit: the amplitude learned here, 5.5 mm, is under twice the smaller guess."""
+    motion = drawn(ball(), sd_mm=2.0, kernel_mm=25.0, seed=3)
+    first, second = (learned(ball(prior_mm=prior), motion, sd_mm=0.2) for prior in (4.0, 8.0))
     assert second == pytest.approx(first, rel=0.05, abs=0.02 * np.abs(first).max())
 
 
 def test_what_is_not_seen_at_all_keeps_a_bounded_prior():
-    here = wall()
+    here = ball()
     variance = learned(here, np.zeros_like(here.points), sd_mm=1e6).diagonal()
     assert np.all(variance > 0.0)
     assert np.all(np.isfinite(variance))

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
 from palpate.inversion.driver_prior import learned_prior
-from palpate.inversion.gauss_newton import Bounds, gauss_newton
+from palpate.inversion.gauss_newton import Bounds
+from palpate.inversion.minima import driven
 from palpate.inversion.problem import InverseProblem, LocalModel
 from palpate.inversion.surrogate import first_surrogate
 from palpate.inversion.weighting import FIRST_LAW, objective_of
@@ -57,14 +58,14 @@ def _fitted(
     bounds = Bounds(np.full(n, -1.0), np.full(n, 1.0))
     objective = objective_of(held, models, FIRST_LAW)
     unknowns = np.concatenate([np.zeros(n), coefficients])
-    for _ in range(2):
-        objective = objective.with_fresh_correspondence(unknowns)
-        found = gauss_newton(objective, unknowns, bounds=bounds, hold_theta=True, tolerance=1e-2)
-        unknowns = found.unknowns
-        objective = replace(objective, prior=learned_prior(held, found.evaluation, unknowns))
+    objective = objective.with_fresh_correspondence(unknowns)
+    first = driven(objective, unknowns[:n], bounds=bounds, coefficients=coefficients)
+    objective = replace(objective, prior=learned_prior(held, first.evaluation, first.unknowns))
+    objective = objective.with_fresh_correspondence(first.unknowns)
+    found = driven(objective, unknowns[:n], bounds=bounds, coefficients=first.unknowns[n:])
     if not found.outcome.converged:
         raise NotConverged(f"the driver's wall could not be fitted to the later image: {found.outcome.value}")
-    return objective.coefficients(unknowns)
+    return objective.coefficients(found.unknowns)
 
 
 def _followed(near: FiniteStrainEquilibrium, coefficients: NDArray[np.float64], shares: Sequence[float]) -> Motions:

@@ -20,8 +20,6 @@ from palpate.observation.wall_modes import Wall
 
 __all__ = ["learned_prior"]
 
-DRIFT_LENGTHS = (1.0, 2.0, 4.0)  # times the modes' own kernel, which they cannot go below
-SWELLING_LENGTHS = (1.0, 2.0)
 AMPLITUDES = (0.005, 2.0)  # times the modes' own standard deviation
 FIRST_AMPLITUDES = ((0.3, 0.05), (0.05, 0.3))  # of drift and swelling; one may hide the other
 LEAST_VARIANCE = 1e-3  # of a coefficient, times its variance under the modes' own kernel: no mode is forbidden
@@ -98,9 +96,7 @@ def _seen(
 
 def _beliefs(wall: Wall, seen: _Seen) -> list[_Belief]:
     """For each pair of kernel lengths the standard deviations with the largest evidence."""
-    drifts = [wall.drift(length * wall.kernel_mm) for length in DRIFT_LENGTHS]
-    swellings = [wall.swelling(length * wall.kernel_mm) for length in SWELLING_LENGTHS]
-    return [_most_evident(pair, seen) for pair in product(drifts, swellings)]
+    return [_most_evident(pair, seen) for pair in product(wall.drifts, wall.swellings)]
 
 
 def _most_evident(parts: Sequence[NDArray[np.float64]], seen: _Seen) -> _Belief:

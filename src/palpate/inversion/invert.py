@@ -11,8 +11,17 @@ from numpy.typing import NDArray
 from palpate.inversion.continuation import continued_at_finite_strain
 from palpate.inversion.directions import deciding_directions
 from palpate.inversion.driver_prior import learned_prior
-from palpate.inversion.gauss_newton import Minimum, gauss_newton
-from palpate.inversion.minima import best_of, continued, groups_of, minimised, settled_between, with_driver, words
+from palpate.inversion.gauss_newton import Minimum
+from palpate.inversion.minima import (
+    best_of,
+    continued,
+    driven,
+    groups_of,
+    minimised,
+    settled_between,
+    with_driver,
+    words,
+)
 from palpate.inversion.noise import NoiseLaw
 from palpate.inversion.objective import Objective
 from palpate.inversion.problem import InverseProblem, Inversion, InversionSettings
@@ -43,8 +52,8 @@ def invert(problem: InverseProblem, settings: InversionSettings, *, progress: Ca
     surrogates = tuple(first_surrogate(model, moduli) for model in problem.models)
     objective = objective_of(problem, _reduced(surrogates), settings.law or FIRST_LAW)
     still = np.concatenate([middle, np.zeros(objective.n_unknowns - len(middle))])
-    driven = _driven(objective.with_fresh_correspondence(still), middle, settings)
-    pairs = zip(surrogates, objective.coefficients(driven.unknowns), strict=True)
+    filled = driven(objective.with_fresh_correspondence(still), middle, bounds=settings.bounds)
+    pairs = zip(surrogates, objective.coefficients(filled.unknowns), strict=True)
     surrogates = tuple(with_modulus_series(s, q, problem.modulus_map.columns) for s, q in pairs)
     linear = invert_with(problem, settings, surrogates, progress=progress)
     if not problem.finite_strain:
@@ -65,8 +74,9 @@ def invert_with(
     still = np.zeros(objective.n_unknowns)
     objective = objective.with_fresh_correspondence(still)
     rest = objective(still)
-    objective = _with_prior(problem, objective, _driven(objective, settings.starts[0], settings))
-    minima = _from_starts(objective, settings, progress)
+    filled = driven(objective, settings.starts[0], bounds=settings.bounds)
+    objective = replace(objective, prior=learned_prior(problem, filled.evaluation, filled.unknowns))
+    minima = _from_starts(objective, settings, filled.unknowns[objective.n_parameters :], progress)
     chosen = best_of(minima)
     best = minima[chosen]
     settled, refinements = False, 0
@@ -75,7 +85,7 @@ def invert_with(
         law = settings.law or residual_law(problem, best.evaluation)
         surrogates = _enriched(problem, surrogates, objective, best, exact=min(EXACT * law.sd, 1e-3))
         before = best
-        law, objective, best = _weighed(problem, _reduced(surrogates), best, settings)
+        law, objective, best = _until_agreed(problem, _reduced(surrogates), best, settings)
         settled = settled_between(before, best, objective.n_parameters)
         if settled:
             done = refinements == REFINEMENTS or round_ == ROUNDS - 1
@@ -84,9 +94,9 @@ def invert_with(
                 break
             surrogates, settled, refinements = finer, False, refinements + 1
     best = continued(objective, best, settings, tolerance=POLISH)
-    driven = [with_driver(m, best, objective.n_parameters) for m in minima]
+    moved = [with_driver(m, best, objective.n_parameters) for m in minima]
     minima = tuple(
-        best if i == chosen else continued(objective, m, settings, tolerance=OTHERS) for i, m in enumerate(driven)
+        best if i == chosen else continued(objective, m, settings, tolerance=OTHERS) for i, m in enumerate(moved)
     )
     counts = sum((s.counts for s in surrogates), SolveCounts())
     return Inversion(
@@ -103,7 +113,7 @@ def invert_with(
     )
 
 
-def _weighed(
+def _until_agreed(
     problem: InverseProblem, models: tuple[ReducedModel, ...], best: Minimum, settings: InversionSettings
 ) -> tuple[NoiseLaw, Objective, Minimum]:
     """Law of the residuals, drivers' prior, weights and estimate in turn until they agree, on the same models."""
@@ -149,27 +159,20 @@ def _enriched(
 
 
 def _from_starts(
-    objective: Objective, settings: InversionSettings, progress: Callable[[str], None]
+    objective: Objective,
+    settings: InversionSettings,
+    coefficients: NDArray[np.float64],
+    progress: Callable[[str], None],
 ) -> tuple[Minimum, ...]:
+    """A minimum from every start, the first with the drivers' motion (n_coefficients,), the others with its result."""
     minima: list[Minimum] = []
     for number, theta in enumerate(settings.starts):
-        driver = minima[0].unknowns[len(theta) :] if minima else np.zeros(objective.n_unknowns - len(theta))
-        unknowns = np.concatenate([theta, driver])
-        first = gauss_newton(objective, unknowns, bounds=settings.bounds, hold_theta=True, tolerance=1e-2)
+        motion = minima[0].unknowns[len(theta) :] if minima else coefficients
+        first = driven(objective, theta, bounds=settings.bounds, coefficients=motion)
         fresh = objective.with_fresh_correspondence(first.unknowns)
         minima.append(minimised(fresh, first.unknowns, settings, tolerance=1e-2))
         progress(f"start {number + 1} of {len(settings.starts)}: {len(minima[-1].history)} steps")
     return tuple(minima)
-
-
-def _driven(objective: Objective, theta: NDArray[np.float64], settings: InversionSettings) -> Minimum:
-    """The driver's motion alone, at log-moduli theta (n_parameters,)."""
-    held = np.concatenate([theta, np.zeros(objective.n_unknowns - len(theta))])
-    return gauss_newton(objective, held, bounds=settings.bounds, hold_theta=True, tolerance=1e-2)
-
-
-def _with_prior(problem: InverseProblem, objective: Objective, minimum: Minimum) -> Objective:
-    return replace(objective, prior=learned_prior(problem, minimum.evaluation, minimum.unknowns))
 
 
 def _reduced(surrogates: tuple[Surrogate, ...]) -> tuple[ReducedModel, ...]:

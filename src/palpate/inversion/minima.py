@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inversion.gauss_newton import Minimum, gauss_newton
+from palpate.inversion.gauss_newton import Bounds, Minimum, gauss_newton
 from palpate.inversion.lbfgs import lbfgs
 from palpate.inversion.objective import Objective
 from palpate.inversion.problem import InverseProblem, InversionSettings
@@ -16,6 +16,7 @@ __all__ = [
     "SETTLED",
     "best_of",
     "continued",
+    "driven",
     "groups_of",
     "minimised",
     "moved_between",
@@ -25,7 +26,24 @@ __all__ = [
 ]
 
 SAME_MINIMUM = 0.02  # of ln E
+DRIVEN = 1e-2  # decrement of the drivers' motion at held moduli, which other unknowns are going to change
 SETTLED = 0.05  # posterior standard deviations by which a round may still move the estimate
+
+
+def driven(
+    objective: Objective,
+    theta: NDArray[np.float64],
+    *,
+    bounds: Bounds,
+    coefficients: NDArray[np.float64] | None = None,
+) -> Minimum:
+    """The best motion of the drivers at held log-moduli theta (n_parameters,), to a decrement of 1e-2.
+
+    coefficients (n_coefficients,), where the search begins; None: at rest.
+    """
+    motion = np.zeros(objective.n_unknowns - len(theta)) if coefficients is None else coefficients
+    start = np.concatenate([theta, motion])
+    return gauss_newton(objective, start, bounds=bounds, hold_theta=True, tolerance=DRIVEN)
 
 
 def minimised(

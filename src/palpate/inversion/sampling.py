@@ -38,13 +38,13 @@ class FrozenPosterior:
     prior: NDArray[np.float64]
 
     def __call__(self, unknowns: NDArray[np.float64]) -> float:
-        """Its value at unknowns (n,); raises `EstimationError` where a reduced stiffness is not positive definite."""
+        """Its value at unknowns (n,); raises `SolverError` where a reduced stiffness is not positive definite."""
         moduli = self.objective.modulus_map.moduli(unknowns[: self.objective.n_parameters])
         total = 0.5 * float(unknowns @ self.prior @ unknowns)
         parts = zip(self.models, self.forms, self.objective.coefficients(unknowns), strict=True)
         for model, form, coefficients in parts:
             given = np.append(coefficients, 1.0)
-            state = np.concatenate([_amplitudes(model, moduli, given), given])
+            state = np.concatenate([model.amplitude(moduli, given), given])
             total += 0.5 * float(state @ form @ state)
         return total
 
@@ -101,16 +101,6 @@ def _frozen(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.f
     return FrozenPosterior(objective, tuple(models), tuple(forms), evaluation.prior)
 
 
-def _amplitudes(model: ReducedModel, moduli: NDArray[np.float64], given: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Basis coefficients (m,) at moduli (n_regions,) kPa and [q, 1] (n_modes + 1,): one small Cholesky solve."""
-    matrix = np.tensordot(moduli, model.stiffness, axes=1)
-    force = moduli @ (model.coupling @ given) - model.load
-    _, solution, failed = linalg.lapack.dposv(matrix, force, lower=1, overwrite_a=1)
-    if failed:
-        raise EstimationError(f"the reduced stiffness is not positive definite at the moduli {moduli.tolist()} kPa")
-    return np.asarray(-solution)
-
-
 def sample_posterior(
     objective: Objective,
     start: NDArray[np.float64],
@@ -151,6 +141,7 @@ class _Laplace:
     factor: NDArray[np.float64]
 
     def energy(self, unknowns: NDArray[np.float64]) -> float:
+        """1/2 (x - c)^T H (x - c) of unknowns x (n_unknowns,), dimensionless."""
         scaled = self.factor.T @ (unknowns - self.centre)
         return 0.5 * float(scaled @ scaled)
 

@@ -12,7 +12,7 @@ from palpate.images.alignment import RigidMotion
 from palpate.images.tissue import Role
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.surface import tissue_surface, triangle_normals
-from palpate.observation.wall_modes import Wall, wall_modes
+from palpate.observation.wall_modes import Wall, wall_modes, wall_of
 
 __all__ = ["PrescribedMotion", "prescribed_motion"]
 
@@ -56,7 +56,9 @@ def prescribed_motion(
         first = sum(b.shape[1] for b in blocks)
         blocks.append(block.reshape(3 * n, -1))
         columns = np.arange(first, first + local.shape[1])
-        walls.append(Wall(space.points[points], normals, columns, local[::3, ::3], kernel_mm, prior_mm))
+        if len(columns):
+            own = {"kernel_mm": kernel_mm, "prior_mm": prior_mm}
+            walls.append(wall_of(space.points[points], normals, local, columns, **own))
         prescribed[points] = True
     modes = np.concatenate(blocks, axis=1) if blocks else np.zeros((3 * n, 0))
     return PrescribedMotion(modes, offset.ravel(), prescribed, tuple(walls))

@@ -7,48 +7,56 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Wall", "kernel_factor", "wall_modes"]
+__all__ = ["Wall", "kernel_factor", "wall_modes", "wall_of"]
 
 RANK_TOLERANCE = 1e-12
+DRIFT_LENGTHS = (1.0, 2.0, 4.0)  # times the modes' own kernel, which they cannot go below
+SWELLING_LENGTHS = (1.0, 2.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Wall:
-    """One driver's wall and the modes of its motion.
+    """How one driver's wall may move: covariances (n_modes, n_modes) of its modes' coefficients, dimensionless.
 
-    points (n_points, 3) mm with unit normals (n_points, 3); columns (n_modes,) of the constraint's modes that move it,
-    three a scalar mode; scalar (n_points, n_modes / 3) mm: the scalar modes, whose coefficients are N(0, 1) under a
-    kernel of `kernel_mm` and a standard deviation of `prior_mm`.
+    columns (n_modes,): the constraint's modes that move it; `drifts`: of motions whose components are alike, one for
+    each of `DRIFT_LENGTHS`; `swellings`: of motions along the normals, one for each of `SWELLING_LENGTHS`. All have the
+    modes' own standard deviation.
     """
 
-    points: NDArray[np.float64]
-    normals: NDArray[np.float64]
     columns: NDArray[np.int64]
-    scalar: NDArray[np.float64]
-    kernel_mm: float
-    prior_mm: float
+    drifts: tuple[NDArray[np.float64], ...]
+    swellings: tuple[NDArray[np.float64], ...]
 
-    def drift(self, kernel_mm: float) -> NDArray[np.float64]:
-        """Covariance (n_modes, n_modes) of the coefficients of a motion whose components are alike, `prior_mm` each.
 
-        B^+ K B^+^T for the modes B and a Gaussian kernel K of length `kernel_mm`.
-        """
-        amounts = np.linalg.lstsq(self.scalar, self._factor(kernel_mm), rcond=None)[0]
-        return np.asarray(np.kron(amounts @ amounts.T, np.eye(3)))
+def wall_of(
+    points: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    modes: NDArray[np.float64],
+    columns: NDArray[np.int64],
+    *,
+    kernel_mm: float,
+    prior_mm: float,
+) -> Wall:
+    """The wall of points (n_points, 3) mm and unit normals (n_points, 3) that `wall_modes` (3 n_points, n_modes) move.
 
-    def swelling(self, kernel_mm: float) -> NDArray[np.float64]:
-        """Covariance (n_modes, n_modes) of the coefficients of a motion along the normals, of `prior_mm`.
-
-        As `drift` with the kernel n(x) . k(x, y) n(y)^T, what a hollow organ does that fills.
-        """
-        factor = self._factor(kernel_mm)
-        along = [np.linalg.lstsq(self.scalar, self.normals[:, [a]] * factor, rcond=None)[0] for a in range(3)]
-        amounts = np.stack(along, axis=1).reshape(len(self.columns), -1)
-        return np.asarray(amounts @ amounts.T)
-
-    def _factor(self, kernel_mm: float) -> NDArray[np.float64]:
-        rank = min(len(self.points), 4 * self.scalar.shape[1])
-        return self.prior_mm * kernel_factor(self.points, kernel_mm, rank)
+    Covariances B^+ K B^+^T for the modes B and a Gaussian process K of standard deviation prior_mm: k(x, y) 1 of a
+    drift and n(x) k(x, y) n(y)^T of a swelling, what a hollow organ does that fills, k with a multiple of kernel_mm.
+    """
+    scalar = modes[::3, ::3]
+    rank = min(len(points), 4 * scalar.shape[1])
+    factors = {m: prior_mm * kernel_factor(points, m * kernel_mm, rank) for m in {*DRIFT_LENGTHS, *SWELLING_LENGTHS}}
+    inverse = np.linalg.pinv(scalar)
+    drifts = [inverse @ factors[multiple] for multiple in DRIFT_LENGTHS]
+    swellings = [
+        np.stack([inverse @ (normals[:, [axis]] * factors[multiple]) for axis in range(3)], axis=1)
+        for multiple in SWELLING_LENGTHS
+    ]
+    along = [amounts.reshape(len(columns), -1) for amounts in swellings]
+    return Wall(
+        columns,
+        tuple(np.asarray(np.kron(a @ a.T, np.eye(3))) for a in drifts),
+        tuple(np.asarray(a @ a.T) for a in along),
+    )
 
 
 def wall_modes(points: NDArray[np.float64], *, n_modes: int, kernel_mm: float, prior_mm: float) -> NDArray[np.float64]:

@@ -28,7 +28,7 @@ SOFT_TISSUE_KPA = (0.05, 2.0e4)  # from brain-like fat to gut wall under tension
 class PublishedStiffness:
     """Young's modulus (kPa) of a tissue from `low` to `high`, how it was measured, and where it was published.
 
-    words: parts of a tissue's name that mean this tissue.
+    words: parts of a tissue's name that mean this tissue; unless: parts that mean another one all the same.
     """
 
     tissue: str
@@ -37,6 +37,7 @@ class PublishedStiffness:
     high: float
     method: str
     source: str
+    unless: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +88,7 @@ PUBLISHED = (
         470.0,
         "tensile test of the wall, linear range",
         "Muslov et al. (2025)",
+        unless=("gall",),
     ),
     PublishedStiffness(
         "colon and rectum wall",
@@ -132,12 +134,10 @@ PUBLISHED = (
 
 
 def published_for(name: str) -> tuple[PublishedStiffness, ...]:
-    """The published values whose words occur in a tissue's `name`, whatever its case, blanks and hyphens.
-
-    A gallbladder is no bladder.
-    """
-    plain = name.lower().replace(" ", "_").replace("-", "_").replace("gallbladder", "").replace("gall_bladder", "")
-    found = [entry for entry in PUBLISHED if any(word in plain for word in entry.words)]
+    """The published values whose words occur in a tissue's `name`, whatever its case, blanks and hyphens."""
+    plain = name.lower().replace(" ", "_").replace("-", "_")
+    named = [entry for entry in PUBLISHED if any(word in plain for word in entry.words)]
+    found = [entry for entry in named if not any(word in plain for word in entry.unless)]
     tumours = [entry for entry in found if entry.tissue == "prostate cancer"]
     return tuple(tumours or found)
 
@@ -205,8 +205,7 @@ def _out_of_range(name: str, value: float) -> Iterable[Remark]:
 
 
 def _effective_modulus(name: str) -> Iterable[Remark]:
-    plain = name.lower()
-    if "bladder" in plain and "wall" not in plain and "gall" not in plain:
+    if "wall" not in name.lower() and any(entry.tissue == "bladder wall" for entry in published_for(name)):
         yield Remark(
             "effective-modulus",
             f"{name}: meshed as one solid, a filled bladder has an effective modulus, not that of its wall; compare it"

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.experiments.reproduce.table import Entry
+from palpate.images.distance import DistanceMap
 from palpate.images.label_image import VoxelGrid
-from palpate.images.segmentation import segment
+from palpate.images.segmentation import Segmentation, segment
 from palpate.images.tissue_distance import tissue_distance_map
 from palpate.inversion.conclude import Observed, conclude
 from palpate.inversion.gauss_newton import Bounds
@@ -25,7 +26,14 @@ from palpate.phantoms.scene import imaged
 from palpate.study.body import Body, ImagedStates, aligned
 from palpate.study.run import fitted_states
 
-__all__ = ["entries_from_surfaces", "entries_from_voxels", "from_half", "imaged_states", "voxel_targets", "with_motion"]
+__all__ = [
+    "entries_from_surfaces",
+    "entries_from_voxels",
+    "from_half",
+    "imaged_states",
+    "voxel_targets",
+    "with_motions",
+]
 
 SEARCHED = 100.0  # the moduli are sought within this factor of the start
 
@@ -37,30 +45,38 @@ def from_half(mapping: ModulusMap, truth: Mapping[str, float]) -> InversionSetti
     return InversionSettings((start,), Bounds(start - reach, start + reach))
 
 
-def imaged_states(space: LagrangeSpace, motion: NDArray[np.float64], grid: VoxelGrid) -> ImagedStates:
-    """Both states of a truth, u (n_points, 3) mm, as label images; tissues that `grid` does not show fall away."""
-    still = np.zeros_like(space.points)
-    images = tuple(imaged(space, displacement, grid) for displacement in (still, motion))
-    shown = set(np.unique(images[0].labels)) & set(np.unique(images[1].labels))
+Motions = Sequence[NDArray[np.float64]]
+
+
+def imaged_states(space: LagrangeSpace, motions: Motions, grid: VoxelGrid) -> ImagedStates:
+    """The rest state of a truth and its later ones, u (n_points, 3) mm each, as label images.
+
+    Tissues that `grid` does not show in all of them fall away.
+    """
+    images = [imaged(space, motion, grid) for motion in (np.zeros_like(space.points), *motions)]
+    shown = set.intersection(*(set(np.unique(image.labels)) for image in images))
     numbered = enumerate(space.mesh.tissues, start=1)
     tissues = tuple(replace(tissue, labels=(label,)) for label, tissue in numbered if label in shown)
-    before, after = (segment(image, tissues) for image in images)
-    return aligned(before, (after,), method="none")
+    before, *after = (segment(image, tissues) for image in images)
+    return aligned(before, tuple(after), method="none")
 
 
-def with_motion(states: ImagedStates, space: LagrangeSpace, motion: NDArray[np.float64]) -> ImagedStates:
-    """The same rest state with the later state of another u (n_points, 3) mm."""
+def with_motions(states: ImagedStates, space: LagrangeSpace, motions: Motions) -> ImagedStates:
+    """The same rest state with the later states of other u (n_points, 3) mm."""
     before = states.before
-    return replace(states, after=(segment(imaged(space, motion, before.grid), before.tissues),))
+    return replace(states, after=tuple(segment(imaged(space, u, before.grid), before.tissues) for u in motions))
 
 
-def voxel_targets(body: Body, surfaces: tuple[ObservedSurface, ...]) -> tuple[SurfaceTarget, ...]:
-    """The surfaces of a body in its two images."""
-    pair = (body.states.before, body.states.after[0])
-    return tuple(
-        surface_target(s, *(tissue_distance_map(image, s.tissue, smoothing_mm=body.smoothing_mm) for image in pair))
-        for s in surfaces
-    )
+def voxel_targets(body: Body, surfaces: tuple[ObservedSurface, ...]) -> tuple[tuple[SurfaceTarget, ...], ...]:
+    """The surfaces of a body in each of its later images."""
+
+    def maps(image: Segmentation) -> dict[int, DistanceMap]:
+        """The distance maps of the observed tissues."""
+        return {s.tissue: tissue_distance_map(image, s.tissue, smoothing_mm=body.smoothing_mm) for s in surfaces}
+
+    before = maps(body.states.before)
+    later = [maps(image) for image in body.states.after]
+    return tuple(tuple(surface_target(s, before[s.tissue], after[s.tissue]) for s in surfaces) for after in later)
 
 
 def entries_from_surfaces(

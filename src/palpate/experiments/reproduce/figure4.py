@@ -180,10 +180,12 @@ class _Bench:
 
     @cached_property
     def space(self) -> LagrangeSpace:
+        """The mesh of truth and estimate."""
         return balls_space(self.balls, self.balls.edge_mm)
 
     @cached_property
     def constraint(self) -> Constraint:
+        """Nothing is held but the rigid motion."""
         return floating(self.space)
 
     @cached_property

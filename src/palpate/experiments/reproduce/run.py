@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 from palpate.errors import ConfigurationError
 from palpate.experiments.reproduce.cohort import CohortSettings
@@ -21,6 +21,7 @@ from palpate.study.outputs import write_json
 
 __all__ = ["EXPERIMENTS", "Reproduction", "Settings", "reproduce"]
 
+ResultT = TypeVar("ResultT", bound="_Result")
 EXPERIMENTS = ("table1", "table2", "figure4", "staging")
 
 
@@ -54,10 +55,10 @@ def reproduce(
     """
     chosen, run = settings or Settings(), _Run(experiment, folder, workers, progress)
     makers: dict[str, Callable[[], Reproduction]] = {
-        "table1": lambda: _table1(chosen.table1, run),
-        "table2": lambda: _table2(chosen.table2, run),
-        "figure4": lambda: _figure4(chosen.figure4, run),
-        "staging": lambda: _staging(chosen.staging, run),
+        "table1": lambda: _reproduced(table1, draw_table, chosen.table1, run),
+        "table2": lambda: _reproduced(table2, draw_table, chosen.table2, run),
+        "figure4": lambda: _reproduced(figure4, draw_figure4, chosen.figure4, run),
+        "staging": lambda: _reproduced(staging, draw_staging, chosen.staging, run),
     }
     if experiment not in makers:
         raise ConfigurationError(f"the experiment is '{experiment}'; it must be one of {list(EXPERIMENTS)}")
@@ -77,6 +78,7 @@ class _Run:
 
     @property
     def figure(self) -> Path:
+        """The picture's file."""
         return self.folder / f"{self.experiment}.svg"
 
     def ledger(self, settings: object) -> Ledger:
@@ -85,25 +87,21 @@ class _Run:
         return Ledger(path, sha256(repr(settings).encode()).hexdigest()[:16])
 
 
-def _table1(settings: Table1Settings, run: _Run) -> Reproduction:
-    table = table1(settings, run.ledger(settings), progress=run.progress, workers=run.workers)
-    draw_table(table, run.figure)
-    return Reproduction(table.to_dict(), table.text(), run.figure)
+class _Result(Protocol):
+    """What every experiment gives."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `--json` prints."""
+        ...
+
+    def text(self) -> list[list[str]]:
+        """The rows of the printed table, its heads first."""
+        ...
 
 
-def _table2(settings: Table2Settings, run: _Run) -> Reproduction:
-    table = table2(settings, run.ledger(settings), progress=run.progress, workers=run.workers)
-    draw_table(table, run.figure)
-    return Reproduction(table.to_dict(), table.text(), run.figure)
-
-
-def _figure4(settings: Figure4Settings, run: _Run) -> Reproduction:
-    result = figure4(settings, run.ledger(settings), progress=run.progress, workers=run.workers)
-    draw_figure4(result, run.figure)
-    return Reproduction(result.to_dict(), result.text(), run.figure)
-
-
-def _staging(settings: CohortSettings, run: _Run) -> Reproduction:
-    result = staging(settings, run.ledger(settings), progress=run.progress, workers=run.workers)
-    draw_staging(result, run.figure)
+def _reproduced(
+    experiment: Callable[..., ResultT], draw: Callable[[ResultT, Path], None], settings: object, run: _Run
+) -> Reproduction:
+    result = experiment(settings, run.ledger(settings), progress=run.progress, workers=run.workers)
+    draw(result, run.figure)
     return Reproduction(result.to_dict(), result.text(), run.figure)

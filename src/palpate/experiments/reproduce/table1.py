@@ -130,14 +130,17 @@ class _Bench:
 
     @cached_property
     def coarse(self) -> LinearModel:
+        """The model that inverts."""
         return _model(balls_space(self.balls, self.balls.edge_mm))
 
     @cached_property
     def fine(self) -> LinearModel:
+        """The truth of the columns `other_mesh` and `voxels`."""
         return _model(balls_space(self.balls, self.balls.truth_edge_mm))
 
     @cached_property
     def linear_tetrahedra(self) -> LinearModel:
+        """The paper's model: the inverting mesh with linear tetrahedra."""
         return _model(balls_space(self.balls, self.balls.edge_mm, element="P1"))
 
 
@@ -162,6 +165,7 @@ class _Case:
 
     @property
     def truth(self) -> dict[str, float]:
+        """True modulus (kPa) of every sphere, by name."""
         return dict(zip(BODIES, self.moduli, strict=True))
 
     @cached_property
@@ -177,6 +181,7 @@ class _Case:
         return loaded.solve(np.array(self.moduli), np.zeros(model.n_modes)).displacement
 
     def from_surfaces(self, truth: LinearModel, progress: Progress) -> dict[str, Entry]:
+        """What exact surfaces of `truth` say of every sphere."""
         model = _pulled_by(self.bench.coarse, self.stress_kpa)
         u = self.displacement(truth)
         surfaces = [observed_surface(model.space, body) for body in range(len(BODIES))]
@@ -185,21 +190,23 @@ class _Case:
         return entries_from_surfaces(inversion, settings, self.truth)
 
     def from_voxels(self, progress: Progress) -> dict[str, Entry]:
+        """What two label images on a random grid say of every sphere."""
         balls, fine = self.bench.balls, self.bench.fine
         grid = random_grid(balls, np.random.default_rng(self.seed))
         space = _renamed(fine.space, self.moduli)
-        states = imaged_states(space, self.displacement(fine), grid)
+        states = imaged_states(space, (self.displacement(fine),), grid)
         mechanics = Mechanics(law="linear", element="P2")
         case = Case("table1", phantom=Phantom("spheres"), mesh=MeshSettings(balls.edge_mm), mechanics=mechanics)
         body = make_body(states, case, progress=progress)
         model = _pulled_by(_model(body.space), self.stress_kpa)
         surfaces = tuple(observed_surface(body.space, number) for number in range(len(BODIES)))
-        inversion, settings = self.inverted(model, voxel_targets(body, surfaces), progress)
+        inversion, settings = self.inverted(model, voxel_targets(body, surfaces)[0], progress)
         return entries_from_voxels(inversion, settings, body, self.truth, seed=self.seed)
 
     def inverted(
         self, model: LinearModel, targets: tuple[SurfaceTarget, ...], progress: Progress
     ) -> tuple[Inversion, InversionSettings]:
+        """The inversion of all spheres' surfaces from half of their moduli, and its settings."""
         mapping = modulus_map(balls_tissues(self.moduli), model.regions, loaded=True)
         settings = from_half(mapping, self.truth)
         problem = InverseProblem((model,), (targets,), mapping, frozenset(BODIES))

@@ -16,7 +16,7 @@ from palpate.experiments.reproduce.columns import (
     from_half,
     imaged_states,
     voxel_targets,
-    with_motion,
+    with_motions,
 )
 from palpate.experiments.reproduce.jobs import Job, Progress, compute
 from palpate.experiments.reproduce.ledger import Ledger
@@ -60,6 +60,7 @@ NOTES = (
     "As in the paper the scene is prostate, bladder, a hollow rectum and a box; bones are part of the surroundings.",
     "The wall's motion is given in all columns but the voxels', as in the paper.",
     "voxels: 1 mm, on one of several grids shifted at random; all is made from the labels, the wall's motion too.",
+    "voxels: two later images, in one of which the rectum is emptier than in the first.",
     "paper_method: its Eq. 4 on linear tetrahedra, L-BFGS, data of its own mesh.",
     "paper_method_other_mesh: the same on the data of the column other_mesh.",
 )
@@ -67,12 +68,16 @@ NOTES = (
 
 @dataclass(frozen=True, slots=True)
 class Table2Settings:
-    """Edges of the inverting and of the truth's mesh (mm), moduli (kPa), random grids, modes of the wall."""
+    """Edges of the inverting and of the truth's mesh (mm), moduli (kPa), random grids, modes of the wall.
+
+    shares: of the filling, in the later images of the voxel column; the other columns have the whole filling.
+    """
 
     edge_mm: float = 7.5
     truth_edge_mm: float = 6.0
     voxel_mm: float = 1.0
     filling_mm: float = 7.5
+    shares: tuple[float, ...] = (1.0, -0.5)
     moduli_kpa: tuple[float, ...] = tuple(PAPER_TABLE2)
     positions: int = 4
     driver: DriverMotion = field(default_factory=DriverMotion)
@@ -131,6 +136,7 @@ class _Bench:
 
     @cached_property
     def pelvis(self) -> RealPelvis:
+        """The scan and its surfaces."""
         return real_pelvis(SURROUNDINGS_KPA)
 
     @cached_property
@@ -150,6 +156,7 @@ class _Bench:
 
     @cached_property
     def surrogates(self) -> tuple[Surrogate, ...]:
+        """The reduced model of `coarse`."""
         return (self.surrogate_of(self.coarse),)
 
     def filled(self, space: LagrangeSpace) -> LinearModel:
@@ -210,6 +217,7 @@ class _Bench:
         return self.fine.system(moduli_of(self.fine, self.middle_kpa)).factorisation
 
     def from_surfaces(self, kpa: float, truth: LinearModel, u: Array, progress: Progress) -> dict[str, Entry]:
+        """What the exact surfaces of `truth` under u (n_points, 3) mm say of both organs."""
         tissues = truth.space.mesh.tissues
         surfaces = [observed_surface(self.coarse.space, i) for i, t in enumerate(tissues) if t.role is Role.ESTIMATE]
         targets = tuple(target_of_truth(truth.space, u, surface) for surface in surfaces)
@@ -220,11 +228,13 @@ class _Bench:
         return entries_from_surfaces(inversion, settings, dict.fromkeys(ORGANS, kpa))
 
     def by_the_paper(self, kpa: float) -> dict[str, Entry]:
+        """The paper's method on data of its own mesh."""
         own = self.linear_tetrahedra
         u = own.solve(moduli_of(own, kpa), np.zeros(0)).displacement
         return self._by_the_paper(kpa, own.space, u)
 
     def by_the_paper_on_other_mesh(self, kpa: float) -> dict[str, Entry]:
+        """The paper's method on the data of `other_mesh`."""
         return self._by_the_paper(kpa, self.fine.space, self.truth(kpa))
 
     def _by_the_paper(self, kpa: float, truth: LagrangeSpace, u: Array) -> dict[str, Entry]:
@@ -248,13 +258,14 @@ class _Imaged:
 
     @cached_property
     def grid(self) -> VoxelGrid:
+        """Voxels over the box, shifted at random."""
         rng = np.random.default_rng([self.bench.settings.seed, self.position])
         return grid_over(self.bench.pelvis.box, self.bench.settings.voxel_mm, rng)
 
     @cached_property
     def body(self) -> Body:
         """Meshed from the labels at rest, in the truth's own domain; its later state is of the middle modulus."""
-        states = imaged_states(self.bench.fine.space, self.bench.truth(self.bench.middle_kpa), self.grid)
+        states = imaged_states(self.bench.fine.space, self.later(self.bench.middle_kpa), self.grid)
         width = smoothing_width(self.grid)
         anatomy = anatomy_of(states.before, box=self.bench.pelvis.box, smoothing_mm=width)
         mesh = tetrahedralise(anatomy, edge_length_mm=self.bench.settings.edge_mm)
@@ -263,6 +274,7 @@ class _Imaged:
 
     @cached_property
     def case(self) -> Case:
+        """The settings of the estimate."""
         settings = self.bench.settings
         return Case(
             "table2",
@@ -280,13 +292,19 @@ class _Imaged:
 
     @cached_property
     def surrogates(self) -> tuple[Surrogate, ...]:
-        return (self.bench.surrogate_of(self.problem.models[0]),)
+        """One for each later state; they have the same model."""
+        return (self.bench.surrogate_of(self.problem.models[0]),) * len(self.problem.models)
+
+    def later(self, kpa: float) -> list[Array]:
+        """Displacements (n_points, 3) mm of the later states: the linear law's grow with the filling."""
+        return [share * self.bench.truth(kpa) for share in self.bench.settings.shares]
 
     def voxels(self, kpa: float, progress: Progress) -> dict[str, Entry]:
-        states = with_motion(self.body.states, self.bench.fine.space, self.bench.truth(kpa))
+        """What the label images alone say of both organs."""
+        states = with_motions(self.body.states, self.bench.fine.space, self.later(kpa))
         body = replace(self.body, states=states)
         surfaces = tuple(target.surface for target in self.problem.targets[0])
-        problem = replace(self.problem, targets=(voxel_targets(body, surfaces),))
+        problem = replace(self.problem, targets=voxel_targets(body, surfaces))
         truth = dict.fromkeys(ORGANS, kpa)
         settings = from_half(problem.modulus_map, truth)
         inversion = invert_with(problem, settings, self.surrogates, progress=progress)
