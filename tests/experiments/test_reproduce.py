@@ -19,7 +19,7 @@ from palpate.experiments.reproduce.figures import draw_figure4, draw_staging, dr
 from palpate.experiments.reproduce.jobs import Job, compute
 from palpate.experiments.reproduce.ledger import Ledger
 from palpate.experiments.reproduce.paper import PAPER_STAGING, PAPER_TABLE1, PAPER_TABLE2
-from palpate.experiments.reproduce.real_pelvis import grid_over
+from palpate.experiments.reproduce.real_pelvis import grid_within
 from palpate.experiments.reproduce.run import reproduce
 from palpate.experiments.reproduce.staging import Staging, paper_remark
 from palpate.experiments.reproduce.statistics import association, pearson_p, points_behind
@@ -219,16 +219,15 @@ def test_figures_are_drawn(tmp_path, table, cohort):
         assert "<svg" in (tmp_path / f"{name}.svg").read_text()
 
 
-def test_a_random_grid_covers_its_box():
+def test_a_random_grid_ends_within_its_box():
     turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     box = Box(np.array([5.0, -3.0, 7.0]), turn, np.array([10.3, 11.0, 12.7]))
-    first, second = (grid_over(box, 1.0, np.random.default_rng(seed)) for seed in (1, 2))
+    first, second = (grid_within(box, 1.0, np.random.default_rng(seed)) for seed in (1, 2))
     assert np.abs(first.affine[:3, 3] - second.affine[:3, 3]).max() > 0.01
     for grid in (first, second):
-        outer = np.array([[-0.5] * 3, np.array(grid.shape) - 0.5])
-        low, high = box.local(grid.world(outer))
-        assert np.all(low <= 0.0)
-        assert np.all(high >= box.lengths)
+        low, high = box.local(grid.world(np.array([[0.0] * 3, np.array(grid.shape) - 1.0])))
+        assert np.all((low >= 0.0) & (low < 1.5))
+        assert np.all((high <= box.lengths) & (high > box.lengths - 1.5))
 
 
 def test_an_unknown_experiment_is_refused(tmp_path):

@@ -24,11 +24,12 @@ def sphere(n, radius):
     return radius * normals, normals
 
 
-def surface(places, normals, jacobian, *, precision, state=0):
+def surface(places, normals, jacobian, *, precision, state=0, rest="a"):
     n = len(places)
     weights = np.full(n, 1.0 / n)
-    residuals = SurfaceResiduals(np.zeros(n), weights, places, normals, None, None)
-    return Linearisation(residuals, jacobian, weights, precision, SimpleNamespace(area=np.ones(n)), None, state)
+    residuals = SurfaceResiduals(np.zeros(n), weights, places, normals, places, None, None)
+    columns, target = np.arange(jacobian.shape[1]), SimpleNamespace(area=np.ones(n), surface=rest)
+    return Linearisation(residuals, columns, jacobian, weights, precision, target, None, state)
 
 
 def evaluation(surfaces, n_parameters):
@@ -93,17 +94,33 @@ def test_correlated_residuals_tell_less(smooth):
     assert np.all(np.diag(long) > 1.5 * np.diag(short))
 
 
-def test_a_second_image_with_noise_of_its_own_halves_the_variance(smooth):
+def twice(smooth, *, sign, rests):
+    """Two later states, the second with `sign` times the motion of the first, with modes of their own."""
     places, normals, jacobian = smooth
-    law = NoiseLaw(np.array([SD**2]), np.array([5.0]))
     modes, none = jacobian[:, 2:], np.zeros((len(places), 3))
     first = np.hstack([jacobian[:, :2], modes, none])
-    second = np.hstack([jacobian[:, :2], none, modes])
-    one = evaluation([surface(places, normals, jacobian, precision=200.0)], 2)
-    two = evaluation(
-        [surface(places, normals, rows, precision=200.0, state=i) for i, rows in enumerate((first, second))], 2
+    second = np.hstack([sign * jacobian[:, :2], none, modes])
+    pairs = enumerate(zip((first, second), rests, strict=True))
+    return evaluation(
+        [surface(places, normals, rows, precision=200.0, state=i, rest=rest) for i, (rows, rest) in pairs], 2
     )
-    assert sandwich_covariance(two, law, 2) == pytest.approx(0.5 * sandwich_covariance(one, law, 2), rel=1e-6)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_second_pair_of_images_halves_the_variance(smooth, sign):
+    law = NoiseLaw(np.array([SD**2]), np.array([5.0]))
+    one = sandwich_covariance(evaluation([surface(*smooth, precision=200.0)], 2), law, 2)
+    two = sandwich_covariance(twice(smooth, sign=sign, rests="ab"), law, 2)
+    assert two == pytest.approx(0.5 * one, rel=1e-6)
+
+
+def test_the_noise_of_a_shared_rest_state_is_not_averaged_away_by_a_like_motion_but_cancels_in_an_opposite_one(smooth):
+    law = NoiseLaw(np.array([SD**2]), np.array([5.0]))
+    pairs = sandwich_covariance(twice(smooth, sign=1.0, rests="ab"), law, 2)
+    alike = sandwich_covariance(twice(smooth, sign=1.0, rests="aa"), law, 2)
+    opposite = sandwich_covariance(twice(smooth, sign=-1.0, rests="aa"), law, 2)
+    assert np.all(np.diag(alike) > 1.2 * np.diag(pairs))
+    assert np.all(np.diag(opposite) < 0.8 * np.diag(pairs))
 
 
 def test_no_estimate_beats_the_cramer_rao_limit(smooth):

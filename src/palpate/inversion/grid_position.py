@@ -59,13 +59,16 @@ def voxel_errors(
 ) -> list[NDArray[np.float64]]:
     """Errors (n_q,) mm of the model -> image residuals of each surface when the fitted model itself is imaged.
 
-    The model, at rest and deformed, is turned into voxels on grids shifted at random by up to half a voxel.
+    The model, at rest and deformed, is turned into voxels on grids shifted at random by up to half a voxel; later
+    states of one reference state have the same image of it.
     """
     lines = iter(inversion.minimum.evaluation.surfaces)
-    errors = []
+    errors, known = list[NDArray[np.float64]](), list[tuple[LagrangeSpace, Segmentation]]()
     for state, fitted in zip(inversion.objective.states, states, strict=True):
         own = fitted.space or space
-        before = _imaged(own, np.zeros_like(fitted.displacement), fitted.before, rng)
+        rest = [image for reference, image in known if reference is own]
+        before = rest[0] if rest else _imaged(own, np.zeros_like(fitted.displacement), fitted.before, rng)
+        known.append((own, before))
         after = _imaged(own, fitted.displacement, fitted.after, rng)
         errors += [_error(next(lines), before, after, fitted.smoothing_mm) for _ in state.targets]
     return errors

@@ -48,13 +48,15 @@ class Weighting:
 
 @dataclass(frozen=True, slots=True)
 class Linearisation:
-    """Residuals of one surface of one `state` with robust weights (n,) and their derivative (n, n_unknowns).
+    """Residuals of one surface of one `state` with robust weights (n,) and their derivative (n, n_columns).
 
-    `jacobian` is that of a smooth surface (see `SurfaceResiduals.normal_jacobian`); `gradient` (n_unknowns,) is the
-    exact one of precision / 2 sum w rho(r).
+    `columns` (n_columns,): the unknowns that move it, the log-moduli and its own state's modes. `jacobian` is that of a
+    smooth surface (see `SurfaceResiduals.normal_jacobian`); `gradient` (n_columns,) is the exact one of
+    precision / 2 sum w rho(r).
     """
 
     residuals: SurfaceResiduals
+    columns: NDArray[np.int64]
     jacobian: NDArray[np.float64]
     weights: NDArray[np.float64]
     precision: float
@@ -127,9 +129,9 @@ class Objective:
         for line, weighting in zip(surfaces, self._flat_weighting(), strict=True):
             root = np.sqrt(line.precision * line.weights)
             scaled = root[:, None] * line.jacobian
-            gradient += line.gradient
-            score += scaled.T @ (root * line.residuals.values)
-            matrix += scaled.T @ scaled  # of one array, which costs half of a general product
+            gradient[line.columns] += line.gradient
+            score[line.columns] += scaled.T @ (root * line.residuals.values)
+            matrix[np.ix_(line.columns, line.columns)] += scaled.T @ scaled  # of one array: half of a general product
             mean = _robust_sum(line.residuals, weighting.cutoff)
             misfit += mean / len(surfaces)
             value += 0.5 * line.precision * mean
@@ -175,22 +177,18 @@ class Objective:
         solution = state.model.solve(self.modulus_map.moduli(theta), self.coefficients(unknowns)[s])
         tangent = solution.tangent()
         n_regions = tangent.shape[1] - state.model.n_modes
-        columns = np.concatenate([self.modulus_map.columns, np.arange(n_regions, tangent.shape[1])])
-        places = np.concatenate([np.arange(self.n_parameters), self._mode_places(s)])
+        moved = np.concatenate([self.modulus_map.columns, np.arange(n_regions, tangent.shape[1])])
+        columns = np.concatenate([np.arange(self.n_parameters), self._mode_places(s)])
         lines = []
         triples = self._surfaces(s, solution.displacement.ravel())
         for rows, (target, motion, weighting) in zip(state.slices(), triples, strict=True):
             residuals = _weighted(target, motion, weighting)
-            by_surface = tangent[rows][:, columns]
+            by_surface = tangent[rows][:, moved]
             jacobian = np.asarray(residuals.normal_jacobian @ by_surface)
-            if len(places) < len(unknowns):  # the other states' modes do not move this one
-                own, jacobian = jacobian, np.zeros((len(jacobian), len(unknowns)))
-                jacobian[:, places] = own
             weights = residuals.weights * _robust_weight(residuals.values, weighting.cutoff)
             pull = np.asarray(residuals.jacobian.T @ (weighting.precision * weights * residuals.values))
-            gradient = np.zeros(len(unknowns))
-            gradient[places] = np.asarray(by_surface.T @ pull)
-            lines.append(Linearisation(residuals, jacobian, weights, weighting.precision, target, gradient, s))
+            gradient = np.asarray(by_surface.T @ pull)
+            lines.append(Linearisation(residuals, columns, jacobian, weights, weighting.precision, target, gradient, s))
         return lines
 
     def _mode_places(self, state: int) -> NDArray[np.int64]:

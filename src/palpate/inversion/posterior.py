@@ -21,24 +21,32 @@ def gain(evaluation: Evaluation, n_parameters: int) -> tuple[NDArray[np.float64]
     G = H^-1 J^T W: a change e of the data moves the estimate by -G e; H is the Gauss-Newton matrix with the prior.
     """
     rows = np.linalg.solve(evaluation.matrix, np.eye(len(evaluation.matrix))[:, :n_parameters]).T
-    return tuple(rows @ (s.precision * s.weights[:, None] * s.jacobian).T for s in evaluation.surfaces)
+    return tuple(rows[:, s.columns] @ (s.precision * s.weights[:, None] * s.jacobian).T for s in evaluation.surfaces)
 
 
 def sandwich_covariance(evaluation: Evaluation, law: NoiseLaw, n_parameters: int) -> NDArray[np.float64]:
     """Covariance (n_parameters, n_parameters) of the log-moduli: H^-1 (J^T W C W J + P) H^-1.
 
     C is the covariance of the residuals under `law`, across all surfaces; P the prior of the driver's coefficients,
-    whose uncertainty is thereby included (White 1980; Aitken's theorem read for correlated errors).
+    whose uncertainty is thereby included (White 1980; Aitken's theorem read for correlated errors). A residual is the
+    error of a later image less that of its rest state's image, each with half of the law: the later ones are
+    independent, that of the rest state is the same for all states that have it, at the material place. Later states
+    that move alike do not average it away, opposite ones do.
     """
     inverse = np.linalg.solve(evaluation.matrix, np.eye(len(evaluation.matrix))[:, :n_parameters])
-    data = np.zeros((n_parameters, n_parameters))
-    places = [s.residuals.places for s in evaluation.surfaces]
-    normals = [s.residuals.normals for s in evaluation.surfaces]
+    data, rows = np.zeros((n_parameters, n_parameters)), gain(evaluation, n_parameters)
+    residuals = [s.residuals for s in evaluation.surfaces]
+
+    def spread(group: Sequence[int], places: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Half of G C G^T of some surfaces together, at places (n, 3) mm of each."""
+        normals = np.concatenate([residuals[i].normals for i in group])
+        carried = np.concatenate([rows[i] for i in group], axis=1)
+        return 0.5 * law.covariance(carried, np.concatenate([places[i] for i in group]), normals)
+
     for group in _states(evaluation):
-        rows = np.concatenate([g for i, g in enumerate(gain(evaluation, n_parameters)) if i in group], axis=1)
-        data += law.covariance(
-            rows, np.concatenate([places[i] for i in group]), np.concatenate([normals[i] for i in group])
-        )
+        data += spread(group, [r.places for r in residuals])
+    for group in _rest_states(evaluation):
+        data += spread(group, [r.material for r in residuals])
     return np.asarray(data + inverse.T @ evaluation.prior @ inverse)
 
 
@@ -46,7 +54,8 @@ def cramer_rao(evaluation: Evaluation, law: NoiseLaw, n_parameters: int) -> NDAr
     """Smallest covariance (n_parameters, n_parameters) of the log-moduli that any unbiased estimate can have.
 
     Inverse of the Fisher information F = sum_states J^T C^-1 J + P over the model's faces (model -> image residuals),
-    each face once, with the prior of the driver's motion.
+    each face once, with the prior of the driver's motion. Of several later states each is taken with a first image of
+    its own.
     """
     information = evaluation.prior.copy()
     for group in _states(evaluation):
@@ -58,14 +67,28 @@ def cramer_rao(evaluation: Evaluation, law: NoiseLaw, n_parameters: int) -> NDAr
             for variance, length in zip(law.variances, law.lengths, strict=True)
         ) * (normals @ normals.T)
         covariance += 1e-4 * law.sd**2 * np.eye(len(places))
-        information += jacobian.T @ np.linalg.solve(covariance, jacobian)
+        columns = evaluation.surfaces[group[0]].columns
+        information[np.ix_(columns, columns)] += jacobian.T @ np.linalg.solve(covariance, jacobian)
     return np.asarray(np.linalg.inv(information)[:n_parameters, :n_parameters])
 
 
 def _states(evaluation: Evaluation) -> Sequence[list[int]]:
-    """Numbers of the surfaces of each image; the errors of different images are independent."""
+    """Numbers of the surfaces of each later state."""
     states = [surface.state for surface in evaluation.surfaces]
     return [[i for i, state in enumerate(states) if state == key] for key in dict.fromkeys(states)]
+
+
+def _rest_states(evaluation: Evaluation) -> Sequence[list[int]]:
+    """Numbers of the surfaces of each rest state, whose later states have the very same observed surfaces."""
+    groups: list[list[int]] = []
+    for state in _states(evaluation):
+        surface = evaluation.surfaces[state[0]].target.surface
+        known = [group for group in groups if evaluation.surfaces[group[0]].target.surface is surface]
+        if known:
+            known[0].extend(state)
+        else:
+            groups.append(list(state))
+    return groups
 
 
 def _face_means(

@@ -36,9 +36,9 @@ def objective_of(
         State(m.at(np.concatenate([t.surface.dofs for t in targets])), targets)
         for m, targets in zip(models, problem.targets, strict=True)
     )
-    precision, noise = _precision(problem, law), law.sd**2 * law.correlation_area
+    noise = law.sd**2 * law.correlation_area
     weighting = tuple(
-        tuple(Weighting(precision, np.inf, _all_of(t), noise) for t in targets) for targets in problem.targets
+        tuple(Weighting(_precision(t, law), np.inf, _all_of(t), noise) for t in targets) for targets in problem.targets
     )
     return Objective(states, problem.modulus_map, weighting, prior)
 
@@ -49,10 +49,9 @@ def _all_of(target: SurfaceTarget) -> ImagePointUse:
     return ImagePointUse(np.ones(n, dtype=bool), np.zeros(n))
 
 
-def _precision(problem: InverseProblem, law: NoiseLaw) -> float:
-    """Weight (mm^-2) of a surface's mean square: independent residuals on a mean surface, by their variance."""
-    areas = [float(target.area.sum()) for targets in problem.targets for target in targets]
-    return max(float(np.mean(areas)) / law.correlation_area, 1.0) / law.sd**2
+def _precision(target: SurfaceTarget, law: NoiseLaw) -> float:
+    """Weight (mm^-2) of a surface's mean square: its independent residuals, by their variance."""
+    return max(float(target.area.sum()) / law.correlation_area, 1.0) / law.sd**2
 
 
 def reweighted(objective: Objective, minimum: Minimum, law: NoiseLaw) -> Objective:

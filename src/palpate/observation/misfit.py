@@ -22,7 +22,7 @@ class SurfaceResiduals:
     """Residuals of one surface, model -> image first, then image -> model.
 
     values (n,) mm; weights (n,) dimensionless, 1/2 in total for each direction; places (n, 3) mm and normals (n, 3) of
-    the deformed surface; jacobian (n, 3 n_vertices)
+    the deformed surface, and where these places are at rest, material (n, 3) mm; jacobian (n, 3 n_vertices)
     d values / d displacement of the surface's points; normal_jacobian: the same for a smooth surface without noise,
     n . du. The exact one also holds how voxel noise and facets change as the surface slides along itself, which tells
     nothing of how it slides.
@@ -32,6 +32,7 @@ class SurfaceResiduals:
     weights: NDArray[np.float64]
     places: NDArray[np.float64]
     normals: NDArray[np.float64]
+    material: NDArray[np.float64]
     jacobian: sparse.csr_matrix[np.float64]
     normal_jacobian: sparse.csr_matrix[np.float64]
 
@@ -70,6 +71,7 @@ def surface_residuals(
         np.concatenate([forward.weights, backward.weights]),
         np.concatenate([forward.places, backward.places]),
         np.concatenate([forward.normals, backward.normals]),
+        np.concatenate([forward.material, backward.material]),
         sparse.vstack([forward.jacobian, backward.jacobian], format="csr"),
         sparse.vstack([forward.normal_jacobian, backward.normal_jacobian], format="csr"),
     )
@@ -89,7 +91,10 @@ def _model_to_image(target: SurfaceTarget, displacement: NDArray[np.float64]) ->
     surface = target.surface
     corners = surface.triangles[target.triangle]
     # (n_q, 1, 3 corners) x (n_q, 3 corners, 3 axes) -> (n_q, 1, 3 axes)
-    places = (target.barycentric[:, None] @ (surface.rest + displacement)[corners])[:, 0]
+    material, places = (
+        (target.barycentric[:, None] @ vertices[corners])[:, 0]
+        for vertices in (surface.rest, surface.rest + displacement)
+    )
     gradient = target.after.gradient_at(places)
     values = target.after.at(places) - target.rest_distance
     rows = target.barycentric[:, :, None] * gradient[:, None]
@@ -99,7 +104,7 @@ def _model_to_image(target: SurfaceTarget, displacement: NDArray[np.float64]) ->
     weights = 0.5 * target.area / target.area.sum()
     n = len(surface.rest)
     exact, normal = _sparse_rows(rows, corners, n), _sparse_rows(smooth, corners, n)
-    return SurfaceResiduals(values, weights, places, normals, exact, normal)
+    return SurfaceResiduals(values, weights, places, normals, material, exact, normal)
 
 
 def _image_to_model(
@@ -126,7 +131,7 @@ def _image_to_model(
     weights = 0.5 * target.image_area[kept] / max(target.image_area[kept].sum(), 1e-30)
     n = len(surface.rest)
     exact, plane = _sparse_rows(rows, corners, n), _sparse_rows(smooth, corners, n)
-    return SurfaceResiduals(values, weights, closest.places, normals, exact, plane)
+    return SurfaceResiduals(values, weights, closest.places, normals, material, exact, plane)
 
 
 def _smooth_normals(

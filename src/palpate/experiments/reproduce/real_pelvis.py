@@ -19,7 +19,7 @@ from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.tetrahedralise import tetrahedralise
 from palpate.phantoms.wall_filling import wall_filling
 
-__all__ = ["ORGANS", "RealPelvis", "grid_over", "real_pelvis"]
+__all__ = ["ORGANS", "RealPelvis", "grid_within", "real_pelvis"]
 
 ORGANS = ("prostate", "bladder")
 DRIVER = "rectum"
@@ -70,9 +70,12 @@ def real_pelvis(surroundings_kpa: float) -> RealPelvis:
     return RealPelvis(scan, anatomy_of(scan, box=box, smoothing_mm=smoothing_width(scan.grid)))
 
 
-def grid_over(box: Box, voxel_mm: float, rng: np.random.Generator) -> VoxelGrid:
-    """A grid of cubic voxels along a box's axes that covers it, with a voxel to spare, shifted at random."""
-    shape = np.ceil(box.lengths / voxel_mm).astype(int) + 2
+def grid_within(box: Box, voxel_mm: float, rng: np.random.Generator) -> VoxelGrid:
+    """A grid of cubic voxels along a box's axes, shifted at random, all of whose centres lie in the box.
+
+    It ends where the body does, as a scan does: beyond its border there is nothing to be seen, not no organ.
+    """
+    shape = np.floor(box.lengths / voxel_mm).astype(int)
     first = 0.5 * (box.lengths - (shape - 1) * voxel_mm) + voxel_mm * rng.uniform(-SHIFT, SHIFT, 3)
     affine = np.eye(4)
     affine[:3, :3] = box.axes.T * voxel_mm

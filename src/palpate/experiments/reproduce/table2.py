@@ -22,7 +22,7 @@ from palpate.experiments.reproduce.jobs import Job, Progress, compute
 from palpate.experiments.reproduce.ledger import Ledger
 from palpate.experiments.reproduce.paper import PAPER_TABLE2
 from palpate.experiments.reproduce.paper_method import paper_estimate, paper_target
-from palpate.experiments.reproduce.real_pelvis import ORGANS, RealPelvis, grid_over, real_pelvis
+from palpate.experiments.reproduce.real_pelvis import ORGANS, RealPelvis, grid_within, real_pelvis
 from palpate.experiments.reproduce.table import COLUMNS, Entry, Table, TableRow, as_part, entries_of
 from palpate.images.distance import observation_width, smoothing_width
 from palpate.images.label_image import VoxelGrid
@@ -260,7 +260,7 @@ class _Imaged:
     def grid(self) -> VoxelGrid:
         """Voxels over the box, shifted at random."""
         rng = np.random.default_rng([self.bench.settings.seed, self.position])
-        return grid_over(self.bench.pelvis.box, self.bench.settings.voxel_mm, rng)
+        return grid_within(self.bench.pelvis.box, self.bench.settings.voxel_mm, rng)
 
     @cached_property
     def body(self) -> Body:
