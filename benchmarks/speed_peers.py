@@ -185,7 +185,7 @@ def finite_difference_lm(problem: InverseProblem, settings: InversionSettings) -
         parts = [unknowns[n:]]
         for target, weighting in zip(problem.targets[0], objective.weighting[0], strict=True):
             motion = values[target.surface.dofs].reshape(-1, 3)
-            found = surface_residuals(target, motion, weighting.image.kept)
+            found = surface_residuals(target, motion, weighting.held)
             parts.append(np.sqrt(weighting.precision * found.weights) * found.values)
         return np.concatenate(parts)
 

@@ -13,7 +13,7 @@ import pytest
 import palpate.inversion
 from palpate.inversion.objective import Objective, State, Weighting
 from palpate.inversion.surrogate import first_surrogate, with_modulus_series
-from palpate.observation.misfit import ImagePointUse
+from palpate.observation.misfit import Correspondence
 
 MEMBERS = ("__call__", "value", "n_parameters", "n_unknowns")
 
@@ -23,13 +23,19 @@ def surrogate_of(model, moduli, columns):
     return with_modulus_series(first_surrogate(model, moduli), np.ones(model.n_modes), columns).reduced
 
 
+def everything(target):
+    """All image points count; the maps' smoothing draws nothing in."""
+    n = len(target.image_points)
+    return Correspondence(np.ones(n, bool), np.zeros(n), np.zeros(len(target.surface.rest)))
+
+
 def objective_of(problem, *, cutoff=np.inf, precision=30.0) -> Objective:
     moduli = problem.modulus_map.moduli(np.zeros(2))
     states, weighting = [], []
     for model, targets in zip(problem.models, problem.targets, strict=True):
         reduced = surrogate_of(model, moduli, problem.modulus_map.columns)
         states.append(State(reduced.at(np.concatenate([t.surface.dofs for t in targets])), targets))
-        every = [ImagePointUse(np.ones(len(t.image_points), bool), np.zeros(len(t.image_points))) for t in targets]
+        every = [everything(t) for t in targets]
         weighting.append(tuple(Weighting(precision, cutoff, use) for use in every))
     return Objective(tuple(states), problem.modulus_map, tuple(weighting))
 

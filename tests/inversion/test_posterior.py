@@ -27,7 +27,7 @@ def sphere(n, radius):
 def surface(places, normals, jacobian, *, precision, state=0, rest="a"):
     n = len(places)
     weights = np.full(n, 1.0 / n)
-    residuals = SurfaceResiduals(np.zeros(n), weights, places, normals, places, None, None)
+    residuals = SurfaceResiduals(np.zeros(n), weights, places, normals, places, np.zeros(n), None, None)
     columns, target = np.arange(jacobian.shape[1]), SimpleNamespace(area=np.ones(n), surface=rest)
     return Linearisation(residuals, columns, jacobian, weights, precision, target, None, state)
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import igl
 import numpy as np
 import pytest
 
 from palpate.images.distance import distance_map
 from palpate.images.label_image import VoxelGrid
-from palpate.observation.misfit import image_point_use, surface_residuals
+from palpate.observation.misfit import Correspondence, correspondence, surface_residuals
 from palpate.observation.observed_surface import ObservedSurface
 from palpate.observation.target import surface_target, target_from
 from palpate.phantoms.shapes import Ellipsoid, ball, rotation_about
@@ -39,7 +41,9 @@ def smooth_target(surface, rng, n=400):
 
 
 def everywhere(target):
-    return np.ones(len(target.image_points), dtype=bool)
+    """All image points count; the maps' smoothing draws nothing in."""
+    n = len(target.image_points)
+    return Correspondence(np.ones(n, dtype=bool), np.zeros(n), np.zeros(len(target.surface.rest)))
 
 
 def closest(target, displacement):
@@ -61,9 +65,10 @@ def test_the_jacobian_leaves_a_remainder_of_second_order(ball_surface, backwards
     target = smooth_target(ball_surface, rng)
     place = 0.3 * rng.standard_normal(ball_surface.rest.shape)
     direction = rng.standard_normal(ball_surface.rest.shape)
-    kept = everywhere(target)
+    drawn_in = 0.1 * rng.standard_normal(len(ball_surface.rest))
+    kept = replace(everywhere(target), shrinkage=drawn_in)
     n = len(target.area)
-    steady = np.ones(len(kept), dtype=bool)
+    steady = np.ones(len(target.image_points), dtype=bool)
     for step in STEPS:
         steady &= np.all(closest(target, place + step * direction) == closest(target, place), axis=1)
     rows = np.concatenate([np.full(n, not backwards), steady & backwards])
@@ -152,13 +157,13 @@ def test_a_shift_towards_the_image_has_the_sign_of_the_distance(ball_surface, rn
 
 def test_each_direction_has_half_of_the_weight(ball_surface, rng):
     target = smooth_target(ball_surface, rng)
-    kept = everywhere(target)
-    kept[::3] = False
-    found = surface_residuals(target, np.zeros_like(ball_surface.rest), kept)
+    held = everywhere(target)
+    held.kept[::3] = False
+    found = surface_residuals(target, np.zeros_like(ball_surface.rest), held)
     n = len(target.area)
     assert found.weights[:n].sum() == pytest.approx(0.5)
     assert found.weights[n:].sum() == pytest.approx(0.5)
-    assert len(found.values) == n + kept.sum()
+    assert len(found.values) == n + held.kept.sum()
 
 
 def test_image_points_that_face_the_hidden_part_are_dropped(sphere, rng):
@@ -171,8 +176,30 @@ def test_image_points_that_face_the_hidden_part_are_dropped(sphere, rng):
     points = CENTRE + 10.5 * towards
     shape = ball(CENTRE, 10.5)
     target = target_from(surface, shape, shape, level=0.0, image=(points, np.ones(500)))
-    kept = image_point_use(target, np.zeros_like(surface.rest)).kept
-    assert np.all(towards[kept, 2] > 0.0)
-    assert kept[towards[:, 2] > 0.1].all()  # nearer to the rim, the rim itself is closest
-    below = surface_residuals(target, np.zeros_like(surface.rest), kept)
+    held = correspondence(target, np.zeros_like(surface.rest))
+    assert np.all(towards[held.kept, 2] > 0.0)
+    assert held.kept[towards[:, 2] > 0.1].all()  # nearer to the rim, the rim itself is closest
+    below = surface_residuals(target, np.zeros_like(surface.rest), held)
     assert below.places[:, 2].min() > CENTRE[2] - 1e-9
+
+
+@pytest.mark.parametrize("grown", [0.5, 1.6])
+def test_a_ball_of_voxels_that_shrinks_or_grows_is_met_where_it_is(sphere, grown):
+    """The maps' smoothing draws a small ball in further than a large one, by sigma^2 / R."""
+    vertices, triangles = sphere(5)
+    whole = replace(surface_of(vertices, triangles), rest=RADIUS * vertices)
+    grid = VoxelGrid((48, 48, 48), np.array([[1.0, 0, 0, -23.4], [0, 1, 0, -23.7], [0, 0, 1, -23.2], [0, 0, 0, 1]]))
+    centres = grid.world(np.indices(grid.shape).reshape(3, -1).T.astype(float))
+    radii = np.linalg.norm(centres, axis=1).reshape(grid.shape)
+    maps = [distance_map(radii < radius, grid, smoothing_mm=1.0) for radius in (RADIUS, grown * RADIUS)]
+    target = surface_target(whole, *maps)
+    motion = (grown - 1.0) * whole.rest
+    held = correspondence(target, motion)
+    drawn = 1.0 / (grown * RADIUS) - 1.0 / RADIUS
+    assert held.shrinkage.mean() == pytest.approx(drawn, rel=0.05)
+    met = surface_residuals(target, motion, held)
+    missed = surface_residuals(target, motion, replace(held, shrinkage=np.zeros(len(vertices))))
+    for found, by in ((met, 0.0), (missed, drawn)):
+        for part in (slice(0, len(target.area)), slice(len(target.area), None)):
+            mean = np.average(found.values[part], weights=found.weights[part])
+            assert mean == pytest.approx(by, abs=0.2 * abs(drawn) + 2e-3)

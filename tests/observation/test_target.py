@@ -8,7 +8,7 @@ import pytest
 from palpate.images.distance import distance_map
 from palpate.images.label_image import VoxelGrid
 from palpate.images.voxel_noise import terrace_noise
-from palpate.observation.misfit import image_point_use
+from palpate.observation.misfit import correspondence
 from palpate.observation.observed_surface import ObservedSurface
 from palpate.observation.target import surface_target, target_from
 from palpate.phantoms.shapes import ball
@@ -49,7 +49,7 @@ def test_the_rounding_at_image_points_is_judged_by_the_models_smooth_surface(sph
     everywhere, rim = np.ones(len(triangles), dtype=bool), np.zeros((len(triangles), 3), dtype=bool)
     whole = ObservedSurface(0, "ball", np.arange(len(vertices)), 9.0 * vertices, triangles, everywhere, rim, 1.0)
     target = surface_target(whole, maps[0], maps[0])
-    found = image_point_use(target, np.zeros_like(whole.rest)).terraces
+    found = correspondence(target, np.zeros_like(whole.rest)).terraces
     radial = target.image_points / np.linalg.norm(target.image_points, axis=1, keepdims=True)
     assert np.corrcoef(found, terrace_noise(maps[0], maps[0], radial))[0, 1] > 0.99
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from palpate.mesh.surface import vertex_normals
-from palpate.observation.misfit import SurfaceResiduals, surface_residuals
+from palpate.observation.misfit import Correspondence, SurfaceResiduals, surface_residuals
 from palpate.observation.observed_surface import ObservedSurface
 from palpate.observation.target import target_from
 from palpate.observation.wall_correction import wall_correction
@@ -36,7 +36,9 @@ def residuals_of(wall, displacement) -> SurfaceResiduals:
     """The later image is the resting ball: a wall that has moved should go back."""
     still = ball(np.zeros(3), RADIUS)
     target = target_from(wall, still, still, level=0.0, image=(wall.rest[::4], np.full(len(wall.rest[::4]), 4.0)))
-    return surface_residuals(target, displacement, np.ones(len(target.image_points), dtype=bool))
+    n = len(target.image_points)
+    held = Correspondence(np.ones(n, dtype=bool), np.zeros(n), np.zeros(len(wall.rest)))
+    return surface_residuals(target, displacement, held)
 
 
 def correction(wall, displacement, present):

@@ -16,15 +16,17 @@ __all__ = ["REACH_MM", "cropped", "tissue_distance_map", "window_around"]
 REACH_MM = 25.0  # organs that move further are not found again
 
 
-def tissue_distance_map(segmentation: Segmentation, tissue: int, *, smoothing_mm: float) -> DistanceMap:
-    """Signed distance map of a tissue by its index; it reaches 25 mm beyond the tissue's bounding box.
+def tissue_distance_map(
+    segmentation: Segmentation, tissue: int, *, smoothing_mm: float, reach_mm: float = REACH_MM
+) -> DistanceMap:
+    """Signed distance map of a tissue by its index; it reaches `reach_mm` beyond the tissue's bounding box.
 
     `smoothing_mm`: see `distance_map`. Raises `InputDataError` when the image has no voxel of the tissue.
     """
     mask = segmentation.mask(tissue)
     if not mask.any():
         raise InputDataError(f"tissue '{segmentation.tissues[tissue].name}' has no voxel in the image")
-    window = window_around(mask, segmentation.grid, reach_mm=REACH_MM)
+    window = window_around(mask, segmentation.grid, reach_mm=reach_mm)
     return distance_map(mask[window], cropped(segmentation.grid, window), smoothing_mm=smoothing_mm)
 
 

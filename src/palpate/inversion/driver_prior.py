@@ -33,13 +33,17 @@ class _Seen:
     information: NDArray[np.float64]
     pull: NDArray[np.float64]
 
-    def log_evidence(self, covariance: NDArray[np.float64]) -> float:
-        """1/2 (b^T (A + C^-1)^-1 b - ln det(1 + C A)) for a prior covariance C (n, n)."""
-        root = linalg.cholesky(covariance, lower=True, check_finite=False)
-        inner = root.T @ self.information @ root
+    def along(self, basis: NDArray[np.float64]) -> _Seen:
+        """The same of amounts y (k,) of a basis W (n, k), x = W y."""
+        return _Seen(basis.T @ self.information @ basis, basis.T @ self.pull)
+
+    def log_evidence(self, variances: NDArray[np.float64]) -> float:
+        """1/2 (b^T (A + C^-1)^-1 b - ln det(1 + C A)) for a prior covariance C = diag(variances) (n, n)."""
+        root = np.sqrt(variances)
+        inner = root[:, None] * self.information * root
         inner[np.diag_indices_from(inner)] += 1.0
-        factor = linalg.cholesky(inner, lower=True, check_finite=False)
-        explained = linalg.solve_triangular(factor, root.T @ self.pull, lower=True, check_finite=False)
+        factor = linalg.cholesky(inner, lower=True, overwrite_a=True, check_finite=False)
+        explained = linalg.solve_triangular(factor, root * self.pull, lower=True, check_finite=False)
         return 0.5 * float(explained @ explained) - float(np.sum(np.log(np.diag(factor))))
 
 
@@ -100,17 +104,23 @@ def _beliefs(wall: Wall, seen: _Seen) -> list[_Belief]:
 
 
 def _most_evident(parts: Sequence[NDArray[np.float64]], seen: _Seen) -> _Belief:
-    """The best weights of drift and swelling, covariances (n_modes, n_modes) at the modes' own standard deviation."""
+    """The best weights of drift and swelling, covariances (n_modes, n_modes) at the modes' own standard deviation.
 
-    def covariance(amplitudes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The sum at ln(standard deviation / the modes' own) of both parts (2,)."""
-        drift, swelling = np.exp(2.0 * np.clip(amplitudes, *np.log(AMPLITUDES)))
-        least = LEAST_VARIANCE * (drift + swelling) * np.eye(len(parts[0]))
-        return np.asarray(drift * parts[0] + swelling * parts[1] + least)
+    In the common eigenvectors of both, D = W W^T and S = W diag(lambda) W^T, every sum of them is diagonal.
+    """
+    drift, swelling = (part + LEAST_VARIANCE * np.eye(len(part)) for part in parts)
+    ratios, vectors = linalg.eigh(swelling, drift, check_finite=False)
+    basis = drift @ vectors
+    within = seen.along(basis)
+
+    def variances(amplitudes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Of the eigenvectors' amounts, at ln(standard deviation / the modes' own) of both parts (2,)."""
+        of_drift, of_swelling = np.exp(2.0 * np.clip(amplitudes, *np.log(AMPLITUDES)))
+        return np.asarray(of_drift + of_swelling * ratios)
 
     def worse(amplitudes: NDArray[np.float64]) -> float:
         """Minus the log-evidence."""
-        return -seen.log_evidence(covariance(amplitudes))
+        return -within.log_evidence(variances(amplitudes))
 
     found = [
         optimize.minimize(
@@ -119,7 +129,7 @@ def _most_evident(parts: Sequence[NDArray[np.float64]], seen: _Seen) -> _Belief:
         for start in FIRST_AMPLITUDES
     ]
     best = min(found, key=lambda trial: float(trial.fun))
-    return _Belief(covariance(best.x), -float(best.fun))
+    return _Belief((basis * variances(best.x)) @ basis.T, -float(best.fun))
 
 
 def _with(

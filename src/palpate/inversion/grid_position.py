@@ -18,6 +18,8 @@ from palpate.mesh.voxelise import voxelise
 
 __all__ = ["FittedState", "grid_position_shifts", "voxel_errors"]
 
+AROUND = 8.0  # widths of the Gaussian: the maps are asked on the surface alone
+
 
 @dataclass(frozen=True, slots=True)
 class FittedState:
@@ -78,8 +80,12 @@ def _error(line: Linearisation, before: Segmentation, after: Segmentation, smoot
     target = line.target
     corners = target.surface.rest[target.surface.triangles[target.triangle]]
     rest = np.einsum("qk,qka->qa", target.barycentric, corners)
-    maps = [tissue_distance_map(image, target.surface.tissue, smoothing_mm=smoothing_mm) for image in (before, after)]
-    return np.asarray(maps[1].at(line.residuals.places[: len(rest)]) - maps[0].at(rest))
+    maps = [
+        tissue_distance_map(image, target.surface.tissue, smoothing_mm=smoothing_mm, reach_mm=AROUND * smoothing_mm)
+        for image in (before, after)
+    ]
+    n = len(rest)
+    return np.asarray(maps[1].at(line.residuals.places[:n]) - maps[0].at(rest) - line.residuals.shrinkage[:n])
 
 
 def _imaged(

@@ -27,7 +27,7 @@ from palpate.inversion.objective import Objective
 from palpate.inversion.problem import InverseProblem, Inversion, InversionSettings
 from palpate.inversion.surrogate import Surrogate, first_surrogate, sharpened, with_modulus_series, with_offset
 from palpate.inversion.wall_refinement import refined_walls
-from palpate.inversion.weighting import FIRST_LAW, objective_of, residual_law, reweighted
+from palpate.inversion.weighting import first_law, objective_of, residual_law, reweighted
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.reduced import ReducedModel
 
@@ -50,7 +50,7 @@ def invert(problem: InverseProblem, settings: InversionSettings, *, progress: Ca
     moduli = problem.modulus_map.moduli(middle)
     progress("responses of the full model at the middle start")
     surrogates = tuple(first_surrogate(model, moduli) for model in problem.models)
-    objective = objective_of(problem, _reduced(surrogates), settings.law or FIRST_LAW)
+    objective = objective_of(problem, _reduced(surrogates), settings.law or first_law(problem))
     still = np.concatenate([middle, np.zeros(objective.n_unknowns - len(middle))])
     filled = driven(objective.with_fresh_correspondence(still), middle, bounds=settings.bounds)
     pairs = zip(surrogates, objective.coefficients(filled.unknowns), strict=True)
@@ -69,7 +69,7 @@ def invert_with(
     progress: Callable[[str], None],
 ) -> Inversion:
     """The linear estimate from reduced models that are already there."""
-    law = settings.law or FIRST_LAW
+    law = settings.law or first_law(problem)
     objective = objective_of(problem, _reduced(surrogates), law)
     still = np.zeros(objective.n_unknowns)
     objective = objective.with_fresh_correspondence(still)

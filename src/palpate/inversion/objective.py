@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from palpate.errors import EstimationError
 from palpate.inversion.modulus_map import ModulusMap
 from palpate.mechanics.forward import ForwardModel
-from palpate.observation.misfit import ImagePointUse, SurfaceResiduals, image_point_use, surface_residuals
+from palpate.observation.misfit import Correspondence, SurfaceResiduals, correspondence, surface_residuals
 from palpate.observation.target import SurfaceTarget
 
 __all__ = ["Evaluation", "Linearisation", "Objective", "State", "Weighting"]
@@ -36,13 +36,13 @@ class State:
 class Weighting:
     """How the residuals of one surface count: `precision` (mm^-2) of its mean square, Tukey `cutoff` (mm, inf: none).
 
-    `image`: the image points in use; `noise` (mm^4, inf: all count by area) is the residuals' variance times their
-    correlation area, against which the voxels' terraces are held.
+    `held`: the image points in use and more; `noise` (mm^4, inf: all count by area) is the residuals' variance times
+    their correlation area, against which the voxels' terraces are held.
     """
 
     precision: float
     cutoff: float
-    image: ImagePointUse
+    held: Correspondence
     noise: float = np.inf
 
 
@@ -150,7 +150,7 @@ class Objective:
         """
         fresh = [
             tuple(
-                replace(weighting, image=image_point_use(target, motion))
+                replace(weighting, held=correspondence(target, motion))
                 for target, motion, weighting in self._surfaces(s, displacement)
             )
             for s, displacement in enumerate(self._displacements(unknowns))
@@ -201,18 +201,18 @@ class Objective:
 
 def _weighted(target: SurfaceTarget, motion: NDArray[np.float64], weighting: Weighting) -> SurfaceResiduals:
     """Residuals at a motion (n_vertices, 3) mm, weights falling as noise / (noise + terraces) with the same sum."""
-    residuals = surface_residuals(target, motion, weighting.image.kept)
+    residuals = surface_residuals(target, motion, weighting.held)
     if not np.isfinite(weighting.noise):
         return residuals
-    terraces = np.concatenate([target.terraces, weighting.image.terraces[weighting.image.kept]])
+    terraces = np.concatenate([target.terraces, weighting.held.terraces[weighting.held.kept]])
     weights = residuals.weights * weighting.noise / (weighting.noise + terraces)
     return replace(residuals, weights=weights * (residuals.weights.sum() / weights.sum()))
 
 
 def _refuse_unseen(target: SurfaceTarget, weighting: Weighting) -> None:
-    if not weighting.image.kept.any():
+    if not weighting.held.kept.any():
         raise EstimationError(
-            f"'{target.surface.name}': none of the {len(weighting.image.kept)} points of its surface in the later image"
+            f"'{target.surface.name}': none of the {len(weighting.held.kept)} points of its surface in the later image"
             " faces the observed part of the model; is it the same organ, and do the images lie on each other?"
         )
 

@@ -11,15 +11,30 @@ from palpate.inversion.gauss_newton import Minimum
 from palpate.inversion.noise import NoiseLaw, fit_noise_law
 from palpate.inversion.objective import Evaluation, Linearisation, Objective, State, Weighting
 from palpate.inversion.problem import InverseProblem, LocalModel
-from palpate.observation.misfit import ImagePointUse
+from palpate.observation.misfit import Correspondence
 from palpate.observation.target import SurfaceTarget
 
-__all__ = ["FIRST_LAW", "objective_of", "residual_law", "reweighted"]
+__all__ = ["FIRST_LAW", "first_law", "objective_of", "residual_law", "reweighted"]
 
 TUKEY = 4.685  # cutoff in standard deviations, 95 % efficient for normal errors (Huber 1981)
 MAD = 1.4826  # standard deviations of a normal law in one median absolute deviation
 LEAST_CUTOFF = 5e-3  # mm
-FIRST_LAW = NoiseLaw(np.array([0.3**2]), np.array([3.0]))  # until the residuals tell
+FIRST_LAW = NoiseLaw(np.array([0.3**2]), np.array([3.0]))  # of segmentations of which nothing is known
+
+
+def first_law(problem: InverseProblem) -> NoiseLaw:
+    """Law of the residuals until they tell: the rounding of both images' voxels; `FIRST_LAW` where there are none.
+
+    Voxels of edge h round a surface by a variance of h^2 / 12 a voxel, which a Gaussian of width sigma spreads:
+    h^4 / (48 pi sigma^2) for each image, with the correlation length sqrt(2) sigma. The residuals that are left put too
+    small a law right; too large a one leaves motion of the drivers in the residuals, which then passes for noise.
+    """
+    maps = [image for targets in problem.targets for t in targets for image in t.voxels or ()]
+    if not maps:
+        return FIRST_LAW
+    variances = [m.grid.voxel_volume ** (4.0 / 3.0) / (48.0 * np.pi * m.smoothing_mm**2) for m in maps]
+    width = float(np.mean([m.smoothing_mm for m in maps]))
+    return NoiseLaw(np.array([2.0 * float(np.mean(variances))]), np.array([np.sqrt(2.0) * width]))
 
 
 def objective_of(
@@ -43,10 +58,10 @@ def objective_of(
     return Objective(states, problem.modulus_map, weighting, prior)
 
 
-def _all_of(target: SurfaceTarget) -> ImagePointUse:
+def _all_of(target: SurfaceTarget) -> Correspondence:
     """Every image point, until the model is near enough to choose."""
     n = len(target.image_points)
-    return ImagePointUse(np.ones(n, dtype=bool), np.zeros(n))
+    return Correspondence(np.ones(n, dtype=bool), np.zeros(n), np.zeros(len(target.surface.rest)))
 
 
 def _precision(target: SurfaceTarget, law: NoiseLaw) -> float:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import igl
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.mesh.tet_mesh import FACES, TetMesh
 
-__all__ = ["Surface", "tissue_surface", "triangle_normals", "vertex_normals"]
+__all__ = ["Surface", "mean_curvature", "tissue_surface", "triangle_normals", "vertex_normals"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,3 +88,17 @@ def _look_up(keys: NDArray[np.int64], table: NDArray[np.int64], values: NDArray[
 def _region_behind(mesh: TetMesh, triangles: NDArray[np.int64]) -> NDArray[np.int64]:
     faces = mesh.tets[:, FACES].reshape(-1, 3)
     return _look_up(_keys(triangles, mesh), _keys(faces, mesh), np.repeat(mesh.region, 4))
+
+
+def mean_curvature(points: NDArray[np.float64], triangles: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Mean curvature H (n_nodes,), 1/mm, at nodes (n_nodes, 3) mm of triangles (n_faces, 3): 1/R on a ball.
+
+    Positive where the surface is convex along its normals; a triangulation's is that of its edges, shared out by area.
+    H = n . sum_j (cot a_ij + cot b_ij) (x_i - x_j) / (4 A_i), A_i a third of the adjacent triangles (Meyer, Desbrun,
+    Schroeder & Barr 2003, equation 8, with barycentric areas).
+    """
+    vertices, faces = np.ascontiguousarray(points), np.ascontiguousarray(triangles)
+    pull = -np.asarray(igl.cotmatrix(vertices, faces) @ vertices)
+    areas = igl.massmatrix(vertices, faces, igl.MASSMATRIX_TYPE_BARYCENTRIC).diagonal()
+    along = np.einsum("na,na->n", pull, vertex_normals(vertices, faces))
+    return np.asarray(0.5 * along / np.maximum(areas, np.finfo(float).tiny))

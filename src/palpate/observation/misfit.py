@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from palpate.mesh.surface import vertex_normals
+from palpate.mesh.surface import mean_curvature, vertex_normals
 from palpate.observation.target import SurfaceTarget
 
-__all__ = ["ImagePointUse", "SurfaceResiduals", "image_point_use", "surface_residuals"]
+__all__ = ["Correspondence", "SurfaceResiduals", "correspondence", "surface_residuals"]
 
 ON_EDGE = 1e-9
 
@@ -22,7 +22,8 @@ class SurfaceResiduals:
     """Residuals of one surface, model -> image first, then image -> model.
 
     values (n,) mm; weights (n,) dimensionless, 1/2 in total for each direction; places (n, 3) mm and normals (n, 3) of
-    the deformed surface, and where these places are at rest, material (n, 3) mm; jacobian (n, 3 n_vertices)
+    the deformed surface, and where these places are at rest, material (n, 3) mm; shrinkage (n,) mm, what was subtracted
+    for the smoothing of the maps (see `Correspondence`); jacobian (n, 3 n_vertices)
     d values / d displacement of the surface's points; normal_jacobian: the same for a smooth surface without noise,
     n . du. The exact one also holds how voxel noise and facets change as the surface slides along itself, which tells
     nothing of how it slides.
@@ -33,16 +34,22 @@ class SurfaceResiduals:
     places: NDArray[np.float64]
     normals: NDArray[np.float64]
     material: NDArray[np.float64]
+    shrinkage: NDArray[np.float64]
     jacobian: sparse.csr_matrix[np.float64]
     normal_jacobian: sparse.csr_matrix[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class ImagePointUse:
-    """Which image points are used, kept (n_i,), and the voxels' terraces (n_i,) mm^4 on the model's surface there."""
+class Correspondence:
+    """What is held while one objective is minimised: of the image points n_i, and of the surface's vertices.
+
+    kept (n_i,): the image points in use; terraces (n_i,) mm^4: the voxels' on the model's surface there; shrinkage
+    (n_vertices,) mm: how much further the maps' smoothing draws in the deformed surface than the one at rest.
+    """
 
     kept: NDArray[np.bool_]
     terraces: NDArray[np.float64]
+    shrinkage: NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,39 +62,62 @@ class _Closest:
 
 
 def surface_residuals(
-    target: SurfaceTarget, displacement: NDArray[np.float64], kept: NDArray[np.bool_]
+    target: SurfaceTarget, displacement: NDArray[np.float64], held: Correspondence
 ) -> SurfaceResiduals:
     """Residuals and their exact derivative at a displacement (n_vertices, 3) mm of the surface's points.
 
-    model -> image: r = d_after(x + u) - d_before(x) at quadrature points of the observed triangles;
-    image -> model: r = s(y) - (d_before(X) - level), where s is the signed distance of the closest model point
-    x = X + u(X) from the image point y, positive when the model lies outside. `kept` (n_i,) marks the image points to
-    use, from `image_point_use`: it is held while one objective is minimised.
+    model -> image: r = d_after(x + u) - d_before(x) - b(x)        at quadrature points of the observed triangles;
+    image -> model: r = s(y) - (d_before(X) - level) - b(X)        where s is the signed distance of the closest model
+    point x = X + u(X) from the image point y, positive when the model lies outside; b is `held.shrinkage`.
     """
-    forward = _model_to_image(target, displacement)
-    backward = _image_to_model(target, displacement, kept)
+    forward = _model_to_image(target, displacement, held.shrinkage)
+    backward = _image_to_model(target, displacement, held)
     return SurfaceResiduals(
         np.concatenate([forward.values, backward.values]),
         np.concatenate([forward.weights, backward.weights]),
         np.concatenate([forward.places, backward.places]),
         np.concatenate([forward.normals, backward.normals]),
         np.concatenate([forward.material, backward.material]),
+        np.concatenate([forward.shrinkage, backward.shrinkage]),
         sparse.vstack([forward.jacobian, backward.jacobian], format="csr"),
         sparse.vstack([forward.normal_jacobian, backward.normal_jacobian], format="csr"),
     )
 
 
-def image_point_use(target: SurfaceTarget, displacement: NDArray[np.float64]) -> ImagePointUse:
-    """Use of the image points at a displacement (n_vertices, 3) mm: those that face the observed part, not its rim."""
+def correspondence(target: SurfaceTarget, displacement: NDArray[np.float64]) -> Correspondence:
+    """Of a displacement (n_vertices, 3) mm: the image points that face the observed part, not its rim; the shrinkage.
+
+    A Gaussian of width sigma moves the half level of an indicator by sigma^2 H towards the inside, H the surface's mean
+    curvature (its heat flow for a time sigma^2 / 2; Merriman, Bence & Osher 1994), so that the difference to the rest
+    state holds b = sigma_after^2 H(x) - sigma_before^2 H(X). Beside parts that are not observed, where the image's cut
+    makes edges, and where the surface is open, there is none.
+    """
     closest = _closest(target, displacement, target.image_points)
     surface = target.surface
     at_rim = np.any((closest.barycentric < ON_EDGE) & surface.rim[closest.triangle], axis=1)
     corners = surface.triangles[closest.triangle]
     normals = _smooth_normals(surface.rest + displacement, surface.triangles, corners, closest.barycentric)
-    return ImagePointUse(surface.observed[closest.triangle] & ~at_rim, target.terraces_along(normals))
+    kept = surface.observed[closest.triangle] & ~at_rim
+    return Correspondence(kept, target.terraces_along(normals), _shrinkage(target, displacement))
 
 
-def _model_to_image(target: SurfaceTarget, displacement: NDArray[np.float64]) -> SurfaceResiduals:
+def _shrinkage(target: SurfaceTarget, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+    surface = target.surface
+    if target.voxels is None:
+        return np.zeros(len(surface.rest))
+    before, after = (
+        distance.smoothing_mm**2 * mean_curvature(vertices, surface.triangles)
+        for distance, vertices in zip(target.voxels, (surface.rest, surface.rest + displacement), strict=True)
+    )
+    shrinkage = after - before
+    shrinkage[np.unique(surface.triangles[~surface.observed])] = 0.0
+    shrinkage[np.array(igl.is_border_vertex(np.ascontiguousarray(surface.triangles)))] = 0.0
+    return np.asarray(shrinkage)
+
+
+def _model_to_image(
+    target: SurfaceTarget, displacement: NDArray[np.float64], shrinkage: NDArray[np.float64]
+) -> SurfaceResiduals:
     surface = target.surface
     corners = surface.triangles[target.triangle]
     # (n_q, 1, 3 corners) x (n_q, 3 corners, 3 axes) -> (n_q, 1, 3 axes)
@@ -96,7 +126,8 @@ def _model_to_image(target: SurfaceTarget, displacement: NDArray[np.float64]) ->
         for vertices in (surface.rest, surface.rest + displacement)
     )
     gradient = target.after.gradient_at(places)
-    values = target.after.at(places) - target.rest_distance
+    drawn_in = np.einsum("qk,qk->q", target.barycentric, shrinkage[corners])
+    values = target.after.at(places) - target.rest_distance - drawn_in
     rows = target.barycentric[:, :, None] * gradient[:, None]
     normals = _smooth_normals(surface.rest + displacement, surface.triangles, corners, target.barycentric)
     slope = np.einsum("qa,qa->q", gradient, normals)
@@ -104,13 +135,11 @@ def _model_to_image(target: SurfaceTarget, displacement: NDArray[np.float64]) ->
     weights = 0.5 * target.area / target.area.sum()
     n = len(surface.rest)
     exact, normal = _sparse_rows(rows, corners, n), _sparse_rows(smooth, corners, n)
-    return SurfaceResiduals(values, weights, places, normals, material, exact, normal)
+    return SurfaceResiduals(values, weights, places, normals, material, drawn_in, exact, normal)
 
 
-def _image_to_model(
-    target: SurfaceTarget, displacement: NDArray[np.float64], kept: NDArray[np.bool_]
-) -> SurfaceResiduals:
-    surface = target.surface
+def _image_to_model(target: SurfaceTarget, displacement: NDArray[np.float64], held: Correspondence) -> SurfaceResiduals:
+    surface, kept = target.surface, held.kept
     image = target.image_points[kept]
     closest = _closest(target, displacement, image)
     corners = surface.triangles[closest.triangle]
@@ -123,15 +152,18 @@ def _image_to_model(
     direction = np.where(length[:, None] > 1e-9, side[:, None] * offset / np.maximum(length, 1e-30)[:, None], normal)
     rest = surface.rest[corners]
     material = (closest.barycentric[:, None] @ rest)[:, 0]
-    values = side * length - (target.before.at(material) - target.level)
+    shrinkage = held.shrinkage[corners]
+    drawn_in = np.einsum("nk,nk->n", closest.barycentric, shrinkage)
+    values = side * length - (target.before.at(material) - target.level) - drawn_in
     rows = closest.barycentric[:, :, None] * direction[:, None]
-    rows += _slide(closest, deformed, offset, target.before.gradient_at(material), rest)
+    at_corners = (rest @ target.before.gradient_at(material)[:, :, None])[:, :, 0] + shrinkage
+    rows += _slide(closest, deformed, offset, at_corners)
     normals = _smooth_normals(surface.rest + displacement, surface.triangles, corners, closest.barycentric)
     smooth = closest.barycentric[:, :, None] * normals[:, None]
     weights = 0.5 * target.image_area[kept] / max(target.image_area[kept].sum(), 1e-30)
     n = len(surface.rest)
     exact, plane = _sparse_rows(rows, corners, n), _sparse_rows(smooth, corners, n)
-    return SurfaceResiduals(values, weights, closest.places, normals, material, exact, plane)
+    return SurfaceResiduals(values, weights, closest.places, normals, material, drawn_in, exact, plane)
 
 
 def _smooth_normals(
@@ -149,12 +181,12 @@ def _slide(
     closest: _Closest,
     deformed: NDArray[np.float64],
     offset: NDArray[np.float64],
-    slope: NDArray[np.float64],
-    rest: NDArray[np.float64],
+    at_corners: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Derivative (n, 3 corners, 3 axes) of -d_before at the closest material point, which slides as the model moves.
+    """Derivative (n, 3 corners, 3 axes) of -d_before - b at the closest material point, which slides with the model.
 
-    With tangents t_i, Gram matrix G_ij = t_i . t_j and the closest-point condition (x - y) . t_i = 0:
+    at_corners (n, 3): d_before + b to first order at its triangle's corners, up to a constant, mm. With tangents t_i,
+    Gram matrix G_ij = t_i . t_j and the closest-point condition (x - y) . t_i = 0:
     G_ij d xi_j = -(t_i . sum_a N_a du_a + (x - y) . d t_i), on an edge with its one tangent, at a corner not at all.
     """
     along = _free_directions(closest.barycentric)
@@ -162,7 +194,7 @@ def _slide(
     gram = tangent @ tangent.transpose(0, 2, 1)
     still = ~np.any(along != 0.0, axis=2)
     gram[:, [0, 1], [0, 1]] += still
-    change = along @ (rest @ slope[:, :, None])
+    change = along @ at_corners[:, :, None]
     rate = np.linalg.solve(gram, change).transpose(0, 2, 1)  # (n, 1, 2)
     rows = closest.barycentric[:, :, None] * (rate @ tangent)
     return np.asarray(rows + (rate @ along).transpose(0, 2, 1) * offset[:, None])
