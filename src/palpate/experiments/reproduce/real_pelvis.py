@@ -24,7 +24,7 @@ __all__ = ["ORGANS", "RealPelvis", "grid_within", "real_pelvis"]
 ORGANS = ("prostate", "bladder")
 DRIVER = "rectum"
 SHIFT = 0.5  # of a voxel: a random grid's place
-LENGTH_MM = 22.0  # of the filling along the rectum (Gaussian): a short one hardly moves a prostate 9 mm away
+LENGTH_MM = 35.0  # of the filling along the rectum (Gaussian): a short one hardly moves a prostate 9 mm away
 
 
 @dataclass(frozen=True, slots=True)

@@ -50,7 +50,7 @@ __all__ = ["SURROUNDINGS_KPA", "Table2Settings", "table2"]
 
 Array = NDArray[np.float64]
 
-SURROUNDINGS_KPA = 50.0  # the paper states none; stiffer organs than some ten times it would say nothing of themselves
+SURROUNDINGS_KPA = 100.0  # the paper states none; organs some ten times as stiff would say nothing of themselves
 ELEMENT = "auto"  # of the truth, too
 OUTER = "sliding"  # the scan ends in the prostate: a border that held it would leave the rectum little to move
 
@@ -60,7 +60,7 @@ NOTES = (
     "As in the paper the scene is prostate, bladder, a hollow rectum and a box; bones are part of the surroundings.",
     "The wall's motion is given in all columns but the voxels', as in the paper.",
     "voxels: 1 mm, on one of several grids shifted at random; all is made from the labels, the wall's motion too.",
-    "voxels: two later images, in one of which the rectum is emptier than in the first.",
+    "voxels: three later images; the rectum is emptier than in the first in one, and fuller in two.",
     "paper_method: its Eq. 4 on linear tetrahedra, L-BFGS, data of its own mesh.",
     "paper_method_other_mesh: the same on the data of the column other_mesh.",
 )
@@ -70,14 +70,15 @@ NOTES = (
 class Table2Settings:
     """Edges of the inverting and of the truth's mesh (mm), moduli (kPa), random grids, modes of the wall.
 
-    shares: of the filling, in the later images of the voxel column; the other columns have the whole filling.
+    filling_mm: of the rectum, 12 to 14 mm in radius at rest; below zero it empties. shares: of it in the later images
+    of the voxel column; the other columns have the whole.
     """
 
     edge_mm: float = 7.5
     truth_edge_mm: float = 6.0
     voxel_mm: float = 1.0
-    filling_mm: float = 7.5
-    shares: tuple[float, ...] = (1.0, -0.5)
+    filling_mm: float = -7.5
+    shares: tuple[float, ...] = (1.0, -0.5, -0.6)
     moduli_kpa: tuple[float, ...] = tuple(PAPER_TABLE2)
     positions: int = 4
     driver: DriverMotion = field(default_factory=DriverMotion)
