@@ -85,7 +85,7 @@ def _error(line: Linearisation, before: Segmentation, after: Segmentation, smoot
         for image in (before, after)
     ]
     n = len(rest)
-    return np.asarray(maps[1].at(line.residuals.places[:n]) - maps[0].at(rest) - line.residuals.shrinkage[:n])
+    return np.asarray(maps[1].at(line.residuals.places[:n]) - maps[0].at(rest) - line.residuals.excess[:n])
 
 
 def _imaged(

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from palpate.mesh.surface import mean_curvature, vertex_normals
+from palpate.mesh.surface import mean_curvature, triangle_normals, vertex_normals
+from palpate.observation.observed_surface import ObservedSurface
 from palpate.observation.target import SurfaceTarget
 
 __all__ = ["Correspondence", "SurfaceResiduals", "correspondence", "surface_residuals"]
@@ -22,8 +23,8 @@ class SurfaceResiduals:
     """Residuals of one surface, model -> image first, then image -> model.
 
     values (n,) mm; weights (n,) dimensionless, 1/2 in total for each direction; places (n, 3) mm and normals (n, 3) of
-    the deformed surface, and where these places are at rest, material (n, 3) mm; shrinkage (n,) mm, what was subtracted
-    for the smoothing of the maps (see `Correspondence`); jacobian (n, 3 n_vertices)
+    the deformed surface, and where these places are at rest, material (n, 3) mm; excess (n,) mm, what was subtracted
+    for maps and facets (see `Correspondence`); jacobian (n, 3 n_vertices)
     d values / d displacement of the surface's points; normal_jacobian: the same for a smooth surface without noise,
     n . du. The exact one also holds how voxel noise and facets change as the surface slides along itself, which tells
     nothing of how it slides.
@@ -34,7 +35,7 @@ class SurfaceResiduals:
     places: NDArray[np.float64]
     normals: NDArray[np.float64]
     material: NDArray[np.float64]
-    shrinkage: NDArray[np.float64]
+    excess: NDArray[np.float64]
     jacobian: sparse.csr_matrix[np.float64]
     normal_jacobian: sparse.csr_matrix[np.float64]
 
@@ -43,13 +44,13 @@ class SurfaceResiduals:
 class Correspondence:
     """What is held while one objective is minimised: of the image points n_i, and of the surface's vertices.
 
-    kept (n_i,): the image points in use; terraces (n_i,) mm^4: the voxels' on the model's surface there; shrinkage
-    (n_vertices,) mm: how much further the maps' smoothing draws in the deformed surface than the one at rest.
+    kept (n_i,): the image points in use; terraces (n_i,) mm^4: the voxels' on the model's surface there; excess
+    (n_vertices,) mm: the residual of a perfect fit, which the maps' smoothing and the surface's plane pieces leave.
     """
 
     kept: NDArray[np.bool_]
     terraces: NDArray[np.float64]
-    shrinkage: NDArray[np.float64]
+    excess: NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,9 +69,9 @@ def surface_residuals(
 
     model -> image: r = d_after(x + u) - d_before(x) - b(x)        at quadrature points of the observed triangles;
     image -> model: r = s(y) - (d_before(X) - level) - b(X)        where s is the signed distance of the closest model
-    point x = X + u(X) from the image point y, positive when the model lies outside; b is `held.shrinkage`.
+    point x = X + u(X) from the image point y, positive when the model lies outside; b is `held.excess`.
     """
-    forward = _model_to_image(target, displacement, held.shrinkage)
+    forward = _model_to_image(target, displacement, held.excess)
     backward = _image_to_model(target, displacement, held)
     return SurfaceResiduals(
         np.concatenate([forward.values, backward.values]),
@@ -78,36 +79,40 @@ def surface_residuals(
         np.concatenate([forward.places, backward.places]),
         np.concatenate([forward.normals, backward.normals]),
         np.concatenate([forward.material, backward.material]),
-        np.concatenate([forward.shrinkage, backward.shrinkage]),
+        np.concatenate([forward.excess, backward.excess]),
         sparse.vstack([forward.jacobian, backward.jacobian], format="csr"),
         sparse.vstack([forward.normal_jacobian, backward.normal_jacobian], format="csr"),
     )
 
 
 def correspondence(target: SurfaceTarget, displacement: NDArray[np.float64]) -> Correspondence:
-    """Of a displacement (n_vertices, 3) mm: the image points that face the observed part, not its rim; the shrinkage.
-
-    A Gaussian of width sigma moves the half level of an indicator by sigma^2 H towards the inside, H the surface's mean
-    curvature (its heat flow for a time sigma^2 / 2; Merriman, Bence & Osher 1994), so that the difference to the rest
-    state holds b = sigma_after^2 H(x) - sigma_before^2 H(X). Beside parts that are not observed, where the image's cut
-    makes edges, and where the surface is open, there is none.
-    """
+    """Of a displacement (n_vertices, 3) mm: the image points that face the observed part, not its rim; the excess."""
     closest = _closest(target, displacement, target.image_points)
     surface = target.surface
     at_rim = np.any((closest.barycentric < ON_EDGE) & surface.rim[closest.triangle], axis=1)
     corners = surface.triangles[closest.triangle]
     normals = _smooth_normals(surface.rest + displacement, surface.triangles, corners, closest.barycentric)
     kept = surface.observed[closest.triangle] & ~at_rim
-    return Correspondence(kept, target.terraces_along(normals), _shrinkage(target, displacement))
-
-
-def _shrinkage(target: SurfaceTarget, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
-    surface = target.surface
     if target.voxels is None:
-        return np.zeros(len(surface.rest))
+        excess = np.zeros(len(surface.rest))
+    else:
+        widths = tuple(distance.smoothing_mm for distance in target.voxels)
+        excess = _shrinkage(surface, displacement, widths) - _bulge(surface, displacement)
+    return Correspondence(kept, target.terraces_along(normals), excess)
+
+
+def _shrinkage(
+    surface: ObservedSurface, displacement: NDArray[np.float64], widths: tuple[float, ...]
+) -> NDArray[np.float64]:
+    """How much further smoothing draws in the deformed surface than the one at rest, (n_vertices,) mm.
+
+    A Gaussian of width sigma moves the half level of an indicator by sigma^2 H towards the inside, H the surface's mean
+    curvature (its heat flow for a time sigma^2 / 2; Merriman, Bence & Osher 1994): sigma_after^2 H(x) - sigma_before^2
+    H(X). None beside parts that are not observed, where the image's cut makes edges, nor where the surface is open.
+    """
     before, after = (
-        distance.smoothing_mm**2 * mean_curvature(vertices, surface.triangles)
-        for distance, vertices in zip(target.voxels, (surface.rest, surface.rest + displacement), strict=True)
+        width**2 * mean_curvature(vertices, surface.triangles)
+        for width, vertices in zip(widths, (surface.rest, surface.rest + displacement), strict=True)
     )
     shrinkage = after - before
     shrinkage[np.unique(surface.triangles[~surface.observed])] = 0.0
@@ -115,8 +120,25 @@ def _shrinkage(target: SurfaceTarget, displacement: NDArray[np.float64]) -> NDAr
     return np.asarray(shrinkage)
 
 
+def _bulge(surface: ObservedSurface, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How far quadratic faces bulge beyond their four plane triangles, (n_vertices,) mm, shared out by area.
+
+    On a triangle with the edges e a quadratic map differs from its linear interpolant by -1/2 sum_e b_i b_j D_e, D_e
+    its second derivative along e, in the mean by -1/24 sum_e D_e; D_01 = x_0 - 2 x_3 + x_1 for each of the four.
+    """
+    vertices = surface.rest + displacement
+    nodes = vertices[surface.faces]  # (n_faces, 6, 3)
+    bend = (2.0 * nodes[:, :3] - 2.0 * nodes[:, 3:]).sum(axis=1) / 24.0
+    triangles = surface.triangles
+    vectors = triangle_normals(vertices, triangles)
+    areas = np.linalg.norm(vectors, axis=1)
+    beyond = -np.einsum("ta,ta->t", np.repeat(bend, 4, axis=0), vectors[: 4 * len(bend)])  # mm^3
+    volumes = np.bincount(triangles[: 4 * len(bend)].ravel(), np.repeat(beyond, 3), len(vertices))
+    return np.asarray(volumes / np.bincount(triangles.ravel(), np.repeat(areas, 3), len(vertices)))
+
+
 def _model_to_image(
-    target: SurfaceTarget, displacement: NDArray[np.float64], shrinkage: NDArray[np.float64]
+    target: SurfaceTarget, displacement: NDArray[np.float64], at_vertices: NDArray[np.float64]
 ) -> SurfaceResiduals:
     surface = target.surface
     corners = surface.triangles[target.triangle]
@@ -126,8 +148,8 @@ def _model_to_image(
         for vertices in (surface.rest, surface.rest + displacement)
     )
     gradient = target.after.gradient_at(places)
-    drawn_in = np.einsum("qk,qk->q", target.barycentric, shrinkage[corners])
-    values = target.after.at(places) - target.rest_distance - drawn_in
+    excess = np.einsum("qk,qk->q", target.barycentric, at_vertices[corners])
+    values = target.after.at(places) - target.rest_distance - excess
     rows = target.barycentric[:, :, None] * gradient[:, None]
     normals = _smooth_normals(surface.rest + displacement, surface.triangles, corners, target.barycentric)
     slope = np.einsum("qa,qa->q", gradient, normals)
@@ -135,7 +157,7 @@ def _model_to_image(
     weights = 0.5 * target.area / target.area.sum()
     n = len(surface.rest)
     exact, normal = _sparse_rows(rows, corners, n), _sparse_rows(smooth, corners, n)
-    return SurfaceResiduals(values, weights, places, normals, material, drawn_in, exact, normal)
+    return SurfaceResiduals(values, weights, places, normals, material, excess, exact, normal)
 
 
 def _image_to_model(target: SurfaceTarget, displacement: NDArray[np.float64], held: Correspondence) -> SurfaceResiduals:
@@ -152,18 +174,18 @@ def _image_to_model(target: SurfaceTarget, displacement: NDArray[np.float64], he
     direction = np.where(length[:, None] > 1e-9, side[:, None] * offset / np.maximum(length, 1e-30)[:, None], normal)
     rest = surface.rest[corners]
     material = (closest.barycentric[:, None] @ rest)[:, 0]
-    shrinkage = held.shrinkage[corners]
-    drawn_in = np.einsum("nk,nk->n", closest.barycentric, shrinkage)
-    values = side * length - (target.before.at(material) - target.level) - drawn_in
+    at_vertices = held.excess[corners]
+    excess = np.einsum("nk,nk->n", closest.barycentric, at_vertices)
+    values = side * length - (target.before.at(material) - target.level) - excess
     rows = closest.barycentric[:, :, None] * direction[:, None]
-    at_corners = (rest @ target.before.gradient_at(material)[:, :, None])[:, :, 0] + shrinkage
+    at_corners = (rest @ target.before.gradient_at(material)[:, :, None])[:, :, 0] + at_vertices
     rows += _slide(closest, deformed, offset, at_corners)
     normals = _smooth_normals(surface.rest + displacement, surface.triangles, corners, closest.barycentric)
     smooth = closest.barycentric[:, :, None] * normals[:, None]
     weights = 0.5 * target.image_area[kept] / max(target.image_area[kept].sum(), 1e-30)
     n = len(surface.rest)
     exact, plane = _sparse_rows(rows, corners, n), _sparse_rows(smooth, corners, n)
-    return SurfaceResiduals(values, weights, closest.places, normals, material, drawn_in, exact, plane)
+    return SurfaceResiduals(values, weights, closest.places, normals, material, excess, exact, plane)
 
 
 def _smooth_normals(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,8 @@ class ObservedSurface:
     points (n_vertices,) numbers of its points in the space; rest (n_vertices, 3) mm; triangles (n_triangles, 3) into
     `points`, normals out of the tissue; observed (n_triangles,) is False where the tissue touches a driver, a bone or
     the cut of the image; rim (n_triangles, 3) marks edges (opposite each corner) where the observed part ends;
-    share of the area that is observed.
+    share of the area that is observed; faces (n_faces, 6): the vertices of each face that its four triangles stand for,
+    corners and then the middles of the edges 01, 12, 20; none where faces are plane.
     """
 
     tissue: int
@@ -37,6 +38,7 @@ class ObservedSurface:
     observed: NDArray[np.bool_]
     rim: NDArray[np.bool_]
     share: float
+    faces: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 6), dtype=np.int64))
 
     @property
     def dofs(self) -> NDArray[np.int64]:
@@ -66,7 +68,8 @@ def observed_surface(space: LagrangeSpace, tissue: int) -> ObservedSurface:
             f"'{name}': only {100 * share:.0f} % of its surface is free of drivers, bones and the image's border, so"
             " its modulus cannot be observed; enlarge the image, or make the tissue `known`"
         )
-    return ObservedSurface(tissue, name, points, rest, triangles, observed, _rim(triangles, observed), share)
+    faces = np.searchsorted(points, facets if space.order == 2 else np.zeros((0, 6), dtype=np.int64))
+    return ObservedSurface(tissue, name, points, rest, triangles, observed, _rim(triangles, observed), share, faces)
 
 
 def _observable(role: Role, other: NDArray[np.int64], roles: list[Role]) -> NDArray[np.bool_]:
