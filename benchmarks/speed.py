@@ -30,7 +30,7 @@ from palpate.inversion.posterior import sandwich_covariance
 from palpate.inversion.problem import InverseProblem, Inversion, InversionSettings
 from palpate.inversion.sampling import sample_posterior
 from palpate.inversion.surrogate import first_surrogate, with_modulus_series
-from palpate.inversion.weighting import FIRST_LAW, objective_of
+from palpate.inversion.weighting import SEGMENTATION_LAW, objective_of
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import linear_model
 from palpate.mechanics.solvers.registry import SOLVERS
@@ -216,7 +216,7 @@ def _gradient(sizes: Sizes, seed: int, say: Say) -> dict[str, object]:
         return with_modulus_series(first_surrogate(model, middle), coefficients, mapping.columns)
 
     offline_s, surrogate = timed(offline)
-    objective = objective_of(problem, (surrogate.reduced,), FIRST_LAW)
+    objective = objective_of(problem, (surrogate.reduced,), SEGMENTATION_LAW)
     theta = np.log(moduli[mapping.columns] / mapping.scale_kpa)
     unknowns = np.concatenate([theta, coefficients])
     objective = objective.with_fresh_correspondence(unknowns)

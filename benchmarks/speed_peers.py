@@ -18,7 +18,7 @@ from scipy.sparse.linalg import splu
 from palpate.inversion.objective import Objective
 from palpate.inversion.problem import InverseProblem, InversionSettings
 from palpate.inversion.surrogate import Surrogate
-from palpate.inversion.weighting import FIRST_LAW, objective_of
+from palpate.inversion.weighting import SEGMENTATION_LAW, objective_of
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.observation.misfit import surface_residuals
 
@@ -172,7 +172,7 @@ def finite_difference_lm(problem: InverseProblem, settings: InversionSettings) -
     n_dof = 3 * len(model.space.points)
     flat = np.zeros((n_dof, model.n_regions + n_modes))
     rest = FirstOrderModel(model.names, mapping.base, np.zeros(n_modes), np.zeros(n_dof), flat)
-    objective = objective_of(problem, (rest,), FIRST_LAW)
+    objective = objective_of(problem, (rest,), SEGMENTATION_LAW)
     objective = objective.with_fresh_correspondence(np.zeros(n + n_modes))
     kept: dict[bytes, object] = {}
 

@@ -9,7 +9,7 @@ import pytest
 
 from palpate.inversion.directions import deciding_directions
 from palpate.inversion.surrogate import SERIES, enriched, first_surrogate, sharpened, with_modulus_series, with_offset
-from palpate.inversion.weighting import FIRST_LAW, objective_of
+from palpate.inversion.weighting import SEGMENTATION_LAW, objective_of
 from palpate.mechanics.linear_model import with_constraint
 
 
@@ -71,7 +71,7 @@ def test_what_it_cost_adds_up(first, twin):
 
 def directions_at(surrogate, twin, exact):
     """The deciding directions at the truth, with the evaluation that they come from."""
-    objective = objective_of(exact, (surrogate.reduced,), FIRST_LAW).with_fresh_correspondence(twin.unknowns)
+    objective = objective_of(exact, (surrogate.reduced,), SEGMENTATION_LAW).with_fresh_correspondence(twin.unknowns)
     evaluation = objective(twin.unknowns)
     return deciding_directions(objective, evaluation)[0], evaluation
 

@@ -8,7 +8,7 @@ import pytest
 from palpate.images.distance import distance_map
 from palpate.images.label_image import VoxelGrid
 from palpate.inversion.surrogate import first_surrogate
-from palpate.inversion.weighting import FIRST_LAW, first_law, objective_of
+from palpate.inversion.weighting import SEGMENTATION_LAW, first_law, objective_of
 
 
 def test_surfaces_count_by_their_area(voxels):
@@ -21,7 +21,7 @@ def test_surfaces_count_by_their_area(voxels):
 
 
 def test_without_voxels_the_first_law_is_that_of_unknown_segmentations(exact):
-    assert first_law(exact) is FIRST_LAW
+    assert first_law(exact) is SEGMENTATION_LAW
 
 
 def test_the_first_law_is_what_rounding_leaves_of_a_plane(voxels):

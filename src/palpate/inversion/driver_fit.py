@@ -14,7 +14,7 @@ from palpate.inversion.gauss_newton import Bounds
 from palpate.inversion.minima import driven
 from palpate.inversion.problem import InverseProblem, LocalModel
 from palpate.inversion.surrogate import first_surrogate
-from palpate.inversion.weighting import FIRST_LAW, objective_of
+from palpate.inversion.weighting import SEGMENTATION_LAW, objective_of
 from palpate.mechanics.equilibrium import from_linear
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
 from palpate.mechanics.first_order import expanded
@@ -56,7 +56,7 @@ def _fitted(
     """Mode coefficients of each state that bring the walls to the images, from given ones, all in one row."""
     n = len(held.modulus_map.tissues)
     bounds = Bounds(np.full(n, -1.0), np.full(n, 1.0))
-    objective = objective_of(held, models, FIRST_LAW)
+    objective = objective_of(held, models, SEGMENTATION_LAW)
     unknowns = np.concatenate([np.zeros(n), coefficients])
     objective = objective.with_fresh_correspondence(unknowns)
     first = driven(objective, unknowns[:n], bounds=bounds, coefficients=coefficients)

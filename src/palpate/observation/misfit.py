@@ -93,7 +93,7 @@ def correspondence(target: SurfaceTarget, displacement: NDArray[np.float64]) -> 
     corners = surface.triangles[closest.triangle]
     normals = _smooth_normals(surface.rest + displacement, surface.triangles, corners, closest.barycentric)
     kept = surface.observed[closest.triangle] & ~at_rim
-    if target.voxels is None:
+    if target.voxels is None:  # exact maps: nothing is smoothed, and they are made of plane pieces themselves
         excess = np.zeros(len(surface.rest))
     else:
         widths = tuple(distance.smoothing_mm for distance in target.voxels)

@@ -10,7 +10,7 @@ import numpy as np
 from palpate.errors import ConfigurationError, ResourceError
 from palpate.images.alignment import RigidMotion, align, moved
 from palpate.images.checks import Finding, check_images
-from palpate.images.distance import observation_width, smoothing_width
+from palpate.images.distance import DistanceMap, observation_width, smoothing_width
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.images.tissue_distance import tissue_distance_map
@@ -37,7 +37,16 @@ from palpate.study.case_loads import case_loads
 from palpate.study.contacts import every_finding
 from palpate.study.refusals import refuse_lost, refuse_unmeshable
 
-__all__ = ["Body", "ImagedStates", "aligned", "case_domain", "inverse_problem", "joint_problem", "make_body"]
+__all__ = [
+    "Body",
+    "ImagedStates",
+    "aligned",
+    "case_domain",
+    "inverse_problem",
+    "joint_problem",
+    "make_body",
+    "surface_targets",
+]
 
 THIN_VOXELS = 4
 STATED = ("motion-below-noise", "sides-exchanged")  # findings on contacts stand in the result as observed shares
@@ -142,7 +151,7 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Callable[[str
 
     All bodies have the same tissues in the same order. Raises as `inverse_problem` does.
     """
-    targets = tuple(target for body in bodies for target in _targets(body))
+    targets = tuple(target for body in bodies for target in surface_targets(body))
     progress("assembling one stiffness matrix a tissue")
     pairs = [pair for body in bodies for pair in _models(body, case)]
     models = tuple(model for model, _ in pairs)
@@ -155,12 +164,22 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Callable[[str
     return InverseProblem(models, targets, mapping, estimated, finite, walls=walls)
 
 
-def _targets(body: Body) -> tuple[tuple[SurfaceTarget, ...], ...]:
-    """The observed surfaces of each later image."""
+def surface_targets(
+    body: Body, surfaces: Sequence[ObservedSurface] | None = None
+) -> tuple[tuple[SurfaceTarget, ...], ...]:
+    """The observed surfaces of each later image; `surfaces` None: of all `estimate` tissues and drivers."""
     tissues = body.space.mesh.tissues
     observed = [i for i, tissue in enumerate(tissues) if tissue.role in (Role.ESTIMATE, Role.DRIVER)]
-    surfaces = [observed_surface(body.space, tissue) for tissue in observed]
-    return tuple(tuple(_target(body, surface, image) for surface in surfaces) for image in body.states.after)
+    seen = [observed_surface(body.space, i) for i in observed] if surfaces is None else surfaces
+
+    def maps(image: Segmentation) -> list[DistanceMap]:
+        """The distance map of each surface's tissue."""
+        return [tissue_distance_map(image, s.tissue, smoothing_mm=body.smoothing_mm) for s in seen]
+
+    before = maps(body.states.before)
+    return tuple(
+        tuple(surface_target(*of) for of in zip(seen, before, maps(image), strict=True)) for image in body.states.after
+    )
 
 
 def _models(body: Body, case: Case) -> list[tuple[LinearModel, tuple[Wall, ...]]]:
@@ -228,14 +247,6 @@ def _refuse_rest(models: tuple[LinearModel, ...], case: Case) -> None:
             'nothing moves this body: no tissue has role = "driver" and no `rigid` tissue moves between the images, so'
             " no modulus can be estimated; give the role driver to the hollow organ whose wall deforms the others"
         )
-
-
-def _target(body: Body, surface: ObservedSurface, image: Segmentation) -> SurfaceTarget:
-    maps = [
-        tissue_distance_map(states, surface.tissue, smoothing_mm=body.smoothing_mm)
-        for states in (body.states.before, image)
-    ]
-    return surface_target(surface, *maps)
 
 
 def case_domain(before: Segmentation, after: Sequence[Segmentation], case: Case) -> Box:

@@ -9,10 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.experiments.reproduce.table import Entry
-from palpate.images.distance import DistanceMap
 from palpate.images.label_image import VoxelGrid
-from palpate.images.segmentation import Segmentation, segment
-from palpate.images.tissue_distance import tissue_distance_map
+from palpate.images.segmentation import segment
 from palpate.inversion.conclude import Observed, conclude
 from palpate.inversion.gauss_newton import Bounds
 from palpate.inversion.modulus_map import ModulusMap
@@ -20,8 +18,6 @@ from palpate.inversion.posterior import sandwich_covariance
 from palpate.inversion.problem import Inversion, InversionSettings
 from palpate.inversion.verdict import log_interval, verdict
 from palpate.mesh.space import LagrangeSpace
-from palpate.observation.observed_surface import ObservedSurface
-from palpate.observation.target import SurfaceTarget, surface_target
 from palpate.phantoms.scene import imaged
 from palpate.study.body import Body, ImagedStates, aligned
 from palpate.study.run import fitted_states
@@ -31,7 +27,6 @@ __all__ = [
     "entries_from_voxels",
     "from_half",
     "imaged_states",
-    "voxel_targets",
     "with_motions",
 ]
 
@@ -65,18 +60,6 @@ def with_motions(states: ImagedStates, space: LagrangeSpace, motions: Motions) -
     """The same rest state with the later states of other u (n_points, 3) mm."""
     before = states.before
     return replace(states, after=tuple(segment(imaged(space, u, before.grid), before.tissues) for u in motions))
-
-
-def voxel_targets(body: Body, surfaces: tuple[ObservedSurface, ...]) -> tuple[tuple[SurfaceTarget, ...], ...]:
-    """The surfaces of a body in each of its later images."""
-
-    def maps(image: Segmentation) -> dict[int, DistanceMap]:
-        """The distance maps of the observed tissues."""
-        return {s.tissue: tissue_distance_map(image, s.tissue, smoothing_mm=body.smoothing_mm) for s in surfaces}
-
-    before = maps(body.states.before)
-    later = [maps(image) for image in body.states.after]
-    return tuple(tuple(surface_target(s, before[s.tissue], after[s.tissue]) for s in surfaces) for after in later)
 
 
 def entries_from_surfaces(

@@ -166,6 +166,7 @@ def nominal_stress(stretch: float) -> float:
     lame, mu = lame_parameters(1.0, POISSON_RATIO)
 
     def side(t: float) -> float:
+        """Stress across the bar at a stretch t of its sides, by Young's modulus."""
         return float(mu * (t**2 - 1.0) + lame * np.log(stretch * t**2))
 
     across = float(brentq(side, 0.2, 2.0))

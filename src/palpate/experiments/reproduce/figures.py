@@ -37,6 +37,7 @@ def draw_table(table: Table, path: Path) -> None:
     bodies = list(dict.fromkeys(row.body for row in table.rows))
 
     def draw(figure: Figure) -> None:
+        """All panels."""
         panels = figure.subplots(1, len(bodies), sharey=True, squeeze=False)[0]
         for axes, body in zip(panels, bodies, strict=True):
             _errors(axes, [row for row in table.rows if row.body == body])
@@ -51,6 +52,7 @@ def draw_figure4(result: Figure4, path: Path) -> None:
     """Error against deformation, a panel a sphere, a line a modulus and law, into `path` (SVG); `ResourceError`."""
 
     def draw(figure: Figure) -> None:
+        """All panels."""
         panels = figure.subplots(1, len(BODIES), sharey=True)
         for axes, body in zip(panels, BODIES, strict=True):
             _lines(axes, result, body)
@@ -66,6 +68,7 @@ def draw_staging(result: Staging, path: Path) -> None:
     """Box plots of the estimates by stage, a panel an organ (the paper's figures 7 and 8), into `path` (SVG)."""
 
     def draw(figure: Figure) -> None:
+        """All panels."""
         panels = figure.subplots(1, len(result.organs))
         for axes, organ in zip(panels, result.organs, strict=True):
             _boxes(axes, result, organ)

@@ -65,6 +65,7 @@ def paper_estimate(
     evaluations = 0
 
     def phi(relative: Array) -> tuple[float, Array]:
+        """Eq. 4 of the paper (mm^2) and its gradient at moduli relative to the start's (n,)."""
         nonlocal evaluations
         evaluations += 1
         trial = moduli.copy()

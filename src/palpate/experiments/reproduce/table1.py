@@ -25,7 +25,6 @@ from palpate.experiments.reproduce.columns import (
     entries_from_voxels,
     from_half,
     imaged_states,
-    voxel_targets,
 )
 from palpate.experiments.reproduce.jobs import Job, Progress, compute
 from palpate.experiments.reproduce.ledger import Ledger
@@ -40,7 +39,7 @@ from palpate.mesh.space import LagrangeSpace
 from palpate.observation.observed_surface import observed_surface
 from palpate.observation.target import SurfaceTarget
 from palpate.phantoms.exact_targets import target_of_truth
-from palpate.study.body import make_body
+from palpate.study.body import make_body, surface_targets
 from palpate.study.case import Case, Mechanics, MeshSettings, Phantom
 
 __all__ = ["Table1Settings", "table1"]
@@ -200,7 +199,7 @@ class _Case:
         body = make_body(states, case, progress=progress)
         model = _pulled_by(_model(body.space), self.stress_kpa)
         surfaces = tuple(observed_surface(body.space, number) for number in range(len(BODIES)))
-        inversion, settings = self.inverted(model, voxel_targets(body, surfaces)[0], progress)
+        inversion, settings = self.inverted(model, surface_targets(body, surfaces)[0], progress)
         return entries_from_voxels(inversion, settings, body, self.truth, seed=self.seed)
 
     def inverted(

@@ -15,7 +15,6 @@ from palpate.experiments.reproduce.columns import (
     entries_from_voxels,
     from_half,
     imaged_states,
-    voxel_targets,
     with_motions,
 )
 from palpate.experiments.reproduce.jobs import Job, Progress, compute
@@ -43,7 +42,7 @@ from palpate.mesh.tetrahedralise import tetrahedralise
 from palpate.observation.observed_surface import observed_surface
 from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.phantoms.exact_targets import target_of_truth
-from palpate.study.body import Body, inverse_problem
+from palpate.study.body import Body, inverse_problem, surface_targets
 from palpate.study.case import Case, Domain, DriverMotion, Mechanics, MeshSettings, Phantom
 
 __all__ = ["SURROUNDINGS_KPA", "Table2Settings", "table2"]
@@ -255,7 +254,7 @@ class _Imaged:
 
     @cached_property
     def grid(self) -> VoxelGrid:
-        """Voxels over the box, shifted at random."""
+        """Voxels within the box, shifted at random."""
         rng = np.random.default_rng([self.bench.settings.seed, self.position])
         return grid_within(self.bench.pelvis.box, self.bench.settings.voxel_mm, rng)
 
@@ -301,7 +300,7 @@ class _Imaged:
         states = with_motions(self.body.states, self.bench.fine.space, self.later(kpa))
         body = replace(self.body, states=states)
         surfaces = tuple(target.surface for target in self.problem.targets[0])
-        problem = replace(self.problem, targets=voxel_targets(body, surfaces))
+        problem = replace(self.problem, targets=surface_targets(body, surfaces))
         truth = dict.fromkeys(ORGANS, kpa)
         settings = from_half(problem.modulus_map, truth)
         inversion = invert_with(problem, settings, self.surrogates, progress=progress)

@@ -60,6 +60,7 @@ class SuperluFactorisation:
         solution = np.empty_like(rhs)
 
         def solve_block(start: int) -> None:
+            """The columns from `start` on."""
             block = slice(start, start + BLOCK)
             ordered = np.asfortranarray(rhs[self._permutation, block])
             solution[self._permutation, block] = self._factors.solve(ordered)
