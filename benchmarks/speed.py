@@ -1,6 +1,6 @@
 """How fast: an estimate in forward solves, the online gradient beside its peers, the posterior, the cost by mesh size.
 
-    python benchmarks/speed.py [--parts linear,nonlinear,gradient,posterior,scaling] [--quick] [--json]
+    python benchmarks/speed.py [--parts linear,nonlinear,gradient,posterior,scaling,front_end] [--quick] [--json]
 
 The body is a simulated pelvis with prostate and bladder to estimate, seen through voxels, with 90 modes of the rectum's
 wall. What is compared is measured in one run, alternating. A peer that is not installed gives null; `make
@@ -10,9 +10,11 @@ benchmark-setup` installs them and PARDISO, with which alone the ratios count. S
 from __future__ import annotations
 
 import argparse
+import cProfile
 import functools
 import json
 import platform
+import pstats
 import resource
 import subprocess
 import sys
@@ -41,9 +43,9 @@ from palpate.phantoms.pelvis import PelvisOptions, pelvis, pelvis_anatomy
 from palpate.phantoms.scene import Scene
 from palpate.study.body import aligned, inverse_problem, make_body
 from palpate.study.case import Case, Mechanics, MeshSettings, Phantom
-from palpate.study.run import inversion_settings
+from palpate.study.run import estimate_states, inversion_settings
 
-PARTS = ("linear", "nonlinear", "gradient", "posterior", "scaling")
+PARTS = ("linear", "nonlinear", "gradient", "posterior", "scaling", "front_end")
 STARTS = (0.5, 1.0, 2.0, 4.0, 8.0)  # moduli to the surroundings'
 SCALING_EDGES = (9.0, 6.0, 4.0, 2.7, 1.85)  # mm: 30 k to 1 M unknowns
 
@@ -318,6 +320,58 @@ def _one_size(edge_mm: float, seed: int) -> dict[str, object]:
     }
 
 
+STAGES = {  # functions whose time, with all that they call, is a stage of its own
+    "images checked and aligned": ("body.py", "aligned"),
+    "level sets": ("anatomy.py", "anatomy_of"),
+    "tetrahedra cut": ("tetrahedralise.py", "_cut_grid"),
+    "tetrahedra remeshed": ("remeshing.py", "remeshed"),
+    "surfaces fitted, tetrahedra smoothed": ("tetrahedralise.py", "_fitted"),
+    "mesh gate": ("quality.py", "check_mesh"),
+    "distance maps and targets": ("body.py", "surface_targets"),
+    "wall modes": ("prescribed_motion.py", "prescribed_motion"),
+    "stiffness assembled": ("linear_model.py", "linear_model"),
+    "finite-strain model": ("finite_strain.py", "finite_strain_model"),
+    "responses and series": ("surrogate.py", "first_surrogate"),
+    "linear estimate": ("invert.py", "invert_with"),
+    "finite-strain estimate": ("continuation.py", "continued_at_finite_strain"),
+    "intervals and fits": ("conclude.py", "conclude"),
+}
+WITHIN = {  # parts of the stages above
+    "closest points": ("misfit.py", "_closest"),
+    "voxels of the model": ("voxelise.py", "voxelise"),
+    "noise law": ("noise.py", "fit_noise_law"),
+}
+
+
+def _front_end(sizes: Sizes, seed: int, say: Say) -> dict[str, object]:
+    """Where the time of a whole case goes, from label images in memory to intervals; under a profiler."""
+    scene = _scene(seed, "neo-hookean")
+    case = Case(f"speed-{seed}", phantom=Phantom("pelvis", seed), mesh=MeshSettings(sizes.nonlinear))
+    profile = cProfile.Profile()
+    profile.enable()
+    before, after = (segment(image, scene.tissues) for image in (scene.before, scene.after))
+    result = estimate_states(aligned(before, (after,), method="none"), case)
+    profile.disable()
+    known = pstats.Stats(profile)
+    total = known.total_tt  # type: ignore[attr-defined]
+    spent = {name: _cumulative(known, *of) for name, of in (STAGES | WITHIN).items()}
+    say(f"{total:.0f} s for {3 * len(result.space.points)} unknowns")
+    return {
+        "front_end": {
+            "dofs": 3 * len(result.space.points),
+            "total_s": total,
+            "shares": {name: spent[name] / total for name in STAGES},
+            "within": {name: spent[name] / total for name in WITHIN},
+        }
+    }
+
+
+def _cumulative(stats: pstats.Stats, file: str, function: str) -> float:
+    """Seconds in a function and what it calls."""
+    rows = stats.stats.items()  # type: ignore[attr-defined]
+    return float(sum(row[3] for (path, _, name), row in rows if name == function and Path(path).name == file))
+
+
 def _peak_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
@@ -328,6 +382,7 @@ PART = {
     "gradient": _gradient,
     "posterior": _posterior,
     "scaling": _scaling,
+    "front_end": _front_end,
 }
 
 if __name__ == "__main__":

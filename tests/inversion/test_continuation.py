@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from palpate.inversion.continuation import continued_at_finite_strain
+from palpate.inversion.directions import deciding_directions
 from palpate.inversion.invert import invert
 from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.laws.registry import law_named
@@ -43,6 +44,15 @@ def test_the_law_that_made_the_data_finds_the_moduli(twins, linear, continued):
     assert continued.minimum.outcome.converged
     assert continued.settled
     assert np.abs(continued.minimum.unknowns[:2] - twins.TRUTH).max() < 1e-3
+
+
+def test_the_derivatives_that_decide_the_moduli_are_those_of_the_equilibrium(body, continued):
+    """The other columns may be those of an earlier one."""
+    objective, unknowns = continued.objective, continued.minimum.unknowns
+    there = body[2].solve(objective.modulus_map.moduli(unknowns[:2]), unknowns[2:])
+    directions = deciding_directions(objective, continued.minimum.evaluation)[0]
+    exact, stated = there.tangent() @ directions, continued.surrogates[0].reduced.derivatives @ directions
+    assert np.linalg.norm(stated - exact, axis=0) == pytest.approx(0.0, abs=0.02 * np.linalg.norm(exact))
 
 
 def test_the_displacement_reported_is_an_equilibrium(body, continued):

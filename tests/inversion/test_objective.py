@@ -13,8 +13,10 @@ import pytest
 import palpate.inversion
 from palpate.inversion.objective import Objective, State, Weighting
 from palpate.inversion.surrogate import first_surrogate, with_modulus_series
+from palpate.inversion.tukey import Tukey
 from palpate.observation.misfit import Correspondence
 
+NO_OUTLIERS = Tukey()
 MEMBERS = ("__call__", "value", "n_parameters", "n_unknowns")
 
 
@@ -29,14 +31,14 @@ def everything(target):
     return Correspondence(np.ones(n, bool), np.zeros(n), np.zeros(len(target.surface.rest)))
 
 
-def objective_of(problem, *, cutoff=np.inf, precision=30.0) -> Objective:
+def objective_of(problem, *, loss=NO_OUTLIERS, precision=30.0) -> Objective:
     moduli = problem.modulus_map.moduli(np.zeros(2))
     states, weighting = [], []
     for model, targets in zip(problem.models, problem.targets, strict=True):
         reduced = surrogate_of(model, moduli, problem.modulus_map.columns)
         states.append(State(reduced.at(np.concatenate([t.surface.dofs for t in targets])), targets))
         every = [everything(t) for t in targets]
-        weighting.append(tuple(Weighting(precision, cutoff, use) for use in every))
+        weighting.append(tuple(Weighting(precision, loss, use) for use in every))
     return Objective(tuple(states), problem.modulus_map, tuple(weighting))
 
 
@@ -45,7 +47,7 @@ def one_image(twins, twin):
 
 
 def robust(twins, twin):
-    return objective_of(twins.voxel_problem(twin), cutoff=0.8)
+    return objective_of(twins.voxel_problem(twin), loss=Tukey(0.5, 0.3))
 
 
 def two_images(twins, twin):

@@ -8,7 +8,8 @@ import pytest
 from palpate.images.distance import distance_map
 from palpate.images.label_image import VoxelGrid
 from palpate.inversion.surrogate import first_surrogate
-from palpate.inversion.weighting import SEGMENTATION_LAW, first_law, objective_of
+from palpate.inversion.tukey import Tukey
+from palpate.inversion.weighting import SEGMENTATION_LAW, first_law, objective_of, robust_loss
 
 
 def test_surfaces_count_by_their_area(voxels):
@@ -42,3 +43,30 @@ def test_the_first_law_is_what_rounding_leaves_of_a_plane(voxels):
         errors.append(found[inner] - depth[inner])
     rounding = 2.0 * float(np.mean(np.concatenate(errors) ** 2))  # of both images
     assert rounding == pytest.approx(law.variances[0], rel=0.5)
+
+
+def test_terraces_that_flip_as_a_whole_are_no_outliers(voxels, rng):
+    """Surfaces along the grid that move by a fifth of a voxel: a fifth of them is seen one voxel further, the rest not.
+
+    The best motion is that fifth; with a cutoff by the quiet residuals alone it would be nearly zero.
+    """
+    target = voxels.targets[0][0]
+    edge = float(target.voxels[0].grid.spacing[0])
+    seen = np.where(rng.random(4000) < 0.2, edge, 0.0) + 0.03 * edge * rng.standard_normal(4000)
+
+    def fitted(loss):
+        motions = np.linspace(-0.2, 0.6, 161) * edge
+        return motions[np.argmin([loss.rho(motion - seen).mean() for motion in motions])]
+
+    loss = robust_loss(seen, target)
+    assert fitted(loss) == pytest.approx(seen.mean(), abs=0.01 * edge)
+    assert abs(fitted(Tukey(loss.cutoff))) < 0.02 * edge
+
+
+def test_what_no_voxel_explains_counts_nothing(voxels, rng):
+    target = voxels.targets[0][0]
+    edge = float(target.voxels[0].grid.spacing[0])
+    values = np.append(0.1 * edge * rng.standard_normal(1000), [-2.0 * edge, 2.0 * edge])
+    loss = robust_loss(values, target)
+    assert loss.rejects(values).nonzero()[0].tolist() == [1000, 1001]
+    assert loss.weight(values[-2:]).tolist() == [0.0, 0.0]

@@ -125,6 +125,18 @@ def test_an_exact_factorisation_changes_the_price_and_not_the_tangent(model):
     assert np.allclose(exact.modulus_tangents(), equilibrium.tangent()[:, :2], atol=1e-9)
 
 
+def test_derivatives_along_directions_need_no_factorisation(model):
+    """From those of another state, with its factorisation: to a hundredth of what was lacking."""
+    there = model.solve(np.array([1.4, 2.2]), np.array([4.0, 1.0]))
+    here = model.solve(MODULI, np.array([5.0, 2.0]), start=there.displacement, nearby=there.factorisation)
+    directions = np.random.default_rng(5).standard_normal((4, 3))
+    guess, expected = there.tangent() @ directions, here.tangent() @ directions
+    lacking = np.linalg.norm(expected - guess, axis=0)
+    found = here.tangent_along(directions, guess)
+    assert np.all(np.linalg.norm(found - expected, axis=0) < 0.03 * lacking)
+    assert np.allclose(here.tangent_along(directions, expected), expected, atol=1e-9)
+
+
 def test_other_modes_of_the_same_points_need_no_new_model(model):
     constraint = replace(model.constraint, modes=model.constraint.modes[:, :1], offset=model.constraint.modes[:, 1])
     found = model.under(constraint).solve(MODULI, np.array([3.0])).values

@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
+from palpate.inversion.directions import deciding_directions
 from palpate.inversion.driver_prior import learned_prior
 from palpate.inversion.gauss_newton import Bounds, Minimum, Outcome
 from palpate.inversion.minima import SETTLED, minimised, moved_between, words
 from palpate.inversion.noise import NoiseLaw
-from palpate.inversion.objective import Objective
+from palpate.inversion.objective import Evaluation, Objective
 from palpate.inversion.problem import InverseProblem, Inversion, InversionSettings, StandIn
 from palpate.inversion.weighting import objective_of, residual_law, reweighted
 from palpate.mechanics.equilibrium import from_start
@@ -188,7 +189,12 @@ def _round(problem: InverseProblem, place: _Place, settings: InversionSettings, 
     if moved < NEAR:
         expansions = tuple(_recentred(before, equilibrium) for equilibrium, before in pairs)
     else:
-        expansions = tuple(_expansion(equilibrium, before.counts) for equilibrium, before in pairs)
+        metrics = _metrics(place.objective, found.evaluation)
+        directions = deciding_directions(place.objective, found.evaluation)
+        expansions = tuple(
+            _sharpened(_recentred(before, equilibrium), *of)
+            for (equilibrium, before), *of in zip(pairs, directions, metrics, strict=True)
+        )
     there = replace(found, unknowns=unknowns, history=(*now.history, *found.history))
     states = objective_of(problem, tuple(e.reduced for e in expansions), place.law).states
     objective = replace(place.objective, states=states)
@@ -229,6 +235,34 @@ def _expansion(equilibrium: FiniteStrainEquilibrium, spent: SolveCounts) -> Expa
     exact = equilibrium.refactorised()
     model = expanded(exact, names=exact.model.names, moduli=exact.moduli, coefficients=exact.coefficients)
     return Expansion(model, exact, spent + equilibrium.counts + exact.tangent_counts + SolveCounts(factorisations=1))
+
+
+def _sharpened(expansion: Expansion, directions: NDArray[np.float64], metric: NDArray[np.float64]) -> Expansion:
+    """The expansion with the derivatives along `directions` D (n_regions + n_modes, k) exact at its equilibrium.
+
+    T + (C - T D) (D^T H D)^+ D^T H with the exact C and H the `metric` (n_regions + n_modes, n_regions + n_modes): of
+    all T' with T' D = C the one that changes least. The other columns stay as they were where T was made.
+    """
+    model, place = expansion.reduced, expansion.equilibrium
+    before = model.derivatives @ directions
+    change = place.tangent_along(directions, before) - before
+    share = np.linalg.pinv(directions.T @ metric @ directions, hermitian=True) @ (directions.T @ metric)
+    sharper = replace(model, derivatives=model.derivatives + change @ share)
+    return replace(expansion, reduced=sharper, counts=expansion.counts + SolveCounts(tangent=directions.shape[1]))
+
+
+def _metrics(objective: Objective, evaluation: Evaluation) -> list[NDArray[np.float64]]:
+    """The Gauss-Newton matrix as one of each state's (ln E, q), (n_regions + n_modes, n_regions + n_modes)."""
+    n, start, found = objective.n_parameters, objective.n_parameters, []
+    for state in objective.states:
+        end = start + state.model.n_modes
+        own = np.concatenate([np.arange(n), np.arange(start, end)])
+        place = np.concatenate([objective.modulus_map.columns, state.model.n_regions + np.arange(end - start)])
+        metric = np.zeros((state.model.n_regions + end - start,) * 2)
+        metric[np.ix_(place, place)] = evaluation.matrix[np.ix_(own, own)]
+        found.append(metric)
+        start = end
+    return found
 
 
 def _recentred(expansion: Expansion, equilibrium: FiniteStrainEquilibrium) -> Expansion:

@@ -13,11 +13,13 @@ from palpate.inversion.directions import deciding_directions
 from palpate.inversion.driver_prior import learned_prior
 from palpate.inversion.gauss_newton import Minimum
 from palpate.inversion.minima import (
+    SETTLED,
     best_of,
     continued,
     driven,
     groups_of,
     minimised,
+    moved_between,
     settled_between,
     with_driver,
     words,
@@ -39,6 +41,8 @@ REFINEMENTS = 2  # of the drivers' walls; what is left then is no motion that th
 EXACT = 3e-3  # standard deviations of a residual, per mm of motion: a smaller model error needs no further snapshot
 POLISH = 1e-5  # decrement of the reported minimum
 OTHERS = 1e-4  # of the other starts'
+ROUGH = 1e-3  # of all, where another law follows
+NEARLY = 0.5  # posterior standard deviations that a round may still move such an estimate
 
 
 def invert(problem: InverseProblem, settings: InversionSettings, *, progress: Callable[[str], None]) -> Inversion:
@@ -68,7 +72,11 @@ def invert_with(
     *,
     progress: Callable[[str], None],
 ) -> Inversion:
-    """The linear estimate from reduced models that are already there."""
+    """The linear estimate from reduced models that are already there.
+
+    Where another law follows it only has to come near: it may still move by half a posterior standard deviation.
+    """
+    enough, polish, others = (NEARLY, *2 * (ROUGH,)) if problem.finite_strain else (SETTLED, POLISH, OTHERS)
     law = settings.law or first_law(problem)
     objective = objective_of(problem, _reduced(surrogates), law)
     still = np.zeros(objective.n_unknowns)
@@ -86,17 +94,17 @@ def invert_with(
         surrogates = _enriched(problem, surrogates, objective, best, exact=min(EXACT * law.sd, 1e-3))
         before = best
         law, objective, best = _until_agreed(problem, _reduced(surrogates), best, settings)
-        settled = settled_between(before, best, objective.n_parameters)
+        settled = moved_between(before, best, objective.n_parameters) < enough
         if settled:
             done = refinements == REFINEMENTS or round_ == ROUNDS - 1
             finer = surrogates if done else _refined(problem, surrogates, best, law)
             if all(a is b for a, b in zip(finer, surrogates, strict=True)):
                 break
             surrogates, settled, refinements = finer, False, refinements + 1
-    best = continued(objective, best, settings, tolerance=POLISH)
+    best = continued(objective, best, settings, tolerance=polish)
     moved = [with_driver(m, best, objective.n_parameters) for m in minima]
     minima = tuple(
-        best if i == chosen else continued(objective, m, settings, tolerance=OTHERS) for i, m in enumerate(moved)
+        best if i == chosen else continued(objective, m, settings, tolerance=others) for i, m in enumerate(moved)
     )
     counts = sum((s.counts for s in surrogates), SolveCounts())
     return Inversion(

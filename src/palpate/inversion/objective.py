@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import EstimationError
 from palpate.inversion.modulus_map import ModulusMap
+from palpate.inversion.tukey import Tukey
 from palpate.mechanics.forward import ForwardModel
 from palpate.observation.misfit import Correspondence, SurfaceResiduals, correspondence, surface_residuals
 from palpate.observation.target import SurfaceTarget
@@ -34,14 +35,14 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Weighting:
-    """How the residuals of one surface count: `precision` (mm^-2) of its mean square, Tukey `cutoff` (mm, inf: none).
+    """How the residuals of one surface count: `precision` (mm^-2) of its mean square under the robust `loss`.
 
     `held`: the image points in use and more; `noise` (mm^4, inf: all count by area) is the residuals' variance times
     their correlation area, against which the voxels' terraces are held.
     """
 
     precision: float
-    cutoff: float
+    loss: Tukey
     held: Correspondence
     noise: float = np.inf
 
@@ -87,8 +88,7 @@ class Objective:
     """J(theta, q) = 1/2 sum_s precision_s sum_j w_j rho(r_j) + 1/2 q^T P q over all surfaces s of all states.
 
     The unknowns are theta (n_parameters,), then the mode coefficients q of each state; P is `prior`
-    (n_coefficients, n_coefficients), the identity where None. rho is Tukey's biweight,
-    rho(r) = c^2/3 (1 - (1 - (r/c)^2)^3), with the slope of r^2 at 0 (Huber 1981, section 4.8).
+    (n_coefficients, n_coefficients), the identity where None. rho: see `Tukey`.
     """
 
     states: tuple[State, ...]
@@ -116,7 +116,7 @@ class Objective:
         for s, displacement in enumerate(self._displacements(unknowns)):
             for target, motion, weighting in self._surfaces(s, displacement):
                 residuals = _weighted(target, motion, weighting)
-                total += 0.5 * weighting.precision * _robust_sum(residuals, weighting.cutoff)
+                total += 0.5 * weighting.precision * _mean(residuals, weighting.loss)
         return total
 
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
@@ -132,7 +132,7 @@ class Objective:
             gradient[line.columns] += line.gradient
             score[line.columns] += scaled.T @ (root * line.residuals.values)
             matrix[np.ix_(line.columns, line.columns)] += scaled.T @ scaled  # of one array: half of a general product
-            mean = _robust_sum(line.residuals, weighting.cutoff)
+            mean = _mean(line.residuals, weighting.loss)
             misfit += mean / len(surfaces)
             value += 0.5 * line.precision * mean
         return Evaluation(value, misfit, gradient, score, matrix, tuple(surfaces), prior)
@@ -185,7 +185,7 @@ class Objective:
             residuals = _weighted(target, motion, weighting)
             by_surface = tangent[rows][:, moved]
             jacobian = np.asarray(residuals.normal_jacobian @ by_surface)
-            weights = residuals.weights * _robust_weight(residuals.values, weighting.cutoff)
+            weights = residuals.weights * weighting.loss.weight(residuals.values)
             pull = np.asarray(residuals.jacobian.T @ (weighting.precision * weights * residuals.values))
             gradient = np.asarray(by_surface.T @ pull)
             lines.append(Linearisation(residuals, columns, jacobian, weights, weighting.precision, target, gradient, s))
@@ -217,14 +217,6 @@ def _refuse_unseen(target: SurfaceTarget, weighting: Weighting) -> None:
         )
 
 
-def _robust_weight(values: NDArray[np.float64], cutoff: float) -> NDArray[np.float64]:
-    """Tukey's weight (n,), (1 - (r/c)^2)^2 within the cutoff c (mm) and 0 beyond."""
-    return np.asarray(np.maximum(1.0 - (values / cutoff) ** 2, 0.0) ** 2)
-
-
-def _robust_sum(residuals: SurfaceResiduals, cutoff: float) -> float:
+def _mean(residuals: SurfaceResiduals, loss: Tukey) -> float:
     """Weighted sum of rho(r), mm^2."""
-    if not np.isfinite(cutoff):
-        return float(residuals.weights @ residuals.values**2)
-    inside = np.maximum(1.0 - (residuals.values / cutoff) ** 2, 0.0)
-    return float(residuals.weights @ (cutoff**2 / 3.0 * (1.0 - inside**3)))
+    return float(residuals.weights @ loss.rho(residuals.values))

@@ -11,10 +11,11 @@ from palpate.inversion.gauss_newton import Minimum
 from palpate.inversion.noise import NoiseLaw, fit_noise_law
 from palpate.inversion.objective import Evaluation, Linearisation, Objective, State, Weighting
 from palpate.inversion.problem import InverseProblem, LocalModel
+from palpate.inversion.tukey import Tukey
 from palpate.observation.misfit import Correspondence
 from palpate.observation.target import SurfaceTarget
 
-__all__ = ["SEGMENTATION_LAW", "first_law", "objective_of", "residual_law", "reweighted"]
+__all__ = ["SEGMENTATION_LAW", "first_law", "objective_of", "residual_law", "reweighted", "robust_loss"]
 
 TUKEY = 4.685  # cutoff in standard deviations, 95 % efficient for normal errors (Huber 1981)
 MAD = 1.4826  # standard deviations of a normal law in one median absolute deviation
@@ -53,7 +54,7 @@ def objective_of(
     )
     noise = law.sd**2 * law.correlation_area
     weighting = tuple(
-        tuple(Weighting(_precision(t, law), np.inf, _all_of(t), noise) for t in targets) for targets in problem.targets
+        tuple(Weighting(_precision(t, law), Tukey(), _all_of(t), noise) for t in targets) for targets in problem.targets
     )
     return Objective(states, problem.modulus_map, weighting, prior)
 
@@ -70,7 +71,7 @@ def _precision(target: SurfaceTarget, law: NoiseLaw) -> float:
 
 
 def reweighted(objective: Objective, minimum: Minimum, law: NoiseLaw) -> Objective:
-    """Tukey cutoffs from the residuals at a minimum, and image points chosen anew there.
+    """Robust losses from the residuals at a minimum, and image points chosen anew there.
 
     A surface that fits worse than the law of the residuals (a driver whose modes cannot follow its wall) counts by its
     own mean square, so that its misfit is not forced into the other unknowns.
@@ -85,15 +86,28 @@ def reweighted(objective: Objective, minimum: Minimum, law: NoiseLaw) -> Objecti
 
 def _weighting_of(line: Linearisation, weighting: Weighting, law: NoiseLaw) -> Weighting:
     values = line.residuals.values
-    cutoff = _cutoff(values)
-    inside = np.abs(values) < cutoff
+    loss = robust_loss(values, line.target)
+    inside = ~loss.rejects(values)
     mean_square = float(np.average(values[inside] ** 2, weights=line.residuals.weights[inside]))
     share = min(1.0, law.sd**2 / max(mean_square, 1e-12))
-    return replace(weighting, cutoff=cutoff, precision=weighting.precision * share)
+    return replace(weighting, loss=loss, precision=weighting.precision * share)
 
 
-def _cutoff(values: NDArray[np.float64]) -> float:
-    return max(TUKEY * MAD * float(np.median(np.abs(values))), LEAST_CUTOFF)
+def robust_loss(values: NDArray[np.float64], target: SurfaceTarget) -> Tukey:
+    """Tukey's biweight for residuals (n,) mm of one surface: its cutoff is 4.685 of their standard deviations.
+
+    Up to the edge of a voxel (half of each image's; root mean square of the three edges) all count fully: so far can
+    rounding move a surface that runs along the grids, and terraces that flip as a whole are no outliers. They are rare
+    and large and carry the motion of a surface that else seems to stand still: if they counted less than what is quiet,
+    every motion would be found too small.
+    """
+    spread = MAD * float(np.median(np.abs(values)))
+    return Tukey(max(TUKEY * spread, LEAST_CUTOFF), _rounding(target))
+
+
+def _rounding(target: SurfaceTarget) -> float:
+    """How far (mm) the rounding of both images' voxels can set a surface off."""
+    return float(sum(0.5 * np.sqrt(np.mean(image.grid.spacing**2)) for image in target.voxels or ()))
 
 
 def residual_law(problem: InverseProblem, evaluation: Evaluation) -> NoiseLaw:

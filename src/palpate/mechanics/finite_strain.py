@@ -33,6 +33,7 @@ __all__ = ["FiniteStrainEquilibrium", "FiniteStrainModel", "finite_strain_model"
 Array = NDArray[np.float64]
 
 FACTORISATION_IN_SOLVES = 30  # right-hand sides that cost as much as a factorisation
+LACKING = 1e-2  # relative residual of a correction to derivatives of a like state
 REFINEMENTS = 12  # solutions with an old factorisation that an exact one takes
 
 
@@ -243,6 +244,19 @@ class FiniteStrainEquilibrium:
         result = np.asarray(self.balance.free @ self._system(stiffness, loads.shape[1]).solve(loads))
         result[:, self.model.n_regions :] += self.model.constraint.modes
         return result
+
+    def tangent_along(self, directions: NDArray[np.float64], guess: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivatives (n_dof, k) mm along directions (n_regions + n_modes, k) of (ln E, q); raises `NotConverged`.
+
+        guess (n_dof, k) mm: the same of a like state; what it lacks is found to a hundredth, without a factorisation.
+        """
+        stiffness, free = self._stiffness(), self.balance.free
+        by_modulus, by_mode = directions[: self.model.n_regions], directions[self.model.n_regions :]
+        prescribed = np.asarray(self.model.constraint.modes @ by_mode)
+        forces = self.balance.region_forces(self.values, self.balance.moduli) @ by_modulus
+        system, known = self._system(stiffness, 1), np.asarray(free.T @ guess)
+        lacking = -np.asarray(free.T @ (forces + stiffness @ prescribed)) - system.matrix @ known
+        return np.asarray(free @ (known + system.solve(lacking, tolerance=LACKING))) + prescribed
 
     def modulus_tangents(self) -> NDArray[np.float64]:
         """Columns du / d ln E_r (n_dof, n_regions) mm alone; raises `NotConverged`."""

@@ -32,22 +32,22 @@ class LinearisedSystem:
         """The system of A^T; the factorisation, of a symmetric matrix, serves both."""
         return self if self.symmetric else replace(self, matrix=sparse.csr_matrix(self.matrix.T))
 
-    def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Solution X (n, m) of A X = rhs (n, m), to rounding; raises `SolverError`."""
+    def solve(self, rhs: NDArray[np.float64], *, tolerance: float = TOLERANCE) -> NDArray[np.float64]:
+        """Solution X (n, m) of A X = rhs (n, m) to a relative residual of `tolerance`; raises `SolverError`."""
         if not self.symmetric:
-            return np.stack([self._unsymmetric(column) for column in rhs.T], axis=1)
+            return np.stack([self._unsymmetric(column, tolerance) for column in rhs.T], axis=1)
         solution, _ = conjugate_gradients(
-            self.matrix, rhs, self.nearby.solve, tolerance=TOLERANCE, max_iterations=MAX_ITERATIONS
+            self.matrix, rhs, self.nearby.solve, tolerance=tolerance, max_iterations=MAX_ITERATIONS
         )
         return solution
 
-    def _unsymmetric(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _unsymmetric(self, rhs: NDArray[np.float64], tolerance: float) -> NDArray[np.float64]:
         """GMRES: Saad & Schultz, SIAM J. Sci. Stat. Comput. 7 (1986) 856-869."""
         n = len(rhs)
         inverse = LinearOperator((n, n), matvec=lambda r: self.nearby.solve(r.reshape(-1, 1))[:, 0], dtype=np.float64)
-        solution, _ = gmres(self.matrix, rhs, rtol=TOLERANCE, restart=MAX_ITERATIONS, maxiter=1, M=inverse)
+        solution, _ = gmres(self.matrix, rhs, rtol=tolerance, restart=MAX_ITERATIONS, maxiter=1, M=inverse)
         share = float(np.linalg.norm(rhs - self.matrix @ solution) / (np.linalg.norm(rhs) or 1.0))
-        if not share <= ACCEPTED:
+        if not share <= max(ACCEPTED, tolerance):
             raise SolverError(
                 f"GMRES stopped at a relative residual of {share:.2g} in {n} unknowns: the loads that follow the body"
                 " are too large for its stiffness"

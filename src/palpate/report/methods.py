@@ -123,10 +123,9 @@ def _fit(data: ReportData, cite: _Citations) -> str:
     return (
         "The misfit was the symmetric surface distance between model and later image, taken as a difference to the rest"
         " state, so that what smoothing, voxels and facets do to both images drops out, under Tukey's biweight"
-        f" {cite('huber')}. It was minimised over the logarithms of the moduli from {starts} starts by {optimiser}"
-        f" {cite(source)}, on a reduced basis whose error was bounded at the estimate {cite('reduced')}; faces on"
-        f" drivers,"
-        f" bones and the image's border were left out.{onwards if finite else ''}"
+        f" {cite('huber')} beyond the edge of a voxel. It was minimised over the logarithms of the moduli from {starts}"
+        f" starts by {optimiser} {cite(source)}, on a reduced basis whose error was bounded at the estimate"
+        f" {cite('reduced')}; faces on drivers, bones and the image's border were left out.{onwards if finite else ''}"
     )
 
 

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.experiments.simulated_pelvis import DATA, MARGIN_MM, TISSUES
-from palpate.images.distance import smoothing_width
 from palpate.images.label_image import VoxelGrid
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_label_image
@@ -24,6 +23,7 @@ __all__ = ["ORGANS", "RealPelvis", "grid_within", "real_pelvis"]
 ORGANS = ("prostate", "bladder")
 DRIVER = "rectum"
 SHIFT = 0.5  # of a voxel: a random grid's place
+SMOOTHING_MM = 4.0  # of the truth's surfaces: no stairs of the scan's 3 mm are left that run along every later grid
 LENGTH_MM = 35.0  # of the filling along the rectum (Gaussian): a short one hardly moves a prostate 9 mm away
 
 
@@ -57,7 +57,8 @@ class RealPelvis:
 def real_pelvis(surroundings_kpa: float) -> RealPelvis:
     """The scan with surroundings of that known modulus (kPa); whoever computes with it sets the organs'.
 
-    As in the paper's scene there are organs and a box around them: bones are part of the surroundings.
+    As in the paper's scene there are organs and a box around them: bones are part of the surroundings. The organs are
+    smoother than the scan's surfaces usually are: what is imaged again must not have the first image's voxels in it.
     """
     shown = [tissue for tissue in TISSUES if tissue.role in (Role.ESTIMATE, Role.DRIVER)]
     rest = next(tissue for tissue in TISSUES if tissue.role is Role.KNOWN)
@@ -67,7 +68,7 @@ def real_pelvis(surroundings_kpa: float) -> RealPelvis:
     observed = [i for i, t in enumerate(scan.tissues) if t.role in (Role.ESTIMATE, Role.DRIVER)]
     voxels = np.argwhere(np.isin(scan.index, observed)).astype(float)
     box = margin_box(domain_box([scan.grid]), scan.grid.world(voxels), margin_mm=MARGIN_MM)
-    return RealPelvis(scan, anatomy_of(scan, box=box, smoothing_mm=smoothing_width(scan.grid)))
+    return RealPelvis(scan, anatomy_of(scan, box=box, smoothing_mm=SMOOTHING_MM))
 
 
 def grid_within(box: Box, voxel_mm: float, rng: np.random.Generator) -> VoxelGrid:

@@ -34,7 +34,6 @@ from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.linear_model import LinearModel, linear_model, weighted_sum
 from palpate.mechanics.linearised import LinearisedSystem
-from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.anatomy import anatomy_of
 from palpate.mesh.quality import check_mesh
 from palpate.mesh.space import LagrangeSpace, lagrange_space
@@ -67,14 +66,16 @@ NOTES = (
 
 @dataclass(frozen=True, slots=True)
 class Table2Settings:
-    """Edges of the inverting and of the truth's mesh (mm), moduli (kPa), random grids, modes of the wall.
+    """Edges of the inverting meshes and of the truth's (mm), moduli (kPa), random grids, modes of the wall.
 
+    voxel_edge_mm: of the meshes that are made from voxels, whose noise is larger than what a finer mesh would better.
     filling_mm: of the rectum, 12 to 14 mm in radius at rest; below zero it empties. shares: of it in the later images
     of the voxel column; the other columns have the whole.
     """
 
-    edge_mm: float = 7.0
-    truth_edge_mm: float = 6.0
+    edge_mm: float = 6.0
+    voxel_edge_mm: float = 7.0
+    truth_edge_mm: float = 5.0
     voxel_mm: float = 1.0
     filling_mm: float = -7.5
     shares: tuple[float, ...] = (1.0, -0.5, -0.6)
@@ -123,6 +124,12 @@ def _bench(settings: Table2Settings) -> _Bench:
     return _Bench(settings)
 
 
+@lru_cache(maxsize=8)
+def _truth(settings: Table2Settings, kpa: float) -> Array:
+    fine = _bench(settings).fine
+    return fine.solve(moduli_of(fine, kpa), np.zeros(0)).displacement
+
+
 @lru_cache(maxsize=1)
 def _imaged(settings: Table2Settings, position: int) -> _Imaged:
     return _Imaged(_bench(settings), position)
@@ -146,8 +153,8 @@ class _Bench:
 
     @cached_property
     def fine(self) -> LinearModel:
-        """The truth: a finer mesh, the wall filled."""
-        return self.filled(self.pelvis.space(self.settings.truth_edge_mm))
+        """The truth: a finer mesh, the wall filled; for one solution a modulus multigrid takes less memory."""
+        return self.filled(self.pelvis.space(self.settings.truth_edge_mm), solver="multigrid")
 
     @cached_property
     def linear_tetrahedra(self) -> LinearModel:
@@ -159,14 +166,14 @@ class _Bench:
         """The reduced model of `coarse`."""
         return (self.surrogate_of(self.coarse),)
 
-    def filled(self, space: LagrangeSpace) -> LinearModel:
-        """A model whose wall is filled, without modes."""
+    def filled(self, space: LagrangeSpace, *, solver: str = "auto") -> LinearModel:
+        """A model whose wall is filled, without modes; `solver`: see `linear_model`."""
         motion = prescribed_motion(space, {}, n_modes=3, kernel_mm=1.0, prior_mm=1.0)
         offset = self.pelvis.filling(space, self.settings.filling_mm).ravel()
         none = np.zeros((offset.size, 0))
         constraint = outer_constraint(space, outer=OUTER, modes=none, offset=offset, prescribed=motion.prescribed)
         dilatation = choose_element(ELEMENT if space.order > 1 else "P1").dilatation
-        return linear_model(space, constraint, dilatation=dilatation)
+        return linear_model(space, constraint, solver=solver, dilatation=dilatation)
 
     def surrogate_of(self, model: LinearModel) -> Surrogate:
         """A reduced model for all rows: all responses at the middle of the table's moduli, and to high order in them.
@@ -201,16 +208,15 @@ class _Bench:
 
     def coarse_truth(self, kpa: float) -> Array:
         """Displacement (n_points, 3) mm of the inverting mesh."""
-        return _solved(self.coarse, kpa, self.surrogates[0].factorisation)
+        nearby, model = self.surrogates[0].factorisation, self.coarse
+        moduli, constraint = moduli_of(model, kpa), model.constraint
+        loads = weighted_sum(moduli, model.coupling).toarray()
+        system = LinearisedSystem(weighted_sum(moduli, model.free_stiffness), nearby, symmetric=True)
+        return np.asarray(constraint.offset + constraint.free @ system.solve(-loads)[:, 0]).reshape(-1, 3)
 
     def truth(self, kpa: float) -> Array:
         """Displacement (n_points, 3) mm of the finer mesh."""
-        return _solved(self.fine, kpa, self.fine_factorisation)
-
-    @cached_property
-    def fine_factorisation(self) -> Factorisation:
-        """One for all moduli: that of the middle one leaves some twenty steps of conjugate gradients to the others."""
-        return self.fine.system(moduli_of(self.fine, self.middle_kpa)).factorisation
+        return _truth(self.settings, kpa)
 
     def from_surfaces(self, kpa: float, truth: LinearModel, u: Array, progress: Progress) -> dict[str, Entry]:
         """What the exact surfaces of `truth` under u (n_points, 3) mm say of both organs."""
@@ -264,7 +270,7 @@ class _Imaged:
         states = imaged_states(self.bench.fine.space, self.later(self.bench.middle_kpa), self.grid)
         width = smoothing_width(self.grid)
         anatomy = anatomy_of(states.before, box=self.bench.pelvis.box, smoothing_mm=width)
-        mesh = tetrahedralise(anatomy, edge_length_mm=self.bench.settings.edge_mm)
+        mesh = tetrahedralise(anatomy, edge_length_mm=self.bench.settings.voxel_edge_mm)
         quality = check_mesh(mesh, anatomy)
         return Body(states, lagrange_space(mesh, "P2"), quality, observation_width(self.grid))
 
@@ -275,7 +281,7 @@ class _Imaged:
         return Case(
             "table2",
             phantom=Phantom("pelvis"),
-            mesh=MeshSettings(settings.edge_mm),
+            mesh=MeshSettings(settings.voxel_edge_mm),
             driver=settings.driver,
             domain=Domain(outer_boundary=OUTER),
             mechanics=Mechanics(law="linear", element=ELEMENT),
@@ -305,15 +311,6 @@ class _Imaged:
         settings = from_half(problem.modulus_map, truth)
         inversion = invert_with(problem, settings, self.surrogates, progress=progress)
         return entries_from_voxels(inversion, settings, body, truth, seed=self.bench.settings.seed)
-
-
-def _solved(model: LinearModel, kpa: float, nearby: Factorisation) -> Array:
-    """Equilibrium (n_points, 3) mm of a model without modes, with the factorisation of like moduli."""
-    moduli, constraint = moduli_of(model, kpa), model.constraint
-    loads = weighted_sum(moduli, model.coupling).toarray()
-    system = LinearisedSystem(weighted_sum(moduli, model.free_stiffness), nearby, symmetric=True)
-    free = constraint.free @ system.solve(-loads)[:, 0]
-    return np.asarray(constraint.offset + free).reshape(-1, 3)
 
 
 def moduli_of(model: LinearModel, kpa: float) -> Array:
