@@ -7,7 +7,7 @@ import pytest
 
 from palpate.experiments.reproduce.real_pelvis import ORGANS, RealPelvis, real_pelvis
 from palpate.experiments.reproduce.table import COLUMNS
-from palpate.experiments.reproduce.table2 import Table2Settings, _Bench, _jobs
+from palpate.experiments.reproduce.table2 import Table2Settings, _Bench, _jobs, _Surfaces
 from palpate.mesh.space import LagrangeSpace
 
 
@@ -43,7 +43,7 @@ def test_every_part_of_the_table_is_made_once():
 
 
 def test_same_mesh_gives_the_moduli_back_where_the_driver_is_given():
-    bench = _Bench(Table2Settings(edge_mm=14.0, moduli_kpa=(50.0, 150.0)))
-    found = bench.column("same_mesh", 150.0, lambda _: None)
+    surfaces = _Surfaces(_Bench(Table2Settings(edge_mm=14.0, moduli_kpa=(50.0, 150.0))))
+    found = surfaces.column("same_mesh", 150.0, lambda _: None)
     assert max(abs(found[organ].error_percent) for organ in ORGANS) < 0.01
     assert {found[organ].verdict for organ in ORGANS} == {"identified"}

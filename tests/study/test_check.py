@@ -64,11 +64,6 @@ def test_cost_grows_with_modes_images_and_pairs_and_shrinks_with_processors(case
     assert expected_cost(case, before, after, n_pairs=1).seconds < plain.seconds
 
 
-def test_the_limit_of_the_linear_algebra_counts_as_processors(monkeypatch):
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    assert cost.processors() == 1
-
-
 @pytest.mark.parametrize(("share", "code"), [(100.0, None), (1.0, 0), (0.1, 6)])
 def test_memory_that_will_not_do_is_told_before(case_result, monkeypatch, share, code):
     needed = expected_cost(case_result.case, case_result.before, case_result.after, n_pairs=1)

@@ -13,6 +13,7 @@ from palpate.inversion.tukey import Tukey
 from palpate.mechanics.forward import ForwardModel
 from palpate.observation.misfit import Correspondence, SurfaceResiduals, correspondence, surface_residuals
 from palpate.observation.target import SurfaceTarget
+from palpate.parallel import mapped
 
 __all__ = ["Evaluation", "Linearisation", "Objective", "State", "Weighting"]
 
@@ -114,9 +115,7 @@ class Objective:
         """J alone, for trial steps."""
         total = 0.5 * float(unknowns @ self.prior_precision() @ unknowns)
         for s, displacement in enumerate(self._displacements(unknowns)):
-            for target, motion, weighting in self._surfaces(s, displacement):
-                residuals = _weighted(target, motion, weighting)
-                total += 0.5 * weighting.precision * _mean(residuals, weighting.loss)
+            total += sum(mapped(_misfit, self._surfaces(s, displacement)))
         return total
 
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
@@ -165,9 +164,7 @@ class Objective:
         q = self.coefficients(unknowns)
         return [state.model.solve(moduli, c).displacement.ravel() for state, c in zip(self.states, q, strict=True)]
 
-    def _surfaces(
-        self, state: int, displacement: NDArray[np.float64]
-    ) -> list[tuple[SurfaceTarget, NDArray[np.float64], Weighting]]:
+    def _surfaces(self, state: int, displacement: NDArray[np.float64]) -> list[_Seen]:
         parts = [displacement[rows].reshape(-1, 3) for rows in self.states[state].slices()]
         return list(zip(self.states[state].targets, parts, self.weighting[state], strict=True))
 
@@ -179,17 +176,19 @@ class Objective:
         n_regions = tangent.shape[1] - state.model.n_modes
         moved = np.concatenate([self.modulus_map.columns, np.arange(n_regions, tangent.shape[1])])
         columns = np.concatenate([np.arange(self.n_parameters), self._mode_places(s)])
-        lines = []
-        triples = self._surfaces(s, solution.displacement.ravel())
-        for rows, (target, motion, weighting) in zip(state.slices(), triples, strict=True):
+
+        def line(of: tuple[slice, _Seen]) -> Linearisation:
+            """One surface's residuals with their derivative."""
+            rows, (target, motion, weighting) = of
             residuals = _weighted(target, motion, weighting)
             by_surface = tangent[rows][:, moved]
             jacobian = np.asarray(residuals.normal_jacobian @ by_surface)
             weights = residuals.weights * weighting.loss.weight(residuals.values)
             pull = np.asarray(residuals.jacobian.T @ (weighting.precision * weights * residuals.values))
             gradient = np.asarray(by_surface.T @ pull)
-            lines.append(Linearisation(residuals, columns, jacobian, weights, weighting.precision, target, gradient, s))
-        return lines
+            return Linearisation(residuals, columns, jacobian, weights, weighting.precision, target, gradient, s)
+
+        return mapped(line, zip(state.slices(), self._surfaces(s, solution.displacement.ravel()), strict=True))
 
     def _mode_places(self, state: int) -> NDArray[np.int64]:
         start = self.n_parameters + sum(s.model.n_modes for s in self.states[:state])
@@ -197,6 +196,15 @@ class Objective:
 
     def _flat_weighting(self) -> list[Weighting]:
         return [weighting for weightings in self.weighting for weighting in weightings]
+
+
+_Seen = tuple[SurfaceTarget, NDArray[np.float64], Weighting]  # a surface, its motion (n_vertices, 3) mm, its weights
+
+
+def _misfit(seen: _Seen) -> float:
+    """What a surface adds to the objective, dimensionless."""
+    weighting = seen[2]
+    return 0.5 * weighting.precision * _mean(_weighted(*seen), weighting.loss)
 
 
 def _weighted(target: SurfaceTarget, motion: NDArray[np.float64], weighting: Weighting) -> SurfaceResiduals:

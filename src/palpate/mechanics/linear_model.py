@@ -23,6 +23,7 @@ from palpate.mechanics.solvers.registry import factorise
 from palpate.mechanics.stiffness import tissue_stiffness
 from palpate.mesh.constraint import Constraint
 from palpate.mesh.space import LagrangeSpace
+from palpate.parallel import mapped
 
 __all__ = ["LinearEquilibrium", "LinearModel", "LinearSystem", "linear_model", "weighted_sum", "with_constraint"]
 
@@ -241,11 +242,13 @@ def linear_model(
         )
     tissues = space.mesh.tissues
     regions = tuple(number for number, tissue in enumerate(tissues) if tissue.meshed)
-    stiffness = tuple(
-        tissue_stiffness(space, region, tissues[region].poisson_ratio, dilatation=dilatation) for region in regions
-    )
-    rows = [sparse.csr_matrix(constraint.free.T @ matrix) for matrix in stiffness]
-    free_stiffness = tuple(sparse.csr_matrix(part @ constraint.free) for part in rows)
+
+    def assembled(region: int) -> tuple[sparse.csr_matrix[np.float64], sparse.csr_matrix[np.float64]]:
+        """K_r and F^T K_r F of one tissue."""
+        matrix = tissue_stiffness(space, region, tissues[region].poisson_ratio, dilatation=dilatation)
+        return matrix, sparse.csr_matrix(sparse.csr_matrix(constraint.free.T @ matrix) @ constraint.free)
+
+    stiffness, free_stiffness = zip(*mapped(assembled, regions), strict=True)
     still = np.zeros_like(space.points)
     load = sum((part.forces(still) for part in loads), np.zeros(n_dof))
     model = LinearModel(space, constraint, regions, stiffness, free_stiffness, (), solver, load)

@@ -15,6 +15,7 @@ from palpate.images.distance import DistanceMap, distance_map
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
+from palpate.parallel import mapped
 
 __all__ = ["Anatomy", "Box", "LevelSet", "anatomy_of", "domain_box", "margin_box", "volume_preserving"]
 
@@ -132,12 +133,15 @@ def anatomy_of(segmentation: Segmentation, *, box: Box, smoothing_mm: float) -> 
     tissues = segmentation.tissues
     filler = _filler(segmentation)
     order = _priority(tissues, filler)
-    level_sets: list[LevelSet | None] = [None] * len(tissues)
-    for rank, tissue in enumerate(order):
-        held = tissues[tissue].role in (Role.RIGID, Role.VOID)
+
+    def level_set(rank: int) -> LevelSet:
+        """That of the tissue at this place of the order."""
+        held = tissues[order[rank]].role in (Role.RIGID, Role.VOID)
         width = HELD_SMOOTHING * smoothing_mm if held else smoothing_mm
-        level_sets[tissue] = _extended_map(segmentation, tissue, order[:rank], width)
-    return Anatomy(tissues, tuple(level_sets), box)
+        return _extended_map(segmentation, order[rank], order[:rank], width)
+
+    made = dict(zip(order, mapped(level_set, range(len(order))), strict=True))
+    return Anatomy(tissues, tuple(made.get(i) for i in range(len(tissues))), box)
 
 
 def domain_box(grids: Sequence[VoxelGrid]) -> Box:

@@ -32,6 +32,7 @@ from palpate.observation.observed_surface import ObservedSurface, observed_surfa
 from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.observation.target import SurfaceTarget, surface_target
 from palpate.observation.wall_modes import Wall
+from palpate.parallel import mapped
 from palpate.study.case import Case, Mechanics
 from palpate.study.case_loads import case_loads
 from palpate.study.contacts import every_finding
@@ -174,7 +175,7 @@ def surface_targets(
 
     def maps(image: Segmentation) -> list[DistanceMap]:
         """The distance map of each surface's tissue."""
-        return [tissue_distance_map(image, s.tissue, smoothing_mm=body.smoothing_mm) for s in seen]
+        return mapped(lambda s: tissue_distance_map(image, s.tissue, smoothing_mm=body.smoothing_mm), seen)
 
     before = maps(body.states.before)
     return tuple(

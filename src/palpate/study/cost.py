@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,10 +13,11 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.mechanics.solvers.registry import SOLVERS
 from palpate.mesh.anatomy import Box
+from palpate.parallel import processors
 from palpate.study.body import case_domain
 from palpate.study.case import Case
 
-__all__ = ["ExpectedCost", "expected_cost", "expected_tets", "free_memory_gb", "processors"]
+__all__ = ["ExpectedCost", "expected_cost", "expected_tets", "free_memory_gb"]
 
 GRADING = 0.45  # the mesher's: growth of the edge length with the distance from a surface, mm per mm
 COARSEST = 4.0  # its longest edge, in edge lengths
@@ -99,13 +99,6 @@ def expected_tets(case: Case, before: Segmentation, after: tuple[Segmentation, .
             sizes = np.minimum(sizes, start + GRADING * _distance_to_surface(index == i, cell))
     meshed = np.array([*(tissue.meshed for tissue in before.tissues), False])[index] & inside
     return max(int(TETS_A_CUBE * np.prod(cell) * float((sizes[meshed] ** -3.0).sum())), 100)
-
-
-def processors() -> int:
-    """Processors that this process may use, and that the linear algebra's own limit leaves."""
-    seen = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    limits = [os.environ.get(name, "") for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")]
-    return min([seen, *(int(limit) for limit in limits if limit.isdigit() and int(limit) > 0)])
 
 
 def free_memory_gb() -> float | None:

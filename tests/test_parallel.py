@@ -1,0 +1,22 @@
+"""Work on several processors gives what one would."""
+
+from __future__ import annotations
+
+import pytest
+
+from palpate.parallel import mapped, processors
+
+
+def test_results_come_in_the_order_of_the_items():
+    assert mapped(lambda n: n * n, range(100)) == [n * n for n in range(100)]
+    assert mapped(str, []) == []
+
+
+def test_what_a_call_raises_is_raised():
+    with pytest.raises(ZeroDivisionError):
+        mapped(lambda n: 1 // n, [2, 1, 0])
+
+
+def test_the_limit_of_the_linear_algebra_holds(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    assert processors() == 1
