@@ -24,7 +24,7 @@ from palpate.inversion.problem import InverseProblem, Inversion, InversionSettin
 from palpate.inversion.weighting import objective_of, residual_law, reweighted
 from palpate.mechanics.equilibrium import from_start
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
-from palpate.mechanics.first_order import FirstOrderModel, expanded
+from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.constraint import Constraint
@@ -37,6 +37,7 @@ NEAR = 0.5  # posterior standard deviations: a round that moves less leaves weig
 REACH = 0.8  # of ln E, within which an expansion is trusted
 HALVINGS = 3
 NOISE = 0.5  # of the objective, in units of log-likelihood: the noise of re-chosen closest points
+COARSE, ROUGH = 3e-2, 1e-5  # of the forces: for a first factorisation; for all rounds but the last
 POLISH = 1e-5  # decrement of a round's minimum
 
 
@@ -91,7 +92,7 @@ def continued_at_finite_strain(
     equilibrium is not found, with the element and the share of the motion where it ended.
     """
     pairs = zip(problem.finite_strain, linear.surrogates, strict=True)
-    models = tuple(model.under(surrogate.constraint) for model, surrogate in pairs)
+    models = tuple(model.under(surrogate.constraint).to_tolerance(ROUGH) for model, surrogate in pairs)
     chosen = linear.groups[linear.best]
     places = {chosen: _followed(problem, models, linear, linear.minimum, settings, progress)}
     for minimum, group in zip(linear.minima, linear.groups, strict=True):
@@ -131,9 +132,13 @@ def _followed(
     """Rounds from one linear minimum until the moduli no longer move."""
     progress("finite strain: the equilibrium at the linear estimate")
     moduli, amounts = _split(linear.objective, start.unknowns)
-    triples = zip(models, linear.surrogates, amounts, strict=True)
-    equilibria = tuple(_near_linear(model, surrogate, moduli, q) for model, surrogate, q in triples)
-    expansions = tuple(_expansion(equilibrium, SolveCounts()) for equilibrium in equilibria)
+    pairs = zip(models, linear.surrogates, strict=True)
+    directions = deciding_directions(linear.objective, start.evaluation)
+    metrics = _metrics(linear.objective, start.evaluation)
+    expansions = tuple(
+        _sharpened(_near_linear(*of, moduli, q), d, m)
+        for of, q, d, m in zip(pairs, amounts, directions, metrics, strict=True)
+    )
     first = _Place(linear.objective, replace(start, history=()), expansions, linear.law)
     place = _weighed(problem, first, settings)
     for number in range(ROUNDS):
@@ -145,17 +150,47 @@ def _followed(
     found = minimised(place.objective, place.minimum.unknowns, settings, tolerance=POLISH)
     # a polish that finds no better point leaves the last round's, which is an equilibrium with its own outcome
     end = _joined(place.minimum, found) if found.outcome.converged else place.minimum
-    if place.settled:
-        return replace(place, minimum=end)
-    left = place.minimum.outcome
-    return replace(place, minimum=replace(end, outcome=Outcome.STEPS if left.converged else left))
+    if not place.settled:
+        left = place.minimum.outcome
+        end = replace(end, outcome=Outcome.STEPS if left.converged else left)
+    return _at_equilibria(problem, place, end)
+
+
+def _at_equilibria(problem: InverseProblem, place: _Place, end: Minimum) -> _Place:
+    """The place with the minimum `end`, at its exact equilibria: the rounds' own were found to what a step needs."""
+    moduli, amounts = _split(place.objective, end.unknowns)
+    expansions = []
+    for model, before, q in zip(problem.finite_strain, place.expansions, amounts, strict=True):
+        near, exact = before.equilibrium, model.under(before.constraint)
+        start = before.reduced.solve(moduli, q).displacement
+        expansions.append(_recentred(before, from_start(exact, moduli, q, start=start, nearby=near.factorisation)))
+    objective = _around(place, tuple(expansions))
+    minimum = replace(end, evaluation=objective(end.unknowns))
+    return replace(place, objective=objective, minimum=minimum, expansions=tuple(expansions))
+
+
+def _around(place: _Place, expansions: tuple[Expansion, ...]) -> Objective:
+    """The place's objective on other expansions."""
+    states = (
+        replace(state, model=expansion.reduced.at(np.concatenate([t.surface.dofs for t in state.targets])))
+        for state, expansion in zip(place.objective.states, expansions, strict=True)
+    )
+    return replace(place.objective, states=tuple(states))
 
 
 def _near_linear(
     model: FiniteStrainModel, linear: StandIn, moduli: NDArray[np.float64], amounts: NDArray[np.float64]
-) -> FiniteStrainEquilibrium:
-    start = linear.reduced.solve(moduli, amounts).displacement
-    return from_start(model, moduli, amounts, start=start, nearby=linear.factorisation)
+) -> Expansion:
+    """The equilibrium near the linear estimate with that law's derivatives, and with a factorisation of its own.
+
+    It is the only one: it serves all solves that follow, which stay near.
+    """
+    there = linear.reduced.solve(moduli, amounts)
+    coarse = model.to_tolerance(COARSE)
+    near = from_start(coarse, moduli, amounts, start=there.displacement, nearby=linear.factorisation).refactorised()
+    found = from_start(model, moduli, amounts, start=near.displacement, nearby=near.factorisation)
+    derivatives = FirstOrderModel(model.names, moduli, amounts, found.values, there.tangent())
+    return Expansion(derivatives, found, near.counts + found.counts + SolveCounts(factorisations=1))
 
 
 def _weighed(problem: InverseProblem, place: _Place, settings: InversionSettings) -> _Place:
@@ -196,8 +231,7 @@ def _round(problem: InverseProblem, place: _Place, settings: InversionSettings, 
             for (equilibrium, before), *of in zip(pairs, directions, metrics, strict=True)
         )
     there = replace(found, unknowns=unknowns, history=(*now.history, *found.history))
-    states = objective_of(problem, tuple(e.reduced for e in expansions), place.law).states
-    objective = replace(place.objective, states=states)
+    objective = _around(place, expansions)
     arrived = _Place(objective, replace(there, evaluation=objective(unknowns)), expansions, place.law, moved)
     return _weighed(problem, arrived, settings) if weigh else arrived
 
@@ -228,13 +262,6 @@ def _solved(expansion: Expansion, moduli: NDArray[np.float64], amounts: NDArray[
     start = expansion.reduced.solve(moduli, amounts).displacement
     found = before.model.attempt(moduli, amounts, start=start, nearby=before.factorisation)
     return found if found.converged else before.model.attempt(moduli, amounts, start=before.displacement)
-
-
-def _expansion(equilibrium: FiniteStrainEquilibrium, spent: SolveCounts) -> Expansion:
-    """Expand around an equilibrium with its own factorisation, which then serves the next solve."""
-    exact = equilibrium.refactorised()
-    model = expanded(exact, names=exact.model.names, moduli=exact.moduli, coefficients=exact.coefficients)
-    return Expansion(model, exact, spent + equilibrium.counts + exact.tangent_counts + SolveCounts(factorisations=1))
 
 
 def _sharpened(expansion: Expansion, directions: NDArray[np.float64], metric: NDArray[np.float64]) -> Expansion:
@@ -278,18 +305,10 @@ def _lowers(place: _Place, equilibria: tuple[FiniteStrainEquilibrium, ...], unkn
     By its value, or by the work of its score along the way (the trapezoidal rule, 1/2 (s_0 + s_1) . step): the value
     has the noise of closest points that slide over voxels, the score has not.
     """
-    states = tuple(
-        replace(state, model=_moved(expansion, e, np.concatenate([t.surface.dofs for t in state.targets])))
-        for state, expansion, e in zip(place.objective.states, place.expansions, equilibria, strict=True)
-    )
-    there, now = replace(place.objective, states=states)(unknowns), place.minimum
+    pairs = zip(place.expansions, equilibria, strict=True)
+    there, now = _around(place, tuple(_recentred(before, found) for before, found in pairs))(unknowns), place.minimum
     work = 0.5 * (there.score + now.evaluation.score) @ (unknowns - now.unknowns)
     return bool(there.value < now.evaluation.value + NOISE or work < 0.0)
-
-
-def _moved(expansion: Expansion, equilibrium: FiniteStrainEquilibrium, dofs: NDArray[np.int64]) -> FirstOrderModel:
-    """The observed part of the expansion, with the displacement of another equilibrium."""
-    return _recentred(expansion, equilibrium).reduced.at(dofs)
 
 
 def _split(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,13 +36,29 @@ from palpate.mechanics.reduced import ReducedModel
 __all__ = ["invert", "invert_with"]
 
 ROUNDS = 9
-WEIGHINGS = 4  # within a round
 REFINEMENTS = 2  # of the drivers' walls; what is left then is no motion that they could follow
+FIRST_STEPS = 5  # of the drivers' motion at a start's moduli, before these move
 EXACT = 3e-3  # standard deviations of a residual, per mm of motion: a smaller model error needs no further snapshot
-POLISH = 1e-5  # decrement of the reported minimum
-OTHERS = 1e-4  # of the other starts'
-ROUGH = 1e-3  # of all, where another law follows
-NEARLY = 0.5  # posterior standard deviations that a round may still move such an estimate
+
+
+@dataclass(frozen=True, slots=True)
+class _Effort:
+    """How far an estimate is taken.
+
+    exact: relative error in energy that a displacement may have; weighings: within a round, at the most; settled: by so
+    many posterior standard deviations a round may still move it; polish, others: decrement of the reported minimum and
+    of the other starts'.
+    """
+
+    exact: float
+    weighings: int
+    settled: float
+    polish: float
+    others: float
+
+
+TO_REPORT = _Effort(exact=1e-3, weighings=4, settled=SETTLED, polish=1e-5, others=1e-4)
+TO_START_FROM = _Effort(exact=1e-2, weighings=1, settled=0.5, polish=1e-3, others=1e-3)
 
 
 def invert(problem: InverseProblem, settings: InversionSettings, *, progress: Callable[[str], None]) -> Inversion:
@@ -50,16 +66,17 @@ def invert(problem: InverseProblem, settings: InversionSettings, *, progress: Ca
 
     The reduced models are made at the middle start and enriched at the estimate until it no longer moves.
     """
-    middle = np.median(np.stack(settings.starts), axis=0)
+    middle = _middle(settings)
     moduli = problem.modulus_map.moduli(middle)
     progress("responses of the full model at the middle start")
     surrogates = tuple(first_surrogate(model, moduli) for model in problem.models)
     objective = objective_of(problem, _reduced(surrogates), settings.law or first_law(problem))
     still = np.concatenate([middle, np.zeros(objective.n_unknowns - len(middle))])
     filled = driven(objective.with_fresh_correspondence(still), middle, bounds=settings.bounds)
-    pairs = zip(surrogates, objective.coefficients(filled.unknowns), strict=True)
+    motions = objective.coefficients(filled.unknowns)
+    pairs = zip(surrogates, motions, strict=True)
     surrogates = tuple(with_modulus_series(s, q, problem.modulus_map.columns) for s, q in pairs)
-    linear = invert_with(problem, settings, surrogates, progress=progress)
+    linear = invert_with(problem, settings, surrogates, progress=progress, motion=np.concatenate(motions))
     if not problem.finite_strain:
         return linear
     return continued_at_finite_strain(problem, linear, settings, progress=progress)
@@ -71,18 +88,20 @@ def invert_with(
     surrogates: tuple[Surrogate, ...],
     *,
     progress: Callable[[str], None],
+    motion: NDArray[np.float64] | None = None,
 ) -> Inversion:
     """The linear estimate from reduced models that are already there.
 
-    Where another law follows it only has to come near: it may still move by half a posterior standard deviation.
+    motion (n_coefficients,): the drivers', where the search begins; None: at rest. Where another law follows, the
+    estimate only has to come near: it may still move by half a posterior standard deviation.
     """
-    enough, polish, others = (NEARLY, *2 * (ROUGH,)) if problem.finite_strain else (SETTLED, POLISH, OTHERS)
+    effort = TO_START_FROM if problem.finite_strain else TO_REPORT
     law = settings.law or first_law(problem)
     objective = objective_of(problem, _reduced(surrogates), law)
     still = np.zeros(objective.n_unknowns)
     objective = objective.with_fresh_correspondence(still)
     rest = objective(still)
-    filled = driven(objective, settings.starts[0], bounds=settings.bounds)
+    filled = driven(objective, _middle(settings), bounds=settings.bounds, coefficients=motion)
     objective = replace(objective, prior=learned_prior(problem, filled.evaluation, filled.unknowns))
     minima = _from_starts(objective, settings, filled.unknowns[objective.n_parameters :], progress)
     chosen = best_of(minima)
@@ -91,20 +110,24 @@ def invert_with(
     for round_ in range(ROUNDS):
         progress(f"round {round_ + 1}: {words(problem, best)}; the full model is solved there")
         law = settings.law or residual_law(problem, best.evaluation)
-        surrogates = _enriched(problem, surrogates, objective, best, exact=min(EXACT * law.sd, 1e-3))
+        exact = min(EXACT * law.sd / TO_REPORT.exact, 1.0) * effort.exact
+        surrogates = _enriched(problem, surrogates, objective, best, exact=exact)
         before = best
-        law, objective, best = _until_agreed(problem, _reduced(surrogates), best, settings)
-        settled = moved_between(before, best, objective.n_parameters) < enough
+        law, objective, best = _until_agreed(problem, _reduced(surrogates), best, settings, effort.weighings)
+        settled = moved_between(before, best, objective.n_parameters) < effort.settled
         if settled:
             done = refinements == REFINEMENTS or round_ == ROUNDS - 1
             finer = surrogates if done else _refined(problem, surrogates, best, law)
             if all(a is b for a, b in zip(finer, surrogates, strict=True)):
                 break
             surrogates, settled, refinements = finer, False, refinements + 1
-    best = continued(objective, best, settings, tolerance=polish)
-    moved = [with_driver(m, best, objective.n_parameters) for m in minima]
+    best = continued(objective, best, settings, tolerance=effort.polish)
+    met = groups_of(minima, objective.n_parameters)
     minima = tuple(
-        best if i == chosen else continued(objective, m, settings, tolerance=others) for i, m in enumerate(moved)
+        replace(best, history=m.history + best.history[len(minima[chosen].history) :])
+        if group == met[chosen]  # starts that have met go on as one
+        else continued(objective, with_driver(m, best, objective.n_parameters), settings, tolerance=effort.others)
+        for m, group in zip(minima, met, strict=True)
     )
     counts = sum((s.counts for s in surrogates), SolveCounts())
     return Inversion(
@@ -121,11 +144,20 @@ def invert_with(
     )
 
 
+def _middle(settings: InversionSettings) -> NDArray[np.float64]:
+    """Median (n_parameters,) of the starts' log-moduli."""
+    return np.asarray(np.median(np.stack(settings.starts), axis=0))
+
+
 def _until_agreed(
-    problem: InverseProblem, models: tuple[ReducedModel, ...], best: Minimum, settings: InversionSettings
+    problem: InverseProblem,
+    models: tuple[ReducedModel, ...],
+    best: Minimum,
+    settings: InversionSettings,
+    weighings: int,
 ) -> tuple[NoiseLaw, Objective, Minimum]:
     """Law of the residuals, drivers' prior, weights and estimate in turn until they agree, on the same models."""
-    for _ in range(WEIGHINGS):
+    for _ in range(weighings):
         law = settings.law or residual_law(problem, best.evaluation)
         prior = learned_prior(problem, best.evaluation, best.unknowns)
         objective = reweighted(objective_of(problem, models, law, prior), best, law)
@@ -176,7 +208,7 @@ def _from_starts(
     minima: list[Minimum] = []
     for number, theta in enumerate(settings.starts):
         motion = minima[0].unknowns[len(theta) :] if minima else coefficients
-        first = driven(objective, theta, bounds=settings.bounds, coefficients=motion)
+        first = driven(objective, theta, bounds=settings.bounds, coefficients=motion, max_steps=FIRST_STEPS)
         fresh = objective.with_fresh_correspondence(first.unknowns)
         minima.append(minimised(fresh, first.unknowns, settings, tolerance=1e-2))
         progress(f"start {number + 1} of {len(settings.starts)}: {len(minima[-1].history)} steps")

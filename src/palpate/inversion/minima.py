@@ -36,14 +36,15 @@ def driven(
     *,
     bounds: Bounds,
     coefficients: NDArray[np.float64] | None = None,
+    max_steps: int = 40,
 ) -> Minimum:
     """The best motion of the drivers at held log-moduli theta (n_parameters,), to a decrement of 1e-2.
 
-    coefficients (n_coefficients,), where the search begins; None: at rest.
+    coefficients (n_coefficients,), where the search begins; None: at rest. It is left where it is after `max_steps`.
     """
     motion = np.zeros(objective.n_unknowns - len(theta)) if coefficients is None else coefficients
     start = np.concatenate([theta, motion])
-    return gauss_newton(objective, start, bounds=bounds, hold_theta=True, tolerance=DRIVEN)
+    return gauss_newton(objective, start, bounds=bounds, hold_theta=True, tolerance=DRIVEN, max_steps=max_steps)
 
 
 def minimised(

@@ -11,6 +11,8 @@ from scipy.optimize import nnls
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from palpate.parallel import mapped
+
 __all__ = ["NoiseLaw", "fit_noise_law"]
 
 LENGTHS = (0.5, 0.8, 1.2, 2.0, 3.0, 4.5, 6.5, 9.5, 14.0)  # mm
@@ -69,9 +71,10 @@ def fit_noise_law(
     (0.5 to 14 mm).
     """
     edges = np.concatenate([[0.0, 1e-6], np.arange(1.0, REACH, 1.0)])
-    sums = np.zeros((4, len(edges) - 1))
-    for residual, place, normal in zip(values, places, normals, strict=True):
-        sums = sums + _binned_products(*_cells(residual, place, normal), edges)
+    sums = sum(
+        mapped(lambda of: _binned_products(*_cells(*of), edges), zip(values, places, normals, strict=True)),
+        np.zeros((4, len(edges) - 1)),
+    )
     products, cosines, distances, count = sums[:, sums[3] > 0]
     weight = np.sqrt(count)
     # (n_bins, n_lengths)

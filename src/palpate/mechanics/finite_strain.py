@@ -149,6 +149,10 @@ class FiniteStrainModel:
             )
         return replace(self, constraint=constraint)
 
+    def to_tolerance(self, tolerance: float) -> FiniteStrainModel:
+        """The same body, its equilibria found to another `tolerance` of the forces (see `NewtonSettings`)."""
+        return replace(self, settings=replace(self.settings, tolerance=tolerance))
+
     def _lame(self, poisson_ratio: float) -> tuple[float, float, float]:
         """(mu, lambda at the points, lambda in the mean) at E = 1."""
         lame, mu = lame_parameters(1.0, poisson_ratio)
