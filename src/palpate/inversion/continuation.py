@@ -1,8 +1,10 @@
 """From the linear estimate to that of a finite-strain law: Gauss-Newton on expansions around true equilibria.
 
 The linear law is off by tens of per cent where a wall moves by half its radius, but near enough to begin. Each round
-minimises the objective on an expansion to first order around the present equilibrium, solves the equilibrium where that
-leads, and expands it anew; where it does not lower the objective the step is halved.
+minimises the objective on an expansion to first order around the present equilibrium and solves the equilibrium where
+that leads; where it does not lower the objective the step is halved. The derivatives begin as the linear law's; of the
+present equilibrium are those along the directions that decide the moduli, which is all that these need to first order.
+One factorisation, made near the first equilibrium, serves every solve.
 """
 
 from __future__ import annotations
