@@ -40,6 +40,7 @@ REACH = 0.8  # of ln E, within which an expansion is trusted
 HALVINGS = 3
 NOISE = 0.5  # of the objective, in units of log-likelihood: the noise of re-chosen closest points
 COARSE, ROUGH = 3e-2, 1e-5  # of the forces: for a first factorisation; for all rounds but the last
+FEW = 24  # moduli and modes, all of whose derivatives cost less than the rounds that they spare
 POLISH = 1e-5  # decrement of a round's minimum
 
 
@@ -135,7 +136,7 @@ def _followed(
     progress("finite strain: the equilibrium at the linear estimate")
     moduli, amounts = _split(linear.objective, start.unknowns)
     pairs = zip(models, linear.surrogates, strict=True)
-    directions = deciding_directions(linear.objective, start.evaluation)
+    directions = _directions(linear.objective, start.evaluation)
     metrics = _metrics(linear.objective, start.evaluation)
     expansions = tuple(
         _sharpened(_near_linear(*of, moduli, q), d, m)
@@ -223,15 +224,13 @@ def _round(problem: InverseProblem, place: _Place, settings: InversionSettings, 
         return replace(place, minimum=replace(now, outcome=outcome), moved=moved)
     unknowns, equilibria = lower
     pairs = zip(equilibria, place.expansions, strict=True)
-    if moved < NEAR:
-        expansions = tuple(_recentred(before, equilibrium) for equilibrium, before in pairs)
-    else:
-        metrics = _metrics(place.objective, found.evaluation)
-        directions = deciding_directions(place.objective, found.evaluation)
-        expansions = tuple(
-            _sharpened(_recentred(before, equilibrium), *of)
-            for (equilibrium, before), *of in zip(pairs, directions, metrics, strict=True)
+    expansions = tuple(_recentred(before, equilibrium) for equilibrium, before in pairs)
+    few = all(e.reduced.n_regions + e.reduced.n_modes <= FEW for e in expansions)
+    if few or moved >= NEAR:
+        of = zip(
+            expansions, _directions(place.objective, found.evaluation), _metrics(place.objective, found.evaluation)
         )
+        expansions = tuple(_sharpened(*each) for each in of)
     there = replace(found, unknowns=unknowns, history=(*now.history, *found.history))
     objective = _around(place, expansions)
     arrived = _Place(objective, replace(there, evaluation=objective(unknowns)), expansions, place.law, moved)
@@ -278,6 +277,12 @@ def _sharpened(expansion: Expansion, directions: NDArray[np.float64], metric: ND
     share = np.linalg.pinv(directions.T @ metric @ directions, hermitian=True) @ (directions.T @ metric)
     sharper = replace(model, derivatives=model.derivatives + change @ share)
     return replace(expansion, reduced=sharper, counts=expansion.counts + SolveCounts(tangent=directions.shape[1]))
+
+
+def _directions(objective: Objective, evaluation: Evaluation) -> list[NDArray[np.float64]]:
+    """Those that decide the moduli, (n_regions + n_modes, k) of each state; all where a state has few unknowns."""
+    deciding = deciding_directions(objective, evaluation)
+    return [np.eye(len(d)) if len(d) <= FEW else d for d in deciding]
 
 
 def _metrics(objective: Objective, evaluation: Evaluation) -> list[NDArray[np.float64]]:
