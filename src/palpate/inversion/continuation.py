@@ -227,10 +227,9 @@ def _round(problem: InverseProblem, place: _Place, settings: InversionSettings, 
     expansions = tuple(_recentred(before, equilibrium) for equilibrium, before in pairs)
     few = all(e.reduced.n_regions + e.reduced.n_modes <= FEW for e in expansions)
     if few or moved >= NEAR:
-        of = zip(
-            expansions, _directions(place.objective, found.evaluation), _metrics(place.objective, found.evaluation)
-        )
-        expansions = tuple(_sharpened(*each) for each in of)
+        directions = _directions(place.objective, found.evaluation)
+        metrics = _metrics(place.objective, found.evaluation)
+        expansions = tuple(_sharpened(*of) for of in zip(expansions, directions, metrics, strict=True))
     there = replace(found, unknowns=unknowns, history=(*now.history, *found.history))
     objective = _around(place, expansions)
     arrived = _Place(objective, replace(there, evaluation=objective(unknowns)), expansions, place.law, moved)
