@@ -47,7 +47,7 @@ from palpate.study.run import estimate_states, inversion_settings
 
 PARTS = ("linear", "nonlinear", "gradient", "posterior", "scaling", "front_end")
 STARTS = (0.5, 1.0, 2.0, 4.0, 8.0)  # moduli to the surroundings'
-SCALING_EDGES = (9.0, 6.0, 4.0, 2.7, 1.85)  # mm: 30 k to 1 M unknowns
+SCALING_EDGES = (9.0, 6.0, 4.0, 2.7, 1.85, 1.65)  # mm: 30 k to 1 M unknowns
 
 
 @dataclass(frozen=True)
