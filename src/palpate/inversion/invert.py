@@ -122,13 +122,7 @@ def invert_with(
                 break
             surrogates, settled, refinements = finer, False, refinements + 1
     best = continued(objective, best, settings, tolerance=effort.polish)
-    met = groups_of(minima, objective.n_parameters)
-    minima = tuple(
-        replace(best, history=m.history + best.history[len(minima[chosen].history) :])
-        if group == met[chosen]  # starts that have met go on as one
-        else continued(objective, with_driver(m, best, objective.n_parameters), settings, tolerance=effort.others)
-        for m, group in zip(minima, met, strict=True)
-    )
+    minima = _ended(objective, settings, minima, best, chosen, tolerance=effort.others)
     counts = sum((s.counts for s in surrogates), SolveCounts())
     return Inversion(
         objective,
@@ -141,6 +135,25 @@ def invert_with(
         settled,
         evaluations=sum(len(minimum.history) for minimum in minima),
         counts=counts,
+    )
+
+
+def _ended(
+    objective: Objective,
+    settings: InversionSettings,
+    minima: tuple[Minimum, ...],
+    best: Minimum,
+    chosen: int,
+    *,
+    tolerance: float,
+) -> tuple[Minimum, ...]:
+    """Where the starts end when the `chosen` one has been followed to `best`: those that had met it go on with it."""
+    met, begun = groups_of(minima, objective.n_parameters), len(minima[chosen].history)
+    return tuple(
+        replace(best, history=m.history + best.history[begun:])
+        if group == met[chosen]
+        else continued(objective, with_driver(m, best, objective.n_parameters), settings, tolerance=tolerance)
+        for m, group in zip(minima, met, strict=True)
     )
 
 
