@@ -224,14 +224,14 @@ def _gradient(sizes: Sizes, seed: int, say: Say) -> dict[str, object]:
     objective = objective.with_fresh_correspondence(unknowns)
     frozen = peers.frozen_misfit(objective, unknowns)
     works = {
-        "gradient_s": lambda: objective(unknowns).gradient,
+        "gradient_s": lambda: objective.value_and_gradient(unknowns),
         "torch_fem_gradient_s": peers.torch_fem(problem, frozen, unknowns),
         "scikit_fem_gradient_s": peers.scikit_fem(problem, frozen, unknowns),
     }
     for name, work in works.items():
         if work is not None and name != "gradient_s":
             say(f"{name}: gradient off by {peers.disagreement(work(), frozen, surrogate, unknowns):.1e}")
-    objective(unknowns)
+    objective.value_and_gradient(unknowns)
     seconds = alternating(sizes.repeats, works)
     say(json.dumps(seconds))
     few = replace(settings, starts=settings.starts[: sizes.starts_of_peers])

@@ -136,3 +136,13 @@ def test_residuals_beyond_the_cutoff_have_no_weight(twins, twin):
     weights = np.concatenate([s.weights for s in now.surfaces])
     assert np.any(np.abs(values) > 0.8)
     assert np.array_equal(weights == 0.0, np.abs(values) >= 0.8)
+
+
+@pytest.mark.parametrize("make", FACTORIES.values(), ids=FACTORIES.keys())
+def test_the_gradient_alone_is_that_of_the_whole_evaluation(twins, twin, make, rng):
+    objective = make(twins, twin)
+    unknowns = 0.3 * rng.standard_normal(objective.n_unknowns)
+    value, gradient = objective.value_and_gradient(unknowns)
+    whole = objective(unknowns)
+    assert value == pytest.approx(whole.value, rel=1e-12)
+    assert gradient == pytest.approx(whole.gradient, rel=1e-9, abs=1e-9 * np.abs(whole.gradient).max())
