@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from palpate.inversion import continuation
 from palpate.inversion.continuation import continued_at_finite_strain
 from palpate.inversion.directions import deciding_directions
 from palpate.inversion.invert import invert
@@ -31,12 +32,15 @@ def linear(twins, body):
     return invert(body[1], twins.settings(0.5, 8.0), progress=twins.silent)
 
 
-@pytest.fixture(scope="module")
-def continued(twins, body, linear):
+@pytest.fixture(scope="module", params=[0, 1000], ids=["those that decide", "all"])
+def continued(request, twins, body, linear):
+    """With the derivatives that decide the moduli made those of each equilibrium, or all of them."""
     _, problem, model = body
-    return continued_at_finite_strain(
-        replace(problem, finite_strain=(model,)), linear, twins.settings(0.5, 8.0), progress=twins.silent
-    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(continuation, "FEW", request.param)
+        return continued_at_finite_strain(
+            replace(problem, finite_strain=(model,)), linear, twins.settings(0.5, 8.0), progress=twins.silent
+        )
 
 
 def test_the_law_that_made_the_data_finds_the_moduli(twins, linear, continued):

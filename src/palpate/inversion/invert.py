@@ -38,16 +38,16 @@ __all__ = ["invert", "invert_with"]
 ROUNDS = 9
 REFINEMENTS = 2  # of the drivers' walls; what is left then is no motion that they could follow
 FIRST_STEPS = 5  # of the drivers' motion at a start's moduli, before these move
-EXACT = 3e-3  # standard deviations of a residual, per mm of motion: a smaller model error needs no further snapshot
+ROUGH_SURFACE = 1.0 / 3.0  # mm, of a residual; below that a model must be as much more exact
 
 
 @dataclass(frozen=True, slots=True)
 class _Effort:
     """How far an estimate is taken.
 
-    exact: relative error in energy that a displacement may have; weighings: within a round, at the most; settled: by so
-    many posterior standard deviations a round may still move it; polish, others: decrement of the reported minimum and
-    of the other starts'.
+    exact: relative error in energy that a displacement may have where surfaces are rough, without a further snapshot;
+    weighings: within a round, at the most; settled: by so many posterior standard deviations a round may still move it;
+    polish, others: decrement of the reported minimum and of the other starts'.
     """
 
     exact: float
@@ -110,7 +110,7 @@ def invert_with(
     for round_ in range(ROUNDS):
         progress(f"round {round_ + 1}: {words(problem, best)}; the full model is solved there")
         law = settings.law or residual_law(problem, best.evaluation)
-        exact = min(EXACT * law.sd / TO_REPORT.exact, 1.0) * effort.exact
+        exact = effort.exact * min(law.sd / ROUGH_SURFACE, 1.0)
         surrogates = _enriched(problem, surrogates, objective, best, exact=exact)
         before = best
         law, objective, best = _until_agreed(problem, _reduced(surrogates), best, settings, effort.weighings)

@@ -198,8 +198,7 @@ class Objective:
             by_surface = tangent[rows][:, moved]
             jacobian = np.asarray(residuals.normal_jacobian @ by_surface)
             weights = residuals.weights * weighting.loss.weight(residuals.values)
-            pull = np.asarray(residuals.jacobian.T @ (weighting.precision * weights * residuals.values))
-            gradient = np.asarray(by_surface.T @ pull)
+            gradient = np.asarray(by_surface.T @ _pull(residuals, weighting))
             return Linearisation(residuals, columns, jacobian, weights, weighting.precision, target, gradient, s)
 
         return mapped(line, zip(state.slices(), self._surfaces(s, solution.displacement.ravel()), strict=True))
@@ -217,17 +216,22 @@ _Seen = tuple[SurfaceTarget, NDArray[np.float64], Weighting]  # a surface, its m
 
 def _misfit(seen: _Seen) -> float:
     """What a surface adds to the objective, dimensionless."""
-    weighting = seen[2]
-    return 0.5 * weighting.precision * _mean(_weighted(*seen), weighting.loss)
+    return _share(_weighted(*seen), seen[2])
 
 
 def _misfit_and_pull(seen: _Seen) -> tuple[float, NDArray[np.float64]]:
     """What a surface adds to the objective, and its derivative (n_dofs,) by the surface's displacement, 1/mm."""
-    weighting = seen[2]
     residuals = _weighted(*seen)
-    pull = residuals.weights * weighting.loss.weight(residuals.values) * residuals.values
-    misfit = 0.5 * weighting.precision * _mean(residuals, weighting.loss)
-    return misfit, np.asarray(residuals.jacobian.T @ (weighting.precision * pull))
+    return _share(residuals, seen[2]), _pull(residuals, seen[2])
+
+
+def _share(residuals: SurfaceResiduals, weighting: Weighting) -> float:
+    return 0.5 * weighting.precision * _mean(residuals, weighting.loss)
+
+
+def _pull(residuals: SurfaceResiduals, weighting: Weighting) -> NDArray[np.float64]:
+    weights = residuals.weights * weighting.loss.weight(residuals.values)
+    return np.asarray(residuals.jacobian.T @ (weighting.precision * weights * residuals.values))
 
 
 def _weighted(target: SurfaceTarget, motion: NDArray[np.float64], weighting: Weighting) -> SurfaceResiduals:

@@ -18,7 +18,7 @@ from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.tetrahedralise import tetrahedralise
 from palpate.phantoms.wall_filling import wall_filling
 
-__all__ = ["ORGANS", "RealPelvis", "grid_within", "real_pelvis"]
+__all__ = ["ORGANS", "SMOOTHING_MM", "RealPelvis", "grid_within", "real_pelvis"]
 
 ORGANS = ("prostate", "bladder")
 DRIVER = "rectum"

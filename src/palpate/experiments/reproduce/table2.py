@@ -21,7 +21,13 @@ from palpate.experiments.reproduce.jobs import Job, Progress, compute
 from palpate.experiments.reproduce.ledger import Ledger
 from palpate.experiments.reproduce.paper import PAPER_TABLE2
 from palpate.experiments.reproduce.paper_method import paper_estimate, paper_target
-from palpate.experiments.reproduce.real_pelvis import ORGANS, RealPelvis, grid_within, real_pelvis
+from palpate.experiments.reproduce.real_pelvis import (
+    ORGANS,
+    SMOOTHING_MM,
+    RealPelvis,
+    grid_within,
+    real_pelvis,
+)
 from palpate.experiments.reproduce.table import COLUMNS, Entry, Table, TableRow, as_part, entries_of
 from palpate.images.distance import observation_width, smoothing_width
 from palpate.images.label_image import VoxelGrid
@@ -55,7 +61,7 @@ OUTER = "sliding"  # the scan ends in the prostate: a border that held it would 
 NOTES = (
     f"The surroundings are known ({SURROUNDINGS_KPA:g} kPa) and set the scale; the paper does not state theirs.",
     "The pelvis is a real CT with automatic labels of 3 mm voxels; its later state is simulated with the linear law.",
-    "Its organs are smoothed by 4 mm: the stairs of the scan would run along every grid that it is imaged on again.",
+    f"Its organs are smoothed by {SMOOTHING_MM:g} mm: the stairs of the scan would run along every later grid, too.",
     "As in the paper the scene is prostate, bladder, a hollow rectum and a box; bones are part of the surroundings.",
     "The wall's motion is given in all columns but the voxels', as in the paper.",
     "voxels: 1 mm, on one of several grids shifted at random; all is made from the labels, the wall's motion too.",
