@@ -23,11 +23,11 @@ from palpate.images.segmentation import segment
 from palpate.images.tissue import Role
 from palpate.inversion.conclude import Observed, conclude
 from palpate.inversion.continuation import Expansion, continued_at_finite_strain
+from palpate.inversion.cramer_rao import cramer_rao
 from palpate.inversion.grid_position import FittedState, voxel_errors
 from palpate.inversion.invert import invert
 from palpate.inversion.modulus_map import modulus_map
 from palpate.inversion.noise import NoiseLaw, fit_noise_law
-from palpate.inversion.posterior import cramer_rao
 from palpate.inversion.problem import InverseProblem, Inversion, InversionSettings
 from palpate.inversion.surrogate import first_surrogate
 from palpate.inversion.weighting import objective_of
@@ -130,7 +130,7 @@ def max_cases(names: list[str]) -> int:
 Truths = dict[tuple[object, ...], tuple[Scene, float]]
 
 
-def _truth(row: Row, seed: int, draw: int, truths: Truths) -> tuple[Scene, PelvisOptions]:
+def truth_of(row: Row, seed: int, draw: int, truths: Truths) -> tuple[Scene, PelvisOptions]:
     """The scene of a row; rows of one seed share the truth where they can, but not the images.
 
     A linear truth is linear in the filling; a finite-strain one is made anew.
@@ -156,7 +156,7 @@ def _case(key: tuple[str, int, int], row: Row, truths: Truths) -> dict[str, obje
     """Make one scene, estimate it, and hold the estimate beside the truth."""
     name, seed, draw = key
     began = time.perf_counter()
-    scene, options = _truth(row, seed, draw, truths)
+    scene, options = truth_of(row, seed, draw, truths)
     filling = options.filling_mm
     scene_seconds = time.perf_counter() - began
     case = Case(
@@ -166,16 +166,12 @@ def _case(key: tuple[str, int, int], row: Row, truths: Truths) -> dict[str, obje
         mechanics=Mechanics(row.law, "P2" if row.law == "linear" and row.poisson_ratio is None else "auto"),
     )
     if row.data == "voxels":
-        space, problem, states = _from_voxels(scene, case)
+        space, problem, states = from_voxels(scene, case)
     else:
         space, problem, states = _from_surfaces(scene, case, options, same_mesh=row.data == "same mesh")
     settings = inversion_settings(case, problem.modulus_map)
     estimated = time.perf_counter()
-    linear = invert(replace(problem, finite_strain=()), settings, progress=_silent)
-    linear_seconds = time.perf_counter() - estimated
-    inversion = (
-        continued_at_finite_strain(problem, linear, settings, progress=_silent) if row.law != "linear" else linear
-    )
+    inversion = invert(problem, settings, progress=_silent)
     seconds = time.perf_counter() - estimated
     result = {
         "row": name,
@@ -191,8 +187,8 @@ def _case(key: tuple[str, int, int], row: Row, truths: Truths) -> dict[str, obje
     }
     result |= _errors(inversion, scene)
     if row.law != "linear":
+        linear = invert(replace(problem, finite_strain=()), settings, progress=_silent)
         result["linear_ln_error"] = _errors(linear, scene)["ln_error"]
-        result["linear_seconds"] = linear_seconds
         if seed % 5 == 1 and draw == 0 and row.noise is None:
             result["far_off_ln_error"] = _errors(_from_far_off(problem, linear, settings), scene)["ln_error"]
     if states:
@@ -214,7 +210,7 @@ def _from_far_off(problem: InverseProblem, linear: Inversion, settings: Inversio
     return continued_at_finite_strain(problem, moved, settings, progress=_silent)
 
 
-def _from_voxels(scene: Scene, case: Case) -> tuple[LagrangeSpace, InverseProblem, tuple[object, ...]]:
+def from_voxels(scene: Scene, case: Case) -> tuple[LagrangeSpace, InverseProblem, tuple[object, ...]]:
     before, after = (segment(image, scene.tissues) for image in (scene.before, scene.after))
     states = aligned(before, (after,), method="none")
     body = make_body(states, case, progress=lambda _: None)
@@ -274,21 +270,21 @@ def _uncertainty(
         "grid_sd": np.sqrt(np.diag(estimation.grid_covariance)).tolist(),
     }
     if row.noise is not None:
-        found["cramer_rao_sd"] = _cramer_rao_sd(_at_truth(inversion, problem, scene), body, scene, row.noise)
-        found["cramer_rao_at_the_estimate_sd"] = _cramer_rao_sd(inversion, body, scene, row.noise)
+        found["cramer_rao_sd"] = _cramer_rao_sd(at_truth(inversion, problem, scene), body, scene, row.noise)
     return found
 
 
 def _cramer_rao_sd(inversion: Inversion, body: Body, scene: Scene, noise: Noise) -> list[float]:
     """Of the log-moduli at an inversion's minimum; what is known before is the prior that the case states."""
     rng = np.random.default_rng([scene.seed, 11])
-    law = _true_law(inversion, body.space, fitted_states(inversion, body), noise, rng)
+    law = true_law(inversion, body.space, fitted_states(inversion, body), noise, rng)
     stated = replace(inversion.objective, prior=None).prior_precision()
     evaluation = replace(inversion.minimum.evaluation, prior=stated)
-    return np.sqrt(np.diag(cramer_rao(evaluation, law, inversion.objective.n_parameters))).tolist()
+    n, cell = inversion.objective.n_parameters, noise.correlation_length_mm
+    return np.sqrt(np.diag(cramer_rao(evaluation, law, n, cell_mm=cell))).tolist()
 
 
-def _at_truth(inversion: Inversion, problem: InverseProblem, scene: Scene) -> Inversion:
+def at_truth(inversion: Inversion, problem: InverseProblem, scene: Scene) -> Inversion:
     """The same with the truth for its minimum: the true moduli, and the wall's motion that comes nearest to it.
 
     A limit taken at the estimate would depend on the noise that moved it.
@@ -309,7 +305,7 @@ def _at_truth(inversion: Inversion, problem: InverseProblem, scene: Scene) -> In
     return replace(inversion, objective=objective, minima=(minimum,), groups=(0,), best=0, surrogates=(surrogate,))
 
 
-def _true_law(
+def true_law(
     inversion: Inversion,
     space: LagrangeSpace,
     fitted: tuple[FittedState, ...],

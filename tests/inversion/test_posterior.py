@@ -7,9 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from palpate.inversion.cramer_rao import cramer_rao, efficient_gain
 from palpate.inversion.noise import NoiseLaw
 from palpate.inversion.objective import Evaluation, Linearisation
-from palpate.inversion.posterior import cramer_rao, gain, sandwich_covariance
+from palpate.inversion.posterior import gain, sandwich_covariance
 from palpate.observation.misfit import SurfaceResiduals
 from palpate.phantoms.boundary_noise import smooth_field
 
@@ -123,10 +124,49 @@ def test_the_noise_of_a_shared_rest_state_is_not_averaged_away_by_a_like_motion_
     assert np.all(np.diag(opposite) < 0.8 * np.diag(pairs))
 
 
-def test_no_estimate_beats_the_cramer_rao_limit(smooth):
-    places, normals, jacobian = (array[::3] for array in smooth)
-    law = NoiseLaw(np.array([SD**2]), np.array([5.0]))
-    now = evaluation([surface(places, normals, jacobian, precision=200.0)], 2)
-    limit = cramer_rao(now, law, 2)
+@pytest.fixture
+def observed(smooth):
+    """An evaluation on the smooth surface, and noise that is smooth over 5 mm."""
+    return evaluation([surface(*smooth, precision=200.0)], 2), NoiseLaw(np.array([SD**2]), np.array([5.0]))
+
+
+def test_no_estimate_beats_the_cramer_rao_limit(observed):
+    now, law = observed
+    limit = cramer_rao(now, law, 2, cell_mm=5.0)
     assert np.linalg.eigvalsh(sandwich_covariance(now, law, 2) - 0.95 * limit).min() > 0.0
     assert np.linalg.eigvalsh(limit).min() > 0.0
+
+
+def test_the_weights_of_the_limit_attain_it_under_noise_of_its_law(observed, rng):
+    now, law = observed
+    places, normals = now.surfaces[0].residuals.places, now.surfaces[0].residuals.normals
+    rows, *_ = efficient_gain(now, law, 2, cell_mm=5.0)
+    kept = np.eye(5)[:2] - rows @ now.surfaces[0].jacobian  # what is not seen of the unknowns comes from their prior
+    assert kept[:, :2] == pytest.approx(np.zeros((2, 2)), abs=1e-9)  # no bias in the log-moduli
+    draws = [
+        rows @ np.einsum("na,na->n", smooth_field(rng, sd_mm=SD, correlation_mm=5.0, features=200).at(places), normals)
+        for _ in range(400)
+    ]
+    found = np.cov(np.transpose(draws)) + kept @ now.prior @ kept.T
+    limit = cramer_rao(now, law, 2, cell_mm=5.0)
+    assert np.sqrt(np.diag(found)) == pytest.approx(np.sqrt(np.diag(limit)), rel=0.12)
+
+
+def test_cells_of_the_noises_length_lose_little(observed):
+    now, law = observed
+    fine, cells = (np.sqrt(np.diag(cramer_rao(now, law, 2, cell_mm=size))) for size in (2.0, 5.0))
+    assert np.all(cells >= fine * (1.0 - 1e-9))
+    assert np.all(cells < 1.1 * fine)
+
+
+def test_rounding_of_single_faces_lowers_no_limit(smooth, observed, rng):
+    """A derivative that is rough from face to face seems to tell the moduli from what smooth noise leaves alone."""
+    places, normals, jacobian = smooth
+    rough = jacobian * (1.0 + 0.05 * rng.standard_normal((len(places), 1)))
+    now, law = evaluation([surface(places, normals, rough, precision=200.0)], 2), observed[1]
+    single, cells, smooth_limit = (
+        np.sqrt(np.diag(cramer_rao(of, law, 2, cell_mm=size)))
+        for of, size in ((now, 0.1), (now, 5.0), (observed[0], 5.0))
+    )
+    assert np.all(cells > 0.8 * smooth_limit)
+    assert np.all(single < 0.4 * smooth_limit)

@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 from palpate.inversion.noise import NoiseLaw
 from palpate.inversion.objective import Evaluation
 
-MAX_FACES = 2500  # of one surface, in the dense covariance of the Cramer-Rao limit
-
-__all__ = ["cramer_rao", "gain", "sandwich_covariance"]
+__all__ = ["gain", "later_states", "sandwich_covariance"]
 
 
 def gain(evaluation: Evaluation, n_parameters: int) -> tuple[NDArray[np.float64], ...]:
@@ -43,45 +41,23 @@ def sandwich_covariance(evaluation: Evaluation, law: NoiseLaw, n_parameters: int
         carried = np.concatenate([rows[i] for i in group], axis=1)
         return 0.5 * law.covariance(carried, np.concatenate([places[i] for i in group]), normals)
 
-    for group in _states(evaluation):
+    for group in later_states(evaluation):
         data += spread(group, [r.places for r in residuals])
-    for group in _rest_states(evaluation):
+    for group in _restlater_states(evaluation):
         data += spread(group, [r.material for r in residuals])
     return np.asarray(data + inverse.T @ evaluation.prior @ inverse)
 
 
-def cramer_rao(evaluation: Evaluation, law: NoiseLaw, n_parameters: int) -> NDArray[np.float64]:
-    """Smallest covariance (n_parameters, n_parameters) of the log-moduli that any unbiased estimate can have.
-
-    Inverse of the Fisher information F = sum_states J^T C^-1 J + P over the model's faces (model -> image residuals),
-    each face once, with the prior of the driver's motion. Of several later states each is taken with a first image of
-    its own.
-    """
-    information = evaluation.prior.copy()
-    for group in _states(evaluation):
-        parts = [_face_means(evaluation, i) for i in group]
-        jacobian, places, normals = (np.concatenate([part[k] for part in parts]) for k in range(3))
-        distance2 = np.sum((places[:, None] - places[None]) ** 2, axis=2)
-        covariance = sum(
-            variance * np.exp(-distance2 / (2.0 * length**2))
-            for variance, length in zip(law.variances, law.lengths, strict=True)
-        ) * (normals @ normals.T)
-        covariance += 1e-4 * law.sd**2 * np.eye(len(places))
-        columns = evaluation.surfaces[group[0]].columns
-        information[np.ix_(columns, columns)] += jacobian.T @ np.linalg.solve(covariance, jacobian)
-    return np.asarray(np.linalg.inv(information)[:n_parameters, :n_parameters])
-
-
-def _states(evaluation: Evaluation) -> Sequence[list[int]]:
+def later_states(evaluation: Evaluation) -> Sequence[list[int]]:
     """Numbers of the surfaces of each later state."""
     states = [surface.state for surface in evaluation.surfaces]
     return [[i for i, state in enumerate(states) if state == key] for key in dict.fromkeys(states)]
 
 
-def _rest_states(evaluation: Evaluation) -> Sequence[list[int]]:
+def _restlater_states(evaluation: Evaluation) -> Sequence[list[int]]:
     """Numbers of the surfaces of each rest state, whose later states have the very same observed surfaces."""
     groups: list[list[int]] = []
-    for state in _states(evaluation):
+    for state in later_states(evaluation):
         surface = evaluation.surfaces[state[0]].target.surface
         known = [group for group in groups if evaluation.surfaces[group[0]].target.surface is surface]
         if known:
@@ -89,17 +65,3 @@ def _rest_states(evaluation: Evaluation) -> Sequence[list[int]]:
         else:
             groups.append(list(state))
     return groups
-
-
-def _face_means(
-    evaluation: Evaluation, surface: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Jacobian rows, places and normals of the model -> image residuals, averaged over groups of neighbours."""
-    line = evaluation.surfaces[surface]
-    size = max(int(np.ceil(len(line.target.area) / MAX_FACES)), 1)
-    n = len(line.target.area) // size
-    jacobian, places, normals = (
-        part[: n * size].reshape(n, size, -1).mean(axis=1)
-        for part in (line.jacobian, line.residuals.places, line.residuals.normals)
-    )
-    return jacobian, places, normals

@@ -1,0 +1,178 @@
+"""What `palpate check` predicts that an estimate will cost, beside what it costs: tetrahedra, seconds, memory.
+
+    python benchmarks/cost.py [--cases N,N,...] [--json]
+
+Each case runs in a process of its own, from label images on disk, so that its peak memory is its own; "superlu" cases
+run as if PARDISO were not installed. The constants of `palpate.study.cost` are fitted to these runs. Simulated data.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from palpate.experiments.simulated_pelvis import DATA
+from palpate.images.readers import write_label_image
+from palpate.phantoms.pelvis import PelvisOptions, pelvis
+from palpate.phantoms.spheres import SpheresOptions, spheres
+from palpate.study.case_file import read_case
+from palpate.study.cost import expected_cost
+from palpate.study.read import read_states
+from palpate.study.run import estimate
+
+
+@dataclass(frozen=True)
+class Run:
+    """One case: the body, what it is computed with, and whether the constants were fitted to it."""
+
+    body: str
+    edge_mm: float
+    modes: int = 90
+    law: str = "linear"
+    element: str = "auto"
+    solver: str = "pardiso"
+    fitted: bool = True
+
+
+RUNS = (
+    Run("spheres", 8.0, modes=30),
+    Run("spheres", 8.0, modes=30, solver="superlu"),
+    Run("spheres", 6.0),
+    Run("spheres", 6.0, solver="superlu"),
+    Run("pelvis", 8.0),
+    Run("pelvis", 8.0, solver="superlu"),
+    Run("pelvis", 8.0, element="P1"),
+    Run("pelvis", 6.0),
+    Run("pelvis", 4.5),
+    Run("demo", 10.0),
+    Run("demo", 10.0, solver="superlu"),
+    Run("spheres", 7.0, law="neo-hookean"),
+    Run("pelvis", 8.0, law="neo-hookean"),
+    Run("pelvis", 8.0, law="neo-hookean", solver="superlu"),
+    Run("pelvis", 5.5, law="neo-hookean"),
+    Run("demo", 8.0, fitted=False),
+    Run("pelvis", 7.0, solver="superlu", fitted=False),
+    Run("pelvis", 6.5, law="neo-hookean", fitted=False),
+)
+SPHERES = """
+[images]
+before = "before.nii.gz"
+after = ["after.nii.gz"]
+[tissues]
+core = {label = 1, role = "estimate"}
+shell = {label = 2, role = "estimate"}
+frame = {label = 3, role = "driver"}
+surroundings = {label = "remaining", role = "known", youngs_modulus_kpa = 10.0}
+"""
+PELVIS = """
+[images]
+before = "before.nii.gz"
+after = ["after.nii.gz"]
+[tissues]
+prostate = {label = 1, role = "estimate"}
+bladder = {label = 2, role = "estimate"}
+rectum = {label = 3, role = "driver"}
+surroundings = {label = "remaining", role = "known", youngs_modulus_kpa = 10.0}
+"""
+
+
+def main() -> int:
+    """Run the cases that were asked for and print what was predicted and found."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cases", default=",".join(str(i) for i in range(len(RUNS))), help="numbers, from 0")
+    parser.add_argument("--json", action="store_true", help="print one JSON document")
+    parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
+    parser.add_argument("--images", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.images:
+        _write_images(Path(arguments.images))
+        return 0
+    if arguments.one:
+        print(json.dumps(_one(RUNS[int(arguments.one[0])], Path(arguments.one[1]))))
+        return 0
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        _child("--images", folder)
+        for number in arguments.cases.split(","):
+            rows.append(json.loads(_child("--one", number, folder)))
+            print(_line(rows[-1]), file=sys.stderr, flush=True)
+    print(json.dumps({"runs": rows}, indent=1) if arguments.json else "\n".join([*HEAD, *(_line(row) for row in rows)]))
+    return 0
+
+
+def _child(*arguments: str) -> str:
+    command = [sys.executable, str(Path(__file__)), *arguments]
+    return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+
+
+def _write_images(folder: Path) -> None:
+    """The label images of both phantoms, whose truths need more memory than their estimates."""
+    scenes = {
+        "spheres": spheres(SpheresOptions(seed=2, truth_edge_mm=5.0)),
+        "pelvis": pelvis(PelvisOptions(seed=1, truth_edge_mm=4.0)),
+    }
+    for (name, scene), text in zip(scenes.items(), (SPHERES, PELVIS), strict=True):
+        (folder / name).mkdir()
+        write_label_image(folder / name / "before.nii.gz", scene.before)
+        write_label_image(folder / name / "after.nii.gz", scene.after)
+        (folder / name / "case.toml").write_text(text)
+
+
+def _one(run: Run, folder: Path) -> dict[str, object]:
+    if run.solver == "superlu":
+        sys.modules["pypardiso"] = None  # as where it is not installed
+    path = DATA / "demo.toml" if run.body == "demo" else folder / run.body / "case.toml"
+    settings = {
+        "mesh.edge_length_mm": run.edge_mm,
+        "driver.modes": run.modes,
+        "mechanics.law": f'"{run.law}"',
+        "mechanics.element": f'"{run.element}"',
+    }
+    case = read_case(path, [f"{key}={value}" for key, value in settings.items()])
+    states = read_states(case)
+    predicted = expected_cost(case, states.before, states.after, n_pairs=1)
+    began = time.perf_counter()
+    result = estimate(case)
+    return {
+        **{key: getattr(run, key) for key in ("body", "edge_mm", "modes", "law", "element", "fitted")},
+        "solver": predicted.solver,
+        "processors": predicted.processors,
+        "unknowns": 3 * len(result.space.points),
+        "organs": len(states.before.tissues),
+        "tets": [predicted.tets, len(result.space.mesh.tets)],
+        "seconds": [round(predicted.seconds, 1), round(time.perf_counter() - began, 1)],
+        "memory_gb": [round(predicted.memory_gb, 2), round(_peak_gb(), 2)],
+        "stages_s": dict(result.provenance.seconds),
+        "status": result.estimation.status,
+    }
+
+
+def _peak_gb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0**2
+
+
+WHAT = ("tetrahedra", "time, s", "memory, GB")
+PAIRS = (f"{what}: {how}" for what in WHAT for how in ("predicted", "found"))
+COLUMNS = ("case", "edge, mm", "modes", "solver", *PAIRS)
+HEAD = (f"| {' | '.join(COLUMNS)} |", "|" + "---|" * len(COLUMNS))
+
+
+def _line(row: dict) -> str:
+    plain = {"linear": "", "neo-hookean": ", neo-Hookean"}[row["law"]] + (", P1" if row["element"] == "P1" else "")
+    name = f"{row['body']}{plain}{'' if row['fitted'] else ', not fitted'}"
+    cells = [name, f"{row['edge_mm']:g}", str(row["modes"]), row["solver"]]
+    cells += [f"{value:g}" for key in ("tets", "seconds", "memory_gb") for value in np.asarray(row[key])]
+    return f"| {' | '.join(cells)} |"
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,118 @@
+"""Whether the Cramer-Rao limit is one: the scatter of its own weights on images with noise, beside what it promises.
+
+    python benchmarks/noise_limit.py [--seed S] [--draws N] [--json]
+
+A neo-Hookean pelvis with the noise of accuracy.py's row `finite-noise` is imaged N times. The residuals at the truth go
+through the weights that the limit stands for, for cells of several edge lengths (0: every face alone), and through the
+estimator's own. Simulated data.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import dataclass, replace
+
+import accuracy
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.images.segmentation import segment
+from palpate.inversion.cramer_rao import cramer_rao, efficient_gain
+from palpate.inversion.invert import invert
+from palpate.inversion.noise import NoiseLaw
+from palpate.inversion.objective import Evaluation
+from palpate.inversion.posterior import gain
+from palpate.phantoms.pelvis import pelvis_grid
+from palpate.phantoms.scene import reimaged
+from palpate.study.body import aligned, surface_targets
+from palpate.study.case import Case, Mechanics, MeshSettings, Phantom
+from palpate.study.run import fitted_states, inversion_settings
+
+ROW = accuracy.ROWS["finite-noise"]
+CELLS_MM = (0.0, 2.0, 4.0, 6.0, 8.0)
+ALONE = 1e-3  # mm: a cell of one face
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Derivative (n_parameters, n_residuals) of the log-moduli, and the covariance that the law promises (None: no)."""
+
+    name: str
+    rows: NDArray[np.float64]
+    promised: NDArray[np.float64] | None
+
+
+def main() -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seed", type=int, default=320)
+    parser.add_argument("--draws", type=int, default=30)
+    parser.add_argument("--json", action="store_true", help="print one JSON document")
+    arguments = parser.parse_args()
+    scene, options = accuracy.truth_of(replace(ROW, noise=None), arguments.seed, 0, {})
+    case = Case(
+        "noise-limit",
+        phantom=Phantom("pelvis", arguments.seed),
+        mesh=MeshSettings(ROW.edge_mm),
+        mechanics=Mechanics(ROW.law, "auto"),
+    )
+    space, problem, (body, *_) = accuracy.from_voxels(scene, case)
+    inversion = invert(problem, inversion_settings(case, problem.modulus_map), progress=lambda _: None)
+    there = accuracy.at_truth(inversion, problem, scene)
+    fitted = fitted_states(inversion, body)
+    law = accuracy.true_law(there, space, fitted, ROW.noise, np.random.default_rng([arguments.seed, 11]))
+    stated = replace(there.objective, prior=None).prior_precision()
+    evaluation = replace(there.minimum.evaluation, prior=stated)
+    weights = _weights(evaluation, law, there.objective.n_parameters)
+    shifts: dict[str, list[NDArray[np.float64]]] = {w.name: [] for w in weights}
+    surfaces = [line.target.surface for line in evaluation.surfaces]
+    for draw in range(1, arguments.draws + 1):
+        noisy = replace(options, noise=ROW.noise)
+        imaged = reimaged(replace(scene, seed=scene.seed + 1000 * draw), pelvis_grid(noisy), noise=ROW.noise)
+        before, after = (segment(image, scene.tissues) for image in (imaged.before, imaged.after))
+        states = aligned(before, (after,), method="none")
+        targets = surface_targets(replace(body, states=states), surfaces)[0]
+        errors = np.concatenate(
+            [
+                target.after.at(line.residuals.places[: len(target.area)]) - target.rest_distance
+                for line, target in zip(evaluation.surfaces, targets, strict=True)
+            ]
+        )
+        for w in weights:
+            shifts[w.name].append(w.rows @ errors)
+        print(f"draw {draw} of {arguments.draws}", file=sys.stderr, flush=True)
+    names = problem.modulus_map.tissues
+    rows = [_row(w, np.array(shifts[w.name]), evaluation, names) for w in weights]
+    print(json.dumps({"seed": arguments.seed, "draws": arguments.draws, "rows": rows}, indent=1))
+    return 0
+
+
+def _weights(evaluation: Evaluation, law: NoiseLaw, n: int) -> list[Weights]:
+    found = []
+    for cell in CELLS_MM:
+        size = max(cell, ALONE)
+        rows = np.concatenate(efficient_gain(evaluation, law, n, cell_mm=size), axis=1)
+        found.append(Weights(f"limit, cells of {cell:g} mm", rows, cramer_rao(evaluation, law, n, cell_mm=size)))
+    pairs = zip(gain(evaluation, n), evaluation.surfaces, strict=True)
+    # half of the weight is on each direction of the distance, which see the same error
+    own = np.concatenate([2.0 * row[:, : len(line.target.area)] for row, line in pairs], axis=1)
+    return [*found, Weights("the estimator's own", own, None)]
+
+
+def _row(
+    weights: Weights, shifts: NDArray[np.float64], evaluation: Evaluation, names: tuple[str, ...]
+) -> dict[str, object]:
+    """Standard deviations of the log-moduli: as promised, and as the draws scatter, with the prior's part."""
+    n = len(names)
+    jacobian = np.concatenate([line.jacobian[: len(line.target.area)] for line in evaluation.surfaces])
+    by_modes = weights.rows @ jacobian[:, n:]  # modes that the weights do not keep out of the moduli
+    by_prior = by_modes @ np.linalg.solve(evaluation.prior[n:, n:], by_modes.T)
+    scatter = np.sqrt(np.diag(np.cov(shifts.T) + by_prior))
+    promised = None if weights.promised is None else np.sqrt(np.diag(weights.promised)).tolist()
+    return {"weights": weights.name, "tissues": list(names), "promised_sd": promised, "scatter_sd": scatter.tolist()}
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

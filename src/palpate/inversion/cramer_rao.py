@@ -1,0 +1,96 @@
+"""The Cramer-Rao limit: what noise leaves open, whatever the method."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.spatial.distance import cdist
+
+from palpate.inversion.noise import NoiseLaw
+from palpate.inversion.objective import Evaluation, Linearisation
+from palpate.inversion.posterior import later_states
+
+__all__ = ["cramer_rao", "efficient_gain"]
+
+RIDGE = 1e-4  # of the variance of a residual, on the cells' covariance
+ROWS = 64  # cells whose pairs are in memory at once
+
+
+def cramer_rao(evaluation: Evaluation, law: NoiseLaw, n_parameters: int, *, cell_mm: float) -> NDArray[np.float64]:
+    """Smallest covariance (n_parameters, n_parameters) of the log-moduli that any unbiased estimate can have.
+
+    Inverse of the Fisher information F = sum_states J^T C^-1 J + P of the model -> image residuals' means over cells of
+    the surfaces, with the prior P of the driver's motion. Of several later states each is taken with a first image of
+    its own.
+
+    `cell_mm`: the noise's correlation length. Within it a smooth law leaves next to no noise, so that single faces
+    would tell moduli from the differences of neighbours, which are rounding that no such law describes: a limit that
+    its own weights miss by far (benchmarks/noise_limit.py).
+    """
+    return np.asarray(_inverse_information(evaluation, law, cell_mm)[:n_parameters, :n_parameters])
+
+
+def efficient_gain(
+    evaluation: Evaluation, law: NoiseLaw, n_parameters: int, *, cell_mm: float
+) -> tuple[NDArray[np.float64], ...]:
+    """Derivative (n_parameters, n_q) of the log-moduli by each surface's model -> image residuals, 1/mm, at the limit.
+
+    G = F^-1 J^T C^-1 on the cells' means: of all weights without bias those of least variance (Aitken 1935). Under
+    noise that obeys `law`, G C G^T with the prior's part is the limit of `cramer_rao`.
+    """
+    inverse, found = _inverse_information(evaluation, law, cell_mm)[:n_parameters], list[NDArray[np.float64]]()
+    for group in later_states(evaluation):
+        lines = [evaluation.surfaces[i] for i in group]
+        weighted, means = _whitened(lines, law, cell_mm)
+        rows = inverse[:, lines[0].columns] @ weighted.T @ means
+        found += np.split(rows, np.cumsum([len(line.target.area) for line in lines])[:-1], axis=1)
+    return tuple(found)
+
+
+def _inverse_information(evaluation: Evaluation, law: NoiseLaw, cell_mm: float) -> NDArray[np.float64]:
+    information = evaluation.prior.copy()
+    for group in later_states(evaluation):
+        lines = [evaluation.surfaces[i] for i in group]
+        weighted, means = _whitened(lines, law, cell_mm)
+        columns = lines[0].columns
+        information[np.ix_(columns, columns)] += weighted.T @ (means @ _jacobian(lines))
+    return np.asarray(np.linalg.inv(information))
+
+
+def _whitened(
+    lines: Sequence[Linearisation], law: NoiseLaw, cell_mm: float
+) -> tuple[NDArray[np.float64], sparse.csr_matrix[np.float64]]:
+    """C^-1 J (n_cells, n_columns) of the cells' means, and the matrix (n_cells, n_q) that makes these means."""
+    means = sparse.block_diag([_cell_means(line, cell_mm) for line in lines], format="csr")
+    places = np.concatenate([line.residuals.places[: len(line.target.area)] for line in lines])
+    normals = np.concatenate([line.residuals.normals[: len(line.target.area)] for line in lines])
+    covariance = np.zeros((means.shape[0],) * 2)
+    for start in range(0, means.shape[0], ROWS):
+        block = means[start : start + ROWS]
+        touched = np.unique(block.indices)
+        distance2 = cdist(places[touched], places, "sqeuclidean")
+        pairs = sum(
+            variance * np.exp(-distance2 / (2.0 * length**2))
+            for variance, length in zip(law.variances, law.lengths, strict=True)
+        ) * (normals[touched] @ normals.T)
+        covariance[start : start + ROWS] = block[:, touched] @ (means @ pairs.T).T
+    covariance[np.diag_indices_from(covariance)] += RIDGE * law.sd**2
+    return np.linalg.solve(covariance, means @ _jacobian(lines)), means
+
+
+def _jacobian(lines: Sequence[Linearisation]) -> NDArray[np.float64]:
+    """Derivative (n_q, n_columns) of the surfaces' model -> image residuals, one surface after the other."""
+    return np.concatenate([line.jacobian[: len(line.target.area)] for line in lines])
+
+
+def _cell_means(line: Linearisation, edge_mm: float) -> sparse.csr_matrix[np.float64]:
+    """Matrix (n_cells, n_q) of means by area over cubes; what looks to other sides is kept apart."""
+    area = line.target.area
+    places, normals = line.residuals.places[: len(area)], line.residuals.normals[: len(area)]
+    number = np.unique(np.column_stack([np.floor(places / edge_mm), normals > 0.0]), axis=0, return_inverse=True)[1]
+    number = number.ravel()
+    share = area / np.bincount(number, area)[number]
+    return sparse.csr_matrix((share, (number, np.arange(len(area)))))
