@@ -211,6 +211,7 @@ def _from_far_off(problem: InverseProblem, linear: Inversion, settings: Inversio
 
 
 def from_voxels(scene: Scene, case: Case) -> tuple[LagrangeSpace, InverseProblem, tuple[object, ...]]:
+    """Everything from the label images: the displacements' space, the inverse problem, the body it is made of."""
     before, after = (segment(image, scene.tissues) for image in (scene.before, scene.after))
     states = aligned(before, (after,), method="none")
     body = make_body(states, case, progress=lambda _: None)

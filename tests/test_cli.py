@@ -314,3 +314,9 @@ def test_help_is_quick():
     assert done.returncode == 0
     for command in ("demo", "init", "check", "mesh", "simulate", "estimate", "report"):
         assert command in done.stdout
+
+
+def test_the_package_runs_as_a_module():
+    command = [sys.executable, "-m", "palpate", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.split()[0]) == (0, "palpate")
