@@ -2,9 +2,9 @@
 
 The linear law is off by tens of per cent where a wall moves by half its radius, but near enough to begin. Each round
 minimises the objective on an expansion to first order around the present equilibrium and solves the equilibrium where
-that leads; where it does not lower the objective the step is halved. The derivatives begin as the linear law's; of the
-present equilibrium are those along the directions that decide the moduli, which is all that these need to first order.
-One factorisation, made near the first equilibrium, serves every solve.
+that leads; where it does not lower the objective the step is halved. One factorisation, made near the first
+equilibrium, gives all derivatives there and serves every solve. At the end the derivatives along the directions that
+decide the moduli, which is all that these need to first order, are made those of the equilibrium there.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ __all__ = ["Expansion", "continued_at_finite_strain"]
 
 ROUNDS = 12
 WEIGHED = (2, 7)  # least and largest number of rounds that weigh the residuals anew
-NEAR = 0.5  # posterior standard deviations: a round that moves less leaves weights and derivatives, and can settle
+NEAR = 0.5  # posterior standard deviations: a round that moves less leaves the weights
 REACH = 0.8  # of ln E, within which an expansion is trusted
 HALVINGS = 3
 NOISE = 0.5  # of the objective, in units of log-likelihood: the noise of re-chosen closest points
-COARSE, ROUGH = 3e-2, 1e-5  # of the forces: for a first factorisation; for all rounds but the last
+COARSE, ROUGH = 3e-2, 1e-4  # of the forces: for a first factorisation; for all rounds but the last
 FEW = 24  # moduli and modes, all of whose derivatives cost less than the rounds that they spare
 POLISH = 1e-5  # decrement of a round's minimum
 
@@ -135,13 +135,8 @@ def _followed(
     """Rounds from one linear minimum until the moduli no longer move."""
     progress("finite strain: the equilibrium at the linear estimate")
     moduli, amounts = _split(linear.objective, start.unknowns)
-    pairs = zip(models, linear.surrogates, strict=True)
-    directions = _directions(linear.objective, start.evaluation)
-    metrics = _metrics(linear.objective, start.evaluation)
-    expansions = tuple(
-        _sharpened(_near_linear(*of, moduli, q), d, m)
-        for of, q, d, m in zip(pairs, amounts, directions, metrics, strict=True)
-    )
+    triples = zip(models, linear.surrogates, amounts, strict=True)
+    expansions = tuple(_near_linear(model, surrogate, moduli, q) for model, surrogate, q in triples)
     first = _Place(linear.objective, replace(start, history=()), expansions, linear.law)
     place = _weighed(problem, first, settings)
     for number in range(ROUNDS):
@@ -150,6 +145,8 @@ def _followed(
         before, place = place, _round(problem, place, settings, weigh=weigh)
         if place.settled or place.expansions is before.expansions:
             break
+    expansions = _sharpened(place.objective, place.minimum.evaluation, place.expansions)
+    place = replace(place, objective=_around(place, expansions), expansions=expansions)
     found = minimised(place.objective, place.minimum.unknowns, settings, tolerance=POLISH)
     # a polish that finds no better point leaves the last round's, which is an equilibrium with its own outcome
     end = _joined(place.minimum, found) if found.outcome.converged else place.minimum
@@ -184,7 +181,7 @@ def _around(place: _Place, expansions: tuple[Expansion, ...]) -> Objective:
 def _near_linear(
     model: FiniteStrainModel, linear: StandIn, moduli: NDArray[np.float64], amounts: NDArray[np.float64]
 ) -> Expansion:
-    """The equilibrium near the linear estimate with that law's derivatives, and with a factorisation of its own.
+    """The equilibrium near the linear estimate, with a factorisation of its own and all derivatives by that.
 
     It is the only one: it serves all solves that follow, which stay near.
     """
@@ -192,8 +189,10 @@ def _near_linear(
     coarse = model.to_tolerance(COARSE)
     near = from_start(coarse, moduli, amounts, start=there.displacement, nearby=linear.factorisation).refactorised()
     found = from_start(model, moduli, amounts, start=near.displacement, nearby=near.factorisation)
-    derivatives = FirstOrderModel(model.names, moduli, amounts, found.values, there.tangent())
-    return Expansion(derivatives, found, near.counts + found.counts + SolveCounts(factorisations=1))
+    derivatives = FirstOrderModel(model.names, moduli, amounts, found.values, near.tangent())
+    return Expansion(
+        derivatives, found, near.counts + near.tangent_counts + found.counts + SolveCounts(factorisations=1)
+    )
 
 
 def _weighed(problem: InverseProblem, place: _Place, settings: InversionSettings) -> _Place:
@@ -226,10 +225,8 @@ def _round(problem: InverseProblem, place: _Place, settings: InversionSettings, 
     pairs = zip(equilibria, place.expansions, strict=True)
     expansions = tuple(_recentred(before, equilibrium) for equilibrium, before in pairs)
     few = all(e.reduced.n_regions + e.reduced.n_modes <= FEW for e in expansions)
-    if few or moved >= NEAR:
-        directions = _directions(place.objective, found.evaluation)
-        metrics = _metrics(place.objective, found.evaluation)
-        expansions = tuple(_sharpened(*of) for of in zip(expansions, directions, metrics, strict=True))
+    if few:
+        expansions = _sharpened(place.objective, found.evaluation, expansions)
     there = replace(found, unknowns=unknowns, history=(*now.history, *found.history))
     objective = _around(place, expansions)
     arrived = _Place(objective, replace(there, evaluation=objective(unknowns)), expansions, place.law, moved)
@@ -264,7 +261,16 @@ def _solved(expansion: Expansion, moduli: NDArray[np.float64], amounts: NDArray[
     return found if found.converged else before.model.attempt(moduli, amounts, start=before.displacement)
 
 
-def _sharpened(expansion: Expansion, directions: NDArray[np.float64], metric: NDArray[np.float64]) -> Expansion:
+def _sharpened(
+    objective: Objective, evaluation: Evaluation, expansions: tuple[Expansion, ...]
+) -> tuple[Expansion, ...]:
+    """The expansions with the derivatives exact, at their equilibria, along the directions that decide the moduli."""
+    metrics = _metrics(objective, evaluation)
+    triples = zip(expansions, _directions(objective, evaluation), metrics, strict=True)
+    return tuple(_sharpened_along(*of) for of in triples)
+
+
+def _sharpened_along(expansion: Expansion, directions: NDArray[np.float64], metric: NDArray[np.float64]) -> Expansion:
     """The expansion with the derivatives along `directions` D (n_regions + n_modes, k) exact at its equilibrium.
 
     T + (C - T D) (D^T H D)^+ D^T H with the exact C and H the `metric` (n_regions + n_modes, n_regions + n_modes): of

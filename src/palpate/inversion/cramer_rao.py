@@ -45,7 +45,7 @@ def efficient_gain(
     for group in later_states(evaluation):
         lines = [evaluation.surfaces[i] for i in group]
         weighted, means = _whitened(lines, law, cell_mm)
-        rows = inverse[:, lines[0].columns] @ weighted.T @ means
+        rows = np.asarray(inverse[:, lines[0].columns] @ weighted.T @ means)
         found += np.split(rows, np.cumsum([len(line.target.area) for line in lines])[:-1], axis=1)
     return tuple(found)
 
@@ -56,7 +56,7 @@ def _inverse_information(evaluation: Evaluation, law: NoiseLaw, cell_mm: float) 
         lines = [evaluation.surfaces[i] for i in group]
         weighted, means = _whitened(lines, law, cell_mm)
         columns = lines[0].columns
-        information[np.ix_(columns, columns)] += weighted.T @ (means @ _jacobian(lines))
+        information[np.ix_(columns, columns)] += weighted.T @ np.asarray(means @ _jacobian(lines))
     return np.asarray(np.linalg.inv(information))
 
 
@@ -64,7 +64,7 @@ def _whitened(
     lines: Sequence[Linearisation], law: NoiseLaw, cell_mm: float
 ) -> tuple[NDArray[np.float64], sparse.csr_matrix[np.float64]]:
     """C^-1 J (n_cells, n_columns) of the cells' means, and the matrix (n_cells, n_q) that makes these means."""
-    means = sparse.block_diag([_cell_means(line, cell_mm) for line in lines], format="csr")
+    means = sparse.csr_matrix(sparse.block_diag([_cell_means(line, cell_mm) for line in lines]))
     places = np.concatenate([line.residuals.places[: len(line.target.area)] for line in lines])
     normals = np.concatenate([line.residuals.normals[: len(line.target.area)] for line in lines])
     covariance = np.zeros((means.shape[0],) * 2)
@@ -78,7 +78,7 @@ def _whitened(
         ) * (normals[touched] @ normals.T)
         covariance[start : start + ROWS] = block[:, touched] @ (means @ pairs.T).T
     covariance[np.diag_indices_from(covariance)] += RIDGE * law.sd**2
-    return np.linalg.solve(covariance, means @ _jacobian(lines)), means
+    return np.asarray(np.linalg.solve(covariance, np.asarray(means @ _jacobian(lines)))), means
 
 
 def _jacobian(lines: Sequence[Linearisation]) -> NDArray[np.float64]:

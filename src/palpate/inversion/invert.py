@@ -37,7 +37,7 @@ __all__ = ["invert", "invert_with"]
 
 ROUNDS = 9
 REFINEMENTS = 2  # of the drivers' walls; what is left then is no motion that they could follow
-FIRST_STEPS = 5  # of the drivers' motion at a start's moduli, before these move
+FIRST_STEPS = 2  # of the drivers' motion at a start's moduli, before these move
 ROUGH_SURFACE = 1.0 / 3.0  # mm, of a residual; below that a model must be as much more exact
 
 
@@ -58,7 +58,7 @@ class _Effort:
 
 
 TO_REPORT = _Effort(exact=1e-3, weighings=4, settled=SETTLED, polish=1e-5, others=1e-4)
-TO_START_FROM = _Effort(exact=1e-2, weighings=1, settled=0.5, polish=1e-3, others=1e-3)
+TO_START_FROM = _Effort(exact=1e-1, weighings=1, settled=0.5, polish=1e-3, others=1e-3)
 
 
 def invert(problem: InverseProblem, settings: InversionSettings, *, progress: Callable[[str], None]) -> Inversion:

@@ -6,9 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from palpate.parallel import mapped
+
 __all__ = ["times"]
 
 FEW = 8  # columns, up to which one after the other is faster: SciPy's kernel for several has no registers for so few
+WORTH_THREADS = 3_000_000  # products of a column; below, handing it to a thread takes longer than it spares
 
 
 def times(matrix: sparse.csr_matrix[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -16,6 +19,15 @@ def times(matrix: sparse.csr_matrix[np.float64], vectors: NDArray[np.float64]) -
     if vectors.shape[1] >= FEW:
         return np.asarray(matrix @ vectors)
     result = np.empty((matrix.shape[0], vectors.shape[1]))
-    for number, column in enumerate(np.ascontiguousarray(vectors.T)):
-        result[:, number] = matrix @ column
+    columns = np.ascontiguousarray(vectors.T)
+
+    def fill(number: int) -> None:
+        """One column of the result."""
+        result[:, number] = matrix @ columns[number]
+
+    if matrix.nnz < WORTH_THREADS or len(columns) == 1:
+        for number in range(len(columns)):
+            fill(number)
+    else:
+        mapped(fill, range(len(columns)))
     return result
