@@ -23,19 +23,18 @@ GRADING = 0.45  # the mesher's: growth of the edge length with the distance from
 COARSEST = 4.0  # its longest edge, in edge lengths
 COARSER = 1.5  # its edge length on bones, air and known tissues, in edge lengths
 LATTICE = 96  # points of the lattice along the longest side, on which edge lengths are summed
-# Fitted to the runs in docs/command-line.md, on one core of a 2.1 GHz server; mesher and inversion have changed since.
-TETS_A_CUBE = 22.8  # tetrahedra in a cube of the wanted edge length: 16.3 in smooth phantoms, 33 in a real pelvis
+# Fitted to the runs of benchmarks/cost.py (docs/command-line.md), on two cores of a 2.1 GHz server.
+TETS_A_CUBE = 22.8  # tetrahedra in a cube of the wanted edge length: 17 in smooth phantoms, 31 in a real pelvis
 UNKNOWNS_A_TET = {"P1": 0.62, "P2": 4.4}
-FIXED_S = 14.0  # start, intervals, report
-SECONDS_AN_UNKNOWN = 4.5e-4  # with 90 modes a driver, for each later image
+FIXED_S = 24.0  # start, first solves, intervals, report
+SECONDS_AN_UNKNOWN = 1.1e-4  # with 90 modes a driver, for each later image; a finite-strain law takes no longer
 SECONDS_A_CUT = 1.4e-4  # of meshing, for each tetrahedron and each tissue that is cut out
-SUPERLU = (4.5, 26_000.0, 1.7)  # seconds more than with PARDISO at so many unknowns, and their power
-FINITE_STRAIN = 2.8  # times the linear estimate's time: the continuation's rounds, in a single run
-FINITE_STRAIN_GB = 1.6  # times its memory in that run: an expansion and a tangent factorisation at once
+SUPERLU = (3.3, 26_000.0, 1.7)  # seconds more than with PARDISO at so many unknowns, and their power
 PARALLEL_SHARE = 0.3  # of the time, that more processors shorten
-FIXED_GB = 0.75
-GB_AN_UNKNOWN = 3.1e-5  # with 90 modes
-SUPERLU_GB_AN_UNKNOWN = 2.0e-5
+FIXED_GB = 0.5
+GB_AN_UNKNOWN = 2.3e-5  # with 90 modes
+SUPERLU_GB_AN_UNKNOWN = 1.0e-5
+FINITE_STRAIN_GB = 1.2  # times the memory: an expansion and a tangent factorisation at once
 USUAL_MODES = 90
 OVERHEAD_MODES = 10  # what an unknown costs without any mode, in modes
 LARGEST_SUPERLU = 250_000  # unknowns, as in the registry
@@ -68,7 +67,7 @@ def expected_cost(case: Case, before: Segmentation, after: tuple[Segmentation, .
     slower = 0.0 if solver == "pardiso" else 1.0
     finite = case.mechanics.law != "linear"
     solving = SECONDS_AN_UNKNOWN * work + slower * SUPERLU[0] * (unknowns / SUPERLU[1]) ** SUPERLU[2]
-    seconds = (FINITE_STRAIN if finite else 1.0) * solving + SECONDS_A_CUT * tets * (len(before.tissues) - 1)
+    seconds = solving + SECONDS_A_CUT * tets * (len(before.tissues) - 1)
     gigabytes = GB_AN_UNKNOWN * work + slower * SUPERLU_GB_AN_UNKNOWN * unknowns
     gigabytes *= FINITE_STRAIN_GB if finite else 1.0
     count = processors()
