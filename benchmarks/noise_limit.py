@@ -1,6 +1,6 @@
 """Whether the Cramer-Rao limit is one: the scatter of its own weights on images with noise, beside what it promises.
 
-    python benchmarks/noise_limit.py [--seed S] [--draws N] [--json]
+    python benchmarks/noise_limit.py [--seed S] [--draws N]
 
 A neo-Hookean pelvis with the noise of accuracy.py's row `finite-noise` is imaged N times. The residuals at the truth go
 through the weights that the limit stands for, for cells of several edge lengths (0: every face alone), and through the
@@ -45,11 +45,10 @@ class Weights:
 
 
 def main() -> int:
-    """Print the table."""
+    """Print one JSON document."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seed", type=int, default=320)
     parser.add_argument("--draws", type=int, default=30)
-    parser.add_argument("--json", action="store_true", help="print one JSON document")
     arguments = parser.parse_args()
     scene, options = accuracy.truth_of(replace(ROW, noise=None), arguments.seed, 0, {})
     case = Case(
