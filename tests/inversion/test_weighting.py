@@ -9,7 +9,7 @@ from palpate.images.distance import distance_map
 from palpate.images.label_image import VoxelGrid
 from palpate.inversion.surrogate import first_surrogate
 from palpate.inversion.tukey import Tukey
-from palpate.inversion.weighting import SEGMENTATION_LAW, first_law, objective_of, robust_loss
+from palpate.inversion.weighting import EXACT_LAW, first_law, objective_of, robust_loss
 
 
 def test_surfaces_count_by_their_area(voxels):
@@ -21,8 +21,8 @@ def test_surfaces_count_by_their_area(voxels):
     assert ratios == pytest.approx([ratios[0]] * len(ratios))
 
 
-def test_without_voxels_the_first_law_is_that_of_unknown_segmentations(exact):
-    assert first_law(exact) is SEGMENTATION_LAW
+def test_without_voxels_the_first_law_is_that_of_exact_surfaces(exact):
+    assert first_law(exact) is EXACT_LAW
 
 
 def test_the_first_law_is_what_rounding_leaves_of_a_plane(voxels):

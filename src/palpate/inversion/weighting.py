@@ -15,16 +15,17 @@ from palpate.inversion.tukey import Tukey
 from palpate.observation.misfit import Correspondence
 from palpate.observation.target import SurfaceTarget
 
-__all__ = ["SEGMENTATION_LAW", "first_law", "objective_of", "residual_law", "reweighted", "robust_loss"]
+__all__ = ["EXACT_LAW", "SEGMENTATION_LAW", "first_law", "objective_of", "residual_law", "reweighted", "robust_loss"]
 
 TUKEY = 4.685  # cutoff in standard deviations, 95 % efficient for normal errors (Huber 1981)
 MAD = 1.4826  # standard deviations of a normal law in one median absolute deviation
 LEAST_CUTOFF = 5e-3  # mm
+EXACT_LAW = NoiseLaw(np.array([0.03**2]), np.array([3.0]))  # of surfaces that no image has rounded
 SEGMENTATION_LAW = NoiseLaw(np.array([0.3**2]), np.array([3.0]))  # of segmentations of which nothing is known
 
 
 def first_law(problem: InverseProblem) -> NoiseLaw:
-    """Law of the residuals until they tell: the rounding of both images' voxels; without any, `SEGMENTATION_LAW`.
+    """Law of the residuals until they tell: the rounding of both images' voxels; without any, `EXACT_LAW`.
 
     Voxels of edge h round a surface by a variance of h^2 / 12 a voxel, which a Gaussian of width sigma spreads:
     h^4 / (48 pi sigma^2) for each image, with the correlation length sqrt(2) sigma. The residuals that are left put too
@@ -32,7 +33,7 @@ def first_law(problem: InverseProblem) -> NoiseLaw:
     """
     maps = [image for targets in problem.targets for t in targets for image in t.voxels or ()]
     if not maps:
-        return SEGMENTATION_LAW
+        return EXACT_LAW
     variances = [m.grid.voxel_volume ** (4.0 / 3.0) / (48.0 * np.pi * m.smoothing_mm**2) for m in maps]
     width = float(np.mean([m.smoothing_mm for m in maps]))
     return NoiseLaw(np.array([2.0 * float(np.mean(variances))]), np.array([np.sqrt(2.0) * width]))
