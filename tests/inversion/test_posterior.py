@@ -147,7 +147,7 @@ def test_the_weights_of_the_limit_attain_it_under_noise_of_its_law(observed, rng
         rows @ np.einsum("na,na->n", smooth_field(rng, sd_mm=SD, correlation_mm=5.0, features=200).at(places), normals)
         for _ in range(400)
     ]
-    found = np.cov(np.transpose(draws)) + kept @ now.prior @ kept.T
+    found = np.cov(np.transpose(draws)) + kept[:, 2:] @ np.linalg.solve(now.prior[2:, 2:], kept[:, 2:].T)
     limit = cramer_rao(now, law, 2, cell_mm=5.0)
     assert np.sqrt(np.diag(found)) == pytest.approx(np.sqrt(np.diag(limit)), rel=0.12)
 
@@ -159,8 +159,11 @@ def test_cells_of_the_noises_length_lose_little(observed):
     assert np.all(cells < 1.1 * fine)
 
 
-def test_rounding_of_single_faces_lowers_no_limit(smooth, observed, rng):
-    """A derivative that is rough from face to face seems to tell the moduli from what smooth noise leaves alone."""
+def test_roughness_of_single_faces_hardly_lowers_the_limit_of_cells(smooth, observed, rng):
+    """A derivative that is rough from face to face seems to tell the moduli from what smooth noise leaves alone.
+
+    Of cells with five faces each the limit falls by 6 %, of single faces to a fifteenth.
+    """
     places, normals, jacobian = smooth
     rough = jacobian * (1.0 + 0.05 * rng.standard_normal((len(places), 1)))
     now, law = evaluation([surface(places, normals, rough, precision=200.0)], 2), observed[1]

@@ -190,9 +190,7 @@ def _near_linear(
     near = from_start(coarse, moduli, amounts, start=there.displacement, nearby=linear.factorisation).refactorised()
     found = from_start(model, moduli, amounts, start=near.displacement, nearby=near.factorisation)
     derivatives = FirstOrderModel(model.names, moduli, amounts, found.values, near.tangent())
-    return Expansion(
-        derivatives, found, near.counts + near.tangent_counts + found.counts + SolveCounts(factorisations=1)
-    )
+    return Expansion(derivatives, found, near.counts + near.tangent_counts + found.counts)
 
 
 def _weighed(problem: InverseProblem, place: _Place, settings: InversionSettings) -> _Place:
@@ -224,8 +222,7 @@ def _round(problem: InverseProblem, place: _Place, settings: InversionSettings, 
     unknowns, equilibria = lower
     pairs = zip(equilibria, place.expansions, strict=True)
     expansions = tuple(_recentred(before, equilibrium) for equilibrium, before in pairs)
-    few = all(e.reduced.n_regions + e.reduced.n_modes <= FEW for e in expansions)
-    if few:
+    if all(e.reduced.n_regions + e.reduced.n_modes <= FEW for e in expansions):
         expansions = _sharpened(place.objective, found.evaluation, expansions)
     there = replace(found, unknowns=unknowns, history=(*now.history, *found.history))
     objective = _around(place, expansions)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +31,8 @@ def cramer_rao(evaluation: Evaluation, law: NoiseLaw, n_parameters: int, *, cell
     would tell moduli from the differences of neighbours, which are rounding that no such law describes: a limit that
     its own weights miss by far (benchmarks/noise_limit.py).
     """
-    return np.asarray(_inverse_information(evaluation, law, cell_mm)[:n_parameters, :n_parameters])
+    inverse = np.linalg.inv(_information(evaluation, _whitened_states(evaluation, law, cell_mm)))
+    return np.asarray(inverse[:n_parameters, :n_parameters])
 
 
 def efficient_gain(
@@ -41,29 +43,40 @@ def efficient_gain(
     G = F^-1 J^T C^-1 on the cells' means: of all weights without bias those of least variance (Aitken 1935). Under
     noise that obeys `law`, G C G^T with the prior's part is the limit of `cramer_rao`.
     """
-    inverse, found = _inverse_information(evaluation, law, cell_mm)[:n_parameters], list[NDArray[np.float64]]()
-    for group in later_states(evaluation):
-        lines = [evaluation.surfaces[i] for i in group]
-        weighted, means = _whitened(lines, law, cell_mm)
-        rows = np.asarray(inverse[:, lines[0].columns] @ weighted.T @ means)
-        found += np.split(rows, np.cumsum([len(line.target.area) for line in lines])[:-1], axis=1)
+    states = _whitened_states(evaluation, law, cell_mm)
+    inverse = np.linalg.inv(_information(evaluation, states))[:n_parameters]
+    found: list[NDArray[np.float64]] = []
+    for state in states:
+        rows = np.asarray(inverse[:, state.lines[0].columns] @ state.weighted.T @ state.means)
+        found += np.split(rows, np.cumsum([len(line.target.area) for line in state.lines])[:-1], axis=1)
     return tuple(found)
 
 
-def _inverse_information(evaluation: Evaluation, law: NoiseLaw, cell_mm: float) -> NDArray[np.float64]:
+@dataclass(frozen=True, slots=True)
+class _Whitened:
+    """One later state: its surfaces, C^-1 J (n_cells, n_columns) and the matrix (n_cells, n_q) of the cells' means."""
+
+    lines: Sequence[Linearisation]
+    weighted: NDArray[np.float64]
+    means: sparse.csr_matrix[np.float64]
+
+
+def _whitened_states(evaluation: Evaluation, law: NoiseLaw, cell_mm: float) -> list[_Whitened]:
+    groups = later_states(evaluation)
+    return [_whitened([evaluation.surfaces[i] for i in group], law, cell_mm) for group in groups]
+
+
+def _information(evaluation: Evaluation, states: Sequence[_Whitened]) -> NDArray[np.float64]:
+    """F (n, n) of all unknowns."""
     information = evaluation.prior.copy()
-    for group in later_states(evaluation):
-        lines = [evaluation.surfaces[i] for i in group]
-        weighted, means = _whitened(lines, law, cell_mm)
-        columns = lines[0].columns
-        information[np.ix_(columns, columns)] += weighted.T @ np.asarray(means @ _jacobian(lines))
-    return np.asarray(np.linalg.inv(information))
+    for state in states:
+        columns = state.lines[0].columns
+        seen = np.asarray(state.means @ _jacobian(state.lines))
+        information[np.ix_(columns, columns)] += state.weighted.T @ seen
+    return information
 
 
-def _whitened(
-    lines: Sequence[Linearisation], law: NoiseLaw, cell_mm: float
-) -> tuple[NDArray[np.float64], sparse.csr_matrix[np.float64]]:
-    """C^-1 J (n_cells, n_columns) of the cells' means, and the matrix (n_cells, n_q) that makes these means."""
+def _whitened(lines: Sequence[Linearisation], law: NoiseLaw, cell_mm: float) -> _Whitened:
     means = sparse.csr_matrix(sparse.block_diag([_cell_means(line, cell_mm) for line in lines]))
     places = np.concatenate([line.residuals.places[: len(line.target.area)] for line in lines])
     normals = np.concatenate([line.residuals.normals[: len(line.target.area)] for line in lines])
@@ -78,7 +91,8 @@ def _whitened(
         ) * (normals[touched] @ normals.T)
         covariance[start : start + ROWS] = block[:, touched] @ (means @ pairs.T).T
     covariance[np.diag_indices_from(covariance)] += RIDGE * law.sd**2
-    return np.asarray(np.linalg.solve(covariance, np.asarray(means @ _jacobian(lines)))), means
+    weighted = np.linalg.solve(covariance, np.asarray(means @ _jacobian(lines)))
+    return _Whitened(lines, np.asarray(weighted), means)
 
 
 def _jacobian(lines: Sequence[Linearisation]) -> NDArray[np.float64]:

@@ -43,7 +43,7 @@ def sandwich_covariance(evaluation: Evaluation, law: NoiseLaw, n_parameters: int
 
     for group in later_states(evaluation):
         data += spread(group, [r.places for r in residuals])
-    for group in _restlater_states(evaluation):
+    for group in _rest_states(evaluation):
         data += spread(group, [r.material for r in residuals])
     return np.asarray(data + inverse.T @ evaluation.prior @ inverse)
 
@@ -54,7 +54,7 @@ def later_states(evaluation: Evaluation) -> Sequence[list[int]]:
     return [[i for i, state in enumerate(states) if state == key] for key in dict.fromkeys(states)]
 
 
-def _restlater_states(evaluation: Evaluation) -> Sequence[list[int]]:
+def _rest_states(evaluation: Evaluation) -> Sequence[list[int]]:
     """Numbers of the surfaces of each rest state, whose later states have the very same observed surfaces."""
     groups: list[list[int]] = []
     for state in later_states(evaluation):

@@ -16,18 +16,7 @@ WORTH_THREADS = 3_000_000  # products of a column; below, handing it to a thread
 
 def times(matrix: sparse.csr_matrix[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """A X (n, k) for A (n, m) and X (m, k), in the unit of their products."""
-    if vectors.shape[1] >= FEW:
+    if not 0 < vectors.shape[1] < FEW:
         return np.asarray(matrix @ vectors)
-    result = np.empty((matrix.shape[0], vectors.shape[1]))
-    columns = np.ascontiguousarray(vectors.T)
-
-    def fill(number: int) -> None:
-        """One column of the result."""
-        result[:, number] = matrix @ columns[number]
-
-    if matrix.nnz < WORTH_THREADS or len(columns) == 1:
-        for number in range(len(columns)):
-            fill(number)
-    else:
-        mapped(fill, range(len(columns)))
-    return result
+    share = mapped if matrix.nnz >= WORTH_THREADS and vectors.shape[1] > 1 else map
+    return np.stack(list(share(matrix.dot, np.ascontiguousarray(vectors.T))), axis=1)
