@@ -18,9 +18,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from memory import peak_mb
 
 from palpate.experiments.simulated_pelvis import DATA
 from palpate.images.readers import write_label_image
+from palpate.images.tissue import Role
 from palpate.phantoms.pelvis import PelvisOptions, pelvis
 from palpate.phantoms.spheres import SpheresOptions, spheres
 from palpate.study.case_file import read_case
@@ -57,24 +59,11 @@ RUNS = (
     Run("demo", 8.0, fitted=False),
     Run("pelvis", 6.5, law="neo-hookean", fitted=False),
 )
-SPHERES = """
+CASE = """
 [images]
 before = "before.nii.gz"
 after = ["after.nii.gz"]
 [tissues]
-core = {label = 1, role = "estimate"}
-shell = {label = 2, role = "estimate"}
-frame = {label = 3, role = "driver"}
-surroundings = {label = "remaining", role = "known", youngs_modulus_kpa = 10.0}
-"""
-PELVIS = """
-[images]
-before = "before.nii.gz"
-after = ["after.nii.gz"]
-[tissues]
-prostate = {label = 1, role = "estimate"}
-bladder = {label = 2, role = "estimate"}
-rectum = {label = 3, role = "driver"}
 surroundings = {label = "remaining", role = "known", youngs_modulus_kpa = 10.0}
 """
 
@@ -114,11 +103,13 @@ def _write_images(folder: Path) -> None:
         "spheres": spheres(SpheresOptions(seed=2, truth_edge_mm=5.0)),
         "pelvis": pelvis(PelvisOptions(seed=1, truth_edge_mm=4.0)),
     }
-    for (name, scene), text in zip(scenes.items(), (SPHERES, PELVIS), strict=True):
+    for name, scene in scenes.items():
         (folder / name).mkdir()
         write_label_image(folder / name / "before.nii.gz", scene.before)
         write_label_image(folder / name / "after.nii.gz", scene.after)
-        (folder / name / "case.toml").write_text(text)
+        seen = [t for t in scene.tissues if t.role in (Role.ESTIMATE, Role.DRIVER)]
+        lines = [f'{t.name} = {{label = {t.labels[0]}, role = "{t.role.value}"}}' for t in seen]
+        (folder / name / "case.toml").write_text(CASE + "\n".join(lines))
 
 
 def _one(run: Run, folder: Path) -> dict[str, object]:
@@ -144,15 +135,10 @@ def _one(run: Run, folder: Path) -> dict[str, object]:
         "organs": len(states.before.tissues),
         "tets": [predicted.tets, len(result.space.mesh.tets)],
         "seconds": [round(predicted.seconds, 1), round(time.perf_counter() - began, 1)],
-        "memory_gb": [round(predicted.memory_gb, 2), round(_peak_gb(), 2)],
+        "memory_gb": [round(predicted.memory_gb, 2), round(peak_mb() / 1024.0, 2)],
         "stages_s": dict(result.provenance.seconds),
         "status": result.estimation.status,
     }
-
-
-def _peak_gb() -> float:
-    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-    return next(float(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1024.0**2
 
 
 WHAT = ("tetrahedra", "time, s", "memory, GB")

@@ -24,6 +24,7 @@ from pathlib import Path
 
 import numpy as np
 import speed_peers as peers
+from memory import peak_mb
 
 from palpate.images.segmentation import segment
 from palpate.inversion.gauss_newton import gauss_newton
@@ -180,7 +181,7 @@ def _linear(sizes: Sizes, seed: int, say: Say) -> dict[str, object]:
         "basis": inversion.surrogates[0].reduced.n_basis,
         "evaluations": inversion.evaluations,
         "factorisations": inversion.counts.factorisations,
-        "peak_mb": _peak_mb(),
+        "peak_mb": peak_mb(),
     }
 
 
@@ -298,7 +299,7 @@ def _one_size(edge_mm: float, seed: int) -> dict[str, object]:
     motion = prescribed_motion(space, {}, n_modes=3, kernel_mm=20.0, prior_mm=5.0)
     given = {"modes": motion.modes, "offset": motion.offset, "prescribed": motion.prescribed}
     constraint = outer_constraint(space, outer="fixed", **given)
-    before = _peak_mb()
+    before = peak_mb()
     began, cpu = time.perf_counter(), time.process_time()
     model = linear_model(space, constraint, solver="multigrid")
     assembled = time.perf_counter()
@@ -314,7 +315,7 @@ def _one_size(edge_mm: float, seed: int) -> dict[str, object]:
         "dofs": 3 * len(space.points),
         "seconds": ended - began,
         "processor_s": time.process_time() - cpu,
-        "peak_mb": _peak_mb(),
+        "peak_mb": peak_mb(),
         "mesh_peak_mb": before,
         "assemble_s": assembled - began,
         "set_up_s": ready - assembled,
@@ -401,12 +402,6 @@ def _cumulative(stats: pstats.Stats, file: str, function: str) -> float:
     """Seconds in a function and what it calls."""
     rows = stats.stats.items()  # type: ignore[attr-defined]
     return float(sum(row[3] for (path, _, name), row in rows if name == function and Path(path).name == file))
-
-
-def _peak_mb() -> float:
-    """Of this program: what getrusage tells of a new process is at least what its parent had."""
-    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-    return next(float(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1024.0
 
 
 PART = {
