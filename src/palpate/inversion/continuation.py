@@ -16,14 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
+from palpate.inversion.agreement import AGREED, EXACT, agreed
 from palpate.inversion.directions import deciding_directions
-from palpate.inversion.driver_prior import learned_prior
 from palpate.inversion.gauss_newton import Bounds, Minimum, Outcome
-from palpate.inversion.minima import SETTLED, minimised, moved_between, words
+from palpate.inversion.minima import SETTLED, change_between, moved_between, posterior_sd, words
 from palpate.inversion.noise import NoiseLaw
 from palpate.inversion.objective import Evaluation, Objective
 from palpate.inversion.problem import InverseProblem, Inversion, InversionSettings, StandIn
-from palpate.inversion.weighting import objective_of, residual_law, reweighted
 from palpate.mechanics.equilibrium import from_start
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
 from palpate.mechanics.first_order import FirstOrderModel
@@ -34,14 +33,14 @@ from palpate.mesh.constraint import Constraint
 __all__ = ["Expansion", "continued_at_finite_strain"]
 
 ROUNDS = 12
-WEIGHED = (2, 7)  # least and largest number of rounds that weigh the residuals anew
-NEAR = 0.5  # posterior standard deviations: a round that moves less leaves the weights
+NEAR = 0.5  # posterior standard deviations: a round that moves less ends where derivatives are worth making exact
+FORCING = 0.1  # of a round's change: to which the next one's weights and estimate agree
+LOOSE = 1e-4  # decrement of the minima of rounds that are not the last
 REACH = 0.8  # of ln E, within which an expansion is trusted
 HALVINGS = 3
 NOISE = 0.5  # of the objective, in units of log-likelihood: the noise of re-chosen closest points
 COARSE, ROUGH = 3e-2, 1e-4  # of the forces: for a first factorisation; for all rounds but the last
 FEW = 24  # moduli and modes, all of whose derivatives cost less than the rounds that they spare
-POLISH = 1e-5  # decrement of a round's minimum
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,21 +64,42 @@ class Expansion:
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """A minimum under the objective made of the expansions around the equilibria where the last round led.
+    """Where the last round led: a point under the objective made of the expansions around the equilibria there.
 
-    moved: by so many posterior standard deviations.
+    change: of ln E by that round, at the most; moved: the same in posterior standard deviations; sharp (n_parameters,):
+    ln E where the expansions' derivatives were made exact, None while they have not been; exact: whether another round
+    would change ln E by no more than `AGREED`.
     """
 
     objective: Objective
     minimum: Minimum
     expansions: tuple[Expansion, ...]
     law: NoiseLaw
+    change: float = np.inf
     moved: float = np.inf
+    sharp: NDArray[np.float64] | None = None
+    exact: bool = False
+
+    @property
+    def theta(self) -> NDArray[np.float64]:
+        """The log-moduli (n_parameters,) there."""
+        return self.minimum.unknowns[: self.objective.n_parameters]
 
     @property
     def settled(self) -> bool:
-        """Whether the last round would have moved the log-moduli by little."""
-        return self.moved < SETTLED
+        """Whether another round would move the log-moduli by little."""
+        return self.exact or self.moved < SETTLED
+
+    def under(self, expansions: tuple[Expansion, ...], minimum: Minimum) -> _Place:
+        """The place with the objective on other expansions, at the unknowns of `minimum`."""
+        objective = self.objective.under([expansion.reduced for expansion in expansions])
+        there = replace(minimum, evaluation=objective(minimum.unknowns))
+        return replace(self, objective=objective, minimum=there, expansions=expansions)
+
+    def weighed(self, law: NoiseLaw, objective: Objective) -> _Place:
+        """The place under other weights."""
+        there = replace(self.minimum, evaluation=objective(self.minimum.unknowns))
+        return replace(self, objective=objective, minimum=there, law=law)
 
 
 def continued_at_finite_strain(
@@ -137,45 +157,29 @@ def _followed(
     moduli, amounts = _split(linear.objective, start.unknowns)
     triples = zip(models, linear.surrogates, amounts, strict=True)
     expansions = tuple(_near_linear(model, surrogate, moduli, q) for model, surrogate, q in triples)
-    first = _Place(linear.objective, replace(start, history=()), expansions, linear.law)
-    place = _weighed(problem, first, settings)
+    objective = linear.objective.under([e.reduced for e in expansions]).with_fresh_correspondence(start.unknowns)
+    first = replace(start, evaluation=objective(start.unknowns), history=())
+    place = _Place(objective, first, expansions, linear.law)
     for number in range(ROUNDS):
         progress(f"finite strain, round {number + 1}: {words(problem, place.minimum)}")
-        weigh = number < WEIGHED[0] or (number < WEIGHED[1] and place.moved > NEAR)
-        before, place = place, _round(problem, place, settings, weigh=weigh)
-        if place.settled or place.expansions is before.expansions:
+        before, place = place, _round(problem, place, settings)
+        if place.exact or place.minimum.unknowns is before.minimum.unknowns:
             break
-    expansions = _sharpened(place.objective, place.minimum.evaluation, place.expansions)
-    place = replace(place, objective=_around(place, expansions), expansions=expansions)
-    found = minimised(place.objective, place.minimum.unknowns, settings, tolerance=POLISH)
-    # a polish that finds no better point leaves the last round's, which is an equilibrium with its own outcome
-    end = _joined(place.minimum, found) if found.outcome.converged else place.minimum
-    if not place.settled:
-        left = place.minimum.outcome
-        end = replace(end, outcome=Outcome.STEPS if left.converged else left)
-    return _at_equilibria(problem, place, end)
+    return _at_equilibria(problem, place)
 
 
-def _at_equilibria(problem: InverseProblem, place: _Place, end: Minimum) -> _Place:
-    """The place with the minimum `end`, at its exact equilibria: the rounds' own were found to what a step needs."""
-    moduli, amounts = _split(place.objective, end.unknowns)
+def _at_equilibria(problem: InverseProblem, place: _Place) -> _Place:
+    """The place at its exact equilibria, for the rounds' own were found to what a step needs, with its outcome."""
+    minimum = place.minimum
+    if not place.settled and minimum.outcome.converged:
+        minimum = replace(minimum, outcome=Outcome.STEPS)
+    moduli, amounts = _split(place.objective, minimum.unknowns)
     expansions = []
     for model, before, q in zip(problem.finite_strain, place.expansions, amounts, strict=True):
         near, exact = before.equilibrium, model.under(before.constraint)
-        start = before.reduced.solve(moduli, q).displacement
-        expansions.append(_recentred(before, from_start(exact, moduli, q, start=start, nearby=near.factorisation)))
-    objective = _around(place, tuple(expansions))
-    minimum = replace(end, evaluation=objective(end.unknowns))
-    return replace(place, objective=objective, minimum=minimum, expansions=tuple(expansions))
-
-
-def _around(place: _Place, expansions: tuple[Expansion, ...]) -> Objective:
-    """The place's objective on other expansions."""
-    states = (
-        replace(state, model=expansion.reduced.at(np.concatenate([t.surface.dofs for t in state.targets])))
-        for state, expansion in zip(place.objective.states, expansions, strict=True)
-    )
-    return replace(place.objective, states=tuple(states))
+        found = from_start(exact, moduli, q, start=near.displacement, nearby=near.factorisation)
+        expansions.append(_recentred(before, found))
+    return place.under(tuple(expansions), minimum)
 
 
 def _near_linear(
@@ -193,41 +197,45 @@ def _near_linear(
     return Expansion(derivatives, found, near.counts + near.tangent_counts + found.counts)
 
 
-def _weighed(problem: InverseProblem, place: _Place, settings: InversionSettings) -> _Place:
-    """The place with the residuals at its own equilibria weighed by their law, and the drivers' prior learned there."""
-    at, models = place.minimum, tuple(expansion.reduced for expansion in place.expansions)
-    prior = place.objective.prior
-    first = objective_of(problem, models, place.law, prior).with_fresh_correspondence(at.unknowns)
-    here = first(at.unknowns)
-    law = settings.law or residual_law(problem, here)
-    learned = learned_prior(problem, here, at.unknowns)
-    objective = reweighted(objective_of(problem, models, law, learned), replace(at, evaluation=here), law)
-    return replace(place, objective=objective, minimum=replace(at, evaluation=objective(at.unknowns)), law=law)
+def _round(problem: InverseProblem, place: _Place, settings: InversionSettings) -> _Place:
+    """Weights and estimate on the present expansions, the equilibria there, or on a part of the way to it.
 
-
-def _round(problem: InverseProblem, place: _Place, settings: InversionSettings, *, weigh: bool) -> _Place:
-    """The minimum on the present expansions, or a part of the way to it, with the equilibria there.
-
-    `weigh`: the residuals there give new weights. Where no part of the way lowers the objective the place stays, its
-    minimum `STALLED` when the whole way is within the estimate's own noise and `STUCK` when not.
+    They are sought together to a fifth of what the last round changed, at the first to what one pass gives. Where no
+    part of the way lowers the objective the place stays, its minimum `STALLED` when the whole way is within the
+    estimate's own noise and `STUCK` when not.
     """
-    now = place.minimum
-    near = replace(settings, bounds=_near(settings.bounds, now.unknowns[: place.objective.n_parameters]))
-    found = minimised(place.objective, now.unknowns, near)
-    moved = moved_between(now, found, place.objective.n_parameters)
+    now, n = place.minimum, place.objective.n_parameters
+    reach = replace(settings, bounds=_near(settings.bounds, place.theta))
+    within = max(AGREED, FORCING * place.change)
+    tolerance = EXACT if within == AGREED else LOOSE
+    end = agreed(problem, place.objective, now, reach, within=within, tolerance=tolerance)
+    place, found = place.weighed(end.law, end.objective), end.minimum
+    change, moved = float(change_between(now, found, n).max(initial=0.0)), moved_between(now, found, n)
     lower = _lower(place, found.unknowns - now.unknowns)
     if lower is None:
         outcome = Outcome.STALLED if moved < SETTLED else Outcome.STUCK
-        return replace(place, minimum=replace(now, outcome=outcome), moved=moved)
+        return replace(place, minimum=replace(now, outcome=outcome), change=change, moved=moved)
     unknowns, equilibria = lower
-    pairs = zip(equilibria, place.expansions, strict=True)
-    expansions = tuple(_recentred(before, equilibrium) for equilibrium, before in pairs)
-    if all(e.reduced.n_regions + e.reduced.n_modes <= FEW for e in expansions):
+    expansions = tuple(_recentred(*pair) for pair in zip(place.expansions, equilibria, strict=True))
+    arrived = replace(place, change=change, moved=moved)
+    if _still_sharp(place, replace(found, unknowns=unknowns)):
+        arrived = replace(arrived, exact=end.change < AGREED and change**2 < AGREED)
+    elif moved < NEAR or all(e.reduced.n_regions + e.reduced.n_modes <= FEW for e in expansions):
         expansions = _sharpened(place.objective, found.evaluation, expansions)
-    there = replace(found, unknowns=unknowns, history=(*now.history, *found.history))
-    objective = _around(place, expansions)
-    arrived = _Place(objective, replace(there, evaluation=objective(unknowns)), expansions, place.law, moved)
-    return _weighed(problem, arrived, settings) if weigh else arrived
+        arrived = replace(arrived, sharp=unknowns[:n])
+    return arrived.under(expansions, replace(found, unknowns=unknowns))
+
+
+def _still_sharp(place: _Place, there: Minimum) -> bool:
+    """Whether the exact derivatives of the place, if it has any, decide an estimate elsewhere to `AGREED` of ln E.
+
+    At a distance d of ln E the derivatives are off by a share d, and so is what the residuals pull with them, which is
+    worth a posterior standard deviation.
+    """
+    if place.sharp is None:
+        return False
+    n = place.objective.n_parameters
+    return bool(np.all(np.abs(there.unknowns[:n] - place.sharp) * posterior_sd(there, n) < AGREED))
 
 
 def _lower(
@@ -315,7 +323,8 @@ def _lowers(place: _Place, equilibria: tuple[FiniteStrainEquilibrium, ...], unkn
     has the noise of closest points that slide over voxels, the score has not.
     """
     pairs = zip(place.expansions, equilibria, strict=True)
-    there, now = _around(place, tuple(_recentred(before, found) for before, found in pairs))(unknowns), place.minimum
+    there = place.objective.under([_recentred(before, found).reduced for before, found in pairs])(unknowns)
+    now = place.minimum
     work = 0.5 * (there.score + now.evaluation.score) @ (unknowns - now.unknowns)
     return bool(there.value < now.evaluation.value + NOISE or work < 0.0)
 

@@ -37,14 +37,20 @@ class _Seen:
         """The same of amounts y (k,) of a basis W (n, k), x = W y."""
         return _Seen(basis.T @ self.information @ basis, basis.T @ self.pull)
 
-    def log_evidence(self, variances: NDArray[np.float64]) -> float:
-        """1/2 (b^T (A + C^-1)^-1 b - ln det(1 + C A)) for a prior covariance C = diag(variances) (n, n)."""
+    def log_evidence(self, variances: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """F = 1/2 (b^T (A + C^-1)^-1 b - ln det(1 + C A)) for a prior covariance C = diag(v) (n, n), and dF / d ln v_i.
+
+        With S = (A + C^-1)^-1 and x = S b the derivative is 1/2 ((x_i^2 + S_ii) / v_i - 1).
+        """
         root = np.sqrt(variances)
         inner = root[:, None] * self.information * root
         inner[np.diag_indices_from(inner)] += 1.0
         factor = linalg.cholesky(inner, lower=True, overwrite_a=True, check_finite=False)
-        explained = linalg.solve_triangular(factor, root * self.pull, lower=True, check_finite=False)
-        return 0.5 * float(explained @ explained) - float(np.sum(np.log(np.diag(factor))))
+        inverse, _ = linalg.lapack.dtrtri(factor, lower=1)
+        explained = inverse @ (root * self.pull)
+        evidence = 0.5 * float(explained @ explained) - float(np.sum(np.log(np.diag(factor))))
+        scaled = inverse.T @ explained  # x / root
+        return evidence, 0.5 * (scaled**2 + np.sum(inverse**2, axis=0) - 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,23 +119,25 @@ def _most_evident(parts: Sequence[NDArray[np.float64]], seen: _Seen) -> _Belief:
     basis = drift @ vectors
     within = seen.along(basis)
 
-    def variances(amplitudes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Of the eigenvectors' amounts, at ln(standard deviation / the modes' own) of both parts (2,)."""
-        of_drift, of_swelling = np.exp(2.0 * np.clip(amplitudes, *np.log(AMPLITUDES)))
-        return np.asarray(of_drift + of_swelling * ratios)
+    def shares(logs: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Both parts' shares in the variances (n,) of the eigenvectors, at ln of their amplitudes (2,)."""
+        of_drift, of_swelling = np.exp(2.0 * logs)
+        return np.full(len(ratios), of_drift), of_swelling * ratios
 
-    def worse(amplitudes: NDArray[np.float64]) -> float:
-        """Minus the log-evidence."""
-        return -within.log_evidence(variances(amplitudes))
+    def worse(logs: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """Minus the log-evidence, with its derivative (2,)."""
+        drifts, swellings = shares(logs)
+        evidence, by_log_variance = within.log_evidence(drifts + swellings)
+        drifting = drifts / (drifts + swellings)
+        return -evidence, -2.0 * np.array([by_log_variance @ drifting, by_log_variance @ (1.0 - drifting)])
 
+    limits = [tuple(np.log(AMPLITUDES))] * 2
     found = [
-        optimize.minimize(
-            worse, np.log(start), method="Nelder-Mead", options={"xatol": 0.03, "fatol": 0.03, "maxfev": 120}
-        )
+        optimize.minimize(worse, np.log(start), jac=True, method="L-BFGS-B", bounds=limits)
         for start in FIRST_AMPLITUDES
     ]
     best = min(found, key=lambda trial: float(trial.fun))
-    return _Belief((basis * variances(best.x)) @ basis.T, -float(best.fun))
+    return _Belief((basis * sum(shares(best.x))) @ basis.T, -float(best.fun))
 
 
 def _with(

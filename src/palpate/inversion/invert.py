@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.inversion.agreement import EXACT, PASSES, agreed
 from palpate.inversion.continuation import continued_at_finite_strain
 from palpate.inversion.directions import deciding_directions
 from palpate.inversion.driver_prior import learned_prior
@@ -20,7 +21,6 @@ from palpate.inversion.minima import (
     groups_of,
     minimised,
     moved_between,
-    settled_between,
     with_driver,
     words,
 )
@@ -29,7 +29,7 @@ from palpate.inversion.objective import Objective
 from palpate.inversion.problem import InverseProblem, Inversion, InversionSettings
 from palpate.inversion.surrogate import Surrogate, first_surrogate, sharpened, with_modulus_series, with_offset
 from palpate.inversion.wall_refinement import refined_walls
-from palpate.inversion.weighting import first_law, objective_of, residual_law, reweighted
+from palpate.inversion.weighting import first_law, objective_of
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.reduced import ReducedModel
 
@@ -46,19 +46,19 @@ class _Effort:
     """How far an estimate is taken.
 
     exact: relative error in energy that a displacement may have where surfaces are rough, without a further snapshot;
-    weighings: within a round, at the most; settled: by so many posterior standard deviations a round may still move it;
-    polish, others: decrement of the reported minimum and of the other starts'.
+    passes: of weights and estimate within a round, at the most; settled: by so many posterior standard deviations a
+    round may still move it; decrement: of the estimate; others: of the starts that ended elsewhere.
     """
 
     exact: float
-    weighings: int
+    passes: int
     settled: float
-    polish: float
+    decrement: float
     others: float
 
 
-TO_REPORT = _Effort(exact=1e-3, weighings=4, settled=SETTLED, polish=1e-5, others=1e-4)
-TO_START_FROM = _Effort(exact=1e-1, weighings=1, settled=0.5, polish=1e-3, others=1e-3)
+TO_REPORT = _Effort(exact=1e-3, passes=PASSES, settled=SETTLED, decrement=EXACT, others=1e-4)
+TO_START_FROM = _Effort(exact=1e-1, passes=1, settled=0.5, decrement=1e-3, others=1e-3)
 
 
 def invert(problem: InverseProblem, settings: InversionSettings, *, progress: Callable[[str], None]) -> Inversion:
@@ -109,11 +109,11 @@ def invert_with(
     settled, refinements = False, 0
     for round_ in range(ROUNDS):
         progress(f"round {round_ + 1}: {words(problem, best)}; the full model is solved there")
-        law = settings.law or residual_law(problem, best.evaluation)
         exact = effort.exact * min(law.sd / ROUGH_SURFACE, 1.0)
         surrogates = _enriched(problem, surrogates, objective, best, exact=exact)
-        before = best
-        law, objective, best = _until_agreed(problem, _reduced(surrogates), best, settings, effort.weighings)
+        before, objective = best, objective.under(_reduced(surrogates))
+        end = agreed(problem, objective, best, settings, passes=effort.passes, tolerance=effort.decrement)
+        law, objective, best = end.law, end.objective, end.minimum
         settled = moved_between(before, best, objective.n_parameters) < effort.settled
         if settled:
             done = refinements == REFINEMENTS or round_ == ROUNDS - 1
@@ -121,7 +121,6 @@ def invert_with(
             if all(a is b for a, b in zip(finer, surrogates, strict=True)):
                 break
             surrogates, settled, refinements = finer, False, refinements + 1
-    best = continued(objective, best, settings, tolerance=effort.polish)
     minima = _ended(objective, settings, minima, best, chosen, tolerance=effort.others)
     counts = sum((s.counts for s in surrogates), SolveCounts())
     return Inversion(
@@ -160,24 +159,6 @@ def _ended(
 def _middle(settings: InversionSettings) -> NDArray[np.float64]:
     """Median (n_parameters,) of the starts' log-moduli."""
     return np.asarray(np.median(np.stack(settings.starts), axis=0))
-
-
-def _until_agreed(
-    problem: InverseProblem,
-    models: tuple[ReducedModel, ...],
-    best: Minimum,
-    settings: InversionSettings,
-    weighings: int,
-) -> tuple[NoiseLaw, Objective, Minimum]:
-    """Law of the residuals, drivers' prior, weights and estimate in turn until they agree, on the same models."""
-    for _ in range(weighings):
-        law = settings.law or residual_law(problem, best.evaluation)
-        prior = learned_prior(problem, best.evaluation, best.unknowns)
-        objective = reweighted(objective_of(problem, models, law, prior), best, law)
-        before, best = best, continued(objective, best, settings)
-        if settled_between(before, best, objective.n_parameters):
-            break
-    return law, objective, best
 
 
 def _refined(

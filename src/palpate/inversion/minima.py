@@ -15,12 +15,13 @@ from palpate.inversion.problem import InverseProblem, InversionSettings
 __all__ = [
     "SETTLED",
     "best_of",
+    "change_between",
     "continued",
     "driven",
     "groups_of",
     "minimised",
     "moved_between",
-    "settled_between",
+    "posterior_sd",
     "with_driver",
     "words",
 ]
@@ -91,16 +92,21 @@ def groups_of(minima: tuple[Minimum, ...], n_parameters: int) -> tuple[int, ...]
     return tuple(groups)
 
 
-def settled_between(before: Minimum, after: Minimum, n_parameters: int) -> bool:
-    """Whether a round moved the log-moduli by little, in units of their own uncertainty."""
-    return moved_between(before, after, n_parameters) < SETTLED
+def change_between(before: Minimum, after: Minimum, n_parameters: int) -> NDArray[np.float64]:
+    """Change of the log-moduli (n_parameters,) without its sign."""
+    return np.asarray(np.abs(after.unknowns - before.unknowns)[:n_parameters])
+
+
+def posterior_sd(minimum: Minimum, n_parameters: int) -> NDArray[np.float64]:
+    """Standard deviations (n_parameters,) of the log-moduli by the Gauss-Newton matrix."""
+    inverse = np.linalg.inv(minimum.evaluation.matrix)[:n_parameters, :n_parameters]
+    return np.asarray(np.sqrt(np.diag(inverse)))
 
 
 def moved_between(before: Minimum, after: Minimum, n_parameters: int) -> float:
     """Largest change of a log-modulus in posterior standard deviations."""
-    inverse = np.linalg.inv(after.evaluation.matrix)[:n_parameters, :n_parameters]
-    moved = np.abs(after.unknowns - before.unknowns)[:n_parameters]
-    return float(np.max(moved / np.sqrt(np.diag(inverse)), initial=0.0))
+    moved = change_between(before, after, n_parameters) / posterior_sd(after, n_parameters)
+    return float(np.max(moved, initial=0.0))
 
 
 def words(problem: InverseProblem, minimum: Minimum) -> str:

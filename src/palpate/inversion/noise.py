@@ -18,8 +18,10 @@ __all__ = ["NoiseLaw", "fit_noise_law"]
 LENGTHS = (0.5, 0.8, 1.2, 2.0, 3.0, 4.5, 6.5, 9.5, 14.0)  # mm
 CELL = 1.0  # mm: residuals nearer than that are averaged before they are compared
 MAX_CELLS = 2500
+CELLS = 2**20  # along an axis, before they are counted from 0 again
 ROWS = 256  # of the pairs' table at once: it stays in the cache
 REACH = 28.0  # mm
+BINS = 1 + int(REACH)  # of a cell with itself, then of 1 mm each
 FLOOR = 1e-3  # mm: no surface in an image is known better
 
 
@@ -70,10 +72,9 @@ def fit_noise_law(
     Mean products of residuals in bins of distance, fitted by non-negative least squares to Gaussians of fixed lengths
     (0.5 to 14 mm).
     """
-    edges = np.concatenate([[0.0, 1e-6], np.arange(1.0, REACH, 1.0)])
     sums = sum(
-        mapped(lambda of: _binned_products(*_cells(*of), edges), zip(values, places, normals, strict=True)),
-        np.zeros((4, len(edges) - 1)),
+        mapped(lambda of: _binned_products(*_cells(*of)), zip(values, places, normals, strict=True)),
+        np.zeros((4, BINS)),
     )
     products, cosines, distances, count = sums[:, sums[3] > 0]
     weight = np.sqrt(count)
@@ -87,37 +88,45 @@ def fit_noise_law(
 
 
 def _binned_products(
-    mean: NDArray[np.float64], centre: NDArray[np.float64], normal: NDArray[np.float64], edges: NDArray[np.float64]
+    mean: NDArray[np.float64], centre: NDArray[np.float64], normal: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Sums (4, n_bins) over pairs of cells: r_i r_j n_i.n_j, (n_i.n_j)^2, distance (mm), 1."""
-    size = len(edges) - 1
-    sums = np.zeros((4, size))
-    for start in range(0, len(mean), ROWS):  # a pair of different cells once, then counted twice
+    """Sums (4, n_bins) over pairs of cells, those of a cell with itself first: r_i r_j n_i.n_j, (n_i.n_j)^2, mm, 1."""
+    sums = np.zeros((4, BINS))
+    for start in range(0, len(mean), ROWS):
         rows, others = slice(start, start + ROWS), slice(start, None)
         distance = cdist(centre[rows], centre[others])
-        bins = np.searchsorted(edges, distance.ravel(), side="right") - 1
-        times = 2.0 * np.triu(np.ones_like(distance), 1)
-        np.fill_diagonal(times, 1.0)
-        inside = (bins < size) & (times.ravel() > 0.0)
-        cosine = normal[rows] @ normal[others].T
-        terms = (np.outer(mean[rows], mean[others]) * cosine, cosine**2, distance, np.ones_like(distance))
-        weights = ((times * term).ravel()[inside] for term in terms)
-        sums += np.stack([np.bincount(bins[inside], weight, minlength=size) for weight in weights])
-    return sums
+        once = np.triu(distance < REACH)  # a pair of different cells once, then counted twice
+        apart = distance[once]
+        bins = np.where(apart > 0.0, 1 + apart.astype(np.int64), 0)
+        cosine = (normal[rows] @ normal[others].T)[once]
+        terms = (np.outer(mean[rows], mean[others])[once] * cosine, cosine**2, apart, np.ones_like(apart))
+        sums += np.stack([np.bincount(bins, term, minlength=BINS) for term in terms])
+    return sums * np.where(np.arange(BINS) > 0, 2.0, 1.0)
 
 
 def _cells(
     values: NDArray[np.float64], places: NDArray[np.float64], normals: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Means of residuals, places and normals in cells of 1 mm, at most 2500 of them."""
-    inverse = _cell_numbers(places, CELL)
+    keys, inverse = _cell_keys(places, CELL)
     count = np.bincount(inverse)
     mean = np.bincount(inverse, values) / count
     centre = np.stack([np.bincount(inverse, places[:, a]) / count for a in range(3)], axis=1)
     normal = np.stack([np.bincount(inverse, normals[:, a]) / count for a in range(3)], axis=1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    chosen = np.random.default_rng(0).permutation(len(mean))[:MAX_CELLS]
+    chosen = np.sort(np.argsort(_scattered(keys), kind="stable")[:MAX_CELLS])
     return mean[chosen], centre[chosen], normal[chosen]
+
+
+def _scattered(keys: NDArray[np.int64]) -> NDArray[np.uint64]:
+    """Numbers (n,) that follow from the keys (n,) but without order (the finaliser of SplitMix64; Steele et al. 2014).
+
+    Cells chosen by them stay chosen when others come and go, so that the law does not jump as a surface moves.
+    """
+    mixed = keys.astype(np.uint64)
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        mixed = (mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)
+    return np.asarray(mixed ^ (mixed >> np.uint64(31)))
 
 
 def _gather(
@@ -134,7 +143,13 @@ def _gather(
 
 
 def _cell_numbers(places: NDArray[np.float64], size: float) -> NDArray[np.int64]:
-    cell = np.floor((places - places.min(axis=0)) / size).astype(np.int64)
-    spans = cell.max(axis=0) + 1
-    keys = (cell[:, 0] * spans[1] + cell[:, 1]) * spans[2] + cell[:, 2]
-    return np.asarray(np.unique(keys, return_inverse=True)[1].ravel())
+    """The cell, from 0, that each place (n, 3) mm lies in."""
+    return _cell_keys(places, size)[1]
+
+
+def _cell_keys(places: NDArray[np.float64], size: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """A key for each cube of edge `size` (mm) that holds places (n, 3) mm, and the number of each place's cube (n,)."""
+    cell = np.floor(places / size).astype(np.int64) % CELLS
+    keys = (cell[:, 0] * CELLS + cell[:, 1]) * CELLS + cell[:, 2]
+    unique, inverse = np.unique(keys, return_inverse=True)
+    return unique, np.asarray(inverse.ravel())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from palpate.errors import EstimationError
 from palpate.inversion.modulus_map import ModulusMap
 from palpate.inversion.tukey import Tukey
-from palpate.mechanics.forward import ForwardModel
+from palpate.mechanics.forward import ForwardModel, LocalModel
 from palpate.observation.misfit import Correspondence, SurfaceResiduals, correspondence, surface_residuals
 from palpate.observation.target import SurfaceTarget
 from palpate.parallel import mapped
@@ -27,6 +28,11 @@ class State:
 
     model: ForwardModel
     targets: tuple[SurfaceTarget, ...]
+
+    @property
+    def dofs(self) -> NDArray[np.int64]:
+        """The unknowns of all targets (n_dofs,), one target after the other."""
+        return np.concatenate([target.surface.dofs for target in self.targets])
 
     def slices(self) -> list[slice]:
         """Rows of the model's answer that belong to each target."""
@@ -110,6 +116,11 @@ class Objective:
     def coefficients(self, unknowns: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         """Mode coefficients (n_modes,) of each state."""
         return np.split(unknowns[self.n_parameters :], np.cumsum([s.model.n_modes for s in self.states])[:-1])
+
+    def under(self, models: Sequence[LocalModel]) -> Objective:
+        """The same surfaces and weights with other models, one a state, that give all points."""
+        pairs = zip(self.states, models, strict=True)
+        return replace(self, states=tuple(replace(s, model=m.at(s.dofs)) for s, m in pairs))
 
     def value(self, unknowns: NDArray[np.float64]) -> float:
         """J alone, for trial steps."""

@@ -13,22 +13,14 @@ from palpate.inversion.modulus_map import ModulusMap
 from palpate.inversion.noise import NoiseLaw
 from palpate.inversion.objective import Evaluation, Objective
 from palpate.mechanics.finite_strain import FiniteStrainModel
-from palpate.mechanics.forward import ForwardModel, SolveCounts
+from palpate.mechanics.forward import LocalModel, SolveCounts
 from palpate.mechanics.linear_model import LinearModel
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.constraint import Constraint
 from palpate.observation.target import SurfaceTarget
 from palpate.observation.wall_modes import Wall
 
-__all__ = ["InverseProblem", "Inversion", "InversionSettings", "LocalModel", "StandIn"]
-
-
-class LocalModel(ForwardModel, Protocol):
-    """A forward model of all points that can answer at some of them only."""
-
-    def at(self, dofs: NDArray[np.int64]) -> ForwardModel:
-        """The same model with the outputs `dofs` (n,) only."""
-        ...
+__all__ = ["InverseProblem", "Inversion", "InversionSettings", "StandIn"]
 
 
 class StandIn(Protocol):

@@ -7,15 +7,26 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.inversion.driver_prior import learned_prior
 from palpate.inversion.gauss_newton import Minimum
 from palpate.inversion.noise import NoiseLaw, fit_noise_law
 from palpate.inversion.objective import Evaluation, Linearisation, Objective, State, Weighting
-from palpate.inversion.problem import InverseProblem, LocalModel
+from palpate.inversion.problem import InverseProblem
 from palpate.inversion.tukey import Tukey
+from palpate.mechanics.forward import LocalModel
 from palpate.observation.misfit import Correspondence
 from palpate.observation.target import SurfaceTarget
 
-__all__ = ["EXACT_LAW", "SEGMENTATION_LAW", "first_law", "objective_of", "residual_law", "reweighted", "robust_loss"]
+__all__ = [
+    "EXACT_LAW",
+    "SEGMENTATION_LAW",
+    "first_law",
+    "objective_of",
+    "residual_law",
+    "reweighted",
+    "robust_loss",
+    "weighed_anew",
+]
 
 TUKEY = 4.685  # cutoff in standard deviations, 95 % efficient for normal errors (Huber 1981)
 MAD = 1.4826  # standard deviations of a normal law in one median absolute deviation
@@ -53,11 +64,28 @@ def objective_of(
         State(m.at(np.concatenate([t.surface.dofs for t in targets])), targets)
         for m, targets in zip(models, problem.targets, strict=True)
     )
+    return Objective(states, problem.modulus_map, _all_by_the_law(states, law), prior)
+
+
+def weighed_anew(
+    problem: InverseProblem, objective: Objective, minimum: Minimum, law: NoiseLaw | None = None
+) -> tuple[NoiseLaw, Objective]:
+    """What the residuals at a minimum of `objective` say: their law (None: fitted), the drivers' prior, their weights.
+
+    The next minimum is sought under the objective that is returned; an estimate has settled when that is the same.
+    """
+    law = law or residual_law(problem, minimum.evaluation)
+    prior = learned_prior(problem, minimum.evaluation, minimum.unknowns)
+    by_law = replace(objective, weighting=_all_by_the_law(objective.states, law), prior=prior)
+    return law, reweighted(by_law, minimum, law)
+
+
+def _all_by_the_law(states: tuple[State, ...], law: NoiseLaw) -> tuple[tuple[Weighting, ...], ...]:
+    """All residuals of each state's surfaces count, by their law."""
     noise = law.sd**2 * law.correlation_area
-    weighting = tuple(
-        tuple(Weighting(_precision(t, law), Tukey(), _all_of(t), noise) for t in targets) for targets in problem.targets
+    return tuple(
+        tuple(Weighting(_precision(t, law), Tukey(), _all_of(t), noise) for t in state.targets) for state in states
     )
-    return Objective(states, problem.modulus_map, weighting, prior)
 
 
 def _all_of(target: SurfaceTarget) -> Correspondence:

@@ -1,0 +1,55 @@
+"""Weights and estimate in turn until they agree: what an estimate is must not depend on the way to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from palpate.inversion.gauss_newton import Minimum
+from palpate.inversion.minima import change_between, continued
+from palpate.inversion.noise import NoiseLaw
+from palpate.inversion.objective import Objective
+from palpate.inversion.problem import InverseProblem, InversionSettings
+from palpate.inversion.weighting import weighed_anew
+
+__all__ = ["AGREED", "EXACT", "PASSES", "Agreement", "agreed"]
+
+AGREED = 3e-4  # of ln E: what is left undone
+EXACT = 1e-7  # decrement of a minimum that is to be exact to that
+PASSES = 15
+
+
+@dataclass(frozen=True, slots=True)
+class Agreement:
+    """A minimum under the objective whose weights, and the `law` behind them, are those of the pass before.
+
+    change: of ln E, at the most, by the last pass.
+    """
+
+    law: NoiseLaw
+    objective: Objective
+    minimum: Minimum
+    change: float
+
+
+def agreed(
+    problem: InverseProblem,
+    objective: Objective,
+    minimum: Minimum,
+    settings: InversionSettings,
+    *,
+    within: float = AGREED,
+    passes: int = PASSES,
+    tolerance: float = EXACT,
+) -> Agreement:
+    """Law of the residuals, drivers' prior, weights and estimate in turn on the same models, from a point.
+
+    It ends when a pass changes the log-moduli by less than `within`, or after so many `passes`; each minimum is found
+    to a decrement of `tolerance`.
+    """
+    for _ in range(passes):
+        law, objective = weighed_anew(problem, objective, minimum, settings.law)
+        before, minimum = minimum, continued(objective, minimum, settings, tolerance=tolerance)
+        change = float(change_between(before, minimum, objective.n_parameters).max(initial=0.0))
+        if change < within:
+            break
+    return Agreement(law, objective, minimum, change)
