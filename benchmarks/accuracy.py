@@ -152,24 +152,41 @@ def truth_of(row: Row, seed: int, draw: int, truths: Truths) -> tuple[Scene, Pel
     return reimaged(replace(scene, seed=seed + 1000 * draw), pelvis_grid(options), noise=row.noise), options
 
 
-def _case(key: tuple[str, int, int], row: Row, truths: Truths) -> dict[str, object]:
-    """Make one scene, estimate it, and hold the estimate beside the truth."""
-    name, seed, draw = key
-    began = time.perf_counter()
+@dataclass(frozen=True)
+class Posed:
+    """One case of a row: the scene, what is asked of it, and the body it was made of where images are seen."""
+
+    scene: Scene
+    filling_mm: float
+    space: LagrangeSpace
+    problem: InverseProblem
+    settings: InversionSettings
+    bodies: tuple[Body, ...]
+
+
+def posed(row: Row, seed: int, draw: int, truths: Truths) -> Posed:
+    """The scene of a row, and the inverse problem that its images or surfaces pose."""
     scene, options = truth_of(row, seed, draw, truths)
-    filling = options.filling_mm
-    scene_seconds = time.perf_counter() - began
     case = Case(
-        f"{name}-{seed}",
+        f"seed-{seed}",
         phantom=Phantom("pelvis", seed),
         mesh=MeshSettings(row.edge_mm),
         mechanics=Mechanics(row.law, "P2" if row.law == "linear" and row.poisson_ratio is None else "auto"),
     )
     if row.data == "voxels":
-        space, problem, states = from_voxels(scene, case)
+        space, problem, bodies = from_voxels(scene, case)
     else:
-        space, problem, states = _from_surfaces(scene, case, options, same_mesh=row.data == "same mesh")
-    settings = inversion_settings(case, problem.modulus_map)
+        space, problem, bodies = _from_surfaces(scene, case, options, same_mesh=row.data == "same mesh")
+    return Posed(scene, options.filling_mm, space, problem, inversion_settings(case, problem.modulus_map), bodies)
+
+
+def _case(key: tuple[str, int, int], row: Row, truths: Truths) -> dict[str, object]:
+    """Make one scene, estimate it, and hold the estimate beside the truth."""
+    name, seed, draw = key
+    began = time.perf_counter()
+    case = posed(row, seed, draw, truths)
+    scene, space, problem, settings = case.scene, case.space, case.problem, case.settings
+    posed_seconds = time.perf_counter() - began
     estimated = time.perf_counter()
     inversion = invert(problem, settings, progress=_silent)
     seconds = time.perf_counter() - estimated
@@ -177,10 +194,10 @@ def _case(key: tuple[str, int, int], row: Row, truths: Truths) -> dict[str, obje
         "row": name,
         "seed": seed,
         "draw": draw,
-        "filling_mm": filling,
+        "filling_mm": case.filling_mm,
         "dofs": 3 * len(space.points),
         "truth_dofs": 3 * len(scene.space.points),
-        "scene_seconds": scene_seconds,
+        "scene_seconds": posed_seconds,
         "estimate_seconds": seconds,
         "outcome": inversion.minimum.outcome.name,
         "starts": [int(group) for group in inversion.groups],
@@ -191,8 +208,8 @@ def _case(key: tuple[str, int, int], row: Row, truths: Truths) -> dict[str, obje
         result["linear_ln_error"] = _errors(linear, scene)["ln_error"]
         if seed % 5 == 1 and draw == 0 and row.noise is None:
             result["far_off_ln_error"] = _errors(_from_far_off(problem, linear, settings), scene)["ln_error"]
-    if states:
-        result |= _uncertainty(inversion, problem, states[0], scene, settings, row)
+    if case.bodies:
+        result |= _uncertainty(inversion, problem, case.bodies[0], scene, settings, row)
         result |= _driver_error(inversion, space, scene)
     return result
 

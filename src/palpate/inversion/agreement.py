@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from palpate.inversion.gauss_newton import Minimum
-from palpate.inversion.minima import change_between, continued
+from palpate.inversion.minima import change_between, continued, posterior_sd
 from palpate.inversion.noise import NoiseLaw
 from palpate.inversion.objective import Objective
 from palpate.inversion.problem import InverseProblem, InversionSettings
 from palpate.inversion.weighting import weighed_anew
 
-__all__ = ["AGREED", "EXACT", "PASSES", "Agreement", "agreed"]
+__all__ = ["AGREED", "EXACT", "PASSES", "Agreement", "agreed", "left_since"]
 
 AGREED = 3e-4  # of ln E: what is left undone
 EXACT = 1e-7  # decrement of a minimum that is to be exact to that
@@ -53,3 +56,15 @@ def agreed(
         if change < within:
             break
     return Agreement(law, objective, minimum, change)
+
+
+def left_since(sharp: NDArray[np.float64] | None, there: Minimum, n_parameters: int) -> float:
+    """How far derivatives that are exact at log-moduli `sharp` (n_parameters,) may set an estimate off, of ln E.
+
+    At a distance d of ln E they are off by a share d, and so is what the residuals pull with them, which is worth a
+    posterior standard deviation: d sd, the largest of all log-moduli; infinite where they are exact nowhere (None).
+    """
+    if sharp is None:
+        return np.inf
+    distance = np.abs(there.unknowns[:n_parameters] - sharp)
+    return float(np.max(distance * posterior_sd(there, n_parameters), initial=0.0))

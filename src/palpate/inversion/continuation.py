@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
-from palpate.inversion.agreement import AGREED, EXACT, agreed
+from palpate.inversion.agreement import AGREED, EXACT, agreed, left_since
 from palpate.inversion.directions import deciding_directions
 from palpate.inversion.gauss_newton import Bounds, Minimum, Outcome
-from palpate.inversion.minima import SETTLED, change_between, moved_between, posterior_sd, words
+from palpate.inversion.minima import SETTLED, change_between, moved_between, words
 from palpate.inversion.noise import NoiseLaw
 from palpate.inversion.objective import Evaluation, Objective
 from palpate.inversion.problem import InverseProblem, Inversion, InversionSettings, StandIn
+from palpate.inversion.wall_refinement import REFINEMENTS, refined_walls
 from palpate.mechanics.equilibrium import from_start
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
 from palpate.mechanics.first_order import FirstOrderModel
@@ -32,7 +33,7 @@ from palpate.mesh.constraint import Constraint
 
 __all__ = ["Expansion", "continued_at_finite_strain"]
 
-ROUNDS = 12
+ROUNDS = 16
 NEAR = 0.5  # posterior standard deviations: a round that moves less ends where derivatives are worth making exact
 FORCING = 0.1  # of a round's change: to which the next one's weights and estimate agree
 LOOSE = 1e-4  # decrement of the minima of rounds that are not the last
@@ -114,8 +115,7 @@ def continued_at_finite_strain(
     Each distinct linear minimum that converged is continued, the best one always. Raises `NotConverged` when its
     equilibrium is not found, with the element and the share of the motion where it ended.
     """
-    pairs = zip(problem.finite_strain, linear.surrogates, strict=True)
-    models = tuple(model.under(surrogate.constraint).to_tolerance(ROUGH) for model, surrogate in pairs)
+    models = tuple(model.to_tolerance(ROUGH) for model in problem.finite_strain)
     chosen = linear.groups[linear.best]
     places = {chosen: _followed(problem, models, linear, linear.minimum, settings, progress)}
     for minimum, group in zip(linear.minima, linear.groups, strict=True):
@@ -159,13 +159,36 @@ def _followed(
     expansions = tuple(_near_linear(model, surrogate, moduli, q) for model, surrogate, q in triples)
     objective = linear.objective.under([e.reduced for e in expansions]).with_fresh_correspondence(start.unknowns)
     first = replace(start, evaluation=objective(start.unknowns), history=())
-    place = _Place(objective, first, expansions, linear.law)
+    place, refinements = _Place(objective, first, expansions, linear.law), 0
     for number in range(ROUNDS):
         progress(f"finite strain, round {number + 1}: {words(problem, place.minimum)}")
         before, place = place, _round(problem, place, settings)
-        if place.exact or place.minimum.unknowns is before.minimum.unknowns:
+        if place.exact:
+            finer = _with_finer_walls(problem, place) if refinements < REFINEMENTS else place
+            if finer is place:
+                break
+            place, refinements = finer, refinements + 1
+        elif place.minimum.unknowns is before.minimum.unknowns:
             break
     return _at_equilibria(problem, place)
+
+
+def _with_finer_walls(problem: InverseProblem, place: _Place) -> _Place:
+    """The place with finer motions of the drivers' walls, where their surfaces ask for it, else the same."""
+    constraints = tuple(expansion.constraint for expansion in place.expansions)
+    finer = refined_walls(problem, constraints, place.minimum.evaluation.surfaces, place.law)
+    if all(a is b for a, b in zip(constraints, finer, strict=True)):
+        return place
+    expansions = tuple(_constrained(*pair) for pair in zip(place.expansions, finer, strict=True))
+    return replace(place, moved=np.inf, sharp=None, exact=False).under(expansions, place.minimum)
+
+
+def _constrained(expansion: Expansion, constraint: Constraint) -> Expansion:
+    """The expansion around the equilibrium that another offset of what is prescribed leads to."""
+    before = expansion.equilibrium
+    model, start = before.model.under(constraint), before.displacement
+    found = from_start(model, before.moduli, before.coefficients, start=start, nearby=before.factorisation)
+    return _recentred(expansion, found)
 
 
 def _at_equilibria(problem: InverseProblem, place: _Place) -> _Place:
@@ -218,24 +241,13 @@ def _round(problem: InverseProblem, place: _Place, settings: InversionSettings) 
     unknowns, equilibria = lower
     expansions = tuple(_recentred(*pair) for pair in zip(place.expansions, equilibria, strict=True))
     arrived = replace(place, change=change, moved=moved)
-    if _still_sharp(place, replace(found, unknowns=unknowns)):
+    there = replace(found, unknowns=unknowns)
+    if left_since(place.sharp, there, n) < AGREED:
         arrived = replace(arrived, exact=end.change < AGREED and change**2 < AGREED)
     elif moved < NEAR or all(e.reduced.n_regions + e.reduced.n_modes <= FEW for e in expansions):
         expansions = _sharpened(place.objective, found.evaluation, expansions)
         arrived = replace(arrived, sharp=unknowns[:n])
-    return arrived.under(expansions, replace(found, unknowns=unknowns))
-
-
-def _still_sharp(place: _Place, there: Minimum) -> bool:
-    """Whether the exact derivatives of the place, if it has any, decide an estimate elsewhere to `AGREED` of ln E.
-
-    At a distance d of ln E the derivatives are off by a share d, and so is what the residuals pull with them, which is
-    worth a posterior standard deviation.
-    """
-    if place.sharp is None:
-        return False
-    n = place.objective.n_parameters
-    return bool(np.all(np.abs(there.unknowns[:n] - place.sharp) * posterior_sd(there, n) < AGREED))
+    return arrived.under(expansions, there)
 
 
 def _lower(

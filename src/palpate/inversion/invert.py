@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inversion.agreement import EXACT, PASSES, agreed
+from palpate.inversion.agreement import AGREED, EXACT, PASSES, agreed, left_since
 from palpate.inversion.continuation import continued_at_finite_strain
 from palpate.inversion.directions import deciding_directions
 from palpate.inversion.driver_prior import learned_prior
@@ -28,15 +28,15 @@ from palpate.inversion.noise import NoiseLaw
 from palpate.inversion.objective import Objective
 from palpate.inversion.problem import InverseProblem, Inversion, InversionSettings
 from palpate.inversion.surrogate import Surrogate, first_surrogate, sharpened, with_modulus_series, with_offset
-from palpate.inversion.wall_refinement import refined_walls
+from palpate.inversion.wall_refinement import REFINEMENTS, refined_walls
 from palpate.inversion.weighting import first_law, objective_of
 from palpate.mechanics.forward import SolveCounts
+from palpate.mechanics.linear_model import with_constraint
 from palpate.mechanics.reduced import ReducedModel
 
 __all__ = ["invert", "invert_with"]
 
 ROUNDS = 9
-REFINEMENTS = 2  # of the drivers' walls; what is left then is no motion that they could follow
 FIRST_STEPS = 2  # of the drivers' motion at a start's moduli, before these move
 ROUGH_SURFACE = 1.0 / 3.0  # mm, of a residual; below that a model must be as much more exact
 
@@ -46,19 +46,24 @@ class _Effort:
     """How far an estimate is taken.
 
     exact: relative error in energy that a displacement may have where surfaces are rough, without a further snapshot;
-    passes: of weights and estimate within a round, at the most; settled: by so many posterior standard deviations a
-    round may still move it; decrement: of the estimate; others: of the starts that ended elsewhere.
+    left: what derivatives that are exact elsewhere may leave of ln E (see `left_since`); passes: of weights and
+    estimate within a round, at the most; settled: by so many posterior standard deviations a round may still move it;
+    decrement: of the estimate; others: of the starts that ended elsewhere; refinements: of the drivers' walls, at most.
     """
 
     exact: float
+    left: float
     passes: int
     settled: float
     decrement: float
     others: float
+    refinements: int
 
 
-TO_REPORT = _Effort(exact=1e-3, passes=PASSES, settled=SETTLED, decrement=EXACT, others=1e-4)
-TO_START_FROM = _Effort(exact=1e-1, passes=1, settled=0.5, decrement=1e-3, others=1e-3)
+TO_REPORT = _Effort(
+    exact=1e-3, left=AGREED, passes=PASSES, settled=SETTLED, decrement=EXACT, others=1e-4, refinements=REFINEMENTS
+)
+TO_START_FROM = _Effort(exact=1e-1, left=np.inf, passes=1, settled=0.5, decrement=1e-3, others=1e-3, refinements=0)
 
 
 def invert(problem: InverseProblem, settings: InversionSettings, *, progress: Callable[[str], None]) -> Inversion:
@@ -106,21 +111,27 @@ def invert_with(
     minima = _from_starts(objective, settings, filled.unknowns[objective.n_parameters :], progress)
     chosen = best_of(minima)
     best = minima[chosen]
+    sharp: NDArray[np.float64] | None = None  # log-moduli where the reduced models' derivatives were made exact
     settled, refinements = False, 0
     for round_ in range(ROUNDS):
         progress(f"round {round_ + 1}: {words(problem, best)}; the full model is solved there")
-        exact = effort.exact * min(law.sd / ROUGH_SURFACE, 1.0)
+        before = best
+        if left_since(sharp, best, objective.n_parameters) > effort.left:
+            exact, sharp = 0.0, best.unknowns[: objective.n_parameters]
+        else:
+            exact = effort.exact * min(law.sd / ROUGH_SURFACE, 1.0)
         surrogates = _enriched(problem, surrogates, objective, best, exact=exact)
-        before, objective = best, objective.under(_reduced(surrogates))
+        objective = objective.under(_reduced(surrogates))
         end = agreed(problem, objective, best, settings, passes=effort.passes, tolerance=effort.decrement)
         law, objective, best = end.law, end.objective, end.minimum
-        settled = moved_between(before, best, objective.n_parameters) < effort.settled
-        if settled:
-            done = refinements == REFINEMENTS or round_ == ROUNDS - 1
+        left = left_since(sharp, best, objective.n_parameters)
+        settled = moved_between(before, best, objective.n_parameters) < effort.settled or left < AGREED
+        if settled and left <= effort.left:
+            done = refinements == effort.refinements or round_ == ROUNDS - 1
             finer = surrogates if done else _refined(problem, surrogates, best, law)
             if all(a is b for a, b in zip(finer, surrogates, strict=True)):
                 break
-            surrogates, settled, refinements = finer, False, refinements + 1
+            surrogates, sharp, settled, refinements = finer, None, False, refinements + 1
     minima = _ended(objective, settings, minima, best, chosen, tolerance=effort.others)
     counts = sum((s.counts for s in surrogates), SolveCounts())
     return Inversion(
@@ -165,16 +176,10 @@ def _refined(
     problem: InverseProblem, surrogates: tuple[Surrogate, ...], minimum: Minimum, law: NoiseLaw
 ) -> tuple[Surrogate, ...]:
     """The surrogates with finer motions of the drivers' walls, where their surfaces ask for it."""
-    models = tuple(s.model for s in surrogates)
-    finer = refined_walls(
-        models,
-        problem.models,
-        minimum.evaluation.surfaces,
-        drivers=problem.drivers,
-        law=law,
-        kernel_mm=problem.fine_kernel_mm,
-    )
-    return tuple(s if model is s.model else with_offset(s, model) for s, model in zip(surrogates, finer, strict=True))
+    constraints = tuple(surrogate.constraint for surrogate in surrogates)
+    finer = refined_walls(problem, constraints, minimum.evaluation.surfaces, law)
+    pairs = zip(surrogates, finer, strict=True)
+    return tuple(s if c is s.constraint else with_offset(s, with_constraint(s.model, c)) for s, c in pairs)
 
 
 def _enriched(
