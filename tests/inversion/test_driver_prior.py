@@ -112,6 +112,25 @@ def test_the_first_guess_of_the_amplitude_does_not_matter():
     assert second == pytest.approx(first, rel=0.05, abs=0.02 * np.abs(first).max())
 
 
+@pytest.mark.parametrize("sd_mm", [0.05, 1.0])
+def test_no_other_amplitude_has_more_evidence(sd_mm):
+    """d/ds of 1/2 (b^T (A + P / s)^-1 b - ln det(A + P / s) + ln det(P / s)) at s = 1, the prior's variance times s."""
+    here = ball()
+    motion = drawn(here, sd_mm=2.0, kernel_mm=20.0, seed=1)
+    precision = learned_precision(here, motion, sd_mm=sd_mm)
+    data, pull = here.modes.T @ here.modes / sd_mm**2, here.modes.T @ motion.ravel() / sd_mm**2
+
+    def evidence(scale):
+        prior = precision / scale
+        total = data + prior
+        return 0.5 * (pull @ np.linalg.solve(total, pull) - np.linalg.slogdet(total)[1] + np.linalg.slogdet(prior)[1])
+
+    slope = (evidence(1.01) - evidence(0.99)) / 0.02
+    curvature = (evidence(1.1) - 2.0 * evidence(1.0) + evidence(0.9)) / 0.01
+    assert curvature < -1.0
+    assert abs(slope / curvature) < 2e-3  # the variance is found to two thousandths
+
+
 def test_what_is_not_seen_at_all_keeps_a_bounded_prior():
     here = ball()
     variance = learned(here, np.zeros_like(here.points), sd_mm=1e6).diagonal()

@@ -62,6 +62,17 @@ def test_a_mixture_shows_both_of_its_parts(rng):
     assert np.sqrt(law.variances[~short].sum()) == pytest.approx(0.3, rel=0.2)
 
 
+def test_the_law_does_not_jump_when_a_few_residuals_come_or_go(rng):
+    """More cells than are compared: those that are drawn stay drawn. A new draw would move the law by a per cent."""
+    places, normals = sphere(40000)
+    values = 0.2 * rng.standard_normal(len(places))
+    gone = np.linalg.norm(places - places[20000], axis=1) < 0.8
+    assert gone.sum() > 10
+    laws = [fit_noise_law([values[kept]], [places[kept]], [normals[kept]]) for kept in (gone | True, ~gone)]
+    assert laws[1].sd == pytest.approx(laws[0].sd, rel=1e-3)
+    assert laws[1].correlation_area == pytest.approx(laws[0].correlation_area, rel=1e-2)
+
+
 def test_residuals_of_nothing_leave_the_floor():
     places, normals = sphere(200)
     law = fit_noise_law([np.zeros(200)], [places], [normals])

@@ -45,12 +45,14 @@ ROUGH_SURFACE = 1.0 / 3.0  # mm, of a residual; below that a model must be as mu
 class _Effort:
     """How far an estimate is taken.
 
-    exact: relative error in energy that a displacement may have where surfaces are rough, without a further snapshot;
-    left: what derivatives that are exact elsewhere may leave of ln E (see `left_since`); passes: of weights and
-    estimate within a round, at the most; settled: by so many posterior standard deviations a round may still move it;
-    decrement: of the estimate; others: of the starts that ended elsewhere; refinements: of the drivers' walls, at most.
+    near: relative error in energy of a displacement, below which a round goes without the full model; exact: that with
+    which an estimate may end where surfaces are rough; left: what derivatives that are exact elsewhere may leave of
+    ln E (see `left_since`); passes: of weights and estimate within a round, at the most; settled: by so many posterior
+    standard deviations a round may still move it; decrement: of the estimate; others: of the starts that ended
+    elsewhere; refinements: of the drivers' walls, at the most.
     """
 
+    near: float
     exact: float
     left: float
     passes: int
@@ -60,10 +62,8 @@ class _Effort:
     refinements: int
 
 
-TO_REPORT = _Effort(
-    exact=1e-3, left=AGREED, passes=PASSES, settled=SETTLED, decrement=EXACT, others=1e-4, refinements=REFINEMENTS
-)
-TO_START_FROM = _Effort(exact=1e-1, left=np.inf, passes=1, settled=0.5, decrement=1e-3, others=1e-3, refinements=0)
+TO_REPORT = _Effort(0.0, 2e-4, AGREED, PASSES, SETTLED, EXACT, 1e-4, REFINEMENTS)
+TO_START_FROM = _Effort(0.1, np.inf, np.inf, 1, 0.5, 1e-3, 1e-3, 0)
 
 
 def invert(problem: InverseProblem, settings: InversionSettings, *, progress: Callable[[str], None]) -> Inversion:
@@ -111,27 +111,22 @@ def invert_with(
     minima = _from_starts(objective, settings, filled.unknowns[objective.n_parameters :], progress)
     chosen = best_of(minima)
     best = minima[chosen]
-    sharp: NDArray[np.float64] | None = None  # log-moduli where the reduced models' derivatives were made exact
     settled, refinements = False, 0
     for round_ in range(ROUNDS):
         progress(f"round {round_ + 1}: {words(problem, best)}; the full model is solved there")
-        before = best
-        if left_since(sharp, best, objective.n_parameters) > effort.left:
-            exact, sharp = 0.0, best.unknowns[: objective.n_parameters]
-        else:
-            exact = effort.exact * min(law.sd / ROUGH_SURFACE, 1.0)
-        surrogates = _enriched(problem, surrogates, objective, best, exact=exact)
+        before, surrogates = best, _enriched(problem, surrogates, objective, best, unless=effort.near)
         objective = objective.under(_reduced(surrogates))
         end = agreed(problem, objective, best, settings, passes=effort.passes, tolerance=effort.decrement)
         law, objective, best = end.law, end.objective, end.minimum
-        left = left_since(sharp, best, objective.n_parameters)
-        settled = moved_between(before, best, objective.n_parameters) < effort.settled or left < AGREED
-        if settled and left <= effort.left:
+        left = left_since(before.unknowns[: objective.n_parameters], best, objective.n_parameters)
+        exact = effort.exact * min(law.sd / ROUGH_SURFACE, 1.0)
+        settled = left < AGREED or moved_between(before, best, objective.n_parameters) < effort.settled
+        if settled and left < effort.left and _relative_error(problem, surrogates, objective, best) < exact:
             done = refinements == effort.refinements or round_ == ROUNDS - 1
             finer = surrogates if done else _refined(problem, surrogates, best, law)
             if all(a is b for a, b in zip(finer, surrogates, strict=True)):
                 break
-            surrogates, sharp, settled, refinements = finer, None, False, refinements + 1
+            surrogates, settled, refinements = finer, False, refinements + 1
     minima = _ended(objective, settings, minima, best, chosen, tolerance=effort.others)
     counts = sum((s.counts for s in surrogates), SolveCounts())
     return Inversion(
@@ -188,13 +183,26 @@ def _enriched(
     objective: Objective,
     minimum: Minimum,
     *,
-    exact: float,
+    unless: float,
 ) -> tuple[Surrogate, ...]:
-    """Solve the full models at a minimum where the reduced ones' relative error is above `exact`."""
+    """Solve the full models at a minimum where the reduced ones' relative error is not below `unless`."""
     moduli = problem.modulus_map.moduli(minimum.unknowns[: objective.n_parameters])
-    amounts = objective.coefficients(minimum.unknowns)
-    triples = zip(surrogates, amounts, deciding_directions(objective, minimum.evaluation), strict=True)
-    return tuple(s if s.relative_error(moduli, q) < exact else sharpened(s, moduli, q, d) for s, q, d in triples)
+    triples = zip(
+        surrogates,
+        objective.coefficients(minimum.unknowns),
+        deciding_directions(objective, minimum.evaluation),
+        strict=True,
+    )
+    return tuple(s if s.relative_error(moduli, q) < unless else sharpened(s, moduli, q, d) for s, q, d in triples)
+
+
+def _relative_error(
+    problem: InverseProblem, surrogates: tuple[Surrogate, ...], objective: Objective, minimum: Minimum
+) -> float:
+    """The largest bound of the reduced models' errors at a minimum, of the displacements in energy."""
+    moduli = problem.modulus_map.moduli(minimum.unknowns[: objective.n_parameters])
+    pairs = zip(surrogates, objective.coefficients(minimum.unknowns), strict=True)
+    return max(surrogate.relative_error(moduli, q) for surrogate, q in pairs)
 
 
 def _from_starts(
