@@ -14,10 +14,9 @@ from palpate.inversion.objective import Objective
 from palpate.inversion.problem import InverseProblem, InversionSettings
 from palpate.inversion.weighting import weighed_anew
 
-__all__ = ["AGREED", "EXACT", "PASSES", "Agreement", "agreed", "left_since"]
+__all__ = ["AGREED", "PASSES", "Agreement", "agreed", "left_since"]
 
 AGREED = 3e-4  # of ln E: what is left undone
-EXACT = 1e-7  # decrement of a minimum that is to be exact to that
 PASSES = 15
 
 
@@ -42,16 +41,15 @@ def agreed(
     *,
     within: float = AGREED,
     passes: int = PASSES,
-    tolerance: float = EXACT,
 ) -> Agreement:
     """Law of the residuals, drivers' prior, weights and estimate in turn on the same models, from a point.
 
     It ends when a pass changes the log-moduli by less than `within`, or after so many `passes`; each minimum is found
-    to a decrement of `tolerance`.
+    to a sixth of that.
     """
     for _ in range(passes):
         law, objective = weighed_anew(problem, objective, minimum, settings.law)
-        before, minimum = minimum, continued(objective, minimum, settings, tolerance=tolerance)
+        before, minimum = minimum, continued(objective, minimum, settings, still=within / 6.0)
         change = float(change_between(before, minimum, objective.n_parameters).max(initial=0.0))
         if change < within:
             break

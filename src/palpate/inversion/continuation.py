@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
-from palpate.inversion.agreement import AGREED, EXACT, agreed, left_since
+from palpate.inversion.agreement import AGREED, agreed, left_since
 from palpate.inversion.directions import deciding_directions
 from palpate.inversion.gauss_newton import Bounds, Minimum, Outcome
 from palpate.inversion.minima import SETTLED, change_between, moved_between, words
@@ -36,7 +36,6 @@ __all__ = ["Expansion", "continued_at_finite_strain"]
 ROUNDS = 16
 NEAR = 0.5  # posterior standard deviations: a round that moves less ends where derivatives are worth making exact
 FORCING = 0.1  # of a round's change: to which the next one's weights and estimate agree
-LOOSE = 1e-4  # decrement of the minima of rounds that are not the last
 REACH = 0.8  # of ln E, within which an expansion is trusted
 HALVINGS = 3
 NOISE = 0.5  # of the objective, in units of log-likelihood: the noise of re-chosen closest points
@@ -230,8 +229,7 @@ def _round(problem: InverseProblem, place: _Place, settings: InversionSettings) 
     now, n = place.minimum, place.objective.n_parameters
     reach = replace(settings, bounds=_near(settings.bounds, place.theta))
     within = max(AGREED, FORCING * place.change)
-    tolerance = EXACT if within == AGREED else LOOSE
-    end = agreed(problem, place.objective, now, reach, within=within, tolerance=tolerance)
+    end = agreed(problem, place.objective, now, reach, within=within)
     place, found = place.weighed(end.law, end.objective), end.minimum
     change, moved = float(change_between(now, found, n).max(initial=0.0)), moved_between(now, found, n)
     lower = _lower(place, found.unknowns - now.unknowns)

@@ -83,6 +83,7 @@ def gauss_newton(
     bounds: Bounds,
     hold_theta: bool = False,
     tolerance: float = 1e-3,
+    still: float = np.inf,
     max_steps: int = 40,
 ) -> Minimum:
     """Minimise `objective` from `start` (n_unknowns,).
@@ -90,7 +91,8 @@ def gauss_newton(
     Step: (J^T W J + P + mu D) d = -s, s the score, with the log-moduli's part no longer than the trust radius; a step
     is taken when it reduces the objective (Nocedal & Wright 2006, Algorithm 4.1) or lowers by a tenth the decrement
     -s.d / 2, the reduction that the quadratic model still promises in units of log-likelihood. It ends when that is
-    under `tolerance`. `hold_theta` moves the driver's coefficients only.
+    under `tolerance` and the step to the model's minimum moves no log-modulus by more than `still`. `hold_theta` moves
+    the driver's coefficients only.
     """
     unknowns, region, history = start.copy(), _Region(), list[Iterate]()
     now = objective(unknowns)
@@ -100,7 +102,7 @@ def gauss_newton(
         free = _free(objective, unknowns, now, bounds, hold_theta)
         decrement = _decrement(now, free)
         history.append(Iterate(unknowns[: objective.n_parameters], now.value, now.misfit_mm2, decrement))
-        if decrement < tolerance:
+        if decrement < tolerance and _moves(now, free, objective.n_parameters) < still:
             return Minimum(unknowns, now, Outcome.CONVERGED, tuple(history))
         found = _search(objective, unknowns, now, free=free, bounds=bounds, region=region)
         if found is None:
@@ -148,6 +150,11 @@ def _free(
 def _decrement(now: Evaluation, free: NDArray[np.bool_]) -> float:
     matrix, score = now.matrix[np.ix_(free, free)], now.score[free]
     return float(0.5 * score @ _solve(matrix, score))
+
+
+def _moves(now: Evaluation, free: NDArray[np.bool_], n_parameters: int) -> float:
+    """Largest change of a log-modulus by the step to the minimum of the quadratic model."""
+    return float(np.abs(_step(now, free, n_parameters, _Region(np.inf, 0.0))[:n_parameters]).max(initial=0.0))
 
 
 def _near(now: Evaluation, free: NDArray[np.bool_], n_parameters: int) -> bool:

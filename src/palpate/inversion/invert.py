@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inversion.agreement import AGREED, EXACT, PASSES, agreed, left_since
+from palpate.inversion.agreement import AGREED, PASSES, agreed, left_since
 from palpate.inversion.continuation import continued_at_finite_strain
 from palpate.inversion.directions import deciding_directions
 from palpate.inversion.driver_prior import learned_prior
@@ -47,23 +47,23 @@ class _Effort:
 
     near: relative error in energy of a displacement, below which a round goes without the full model; exact: that with
     which an estimate may end where surfaces are rough; left: what derivatives that are exact elsewhere may leave of
-    ln E (see `left_since`); passes: of weights and estimate within a round, at the most; settled: by so many posterior
-    standard deviations a round may still move it; decrement: of the estimate; others: of the starts that ended
-    elsewhere; refinements: of the drivers' walls, at the most.
+    ln E (see `left_since`); within, passes: to which weights and estimate agree in a round, after so many passes at the
+    most; settled: by so many posterior standard deviations a round may still move it; others: decrement of the starts
+    that ended elsewhere; refinements: of the drivers' walls, at the most.
     """
 
     near: float
     exact: float
     left: float
+    within: float
     passes: int
     settled: float
-    decrement: float
     others: float
     refinements: int
 
 
-TO_REPORT = _Effort(0.0, 2e-4, AGREED, PASSES, SETTLED, EXACT, 1e-4, REFINEMENTS)
-TO_START_FROM = _Effort(0.1, np.inf, np.inf, 1, 0.5, 1e-3, 1e-3, 0)
+TO_REPORT = _Effort(0.0, 2e-4, AGREED, AGREED, PASSES, SETTLED, 1e-4, REFINEMENTS)
+TO_START_FROM = _Effort(0.1, np.inf, np.inf, np.inf, 1, 0.5, 1e-3, 0)
 
 
 def invert(problem: InverseProblem, settings: InversionSettings, *, progress: Callable[[str], None]) -> Inversion:
@@ -116,7 +116,7 @@ def invert_with(
         progress(f"round {round_ + 1}: {words(problem, best)}; the full model is solved there")
         before, surrogates = best, _enriched(problem, surrogates, objective, best, unless=effort.near)
         objective = objective.under(_reduced(surrogates))
-        end = agreed(problem, objective, best, settings, passes=effort.passes, tolerance=effort.decrement)
+        end = agreed(problem, objective, best, settings, within=effort.within, passes=effort.passes)
         law, objective, best = end.law, end.objective, end.minimum
         left = left_since(before.unknowns[: objective.n_parameters], best, objective.n_parameters)
         exact = effort.exact * min(law.sd / ROUGH_SURFACE, 1.0)

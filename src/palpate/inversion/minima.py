@@ -28,6 +28,7 @@ __all__ = [
 
 SAME_MINIMUM = 0.02  # of ln E
 DRIVEN = 1e-2  # decrement of the drivers' motion at held moduli, which other unknowns are going to change
+POLISH = 1e-5  # decrement of a minimum by a method that does not tell how far the log-moduli are from it
 SETTLED = 0.05  # posterior standard deviations by which a round may still move the estimate
 
 
@@ -49,19 +50,33 @@ def driven(
 
 
 def minimised(
-    objective: Objective, start: NDArray[np.float64], settings: InversionSettings, *, tolerance: float = 1e-3
+    objective: Objective,
+    start: NDArray[np.float64],
+    settings: InversionSettings,
+    *,
+    tolerance: float = 1e-3,
+    still: float = np.inf,
 ) -> Minimum:
-    """The minimum from `start` (n_unknowns,) by the method of the settings; `tolerance` of the decrement."""
+    """The minimum from `start` (n_unknowns,) by the method of the settings.
+
+    `tolerance` of the decrement; `still`: how far the log-moduli may yet be from it.
+    """
     if settings.method == "lbfgs":
-        return lbfgs(objective, start, bounds=settings.bounds, tolerance=tolerance)
-    return gauss_newton(objective, start, bounds=settings.bounds, tolerance=tolerance)
+        polish = min(tolerance, POLISH) if np.isfinite(still) else tolerance
+        return lbfgs(objective, start, bounds=settings.bounds, tolerance=polish)
+    return gauss_newton(objective, start, bounds=settings.bounds, tolerance=tolerance, still=still)
 
 
 def continued(
-    objective: Objective, minimum: Minimum, settings: InversionSettings, *, tolerance: float = 1e-3
+    objective: Objective,
+    minimum: Minimum,
+    settings: InversionSettings,
+    *,
+    tolerance: float = 1e-3,
+    still: float = np.inf,
 ) -> Minimum:
     """Go on from a minimum under a new objective; the history goes on, too."""
-    found = minimised(objective, minimum.unknowns, settings, tolerance=tolerance)
+    found = minimised(objective, minimum.unknowns, settings, tolerance=tolerance, still=still)
     return replace(found, history=minimum.history + found.history)
 
 
