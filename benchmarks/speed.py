@@ -27,7 +27,6 @@ import speed_peers as peers
 from memory import peak_mb
 
 from palpate.images.segmentation import segment
-from palpate.inversion.gauss_newton import gauss_newton
 from palpate.inversion.invert import invert
 from palpate.inversion.posterior import sandwich_covariance
 from palpate.inversion.problem import InverseProblem, Inversion, InversionSettings
@@ -35,7 +34,6 @@ from palpate.inversion.sampling import sample_posterior
 from palpate.inversion.surrogate import first_surrogate, with_modulus_series
 from palpate.inversion.weighting import SEGMENTATION_LAW, objective_of
 from palpate.mechanics.boundary import outer_constraint
-from palpate.mechanics.first_order import expanded
 from palpate.mechanics.linear_model import linear_model
 from palpate.mechanics.solvers.registry import SOLVERS
 from palpate.mesh.space import lagrange_space
@@ -47,7 +45,7 @@ from palpate.study.body import aligned, inverse_problem, make_body
 from palpate.study.case import Case, Mechanics, MeshSettings, Phantom
 from palpate.study.run import estimate_states, inversion_settings
 
-PARTS = ("linear", "nonlinear", "gradient", "posterior", "scaling", "front_end", "answers")
+PARTS = ("linear", "nonlinear", "gradient", "posterior", "scaling", "front_end")
 IN_A_ROW = 20  # gradients, as an optimiser asks for them
 STARTS = (0.5, 1.0, 2.0, 4.0, 8.0)  # moduli to the surroundings'
 SCALING_EDGES = (9.0, 6.0, 4.0, 2.7, 1.85, 1.65)  # mm: 30 k to 1 M unknowns
@@ -324,34 +322,6 @@ def _one_size(edge_mm: float, seed: int) -> dict[str, object]:
     }
 
 
-def _answers(sizes: Sizes, seed: int, say: Say) -> dict[str, object]:
-    """By how much the full model, solved exactly for every unknown's derivative, would still move the moduli."""
-    found = {}
-    for law, edge in (("linear", sizes.linear), ("neo-hookean", sizes.nonlinear)):
-        problem, settings, _ = problem_of(edge, seed, law)
-        inversion = invert(problem, settings, progress=_silent)
-        objective, unknowns, n = inversion.objective, inversion.minimum.unknowns, inversion.objective.n_parameters
-        moduli, mapping = objective.modulus_map.moduli(unknowns[:n]), objective.modulus_map
-        (amounts,), (state,), (stand_in,) = objective.coefficients(unknowns), objective.states, inversion.surrogates
-        if law == "linear":
-            exact, names = stand_in.model.solve(moduli, amounts), stand_in.model.names
-        else:
-            exact, names = stand_in.equilibrium.refactorised(), stand_in.equilibrium.model.names
-        model = expanded(exact, names=names, moduli=moduli, coefficients=amounts)
-        model = model.at(np.concatenate([target.surface.dofs for target in state.targets]))
-        full = replace(objective, states=(replace(state, model=model),))
-        end = gauss_newton(full, unknowns, bounds=settings.bounds, tolerance=1e-8)
-        change = 100.0 * np.expm1(end.unknowns[:n] - unknowns[:n])
-        sd = np.sqrt(np.diag(sandwich_covariance(end.evaluation, inversion.law, n)))
-        found[law] = {
-            "tissues": list(mapping.tissues),
-            "change_percent": change.tolist(),
-            "sd_percent": (100.0 * sd).tolist(),
-        }
-        say(json.dumps(found[law]))
-    return {"answers": found}
-
-
 STAGES = {  # functions whose time, with all that they call, is a stage of its own
     "images checked and aligned": ("body.py", "aligned"),
     "level sets": ("anatomy.py", "anatomy_of"),
@@ -411,7 +381,6 @@ PART = {
     "posterior": _posterior,
     "scaling": _scaling,
     "front_end": _front_end,
-    "answers": _answers,
 }
 
 if __name__ == "__main__":
