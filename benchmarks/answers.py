@@ -26,7 +26,7 @@ from palpate.inversion.agreement import AGREED, agreed
 from palpate.inversion.driver_prior import learned_prior
 from palpate.inversion.gauss_newton import Bounds, Minimum
 from palpate.inversion.invert import invert
-from palpate.inversion.minima import change_between, driven, posterior_sd
+from palpate.inversion.minima import change_between, continued, driven, posterior_sd
 from palpate.inversion.noise import NoiseLaw
 from palpate.inversion.objective import Objective
 from palpate.inversion.problem import InverseProblem, InversionSettings
@@ -121,6 +121,7 @@ def plain_estimate(problem: InverseProblem, settings: InversionSettings) -> Plai
     filled = driven(objective.with_fresh_correspondence(rest), theta, bounds=settings.bounds)
     objective = replace(objective, prior=learned_prior(problem, filled.evaluation, filled.unknowns))
     found = Plain(filled, objective.with_fresh_correspondence(filled.unknowns), settings.law or first_law(problem), 0)
+    found = _followed(problem, _Linear(problem.models), found, settings, weigh=False)
     if not problem.finite_strain:
         return _with_walls(problem, _Linear(problem.models), found, settings)
     found = _followed(problem, _Linear(problem.models), found, settings)
@@ -139,8 +140,13 @@ def _with_walls(problem: InverseProblem, full: Full, start: Plain, settings: Inv
     return found
 
 
-def _followed(problem: InverseProblem, full: Full, start: Plain, settings: InversionSettings) -> Plain:
-    """Rounds until the log-moduli do not change: the full model where the last one led, the estimate on that."""
+def _followed(
+    problem: InverseProblem, full: Full, start: Plain, settings: InversionSettings, *, weigh: bool = True
+) -> Plain:
+    """Rounds until the log-moduli do not change: the full model where the last one led, the estimate on that.
+
+    Not `weigh`: under the weights of the start, until they change by no more than a per cent.
+    """
     objective, minimum, change = start.objective, start.minimum, 1.0
     n = objective.n_parameters
     for number in range(1, ROUNDS + 1):
@@ -155,13 +161,17 @@ def _followed(problem: InverseProblem, full: Full, start: Plain, settings: Inver
             np.minimum(settings.bounds.upper, theta + REACH),
         )
         near = replace(settings, bounds=Bounds(lower, upper))
-        end = agreed(problem, objective, minimum, near, within=max(0.3 * UNCHANGED, 0.1 * change))
-        change = min(float(change_between(minimum, end.minimum, n).max()), 1.0)
-        objective, minimum = end.objective, end.minimum
+        law, before = start.law, minimum
+        if weigh:
+            end = agreed(problem, objective, minimum, near, within=max(0.3 * UNCHANGED, 0.1 * change))
+            law, objective, minimum = end.law, end.objective, end.minimum
+        else:
+            minimum = continued(objective.with_fresh_correspondence(minimum.unknowns), minimum, near)
+        change = min(float(change_between(before, minimum, n).max()), 1.0)
         print(f"  round {number}: {np.exp(minimum.unknowns[:n])}, changed by {change:.1e}", file=sys.stderr, flush=True)
-        if change < UNCHANGED:
+        if change < (UNCHANGED if weigh else 1e-2):
             break
-    return Plain(minimum, objective, end.law, start.rounds + number)
+    return Plain(minimum, objective, law, start.rounds + number)
 
 
 class Full(Protocol):
