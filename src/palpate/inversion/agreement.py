@@ -18,6 +18,7 @@ __all__ = ["AGREED", "PASSES", "Agreement", "agreed", "left_since"]
 
 AGREED = 3e-4  # of ln E: what is left undone
 PASSES = 15
+LEAST_SD = 0.03  # of ln E: a distance of a per cent from exact derivatives leaves `AGREED` then
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,9 +61,10 @@ def left_since(sharp: NDArray[np.float64] | None, there: Minimum, n_parameters: 
     """How far derivatives that are exact at log-moduli `sharp` (n_parameters,) may set an estimate off, of ln E.
 
     At a distance d of ln E they are off by a share d, and so is what the residuals pull with them, which is worth a
-    posterior standard deviation: d sd, the largest of all log-moduli; infinite where they are exact nowhere (None).
+    posterior standard deviation: d sd, the largest of all log-moduli; infinite where they are exact nowhere (None). A
+    standard deviation counts as 0.03 at least: its own error is a share d, too, and may be a per cent.
     """
     if sharp is None:
         return np.inf
     distance = np.abs(there.unknowns[:n_parameters] - sharp)
-    return float(np.max(distance * posterior_sd(there, n_parameters), initial=0.0))
+    return float(np.max(distance * np.maximum(posterior_sd(there, n_parameters), LEAST_SD), initial=0.0))

@@ -70,7 +70,7 @@ def fit_noise_law(
     """Fit the law to residuals (n,) mm of several surfaces at places (n, 3) mm with normals (n, 3).
 
     Mean products of residuals in bins of distance, fitted by non-negative least squares to Gaussians of fixed lengths
-    (0.5 to 14 mm).
+    (0.5 to 14 mm). Residuals below 0.001 mm tell no law: they are independent ones of that size.
     """
     sums = sum(
         mapped(lambda of: _binned_products(*_cells(*of)), zip(values, places, normals, strict=True)),
@@ -82,7 +82,7 @@ def fit_noise_law(
     kernels = np.exp(-((distances / count)[:, None] ** 2) / (2.0 * np.square(LENGTHS)))
     variances, _ = nnls(weight[:, None] * kernels, weight * products / cosines)
     kept = variances > 0.0
-    if not kept.any():
+    if variances.sum() < FLOOR**2:
         return NoiseLaw(np.array([FLOOR**2]), np.array([1.0]))
     return NoiseLaw(np.maximum(variances[kept], FLOOR**2), np.array(LENGTHS)[kept])
 
