@@ -222,7 +222,7 @@ def _near_linear(
 def _round(problem: InverseProblem, place: _Place, settings: InversionSettings) -> _Place:
     """Weights and estimate on the present expansions, the equilibria there, or on a part of the way to it.
 
-    They are sought together to a fifth of what the last round changed, at the first to what one pass gives. Where no
+    They are sought together to a tenth of what the last round changed, at the first to what one pass gives. Where no
     part of the way lowers the objective the place stays, its minimum `STALLED` when the whole way is within the
     estimate's own noise and `STUCK` when not.
     """
