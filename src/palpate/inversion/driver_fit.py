@@ -12,13 +12,13 @@ from palpate.errors import NotConverged
 from palpate.inversion.driver_prior import learned_prior
 from palpate.inversion.gauss_newton import Bounds
 from palpate.inversion.minima import driven
+from palpate.inversion.objective import LocalModel
 from palpate.inversion.problem import InverseProblem
 from palpate.inversion.surrogate import first_surrogate
 from palpate.inversion.weighting import SEGMENTATION_LAW, objective_of
 from palpate.mechanics.equilibrium import from_linear
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
 from palpate.mechanics.first_order import expanded
-from palpate.mechanics.forward import LocalModel
 
 __all__ = ["fit_driver"]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +12,20 @@ from numpy.typing import NDArray
 from palpate.errors import EstimationError
 from palpate.inversion.modulus_map import ModulusMap
 from palpate.inversion.tukey import Tukey
-from palpate.mechanics.forward import ForwardModel, LocalModel
+from palpate.mechanics.forward import ForwardModel
 from palpate.observation.misfit import Correspondence, SurfaceResiduals, correspondence, surface_residuals
 from palpate.observation.target import SurfaceTarget
 from palpate.parallel import mapped
 
-__all__ = ["Evaluation", "Linearisation", "Objective", "State", "Weighting"]
+__all__ = ["Evaluation", "Linearisation", "LocalModel", "Objective", "State", "Weighting"]
+
+
+class LocalModel(ForwardModel, Protocol):
+    """A forward model of all points that can answer at some of them only."""
+
+    def at(self, dofs: NDArray[np.int64]) -> ForwardModel:
+        """The same model with the outputs `dofs` (n,) only."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)

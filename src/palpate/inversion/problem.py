@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from palpate.inversion.gauss_newton import Bounds, Minimum
 from palpate.inversion.modulus_map import ModulusMap
 from palpate.inversion.noise import NoiseLaw
-from palpate.inversion.objective import Evaluation, Objective
+from palpate.inversion.objective import Evaluation, LocalModel, Objective
 from palpate.mechanics.finite_strain import FiniteStrainModel
-from palpate.mechanics.forward import LocalModel, SolveCounts
+from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import LinearModel
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.constraint import Constraint

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from palpate.inversion.driver_prior import learned_prior
 from palpate.inversion.gauss_newton import Minimum
 from palpate.inversion.noise import NoiseLaw, fit_noise_law
-from palpate.inversion.objective import Evaluation, Linearisation, Objective, State, Weighting
+from palpate.inversion.objective import Evaluation, Linearisation, LocalModel, Objective, State, Weighting
 from palpate.inversion.problem import InverseProblem
 from palpate.inversion.tukey import Tukey
-from palpate.mechanics.forward import LocalModel
 from palpate.observation.misfit import Correspondence
 from palpate.observation.target import SurfaceTarget
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from palpate.errors import ConfigurationError
 
-__all__ = ["Equilibrium", "ForwardModel", "LocalModel", "SolveCounts", "checked_coefficients", "checked_moduli"]
+__all__ = ["Equilibrium", "ForwardModel", "SolveCounts", "checked_coefficients", "checked_moduli"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,14 +87,6 @@ class ForwardModel(Protocol):
 
     def solve(self, moduli: NDArray[np.float64], coefficients: NDArray[np.float64]) -> Equilibrium:
         """Equilibrium at moduli (n_regions,) kPa and coefficients (n_modes,); raises `SolverError`."""
-        ...
-
-
-class LocalModel(ForwardModel, Protocol):
-    """A forward model of all points that can answer at some of them only."""
-
-    def at(self, dofs: NDArray[np.int64]) -> ForwardModel:
-        """The same model with the outputs `dofs` (n,) only."""
         ...
 
 
