@@ -11,7 +11,7 @@ from scipy import sparse
 
 from palpate.mesh.surface import mean_curvature, triangle_normals, vertex_normals
 from palpate.observation.observed_surface import ObservedSurface
-from palpate.observation.target import SurfaceTarget
+from palpate.observation.target import SurfaceTarget, places_within
 
 __all__ = ["Correspondence", "SurfaceResiduals", "correspondence", "surface_residuals"]
 
@@ -142,10 +142,8 @@ def _model_to_image(
 ) -> SurfaceResiduals:
     surface = target.surface
     corners = surface.triangles[target.triangle]
-    # (n_q, 1, 3 corners) x (n_q, 3 corners, 3 axes) -> (n_q, 1, 3 axes)
     material, places = (
-        (target.barycentric[:, None] @ vertices[corners])[:, 0]
-        for vertices in (surface.rest, surface.rest + displacement)
+        places_within(vertices[corners], target.barycentric) for vertices in (surface.rest, surface.rest + displacement)
     )
     gradient = target.after.gradient_at(places)
     excess = np.einsum("qk,qk->q", target.barycentric, at_vertices[corners])

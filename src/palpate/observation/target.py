@@ -14,7 +14,7 @@ from palpate.mesh.anatomy import LevelSet
 from palpate.mesh.surface import triangle_normals
 from palpate.observation.observed_surface import ObservedSurface
 
-__all__ = ["SurfaceTarget", "surface_target", "target_from"]
+__all__ = ["SurfaceTarget", "places_within", "surface_target", "target_from"]
 
 # Strang & Fix 1973: three interior points, exact for quadratics; one point where triangles are as small as voxels
 THREE_POINTS = np.array([[4.0, 1.0, 1.0], [1.0, 4.0, 1.0], [1.0, 1.0, 4.0]]) / 6.0
@@ -77,6 +77,14 @@ def surface_target(surface: ObservedSurface, before: DistanceMap, after: Distanc
     )
 
 
+def places_within(corners: NDArray[np.float64], barycentric: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Places (n, 3) mm at barycentric coordinates (n, 3) of triangles with corners (n, 3, 3) mm.
+
+    One way to them: what has not moved then has a residual of zero to the last digit, whatever the processor.
+    """
+    return np.asarray((barycentric[:, None] @ corners)[:, 0])
+
+
 def target_from(
     surface: ObservedSurface,
     before: LevelSet,
@@ -95,7 +103,6 @@ def target_from(
     triangle = np.repeat(seen, len(rule))
     barycentric = np.tile(rule, (len(seen), 1))
     area = np.repeat(size / len(rule), len(rule))
-    # (n_q, 3 corners) x (n_q, 3 corners, 3 axes) -> (n_q, 3)
-    places = np.einsum("qk,qka->qa", barycentric, surface.rest[surface.triangles[triangle]])
+    places = places_within(surface.rest[surface.triangles[triangle]], barycentric)
     quiet = np.zeros(len(area))
     return SurfaceTarget(surface, before, after, triangle, barycentric, area, before.at(places), level, *image, quiet)
