@@ -63,14 +63,14 @@ def test_a_mixture_shows_both_of_its_parts(rng):
 
 
 def test_the_law_does_not_jump_when_a_few_residuals_come_or_go(rng):
-    """More cells than are compared: those that are drawn stay drawn. A new draw would move the law by a per cent."""
+    """More cells than are compared: those that are drawn stay drawn. New draws would move the law by 2 to 6 %."""
     places, normals = sphere(40000)
     values = 0.2 * rng.standard_normal(len(places))
-    gone = np.linalg.norm(places - places[20000], axis=1) < 0.8
-    assert gone.sum() > 10
-    laws = [fit_noise_law([values[kept]], [places[kept]], [normals[kept]]) for kept in (gone | True, ~gone)]
-    assert laws[1].sd == pytest.approx(laws[0].sd, rel=1e-3)
-    assert laws[1].correlation_area == pytest.approx(laws[0].correlation_area, rel=1e-2)
+    whole = fit_noise_law([values], [places], [normals])
+    for hole in range(2000, 40000, 5000):
+        kept = np.linalg.norm(places - places[hole], axis=1) > 1.2
+        without = fit_noise_law([values[kept]], [places[kept]], [normals[kept]])
+        assert without.sd == pytest.approx(whole.sd, rel=4e-3)
 
 
 def test_residuals_of_nothing_leave_the_floor():

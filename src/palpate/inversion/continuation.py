@@ -3,8 +3,8 @@
 The linear law is off by tens of per cent where a wall moves by half its radius, but near enough to begin. Each round
 minimises the objective on an expansion to first order around the present equilibrium and solves the equilibrium where
 that leads; where it does not lower the objective the step is halved. One factorisation, made near the first
-equilibrium, gives all derivatives there and serves every solve. At the end the derivatives along the directions that
-decide the moduli, which is all that these need to first order, are made those of the equilibrium there.
+equilibrium, gives all derivatives there and serves every solve. Near the estimate the derivatives along the directions
+that decide the moduli, which is all that these need to first order, are made those of the equilibrium there.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class _Place:
     """Where the last round led: a point under the objective made of the expansions around the equilibria there.
 
     change: of ln E by that round, at the most; moved: the same in posterior standard deviations; sharp (n_parameters,):
-    ln E where the expansions' derivatives were made exact, None while they have not been; exact: whether another round
+    ln E where the expansions' derivatives were made exact, None while they have not been; final: whether another round
     would change ln E by no more than `AGREED`.
     """
 
@@ -78,7 +78,7 @@ class _Place:
     change: float = np.inf
     moved: float = np.inf
     sharp: NDArray[np.float64] | None = None
-    exact: bool = False
+    final: bool = False
 
     @property
     def theta(self) -> NDArray[np.float64]:
@@ -88,7 +88,7 @@ class _Place:
     @property
     def settled(self) -> bool:
         """Whether another round would move the log-moduli by little."""
-        return self.exact or self.moved < SETTLED
+        return self.final or self.moved < SETTLED
 
     def under(self, expansions: tuple[Expansion, ...], minimum: Minimum) -> _Place:
         """The place with the objective on other expansions, at the unknowns of `minimum`."""
@@ -162,7 +162,7 @@ def _followed(
     for number in range(ROUNDS):
         progress(f"finite strain, round {number + 1}: {words(problem, place.minimum)}")
         before, place = place, _round(problem, place, settings)
-        if place.exact:
+        if place.final:
             finer = _with_finer_walls(problem, place) if refinements < REFINEMENTS else place
             if finer is place:
                 break
@@ -179,7 +179,7 @@ def _with_finer_walls(problem: InverseProblem, place: _Place) -> _Place:
     if all(a is b for a, b in zip(constraints, finer, strict=True)):
         return place
     expansions = tuple(_constrained(*pair) for pair in zip(place.expansions, finer, strict=True))
-    return replace(place, moved=np.inf, sharp=None, exact=False).under(expansions, place.minimum)
+    return replace(place, moved=np.inf, sharp=None, final=False).under(expansions, place.minimum)
 
 
 def _constrained(expansion: Expansion, constraint: Constraint) -> Expansion:
@@ -241,7 +241,7 @@ def _round(problem: InverseProblem, place: _Place, settings: InversionSettings) 
     arrived = replace(place, change=change, moved=moved)
     there = replace(found, unknowns=unknowns)
     if left_since(place.sharp, there, n) < AGREED:
-        arrived = replace(arrived, exact=end.change < AGREED and change**2 < AGREED)
+        arrived = replace(arrived, final=end.change < AGREED and change**2 < AGREED)
     elif moved < NEAR or all(e.reduced.n_regions + e.reduced.n_modes <= FEW for e in expansions):
         expansions = _sharpened(place.objective, found.evaluation, expansions)
         arrived = replace(arrived, sharp=unknowns[:n])

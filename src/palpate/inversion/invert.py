@@ -45,15 +45,15 @@ ROUGH_SURFACE = 1.0 / 3.0  # mm, of a residual; below that a model must be as mu
 class _Effort:
     """How far an estimate is taken.
 
-    near: relative error in energy of a displacement, below which a round goes without the full model; exact: that with
-    which an estimate may end where surfaces are rough; left: what derivatives that are exact elsewhere may leave of
+    unsolved: relative error in energy of a displacement, below which a round goes without the full model; certified:
+    that with which an estimate may end where surfaces are rough; left: what derivatives that are exact elsewhere may leave of
     ln E (see `left_since`); within, passes: to which weights and estimate agree in a round, after so many passes at the
     most; settled: by so many posterior standard deviations a round may still move it; others: decrement of the starts
     that ended elsewhere; refinements: of the drivers' walls, at the most.
     """
 
-    near: float
-    exact: float
+    unsolved: float
+    certified: float
     left: float
     within: float
     passes: int
@@ -114,14 +114,14 @@ def invert_with(
     settled, refinements = False, 0
     for round_ in range(ROUNDS):
         progress(f"round {round_ + 1}: {words(problem, best)}; the full model is solved there")
-        before, surrogates = best, _enriched(problem, surrogates, objective, best, unless=effort.near)
+        before, surrogates = best, _enriched(problem, surrogates, objective, best, unless=effort.unsolved)
         objective = objective.under(_reduced(surrogates))
         end = agreed(problem, objective, best, settings, within=effort.within, passes=effort.passes)
         law, objective, best = end.law, end.objective, end.minimum
         left = left_since(before.unknowns[: objective.n_parameters], best, objective.n_parameters)
-        exact = effort.exact * min(law.sd / ROUGH_SURFACE, 1.0)
+        certified = effort.certified * min(law.sd / ROUGH_SURFACE, 1.0)
         settled = left < AGREED or moved_between(before, best, objective.n_parameters) < effort.settled
-        if settled and left < effort.left and _relative_error(problem, surrogates, objective, best) < exact:
+        if settled and left < effort.left and _relative_error(problem, surrogates, objective, best) < certified:
             done = refinements == effort.refinements or round_ == ROUNDS - 1
             finer = surrogates if done else _refined(problem, surrogates, best, law)
             if all(a is b for a, b in zip(finer, surrogates, strict=True)):

@@ -59,11 +59,8 @@ def objective_of(
 
     prior (n_coefficients, n_coefficients): precision of all the drivers' coefficients; None: the modes' own.
     """
-    states = tuple(
-        State(m.at(np.concatenate([t.surface.dofs for t in targets])), targets)
-        for m, targets in zip(models, problem.targets, strict=True)
-    )
-    return Objective(states, problem.modulus_map, _all_by_the_law(states, law), prior)
+    states = tuple(State(model, targets) for model, targets in zip(models, problem.targets, strict=True))
+    return Objective(states, problem.modulus_map, _all_by_the_law(states, law), prior).under(models)
 
 
 def weighed_anew(
