@@ -46,10 +46,10 @@ class _Effort:
     """How far an estimate is taken.
 
     unsolved: relative error in energy of a displacement, below which a round goes without the full model; certified:
-    that with which an estimate may end where surfaces are rough; left: what derivatives that are exact elsewhere may leave of
-    ln E (see `left_since`); within, passes: to which weights and estimate agree in a round, after so many passes at the
-    most; settled: by so many posterior standard deviations a round may still move it; others: decrement of the starts
-    that ended elsewhere; refinements: of the drivers' walls, at the most.
+    that with which an estimate may end where surfaces are rough; left: what derivatives that are exact elsewhere may
+    leave of ln E (see `left_since`); within, passes: to which weights and estimate agree in a round, after so many
+    passes at the most; settled: by so many posterior standard deviations a round may still move it; others: decrement
+    of the starts that ended elsewhere; refinements: of the drivers' walls, at the most.
     """
 
     unsolved: float
