@@ -14,6 +14,7 @@ import argparse
 import json
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
@@ -26,14 +27,14 @@ from palpate.inversion.agreement import AGREED, agreed
 from palpate.inversion.driver_prior import learned_prior
 from palpate.inversion.gauss_newton import Bounds, Minimum
 from palpate.inversion.invert import invert
-from palpate.inversion.minima import change_between, continued, driven, posterior_sd
+from palpate.inversion.minima import continued, driven, posterior_sd
 from palpate.inversion.noise import NoiseLaw
-from palpate.inversion.objective import Objective
+from palpate.inversion.objective import LocalModel, Objective
 from palpate.inversion.problem import InverseProblem, InversionSettings
 from palpate.inversion.wall_refinement import REFINEMENTS, refined_walls
 from palpate.inversion.weighting import first_law, objective_of
 from palpate.mechanics.equilibrium import from_linear, from_start
-from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
+from palpate.mechanics.finite_strain import FiniteStrainModel
 from palpate.mechanics.first_order import expanded
 from palpate.mechanics.forward import Equilibrium
 from palpate.mechanics.linear_model import LinearModel, with_constraint
@@ -42,16 +43,20 @@ from palpate.mesh.constraint import Constraint
 ROUNDS = 40
 REACH = 0.8  # of ln E, within which an expansion is used
 UNCHANGED = AGREED  # of ln E by a whole round
+MIXED = 4  # rounds before the last one
+
+Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Plain:
-    """A plain estimate: where it ended, under which weights, after so many rounds."""
+    """A plain estimate: where it ended, under which weights and on which equilibria, after so many rounds."""
 
     minimum: Minimum
     objective: Objective
     law: NoiseLaw
-    rounds: int
+    equilibria: tuple[Equilibrium, ...] = ()
+    rounds: int = 0
 
 
 def main() -> int:
@@ -112,20 +117,20 @@ def _silent(message: str) -> None:
 def plain_estimate(problem: InverseProblem, settings: InversionSettings) -> Plain:
     """The estimate from the middle start, the full model solved with all its derivatives at every place."""
     theta = np.asarray(np.median(np.stack(settings.starts), axis=0))
-    moduli, still = problem.modulus_map.moduli(theta), [np.zeros(model.n_modes) for model in problem.models]
-    full = _Linear(problem.models)
-    pairs = zip(full.solve(moduli, still), full.names, still, strict=True)
-    models = tuple(expanded(e, names=names, moduli=moduli, coefficients=q) for e, names, q in pairs)
-    objective = objective_of(problem, models, settings.law or first_law(problem))
+    full = _Linear(problem.models, tuple(model.constraint for model in problem.models))
+    still = [np.zeros(model.n_modes) for model in problem.models]
+    moduli = problem.modulus_map.moduli(theta)
+    law = settings.law or first_law(problem)
+    objective = objective_of(problem, _expanded(full, full.solve(moduli, still, ()), moduli, still), law)
     rest = np.concatenate([theta, *still])
     filled = driven(objective.with_fresh_correspondence(rest), theta, bounds=settings.bounds)
     objective = replace(objective, prior=learned_prior(problem, filled.evaluation, filled.unknowns))
-    found = Plain(filled, objective.with_fresh_correspondence(filled.unknowns), settings.law or first_law(problem), 0)
-    found = _followed(problem, _Linear(problem.models), found, settings, weigh=False)
+    found = Plain(filled, objective.with_fresh_correspondence(filled.unknowns), law)
+    found = _followed(problem, full, found, settings, weigh=False)
     if not problem.finite_strain:
-        return _with_walls(problem, _Linear(problem.models), found, settings)
-    found = _followed(problem, _Linear(problem.models), found, settings)
-    return _with_walls(problem, _Equilibria(problem.finite_strain, problem.models), found, settings)
+        return _with_walls(problem, full, found, settings)
+    found = replace(_followed(problem, full, found, settings), equilibria=())
+    return _with_walls(problem, _FiniteStrain(problem.models, full.constraints, problem.finite_strain), found, settings)
 
 
 def _with_walls(problem: InverseProblem, full: Full, start: Plain, settings: InversionSettings) -> Plain:
@@ -135,7 +140,7 @@ def _with_walls(problem: InverseProblem, full: Full, start: Plain, settings: Inv
         finer = refined_walls(problem, full.constraints, found.minimum.evaluation.surfaces, found.law)
         if all(a is b for a, b in zip(full.constraints, finer, strict=True)):
             break
-        full.constraints = finer
+        full = replace(full, constraints=finer)
         found = _followed(problem, full, found, settings)
     return found
 
@@ -145,74 +150,96 @@ def _followed(
 ) -> Plain:
     """Rounds until the log-moduli do not change: the full model where the last one led, the estimate on that.
 
-    Not `weigh`: under the weights of the start, until they change by no more than a per cent.
+    Not `weigh`: under the weights of the start, until they change by no more than a per cent. Where moduli are known to
+    half their size only, rounds overshoot; they are mixed then.
     """
-    objective, minimum, change = start.objective, start.minimum, 1.0
-    n = objective.n_parameters
+    found, places, ends, n = start, list[Vector](), list[Vector](), start.objective.n_parameters
+    unknowns, change = start.minimum.unknowns, 1.0
     for number in range(1, ROUNDS + 1):
-        theta = minimum.unknowns[:n]
-        moduli, amounts = objective.modulus_map.moduli(theta), objective.coefficients(minimum.unknowns)
-        there = full.solve(moduli, amounts)
-        pairs = zip(there, full.names, amounts, strict=True)
-        objective = objective.under([expanded(e, names=names, moduli=moduli, coefficients=q) for e, names, q in pairs])
-        minimum = replace(minimum, evaluation=objective(minimum.unknowns))
-        lower, upper = (
-            np.maximum(settings.bounds.lower, theta - REACH),
-            np.minimum(settings.bounds.upper, theta + REACH),
-        )
-        near = replace(settings, bounds=Bounds(lower, upper))
-        law, before = start.law, minimum
+        theta, objective = unknowns[:n], found.objective
+        moduli, amounts = objective.modulus_map.moduli(theta), objective.coefficients(unknowns)
+        there = full.solve(moduli, amounts, found.equilibria)
+        objective = objective.under(_expanded(full, there, moduli, amounts))
+        minimum = replace(found.minimum, unknowns=unknowns, evaluation=objective(unknowns))
+        lower = np.maximum(settings.bounds.lower, theta - REACH)
+        near = replace(settings, bounds=Bounds(lower, np.minimum(settings.bounds.upper, theta + REACH)))
+        law = found.law
         if weigh:
             end = agreed(problem, objective, minimum, near, within=max(0.3 * UNCHANGED, 0.1 * change))
             law, objective, minimum = end.law, end.objective, end.minimum
         else:
-            minimum = continued(objective.with_fresh_correspondence(minimum.unknowns), minimum, near)
-        change = min(float(change_between(before, minimum, n).max()), 1.0)
+            minimum = continued(objective.with_fresh_correspondence(unknowns), minimum, near)
+        change = min(float(np.abs(minimum.unknowns - unknowns)[:n].max()), 1.0)
+        found = Plain(minimum, objective, law, there, start.rounds + number)
         print(f"  round {number}: {np.exp(minimum.unknowns[:n])}, changed by {change:.1e}", file=sys.stderr, flush=True)
         if change < (UNCHANGED if weigh else 1e-2):
             break
-    return Plain(minimum, objective, law, start.rounds + number)
+        places, ends = [*places[-MIXED:], unknowns], [*ends[-MIXED:], minimum.unknowns]
+        unknowns = _mixed(np.array(places), np.array(ends), minimum.evaluation.matrix, n)
+    return found
+
+
+def _mixed(places: Vector, ends: Vector, metric: Vector, n_parameters: int) -> Vector:
+    """Where the next round begins after rounds from `places` (k, n) to `ends` (k, n).
+
+    The affine combination of the ends whose step, combined likewise, is the smallest in the objective's `metric` (n, n)
+    (Anderson 1965, J. ACM 12, 547-560); the last end where the log-moduli would go further than 1/4 from it.
+    """
+    steps = ends - places
+    by_step, by_end = np.diff(steps, axis=0), np.diff(ends, axis=0)
+    share = np.linalg.pinv(by_step @ metric @ by_step.T, hermitian=True) @ (by_step @ metric @ steps[-1])
+    back = share @ by_end
+    return ends[-1] - back if np.abs(back[:n_parameters]).max(initial=0.0) < 0.25 else ends[-1]
+
+
+def _expanded(
+    full: Full, there: Sequence[Equilibrium], moduli: Vector, amounts: list[Vector]
+) -> tuple[LocalModel, ...]:
+    """All states' models to first order around their equilibria."""
+    triples = zip(there, full.models, amounts, strict=True)
+    return tuple(expanded(e, names=model.names, moduli=moduli, coefficients=q) for e, model, q in triples)
 
 
 class Full(Protocol):
-    """Full models of all states, solved where they are asked to; `constraints` may be exchanged for others."""
+    """Full models of all states under their constraints."""
 
+    models: tuple[LinearModel, ...]
     constraints: tuple[Constraint, ...]
-    names: tuple[tuple[str, ...], ...]
 
-    def solve(self, moduli: NDArray[np.float64], amounts: list[NDArray[np.float64]]) -> list[Equilibrium]:
-        """Equilibria at moduli (n_regions,) kPa and each state's coefficients (n_modes,), which have derivatives."""
+    def solve(self, moduli: Vector, amounts: list[Vector], before: tuple[Equilibrium, ...]) -> tuple[Equilibrium, ...]:
+        """Equilibria at moduli (n_regions,) kPa and each state's coefficients (n_modes,), which have derivatives.
+
+        before: those that it may begin at; none: at rest.
+        """
         ...
 
 
+@dataclass(frozen=True)
 class _Linear:
-    def __init__(self, models: tuple[LinearModel, ...]) -> None:
-        self._models, self.names = models, tuple(model.names for model in models)
-        self.constraints = tuple(model.constraint for model in models)
+    models: tuple[LinearModel, ...]
+    constraints: tuple[Constraint, ...]
 
-    def solve(self, moduli: NDArray[np.float64], amounts: list[NDArray[np.float64]]) -> list[Equilibrium]:
-        three = zip(self._models, self.constraints, amounts, strict=True)
-        return [with_constraint(model, c).solve(moduli, q) for model, c, q in three]
+    def solve(self, moduli: Vector, amounts: list[Vector], before: tuple[Equilibrium, ...]) -> tuple[Equilibrium, ...]:
+        del before
+        three = zip(self.models, self.constraints, amounts, strict=True)
+        return tuple(with_constraint(model, c).solve(moduli, q) for model, c, q in three)
 
 
-class _Equilibria:
-    """Each equilibrium is sought from the one before, the first from the linear law's."""
+@dataclass(frozen=True)
+class _FiniteStrain:
+    models: tuple[LinearModel, ...]
+    constraints: tuple[Constraint, ...]
+    finite: tuple[FiniteStrainModel, ...]
 
-    def __init__(self, models: tuple[FiniteStrainModel, ...], linear: tuple[LinearModel, ...]) -> None:
-        self._models, self._linear, self.names = models, linear, tuple(model.names for model in models)
-        self.constraints = tuple(model.constraint for model in models)
-        self._before: list[FiniteStrainEquilibrium] = []
-
-    def solve(self, moduli: NDArray[np.float64], amounts: list[NDArray[np.float64]]) -> list[Equilibrium]:
-        models = [model.under(c) for model, c in zip(self._models, self.constraints, strict=True)]
-        if self._before:
-            three = zip(models, self._before, amounts, strict=True)
-            there = [from_start(m, moduli, q, start=b.displacement, nearby=b.factorisation) for m, b, q in three]
+    def solve(self, moduli: Vector, amounts: list[Vector], before: tuple[Equilibrium, ...]) -> tuple[Equilibrium, ...]:
+        models = [model.under(c) for model, c in zip(self.finite, self.constraints, strict=True)]
+        if before:
+            triples = zip(models, before, amounts, strict=True)
+            there = [from_start(m, moduli, q, start=b.displacement, nearby=b.factorisation) for m, b, q in triples]
         else:
-            three = zip(models, self._linear, amounts, strict=True)
-            there = [from_linear(m, linear.system(moduli), q) for m, linear, q in three]
-        self._before = [equilibrium.refactorised() for equilibrium in there]
-        return list(self._before)
+            linear = [with_constraint(m, c).system(moduli) for m, c in zip(self.models, self.constraints, strict=True)]
+            there = [from_linear(m, system, q) for m, system, q in zip(models, linear, amounts, strict=True)]
+        return tuple(equilibrium.refactorised() for equilibrium in there)
 
 
 HEAD = ("| row | seed | tissue | error, % | plainly | difference, % | sd, % |", "|---|---|---|---|---|---|---|")

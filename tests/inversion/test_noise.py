@@ -73,6 +73,16 @@ def test_the_law_does_not_jump_when_a_few_residuals_come_or_go(rng):
         assert without.sd == pytest.approx(whole.sd, rel=4e-3)
 
 
+def test_how_far_residuals_are_correlated_does_not_depend_on_their_size(rng):
+    """Down to a few thousandths of a millimetre: no term of the law is raised on its own, however little it counts."""
+    values, places, normals = residuals(rng, 0.3, 1.5)
+    rough = [value + 0.1 * rng.standard_normal(len(value)) for value in values]
+    law = fit_noise_law(rough, places, normals)
+    small = fit_noise_law([0.01 * value for value in rough], places, normals)
+    assert small.sd == pytest.approx(0.01 * law.sd)
+    assert small.correlation_area == pytest.approx(law.correlation_area)
+
+
 def test_residuals_of_nothing_leave_the_floor():
     places, normals = sphere(200)
     law = fit_noise_law([np.zeros(200)], [places], [normals])

@@ -84,7 +84,7 @@ def fit_noise_law(
     kept = variances > 0.0
     if variances.sum() < FLOOR**2:
         return NoiseLaw(np.array([FLOOR**2]), np.array([1.0]))
-    return NoiseLaw(np.maximum(variances[kept], FLOOR**2), np.array(LENGTHS)[kept])
+    return NoiseLaw(variances[kept], np.array(LENGTHS)[kept])
 
 
 def _binned_products(
