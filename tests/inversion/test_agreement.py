@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import count
+
 import numpy as np
 import pytest
 
+from palpate.inversion import agreement
+from palpate.inversion import invert as linear
 from palpate.inversion.agreement import AGREED, agreed, left_since
 from palpate.inversion.gauss_newton import gauss_newton
 from palpate.inversion.invert import invert
+from palpate.inversion.weighting import weighed_anew
 from palpate.mechanics.first_order import expanded
 
 SAME = 1e-3  # of ln E: two ways, each to AGREED
@@ -29,6 +35,21 @@ def test_the_way_to_the_estimate_does_not_show(twins, voxels, found, ratio):
 
 def test_another_pass_changes_nothing(twins, voxels, found):
     assert agreed(voxels, found.objective, found.minimum, twins.settings(0.5), passes=1).change < AGREED
+
+
+def test_weights_that_never_agree_are_not_called_settled(twins, voxels, monkeypatch):
+    """Three sets of weights in turn: a round of three passes ends where it began, and still nothing has settled."""
+    passes = count()
+
+    def in_turn(problem, objective, minimum, law=None):
+        law, weighed = weighed_anew(problem, objective, minimum, law)
+        times = (1.0, 9.0, 81.0)[next(passes) % 3]
+        first = [[replace(w, precision=times * w.precision), *others] for w, *others in weighed.weighting]
+        return law, replace(weighed, weighting=tuple(map(tuple, first)))
+
+    monkeypatch.setattr(agreement, "weighed_anew", in_turn)
+    monkeypatch.setattr(linear, "TO_REPORT", replace(linear.TO_REPORT, passes=3))
+    assert not invert(voxels, twins.settings(0.5), progress=twins.silent).settled
 
 
 def test_the_full_model_finds_the_same_where_the_reduced_one_stands(twins, twin, voxels, found):

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.inversion.gauss_newton import Minimum
-from palpate.inversion.minima import change_between, continued, posterior_sd
+from palpate.inversion.minima import change_between, continued, moved_between, posterior_sd
 from palpate.inversion.noise import NoiseLaw
 from palpate.inversion.objective import Objective
 from palpate.inversion.problem import InverseProblem, InversionSettings
@@ -25,13 +25,14 @@ LEAST_SD = 0.03  # of ln E: a distance of a per cent from exact derivatives leav
 class Agreement:
     """A minimum under the objective whose weights, and the `law` behind them, are those of the pass before.
 
-    change: of ln E, at the most, by the last pass.
+    change: of ln E, at the most, by the last pass; moved: the same in posterior standard deviations.
     """
 
     law: NoiseLaw
     objective: Objective
     minimum: Minimum
     change: float
+    moved: float
 
 
 def agreed(
@@ -54,7 +55,7 @@ def agreed(
         change = float(change_between(before, minimum, objective.n_parameters).max(initial=0.0))
         if change < within:
             break
-    return Agreement(law, objective, minimum, change)
+    return Agreement(law, objective, minimum, change, moved_between(before, minimum, objective.n_parameters))
 
 
 def left_since(sharp: NDArray[np.float64] | None, there: Minimum, n_parameters: int) -> float:

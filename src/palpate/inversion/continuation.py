@@ -66,9 +66,9 @@ class Expansion:
 class _Place:
     """Where the last round led: a point under the objective made of the expansions around the equilibria there.
 
-    change: of ln E by that round, at the most; moved: the same in posterior standard deviations; sharp (n_parameters,):
-    ln E where the expansions' derivatives were made exact, None while they have not been; final: whether another round
-    would change ln E by no more than `AGREED`.
+    change: of ln E by that round, at the most; moved: the same in posterior standard deviations, or by the last pass of
+    its weights and estimate where that is more; sharp (n_parameters,): ln E where the expansions' derivatives were made
+    exact, None while they have not been; final: whether another round would change ln E by no more than `AGREED`.
     """
 
     objective: Objective
@@ -231,7 +231,7 @@ def _round(problem: InverseProblem, place: _Place, settings: InversionSettings) 
     within = max(AGREED, FORCING * place.change)
     end = agreed(problem, place.objective, now, reach, within=within)
     place, found = place.weighed(end.law, end.objective), end.minimum
-    change, moved = float(change_between(now, found, n).max(initial=0.0)), moved_between(now, found, n)
+    change, moved = float(change_between(now, found, n).max(initial=0.0)), max(moved_between(now, found, n), end.moved)
     lower = _lower(place, found.unknowns - now.unknowns)
     if lower is None:
         outcome = Outcome.STALLED if moved < SETTLED else Outcome.STUCK

@@ -120,7 +120,8 @@ def invert_with(
         law, objective, best = end.law, end.objective, end.minimum
         left = left_since(before.unknowns[: objective.n_parameters], best, objective.n_parameters)
         certified = effort.certified * min(law.sd / ROUGH_SURFACE, 1.0)
-        settled = left < AGREED or moved_between(before, best, objective.n_parameters) < effort.settled
+        quiet = end.change < AGREED or end.moved < effort.settled
+        settled = quiet and (left < AGREED or moved_between(before, best, objective.n_parameters) < effort.settled)
         if settled and left < effort.left and _relative_error(problem, surrogates, objective, best) < certified:
             done = refinements == effort.refinements or round_ == ROUNDS - 1
             finer = surrogates if done else _refined(problem, surrogates, best, law)
