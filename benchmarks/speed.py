@@ -195,7 +195,6 @@ def _nonlinear(sizes: Sizes, seed: int, say: Say) -> dict[str, object]:
         {
             "forward_solve_s": lambda: model.solve(moduli, coefficients),
             "estimate_s": lambda: inversions.append(_estimate(problem, settings)),
-            "linear_part_s": lambda: invert(replace(problem, finite_strain=()), settings, progress=_silent),
         },
     )
     found = {
