@@ -66,6 +66,21 @@ TO_REPORT = _Effort(0.0, 2e-4, AGREED, AGREED, PASSES, SETTLED, 1e-4, REFINEMENT
 TO_START_FROM = _Effort(0.1, np.inf, np.inf, np.inf, 1, 0.5, 1e-3, 0)
 
 
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where the last round led: a minimum of the objective made of the reduced models.
+
+    settled: whether weights and models would move it by little; final: whether they are exact enough to end there.
+    """
+
+    objective: Objective
+    minimum: Minimum
+    law: NoiseLaw
+    surrogates: tuple[Surrogate, ...]
+    settled: bool = False
+    final: bool = False
+
+
 def invert(problem: InverseProblem, settings: InversionSettings, *, progress: Callable[[str], None]) -> Inversion:
     """Estimate log-moduli and driver motion together, from all starts, with the linear law first.
 
@@ -110,38 +125,56 @@ def invert_with(
     objective = replace(objective, prior=learned_prior(problem, filled.evaluation, filled.unknowns))
     minima = _from_starts(objective, settings, filled.unknowns[objective.n_parameters :], progress)
     chosen = best_of(minima)
-    best = minima[chosen]
-    settled, refinements = False, 0
-    for round_ in range(ROUNDS):
-        progress(f"round {round_ + 1}: {words(problem, best)}; the full model is solved there")
-        before, surrogates = best, _enriched(problem, surrogates, objective, best, unless=effort.unsolved)
-        objective = objective.under(_reduced(surrogates))
-        end = agreed(problem, objective, best, settings, within=effort.within, passes=effort.passes)
-        law, objective, best = end.law, end.objective, end.minimum
-        left = left_since(before.unknowns[: objective.n_parameters], best, objective.n_parameters)
-        certified = effort.certified * min(law.sd / ROUGH_SURFACE, 1.0)
-        quiet = end.change < AGREED or end.moved < effort.settled
-        settled = quiet and (left < AGREED or moved_between(before, best, objective.n_parameters) < effort.settled)
-        if settled and left < effort.left and _relative_error(problem, surrogates, objective, best) < certified:
-            done = refinements == effort.refinements or round_ == ROUNDS - 1
-            finer = surrogates if done else _refined(problem, surrogates, best, law)
-            if all(a is b for a, b in zip(finer, surrogates, strict=True)):
-                break
-            surrogates, settled, refinements = finer, False, refinements + 1
-    minima = _ended(objective, settings, minima, best, chosen, tolerance=effort.others)
-    counts = sum((s.counts for s in surrogates), SolveCounts())
+    end = _followed(problem, _Place(objective, minima[chosen], law, surrogates), settings, effort, progress)
+    minima = _ended(end.objective, settings, minima, end.minimum, chosen, tolerance=effort.others)
+    counts = sum((s.counts for s in end.surrogates), SolveCounts())
     return Inversion(
-        objective,
+        end.objective,
         minima,
         groups_of(minima, objective.n_parameters),
         best_of(minima),
-        law,
-        surrogates,
+        end.law,
+        end.surrogates,
         rest,
-        settled,
+        end.settled,
         evaluations=sum(len(minimum.history) for minimum in minima),
         counts=counts,
     )
+
+
+def _followed(
+    problem: InverseProblem,
+    place: _Place,
+    settings: InversionSettings,
+    effort: _Effort,
+    progress: Callable[[str], None],
+) -> _Place:
+    """Rounds from a minimum until it moves no more, its walls refined where they ask for it."""
+    refinements = 0
+    for round_ in range(ROUNDS):
+        progress(f"round {round_ + 1}: {words(problem, place.minimum)}; the full model is solved there")
+        place = _round(problem, place, settings, effort)
+        if place.final:
+            done = refinements == effort.refinements or round_ == ROUNDS - 1
+            finer = place.surrogates if done else _refined(problem, place.surrogates, place.minimum, place.law)
+            if all(a is b for a, b in zip(finer, place.surrogates, strict=True)):
+                break
+            place, refinements = replace(place, surrogates=finer, settled=False, final=False), refinements + 1
+    return place
+
+
+def _round(problem: InverseProblem, place: _Place, settings: InversionSettings, effort: _Effort) -> _Place:
+    """The full model at the place, then weights and estimate that agree on what the reduced one has learned there."""
+    before, n = place.minimum, place.objective.n_parameters
+    surrogates = _enriched(problem, place.surrogates, place.objective, before, unless=effort.unsolved)
+    objective = place.objective.under(_reduced(surrogates))
+    end = agreed(problem, objective, before, settings, within=effort.within, passes=effort.passes)
+    left = left_since(before.unknowns[:n], end.minimum, n)
+    quiet = end.change < AGREED or end.moved < effort.settled
+    settled = quiet and (left < AGREED or moved_between(before, end.minimum, n) < effort.settled)
+    arrived = _Place(end.objective, end.minimum, end.law, surrogates, settled)
+    certified = effort.certified * min(end.law.sd / ROUGH_SURFACE, 1.0)
+    return replace(arrived, final=settled and left < effort.left and _relative_error(problem, arrived) < certified)
 
 
 def _ended(
@@ -197,12 +230,11 @@ def _enriched(
     return tuple(s if s.relative_error(moduli, q) < unless else sharpened(s, moduli, q, d) for s, q, d in triples)
 
 
-def _relative_error(
-    problem: InverseProblem, surrogates: tuple[Surrogate, ...], objective: Objective, minimum: Minimum
-) -> float:
-    """The largest bound of the reduced models' errors at a minimum, of the displacements in energy."""
-    moduli = problem.modulus_map.moduli(minimum.unknowns[: objective.n_parameters])
-    pairs = zip(surrogates, objective.coefficients(minimum.unknowns), strict=True)
+def _relative_error(problem: InverseProblem, place: _Place) -> float:
+    """The largest bound of the reduced models' errors at a place, of the displacements in energy."""
+    unknowns, objective = place.minimum.unknowns, place.objective
+    moduli = problem.modulus_map.moduli(unknowns[: objective.n_parameters])
+    pairs = zip(place.surrogates, objective.coefficients(unknowns), strict=True)
     return max(surrogate.relative_error(moduli, q) for surrogate, q in pairs)
 
 
