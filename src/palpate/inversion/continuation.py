@@ -19,7 +19,7 @@ from palpate.errors import NotConverged
 from palpate.inversion.agreement import AGREED, agreed, left_since
 from palpate.inversion.directions import deciding_directions
 from palpate.inversion.gauss_newton import Bounds, Minimum, Outcome
-from palpate.inversion.minima import SETTLED, change_between, moved_between, words
+from palpate.inversion.minima import SETTLED, change_between, moved_between, posterior_sd, words
 from palpate.inversion.noise import NoiseLaw
 from palpate.inversion.objective import Evaluation, Objective
 from palpate.inversion.problem import InverseProblem, Inversion, InversionSettings, StandIn
@@ -36,6 +36,7 @@ __all__ = ["Expansion", "continued_at_finite_strain"]
 ROUNDS = 16
 NEAR = 0.5  # posterior standard deviations: a round that moves less ends where derivatives are worth making exact
 FORCING = 0.1  # of a round's change: to which the next one's weights and estimate agree
+FINEST = 1e-5  # of ln E: what exact surfaces tell
 REACH = 0.8  # of ln E, within which an expansion is trusted
 HALVINGS = 3
 NOISE = 0.5  # of the objective, in units of log-likelihood: the noise of re-chosen closest points
@@ -68,7 +69,8 @@ class _Place:
 
     change: of ln E by that round, at the most; moved: the same in posterior standard deviations, or by the last pass of
     its weights and estimate where that is more; sharp (n_parameters,): ln E where the expansions' derivatives were made
-    exact, None while they have not been; final: whether another round would change ln E by no more than `AGREED`.
+    exact, None while they have not been; final: whether another round, if it changes ln E by as much less than this one
+    as this one did than the one before, changes it by no more than `AGREED` and `SETTLED` standard deviations.
     """
 
     objective: Objective
@@ -88,7 +90,7 @@ class _Place:
     @property
     def settled(self) -> bool:
         """Whether another round would move the log-moduli by little."""
-        return self.final or self.moved < SETTLED
+        return self.final or self.change < AGREED or self.moved < SETTLED
 
     def under(self, expansions: tuple[Expansion, ...], minimum: Minimum) -> _Place:
         """The place with the objective on other expansions, at the unknowns of `minimum`."""
@@ -226,7 +228,7 @@ def _round(problem: InverseProblem, place: _Place, settings: InversionSettings) 
     part of the way lowers the objective the place stays, its minimum `STALLED` when the whole way is within the
     estimate's own noise and `STUCK` when not.
     """
-    now, n = place.minimum, place.objective.n_parameters
+    now, n, before = place.minimum, place.objective.n_parameters, place.change
     reach = replace(settings, bounds=_near(settings.bounds, place.theta))
     within = max(AGREED, FORCING * place.change)
     end = agreed(problem, place.objective, now, reach, within=within)
@@ -241,11 +243,17 @@ def _round(problem: InverseProblem, place: _Place, settings: InversionSettings) 
     arrived = replace(place, change=change, moved=moved)
     there = replace(found, unknowns=unknowns)
     if left_since(place.sharp, there, n) < AGREED:
-        arrived = replace(arrived, final=end.change < AGREED and change**2 < AGREED)
+        wanted = np.clip(SETTLED * posterior_sd(found, n).min(initial=np.inf), FINEST, AGREED)
+        arrived = replace(arrived, final=end.change < AGREED and _next(change, before) < wanted)
     elif moved < NEAR or all(e.reduced.n_regions + e.reduced.n_modes <= FEW for e in expansions):
         expansions = _sharpened(place.objective, found.evaluation, expansions)
         arrived = replace(arrived, sharp=unknowns[:n])
     return arrived.under(expansions, there)
+
+
+def _next(change: float, before: float) -> float:
+    """By how much another round would change ln E, if that shrinks as it did from `before` to `change`."""
+    return change * min(change / before, 1.0) if 0.0 < before < np.inf else change
 
 
 def _lower(
