@@ -240,12 +240,12 @@ def _round(problem: InverseProblem, place: _Place, settings: InversionSettings) 
         return replace(place, minimum=replace(now, outcome=outcome), change=change, moved=moved)
     unknowns, equilibria = lower
     expansions = tuple(_recentred(*pair) for pair in zip(place.expansions, equilibria, strict=True))
-    arrived = replace(place, change=change, moved=moved)
     there = replace(found, unknowns=unknowns)
-    if left_since(place.sharp, there, n) < AGREED:
-        wanted = np.clip(SETTLED * posterior_sd(found, n).min(initial=np.inf), FINEST, AGREED)
-        arrived = replace(arrived, final=end.change < AGREED and _next(change, before) < wanted)
-    elif moved < NEAR or all(e.reduced.n_regions + e.reduced.n_modes <= FEW for e in expansions):
+    wanted = np.clip(SETTLED * posterior_sd(found, n).min(initial=np.inf), FINEST, AGREED)
+    agree = end.change < AGREED and left_since(place.sharp, there, n) < AGREED
+    arrived = replace(place, change=change, moved=moved, final=agree and _next(change, before) < wanted)
+    few = all(e.reduced.n_regions + e.reduced.n_modes <= FEW for e in expansions)
+    if not arrived.final and (moved < NEAR or few):
         expansions = _sharpened(place.objective, found.evaluation, expansions)
         arrived = replace(arrived, sharp=unknowns[:n])
     return arrived.under(expansions, there)
