@@ -45,7 +45,7 @@ REACH = 0.8  # of ln E, within which an expansion is used
 UNCHANGED = AGREED  # of ln E by a whole round
 MIXED = 4  # rounds before the last one
 
-Vector = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ def _followed(
     Not `weigh`: under the weights of the start, until they change by no more than a per cent. Where moduli are known to
     half their size only, rounds overshoot; they are mixed then.
     """
-    found, places, ends, n = start, list[Vector](), list[Vector](), start.objective.n_parameters
+    found, places, ends, n = start, list[Array](), list[Array](), start.objective.n_parameters
     unknowns, change = start.minimum.unknowns, 1.0
     for number in range(1, ROUNDS + 1):
         theta, objective = unknowns[:n], found.objective
@@ -179,7 +179,7 @@ def _followed(
     return found
 
 
-def _mixed(places: Vector, ends: Vector, metric: Vector, n_parameters: int) -> Vector:
+def _mixed(places: Array, ends: Array, metric: Array, n_parameters: int) -> Array:
     """Where the next round begins after rounds from `places` (k, n) to `ends` (k, n).
 
     The affine combination of the ends whose step, combined likewise, is the smallest in the objective's `metric` (n, n)
@@ -192,9 +192,7 @@ def _mixed(places: Vector, ends: Vector, metric: Vector, n_parameters: int) -> V
     return ends[-1] - back if np.abs(back[:n_parameters]).max(initial=0.0) < 0.25 else ends[-1]
 
 
-def _expanded(
-    full: Full, there: Sequence[Equilibrium], moduli: Vector, amounts: list[Vector]
-) -> tuple[LocalModel, ...]:
+def _expanded(full: Full, there: Sequence[Equilibrium], moduli: Array, amounts: list[Array]) -> tuple[LocalModel, ...]:
     """All states' models to first order around their equilibria."""
     triples = zip(there, full.models, amounts, strict=True)
     return tuple(expanded(e, names=model.names, moduli=moduli, coefficients=q) for e, model, q in triples)
@@ -206,7 +204,7 @@ class Full(Protocol):
     models: tuple[LinearModel, ...]
     constraints: tuple[Constraint, ...]
 
-    def solve(self, moduli: Vector, amounts: list[Vector], before: tuple[Equilibrium, ...]) -> tuple[Equilibrium, ...]:
+    def solve(self, moduli: Array, amounts: list[Array], before: tuple[Equilibrium, ...]) -> tuple[Equilibrium, ...]:
         """Equilibria at moduli (n_regions,) kPa and each state's coefficients (n_modes,), which have derivatives.
 
         before: those that it may begin at; none: at rest.
@@ -219,7 +217,7 @@ class _Linear:
     models: tuple[LinearModel, ...]
     constraints: tuple[Constraint, ...]
 
-    def solve(self, moduli: Vector, amounts: list[Vector], before: tuple[Equilibrium, ...]) -> tuple[Equilibrium, ...]:
+    def solve(self, moduli: Array, amounts: list[Array], before: tuple[Equilibrium, ...]) -> tuple[Equilibrium, ...]:
         del before
         three = zip(self.models, self.constraints, amounts, strict=True)
         return tuple(with_constraint(model, c).solve(moduli, q) for model, c, q in three)
@@ -231,7 +229,7 @@ class _FiniteStrain:
     constraints: tuple[Constraint, ...]
     finite: tuple[FiniteStrainModel, ...]
 
-    def solve(self, moduli: Vector, amounts: list[Vector], before: tuple[Equilibrium, ...]) -> tuple[Equilibrium, ...]:
+    def solve(self, moduli: Array, amounts: list[Array], before: tuple[Equilibrium, ...]) -> tuple[Equilibrium, ...]:
         models = [model.under(c) for model, c in zip(self.finite, self.constraints, strict=True)]
         if before:
             triples = zip(models, before, amounts, strict=True)

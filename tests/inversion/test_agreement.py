@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from palpate.inversion import agreement
-from palpate.inversion import invert as linear
 from palpate.inversion.agreement import AGREED, agreed, left_since
 from palpate.inversion.gauss_newton import gauss_newton
-from palpate.inversion.invert import invert
+from palpate.inversion.invert import TO_REPORT, invert
 from palpate.inversion.weighting import weighed_anew
 from palpate.mechanics.first_order import expanded
 
@@ -48,7 +47,7 @@ def test_weights_that_never_agree_are_not_called_settled(twins, voxels, monkeypa
         return law, replace(weighed, weighting=tuple(map(tuple, first)))
 
     monkeypatch.setattr(agreement, "weighed_anew", in_turn)
-    monkeypatch.setattr(linear, "TO_REPORT", replace(linear.TO_REPORT, passes=3))
+    monkeypatch.setattr("palpate.inversion.invert.TO_REPORT", replace(TO_REPORT, passes=3))
     assert not invert(voxels, twins.settings(0.5), progress=twins.silent).settled
 
 

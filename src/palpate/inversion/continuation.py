@@ -36,7 +36,7 @@ __all__ = ["Expansion", "continued_at_finite_strain"]
 ROUNDS = 16
 NEAR = 0.5  # posterior standard deviations: a round that moves less ends where derivatives are worth making exact
 FORCING = 0.1  # of a round's change: to which the next one's weights and estimate agree
-FINEST = 1e-5  # of ln E: what exact surfaces tell
+RESOLVED = 1e-5  # of ln E: what exact surfaces tell
 REACH = 0.8  # of ln E, within which an expansion is trusted
 HALVINGS = 3
 NOISE = 0.5  # of the objective, in units of log-likelihood: the noise of re-chosen closest points
@@ -67,10 +67,11 @@ class Expansion:
 class _Place:
     """Where the last round led: a point under the objective made of the expansions around the equilibria there.
 
-    change: of ln E by that round, at the most; moved: the same in posterior standard deviations, or by the last pass of
-    its weights and estimate where that is more; sharp (n_parameters,): ln E where the expansions' derivatives were made
-    exact, None while they have not been; final: whether another round, if it changes ln E by as much less than this one
-    as this one did than the one before, changes it by no more than `AGREED` and `SETTLED` standard deviations.
+    change: of ln E by that round, at the most, or by the last pass of its weights and estimate where that is more;
+    moved: the same in posterior standard deviations; sharp (n_parameters,): ln E where the expansions' derivatives were
+    made exact, None while they have not been; final: whether another round, if it changes ln E by as much less than
+    this one as this one did than the one before, changes it by no more than `AGREED` and `SETTLED` standard
+    deviations.
     """
 
     objective: Objective
@@ -90,7 +91,7 @@ class _Place:
     @property
     def settled(self) -> bool:
         """Whether another round would move the log-moduli by little."""
-        return self.final or self.change < AGREED or self.moved < SETTLED
+        return self.change < AGREED or self.moved < SETTLED
 
     def under(self, expansions: tuple[Expansion, ...], minimum: Minimum) -> _Place:
         """The place with the objective on other expansions, at the unknowns of `minimum`."""
@@ -165,7 +166,8 @@ def _followed(
         progress(f"finite strain, round {number + 1}: {words(problem, place.minimum)}")
         before, place = place, _round(problem, place, settings)
         if place.final:
-            finer = _with_finer_walls(problem, place) if refinements < REFINEMENTS else place
+            done = refinements == REFINEMENTS or number == ROUNDS - 1
+            finer = place if done else _with_finer_walls(problem, place)
             if finer is place:
                 break
             place, refinements = finer, refinements + 1
@@ -233,7 +235,8 @@ def _round(problem: InverseProblem, place: _Place, settings: InversionSettings) 
     within = max(AGREED, FORCING * place.change)
     end = agreed(problem, place.objective, now, reach, within=within)
     place, found = place.weighed(end.law, end.objective), end.minimum
-    change, moved = float(change_between(now, found, n).max(initial=0.0)), max(moved_between(now, found, n), end.moved)
+    change = float(change_between(now, found, n).max(initial=end.change))
+    moved = max(moved_between(now, found, n), end.moved)
     lower = _lower(place, found.unknowns - now.unknowns)
     if lower is None:
         outcome = Outcome.STALLED if moved < SETTLED else Outcome.STUCK
@@ -241,7 +244,7 @@ def _round(problem: InverseProblem, place: _Place, settings: InversionSettings) 
     unknowns, equilibria = lower
     expansions = tuple(_recentred(*pair) for pair in zip(place.expansions, equilibria, strict=True))
     there = replace(found, unknowns=unknowns)
-    wanted = np.clip(SETTLED * posterior_sd(found, n).min(initial=np.inf), FINEST, AGREED)
+    wanted = np.clip(SETTLED * posterior_sd(found, n).min(initial=np.inf), RESOLVED, AGREED)
     agree = end.change < AGREED and left_since(place.sharp, there, n) < AGREED
     arrived = replace(place, change=change, moved=moved, final=agree and _next(change, before) < wanted)
     few = all(e.reduced.n_regions + e.reduced.n_modes <= FEW for e in expansions)

@@ -170,8 +170,8 @@ def _round(problem: InverseProblem, place: _Place, settings: InversionSettings, 
     objective = place.objective.under(_reduced(surrogates))
     end = agreed(problem, objective, before, settings, within=effort.within, passes=effort.passes)
     left = left_since(before.unknowns[:n], end.minimum, n)
-    quiet = end.change < AGREED or end.moved < effort.settled
-    settled = quiet and (left < AGREED or moved_between(before, end.minimum, n) < effort.settled)
+    agree = end.change < AGREED or end.moved < effort.settled
+    settled = agree and (left < AGREED or moved_between(before, end.minimum, n) < effort.settled)
     arrived = _Place(end.objective, end.minimum, end.law, surrogates, settled)
     certified = effort.certified * min(end.law.sd / ROUGH_SURFACE, 1.0)
     return replace(arrived, final=settled and left < effort.left and _relative_error(problem, arrived) < certified)
