@@ -12,7 +12,8 @@ import pytest
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.segmentation import segment
 from palpate.images.tissue import Role
-from palpate.inversion.estimation import Estimation, Iteration, ModulusEstimate, Remark, Start, SurfaceFit, TissueFit
+from palpate.inversion.result import Estimation, Iteration, ModulusEstimate, Remark, Start, TissueFit
+from palpate.observation.contract import Fit
 from palpate.mesh.space import lagrange_space
 from palpate.mesh.tet_mesh import OUTER, TetMesh
 from palpate.mesh.tetrahedralise import boundary_of
@@ -101,7 +102,7 @@ def make_start(ratio: float) -> Start:
 
 
 def make_estimation(displacement: np.ndarray) -> Estimation:
-    fit = TissueFit("prostate", SurfaceFit(0.6, 0.8, 1.6, 0.91), SurfaceFit(0.08, 0.11, 0.22, 0.984), 0.93)
+    fit = TissueFit("prostate", Fit(0.6, 0.8, 1.6, 0.91), Fit(0.08, 0.11, 0.22, 0.984), 0.93)
     return Estimation(
         status="converged",
         reason="the decrement fell under its tolerance",

@@ -9,9 +9,7 @@ import numpy as np
 from palpate.images.segmentation import segment
 from palpate.images.tissue import Role, Tissue
 from palpate.images.tissue_distance import tissue_distance_map
-from palpate.inversion.gauss_newton import Bounds
-from palpate.inversion.modulus_map import modulus_map
-from palpate.inversion.problem import InverseProblem, InversionSettings
+from palpate.inversion import Bounds, InverseProblem, InversionSettings, LaterState, parameter_map
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import LinearModel, linear_model
 from palpate.mesh.anatomy import Anatomy, Box
@@ -19,6 +17,7 @@ from palpate.mesh.space import lagrange_space
 from palpate.mesh.tetrahedralise import tetrahedralise
 from palpate.observation.observed_surface import observed_surface
 from palpate.observation.prescribed_motion import prescribed_motion
+from palpate.observation.surface_distance import surface_distance
 from palpate.observation.target import surface_target
 from palpate.phantoms.exact_targets import exact_target
 from palpate.phantoms.scene import Scene, centred_grid, imaged
@@ -75,14 +74,17 @@ def deformed(model, *, voxel_mm=1.5, seed=5) -> Twin:
     return Twin(model, Scene(space, displacement, before, after, {}, seed), moduli, coefficients)
 
 
-def problem_of(twins, targets) -> InverseProblem:
-    mapping = modulus_map(twins[0].scene.tissues, twins[0].model.regions)
-    return InverseProblem(tuple(t.model for t in twins), targets, mapping, frozenset({"gland", "sac"}))
+def problem_of(twins, targets, noise=None) -> InverseProblem:
+    models = [twin.model for twin in twins]
+    mapping = parameter_map(twins[0].scene.tissues, models[0].regions, [model.n_modes for model in models])
+    observations = [tuple(surface_distance(t, stated_noise=noise) for t in of_state) for of_state in targets]
+    states = [LaterState(m, o, reference=i) for i, (m, o) in enumerate(zip(models, observations, strict=True))]
+    return InverseProblem(tuple(states), mapping)
 
 
-def exact_problem(*twins) -> InverseProblem:
+def exact_problem(*twins, noise=None) -> InverseProblem:
     """The images are the model's own triangles."""
-    return problem_of(twins, tuple(tuple(exact_target(t.scene, s) for s in t.surfaces) for t in twins))
+    return problem_of(twins, tuple(tuple(exact_target(t.scene, s) for s in t.surfaces) for t in twins), noise)
 
 
 def voxel_problem(*twins, bias=0.0) -> InverseProblem:

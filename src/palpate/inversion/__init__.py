@@ -1,1 +1,57 @@
-"""From misfit to moduli: parameters, objective, optimisers, starts, posterior."""
+"""The inverse problem: from later states and what is observed of them to moduli with intervals and verdicts."""
+
+from palpate.inversion.approximation import Approximation, ExactApproximation, Place, exact_approximation
+from palpate.inversion.driver_fit import fit_driver
+from palpate.inversion.estimate import Inversion, continue_at_finite_strain, invert
+from palpate.inversion.later_state import InverseProblem, LaterState
+from palpate.inversion.objective import Evaluation, Objective
+from palpate.inversion.optimise import Bounds, Minimum, Outcome, fit_coefficients, gauss_newton, posterior_sd
+from palpate.inversion.outer_loop import InversionSettings, OuterIterate, StopRule, outer_loop
+from palpate.inversion.parameters import ParameterMap, parameter_map
+from palpate.inversion.reduced_basis import ReducedBasis, reduced_basis
+from palpate.inversion.result import Estimation, Observed, Remark, conclude
+from palpate.inversion.reweighting import reweighted, with_first_noise
+from palpate.inversion.sampling import sample_posterior
+from palpate.inversion.uncertainty import FittedState, Interval, gain, log_interval, sandwich_covariance, verdict
+
+__all__ = [
+    "Approximation",
+    "Bounds",
+    "Estimation",
+    "Evaluation",
+    "ExactApproximation",
+    "FittedState",
+    "Interval",
+    "InverseProblem",
+    "Inversion",
+    "InversionSettings",
+    "LaterState",
+    "Minimum",
+    "Objective",
+    "Observed",
+    "Outcome",
+    "OuterIterate",
+    "ParameterMap",
+    "Place",
+    "ReducedBasis",
+    "Remark",
+    "StopRule",
+    "conclude",
+    "continue_at_finite_strain",
+    "exact_approximation",
+    "fit_coefficients",
+    "fit_driver",
+    "gain",
+    "gauss_newton",
+    "invert",
+    "log_interval",
+    "outer_loop",
+    "parameter_map",
+    "posterior_sd",
+    "reduced_basis",
+    "reweighted",
+    "sample_posterior",
+    "sandwich_covariance",
+    "verdict",
+    "with_first_noise",
+]

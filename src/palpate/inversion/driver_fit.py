@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
-from palpate.inversion.driver_prior import learned_prior
-from palpate.inversion.gauss_newton import Bounds
-from palpate.inversion.minima import driven
-from palpate.inversion.objective import LocalModel
-from palpate.inversion.problem import InverseProblem
-from palpate.inversion.surrogate import first_surrogate
-from palpate.inversion.weighting import SEGMENTATION_LAW, objective_of
-from palpate.mechanics.equilibrium import from_linear
+from palpate.inversion.approximation import Approximation, Place
+from palpate.inversion.driver import learned_precision
+from palpate.inversion.expansion import expansion_near
+from palpate.inversion.later_state import InverseProblem
+from palpate.inversion.objective import Objective
+from palpate.inversion.optimise import Bounds, fit_coefficients
+from palpate.inversion.reduced_basis import reduced_basis
+from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
-from palpate.mechanics.first_order import expanded
+from palpate.observation.noise_model import SEGMENTATION_NOISE
 
 __all__ = ["fit_driver"]
 
@@ -30,43 +30,40 @@ def fit_driver(
 ) -> tuple[Motions, ...]:
     """Displacements (n_points, 3) mm of each later image at moduli (n_regions,) kPa and at shares of its motion.
 
-    Under the problem's finite-strain law, where it has one, every share is in equilibrium. Raises `NotConverged` when
+    Under the states' finite-strain law, where they have one, every share is in equilibrium. Raises `NotConverged` when
     the driver's wall cannot be brought to the images, or a path ends early.
     """
-    surrogates = tuple(first_surrogate(model, moduli) for model in problem.models)
-    held = replace(problem, modulus_map=replace(problem.modulus_map, base=moduli))
-    linear = tuple(surrogate.reduced for surrogate in surrogates)
-    amounts = _fitted(held, linear, np.zeros(sum(model.n_modes for model in linear)))
+    held = Objective(problem.states, replace(problem.parameters, base=moduli))
+    linear = [reduced_basis(state.model, moduli) for state in problem.states]
+    amounts = _fitted(held, linear, np.zeros(sum(problem.parameters.n_modes)))
     if not problem.finite_strain:
-        pairs = zip(linear, amounts, strict=True)
-        return tuple(_scaled(model.solve(moduli, q).displacement, shares) for model, q in pairs)
-    triples = zip(problem.finite_strain, surrogates, amounts, strict=True)
-    first = [from_linear(model, surrogate.system, q) for model, surrogate, q in triples]
-    models = tuple(expanded(e, names=e.model.names, moduli=e.moduli, coefficients=e.coefficients) for e in first)
-    amounts = _fitted(held, models, np.concatenate(amounts))
-    return tuple(_followed(equilibrium, q, shares) for equilibrium, q in zip(first, amounts, strict=True))
-
-
-def _scaled(displacement: NDArray[np.float64], shares: Sequence[float]) -> Motions:
-    return tuple(share * displacement for share in shares)
+        motions = [basis.model.solve(moduli, q).displacement for basis, q in zip(linear, amounts, strict=True)]
+        return tuple(tuple(share * motion for share in shares) for motion in motions)
+    first = []
+    for state, basis, q in zip(problem.states, linear, amounts, strict=True):
+        assert state.finite_strain is not None
+        first.append(expansion_near(state.finite_strain, basis, Place(moduli, q), tolerance=ACCURACY))
+    amounts = _fitted(held, first, np.concatenate(amounts))
+    return tuple(_followed(near.equilibrium, q, shares) for near, q in zip(first, amounts, strict=True))
 
 
 def _fitted(
-    held: InverseProblem, models: tuple[LocalModel, ...], coefficients: NDArray[np.float64]
+    held: Objective, models: Sequence[Approximation], coefficients: NDArray[np.float64]
 ) -> list[NDArray[np.float64]]:
-    """Mode coefficients of each state that bring the walls to the images, from given ones, all in one row."""
-    n = len(held.modulus_map.tissues)
-    bounds = Bounds(np.full(n, -1.0), np.full(n, 1.0))
-    objective = objective_of(held, models, SEGMENTATION_LAW)
-    unknowns = np.concatenate([np.zeros(n), coefficients])
-    objective = objective.with_fresh_correspondence(unknowns)
-    first = driven(objective, unknowns[:n], bounds=bounds, coefficients=coefficients)
-    objective = replace(objective, prior=learned_prior(held, first.evaluation, first.unknowns))
-    objective = objective.with_fresh_correspondence(first.unknowns)
-    found = driven(objective, unknowns[:n], bounds=bounds, coefficients=first.unknowns[n:])
-    if not found.outcome.converged:
+    """Driver coefficients of each state that bring the walls to the images, from given ones, all in one row."""
+    parameters = held.parameters
+    theta, bounds = np.zeros(held.n_parameters), Bounds(*np.outer([-1.0, 1.0], np.ones(held.n_parameters)))
+    objective = held.under(models).with_observations([o.with_noise(SEGMENTATION_NOISE) for o in held.observations])
+    objective = objective.rematched(np.concatenate([theta, coefficients]))
+    first = fit_coefficients(objective, theta, bounds=bounds, coefficients=coefficients)
+    precision = learned_precision(objective, first.evaluation, first.unknowns)
+    if precision is not None:
+        objective = replace(objective, parameters=parameters.with_driver_precision(precision))
+    objective = objective.rematched(first.unknowns)
+    found = fit_coefficients(objective, theta, bounds=bounds, coefficients=first.unknowns[len(theta) :])
+    if not found.converged:
         raise NotConverged(f"the driver's wall could not be fitted to the later image: {found.outcome.value}")
-    return objective.coefficients(found.unknowns)
+    return parameters.coefficients(found.unknowns)
 
 
 def _followed(near: FiniteStrainEquilibrium, coefficients: NDArray[np.float64], shares: Sequence[float]) -> Motions:

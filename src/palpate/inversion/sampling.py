@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from palpate.errors import ConfigurationError, EstimationError
-from palpate.inversion.gauss_newton import Bounds
 from palpate.inversion.objective import Evaluation, Objective
+from palpate.inversion.optimise import Bounds
 from palpate.mechanics.reduced import ReducedModel
 
 __all__ = ["FrozenPosterior", "PosteriorSamples", "frozen_posterior", "sample_posterior"]
@@ -26,7 +26,7 @@ GAP = 1.0  # of log-likelihood, that the frozen posterior may be off; re-chosen 
 
 @dataclass(frozen=True, slots=True)
 class FrozenPosterior:
-    """Minus log-posterior 1/2 sum_s z_s^T Q_s z_s + 1/2 x^T P x, dimensionless, of unknowns x (n,).
+    """Minus log-posterior 1/2 sum_s z_s^T Q_s z_s + 1/2 (x - m)^T P (x - m), dimensionless, of unknowns x (n,).
 
     z_s = [a, q, 1] of each state s: amplitudes a (m,) of its reduced model `models[s]` and mode coefficients q;
     forms: Q_s (m + n_modes + 1, m + n_modes + 1); prior: P (n, n).
@@ -39,9 +39,10 @@ class FrozenPosterior:
 
     def __call__(self, unknowns: NDArray[np.float64]) -> float:
         """Its value at unknowns (n,); raises `SolverError` where a reduced stiffness is not positive definite."""
-        moduli = self.objective.modulus_map.moduli(unknowns[: self.objective.n_parameters])
-        total = 0.5 * float(unknowns @ self.prior @ unknowns)
-        parts = zip(self.models, self.forms, self.objective.coefficients(unknowns), strict=True)
+        parameters = self.objective.parameters
+        moduli, away = parameters.moduli(unknowns), unknowns - parameters.prior_centre
+        total = 0.5 * float(away @ self.prior @ away)
+        parts = zip(self.models, self.forms, parameters.coefficients(unknowns), strict=True)
         for model, form, coefficients in parts:
             given = np.append(coefficients, 1.0)
             state = np.concatenate([model.amplitude(moduli, given), given])
@@ -78,25 +79,25 @@ def frozen_posterior(objective: Objective, unknowns: NDArray[np.float64]) -> Fro
 
 
 def _frozen(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> FrozenPosterior:
-    moduli = objective.modulus_map.moduli(unknowns[: objective.n_parameters])
-    models, forms = [], []
-    for number, coefficients in enumerate(objective.coefficients(unknowns)):
-        state = objective.states[number]
-        if not isinstance(state.model, ReducedModel):
+    parameters = objective.parameters
+    moduli, models, forms = parameters.moduli(unknowns), [], []
+    for number, coefficients in enumerate(parameters.coefficients(unknowns)):
+        state, model = objective.states[number], objective.states[number].observed
+        if not isinstance(model, ReducedModel):
             raise ConfigurationError(
-                f"the posterior is sampled on reduced models; state {number} has a {type(state.model).__name__}"
+                f"the posterior is sampled on reduced models; state {number} has a {type(model).__name__}"
             )
-        lines = [line for line in evaluation.surfaces if line.state == number]
-        answer = np.concatenate([state.model.output_basis, state.model.output_given], axis=1)
-        values = state.model.solve(moduli, coefficients).values
+        lines = [line for line in evaluation.lines if line.state == number]
+        answer = np.concatenate([model.output_basis, model.output_given], axis=1)
+        values = model.solve(moduli, coefficients).values
         form = np.zeros((answer.shape[1],) * 2)
-        for rows, line in zip(state.slices(), lines, strict=True):
-            normal = line.residuals.normal_jacobian
+        for rows, line in zip(state.slices, lines, strict=True):
+            normal = line.residuals.smooth_jacobian
             design = np.asarray(normal @ answer[rows])
             design[:, -1] += line.residuals.values - normal @ values[rows]
             design *= np.sqrt(line.precision * line.weights)[:, None]
             form += design.T @ design
-        models.append(state.model)
+        models.append(model)
         forms.append(form)
     return FrozenPosterior(objective, tuple(models), tuple(forms), evaluation.prior)
 

@@ -27,7 +27,8 @@ class ObservedSurface:
     `points`, normals out of the tissue; observed (n_triangles,) is False where the tissue touches a driver, a bone or
     the cut of the image; rim (n_triangles, 3) marks edges (opposite each corner) where the observed part ends;
     share of the area that is observed; faces (n_faces, 6): the vertices of each face that its four triangles stand for,
-    corners and then the middles of the edges 01, 12, 20; none where faces are plane.
+    corners and then the middles of the edges 01, 12, 20, none where faces are plane; driver: whether it is the wall of
+    one, whose motion is prescribed.
     """
 
     tissue: int
@@ -39,6 +40,7 @@ class ObservedSurface:
     rim: NDArray[np.bool_]
     share: float
     faces: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 6), dtype=np.int64))
+    driver: bool = False
 
     @property
     def dofs(self) -> NDArray[np.int64]:
@@ -69,7 +71,9 @@ def observed_surface(space: LagrangeSpace, tissue: int) -> ObservedSurface:
             " its modulus cannot be observed; enlarge the image, or make the tissue `known`"
         )
     faces = np.searchsorted(points, facets if space.order == 2 else np.zeros((0, 6), dtype=np.int64))
-    return ObservedSurface(tissue, name, points, rest, triangles, observed, _rim(triangles, observed), share, faces)
+    driver = mesh.tissues[tissue].role is Role.DRIVER
+    rim = _rim(triangles, observed)
+    return ObservedSurface(tissue, name, points, rest, triangles, observed, rim, share, faces, driver)
 
 
 def _observable(role: Role, other: NDArray[np.int64], roles: list[Role]) -> NDArray[np.bool_]:

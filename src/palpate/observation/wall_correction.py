@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from palpate.mesh.surface import vertex_normals
-from palpate.observation.misfit import SurfaceResiduals
+from palpate.observation.contract import Residuals
 from palpate.observation.observed_surface import ObservedSurface
 from palpate.observation.wall_modes import kernel_factor
 
@@ -18,7 +18,7 @@ FINE_MODES = 400  # at the most: the kernel's rank on a wall of a hundred square
 
 def wall_correction(
     surface: ObservedSurface,
-    residuals: SurfaceResiduals,
+    residuals: Residuals,
     precision: NDArray[np.float64],
     *,
     present: NDArray[np.float64],
@@ -29,13 +29,13 @@ def wall_correction(
 
     Along the unit normals n it is a Gaussian process with the covariance prior^2 exp(-|x - y|^2 / (2 kernel^2)); the
     result is its posterior mean under r = r_0 + J w + noise, with the residuals r at the `present` (n_vertices, 3) mm,
-    J their `normal_jacobian` and `precision` (n,) mm^-2 that of each residual (Rasmussen & Williams 2006, Eq. 2.11).
+    J their `smooth_jacobian` and `precision` (n,) mm^-2 that of each residual (Rasmussen & Williams 2006, Eq. 2.11).
     """
     scalar = prior_mm * kernel_factor(surface.rest, kernel_mm, FINE_MODES)
     normals = vertex_normals(surface.rest, surface.triangles)
     modes = (normals[:, :, None] * scalar[:, None, :]).reshape(-1, scalar.shape[1])
-    design = np.asarray(residuals.normal_jacobian @ modes)
-    values = residuals.values - residuals.normal_jacobian @ present.ravel()
+    design = np.asarray(residuals.smooth_jacobian @ modes)
+    values = residuals.values - residuals.smooth_jacobian @ present.ravel()
     matrix = design.T @ (precision[:, None] * design) + np.eye(design.shape[1])
     coefficients = linalg.solve(matrix, -design.T @ (precision * values), assume_a="pos")
     return np.asarray((modes @ coefficients).reshape(-1, 3))

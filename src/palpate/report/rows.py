@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from palpate.inversion.estimation import Interval
+from palpate.inversion import Interval
 
 __all__ = ["Bar", "EstimateRow", "estimate_rows", "interval_text", "number", "scale_marks"]
 

@@ -14,8 +14,7 @@ from palpate.images.distance import DistanceMap, observation_width, smoothing_wi
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.images.tissue_distance import tissue_distance_map
-from palpate.inversion.modulus_map import modulus_map
-from palpate.inversion.problem import InverseProblem
+from palpate.inversion import InverseProblem, LaterState, parameter_map
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.equilibrium import ACCURACY
@@ -28,9 +27,12 @@ from palpate.mesh.anatomy import Anatomy, Box, anatomy_of, domain_box, margin_bo
 from palpate.mesh.quality import MeshQuality, check_mesh
 from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.tetrahedralise import tetrahedralise
+from palpate.observation.contract import Observation
+from palpate.observation.noise_model import NoiseModel
 from palpate.observation.observed_surface import ObservedSurface, observed_surface
 from palpate.observation.prescribed_motion import prescribed_motion
-from palpate.observation.target import SurfaceTarget, surface_target
+from palpate.observation.surface_distance import surface_distance
+from palpate.observation.target import surface_target
 from palpate.observation.wall_modes import Wall
 from palpate.parallel import mapped
 from palpate.study.case import Case, Mechanics
@@ -46,7 +48,8 @@ __all__ = [
     "inverse_problem",
     "joint_problem",
     "make_body",
-    "surface_targets",
+    "stated_noise",
+    "surface_observations",
 ]
 
 THIN_VOXELS = 4
@@ -152,22 +155,32 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Callable[[str
 
     All bodies have the same tissues in the same order. Raises as `inverse_problem` does.
     """
-    targets = tuple(target for body in bodies for target in surface_targets(body))
+    noise = stated_noise(case)
+    seen = [(r, o) for r, body in enumerate(bodies) for o in surface_observations(body, stated_noise=noise)]
     progress("assembling one stiffness matrix a tissue")
     pairs = [pair for body in bodies for pair in _models(body, case)]
     models = tuple(model for model, _ in pairs)
     _refuse_rest(models, case)
     finite = _finite_strain(models, case)
-    tissues = bodies[0].space.mesh.tissues
-    estimated = frozenset(tissue.name for tissue in tissues if tissue.role is Role.ESTIMATE)
-    mapping = modulus_map(tissues, models[0].regions, loaded=bool(case.loads))
-    walls = tuple(walls for _, walls in pairs) if case.driver.learn_prior else ()
-    return InverseProblem(models, targets, mapping, estimated, finite, walls=walls)
+    states = tuple(
+        LaterState(model, observations, law, walls if case.driver.learn_prior else (), reference)
+        for (model, walls), law, (reference, observations) in zip(pairs, finite, seen, strict=True)
+    )
+    tissues, n_modes = bodies[0].space.mesh.tissues, [model.n_modes for model in models]
+    return InverseProblem(states, parameter_map(tissues, models[0].regions, n_modes, loaded=bool(case.loads)))
 
 
-def surface_targets(
-    body: Body, surfaces: Sequence[ObservedSurface] | None = None
-) -> tuple[tuple[SurfaceTarget, ...], ...]:
+def stated_noise(case: Case) -> NoiseModel | None:
+    """The noise model of the residuals that a case states: both images' surfaces have it; None: from the residuals."""
+    if case.noise.surface_sd_mm is None:
+        return None
+    length = case.noise.correlation_length_mm or 6.0
+    return NoiseModel(np.array([2.0 * case.noise.surface_sd_mm**2]), np.array([length]))
+
+
+def surface_observations(
+    body: Body, surfaces: Sequence[ObservedSurface] | None = None, *, stated_noise: NoiseModel | None = None
+) -> tuple[tuple[Observation, ...], ...]:
     """The observed surfaces of each later image; `surfaces` None: of all `estimate` tissues and drivers."""
     tissues = body.space.mesh.tissues
     observed = [i for i, tissue in enumerate(tissues) if tissue.role in (Role.ESTIMATE, Role.DRIVER)]
@@ -179,7 +192,11 @@ def surface_targets(
 
     before = maps(body.states.before)
     return tuple(
-        tuple(surface_target(*of) for of in zip(seen, before, maps(image), strict=True)) for image in body.states.after
+        tuple(
+            surface_distance(surface_target(*of), stated_noise=stated_noise)
+            for of in zip(seen, before, maps(image), strict=True)
+        )
+        for image in body.states.after
     )
 
 
@@ -211,16 +228,16 @@ def _models(body: Body, case: Case) -> list[tuple[LinearModel, tuple[Wall, ...]]
     return models
 
 
-def _finite_strain(models: tuple[LinearModel, ...], case: Case) -> tuple[FiniteStrainModel, ...]:
-    """The same bodies under the case's law; none where that is the linear one."""
+def _finite_strain(models: tuple[LinearModel, ...], case: Case) -> Sequence[FiniteStrainModel | None]:
+    """The same bodies under the case's law; None where that is the linear one."""
     law = law_of(case.mechanics)
-    if law.name == "linear":
-        return ()
+    if not law.finite:
+        return [None] * len(models)
     found: list[FiniteStrainModel] = []
     for model in models:
         like = next((other for other in found if other.space is model.space), None)
         found.append(like.under(model.constraint) if like else _finite_strain_model(model, law, case))
-    return tuple(found)
+    return found
 
 
 def law_of(mechanics: Mechanics) -> Law:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from palpate.images.tissue import Role
-from palpate.inversion.estimation import Estimation, Remark
+from palpate.inversion import Estimation, Remark
 from palpate.study.case import Case
 
 __all__ = [

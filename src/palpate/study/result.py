@@ -15,7 +15,8 @@ from palpate.errors import NotConverged, PalpateError
 from palpate.images.label_image import LabelImage
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
-from palpate.inversion.estimation import Estimation, ModulusEstimate, Remark, Start, TissueFit
+from palpate.inversion import Estimation, Remark
+from palpate.inversion.result import ModulusEstimate, Start, TissueFit, no_estimate
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.case import Case
 
@@ -125,6 +126,7 @@ class CaseResult:
             "correlation": estimation.correlation.tolist(),
             "fit": [_fit(name, fits) for name, fits in zip(image_names(self.case), estimation.fits, strict=False)],
             "starts": [_start(start) for start in estimation.starts],
+            "outer_iterations": {"history_mm2": [step.objective_mm2 for step in estimation.outer_iterations]},
             "counts": dict(estimation.counts),
             "mesh": _plain(self.mesh_summary),
         }
@@ -190,32 +192,21 @@ def failure_document(case: Case, error: PalpateError) -> dict[str, Any]:
     why = f"the estimation ended with the status '{status}'"
     unknown = [tissue.name for tissue in case.tissues if tissue.role is Role.ESTIMATE]
     known = [tissue.name for tissue in case.tissues if tissue.role is Role.KNOWN]
+    absolute = bool(known or case.loads or case.phantom)
     empty: dict[str, Any] = {
-        "estimates": [_estimate(_no_estimate(name, (known or unknown)[0], why), status) for name in unknown],
+        "estimates": [
+            _estimate(no_estimate(name, absolute=absolute, relative_to=(known or unknown)[0], why=why), status)
+            for name in unknown
+        ],
         "correlation": [],
         "fit": [],
         "starts": [],
+        "outer_iterations": {"history_mm2": []},
         "counts": {},
         "mesh": None,
         "note": "",
     }
     return json_object(_heading(case, status, str(error)) | empty | _closing(case, Provenance(), ()))
-
-
-def _no_estimate(tissue: str, relative_to: str, why: str) -> ModulusEstimate:
-    return ModulusEstimate(
-        tissue=tissue,
-        parameter="youngs_modulus",
-        unit="kPa",
-        value=None,
-        interval95=None,
-        interval_kind="linearised",
-        relative_to=relative_to,
-        ratio=None,
-        ratio_interval95=None,
-        verdict="not identified",
-        why=why,
-    )
 
 
 def json_object(mapping: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,14 +10,18 @@ import numpy as np
 
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role
-from palpate.inversion.conclude import Observed, conclude
-from palpate.inversion.estimation import Estimation, Remark
-from palpate.inversion.gauss_newton import Bounds
-from palpate.inversion.grid_position import FittedState
-from palpate.inversion.invert import invert
-from palpate.inversion.modulus_map import ModulusMap
-from palpate.inversion.noise import NoiseLaw
-from palpate.inversion.problem import Inversion, InversionSettings
+from palpate.inversion import (
+    Bounds,
+    Estimation,
+    FittedState,
+    Inversion,
+    InversionSettings,
+    Observed,
+    ParameterMap,
+    Remark,
+    conclude,
+    invert,
+)
 from palpate.study.body import Body, ImagedStates, joint_problem, make_body
 from palpate.study.case import Case
 from palpate.study.plausibility import estimate_warnings, unit_warnings
@@ -85,11 +89,11 @@ def estimate_states(
     clock.append(time.perf_counter())
     problem = joint_problem(bodies, case, progress=progress)
     clock.append(time.perf_counter())
-    settings = inversion_settings(case, problem.modulus_map)
+    settings = inversion_settings(case, problem.parameters)
     inversion = invert(problem, settings, progress=progress)
     progress("intervals: residuals' correlation, grid position, driver")
     images = tuple(image.index for pair in bodies for image in pair.states.after)
-    observed = Observed(body.space, fitted_states(inversion, *bodies), images)
+    observed = Observed(fitted_states(inversion, *bodies), images)
     estimation = conclude(inversion, settings, observed, truth=truth or {}, seed=case.seed)
     clock.append(time.perf_counter())
     stages = np.diff(clock)
@@ -123,31 +127,26 @@ def mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
     return MeshResult(case, body.space, mesh_summary(body), states.before, provenance, _remarks(case, states))
 
 
-def inversion_settings(case: Case, mapping: ModulusMap) -> InversionSettings:
+def inversion_settings(case: Case, parameters: ParameterMap) -> InversionSettings:
     """Starts and bounds as theta; those in kPa are divided by the scale's modulus."""
-    scale = mapping.scale_kpa
+    scale = parameters.scale_kpa
     options = case.estimate
     starts = np.array(options.starts_kpa) / scale if options.starts_kpa else np.array(options.start_ratios)
     bounds = np.array(options.bounds_kpa) / scale if options.bounds_kpa else np.array(options.bounds_ratio)
-    n = len(mapping.tissues)
-    law = None
-    if case.noise.surface_sd_mm is not None:
-        length = case.noise.correlation_length_mm or 6.0
-        law = NoiseLaw(np.array([2.0 * case.noise.surface_sd_mm**2]), np.array([length]))
+    n = parameters.n_parameters
     limits = Bounds(np.full(n, np.log(bounds[0])), np.full(n, np.log(bounds[1])))
-    return InversionSettings(tuple(np.full(n, np.log(start)) for start in starts), limits, options.method, law)
+    return InversionSettings(tuple(np.full(n, np.log(start)) for start in starts), limits, options.method)
 
 
 def fitted_states(inversion: Inversion, *bodies: Body) -> tuple[FittedState, ...]:
     """Displacements of the whole meshes at the estimate, with the grids that they were seen on, body after body."""
     objective, unknowns = inversion.objective, inversion.minimum.unknowns
-    moduli = objective.modulus_map.moduli(unknowns[: objective.n_parameters])
+    moduli, coefficients = objective.parameters.moduli(unknowns), objective.parameters.coefficients(unknowns)
     images = [(body, image) for body in bodies for image in body.states.after]
-    fitted = []
-    for surrogate, q, (body, image) in zip(inversion.surrogates, objective.coefficients(unknowns), images, strict=True):
-        displacement = surrogate.reduced.solve(moduli, q).displacement
-        fitted.append(FittedState(displacement, body.states.before.grid, image.grid, body.smoothing_mm, body.space))
-    return tuple(fitted)
+    return tuple(
+        FittedState(body.space, state.displacement(moduli, q), body.states.before.grid, image.grid)
+        for state, q, (body, image) in zip(objective.states, coefficients, images, strict=True)
+    )
 
 
 def _further(bodies: tuple[Body, ...], estimation: Estimation) -> tuple[PairResult, ...]:

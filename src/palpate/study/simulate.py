@@ -12,8 +12,7 @@ from palpate.errors import ConfigurationError
 from palpate.images.label_image import LabelImage
 from palpate.images.segmentation import Segmentation, first_labels
 from palpate.images.tissue import Role, Tissue
-from palpate.inversion.driver_fit import fit_driver
-from palpate.inversion.estimation import Remark
+from palpate.inversion import Remark, fit_driver
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.equilibrium import equilibrium

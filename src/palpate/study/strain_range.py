@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inversion.estimation import Remark
+from palpate.inversion import Remark
 from palpate.mechanics.deformation import largest_strains
 from palpate.mesh.space import LagrangeSpace
 

@@ -9,19 +9,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.images.tissue import Role, Tissue
-from palpate.inversion.gauss_newton import Bounds, gauss_newton
-from palpate.inversion.modulus_map import modulus_map
-from palpate.inversion.noise import NoiseLaw
-from palpate.inversion.problem import InverseProblem
-from palpate.inversion.surrogate import Surrogate, enriched, first_surrogate
-from palpate.inversion.weighting import objective_of, reweighted
+from palpate.inversion import (
+    Bounds,
+    InverseProblem,
+    InversionSettings,
+    LaterState,
+    Place,
+    ReducedBasis,
+    StopRule,
+    invert,
+    parameter_map,
+    reduced_basis,
+)
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import LinearModel, LinearSystem, linear_model, with_constraint
 from palpate.mesh.anatomy import Anatomy, Box
 from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.tetrahedralise import tetrahedralise
+from palpate.observation.noise_model import NoiseModel
 from palpate.observation.observed_surface import observed_surface
 from palpate.observation.prescribed_motion import prescribed_motion
+from palpate.observation.surface_distance import surface_distance
 from palpate.phantoms.boundary_noise import smooth_field
 from palpate.phantoms.exact_targets import target_of_truth
 from palpate.phantoms.motion import filling_of
@@ -39,6 +47,9 @@ FIELD_MM = (110.0, 120.0, 120.0)
 POISSON_RATIO = 0.45
 SPREAD = 3.0  # the reduced model is made at the middle modulus, and at it times and over this factor
 SEARCHED = (0.1, 100.0)  # bounds of the moduli, relative to the surroundings
+REDUCED_ALONE = StopRule(  # residuals are weighted robustly once, and the full model is not asked again
+    step_sd=np.inf, model_error=np.inf, derivatives=False, solve_above=np.inf, passes=1, iterations=1, refinements=0
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,11 +104,11 @@ def estimate_patient(settings: CohortSettings, patient: int, progress: Callable[
     space = lagrange_space(tetrahedralise(_anatomy(shapes), edge_length_mm=settings.edge_mm), "P2")
     model = _model(space, settings.driver)
     progress(f"patient {patient + 1}: {3 * len(space.points)} unknowns")
-    surrogate = _surrogate(model)
+    basis = _basis(model)
     held = replace(model.constraint, modes=np.zeros((3 * len(space.points), 0)))
     system = with_constraint(model, held).system(_moduli(model, truth))
     pairs = [
-        _Pair(settings, shapes, surrogate, system, np.random.default_rng([seed, number]))
+        _Pair(settings, shapes, basis, system, np.random.default_rng([seed, number]))
         for number in range(settings.pairs[patient])
     ]
     found = [pair.estimate() for pair in pairs]
@@ -126,25 +137,19 @@ class _Pair:
 
     settings: CohortSettings
     shapes: PelvisShapes
-    surrogate: Surrogate
+    basis: ReducedBasis
     system: LinearSystem
     rng: np.random.Generator
 
     def estimate(self) -> _Estimate:
         """Moduli (kPa) of both organs from the noisy surfaces of the pair, by the reduced model alone."""
-        noise = self.settings.noise
-        law = NoiseLaw(np.array([2.0 * noise.surface_sd_mm**2]), np.array([noise.correlation_length_mm]))
         problem = self.problem()
-        objective = objective_of(problem, (self.surrogate.reduced,), law)
         bounds = Bounds(*np.log(np.outer(SEARCHED, np.ones(len(ORGANS)))))
-        start = np.concatenate([np.log(np.full(len(ORGANS), 2.0)), np.zeros(self.surrogate.model.n_modes)])
-        objective = objective.with_fresh_correspondence(start)
-        first = gauss_newton(objective, start, bounds=bounds, hold_theta=True, tolerance=1e-1)
-        found = gauss_newton(objective.with_fresh_correspondence(first.unknowns), first.unknowns, bounds=bounds)
-        found = gauss_newton(reweighted(objective, found, law), found.unknowns, bounds=bounds)
-        theta, q = found.unknowns[: len(ORGANS)], found.unknowns[len(ORGANS) :]
-        bound = self.surrogate.relative_error(problem.modulus_map.moduli(theta), q)
-        return _Estimate(SURROUNDINGS_KPA * np.exp(theta), found.outcome.converged, bound)
+        settings = InversionSettings((np.log(np.full(len(ORGANS), 2.0)),), bounds)
+        found = invert(problem, settings, progress=lambda _: None, rule=REDUCED_ALONE).minimum
+        coefficients = problem.parameters.coefficients(found.unknowns)[0]
+        bound = self.basis.error(Place(problem.parameters.moduli(found.unknowns), coefficients))
+        return _Estimate(SURROUNDINGS_KPA * np.exp(found.unknowns[: len(ORGANS)]), found.converged, bound)
 
     def problem(self) -> InverseProblem:
         """The patient's model and the surfaces of this pair."""
@@ -157,9 +162,12 @@ class _Pair:
         tissues = space.mesh.tissues
         observed = [i for i, t in enumerate(tissues) if t.role in (Role.ESTIMATE, Role.DRIVER)]
         warps = (draws[0].warp, draws[1].warp)
-        targets = tuple(target_of_truth(space, u, observed_surface(space, i), warps=warps) for i in observed)
-        mapping = modulus_map(tissues, self.system.model.regions)
-        return InverseProblem((self.surrogate.model,), (targets,), mapping, frozenset(ORGANS))
+        stated = NoiseModel(np.array([2.0 * noise.surface_sd_mm**2]), np.array([noise.correlation_length_mm]))
+        targets = [target_of_truth(space, u, observed_surface(space, i), warps=warps) for i in observed]
+        model = self.basis.full_model
+        state = LaterState(model, tuple(surface_distance(target, stated_noise=stated) for target in targets))
+        mapping = parameter_map(tissues, model.regions, [model.n_modes])
+        return InverseProblem((state.with_approximation(self.basis),), mapping)
 
     def displacement(self) -> Array:
         """Displacement (n_points, 3) mm of the truth under a filling of its own."""
@@ -203,15 +211,15 @@ def _model(space: LagrangeSpace, driver: DriverMotion) -> LinearModel:
     return linear_model(space, constraint)
 
 
-def _surrogate(model: LinearModel) -> Surrogate:
+def _basis(model: LinearModel) -> ReducedBasis:
     """One reduced model for all pairs: responses at five places of the two moduli."""
     middle = 2.5 * SURROUNDINGS_KPA
-    surrogate = first_surrogate(model, _moduli(model, dict.fromkeys(ORGANS, middle)))
+    basis = reduced_basis(model, _moduli(model, dict.fromkeys(ORGANS, middle)))
     none = np.zeros(model.n_modes)
     for first in (middle / SPREAD, middle * SPREAD):
         for second in (middle / SPREAD, middle * SPREAD):
-            surrogate = enriched(surrogate, _moduli(model, dict(zip(ORGANS, (first, second), strict=True))), none)
-    return surrogate
+            basis = basis.with_responses(_moduli(model, dict(zip(ORGANS, (first, second), strict=True))), none)
+    return basis
 
 
 def _moduli(model: LinearModel, organs: dict[str, float]) -> Array:

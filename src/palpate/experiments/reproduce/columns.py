@@ -11,12 +11,17 @@ from numpy.typing import NDArray
 from palpate.experiments.reproduce.table import Entry
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import segment
-from palpate.inversion.conclude import Observed, conclude
-from palpate.inversion.gauss_newton import Bounds
-from palpate.inversion.modulus_map import ModulusMap
-from palpate.inversion.posterior import sandwich_covariance
-from palpate.inversion.problem import Inversion, InversionSettings
-from palpate.inversion.verdict import log_interval, verdict
+from palpate.inversion import (
+    Bounds,
+    Inversion,
+    InversionSettings,
+    Observed,
+    ParameterMap,
+    conclude,
+    log_interval,
+    sandwich_covariance,
+    verdict,
+)
 from palpate.mesh.space import LagrangeSpace
 from palpate.phantoms.scene import imaged
 from palpate.study.body import Body, ImagedStates, aligned
@@ -33,7 +38,7 @@ __all__ = [
 SEARCHED = 100.0  # the moduli are sought within this factor of the start
 
 
-def from_half(mapping: ModulusMap, truth: Mapping[str, float]) -> InversionSettings:
+def from_half(mapping: ParameterMap, truth: Mapping[str, float]) -> InversionSettings:
     """One start, at half of every true modulus (kPa), as in the paper."""
     start = np.log([0.5 * truth[name] / mapping.scale_kpa for name in mapping.tissues])
     reach = np.log(SEARCHED)
@@ -66,12 +71,11 @@ def entries_from_surfaces(
     inversion: Inversion, settings: InversionSettings, truth: Mapping[str, float]
 ) -> dict[str, Entry]:
     """What an inversion of exact surfaces says of each body; its interval knows of no voxels."""
-    mapping, minimum = inversion.objective.modulus_map, inversion.minimum
-    n = len(mapping.tissues)
-    spread = np.sqrt(np.diag(sandwich_covariance(minimum.evaluation, inversion.law, n)))
+    mapping, minimum = inversion.objective.parameters, inversion.minimum
+    spread = np.sqrt(np.diag(sandwich_covariance(inversion.objective, minimum.evaluation)))
     found = {}
+    steps = _steps(inversion)
     for i, name in enumerate(mapping.tissues):
-        steps = len(minimum.history)
         if not minimum.outcome.converged:
             found[name] = Entry.of(None, truth[name], verdict="not identified", iterations=steps)
             continue
@@ -90,10 +94,16 @@ def entries_from_voxels(
 ) -> dict[str, Entry]:
     """What an inversion of voxels says of each body, with the interval that a case's result would state."""
     images = tuple(image.index for image in body.states.after)
-    observed = Observed(body.space, fitted_states(inversion, body), images)
+    observed = Observed(fitted_states(inversion, body), images)
     estimation = conclude(inversion, settings, observed, truth=truth, seed=seed)
-    steps = len(inversion.minimum.history)
+    steps = _steps(inversion)
     return {
         e.tissue: Entry.of(e.value, truth[e.tissue], interval95=e.interval95, verdict=e.verdict, iterations=steps)
         for e in estimation.estimates
     }
+
+
+def _steps(inversion: Inversion) -> int:
+    """Accepted points on the way from the first start of the best minimum to the estimate."""
+    first = next(start for start in inversion.starts if start.candidate == inversion.best)
+    return len(first.minimum.history) + len(inversion.minimum.history)

@@ -25,10 +25,7 @@ from palpate.experiments.reproduce.balls import (
 from palpate.experiments.reproduce.columns import from_half
 from palpate.experiments.reproduce.jobs import Job, Progress, compute
 from palpate.experiments.reproduce.ledger import Ledger
-from palpate.inversion.continuation import continued_at_finite_strain
-from palpate.inversion.invert import invert
-from palpate.inversion.modulus_map import modulus_map
-from palpate.inversion.problem import InverseProblem, Inversion
+from palpate.inversion import InverseProblem, Inversion, LaterState, invert, parameter_map
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.equilibrium import ACCURACY, equilibrium
 from palpate.mechanics.finite_strain import finite_strain_model
@@ -39,6 +36,7 @@ from palpate.mechanics.stiffness import lame_parameters
 from palpate.mesh.constraint import Constraint
 from palpate.mesh.space import LagrangeSpace
 from palpate.observation.observed_surface import observed_surface
+from palpate.observation.surface_distance import surface_distance
 from palpate.phantoms.exact_targets import target_of_truth
 
 __all__ = ["Figure4", "Figure4Settings", "Point", "figure4", "nominal_stress"]
@@ -204,18 +202,18 @@ class _Bench:
             self.space, self.constraint, np.array(moduli), law=law, dilatation=Dilatation.BLENDED, loads=(load,)
         ).displacement
         surfaces = [observed_surface(self.space, body) for body in range(len(BODIES))]
-        targets = tuple(target_of_truth(self.space, truth, surface) for surface in surfaces)
-        mapping = modulus_map(balls_tissues(moduli), self.linear.regions, loaded=True)
+        observations = tuple(surface_distance(target_of_truth(self.space, truth, surface)) for surface in surfaces)
+        n_modes = [self.linear.n_modes]
+        mapping = parameter_map(balls_tissues(moduli), self.linear.regions, n_modes, loaded=True)
         settings = from_half(mapping, dict(zip(BODIES, moduli, strict=True)))
         model = replace(self.linear, load=load.nodal)
-        problem = InverseProblem((model,), (targets,), mapping, frozenset(BODIES))
-        linear = invert(problem, settings, progress=progress)
         finite = finite_strain_model(
             self.space, self.constraint, law, loads=(load,), settings=NewtonSettings(tolerance=ACCURACY)
         )
+        problem = InverseProblem((LaterState(model, observations, finite),), mapping)
+        linear = invert(problem.linear(), settings, progress=progress)
         try:
-            problem = replace(problem, finite_strain=(finite,))
-            continued = _errors(continued_at_finite_strain(problem, linear, settings, progress=progress), moduli)
+            continued = _errors(invert(problem, settings, progress=progress), moduli)
         except NotConverged as error:
             progress(f"not converged: {error}")
             continued = [None] * len(BODIES)
@@ -232,7 +230,7 @@ class _Bench:
 def _errors(inversion: Inversion, moduli: Moduli) -> list[float | None]:
     if not inversion.minimum.outcome.converged:
         return [None] * len(moduli)
-    found = inversion.objective.modulus_map.moduli(inversion.minimum.unknowns[: len(moduli)])
+    found = inversion.objective.parameters.moduli(inversion.minimum.unknowns)
     return [float(100.0 * (value / truth - 1.0)) for value, truth in zip(found, moduli, strict=True)]
 
 

@@ -31,15 +31,14 @@ from palpate.experiments.reproduce.ledger import Ledger
 from palpate.experiments.reproduce.paper import PAPER_TABLE1
 from palpate.experiments.reproduce.paper_method import paper_estimate, paper_target
 from palpate.experiments.reproduce.table import COLUMNS, Entry, Table, TableRow, as_part, entries_of
-from palpate.inversion.invert import invert
-from palpate.inversion.modulus_map import modulus_map
-from palpate.inversion.problem import InverseProblem, Inversion, InversionSettings
+from palpate.inversion import InverseProblem, Inversion, InversionSettings, LaterState, invert, parameter_map
 from palpate.mechanics.linear_model import LinearModel, linear_model, with_constraint
 from palpate.mesh.space import LagrangeSpace
+from palpate.observation.contract import Observation
 from palpate.observation.observed_surface import observed_surface
-from palpate.observation.target import SurfaceTarget
+from palpate.observation.surface_distance import surface_distance
 from palpate.phantoms.exact_targets import target_of_truth
-from palpate.study.body import make_body, surface_targets
+from palpate.study.body import make_body, surface_observations
 from palpate.study.case import Case, Mechanics, MeshSettings, Phantom
 
 __all__ = ["Table1Settings", "table1"]
@@ -184,8 +183,8 @@ class _Case:
         model = _pulled_by(self.bench.coarse, self.stress_kpa)
         u = self.displacement(truth)
         surfaces = [observed_surface(model.space, body) for body in range(len(BODIES))]
-        targets = tuple(target_of_truth(truth.space, u, surface) for surface in surfaces)
-        inversion, settings = self.inverted(model, targets, progress)
+        observations = tuple(surface_distance(target_of_truth(truth.space, u, surface)) for surface in surfaces)
+        inversion, settings = self.inverted(model, observations, progress)
         return entries_from_surfaces(inversion, settings, self.truth)
 
     def from_voxels(self, progress: Progress) -> dict[str, Entry]:
@@ -199,16 +198,16 @@ class _Case:
         body = make_body(states, case, progress=progress)
         model = _pulled_by(_model(body.space), self.stress_kpa)
         surfaces = tuple(observed_surface(body.space, number) for number in range(len(BODIES)))
-        inversion, settings = self.inverted(model, surface_targets(body, surfaces)[0], progress)
+        inversion, settings = self.inverted(model, surface_observations(body, surfaces)[0], progress)
         return entries_from_voxels(inversion, settings, body, self.truth, seed=self.seed)
 
     def inverted(
-        self, model: LinearModel, targets: tuple[SurfaceTarget, ...], progress: Progress
+        self, model: LinearModel, observations: tuple[Observation, ...], progress: Progress
     ) -> tuple[Inversion, InversionSettings]:
         """The inversion of all spheres' surfaces from half of their moduli, and its settings."""
-        mapping = modulus_map(balls_tissues(self.moduli), model.regions, loaded=True)
+        mapping = parameter_map(balls_tissues(self.moduli), model.regions, [model.n_modes], loaded=True)
         settings = from_half(mapping, self.truth)
-        problem = InverseProblem((model,), (targets,), mapping, frozenset(BODIES))
+        problem = InverseProblem((LaterState(model, observations),), mapping)
         return invert(problem, settings, progress=progress), settings
 
     def by_the_paper(self, truth: LinearModel) -> dict[str, Entry]:

@@ -32,10 +32,7 @@ from palpate.experiments.reproduce.table import COLUMNS, Entry, Table, TableRow,
 from palpate.images.distance import observation_width, smoothing_width
 from palpate.images.label_image import VoxelGrid
 from palpate.images.tissue import Role
-from palpate.inversion.invert import invert_with
-from palpate.inversion.modulus_map import modulus_map
-from palpate.inversion.problem import InverseProblem
-from palpate.inversion.surrogate import Surrogate, first_surrogate, with_modulus_series
+from palpate.inversion import InverseProblem, LaterState, ReducedBasis, invert, parameter_map, reduced_basis
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.linear_model import LinearModel, linear_model, weighted_sum
@@ -46,8 +43,9 @@ from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.tetrahedralise import tetrahedralise
 from palpate.observation.observed_surface import observed_surface
 from palpate.observation.prescribed_motion import prescribed_motion
+from palpate.observation.surface_distance import surface_distance
 from palpate.phantoms.exact_targets import target_of_truth
-from palpate.study.body import Body, inverse_problem, surface_targets
+from palpate.study.body import Body, inverse_problem, surface_observations
 from palpate.study.case import Case, Domain, DriverMotion, Mechanics, MeshSettings, Phantom
 
 __all__ = ["SURROUNDINGS_KPA", "Table2Settings", "table2"]
@@ -173,13 +171,14 @@ class _Bench:
         dilatation = choose_element(ELEMENT if space.order > 1 else "P1").dilatation
         return linear_model(space, constraint, solver=solver, dilatation=dilatation)
 
-    def surrogate_of(self, model: LinearModel) -> Surrogate:
+    def basis_of(self, model: LinearModel) -> ReducedBasis:
         """A reduced model for all rows: all responses at the middle of the table's moduli, and to high order in them.
 
         What it is made of cannot bias an estimate: its error is bounded at every estimate, and it is sharpened there.
         """
-        columns, filling = np.flatnonzero([name in ORGANS for name in model.names]), self.filling_modes(model)
-        return with_modulus_series(first_surrogate(model, moduli_of(model, self.middle_kpa)), filling, columns)
+        organs = np.array([[float(name == organ) for organ in ORGANS] for name in model.names])
+        basis = reduced_basis(model, moduli_of(model, self.middle_kpa))
+        return basis.with_modulus_series(self.filling_modes(model), organs)
 
     @property
     def middle_kpa(self) -> float:
@@ -216,9 +215,9 @@ class _Surfaces:
         return self.bench.filled(lagrange_space(self.coarse.space.mesh, "P1"))
 
     @cached_property
-    def surrogates(self) -> tuple[Surrogate, ...]:
+    def basis(self) -> ReducedBasis:
         """The reduced model of `coarse`."""
-        return (self.bench.surrogate_of(self.coarse),)
+        return self.bench.basis_of(self.coarse)
 
     def column(self, name: str, kpa: float, progress: Progress) -> dict[str, Entry]:
         """What a column that sees no voxels says of both organs."""
@@ -232,7 +231,7 @@ class _Surfaces:
 
     def coarse_truth(self, kpa: float) -> Array:
         """Displacement (n_points, 3) mm of the inverting mesh."""
-        nearby, model = self.surrogates[0].factorisation, self.coarse
+        nearby, model = self.basis.factorisation, self.coarse
         moduli, constraint = moduli_of(model, kpa), model.constraint
         loads = weighted_sum(moduli, model.coupling).toarray()
         system = LinearisedSystem(weighted_sum(moduli, model.free_stiffness), nearby, symmetric=True)
@@ -242,11 +241,11 @@ class _Surfaces:
         """What the exact surfaces of `truth` under u (n_points, 3) mm say of both organs."""
         tissues = truth.space.mesh.tissues
         surfaces = [observed_surface(self.coarse.space, i) for i, t in enumerate(tissues) if t.role is Role.ESTIMATE]
-        targets = tuple(target_of_truth(truth.space, u, surface) for surface in surfaces)
-        mapping = modulus_map(tissues, self.coarse.regions)
-        problem = InverseProblem((self.coarse,), (targets,), mapping, frozenset(ORGANS))
+        observations = tuple(surface_distance(target_of_truth(truth.space, u, surface)) for surface in surfaces)
+        mapping = parameter_map(tissues, self.coarse.regions, [self.coarse.n_modes])
+        state = LaterState(self.coarse, observations).with_approximation(self.basis)
         settings = from_half(mapping, dict.fromkeys(ORGANS, kpa))
-        inversion = invert_with(problem, settings, self.surrogates, progress=progress)
+        inversion = invert(InverseProblem((state,), mapping), settings, progress=progress)
         return entries_from_surfaces(inversion, settings, dict.fromkeys(ORGANS, kpa))
 
     def by_the_paper(self, kpa: float) -> dict[str, Entry]:
@@ -313,9 +312,9 @@ class _Imaged:
         return inverse_problem(self.body, self.case, progress=lambda _: None)
 
     @cached_property
-    def surrogates(self) -> tuple[Surrogate, ...]:
-        """One for each later state; they have the same model."""
-        return (self.bench.surrogate_of(self.problem.models[0]),) * len(self.problem.models)
+    def basis(self) -> ReducedBasis:
+        """That of all later states, which have the same model."""
+        return self.bench.basis_of(self.problem.states[0].model)
 
     def later(self, kpa: float) -> list[Array]:
         """Displacements (n_points, 3) mm of the later states: the linear law's grow with the filling."""
@@ -323,13 +322,13 @@ class _Imaged:
 
     def voxels(self, kpa: float, progress: Progress) -> dict[str, Entry]:
         """What the label images alone say of both organs."""
-        states = with_motions(self.body.states, self.bench.fine.space, self.later(kpa))
-        body = replace(self.body, states=states)
-        surfaces = tuple(target.surface for target in self.problem.targets[0])
-        problem = replace(self.problem, targets=surface_targets(body, surfaces))
-        truth = dict.fromkeys(ORGANS, kpa)
-        settings = from_half(problem.modulus_map, truth)
-        inversion = invert_with(problem, settings, self.surrogates, progress=progress)
+        imaged_later = with_motions(self.body.states, self.bench.fine.space, self.later(kpa))
+        body = replace(self.body, states=imaged_later)
+        pairs = zip(self.problem.states, surface_observations(body), strict=True)
+        states = tuple(state.with_observations(seen).with_approximation(self.basis) for state, seen in pairs)
+        truth, problem = dict.fromkeys(ORGANS, kpa), replace(self.problem, states=states)
+        settings = from_half(problem.parameters, truth)
+        inversion = invert(problem, settings, progress=progress)
         return entries_from_voxels(inversion, settings, body, truth, seed=self.bench.settings.seed)
 
 

@@ -9,23 +9,23 @@ from palpate.experiments.verification.concentric import SENSITIVITIES, hollow_sp
 from palpate.experiments.verification.inflation import NEO, NU, bore_of, inflated_model, youngs
 from palpate.experiments.verification.problem import Check, Problem
 from palpate.experiments.verification.structured_meshes import known, octant_mesh
-from palpate.experiments.verification.twin import (
-    TRUTH,
-    settings_from,
-    twin_model,
-    twin_problem,
-    with_law,
+from palpate.experiments.verification.twin import TRUTH, noise_of, settings_from, twin_model, twin_problem
+from palpate.inversion import (
+    Inversion,
+    InversionSettings,
+    Objective,
+    gauss_newton,
+    invert,
+    log_interval,
+    sandwich_covariance,
+    verdict,
+    with_first_noise,
 )
-from palpate.inversion.gauss_newton import gauss_newton
-from palpate.inversion.invert import invert
-from palpate.inversion.noise import NoiseLaw
-from palpate.inversion.posterior import sandwich_covariance
-from palpate.inversion.problem import Inversion, InversionSettings
-from palpate.inversion.verdict import NORMAL_95, log_interval, verdict
-from palpate.inversion.weighting import objective_of
+from palpate.inversion.uncertainty import NORMAL_95
 from palpate.mechanics.forward import ForwardModel
 from palpate.mechanics.linear_model import LinearModel
 from palpate.mesh.space import lagrange_space
+from palpate.observation.noise_model import NoiseModel
 from palpate.phantoms.boundary_noise import smooth_field
 
 __all__ = ["ESTIMATOR_PROBLEMS", "coverage", "gradient_error", "recovered"]
@@ -38,14 +38,14 @@ SHARP = (1e-3, 3.0)  # law of residuals of images without noise, mm
 SOURCE = "truth of the simulated case (B4, closed form)"
 
 
-def _inverted(model: LinearModel, settings: InversionSettings) -> Inversion:
-    return invert(twin_problem(model), settings, progress=lambda _: None)
+def _inverted(model: LinearModel, settings: InversionSettings, noise: NoiseModel) -> Inversion:
+    return invert(twin_problem(model, stated_noise=noise), settings, progress=lambda _: None)
 
 
 def recovered(n_surface: int, start: float) -> Array:
     """Moduli (2,) kPa of core and middle on a mesh with n_surface cells, both started at `start` of the outer one's."""
-    settings = with_law(settings_from(np.full(2, start)), *SHARP)
-    return np.asarray(TRUTH[2] * np.exp(_inverted(twin_model(n_surface), settings).minimum.unknowns))
+    found = _inverted(twin_model(n_surface), settings_from(np.full(2, start)), noise_of(*SHARP))
+    return np.asarray(TRUTH[2] * np.exp(found.minimum.unknowns))
 
 
 def coverage(repeats: int, seed: int) -> Array:
@@ -54,17 +54,17 @@ def coverage(repeats: int, seed: int) -> Array:
     Each repeat moves the later surfaces by a smooth random field, minimises anew and makes its own interval.
     """
     model, rng = twin_model(8), np.random.default_rng(seed)
-    law = NoiseLaw(np.array([NOISE_SD**2]), np.array([NOISE_LENGTH]))
-    settings = with_law(settings_from(np.ones(2)), NOISE_SD, NOISE_LENGTH)
-    first = _inverted(model, settings)
-    reduced, start = tuple(s.reduced for s in first.surrogates), first.minimum.unknowns
+    stated, settings = noise_of(NOISE_SD, NOISE_LENGTH), settings_from(np.ones(2))
+    first = _inverted(model, settings, stated)
+    approximation, start = first.objective.states[0].approximation, first.minimum.unknowns
+    assert approximation is not None
     truth, inside = np.log(TRUTH[:2] / TRUTH[2]), np.zeros(2)
     for _ in range(repeats):
         noise = smooth_field(rng, sd_mm=NOISE_SD, correlation_mm=NOISE_LENGTH, features=200)
-        problem = twin_problem(model, noise)
-        objective = objective_of(problem, reduced, law).with_fresh_correspondence(start)
-        found = gauss_newton(objective, start, bounds=settings.bounds)
-        sd = np.sqrt(np.diag(sandwich_covariance(found.evaluation, law, 2)))
+        problem = twin_problem(model, noise, stated_noise=stated)
+        objective = with_first_noise(Objective(problem.states, problem.parameters).under([approximation]))
+        found = gauss_newton(objective.rematched(start), start, bounds=settings.bounds)
+        sd = np.sqrt(np.diag(sandwich_covariance(objective, found.evaluation)))
         inside += np.abs(found.unknowns - truth) < NORMAL_95 * sd
     return np.asarray(inside / repeats)
 
@@ -96,7 +96,7 @@ def _scale_checks() -> tuple[Check, ...]:
     model = twin_model(8, outer_known=False)
     tangent = model.solve(TRUTH, np.zeros(0)).tangent()
     together = float(np.abs(tangent.sum(axis=1)).max() / np.abs(tangent).max())
-    mapping = twin_problem(model).modulus_map
+    mapping = twin_problem(model).parameters
     word, _ = verdict((0.9, 1.1), at_bound=False, absolute=mapping.absolute)
     return (
         Check("du by a common factor of all moduli, over the largest part", 0.0, together, 1e-7, scale=1.0),
@@ -143,8 +143,7 @@ def _information_checks() -> tuple[Check, ...]:
 
 def _bound_checks() -> tuple[Check, ...]:
     """The truth of the core (1/3) lies below the lower bound (1/2)."""
-    settings = with_law(settings_from(np.ones(2), lower=0.5), *SHARP)
-    found = _inverted(twin_model(8), settings)
+    found = _inverted(twin_model(8), settings_from(np.ones(2), lower=0.5), noise_of(*SHARP))
     ratio = float(np.exp(found.minimum.unknowns[0]))
     interval = log_interval(ratio, 0.05, lower=0.5, upper=10.0)
     word, _ = verdict(interval, at_bound=abs(ratio / 0.5 - 1.0) < 1e-6, absolute=True)

@@ -5,27 +5,26 @@ Radii 5, 10, 20, 30 mm, nu = 0.4; E = 50 and 100 kPa are sought, the outer 150 k
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.experiments.verification.conditions import held_components, sphere_faces
 from palpate.experiments.verification.structured_meshes import known, octant_mesh, unknown
-from palpate.inversion.gauss_newton import Bounds
-from palpate.inversion.modulus_map import modulus_map
-from palpate.inversion.noise import NoiseLaw
-from palpate.inversion.problem import InverseProblem, InversionSettings
+from palpate.inversion import Bounds, InverseProblem, InversionSettings, LaterState, parameter_map
 from palpate.mechanics.element import triangle_quadrature
 from palpate.mechanics.linear_model import LinearModel, linear_model
 from palpate.mesh.anatomy import LevelSet
 from palpate.mesh.space import lagrange_space
 from palpate.mesh.surface import triangle_normals
+from palpate.observation.noise_model import NoiseModel
 from palpate.observation.observed_surface import ObservedSurface, observed_surface
+from palpate.observation.surface_distance import surface_distance
 from palpate.observation.target import SurfaceTarget, target_from
 from palpate.phantoms.boundary_noise import SmoothField
 
-__all__ = ["TRUTH", "SphericalShell", "Warped", "settings_from", "twin_model", "twin_problem", "with_law"]
+__all__ = ["TRUTH", "SphericalShell", "Warped", "noise_of", "settings_from", "twin_model", "twin_problem"]
 
 Array = NDArray[np.float64]
 
@@ -86,16 +85,19 @@ def twin_model(n_surface: int = 8, *, outer_known: bool = True) -> LinearModel:
     return linear_model(space, held_components(held, motion))
 
 
-def twin_problem(model: LinearModel, noise: SmoothField | None = None) -> InverseProblem:
-    """Core and middle are observed; `noise` moves their later surfaces."""
+def twin_problem(
+    model: LinearModel, noise: SmoothField | None = None, *, stated_noise: NoiseModel | None = None
+) -> InverseProblem:
+    """Core and middle are observed; `noise` moves their later surfaces; stated_noise: what the estimate is told."""
     shells = ((5.0, 10.0, 5.0 + PUSH, LATER[0]), (10.0, 20.0, LATER[0], LATER[1]))
-    targets = []
+    observations = []
     for tissue, (inner, outer, later_inner, later_outer) in enumerate(shells):
         surface = observed_surface(model.space, tissue)
         later = SphericalShell(later_inner, later_outer)
-        targets.append(_target(model, surface, SphericalShell(inner, outer), later, noise))
-    mapping = modulus_map(model.space.mesh.tissues, model.regions)
-    return InverseProblem((model,), (tuple(targets),), mapping, frozenset({"core", "middle"}))
+        target = _target(model, surface, SphericalShell(inner, outer), later, noise)
+        observations.append(surface_distance(target, stated_noise=stated_noise))
+    mapping = parameter_map(model.space.mesh.tissues, model.regions, [model.n_modes])
+    return InverseProblem((LaterState(model, tuple(observations)),), mapping)
 
 
 def _target(
@@ -126,6 +128,6 @@ def settings_from(start: Array, *, lower: float = 0.01, upper: float = 10.0) -> 
     return InversionSettings((np.log(start),), Bounds(np.full(n, np.log(lower)), np.full(n, np.log(upper))))
 
 
-def with_law(settings: InversionSettings, sd_mm: float, length_mm: float) -> InversionSettings:
-    """The same under a given law of the residuals: standard deviation and correlation length, mm."""
-    return replace(settings, law=NoiseLaw(np.array([sd_mm**2]), np.array([length_mm])))
+def noise_of(sd_mm: float, length_mm: float) -> NoiseModel:
+    """Noise with a standard deviation and a correlation length, mm."""
+    return NoiseModel(np.array([sd_mm**2]), np.array([length_mm]))

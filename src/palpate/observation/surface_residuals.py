@@ -1,4 +1,4 @@
-"""Signed surface distances between a deformed model and an image, as differences to the rest state."""
+"""Signed distances between a deformed surface and an image, as differences to the rest state, with derivatives."""
 
 from __future__ import annotations
 
@@ -10,34 +10,13 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from palpate.mesh.surface import mean_curvature, triangle_normals, vertex_normals
+from palpate.observation.contract import Residuals
 from palpate.observation.observed_surface import ObservedSurface
 from palpate.observation.target import SurfaceTarget, places_within
 
-__all__ = ["Correspondence", "SurfaceResiduals", "correspondence", "surface_residuals"]
+__all__ = ["Correspondence", "correspondence", "surface_residuals"]
 
 ON_EDGE = 1e-9
-
-
-@dataclass(frozen=True, slots=True)
-class SurfaceResiduals:
-    """Residuals of one surface, model -> image first, then image -> model.
-
-    values (n,) mm; weights (n,) dimensionless, 1/2 in total for each direction; places (n, 3) mm and normals (n, 3) of
-    the deformed surface, and where these places are at rest, material (n, 3) mm; excess (n,) mm, what was subtracted
-    for maps and facets (see `Correspondence`); jacobian (n, 3 n_vertices)
-    d values / d displacement of the surface's points; normal_jacobian: the same for a smooth surface without noise,
-    n . du. The exact one also holds how voxel noise and facets change as the surface slides along itself, which tells
-    nothing of how it slides.
-    """
-
-    values: NDArray[np.float64]
-    weights: NDArray[np.float64]
-    places: NDArray[np.float64]
-    normals: NDArray[np.float64]
-    material: NDArray[np.float64]
-    excess: NDArray[np.float64]
-    jacobian: sparse.csr_matrix[np.float64]
-    normal_jacobian: sparse.csr_matrix[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,26 +41,21 @@ class _Closest:
     places: NDArray[np.float64]
 
 
-def surface_residuals(
-    target: SurfaceTarget, displacement: NDArray[np.float64], held: Correspondence
-) -> SurfaceResiduals:
+def surface_residuals(target: SurfaceTarget, displacement: NDArray[np.float64], held: Correspondence) -> Residuals:
     """Residuals and their exact derivative at a displacement (n_vertices, 3) mm of the surface's points.
 
-    model -> image: r = d_after(x + u) - d_before(x) - b(x)        at quadrature points of the observed triangles;
-    image -> model: r = s(y) - (d_before(X) - level) - b(X)        where s is the signed distance of the closest model
-    point x = X + u(X) from the image point y, positive when the model lies outside; b is `held.excess`.
+    model -> image first, then image -> model (see `SurfaceDistance`), each with half of the weight, shared out by area.
     """
-    forward = _model_to_image(target, displacement, held.excess)
+    forward = _model_to_image(target, displacement, held)
     backward = _image_to_model(target, displacement, held)
-    return SurfaceResiduals(
+    return Residuals(
         np.concatenate([forward.values, backward.values]),
         np.concatenate([forward.weights, backward.weights]),
         np.concatenate([forward.places, backward.places]),
         np.concatenate([forward.normals, backward.normals]),
         np.concatenate([forward.material, backward.material]),
-        np.concatenate([forward.excess, backward.excess]),
         sparse.vstack([forward.jacobian, backward.jacobian], format="csr"),
-        sparse.vstack([forward.normal_jacobian, backward.normal_jacobian], format="csr"),
+        sparse.vstack([forward.smooth_jacobian, backward.smooth_jacobian], format="csr"),
     )
 
 
@@ -137,16 +111,14 @@ def _bulge(surface: ObservedSurface, displacement: NDArray[np.float64]) -> NDArr
     return np.asarray(volumes / np.bincount(triangles.ravel(), np.repeat(areas, 3), len(vertices)))
 
 
-def _model_to_image(
-    target: SurfaceTarget, displacement: NDArray[np.float64], at_vertices: NDArray[np.float64]
-) -> SurfaceResiduals:
+def _model_to_image(target: SurfaceTarget, displacement: NDArray[np.float64], held: Correspondence) -> Residuals:
     surface = target.surface
     corners = surface.triangles[target.triangle]
     material, places = (
         places_within(vertices[corners], target.barycentric) for vertices in (surface.rest, surface.rest + displacement)
     )
     gradient = target.after.gradient_at(places)
-    excess = np.einsum("qk,qk->q", target.barycentric, at_vertices[corners])
+    excess = np.einsum("qk,qk->q", target.barycentric, held.excess[corners])
     values = target.after.at(places) - target.rest_distance - excess
     rows = target.barycentric[:, :, None] * gradient[:, None]
     normals = _smooth_normals(surface.rest + displacement, surface.triangles, corners, target.barycentric)
@@ -155,10 +127,10 @@ def _model_to_image(
     weights = 0.5 * target.area / target.area.sum()
     n = len(surface.rest)
     exact, normal = _sparse_rows(rows, corners, n), _sparse_rows(smooth, corners, n)
-    return SurfaceResiduals(values, weights, places, normals, material, excess, exact, normal)
+    return Residuals(values, weights, places, normals, material, exact, normal)
 
 
-def _image_to_model(target: SurfaceTarget, displacement: NDArray[np.float64], held: Correspondence) -> SurfaceResiduals:
+def _image_to_model(target: SurfaceTarget, displacement: NDArray[np.float64], held: Correspondence) -> Residuals:
     surface, kept = target.surface, held.kept
     image = target.image_points[kept]
     closest = _closest(target, displacement, image)
@@ -183,7 +155,7 @@ def _image_to_model(target: SurfaceTarget, displacement: NDArray[np.float64], he
     weights = 0.5 * target.image_area[kept] / max(target.image_area[kept].sum(), 1e-30)
     n = len(surface.rest)
     exact, plane = _sparse_rows(rows, corners, n), _sparse_rows(smooth, corners, n)
-    return SurfaceResiduals(values, weights, closest.places, normals, material, excess, exact, plane)
+    return Residuals(values, weights, closest.places, normals, material, exact, plane)
 
 
 def _smooth_normals(

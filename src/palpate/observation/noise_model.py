@@ -1,4 +1,4 @@
-"""The law of the surfaces' residuals: how large they are and how far they are correlated."""
+"""The noise model of residuals: how large they are and how far they are correlated."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scipy.spatial.distance import cdist
 
 from palpate.parallel import mapped
 
-__all__ = ["NoiseLaw", "fit_noise_law"]
+__all__ = ["EXACT_NOISE", "SEGMENTATION_NOISE", "NoiseModel", "fit_noise_model"]
 
 LENGTHS = (0.5, 0.8, 1.2, 2.0, 3.0, 4.5, 6.5, 9.5, 14.0)  # mm
 CELL = 1.0  # mm: residuals nearer than that are averaged before they are compared
@@ -26,7 +26,7 @@ FLOOR = 1e-3  # mm: no surface in an image is known better
 
 
 @dataclass(frozen=True, slots=True)
-class NoiseLaw:
+class NoiseModel:
     """Covariance of two residuals, C(d) n_i.n_j with C(d) = sum_m variance_m exp(-d^2 / (2 length_m^2)).
 
     variances (n_terms,) mm^2; lengths (n_terms,) mm; n_i.n_j is the product of the surface's normals.
@@ -64,13 +64,17 @@ class NoiseLaw:
         return total
 
 
-def fit_noise_law(
+EXACT_NOISE = NoiseModel(np.array([0.03**2]), np.array([3.0]))  # of surfaces that no image has rounded
+SEGMENTATION_NOISE = NoiseModel(np.array([0.3**2]), np.array([3.0]))  # of segmentations of which nothing is known
+
+
+def fit_noise_model(
     values: Sequence[NDArray[np.float64]], places: Sequence[NDArray[np.float64]], normals: Sequence[NDArray[np.float64]]
-) -> NoiseLaw:
-    """Fit the law to residuals (n,) mm of several surfaces at places (n, 3) mm with normals (n, 3).
+) -> NoiseModel:
+    """Fit the model to residuals (n,) mm of several surfaces at places (n, 3) mm with normals (n, 3).
 
     Mean products of residuals in bins of distance, fitted by non-negative least squares to Gaussians of fixed lengths
-    (0.5 to 14 mm). Residuals below 0.001 mm tell no law: they are independent ones of that size.
+    (0.5 to 14 mm). Residuals below 0.001 mm tell no more: they are independent ones of that size.
     """
     sums = sum(
         mapped(lambda of: _binned_products(*_cells(*of)), zip(values, places, normals, strict=True)),
@@ -83,8 +87,8 @@ def fit_noise_law(
     variances, _ = nnls(weight[:, None] * kernels, weight * products / cosines)
     kept = variances > 0.0
     if variances.sum() < FLOOR**2:
-        return NoiseLaw(np.array([FLOOR**2]), np.array([1.0]))
-    return NoiseLaw(variances[kept], np.array(LENGTHS)[kept])
+        return NoiseModel(np.array([FLOOR**2]), np.array([1.0]))
+    return NoiseModel(variances[kept], np.array(LENGTHS)[kept])
 
 
 def _binned_products(
@@ -121,7 +125,7 @@ def _cells(
 def _scattered(keys: NDArray[np.int64]) -> NDArray[np.uint64]:
     """Numbers (n,) that follow from the keys (n,) but without order (the finaliser of SplitMix64; Steele et al. 2014).
 
-    Cells chosen by them stay chosen when others come and go, so that the law does not jump as a surface moves.
+    Cells chosen by them stay chosen when others come and go, so that the fit does not jump as a surface moves.
     """
     mixed = keys.astype(np.uint64)
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):

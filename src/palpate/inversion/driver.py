@@ -1,4 +1,4 @@
-"""What is believed of the drivers' motion before the organs are asked: learned from the images by its evidence.
+"""The drivers' motion: what is believed of it, learned from the images by its evidence, and its finer part.
 
 A wall that moves by 3 mm as one piece must not be allowed to slide by 5 mm on its own: nothing in the images holds it
 back along itself, and the moduli then pay for it. Nor must one that swells be taken for one that drifts.
@@ -7,23 +7,23 @@ back along itself, and the moduli then pay for it. Nor must one that swells be t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, optimize
 
-from palpate.inversion.objective import Evaluation
-from palpate.inversion.problem import InverseProblem
-from palpate.observation.wall_modes import Wall
+from palpate.inversion.objective import Evaluation, Objective
+from palpate.mesh.constraint import Constraint
 
-__all__ = ["learned_prior"]
+__all__ = ["learned_precision", "refined_walls"]
 
 AMPLITUDES = (0.005, 2.0)  # times the modes' own standard deviation
 FIRST_AMPLITUDES = ((0.3, 0.05), (0.05, 0.3))  # of drift and swelling; one may hide the other
 LEAST_VARIANCE = 1e-3  # of a coefficient, times its variance under the modes' own kernel: no mode is forbidden
 ALIKE = 2.0  # of the log-evidence
+FINE_KERNEL_MM = 8.0  # correlation length of what a wall does beyond its modes
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,32 +61,54 @@ class _Belief:
     evidence: float
 
 
-def learned_prior(
-    problem: InverseProblem, evaluation: Evaluation, unknowns: NDArray[np.float64]
+def learned_precision(
+    objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
-    """Precision P (n_coefficients, n_coefficients) with the largest evidence; None where the walls are not given.
+    """Precision P (n_coefficients, n_coefficients) with the largest evidence; None where no walls are given.
 
     Each wall's motion is the sum of two Gaussian processes, a drift and a swelling (see `Wall`), with kernel lengths
     and standard deviations of their own. With the residuals linear around `unknowns` x (n_unknowns,), A = J^T W J and
     b = A x - J^T W r, the log-evidence of P is 1/2 (b^T (A + P)^-1 b - ln det(A + P) + ln det P) up to a constant
-    (MacKay 1992, Neural Computation 4, 415-447, section 4; the log-moduli have no prior). Of kernels whose evidence is
-    as good as equal, those that leave the log-moduli the widest posterior.
+    (MacKay 1992, Neural Computation 4, 415-447, section 4). Of kernels whose evidence is as good as equal, those that
+    leave the log-moduli the widest posterior.
     """
-    if not any(problem.walls):
+    if not any(state.walls for state in objective.states):
         return None
     data = evaluation.matrix - evaluation.prior
-    pull = data @ unknowns - (evaluation.score - evaluation.prior @ unknowns)
-    n_parameters = len(problem.modulus_map.tissues)
-    prior, start = evaluation.prior.copy(), n_parameters
-    for model, walls in zip(problem.models, problem.walls, strict=True):
-        for wall in walls:
-            places = start + wall.columns
-            beliefs = _beliefs(wall, _seen(data + prior, data, pull, places))
+    pull = data @ unknowns - (evaluation.score - evaluation.prior_score)
+    n_parameters, prior = objective.n_parameters, evaluation.prior.copy()
+    for s, state in enumerate(objective.states):
+        own = objective.parameters.unknowns_of(s)[n_parameters:]
+        for wall in state.walls:
+            places = own[wall.columns]
+            seen = _seen(data + prior, data, pull, places)
+            beliefs = [_most_evident(pair, seen) for pair in product(wall.drifts, wall.swellings)]
             best = max(belief.evidence for belief in beliefs)
             alike = [(b.evidence, _with(prior, places, b.covariance)) for b in beliefs if b.evidence > best - ALIKE]
             prior = max(alike, key=lambda pair: (_width(data + pair[1], n_parameters), pair[0]))[1]
-        start += model.n_modes
     return prior[n_parameters:, n_parameters:]
+
+
+def refined_walls(objective: Objective, evaluation: Evaluation) -> list[Constraint | None]:
+    """Each state's constraint with a finer motion of the wall in its offset; None where no driver asks for it.
+
+    The correction is found anew each time, jointly over all outer iterations with the modes and the moduli (block
+    coordinate descent), from the residuals of an evaluation (see `Observation.wall_motion`).
+    """
+    refined: list[Constraint | None] = []
+    for s, state in enumerate(objective.states):
+        rest, present = state.model.constraint, state.constraint
+        offset, asked = present.offset.copy(), False
+        for line in (line for line in evaluation.lines if line.state == s):
+            dofs = line.observation.dofs
+            motion = line.observation.wall_motion(
+                line.residuals, present=(present.offset - rest.offset)[dofs], kernel_mm=FINE_KERNEL_MM
+            )
+            if motion is not None:
+                moves = np.any(rest.modes[dofs] != 0.0, axis=1)  # not where a bone holds the wall
+                offset[dofs], asked = rest.offset[dofs] + np.where(moves, motion, 0.0), True
+        refined.append(replace(present, offset=offset) if asked else None)
+    return refined
 
 
 def _seen(
@@ -102,11 +124,6 @@ def _seen(
     followed = across.T @ (scale[:, None] * linalg.solve(scaled, right, assume_a="pos", check_finite=False))
     information = data[np.ix_(places, places)] - followed[:, :-1]
     return _Seen(0.5 * (information + information.T), pull[places] - followed[:, -1])
-
-
-def _beliefs(wall: Wall, seen: _Seen) -> list[_Belief]:
-    """For each pair of kernel lengths the standard deviations with the largest evidence."""
-    return [_most_evident(pair, seen) for pair in product(wall.drifts, wall.swellings)]
 
 
 def _most_evident(parts: Sequence[NDArray[np.float64]], seen: _Seen) -> _Belief:

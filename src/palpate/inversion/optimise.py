@@ -1,19 +1,22 @@
-"""Gauss-Newton steps on all unknowns, with a trust region on the log-moduli."""
+"""Minima of an objective over all unknowns: Gauss-Newton with a trust region on the log-moduli, or L-BFGS-B."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import optimize
 
 from palpate.inversion.objective import Evaluation, Objective
 
-__all__ = ["Bounds", "Iterate", "Minimum", "Outcome", "gauss_newton"]
+__all__ = ["Bounds", "Iterate", "Minimum", "Outcome", "fit_coefficients", "gauss_newton", "lbfgs", "posterior_sd"]
 
 FIRST_RADIUS = 1.0  # of the log-moduli, per step: a factor e
 MAX_RADIUS = 2.0
+SEARCHES = 8  # trials of a step
+COEFFICIENTS = 1e-2  # decrement of the drivers' coefficients at held moduli, which other unknowns are going to change
 STALLED = 1e-2  # decrement under which a refused step is the noise of re-chosen closest points, whatever it moves
 
 
@@ -25,6 +28,7 @@ class Outcome(StrEnum):
     STEPS = "the iteration reached its largest number of steps; raise it, or start nearer"
     STUCK = "no step reduced the objective; look at the fit of the driver's surface and at the images"
     NOT_FINITE = "the objective is not a finite number; check the images and the moduli's bounds"
+    NO_EQUILIBRIUM = "the body has no equilibrium there under the material law"
 
     @property
     def converged(self) -> bool:
@@ -52,12 +56,23 @@ class Iterate:
 
 @dataclass(frozen=True, slots=True)
 class Minimum:
-    """Where an iteration ended: unknowns (n,), the evaluation there, the outcome and the way to it."""
+    """Where an iteration ended: unknowns (n,), the evaluation there, the outcome, the way to it, what it cost."""
 
     unknowns: NDArray[np.float64]
     evaluation: Evaluation
     outcome: Outcome
     history: tuple[Iterate, ...]
+    evaluations: int = 0
+
+    @property
+    def converged(self) -> bool:
+        """Whether it is a minimum."""
+        return self.outcome.converged
+
+    def after(self, before: Minimum) -> Minimum:
+        """The same with the way, and the cost, of what led to where it began."""
+        history, evaluations = before.history + self.history, before.evaluations + self.evaluations
+        return replace(self, history=history, evaluations=evaluations)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +91,30 @@ class _Region:
         return _Region(min(2.0 * self.radius, MAX_RADIUS), self.damping / 10.0 if self.damping > 1e-6 else 0.0)
 
 
+def posterior_sd(minimum: Minimum, n_parameters: int) -> NDArray[np.float64]:
+    """Standard deviations (n_parameters,) of the log-moduli by the Gauss-Newton matrix."""
+    inverse = np.linalg.inv(minimum.evaluation.matrix)[:n_parameters, :n_parameters]
+    return np.asarray(np.sqrt(np.diag(inverse)))
+
+
+def fit_coefficients(
+    objective: Objective,
+    theta: NDArray[np.float64],
+    *,
+    bounds: Bounds,
+    coefficients: NDArray[np.float64] | None = None,
+    max_steps: int = 40,
+) -> Minimum:
+    """The best driver coefficients at held log-moduli theta (n_parameters,), to a decrement of 1e-2.
+
+    coefficients (n_coefficients,), where the search begins; None: at rest. They are left where they are after
+    `max_steps`.
+    """
+    first = np.zeros(objective.parameters.n_unknowns - len(theta)) if coefficients is None else coefficients
+    start = np.concatenate([theta, first])
+    return gauss_newton(objective, start, bounds=bounds, hold_theta=True, tolerance=COEFFICIENTS, max_steps=max_steps)
+
+
 def gauss_newton(
     objective: Objective,
     start: NDArray[np.float64],
@@ -83,7 +122,7 @@ def gauss_newton(
     bounds: Bounds,
     hold_theta: bool = False,
     tolerance: float = 1e-3,
-    still: float = np.inf,
+    within: NDArray[np.float64] | float = np.inf,
     max_steps: int = 40,
 ) -> Minimum:
     """Minimise `objective` from `start` (n_unknowns,).
@@ -91,25 +130,29 @@ def gauss_newton(
     Step: (J^T W J + P + mu D) d = -s, s the score, with the log-moduli's part no longer than the trust radius; a step
     is taken when it reduces the objective (Nocedal & Wright 2006, Algorithm 4.1) or lowers by a tenth the decrement
     -s.d / 2, the reduction that the quadratic model still promises in units of log-likelihood. It ends when that is
-    under `tolerance` and the step to the model's minimum moves no log-modulus by more than `still`. `hold_theta` moves
-    the driver's coefficients only.
+    under `tolerance` and the step to the model's minimum moves each log-modulus by less than `within` (one number, or
+    (n_parameters,)). `hold_theta` moves the drivers' coefficients only.
     """
     unknowns, region, history = start.copy(), _Region(), list[Iterate]()
-    now = objective(unknowns)
+    now, evaluations, outcome = objective(unknowns), 1, Outcome.STEPS
     for _ in range(max_steps):
         if not np.isfinite(now.value):
-            return Minimum(unknowns, now, Outcome.NOT_FINITE, tuple(history))
+            outcome = Outcome.NOT_FINITE
+            break
         free = _free(objective, unknowns, now, bounds, hold_theta)
         decrement = _decrement(now, free)
         history.append(Iterate(unknowns[: objective.n_parameters], now.value, now.misfit_mm2, decrement))
-        if decrement < tolerance and _moves(now, free, objective.n_parameters) < still:
-            return Minimum(unknowns, now, Outcome.CONVERGED, tuple(history))
-        found = _search(objective, unknowns, now, free=free, bounds=bounds, region=region)
+        if decrement < tolerance and np.all(_moves(now, free, objective.n_parameters) < within):
+            outcome = Outcome.CONVERGED
+            break
+        found, trials = _search(objective, unknowns, now, free=free, bounds=bounds, region=region)
+        evaluations += trials
         if found is None:
             near = decrement < STALLED or _near(now, free, objective.n_parameters)
-            return Minimum(unknowns, now, Outcome.STALLED if near else Outcome.STUCK, tuple(history))
+            outcome = Outcome.STALLED if near else Outcome.STUCK
+            break
         unknowns, now, region = found
-    return Minimum(unknowns, now, Outcome.STEPS, tuple(history))
+    return Minimum(unknowns, now, outcome, tuple(history), evaluations)
 
 
 def _search(
@@ -120,21 +163,20 @@ def _search(
     free: NDArray[np.bool_],
     bounds: Bounds,
     region: _Region,
-) -> tuple[NDArray[np.float64], Evaluation, _Region] | None:
-    """First step that makes progress, with the region for the next; None when eight did not."""
+) -> tuple[tuple[NDArray[np.float64], Evaluation, _Region] | None, int]:
+    """First step that makes progress, with the region for the next, None when eight did not; and the trials."""
     n = objective.n_parameters
     before = _decrement(now, free)
-    for _ in range(8):
-        step = _step(now, free, n, region)
-        trial = unknowns + step
+    for trials in range(1, SEARCHES + 1):
+        trial = unknowns + _step(now, free, n, region)
         trial[:n] = np.clip(trial[:n], bounds.lower, bounds.upper)
-        there = objective(trial)
+        step, there = trial - unknowns, objective(trial)
         promised = -now.score @ step - 0.5 * step @ now.matrix @ step
         gain = now.value - there.value
         if gain > 1e-4 * promised or _decrement(there, free) < 0.9 * before:
-            return trial, there, region.larger() if gain > 0.25 * promised else region
+            return (trial, there, region.larger() if gain > 0.25 * promised else region), trials
         region = region.smaller()
-    return None
+    return None, SEARCHES
 
 
 def _free(
@@ -152,9 +194,9 @@ def _decrement(now: Evaluation, free: NDArray[np.bool_]) -> float:
     return float(0.5 * score @ _solve(matrix, score))
 
 
-def _moves(now: Evaluation, free: NDArray[np.bool_], n_parameters: int) -> float:
-    """Largest change of a log-modulus by the step to the minimum of the quadratic model."""
-    return float(np.abs(_step(now, free, n_parameters, _Region(np.inf, 0.0))[:n_parameters]).max(initial=0.0))
+def _moves(now: Evaluation, free: NDArray[np.bool_], n_parameters: int) -> NDArray[np.float64]:
+    """Change (n_parameters,), without sign, of the log-moduli by the step to the minimum of the quadratic model."""
+    return np.abs(_step(now, free, n_parameters, _Region(np.inf, 0.0))[:n_parameters])
 
 
 def _near(now: Evaluation, free: NDArray[np.bool_], n_parameters: int) -> bool:
@@ -193,3 +235,52 @@ def _solve(matrix: NDArray[np.float64], rhs: NDArray[np.float64]) -> NDArray[np.
     scaled = scale[:, None] * matrix * scale
     scaled[np.diag_indices_from(scaled)] += 1e-12
     return np.asarray(scale * np.linalg.solve(scaled, scale * rhs))
+
+
+def lbfgs(
+    objective: Objective, start: NDArray[np.float64], *, bounds: Bounds, tolerance: float = 1e-4, max_steps: int = 60
+) -> Minimum:
+    """Minimise min_q J(theta, q) over theta from `start` (n_unknowns,) with L-BFGS-B (Byrd et al. 1995).
+
+    Its gradient is dJ/dtheta at the best q (envelope theorem). It ends when the projected gradient, scaled by the
+    curvature at the start, falls under the square root of `tolerance`.
+    """
+    n = objective.n_parameters
+    first = gauss_newton(objective, start, bounds=bounds, hold_theta=True, tolerance=tolerance)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(first.evaluation.matrix)[:n], 1e-30))
+    profile = dict[bytes, Minimum]()  # of pure answers: what was asked before changes none
+
+    def at(scaled: NDArray[np.float64]) -> Minimum:
+        """The best coefficients at scaled log-moduli (n_parameters,), sought from those of the start."""
+        key = scaled.tobytes()
+        if key not in profile:
+            unknowns = np.concatenate([scaled * scale, first.unknowns[n:]])
+            profile[key] = gauss_newton(objective, unknowns, bounds=bounds, hold_theta=True, tolerance=tolerance)
+        return profile[key]
+
+    def value_and_slope(scaled: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """min_q J and its slope (n_parameters,) by the scaled log-moduli (n_parameters,)."""
+        now = at(scaled).evaluation
+        return now.value, now.gradient[:n] * scale
+
+    found = optimize.minimize(
+        value_and_slope,
+        start[:n] / scale,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=optimize.Bounds(bounds.lower / scale, bounds.upper / scale),
+        options={"maxiter": max_steps, "ftol": 1e-14, "gtol": float(np.sqrt(tolerance))},
+    )
+    best = at(found.x)
+    history = tuple(_iterate(minimum, n, scale) for minimum in [*profile.values(), best])
+    small = history[-1].decrement < 100.0 * tolerance
+    outcome = Outcome.CONVERGED if found.success else Outcome.STALLED if small else Outcome.STEPS
+    evaluations = first.evaluations + sum(minimum.evaluations for minimum in profile.values())
+    return Minimum(best.unknowns, best.evaluation, outcome, history, evaluations)
+
+
+def _iterate(minimum: Minimum, n_parameters: int, scale: NDArray[np.float64]) -> Iterate:
+    """The point with half of the squared scaled slope in the place of the decrement."""
+    now = minimum.evaluation
+    slope = now.gradient[:n_parameters] * scale
+    return Iterate(minimum.unknowns[:n_parameters], now.value, now.misfit_mm2, float(0.5 * slope @ slope))

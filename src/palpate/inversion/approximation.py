@@ -1,0 +1,172 @@
+"""What stands in for a full model while an objective is minimised, and the plainest such: it solves everywhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.mechanics.equilibrium import from_start
+from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
+from palpate.mechanics.first_order import FirstOrderModel, expanded
+from palpate.mechanics.forward import Equilibrium, ForwardModel, SolveCounts
+from palpate.mechanics.linear_model import LinearModel, with_constraint
+from palpate.mechanics.solvers.contract import Factorisation
+from palpate.mesh.constraint import Constraint
+
+__all__ = ["Approximation", "ExactApproximation", "LocalModel", "Place"]
+
+
+class LocalModel(ForwardModel, Protocol):
+    """A forward model of all points that can answer at some of them only."""
+
+    def at(self, dofs: NDArray[np.int64]) -> ForwardModel:
+        """The same model with the outputs `dofs` (n,) only."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Moduli (n_regions,) kPa and driver coefficients (n_modes,) at which a model is approximated.
+
+    directions (n_regions + n_modes, k) of (ln E, q): those along which derivatives are wanted, None where the
+    displacement alone is; metric (n_regions + n_modes, n_regions + n_modes): the Gauss-Newton matrix there; near:
+    whether the estimate is so near that exact derivatives are worth their price.
+    """
+
+    moduli: NDArray[np.float64]
+    coefficients: NDArray[np.float64]
+    directions: NDArray[np.float64] | None = None
+    metric: NDArray[np.float64] | None = None
+    near: bool = True
+
+    def same_as(self, other: Place | None) -> bool:
+        """Whether moduli and coefficients are those of another place."""
+        return (
+            other is not None
+            and np.array_equal(self.moduli, other.moduli)
+            and np.array_equal(self.coefficients, other.coefficients)
+        )
+
+
+class Approximation(Protocol):
+    """A cheap model of all points near some place, and the way to make it exact elsewhere; an immutable value."""
+
+    @property
+    def model(self) -> LocalModel:
+        """The cheap model."""
+        ...
+
+    @property
+    def constraint(self) -> Constraint:
+        """What is prescribed to the full model."""
+        ...
+
+    @property
+    def factorisation(self) -> Factorisation | None:
+        """A factorisation of the full model's stiffness near the last place."""
+        ...
+
+    @property
+    def counts(self) -> SolveCounts:
+        """What the full model has cost so far."""
+        ...
+
+    @property
+    def reach(self) -> float:
+        """Distance in ln E from its place within which the approximation is used."""
+        ...
+
+    @property
+    def derivatives_at(self) -> NDArray[np.float64] | None:
+        """Moduli (n_regions,) kPa where the derivatives that decide the estimate are exact; None: nowhere yet."""
+        ...
+
+    def update(self, at: Place) -> Self:
+        """The approximation made exact at a place: the displacement, and the derivatives along its directions.
+
+        Raises `NotConverged` when the full model has no equilibrium there, `SolverError` when it cannot be solved.
+        """
+        ...
+
+    def error(self, at: Place) -> float:
+        """Relative error, in energy, of the displacement at a place: a bound or an estimate."""
+        ...
+
+    def with_constraint(self, constraint: Constraint) -> Self:
+        """The approximation of the same body with another offset of what is prescribed."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class ExactApproximation:
+    """The full model, solved anew at every place with all its derivatives; implements `Approximation`.
+
+    Nothing is spared: what the other ones find is held against it.
+    """
+
+    linear: LinearModel
+    finite_strain: FiniteStrainModel | None
+    model: FirstOrderModel
+    place: Place
+    equilibrium: Equilibrium = field(repr=False)
+    counts: SolveCounts
+
+    @property
+    def constraint(self) -> Constraint:
+        """What is prescribed to the model."""
+        return self.linear.constraint
+
+    @property
+    def factorisation(self) -> Factorisation | None:
+        """That of the finite-strain equilibrium, if it is one."""
+        return self.equilibrium.factorisation if isinstance(self.equilibrium, FiniteStrainEquilibrium) else None
+
+    @property
+    def reach(self) -> float:
+        """As far as an expansion to first order is trusted."""
+        return 0.8
+
+    @property
+    def derivatives_at(self) -> NDArray[np.float64]:
+        """Where the model was last solved: there all derivatives are exact."""
+        return self.place.moduli
+
+    def update(self, at: Place) -> ExactApproximation:
+        """The model solved at a place, and expanded there; raises as `Approximation.update` does."""
+        if at.same_as(self.place):
+            return self
+        return exact_approximation(self.linear, self.finite_strain, at, nearby=self)
+
+    def error(self, at: Place) -> float:
+        """Nothing where it was solved; elsewhere what another solution changes, over the length of the displacement."""
+        if at.same_as(self.place):
+            return 0.0
+        stated, there = self.model.solve(at.moduli, at.coefficients).values, self.update(at).equilibrium.values
+        return float(np.linalg.norm(stated - there) / max(np.linalg.norm(there), np.finfo(float).tiny))
+
+    def with_constraint(self, constraint: Constraint) -> ExactApproximation:
+        """The model solved again under another offset."""
+        finite = None if self.finite_strain is None else self.finite_strain.under(constraint)
+        linear = with_constraint(self.linear, constraint)
+        return exact_approximation(linear, finite, self.place, nearby=self)
+
+
+def exact_approximation(
+    linear: LinearModel, finite_strain: FiniteStrainModel | None, at: Place, *, nearby: ExactApproximation | None = None
+) -> ExactApproximation:
+    """Solve the model at a place, from an equilibrium `nearby` where there is one; raises as `update` does."""
+    before = None if nearby is None else nearby.equilibrium
+    there: Equilibrium
+    if finite_strain is None:
+        there = linear.solve(at.moduli, at.coefficients)
+    else:
+        near = before.factorisation if isinstance(before, FiniteStrainEquilibrium) else None
+        start = before or linear.solve(at.moduli, at.coefficients)
+        found = from_start(finite_strain, at.moduli, at.coefficients, start=start.displacement, nearby=near)
+        there = found.refactorised()
+    model = expanded(there, names=linear.names, moduli=at.moduli, coefficients=at.coefficients)
+    spent = SolveCounts() if nearby is None else nearby.counts
+    return ExactApproximation(linear, finite_strain, model, at, there, spent + there.counts + there.tangent_counts)

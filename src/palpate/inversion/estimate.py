@@ -1,0 +1,308 @@
+"""From models and observations to the moduli that explain the later images: starts, linear law, finite strain."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import EstimationError
+from palpate.inversion.approximation import Place
+from palpate.inversion.driver import learned_precision
+from palpate.inversion.expansion import Expansion, expansion_near
+from palpate.inversion.later_state import InverseProblem, LaterState
+from palpate.inversion.objective import Evaluation, Objective
+from palpate.inversion.optimise import Minimum, Outcome, fit_coefficients, posterior_sd
+from palpate.inversion.outer_loop import (
+    Convergence,
+    InversionSettings,
+    OuterIterate,
+    StopRule,
+    minimised,
+    outer_loop,
+)
+from palpate.inversion.reduced_basis import reduced_basis
+from palpate.inversion.reweighting import with_first_noise
+from palpate.mechanics.equilibrium import ACCURACY
+from palpate.mechanics.forward import SolveCounts
+
+__all__ = ["Candidate", "Inversion", "StartRun", "continue_at_finite_strain", "invert"]
+
+FIRST_STEPS = 2  # of the drivers' coefficients at a start's moduli, before these move
+START = 1e-2  # decrement to which a start is followed under the first noise model
+OTHER = 1e-4  # decrement of the minima that are not the best one
+SAME_MINIMUM, SAME_SD = 0.02, 0.1  # of ln E, and of a posterior standard deviation: minima no further apart are one
+LOWER = 0.5  # in units of log-likelihood: a minimum that is lower by less is as good
+REPORTED = StopRule()
+FIRST_GUESS = StopRule(step_sd=0.5, model_error=np.inf, derivatives=False, solve_above=0.1, passes=1, refinements=0)
+EQUILIBRIUM = 1e-4  # of the forces, at the most, while the estimate moves
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class StartRun:
+    """What one start did on its own: log-moduli (n_parameters,) where it began, the minimum it found and the way there.
+
+    candidate: number of the distinct minimum that it leads to.
+    """
+
+    theta: NDArray[np.float64]
+    minimum: Minimum
+    candidate: int
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A distinct minimum as it ended, and its value under the one objective under which all candidates are compared."""
+
+    iterate: OuterIterate
+    value: float
+
+    @property
+    def minimum(self) -> Minimum:
+        """The minimum under its own objective."""
+        return self.iterate.minimum
+
+
+@dataclass(frozen=True, slots=True)
+class Inversion:
+    """The distinct minima, the number of the best one, every start, and the evaluation at no motion (`rest`)."""
+
+    candidates: tuple[Candidate, ...]
+    best: int
+    starts: tuple[StartRun, ...]
+    rest: Evaluation
+    evaluations: int
+    counts: SolveCounts
+
+    @property
+    def objective(self) -> Objective:
+        """The objective of the best minimum, with its approximations and noise models."""
+        return self.candidates[self.best].iterate.objective
+
+    @property
+    def minimum(self) -> Minimum:
+        """The best minimum; its history is that of the outer loop that all of its starts share."""
+        return self.candidates[self.best].minimum
+
+    @property
+    def convergence(self) -> Convergence:
+        """What the best minimum's last outer iteration left open."""
+        return self.candidates[self.best].iterate.convergence
+
+
+def invert(
+    problem: InverseProblem, settings: InversionSettings, *, progress: Progress, rule: StopRule | None = None
+) -> Inversion:
+    """Estimate log-moduli and drivers' motion together, from all starts, with the linear law first.
+
+    States that bring an approximation are estimated on it; for the others a reduced basis is made at the middle start
+    and extended where the estimate goes. rule: when the linear estimate ends; None: at its full accuracy, or when it is
+    near where another law follows. Raises `EstimationError`s of solving; an estimate that did not converge says so in
+    its minimum's outcome.
+    """
+    middle = np.asarray(np.median(np.stack(settings.starts), axis=0))
+    states = problem.states
+    if any(state.approximation is None for state in states):
+        progress("responses of the full model at the middle start")
+        states = _with_reduced_bases(problem, settings, middle)
+    rule = rule or (FIRST_GUESS if problem.finite_strain else REPORTED)
+    linear = _linear(Objective(states, problem.parameters), settings, middle, rule, progress)
+    return continue_at_finite_strain(linear, settings, progress=progress) if problem.finite_strain else linear
+
+
+def continue_at_finite_strain(linear: Inversion, settings: InversionSettings, *, progress: Progress) -> Inversion:
+    """The estimate under the law of the states' `finite_strain` models, from the candidates of the `linear` one.
+
+    The best one is continued always, the others where they are minima; one of these without equilibrium is left out of
+    the comparison. Raises `NotConverged` when the best one's equilibrium is not found, with the element and the share
+    of the motion where it ended.
+    """
+    ends, spent, evaluations = list[OuterIterate](), linear.counts, linear.evaluations
+    for number, candidate in enumerate(linear.candidates):
+        end = candidate.iterate
+        if number == linear.best or candidate.minimum.converged:
+            try:
+                end = _at_finite_strain(candidate.iterate, settings, progress)
+                spent, evaluations = spent + _counts(end), evaluations + end.minimum.evaluations
+            except EstimationError:
+                if number == linear.best:
+                    raise
+                end = replace(end, minimum=replace(end.minimum, outcome=Outcome.NO_EQUILIBRIUM))
+        ends.append(end)
+    found = _concluded(ends, linear.starts, linear.rest, settings, linear.best)
+    return replace(found, evaluations=found.evaluations + evaluations, counts=spent)
+
+
+def _with_reduced_bases(
+    problem: InverseProblem, settings: InversionSettings, middle: NDArray[np.float64]
+) -> tuple[LaterState, ...]:
+    """The states with reduced bases made at the middle start, where their drivers' motion is fitted first."""
+    parameters, moduli = problem.parameters, problem.parameters.moduli(middle)
+    bases = [reduced_basis(state.model, moduli) for state in problem.states]
+    objective = with_first_noise(Objective(problem.states, parameters).under(bases))
+    still = np.concatenate([middle, np.zeros(sum(parameters.n_modes))])
+    fitted = fit_coefficients(objective.rematched(still), middle, bounds=settings.bounds)
+    triples = zip(problem.states, bases, parameters.coefficients(fitted.unknowns), strict=True)
+    return tuple(s.with_approximation(b.with_modulus_series(q, parameters.selection)) for s, b, q in triples)
+
+
+def _linear(
+    objective: Objective, settings: InversionSettings, middle: NDArray[np.float64], rule: StopRule, progress: Progress
+) -> Inversion:
+    """The estimate of the linear law: every start under the first noise model, the best one followed to its end."""
+    still = np.zeros(objective.parameters.n_unknowns)
+    objective = with_first_noise(objective).rematched(still)
+    rest = objective(still)
+    fitted = fit_coefficients(objective, middle, bounds=settings.bounds)
+    precision = learned_precision(objective, fitted.evaluation, fitted.unknowns)
+    if precision is not None:
+        objective = replace(objective, parameters=objective.parameters.with_driver_precision(precision))
+    minima = _from_starts(objective, settings, fitted.unknowns[objective.n_parameters :], progress)
+    groups = _groups(minima, objective.n_parameters)
+    best = groups[_best(minima)]
+    followed = [outer_loop(objective, minima[_best(minima)], settings, rule, progress=progress, title="linear law")]
+    for group in dict.fromkeys(g for g in groups if g != best):
+        member = min((m for m, g in zip(minima, groups, strict=True) if g == group), key=lambda m: m.evaluation.value)
+        followed.append(_another(followed[0], member, settings, rule, progress))
+    order = [best, *dict.fromkeys(g for g in groups if g != best)]
+    triples = zip(settings.starts, minima, groups, strict=True)
+    starts = tuple(StartRun(theta, minimum, order.index(group)) for theta, minimum, group in triples)
+    evaluations = 1 + fitted.evaluations + sum(m.evaluations for m in (*minima, *(f.minimum for f in followed)))
+    found = _concluded(followed, starts, rest, settings, 0)
+    return replace(found, evaluations=found.evaluations + evaluations, counts=_counts(followed[0]))
+
+
+def _from_starts(
+    objective: Objective, settings: InversionSettings, coefficients: NDArray[np.float64], progress: Progress
+) -> list[Minimum]:
+    """A minimum from every start, the first with given coefficients (n_coefficients,), the others with its result."""
+    minima: list[Minimum] = []
+    for number, theta in enumerate(settings.starts, start=1):
+        motion = minima[0].unknowns[len(theta) :] if minima else coefficients
+        bounds = settings.bounds
+        first = fit_coefficients(objective, theta, bounds=bounds, coefficients=motion, max_steps=FIRST_STEPS)
+        fresh = objective.rematched(first.unknowns)
+        found = minimised(fresh, first.unknowns, settings, tolerance=START)
+        minima.append(replace(found, evaluations=found.evaluations + first.evaluations))
+        progress(f"start {number} of {len(settings.starts)}: {len(found.history)} steps, {found.outcome.value}")
+    return minima
+
+
+def _another(
+    best: OuterIterate, minimum: Minimum, settings: InversionSettings, rule: StopRule, progress: Progress
+) -> OuterIterate:
+    """Where another minimum ends under the best one's objective; followed on its own where it is lower there.
+
+    It begins with the drivers' coefficients of the best one, which the outer loop has refined.
+    """
+    n = best.objective.n_parameters
+    start = np.concatenate([minimum.unknowns[:n], best.minimum.unknowns[n:]])
+    found = minimised(best.objective, start, settings, tolerance=OTHER)
+    if found.converged and found.evaluation.value < best.minimum.evaluation.value - LOWER:
+        return outer_loop(best.objective, found, settings, rule, progress=progress, title="linear law, another minimum")
+    return OuterIterate(best.objective, found, best.convergence)
+
+
+def _at_finite_strain(linear: OuterIterate, settings: InversionSettings, progress: Progress) -> OuterIterate:
+    """The outer loop on expansions around the equilibria at a linear minimum, ended at exact equilibria."""
+    progress("finite strain: the equilibrium at the linear estimate")
+    tolerance = float(np.clip(0.1 * REPORTED.error_limit(linear.objective), ACCURACY, EQUILIBRIUM))
+    unknowns, first = linear.minimum.unknowns, list[Expansion]()
+    for state, place in _placed(linear.objective, unknowns):
+        assert state.finite_strain is not None
+        assert state.approximation is not None
+        first.append(expansion_near(state.finite_strain, state.approximation, place, tolerance=tolerance))
+    objective = linear.objective.under(first).rematched(unknowns)
+    start = replace(linear.minimum, evaluation=objective(unknowns))
+    end = outer_loop(objective, start, settings, REPORTED, progress=progress, title="finite strain")
+    exact = []
+    for state, place in _placed(end.objective, end.minimum.unknowns):
+        assert isinstance(state.approximation, Expansion)
+        exact.append(state.approximation.at_equilibrium(place, tolerance=ACCURACY))
+    final = end.objective.under(exact)
+    evaluation, spent = final(end.minimum.unknowns), end.minimum.evaluations + 2
+    return replace(end, objective=final, minimum=replace(end.minimum, evaluation=evaluation, evaluations=spent))
+
+
+def _placed(objective: Objective, unknowns: NDArray[np.float64]) -> list[tuple[LaterState, Place]]:
+    """Each state with the place that unknowns (n_unknowns,) mean for it."""
+    moduli, coefficients = objective.parameters.moduli(unknowns), objective.parameters.coefficients(unknowns)
+    return [(state, Place(moduli, q)) for state, q in zip(objective.states, coefficients, strict=True)]
+
+
+def _concluded(
+    followed: Sequence[OuterIterate],
+    starts: tuple[StartRun, ...],
+    rest: Evaluation,
+    settings: InversionSettings,
+    first: int,
+) -> Inversion:
+    """The distinct ones of the iterates, compared with each other; `first`: the number of the one sought first."""
+    n = followed[0].objective.n_parameters
+    groups = _groups([iterate.minimum for iterate in followed], n)
+    leaders = [_leader(followed, groups, group, first) for group in range(max(groups) + 1)]
+    distinct = [followed[i] for i in leaders]
+    values, evaluations = _values(distinct, settings)
+    candidates = tuple(Candidate(iterate, value) for iterate, value in zip(distinct, values, strict=True))
+    usable = [c.value if c.minimum.converged else np.inf for c in candidates]
+    best = int(np.argmin(usable)) if np.isfinite(usable).any() else groups[first]
+    joined = tuple(replace(start, candidate=groups[start.candidate]) for start in starts)
+    return Inversion(candidates, best, joined, rest, evaluations, SolveCounts())
+
+
+def _leader(followed: Sequence[OuterIterate], groups: Sequence[int], group: int, first: int) -> int:
+    """Number of the iterate that stands for its group: the one sought first, else one that converged."""
+    members = [i for i, g in enumerate(groups) if g == group]
+    return min(members, key=lambda i: (i != first, not followed[i].minimum.converged, i))
+
+
+def _values(distinct: Sequence[OuterIterate], settings: InversionSettings) -> tuple[list[float], int]:
+    """The iterates' values under one objective, each at its minimum under that, and what it cost in evaluations.
+
+    Each iterate has noise models, weights and a prior of its own, and a worse fit is a smaller value where the noise is
+    believed to be larger: all are compared under the objective of the one with the least noise, on their own
+    approximations.
+    """
+    if len(distinct) == 1:
+        return [distinct[0].minimum.evaluation.value], 0
+    usable = [iterate for iterate in distinct if iterate.minimum.converged] or list(distinct)
+    reference = min(usable, key=lambda iterate: max(noise.sd for noise in iterate.objective.noise.values()))
+    values, evaluations = [], 0
+    for iterate in distinct:
+        unknowns = iterate.minimum.unknowns
+        own = [state.approximation for state in iterate.objective.states if state.approximation is not None]
+        there = minimised(reference.objective.under(own).rematched(unknowns), unknowns, settings)
+        values.append(there.evaluation.value)
+        evaluations += there.evaluations
+    return values, evaluations
+
+
+def _best(minima: Sequence[Minimum]) -> int:
+    """Number of the converged minimum with the smallest value; of them all when none converged."""
+    values = [m.evaluation.value if m.converged else np.inf for m in minima]
+    if not np.isfinite(values).any():
+        values = [m.evaluation.value for m in minima]
+    return int(np.argmin(values))
+
+
+def _groups(minima: Sequence[Minimum], n_parameters: int) -> list[int]:
+    """Number of the distinct minimum that each one is, in their order."""
+    distinct: list[Minimum] = []
+    groups = []
+    for minimum in minima:
+        width = np.maximum(SAME_MINIMUM, SAME_SD * posterior_sd(minimum, n_parameters))
+        apart = [np.abs(minimum.unknowns - other.unknowns)[:n_parameters] for other in distinct]
+        same = [i for i, distance in enumerate(apart) if np.all(distance < width)]
+        if not same:
+            distinct.append(minimum)
+        groups.append(same[0] if same else len(distinct) - 1)
+    return groups
+
+
+def _counts(iterate: OuterIterate) -> SolveCounts:
+    approximations = [state.approximation for state in iterate.objective.states]
+    return sum((a.counts for a in approximations if a is not None), SolveCounts())

@@ -1,0 +1,150 @@
+"""A finite-strain model to first order around one of its equilibria.
+
+Where the estimate goes the expansion moves with it: the equilibrium is solved anew, its derivatives stay as long as
+they serve. One factorisation, made near the first equilibrium, gives all derivatives there and serves every solve. Near
+the estimate the derivatives along the directions that decide the moduli, which is all that these need to first order,
+are made those of the equilibrium there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import NotConverged
+from palpate.inversion.approximation import Approximation, Place
+from palpate.mechanics.equilibrium import from_start
+from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
+from palpate.mechanics.first_order import FirstOrderModel
+from palpate.mechanics.forward import SolveCounts
+from palpate.mechanics.solvers.contract import Factorisation
+from palpate.mesh.constraint import Constraint
+
+__all__ = ["Expansion", "expansion_near"]
+
+REACH = 0.8  # of ln E, within which it is trusted
+COARSE = 3e-2  # of the forces: for the equilibrium whose stiffness is factorised
+FEW = 24  # moduli and modes, all of whose derivatives cost less than the iterations that they spare
+
+
+@dataclass(frozen=True, slots=True)
+class Expansion:
+    """u_0 + T [ln E - ln E_0, q - q_0] around an equilibrium; implements `Approximation`.
+
+    derivatives_at (n_regions,) kPa: moduli where T was last made exact along the directions that decide; None: nowhere
+    yet, it is that of an earlier equilibrium.
+    """
+
+    model: FirstOrderModel
+    equilibrium: FiniteStrainEquilibrium = field(repr=False)
+    counts: SolveCounts
+    derivatives_at: NDArray[np.float64] | None = None
+
+    @property
+    def constraint(self) -> Constraint:
+        """What is prescribed to the full model."""
+        return self.equilibrium.model.constraint
+
+    @property
+    def factorisation(self) -> Factorisation | None:
+        """That of the tangent stiffness near the equilibrium."""
+        return self.equilibrium.factorisation
+
+    @property
+    def reach(self) -> float:
+        """As far as it is trusted."""
+        return REACH
+
+    @property
+    def place(self) -> Place:
+        """Where it is exact."""
+        return Place(self.equilibrium.moduli, self.equilibrium.coefficients)
+
+    def update(self, at: Place) -> Expansion:
+        """The expansion around the equilibrium at another place, its derivatives exact there where they are worth it.
+
+        They are worth their price near the estimate, or where there are few. Raises `NotConverged` when there is no
+        equilibrium.
+        """
+        there = self if at.same_as(self.place) else self._around(self._equilibrium(at))
+        few = there.model.n_regions + there.model.n_modes <= FEW
+        if at.directions is None or at.metric is None or not (at.near or few):
+            return there
+        return _with_derivatives(there, np.eye(len(at.directions)) if few else at.directions, at.metric)
+
+    def error(self, at: Place) -> float:
+        """Estimated relative error in energy of the displacement: of one correction r^T K^-1 r by its residual r.
+
+        K is the stiffness at hand, not the one there. Without a factorisation, infinite but at its own equilibrium.
+        """
+        if at.same_as(self.place):
+            return 0.0
+        if self.factorisation is None:
+            return np.inf
+        balance = self.equilibrium.model.balance(at.moduli)
+        displacement = self.model.solve(at.moduli, at.coefficients).values
+        residual = np.asarray(balance.free.T @ balance.residual(displacement)[0])
+        correction = self.factorisation.solve(residual[:, None])[:, 0]
+        internal = balance.region_forces(displacement, balance.moduli).sum(axis=1)
+        squared = abs(residual @ correction) / max(abs(float(internal @ displacement)), np.finfo(float).tiny)
+        return float(np.sqrt(squared)) if np.isfinite(squared) else np.inf
+
+    def with_constraint(self, constraint: Constraint) -> Expansion:
+        """The expansion around the equilibrium that another offset of what is prescribed leads to; `NotConverged`."""
+        before = self.equilibrium
+        model, start = before.model.under(constraint), before.displacement
+        found = from_start(model, before.moduli, before.coefficients, start=start, nearby=before.factorisation)
+        return replace(self._around(found), derivatives_at=None)
+
+    def at_equilibrium(self, at: Place, *, tolerance: float) -> Expansion:
+        """The expansion around the equilibrium at a place near by, to a tolerance of the forces; `NotConverged`."""
+        before, model = self.equilibrium, self.equilibrium.model.to_tolerance(tolerance)
+        start, nearby = self.model.solve(at.moduli, at.coefficients).displacement, before.factorisation
+        return self._around(from_start(model, at.moduli, at.coefficients, start=start, nearby=nearby))
+
+    def _equilibrium(self, at: Place) -> FiniteStrainEquilibrium:
+        """The equilibrium at a place, from where the expansion says that it is, else from the present one."""
+        before, start = self.equilibrium, self.model.solve(at.moduli, at.coefficients).displacement
+        found = before.model.attempt(at.moduli, at.coefficients, start=start, nearby=before.factorisation)
+        if not found.converged:
+            found = before.model.attempt(at.moduli, at.coefficients, start=before.displacement)
+        if not found.converged:
+            raise NotConverged(f"no equilibrium near the estimate: {found.reason}")
+        return found
+
+    def _around(self, there: FiniteStrainEquilibrium) -> Expansion:
+        """The expansion around an equilibrium so near that its derivatives still hold there: a third of the price."""
+        model = replace(self.model, moduli=there.moduli, coefficients=there.coefficients, values=there.values)
+        return Expansion(model, there, self.counts + there.counts, self.derivatives_at)
+
+
+def expansion_near(model: FiniteStrainModel, linear: Approximation, at: Place, *, tolerance: float) -> Expansion:
+    """The expansion around the equilibrium near the linear law's displacement at a place, with all derivatives.
+
+    tolerance: of the forces, of every equilibrium that follows. Its factorisation is the only one: it serves all solves
+    that stay near. Raises `NotConverged` with the element and the share of the motion where the path ended.
+    """
+    start = linear.model.solve(at.moduli, at.coefficients).displacement
+    near = from_start(
+        model.to_tolerance(COARSE), at.moduli, at.coefficients, start=start, nearby=linear.factorisation
+    ).refactorised()
+    full = model.to_tolerance(tolerance)
+    found = from_start(full, at.moduli, at.coefficients, start=near.displacement, nearby=near.factorisation)
+    derivatives = FirstOrderModel(model.names, at.moduli, at.coefficients, found.values, near.tangent())
+    return Expansion(derivatives, found, near.counts + near.tangent_counts + found.counts)
+
+
+def _with_derivatives(near: Expansion, directions: NDArray[np.float64], metric: NDArray[np.float64]) -> Expansion:
+    """The expansion with the derivatives along `directions` D (n_regions + n_modes, k) exact at its equilibrium.
+
+    T + (C - T D) (D^T H D)^+ D^T H with the exact C and H the `metric` (n_regions + n_modes, n_regions + n_modes): of
+    all T' with T' D = C the one that changes least. The other columns stay as they were where T was made.
+    """
+    before = near.model.derivatives @ directions
+    change = near.equilibrium.tangent_along(directions, before) - before
+    share = np.linalg.pinv(directions.T @ metric @ directions, hermitian=True) @ (directions.T @ metric)
+    sharper = replace(near.model, derivatives=near.model.derivatives + change @ share)
+    spent = near.counts + SolveCounts(tangent=directions.shape[1])
+    return replace(near, model=sharper, counts=spent, derivatives_at=near.equilibrium.moduli)

@@ -1,0 +1,86 @@
+"""A later image of a body, and the inverse problem that several of them pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import ConfigurationError
+from palpate.inversion.approximation import Approximation
+from palpate.inversion.parameters import ParameterMap
+from palpate.mechanics.finite_strain import FiniteStrainModel
+from palpate.mechanics.forward import ForwardModel
+from palpate.mechanics.linear_model import LinearModel
+from palpate.mesh.constraint import Constraint
+from palpate.observation.contract import Observation
+from palpate.observation.wall_modes import Wall
+
+__all__ = ["InverseProblem", "LaterState"]
+
+
+@dataclass(frozen=True, slots=True)
+class LaterState:
+    """One later state of a body: its model, what its image shows, and what stands in for the model.
+
+    model: the body under the linear law; finite_strain: under the law that the estimate is continued to, None where
+    that is the linear one; walls: the drivers' walls, whose prior is learned from the images, none where the modes' own
+    prior holds; reference: number of the rest state that it belongs to; observed: the approximation's model at the
+    observed unknowns alone, one observation after the other.
+    """
+
+    model: LinearModel
+    observations: tuple[Observation, ...]
+    finite_strain: FiniteStrainModel | None = None
+    walls: tuple[Wall, ...] = ()
+    reference: int = 0
+    approximation: Approximation | None = field(default=None, repr=False)
+    observed: ForwardModel | None = field(default=None, repr=False)
+
+    @property
+    def constraint(self) -> Constraint:
+        """What is prescribed: the approximation's, where a wall has been refined there."""
+        return self.model.constraint if self.approximation is None else self.approximation.constraint
+
+    @property
+    def slices(self) -> list[slice]:
+        """Rows of the `observed` answer that belong to each observation."""
+        ends = np.cumsum([len(observation.dofs) for observation in self.observations])
+        return [slice(e - len(o.dofs), e) for e, o in zip(ends.tolist(), self.observations, strict=True)]
+
+    def with_approximation(self, approximation: Approximation) -> LaterState:
+        """The same state with another approximation of its model."""
+        dofs = np.concatenate([observation.dofs for observation in self.observations])
+        return replace(self, approximation=approximation, observed=approximation.model.at(dofs))
+
+    def with_observations(self, observations: Sequence[Observation]) -> LaterState:
+        """The same state with the same observations otherwise weighted or matched."""
+        return replace(self, observations=tuple(observations))
+
+    def displacement(self, moduli: NDArray[np.float64], coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Displacement (n_points, 3) mm of the whole mesh at moduli (n_regions,) kPa and coefficients (n_modes,).
+
+        Raises `ConfigurationError` while nothing stands in for the model.
+        """
+        if self.approximation is None:
+            raise ConfigurationError("this state has no approximation of its model yet: see `with_approximation`")
+        return self.approximation.model.solve(moduli, coefficients).displacement
+
+
+@dataclass(frozen=True, slots=True)
+class InverseProblem:
+    """The later states of one patient and the moduli that they share, by `parameters`."""
+
+    states: tuple[LaterState, ...]
+    parameters: ParameterMap
+
+    @property
+    def finite_strain(self) -> bool:
+        """Whether the estimate is continued to a finite-strain law."""
+        return all(state.finite_strain is not None for state in self.states)
+
+    def linear(self) -> InverseProblem:
+        """The same problem under the linear law."""
+        return replace(self, states=tuple(replace(state, finite_strain=None) for state in self.states))

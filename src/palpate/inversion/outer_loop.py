@@ -1,0 +1,344 @@
+"""The outer loop of an estimate: reweight, step, update the approximation, until one stop rule is met.
+
+It is the same for the linear and for a finite-strain law, and for every approximation of the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import NotConverged
+from palpate.inversion.approximation import Approximation, Place
+from palpate.inversion.driver import refined_walls
+from palpate.inversion.objective import Evaluation, Objective, deciding_directions
+from palpate.inversion.optimise import Bounds, Minimum, Outcome, gauss_newton, lbfgs, posterior_sd
+from palpate.inversion.reweighting import reweighted
+
+__all__ = [
+    "Convergence",
+    "Criterion",
+    "InversionSettings",
+    "OuterIterate",
+    "StopRule",
+    "minimised",
+    "outer_loop",
+    "ratios_in_words",
+    "updated",
+]
+
+FORCING = 0.1  # of the last outer iteration's step: to which the next one's weights and estimate agree
+INNER = 6.0  # a minimum is found to so small a part of what a reweighting may still change
+POLISH = 1e-5  # decrement of a minimum by a method that does not tell how far the log-moduli are from it
+NEAR = 0.5  # posterior standard deviations: a step that is shorter ends where derivatives are worth making exact
+ROUGH_SURFACE = 1.0 / 3.0  # mm, of a residual: below that a model must be as much more exact
+LEAST_SD = 0.03  # of ln E, see `_linearisation`
+HALVINGS = 3
+TRUSTED = 0.03  # error in energy of an approximation, below which the step on it needs no line search
+ROUGHNESS = 0.5  # of the objective, in units of log-likelihood: the noise of re-chosen closest points
+FAR = 5.0  # tolerances: an estimate that still moves by more has not converged
+
+
+@dataclass(frozen=True, slots=True)
+class InversionSettings:
+    """Starts theta (n_parameters,) each, their bounds, the optimiser's name."""
+
+    starts: tuple[NDArray[np.float64], ...]
+    bounds: Bounds
+    method: str = "gauss-newton"
+
+
+class Criterion(StrEnum):
+    """What must hold for an estimate to end; the value is what the user reads where it does not."""
+
+    REWEIGHTING = "the residuals' weights and the estimate still change each other"
+    LINEARISATION = "the estimate still moves where the model is linearised anew"
+    MODEL_ERROR = "the model that stands in for the full one is not exact enough where the estimate lies"
+
+
+@dataclass(frozen=True, slots=True)
+class Convergence:
+    """What an outer iteration left open, each over its tolerance: converged where none exceeds 1."""
+
+    reweighting: float = np.inf
+    linearisation: float = np.inf
+    model_error: float = np.inf
+
+    @property
+    def unmet(self) -> tuple[Criterion, ...]:
+        """The criteria that do not hold."""
+        return tuple(c for c in Criterion if getattr(self, c.name.lower()) >= 1.0)
+
+    @property
+    def converged(self) -> bool:
+        """Whether all hold."""
+        return not self.unmet
+
+
+@dataclass(frozen=True, slots=True)
+class StopRule:
+    """When an estimate ends, in its own posterior standard deviations.
+
+    step_sd, floor: a log-modulus may still move by so many of its standard deviations, or by `floor` (of ln E) where
+    that is more; model_error: relative error in energy of the displacement that the approximation may have where
+    residuals are rough; derivatives: whether those that decide the moduli must be exact so near that they leave no more
+    than a step; solve_above: error from which the full model is solved; passes: of weights and estimate in turn on one
+    approximation; iterations; refinements of the drivers' walls: the largest numbers of each.
+    """
+
+    step_sd: float = 0.02
+    floor: float = 3e-4
+    model_error: float = 2e-4
+    derivatives: bool = True
+    solve_above: float = 0.0
+    passes: int = 15
+    iterations: int = 16
+    refinements: int = 2
+
+    def tolerance(self, minimum: Minimum, n_parameters: int) -> NDArray[np.float64]:
+        """By how much each log-modulus (n_parameters,) may still move."""
+        return np.maximum(self.step_sd * posterior_sd(minimum, n_parameters), self.floor)
+
+    def error_limit(self, objective: Objective) -> float:
+        """Relative error in energy that the approximation may have: the less, the finer the residuals."""
+        return self.model_error * min(1.0, *(noise.sd / ROUGH_SURFACE for noise in objective.noise.values()))
+
+
+@dataclass(frozen=True, slots=True)
+class OuterIterate:
+    """Where an outer iteration ended: a minimum under the objective that it was found with.
+
+    step: how far it moved a log-modulus, over the stop rule's tolerance.
+    """
+
+    objective: Objective
+    minimum: Minimum
+    convergence: Convergence = Convergence()
+    step: float = np.inf
+
+
+def outer_loop(
+    objective: Objective,
+    start: Minimum,
+    settings: InversionSettings,
+    rule: StopRule,
+    *,
+    progress: Callable[[str], None],
+    title: str,
+) -> OuterIterate:
+    """Follow a minimum until reweighting it and updating its approximations change it no more.
+
+    Drivers' walls are refined where their surfaces ask for it (see `refined_walls`). `title` begins each line of
+    `progress`. The minimum's history is that of the loop alone. Raises `NotConverged` when the full model has no
+    equilibrium where every part of a step leads.
+    """
+    begun = replace(start, history=(), evaluations=0)
+    now, refinements = updated(OuterIterate(objective, begun), rule), 0
+    for number in range(1, rule.iterations + 1):
+        line = f"{title}, outer iteration {number}"
+        progress(f"{line}: {ratios_in_words(now)}")
+        now = _iteration(now, settings, rule, partial(_say, progress, line))
+        if now.minimum.outcome is Outcome.STUCK:
+            return now
+        if now.convergence.converged:
+            done = refinements == rule.refinements or number == rule.iterations
+            finer = None if done else _with_finer_walls(now)
+            if finer is None:
+                return now
+            now, refinements = finer, refinements + 1
+    if max(now.convergence.reweighting, now.convergence.linearisation) > FAR and now.minimum.converged:
+        now = replace(now, minimum=replace(now.minimum, outcome=Outcome.STEPS))
+    return now
+
+
+def updated(now: OuterIterate, rule: StopRule) -> OuterIterate:
+    """The iterate on approximations that are exact at its unknowns, with derivatives, where their error asks for it."""
+    if _model_error(now.objective, now.minimum.unknowns) < rule.solve_above:
+        return now
+    return _with_approximations(now, _solved(now.objective, now.minimum.unknowns, now.minimum.evaluation, near=False))
+
+
+def minimised(
+    objective: Objective,
+    start: NDArray[np.float64],
+    settings: InversionSettings,
+    *,
+    tolerance: float = 1e-3,
+    within: NDArray[np.float64] | float = np.inf,
+) -> Minimum:
+    """The minimum from `start` (n_unknowns,) by the method of the settings.
+
+    `tolerance` of the decrement; `within` (one, or (n_parameters,)): how far the log-moduli may yet be from it.
+    """
+    if settings.method == "lbfgs":
+        polish = min(tolerance, POLISH) if np.all(np.isfinite(within)) else tolerance
+        return lbfgs(objective, start, bounds=settings.bounds, tolerance=polish)
+    return gauss_newton(objective, start, bounds=settings.bounds, tolerance=tolerance, within=within)
+
+
+def ratios_in_words(now: OuterIterate) -> str:
+    """The moduli of an iterate in words, for the progress."""
+    mapping = now.objective.parameters
+    ratios = np.exp(now.minimum.unknowns[: mapping.n_parameters])
+    return ", ".join(
+        f"{name} {ratio:.2f} x {mapping.relative_to}" for name, ratio in zip(mapping.tissues, ratios, strict=True)
+    )
+
+
+def _say(progress: Callable[[str], None], line: str, words: str) -> None:
+    progress(f"{line}, {words}")
+
+
+def _iteration(
+    now: OuterIterate, settings: InversionSettings, rule: StopRule, progress: Callable[[str], None]
+) -> OuterIterate:
+    """Reweight and minimise on the present approximations, and update these there, or on a part of the way."""
+    objective, found, reweighting = _reweighted_minimum(now, settings, rule, progress)
+    n = objective.n_parameters
+    tolerance = rule.tolerance(found, n)
+    moved = np.abs(found.unknowns - now.minimum.unknowns)[:n]
+    step = float(np.max(moved / tolerance, initial=0.0))
+    open_ = np.max(_linearisation(objective, found) / tolerance, initial=0.0) if rule.derivatives else step
+    error, limit = _model_error(objective, found.unknowns), rule.error_limit(objective)
+    convergence = Convergence(reweighting, float(open_), error / limit if np.isfinite(limit) else 0.0)
+    there = OuterIterate(objective, found, convergence, step)
+    if convergence.converged or error < rule.solve_above:
+        return there
+    near = bool(np.all(moved < NEAR * posterior_sd(found, n)))
+    if error < TRUSTED:
+        return _with_approximations(there, _solved(objective, found.unknowns, found.evaluation, near=near))
+    return _line_search(now, there, near=near)
+
+
+def _reweighted_minimum(
+    now: OuterIterate, settings: InversionSettings, rule: StopRule, progress: Callable[[str], None]
+) -> tuple[Objective, Minimum, float]:
+    """Iteratively reweighted minimisation on the present approximations, and what its last pass changed.
+
+    Weights and estimate agree to the tolerance, or to a tenth of the last outer iteration's step where that is more.
+    The log-moduli go no further than the approximations reach.
+    """
+    n, objective, minimum = now.objective.n_parameters, now.objective, now.minimum
+    reach = min(_approximation(objective, s).reach for s in range(len(objective.states)))
+    theta, bounds = minimum.unknowns[:n], settings.bounds
+    near = Bounds(np.maximum(bounds.lower, theta - reach), np.minimum(bounds.upper, theta + reach))
+    forcing, change = max(1.0, FORCING * now.step), np.inf
+    for number in range(1, rule.passes + 1):
+        objective = reweighted(objective, minimum)
+        before, within = minimum, forcing * rule.tolerance(minimum, n) / INNER
+        found = minimised(objective, before.unknowns, replace(settings, bounds=near), within=within)
+        minimum = found.after(before)
+        moved = np.abs(minimum.unknowns - before.unknowns)[:n]
+        change = float(np.max(moved / rule.tolerance(minimum, n), initial=0.0))
+        if change < forcing:
+            break
+        progress(f"reweighting {number}: {ratios_in_words(OuterIterate(objective, minimum))}")
+    return objective, minimum, change
+
+
+def _line_search(now: OuterIterate, there: OuterIterate, *, near: bool) -> OuterIterate:
+    """The first of step, step / 2, step / 4 ... that lowers the objective on the full model, updated there.
+
+    Where none does the iterate stays: `STALLED` when the step is within the tolerance, else `STUCK`. Raises
+    `NotConverged` when the last of them has no equilibrium.
+    """
+    before = now.minimum.unknowns
+    here = there.objective(before)
+    step, evaluations, failure = there.minimum.unknowns - before, 1, None
+    for halving in range(HALVINGS + 1):
+        unknowns = before + 0.5**halving * step
+        try:
+            trial = there.objective.under(_solved(there.objective, unknowns))
+        except NotConverged as error:
+            failure = error
+            continue
+        evaluation, evaluations, failure = trial(unknowns), evaluations + 1, None
+        if _lowers(here, evaluation, unknowns - before):
+            spent = there.minimum.evaluations + evaluations
+            reached = replace(there.minimum, unknowns=unknowns, evaluation=evaluation, evaluations=spent)
+            arrived = replace(there, objective=trial, minimum=reached)
+            return _with_approximations(arrived, _solved(trial, unknowns, there.minimum.evaluation, near=near))
+    if failure is not None:
+        raise failure
+    outcome = Outcome.STALLED if there.step < 1.0 else Outcome.STUCK
+    spent = there.minimum.evaluations + evaluations
+    stayed = replace(there.minimum, unknowns=before, evaluation=here, outcome=outcome, evaluations=spent)
+    return replace(there, minimum=stayed)
+
+
+def _lowers(now: Evaluation, there: Evaluation, step: NDArray[np.float64]) -> bool:
+    """Whether the objective is lower after a step (n_unknowns,).
+
+    By its value, or by the work of its score along the way (the trapezoidal rule, 1/2 (s_0 + s_1) . step): the value
+    has the noise of closest points that slide over voxels, the score has not.
+    """
+    return bool(there.value < now.value + ROUGHNESS or 0.5 * (there.score + now.score) @ step < 0.0)
+
+
+def _linearisation(objective: Objective, there: Minimum) -> NDArray[np.float64]:
+    """How far (n_parameters,), of ln E, derivatives that are exact elsewhere may set an estimate off.
+
+    At a distance d of ln E they are off by a share d, and so is what the residuals pull with them, which is worth a
+    posterior standard deviation: d sd, d the largest of all log-moduli; infinite where they are exact nowhere yet. A
+    standard deviation counts as 0.03 at least: its own error is a share d, too, and may be a per cent.
+    """
+    moduli, distance = objective.parameters.moduli(there.unknowns), 0.0
+    for s in range(len(objective.states)):
+        exact = _approximation(objective, s).derivatives_at
+        distance = np.inf if exact is None else max(distance, float(np.abs(np.log(moduli / exact)).max()))
+    return distance * np.maximum(posterior_sd(there, objective.n_parameters), LEAST_SD)
+
+
+def _with_finer_walls(now: OuterIterate) -> OuterIterate | None:
+    """The iterate with finer motions of the drivers' walls, where their surfaces ask for it; None where none does."""
+    finer = refined_walls(now.objective, now.minimum.evaluation)
+    if all(constraint is None for constraint in finer):
+        return None
+    held = [_approximation(now.objective, s) for s in range(len(finer))]
+    moved = [a if c is None else a.with_constraint(c) for a, c in zip(held, finer, strict=True)]
+    return replace(_with_approximations(now, moved), convergence=Convergence(), step=np.inf)
+
+
+def _with_approximations(now: OuterIterate, approximations: list[Approximation]) -> OuterIterate:
+    """The iterate evaluated on other approximations."""
+    objective = now.objective.under(approximations)
+    evaluation, spent = objective(now.minimum.unknowns), now.minimum.evaluations + 1
+    return replace(now, objective=objective, minimum=replace(now.minimum, evaluation=evaluation, evaluations=spent))
+
+
+def _solved(
+    objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation | None = None, *, near: bool = False
+) -> list[Approximation]:
+    """The states' approximations updated at unknowns, with the derivatives that decide by an evaluation."""
+    places = _places(objective, unknowns, evaluation, near=near)
+    return [_approximation(objective, s).update(place) for s, place in enumerate(places)]
+
+
+def _places(
+    objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation | None = None, *, near: bool = False
+) -> list[Place]:
+    parameters = objective.parameters
+    moduli, coefficients = parameters.moduli(unknowns), parameters.coefficients(unknowns)
+    if evaluation is None:
+        return [Place(moduli, q) for q in coefficients]
+    directions = deciding_directions(parameters, evaluation)
+    return [
+        Place(moduli, q, d, parameters.metric_of(s, evaluation.matrix), near)
+        for s, (q, d) in enumerate(zip(coefficients, directions, strict=True))
+    ]
+
+
+def _model_error(objective: Objective, unknowns: NDArray[np.float64]) -> float:
+    """The largest error in energy of the approximations at unknowns (n_unknowns,)."""
+    return max(_approximation(objective, s).error(place) for s, place in enumerate(_places(objective, unknowns)))
+
+
+def _approximation(objective: Objective, s: int) -> Approximation:
+    approximation = objective.states[s].approximation
+    assert approximation is not None, "an objective is made of states with approximations"
+    return approximation

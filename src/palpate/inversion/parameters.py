@@ -1,0 +1,164 @@
+"""From the unknowns to Young's moduli and drivers' motion, and what is believed of both before the images are seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import ConfigurationError
+from palpate.images.tissue import Role, Tissue
+
+__all__ = ["ParameterMap", "parameter_map"]
+
+LOADS = "the known loads"
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterMap:
+    """Unknowns x = [theta, q_1, ..., q_S] (n_unknowns,): theta = ln(E / E_reference), then each state's coefficients.
+
+    base (n_regions,) kPa: moduli of the meshed tissues, in the order of the mesh's regions, at theta = 0; selection
+    (n_regions, n_parameters): 1 where a parameter scales a region, several regions where tissues are tied; `tissues`:
+    the parameters' names; n_modes: driver coefficients of each later state. `relative_to`: the tissue that holds the
+    scale; `absolute` is False when nothing sets one: then the first `estimate` tissue is held at 1 and every value is a
+    ratio to it. Where known loads alone set it, `relative_to` says so, and the base is 1 kPa.
+
+    The prior is normal: theta with `prior_mean` (n_parameters,) and `prior_precision` (n_parameters, n_parameters),
+    flat by default, the coefficients with mean 0 and `driver_precision` (n_coefficients, n_coefficients), by default 1.
+    """
+
+    base: NDArray[np.float64]
+    selection: NDArray[np.float64]
+    tissues: tuple[str, ...]
+    relative_to: str
+    absolute: bool
+    n_modes: tuple[int, ...]
+    prior_mean: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    prior_precision: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    driver_precision: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def __post_init__(self) -> None:
+        n, n_coefficients = len(self.tissues), sum(self.n_modes)
+        if not len(self.prior_mean):
+            object.__setattr__(self, "prior_mean", np.zeros(n))
+            object.__setattr__(self, "prior_precision", np.zeros((n, n)))
+        if len(self.driver_precision) != n_coefficients:
+            object.__setattr__(self, "driver_precision", np.eye(n_coefficients))
+
+    @property
+    def by_load(self) -> bool:
+        """Whether known loads, and no known modulus, set the scale."""
+        return self.relative_to == LOADS
+
+    @property
+    def scale_kpa(self) -> float:
+        """Modulus (kPa) of the tissue that holds the scale; 1 when none is known."""
+        return float(self.base[self.selection[:, 0] > 0.0][0])
+
+    @property
+    def n_parameters(self) -> int:
+        """Number of log-moduli among the unknowns."""
+        return len(self.tissues)
+
+    @property
+    def n_unknowns(self) -> int:
+        """Number of all unknowns."""
+        return self.n_parameters + sum(self.n_modes)
+
+    @property
+    def prior_matrix(self) -> NDArray[np.float64]:
+        """Precision P (n_unknowns, n_unknowns) of all unknowns before the images are seen."""
+        n, matrix = self.n_parameters, np.zeros((self.n_unknowns, self.n_unknowns))
+        matrix[:n, :n] = self.prior_precision
+        matrix[n:, n:] = self.driver_precision
+        return matrix
+
+    @property
+    def prior_centre(self) -> NDArray[np.float64]:
+        """Mean (n_unknowns,) of all unknowns before the images are seen."""
+        return np.concatenate([self.prior_mean, np.zeros(sum(self.n_modes))])
+
+    def moduli(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Young's moduli (n_regions,) kPa of unknowns (n_unknowns,), or of theta (n_parameters,) alone."""
+        return np.asarray(self.base * np.exp(self.selection @ unknowns[: self.n_parameters]))
+
+    def coefficients(self, unknowns: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """Driver coefficients (n_modes,) of each state."""
+        return np.split(unknowns[self.n_parameters :], np.cumsum(self.n_modes)[:-1])
+
+    def unknowns_of(self, state: int) -> NDArray[np.int64]:
+        """Numbers (n_parameters + n_modes,) of the unknowns that move a state: theta, then its own coefficients."""
+        start = self.n_parameters + sum(self.n_modes[:state])
+        return np.concatenate([np.arange(self.n_parameters), np.arange(start, start + self.n_modes[state])])
+
+    def by_unknowns(self, tangent: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivatives (n, n_parameters + n_modes) by a state's unknowns, from those by (ln E, q)."""
+        n_regions = len(self.base)
+        return np.concatenate([tangent[:, :n_regions] @ self.selection, tangent[:, n_regions:]], axis=1)
+
+    def directions_of(self, state: int, directions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Directions (n_unknowns, k) of the unknowns as those of a state's (ln E, q), (n_regions + n_modes, k)."""
+        return self._by_region(directions[self.unknowns_of(state)])
+
+    def metric_of(self, state: int, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A quadratic form (n_unknowns, n_unknowns) as one of a state's (ln E, q), (n_regions + n_modes, the same)."""
+        own = self.unknowns_of(state)
+        return self._by_region(self._by_region(matrix[np.ix_(own, own)]).T)
+
+    def _by_region(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Rows (n_parameters + n_modes, k) with each parameter's at the regions that it scales."""
+        return np.concatenate([self.selection @ rows[: self.n_parameters], rows[self.n_parameters :]])
+
+    def with_prior(self, mean: NDArray[np.float64], sd: NDArray[np.float64]) -> ParameterMap:
+        """The same with a normal prior of theta: mean and standard deviation (n_parameters,), inf where it is flat."""
+        return replace(self, prior_mean=np.where(np.isfinite(sd), mean, 0.0), prior_precision=np.diag(sd**-2.0))
+
+    def with_driver_precision(self, precision: NDArray[np.float64]) -> ParameterMap:
+        """The same with another prior of the coefficients: precision (n_coefficients, n_coefficients)."""
+        return replace(self, driver_precision=precision)
+
+
+def parameter_map(
+    tissues: tuple[Tissue, ...],
+    regions: tuple[int, ...],
+    n_modes: Sequence[int],
+    *,
+    loaded: bool = False,
+    tied: Sequence[Sequence[str]] = (),
+) -> ParameterMap:
+    """Make the map for a mesh whose regions are `tissues[i] for i in regions` and later states with n_modes each.
+
+    The scale is the modulus of the first `known` tissue in the file, or without one what the loads say (`loaded`: known
+    loads act). tied: groups of `estimate` tissues, by name, that share one modulus. Raises `ConfigurationError` when
+    there is nothing to estimate, or a single tissue and nothing to compare it with.
+    """
+    meshed = [tissues[i] for i in regions]
+    known = [tissue for tissue in meshed if tissue.role is Role.KNOWN]
+    groups = _groups([tissue.name for tissue in meshed if tissue.role is Role.ESTIMATE], tied)
+    absolute = bool(known)
+    sought = groups if absolute or loaded else groups[1:]
+    if not sought:
+        raise ConfigurationError(
+            "nothing can be estimated: displacements fix ratios of moduli only, so a case needs an `estimate` tissue"
+            " and a `known` tissue, a known load, or a second `estimate` tissue"
+        )
+    selection = np.array([[float(tissue.name in group) for group in sought] for tissue in meshed])
+    names, modes = tuple(" and ".join(group) for group in sought), tuple(n_modes)
+    if loaded and not known:
+        return ParameterMap(np.ones(len(meshed)), selection, names, LOADS, True, modes)
+    unit = (known[0].youngs_modulus_kpa or 1.0) if absolute else 1.0
+    base = np.array([(t.youngs_modulus_kpa or unit) if t.role is Role.KNOWN else unit for t in meshed])
+    scale = known[0].name if absolute else " and ".join(groups[0])
+    return ParameterMap(base, selection, names, scale, absolute, modes)
+
+
+def _groups(names: Sequence[str], tied: Sequence[Sequence[str]]) -> list[tuple[str, ...]]:
+    """The names in groups that share a parameter, in the order of their first; raises `ConfigurationError`."""
+    strange = sorted({name for group in tied for name in group} - set(names))
+    if strange:
+        raise ConfigurationError(f"tied tissues must have the role `estimate`: of {list(names)}, not {strange}")
+    of = {name: tuple(group) for group in tied for name in group}
+    return list(dict.fromkeys(of.get(name, (name,)) for name in names))

@@ -1,0 +1,187 @@
+"""A reduced model that is exact where it matters: built at one place, extended where the estimate goes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from palpate.inversion.approximation import Place
+from palpate.mechanics.forward import SolveCounts
+from palpate.mechanics.linear_model import LinearModel, LinearSystem, weighted_sum, with_constraint
+from palpate.mechanics.reduced import Projection, ReducedModel, projection
+from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
+from palpate.mechanics.solvers.contract import Factorisation
+from palpate.mechanics.solvers.registry import SOLVERS, CheckedFactorisation
+from palpate.mesh.constraint import Constraint
+
+__all__ = ["ReducedBasis", "reduced_basis"]
+
+SERIES = 40  # vectors at the most
+FAR = 30.0  # spread of the moduli's ratios to the factorised ones, beyond which a new factorisation costs less
+DISPLACEMENT, TANGENT = 1e-4, 1e-2  # of the reduced model's error, that a correction may leave
+MAX_ITERATIONS = 60
+
+
+@dataclass(frozen=True, slots=True)
+class ReducedBasis:
+    """A linear model projected on m displacements (n_free, m); implements `Approximation`.
+
+    system: the last factorised one; counts: what it cost; place: where it was last made exact, None: nowhere yet.
+    """
+
+    projection: Projection
+    system: LinearSystem
+    counts: SolveCounts
+    place: Place | None = None
+
+    @property
+    def full_model(self) -> LinearModel:
+        """The model that is projected."""
+        return self.projection.model
+
+    @property
+    def model(self) -> ReducedModel:
+        """The reduced model."""
+        return self.projection.reduced
+
+    @property
+    def constraint(self) -> Constraint:
+        """What is prescribed to the model."""
+        return self.full_model.constraint
+
+    @property
+    def factorisation(self) -> Factorisation:
+        """That of the system that was factorised last."""
+        return self.system.factorisation
+
+    @property
+    def reach(self) -> float:
+        """A projection holds however far."""
+        return np.inf
+
+    @property
+    def derivatives_at(self) -> NDArray[np.float64] | None:
+        """Moduli (n_regions,) kPa where it was last made exact with its derivatives."""
+        return None if self.place is None or self.place.directions is None else self.place.moduli
+
+    def update(self, at: Place) -> ReducedBasis:
+        """Add what the reduced model misses at a place: of the displacement there, and of its derivatives.
+
+        Both are corrections by conjugate gradients with the factorisation that is there, from the reduced answers on;
+        where it is none, or the moduli are far from its own, with a new one. Raises `SolverError`.
+        """
+        model, near = self.full_model, _near(self, at.moduli)
+        sharper, displacement = replace(self, system=near.system), self.model.solve(at.moduli, at.coefficients).values
+        if not at.same_as(self.place):
+            missing = -near.solve(model.residual(at.moduli, displacement[:, None]), DISPLACEMENT)
+            displacement = displacement + np.asarray(model.constraint.free @ missing)[:, 0]
+            sharper = _extended(sharper, missing, near.counts + SolveCounts(forward=1))
+        if at.directions is None:
+            return replace(sharper, place=at)
+        loads = _loads_along(at.directions, model, at.moduli, displacement)
+        vectors = sharper.projection.vectors
+        known = vectors @ sharper.model.system(at.moduli).backward(vectors.T @ loads)
+        rest = near.solve(loads - near.matrix @ known, TANGENT)
+        return replace(_extended(sharper, rest, SolveCounts(tangent=rest.shape[1])), place=at)
+
+    def error(self, at: Place) -> float:
+        """Upper bound of the displacement's relative error in energy (see `LinearSystem.error_bound`)."""
+        displacement = self.model.solve(at.moduli, at.coefficients).values
+        return float(self.system.error_bound(at.moduli, displacement[:, None])[0])
+
+    def with_constraint(self, constraint: Constraint) -> ReducedBasis:
+        """The same vectors under another offset, and the response to it added."""
+        model = with_constraint(self.full_model, constraint)
+        system = replace(self.system, model=model)
+        fresh = np.asarray(constraint.free.T @ system.solve(np.zeros(model.n_modes)).values)[:, None]
+        moved = replace(self, projection=self.projection.under(model), system=system, place=None)
+        return _extended(moved, fresh, SolveCounts(forward=1))
+
+    def with_modulus_series(self, coefficients: NDArray[np.float64], selection: NDArray[np.float64]) -> ReducedBasis:
+        """Add how the displacement at `coefficients` (n_modes,) changes with the parameters, to high order.
+
+        selection (n_regions, n_parameters): the regions that each log-modulus scales. The repeated derivatives
+        w -> K^-1 (-E_r K_r w) of all orders up to a number span the dependence on the moduli over a wide range, for K
+        is affine in them (moment matching; Grimme 1997). One right-hand side each, no factorisation.
+        """
+        model, system, regions = self.full_model, self.system, np.flatnonzero(selection.any(axis=1))
+        groups = [np.flatnonzero(column[regions]) for column in selection.T]
+        level = self.model.solve(system.moduli, coefficients).values[:, None]
+        vectors: list[NDArray[np.float64]] = []
+        while level.shape[1] * len(groups) + sum(v.shape[1] for v in vectors) <= SERIES:
+            by_region = system.modulus_responses(level, regions=regions)
+            level = np.concatenate([by_region[group].sum(axis=0) for group in groups], axis=1)
+            vectors.append(level)
+        if not vectors:
+            return self
+        fresh = np.asarray(model.constraint.free.T @ np.concatenate(vectors, axis=1))
+        return _extended(self, fresh, SolveCounts(tangent=fresh.shape[1]))
+
+    def with_responses(self, moduli: NDArray[np.float64], coefficients: NDArray[np.float64]) -> ReducedBasis:
+        """Add all responses at moduli (n_regions,) kPa and the modulus derivatives of the displacement there.
+
+        A factorisation and a right-hand side a mode: `update` costs a fraction, but serves the given place only.
+        """
+        system = self.full_model.system(moduli)
+        responses = system.responses()
+        solution = responses @ np.append(coefficients, 1.0)
+        derivatives = system.modulus_responses(solution[:, None])[:, :, 0].T
+        free = self.constraint.free
+        fresh = np.concatenate([free.T @ responses, free.T @ derivatives], axis=1)
+        cost = system.response_counts + SolveCounts(tangent=self.full_model.n_regions)
+        return _extended(replace(self, system=system), fresh, cost)
+
+
+def reduced_basis(model: LinearModel, moduli: NDArray[np.float64]) -> ReducedBasis:
+    """The model on its responses to every boundary mode at moduli (n_regions,) kPa; one factorisation."""
+    system = model.system(moduli)
+    snapshots = np.asarray(model.constraint.free.T @ system.responses())
+    return ReducedBasis(projection(model, snapshots), system, system.response_counts)
+
+
+def _extended(basis: ReducedBasis, snapshots: NDArray[np.float64], cost: SolveCounts) -> ReducedBasis:
+    return replace(basis, projection=basis.projection.extended(snapshots), counts=basis.counts + cost)
+
+
+def _loads_along(
+    directions: NDArray[np.float64], model: LinearModel, moduli: NDArray[np.float64], values: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Loads (n_free, k), mN, whose responses are the free part of the derivatives of u (n_dof,) along directions."""
+    by_modulus, by_mode = directions[: model.n_regions], directions[model.n_regions :]
+    loads = -np.asarray(weighted_sum(moduli, model.coupling)[:, :-1] @ by_mode)
+    for modulus, matrix, share in zip(moduli, model.stiffness, by_modulus, strict=True):
+        loads -= np.outer(model.constraint.free.T @ (modulus * (matrix @ values)), share)
+    return loads
+
+
+@dataclass(frozen=True, slots=True)
+class _Near:
+    """The stiffness `matrix` (n_free, n_free), mN/mm, at some moduli; `system`: that of the factors at hand."""
+
+    matrix: sparse.csr_matrix[np.float64]
+    system: LinearSystem
+    counts: SolveCounts
+
+    def solve(self, rhs: NDArray[np.float64], tolerance: float) -> NDArray[np.float64]:
+        """Solution (n_free, k) mm to a relative residual; raises `SolverError`."""
+        solution, _ = conjugate_gradients(
+            self.matrix, rhs, self.system.factorisation.solve, tolerance=tolerance, max_iterations=MAX_ITERATIONS
+        )
+        return solution
+
+
+def _near(basis: ReducedBasis, moduli: NDArray[np.float64]) -> _Near:
+    """The stiffness at moduli (n_regions,) kPa with the factors at hand, or with its own where those are no help."""
+    system, matrix = basis.system, weighted_sum(moduli, basis.full_model.free_stiffness)
+    ratios = moduli / system.moduli
+    if ratios.max() < FAR * ratios.min() and _direct(system.factorisation):
+        return _Near(matrix, system, SolveCounts())
+    return _Near(matrix, basis.full_model.system(moduli), SolveCounts(factorisations=1))
+
+
+def _direct(factorisation: Factorisation) -> bool:
+    """Whether a solution costs little beside the factorisation: not where it iterates itself."""
+    return isinstance(factorisation, CheckedFactorisation) and SOLVERS[factorisation.solver].direct

@@ -1,0 +1,373 @@
+"""What an inversion states: moduli with interval and verdict, every start, the fit of everything observed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.inversion.estimate import Inversion, StartRun
+from palpate.inversion.optimise import Iterate, Outcome
+from palpate.inversion.outer_loop import InversionSettings
+from palpate.inversion.uncertainty import (
+    FittedState,
+    Interval,
+    grid_position_shifts,
+    hull,
+    log_interval,
+    sandwich_covariance,
+    verdict,
+)
+from palpate.mechanics.deformation import deformation_determinants
+from palpate.mesh.voxelise import voxelise
+from palpate.observation.contract import Fit
+
+__all__ = [
+    "Estimation",
+    "Iteration",
+    "ModulusEstimate",
+    "Observed",
+    "Remark",
+    "Start",
+    "TissueFit",
+    "conclude",
+    "no_estimate",
+]
+
+GRID_DRAWS = 8
+AT_BOUND = 1e-6
+STRONG_CORRELATION = 0.99
+AS_GOOD = 0.05  # of the objective: another minimum that is worse by less cannot be excluded
+
+
+@dataclass(frozen=True, slots=True)
+class Remark:
+    """A warning that stands beside a result: a `code` for programs, a `message` for readers."""
+
+    code: str
+    message: str
+
+
+@dataclass(frozen=True, slots=True)
+class Iteration:
+    """One step of one start: misfit (mm^2), moduli (kPa, or ratios), and the decrement still promised."""
+
+    objective_mm2: float
+    moduli: Mapping[str, float]
+    decrement: float
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """What one start did alone: moduli (kPa, or ratios) it began and ended with, its steps and how they ended.
+
+    minimum: number, from 0, of the distinct minimum that it leads to.
+    """
+
+    start: Mapping[str, float]
+    end: Mapping[str, float]
+    objective_mm2: float
+    status: str
+    reason: str
+    minimum: int
+    history: tuple[Iteration, ...]
+
+    @property
+    def iterations(self) -> int:
+        """Number of accepted points."""
+        return len(self.history)
+
+
+@dataclass(frozen=True, slots=True)
+class ModulusEstimate:
+    """Young's modulus of one tissue, in `unit` (kPa, or a ratio to `relative_to`), with its 95 % interval.
+
+    None in an interval is an open end; `value` is None in ratio mode and when nothing converged.
+    """
+
+    tissue: str
+    unit: str
+    value: float | None
+    interval95: Interval | None
+    interval_kind: str
+    relative_to: str
+    ratio: float | None
+    ratio_interval95: Interval | None
+    verdict: str
+    why: str
+    truth: float | None = None
+    parameter: str = "youngs_modulus"
+
+
+@dataclass(frozen=True, slots=True)
+class TissueFit:
+    """Fit of one observation in one later image, before and after the estimation; `tissue`: its name."""
+
+    tissue: str
+    start: Fit
+    end: Fit
+    observed_share: float
+
+
+@dataclass(frozen=True, slots=True)
+class Estimation:
+    """Result of one inversion.
+
+    correlation (n, n) of the log-moduli; fits: the tissues of each later image; displacements: (n_points, 3) mm of
+    each later image; covariance (n, n) of the log-moduli, grid_covariance (n, n) the part of the voxel grid's place;
+    outer_iterations: the steps from the best start's minimum to the estimate, which all starts of that minimum share.
+    """
+
+    status: str
+    reason: str
+    estimates: tuple[ModulusEstimate, ...]
+    covariance: NDArray[np.float64]
+    starts: tuple[Start, ...]
+    fits: tuple[tuple[TissueFit, ...], ...]
+    displacements: tuple[NDArray[np.float64], ...]
+    counts: Mapping[str, int]
+    outer_iterations: tuple[Iteration, ...] = ()
+    remarks: tuple[Remark, ...] = ()
+    grid_covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+
+    @property
+    def correlation(self) -> NDArray[np.float64]:
+        """Correlation (n, n) of the log-moduli, dimensionless."""
+        sd = np.sqrt(np.diag(self.covariance))
+        return np.asarray(self.covariance / np.outer(sd, sd))
+
+
+@dataclass(frozen=True, slots=True)
+class Observed:
+    """The fitted later states, and each image's tissue index (nx, ny, nz)."""
+
+    states: tuple[FittedState, ...]
+    images: tuple[NDArray[np.int16], ...]
+
+
+def conclude(
+    inversion: Inversion, settings: InversionSettings, observed: Observed, *, truth: Mapping[str, float], seed: int
+) -> Estimation:
+    """State the result of an inversion; `truth`: true moduli (kPa) by tissue where they are known.
+
+    The covariance is the sandwich under the residuals' law plus the scatter over grid positions.
+    """
+    objective, minimum = inversion.objective, inversion.minimum
+    rng = np.random.default_rng(seed)
+    shifts = grid_position_shifts(objective, minimum.evaluation, observed.states, draws=GRID_DRAWS, rng=rng)
+    grid_part = shifts.T @ shifts / len(shifts)
+    covariance = sandwich_covariance(objective, minimum.evaluation) + grid_part
+    return Estimation(
+        status="converged" if minimum.converged else "not converged",
+        reason=_reason(inversion),
+        estimates=_estimates(inversion, settings, covariance, truth),
+        covariance=covariance,
+        starts=tuple(_start(inversion, start) for start in inversion.starts),
+        fits=_fits(inversion, observed),
+        displacements=tuple(state.displacement for state in observed.states),
+        counts={
+            "forward": inversion.counts.forward,
+            "adjoint": inversion.counts.adjoint,
+            "tangent": inversion.counts.tangent,
+            "factorisations": inversion.counts.factorisations,
+            "evaluations": inversion.evaluations,
+        },
+        outer_iterations=tuple(_iteration(inversion, iterate) for iterate in minimum.history),
+        remarks=(*_remarks(inversion, covariance), *_folds(observed)),
+        grid_covariance=grid_part,
+    )
+
+
+def no_estimate(
+    tissue: str, *, absolute: bool, relative_to: str, why: str, truth: float | None = None
+) -> ModulusEstimate:
+    """The entry of a tissue when nothing converged: no value that could be taken for a result."""
+    return ModulusEstimate(
+        tissue=tissue,
+        unit="kPa" if absolute else "ratio",
+        value=None,
+        interval95=None,
+        interval_kind="linearised",
+        relative_to=relative_to,
+        ratio=None,
+        ratio_interval95=None,
+        verdict="not identified",
+        why=why,
+        truth=truth,
+    )
+
+
+def _reason(inversion: Inversion) -> str:
+    """How the estimate ended, and what became of the starts."""
+    converged = sum(start.minimum.converged for start in inversion.starts)
+    distinct = {s.candidate for s in inversion.starts if s.minimum.converged}
+    lost = sum(candidate.minimum.outcome is Outcome.NO_EQUILIBRIUM for candidate in inversion.candidates)
+    return (
+        f"{inversion.minimum.outcome.value}; {converged} of {len(inversion.starts)} starts converged,"
+        f" to {len(distinct)} distinct {'minimum' if len(distinct) == 1 else 'minima'}"
+        + (f", {lost} of which {'has' if lost == 1 else 'have'} no equilibrium under the law" if lost else "")
+    )
+
+
+def _estimates(
+    inversion: Inversion, settings: InversionSettings, covariance: NDArray[np.float64], truth: Mapping[str, float]
+) -> tuple[ModulusEstimate, ...]:
+    mapping = inversion.objective.parameters
+    theta = inversion.minimum.unknowns[: mapping.n_parameters]
+    bounds = settings.bounds
+    scale = mapping.scale_kpa
+    if not inversion.minimum.converged:
+        why = f"the estimation did not converge: {inversion.minimum.outcome.value}"
+        return tuple(
+            no_estimate(
+                name, absolute=mapping.absolute, relative_to=mapping.relative_to, why=why, truth=truth.get(name)
+            )
+            for name in mapping.tissues
+        )
+    found = []
+    for i, name in enumerate(mapping.tissues):
+        ratio = float(np.exp(theta[i]))
+        limits = {"lower": float(np.exp(bounds.lower[i])), "upper": float(np.exp(bounds.upper[i]))}
+        sd = float(np.sqrt(covariance[i, i]))
+        interval = hull([log_interval(float(np.exp(t[i])), sd, **limits) for t in _as_good(inversion)])
+        at_bound = bool(np.min(np.abs([theta[i] - bounds.lower[i], theta[i] - bounds.upper[i]])) < AT_BOUND)
+        word, why = verdict(interval, at_bound=at_bound, absolute=mapping.absolute)
+        low, high = interval
+        found.append(
+            ModulusEstimate(
+                tissue=name,
+                unit="kPa" if mapping.absolute else "ratio",
+                value=ratio * scale if mapping.absolute else None,
+                interval95=(low and low * scale, high and high * scale) if mapping.absolute else None,
+                interval_kind="linearised",
+                relative_to=mapping.relative_to,
+                ratio=None if mapping.by_load else ratio,
+                ratio_interval95=None if mapping.by_load else interval,
+                verdict=word,
+                why=why,
+                truth=truth.get(name),
+            )
+        )
+    return tuple(found)
+
+
+def _as_good(inversion: Inversion) -> list[NDArray[np.float64]]:
+    """Log-moduli (n_parameters,) of the best minimum and of every other that explains the images nearly as well.
+
+    Voxels make the objective rough by some hundredths of it, so that its value alone cannot choose between them.
+    """
+    n, best = inversion.objective.n_parameters, inversion.candidates[inversion.best]
+    limit = (1.0 + AS_GOOD) * best.value
+    good = [c.minimum for c in inversion.candidates if c.minimum.converged and c.value <= limit]
+    return [minimum.unknowns[:n] for minimum in good]
+
+
+def _start(inversion: Inversion, start: StartRun) -> Start:
+    minimum = start.minimum
+    return Start(
+        start=_moduli(inversion, start.theta),
+        end=_moduli(inversion, minimum.unknowns[: len(start.theta)]),
+        objective_mm2=minimum.evaluation.misfit_mm2,
+        status="converged" if minimum.converged else "not converged",
+        reason=minimum.outcome.value,
+        minimum=start.candidate,
+        history=tuple(_iteration(inversion, iterate) for iterate in minimum.history),
+    )
+
+
+def _iteration(inversion: Inversion, iterate: Iterate) -> Iteration:
+    return Iteration(iterate.misfit_mm2, _moduli(inversion, iterate.theta), iterate.decrement)
+
+
+def _moduli(inversion: Inversion, theta: NDArray[np.float64]) -> dict[str, float]:
+    """Moduli in kPa, or ratios when no modulus is known."""
+    mapping = inversion.objective.parameters
+    return {name: float(mapping.scale_kpa * np.exp(value)) for name, value in zip(mapping.tissues, theta, strict=True)}
+
+
+def _fits(inversion: Inversion, observed: Observed) -> tuple[tuple[TissueFit, ...], ...]:
+    fits = []
+    for s, (fitted, image) in enumerate(zip(observed.states, observed.images, strict=True)):
+        motions = (np.zeros_like(fitted.displacement), fitted.displacement)
+        modelled = [voxelise(fitted.space, motion, fitted.after, crossing=True) for motion in motions]
+        seen = zip(inversion.rest.lines, inversion.minimum.evaluation.lines, strict=True)
+        of_state = [pair for pair in seen if pair[0].state == s]
+        fits.append(
+            tuple(
+                TissueFit(
+                    end.observation.name,
+                    start.observation.fit(start.residuals, modelled[0], image),
+                    end.observation.fit(end.residuals, modelled[1], image),
+                    end.observation.observed_share,
+                )
+                for start, end in of_state
+            )
+        )
+    return tuple(fits)
+
+
+def _folds(observed: Observed) -> tuple[Remark, ...]:
+    """A warning for each later image in which the fitted model turns elements inside out."""
+    remarks = []
+    for number, state in enumerate(observed.states, start=1):
+        space = state.space
+        smallest = deformation_determinants(space, state.displacement).min(axis=1)
+        folded = int(np.count_nonzero(smallest <= 0.0))
+        if folded:
+            worst = space.mesh.nodes[space.mesh.tets[int(smallest.argmin())]].mean(axis=0)
+            remarks.append(
+                Remark(
+                    "fold-over",
+                    f"after image {number}: {folded} of {len(smallest)} elements are turned inside out, the worst near"
+                    f" {np.round(worst).astype(int).tolist()} mm (RAS): the motion is too large there for the law or"
+                    " the mesh",
+                )
+            )
+    return tuple(remarks)
+
+
+def _remarks(inversion: Inversion, covariance: NDArray[np.float64]) -> tuple[Remark, ...]:
+    mapping = inversion.objective.parameters
+    remarks = []
+    if not mapping.absolute:
+        remarks.append(
+            Remark(
+                "ratio-only",
+                f"no tissue's modulus is known, so only ratios to '{mapping.relative_to}' are determined; give one"
+                " tissue role `known` with its youngs_modulus_kpa to get kPa",
+            )
+        )
+    if inversion.minimum.converged and inversion.convergence.unmet:
+        remarks.append(
+            Remark(
+                "unsettled",
+                f"the outer loop ended at its largest number of iterations: {'; '.join(inversion.convergence.unmet)};"
+                " the model may not fit the images (edge length, driver modes, law), or [noise] should be given",
+            )
+        )
+    lost = [c for c in inversion.candidates if c.minimum.outcome is Outcome.NO_EQUILIBRIUM]
+    if lost:
+        remarks.append(
+            Remark(
+                "no-equilibrium",
+                f"{len(lost)} of {len(inversion.candidates)} minima of the linear law have no equilibrium under the"
+                " case's law and are not compared with the others",
+            )
+        )
+    if len(inversion.candidates) - len(lost) > 1:
+        remarks.append(
+            Remark(
+                "several-minima",
+                "the starts ended in different minima; the best fit under one noise model is reported, and the"
+                " intervals reach over all that fit nearly as well",
+            )
+        )
+    sd = np.sqrt(np.diag(covariance))
+    for i in range(len(sd)):
+        for j in range(i):
+            if abs(covariance[i, j]) > STRONG_CORRELATION * sd[i] * sd[j]:
+                names = f"'{mapping.tissues[j]}' and '{mapping.tissues[i]}'"
+                remarks.append(Remark("correlated", f"the moduli of {names} cannot be told apart by these images"))
+    return tuple(remarks)

@@ -1,0 +1,168 @@
+"""How uncertain the estimate is: covariance under correlated residuals, voxel grid, intervals and verdicts in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.images.label_image import VoxelGrid
+from palpate.images.segmentation import Segmentation
+from palpate.inversion.objective import Evaluation, Linearisation, Objective
+from palpate.mesh.space import LagrangeSpace
+from palpate.mesh.voxelise import voxelise
+from palpate.observation.noise_model import NoiseModel
+
+__all__ = [
+    "NORMAL_95",
+    "FittedState",
+    "Interval",
+    "gain",
+    "grid_position_shifts",
+    "hull",
+    "imaging_errors",
+    "log_interval",
+    "sandwich_covariance",
+    "verdict",
+]
+
+Interval = tuple[float | None, float | None]
+
+NORMAL_95 = 1.959964
+IDENTIFIED, WEAK = 2.0, 10.0  # largest ratio of an interval's ends
+
+
+@dataclass(frozen=True, slots=True)
+class FittedState:
+    """A fitted later state: displacement (n_points, 3) mm of its `space`, and the grids of both images."""
+
+    space: LagrangeSpace
+    displacement: NDArray[np.float64]
+    before: VoxelGrid
+    after: VoxelGrid
+
+
+def gain(evaluation: Evaluation, n_parameters: int) -> tuple[NDArray[np.float64], ...]:
+    """Derivative (n_parameters, n_residuals) of the estimated log-moduli by the residuals of each surface, 1/mm.
+
+    G = H^-1 J^T W: a change e of the data moves the estimate by -G e; H is the Gauss-Newton matrix with the prior.
+    """
+    rows = np.linalg.solve(evaluation.matrix, np.eye(len(evaluation.matrix))[:, :n_parameters]).T
+    return tuple(rows[:, s.columns] @ (s.precision * s.weights[:, None] * s.jacobian).T for s in evaluation.lines)
+
+
+def sandwich_covariance(objective: Objective, evaluation: Evaluation) -> NDArray[np.float64]:
+    """Covariance (n_parameters, n_parameters) of the log-moduli: H^-1 (J^T W C W J + P) H^-1.
+
+    C is the covariance of the residuals under each kind's noise model, across all observations of the kind; P the
+    prior, whose uncertainty is thereby included (White 1980; Aitken's theorem read for correlated errors). A residual
+    is the error of a later image less that of its rest state's image, each with half of the noise: the later ones are
+    independent, that of the rest state is the same for all states that have it, at the material place. Later states
+    that move alike do not average it away, opposite ones do.
+    """
+    n = objective.n_parameters
+    inverse = np.linalg.solve(evaluation.matrix, np.eye(len(evaluation.matrix))[:, :n])
+    data = np.zeros((n, n))
+    pairs = list(zip(evaluation.lines, gain(evaluation, n), strict=True))
+    for kind, noise in objective.noise.items():
+        of_kind = [(line, row) for line, row in pairs if line.observation.kind == kind]
+        later = [line.state for line, _ in of_kind]
+        for groups, at_rest in ((later, False), ([objective.states[s].reference for s in later], True)):
+            for key in dict.fromkeys(groups):
+                group = [pair for pair, own in zip(of_kind, groups, strict=True) if own == key]
+                data += 0.5 * _propagated(noise, group, at_rest=at_rest)
+    return np.asarray(data + inverse.T @ evaluation.prior @ inverse)
+
+
+def _propagated(
+    noise: NoiseModel, group: Sequence[tuple[Linearisation, NDArray[np.float64]]], *, at_rest: bool
+) -> NDArray[np.float64]:
+    """G C G^T (n_parameters, n_parameters) of observations with their gains G, C between their places."""
+    carried = np.concatenate([row for _, row in group], axis=1)
+    residuals = [line.residuals for line, _ in group]
+    places = np.concatenate([r.material if at_rest else r.places for r in residuals])
+    return noise.covariance(carried, places, np.concatenate([r.normals for r in residuals]))
+
+
+def grid_position_shifts(
+    objective: Objective,
+    evaluation: Evaluation,
+    states: tuple[FittedState, ...],
+    *,
+    draws: int,
+    rng: np.random.Generator,
+) -> NDArray[np.float64]:
+    """Shifts (draws, n_parameters) of the estimated log-moduli when an exact model is imaged on random grids.
+
+    The errors e of the residuals (see `imaging_errors`) go through the gain of one Gauss-Newton step, -G e.
+    """
+    rows = gain(evaluation, objective.n_parameters)
+    shifts = np.zeros((draws, objective.n_parameters))
+    for draw in range(draws):
+        for row, error in zip(rows, imaging_errors(objective, evaluation, states, rng=rng), strict=True):
+            shifts[draw] -= row @ error
+    return shifts
+
+
+def imaging_errors(
+    objective: Objective, evaluation: Evaluation, states: tuple[FittedState, ...], *, rng: np.random.Generator
+) -> list[NDArray[np.float64]]:
+    """Errors (n,) mm of the residuals of each observation when the fitted model itself is imaged.
+
+    The model, at rest and deformed, is turned into voxels on grids shifted at random by up to half a voxel; later
+    states of one reference state have the same image of it.
+    """
+    errors, rest = list[NDArray[np.float64]](), dict[int, Segmentation]()
+    for s, (state, fitted) in enumerate(zip(objective.states, states, strict=True)):
+        if state.reference not in rest:
+            rest[state.reference] = _imaged(fitted.space, np.zeros_like(fitted.displacement), fitted.before, rng)
+        after = _imaged(fitted.space, fitted.displacement, fitted.after, rng)
+        lines: list[Linearisation] = [line for line in evaluation.lines if line.state == s]
+        errors += [line.observation.imaging_error(line.residuals, rest[state.reference], after) for line in lines]
+    return errors
+
+
+def log_interval(centre: float, sd: float, *, lower: float, upper: float) -> Interval:
+    """95 % interval exp(ln centre +- 1.96 sd); an end beyond the bounds (lower, upper), in `centre`'s unit, is open."""
+    low, high = centre * np.exp(-NORMAL_95 * sd), centre * np.exp(NORMAL_95 * sd)
+    return (float(low) if low > lower else None, float(high) if high < upper else None)
+
+
+def hull(intervals: Sequence[Interval]) -> Interval:
+    """Smallest interval that holds all of one or more; an end that is open in one of them is open."""
+    lows, highs = [low for low, _ in intervals], [high for _, high in intervals]
+    low = None if None in lows else min(end for end in lows if end is not None)
+    high = None if None in highs else max(end for end in highs if end is not None)
+    return low, high
+
+
+def verdict(interval: Interval, *, at_bound: bool, absolute: bool) -> tuple[str, str]:
+    """Verdict and its reason from the interval of a modulus or ratio.
+
+    `identified`: closed and high/low <= 2; `weak`: closed and wider; `not identified`: an open end, a bound, or
+    high/low > 10; `ratio only`: identified or weak, but no known modulus holds the scale.
+    """
+    low, high = interval
+    if at_bound:
+        return "not identified", "the estimate lies at its bound; the images do not hold it back"
+    if low is None or high is None:
+        return "not identified", "the 95 % interval is open: it reaches beyond the bounds of the search"
+    width = high / low
+    if width > WEAK:
+        return "not identified", f"the 95 % interval spans a factor {width:.1f}"
+    if not absolute:
+        return "ratio only", f"no modulus is known, so only the ratio is determined (within a factor {width:.2f})"
+    if width <= IDENTIFIED:
+        return "identified", f"the 95 % interval spans a factor {width:.2f}"
+    return "weak", f"the 95 % interval spans a factor {width:.2f}; more image pairs or a larger motion narrow it"
+
+
+def _imaged(
+    space: LagrangeSpace, displacement: NDArray[np.float64], grid: VoxelGrid, rng: np.random.Generator
+) -> Segmentation:
+    affine = np.array(grid.affine)
+    affine[:3, 3] += affine[:3, :3] @ rng.uniform(-0.5, 0.5, 3)
+    shifted = replace(grid, affine=affine)
+    return Segmentation(voxelise(space, displacement, shifted, crossing=True), shifted, space.mesh.tissues)

@@ -1,0 +1,220 @@
+"""The distance between a surface of the model and an image's, as a difference to the rest state: an `Observation`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import EstimationError
+from palpate.images.segmentation import Segmentation
+from palpate.images.tissue_distance import tissue_distance_map
+from palpate.observation.contract import Fit, Residuals, Weighting
+from palpate.observation.noise_model import EXACT_NOISE, SEGMENTATION_NOISE, NoiseModel, fit_noise_model
+from palpate.observation.robust_loss import Tukey
+from palpate.observation.surface_residuals import Correspondence, correspondence, surface_residuals
+from palpate.observation.target import SurfaceTarget
+from palpate.observation.wall_correction import wall_correction
+
+__all__ = ["SurfaceDistance", "robust_loss", "surface_distance"]
+
+TUKEY = 4.685  # cutoff in standard deviations, 95 % efficient for normal errors (Huber 1981)
+MAD = 1.4826  # standard deviations of a normal law in one median absolute deviation
+LEAST_CUTOFF = 5e-3  # mm
+ROUGH_WALL = 1.5  # times the noise's variance: a driver's mean square residual above it is motion, not noise
+FINEST_WALL = 5e-3  # mm, root mean square: less moves no modulus
+AROUND = 8.0  # widths of the Gaussian, within which the maps of an imaged model are asked
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceDistance:
+    """Signed distances between one surface of the model and both images of it; implements `Observation`.
+
+    model -> image: r = d_after(x + u) - d_before(x) - b(x)        at quadrature points of the observed triangles;
+    image -> model: r = s(y) - (d_before(X) - level) - b(X)        where s is the signed distance of the closest model
+    point x = X + u(X) from the image point y, positive when the model lies outside; b is `held.excess`. Each direction
+    has half of the weight, shared out by area and, where voxels' terraces add to the noise n (mm^4, its variance times
+    its correlation area), as n / (n + terraces). stated_noise: that of the case, which holds whatever the residuals
+    say.
+    """
+
+    target: SurfaceTarget
+    held: Correspondence
+    noise_model: NoiseModel
+    weighting: Weighting
+    stated_noise: NoiseModel | None = None
+
+    @property
+    def kind(self) -> str:
+        """What is compared."""
+        return "surface distance"
+
+    @property
+    def name(self) -> str:
+        """The tissue's name."""
+        return self.target.surface.name
+
+    @property
+    def dofs(self) -> NDArray[np.int64]:
+        """Numbers (n_dofs,) of the surface's unknowns."""
+        return self.target.surface.dofs
+
+    @property
+    def of_driver(self) -> bool:
+        """Whether the surface is a driver's wall."""
+        return self.target.surface.driver
+
+    @property
+    def observed_share(self) -> float:
+        """Share of the surface's area that touches neither driver, bone nor the image's border."""
+        return self.target.surface.share
+
+    def residuals(self, displacement: NDArray[np.float64]) -> Residuals:
+        """Residuals and their derivative at a displacement (n_dofs,) mm: model -> image first, then image -> model.
+
+        The smooth Jacobian is that of a smooth surface without noise, n . du. The exact one also holds how voxel noise
+        and facets change as the surface slides along itself, which tells nothing of how it slides.
+        """
+        found = surface_residuals(self.target, displacement.reshape(-1, 3), self.held)
+        noise = self.noise_model.sd**2 * self.noise_model.correlation_area
+        terraces = np.concatenate([self.target.terraces, self.held.terraces[self.held.kept]])
+        weights = found.weights * noise / (noise + terraces)
+        return replace(found, weights=weights * (found.weights.sum() / weights.sum()))
+
+    def rematched(self, displacement: NDArray[np.float64]) -> SurfaceDistance:
+        """The same with the image points that face the observed part chosen at a displacement (n_dofs,) mm.
+
+        Raises `EstimationError` when none does.
+        """
+        held = correspondence(self.target, displacement.reshape(-1, 3))
+        if not held.kept.any():
+            raise EstimationError(
+                f"'{self.name}': none of the {len(held.kept)} points of its surface in the later image faces the"
+                " observed part of the model; is it the same organ, and do the images lie on each other?"
+            )
+        return replace(self, held=held)
+
+    def with_noise(self, noise: NoiseModel) -> SurfaceDistance:
+        """All residuals and all image points count, its independent ones by their variance."""
+        return replace(
+            self, held=_everywhere(self.target), noise_model=noise, weighting=Weighting(self._precision(noise), Tukey())
+        )
+
+    def reweighted(self, residuals: Residuals) -> SurfaceDistance:
+        """The same with a robust loss by its residuals.
+
+        A surface that fits worse than the noise (a driver whose modes cannot follow its wall) counts by its own mean
+        square, so that its misfit is not forced into the other unknowns.
+        """
+        loss = robust_loss(residuals.values, self.target)
+        inside = ~loss.rejects(residuals.values)
+        mean_square = float(np.average(residuals.values[inside] ** 2, weights=residuals.weights[inside]))
+        share = min(1.0, self.noise_model.sd**2 / max(mean_square, 1e-12))
+        return replace(self, weighting=Weighting(self._precision(self.noise_model) * share, loss))
+
+    def first_noise(self, peers: Sequence[SurfaceDistance]) -> NoiseModel:
+        """The rounding of both images' voxels; without any, `EXACT_NOISE`; what is stated, where it is.
+
+        Voxels of edge h round a surface by a variance of h^2 / 12 a voxel, which a Gaussian of width sigma spreads:
+        h^4 / (48 pi sigma^2) for each image, with the correlation length sqrt(2) sigma. Residuals that are left put too
+        small a noise right; too large a one leaves motion of the drivers in them, which then passes for noise.
+        """
+        if self.stated_noise is not None:
+            return self.stated_noise
+        maps = [image for peer in peers for image in peer.target.voxels or ()]
+        if not maps:
+            return EXACT_NOISE
+        variances = [m.grid.voxel_volume ** (4.0 / 3.0) / (48.0 * np.pi * m.smoothing_mm**2) for m in maps]
+        width = float(np.mean([m.smoothing_mm for m in maps]))
+        return NoiseModel(np.array([2.0 * float(np.mean(variances))]), np.array([np.sqrt(2.0) * width]))
+
+    def fitted_noise(self, residuals: Sequence[Residuals]) -> NoiseModel:
+        """What the residuals tell (see `fit_noise_model`); what is stated, where it is."""
+        if self.stated_noise is not None:
+            return self.stated_noise
+        return fit_noise_model(
+            [r.values for r in residuals], [r.places for r in residuals], [r.normals for r in residuals]
+        )
+
+    def wall_motion(
+        self, residuals: Residuals, *, present: NDArray[np.float64], kernel_mm: float
+    ) -> NDArray[np.float64] | None:
+        """See `Observation` and `wall_correction`; the prior is as wide as the residuals' root mean square."""
+        mean_square = float(np.average(np.square(residuals.values), weights=residuals.weights))
+        if not self.of_driver or mean_square <= max(ROUGH_WALL * self.noise_model.sd**2, FINEST_WALL**2):
+            return None
+        correction = wall_correction(
+            self.target.surface,
+            residuals,
+            residuals.weights * self._precision(self.noise_model),
+            present=present.reshape(-1, 3),
+            kernel_mm=kernel_mm,
+            prior_mm=float(np.sqrt(mean_square)),
+        )
+        return correction.ravel()
+
+    def imaging_error(self, residuals: Residuals, before: Segmentation, after: Segmentation) -> NDArray[np.float64]:
+        """Errors (n,) mm of the residuals when the fitted model itself is imaged.
+
+        Both directions of the distance see the same error and have half the weight each: that of the direction model ->
+        image counts twice, and the other one not.
+        """
+        target, surface = self.target, self.target.surface
+        if target.voxels is None:
+            return np.zeros(len(residuals.values))
+        width = target.voxels[1].smoothing_mm
+        corners = surface.triangles[target.triangle]
+        rest = np.einsum("qk,qka->qa", target.barycentric, surface.rest[corners])
+        excess = np.einsum("qk,qk->q", target.barycentric, self.held.excess[corners])
+        maps = [
+            tissue_distance_map(image, surface.tissue, smoothing_mm=width, reach_mm=AROUND * width)
+            for image in (before, after)
+        ]
+        errors, n = np.zeros(len(residuals.values)), len(rest)
+        errors[:n] = 2.0 * (maps[1].at(residuals.places[:n]) - maps[0].at(rest) - excess)
+        return errors
+
+    def fit(self, residuals: Residuals, modelled: NDArray[np.int16], image: NDArray[np.int16]) -> Fit:
+        """Distances by area, and Dice's 2 |A and B| / (|A| + |B|) of the tissue's voxels in model and image."""
+        distance, weights = np.abs(residuals.values), residuals.weights
+        order = np.argsort(distance)
+        share = np.cumsum(weights[order]) / float(weights.sum())
+        shown, seen = modelled == self.target.surface.tissue, image == self.target.surface.tissue
+        return Fit(
+            mean_mm=float(np.average(distance, weights=weights)),
+            rms_mm=float(np.sqrt(np.average(distance**2, weights=weights))),
+            hd95_mm=float(distance[order][np.searchsorted(share, 0.95)]),
+            dice=2.0 * int((shown & seen).sum()) / max(int(shown.sum()) + int(seen.sum()), 1),
+        )
+
+    def _precision(self, noise: NoiseModel) -> float:
+        """Weight (mm^-2) of the surface's mean square: its independent residuals, by their variance."""
+        return max(float(self.target.area.sum()) / noise.correlation_area, 1.0) / noise.sd**2
+
+
+def surface_distance(target: SurfaceTarget, *, stated_noise: NoiseModel | None = None) -> SurfaceDistance:
+    """The observation of one surface; all its residuals count by the stated noise, or by what voxels leave of it."""
+    noise = stated_noise or SEGMENTATION_NOISE
+    made = SurfaceDistance(target, _everywhere(target), noise, Weighting(1.0, Tukey()), stated_noise)
+    return made.with_noise(made.first_noise((made,)))
+
+
+def robust_loss(values: NDArray[np.float64], target: SurfaceTarget) -> Tukey:
+    """Tukey's biweight for residuals (n,) mm of one surface: its cutoff is 4.685 of their standard deviations.
+
+    Up to the edge of a voxel (half of each image's; root mean square of the three edges) all count fully: so far can
+    rounding move a surface that runs along the grids, and terraces that flip as a whole are no outliers. They are rare
+    and large and carry the motion of a surface that else seems to stand still: if they counted less than what is quiet,
+    every motion would be found too small.
+    """
+    spread = MAD * float(np.median(np.abs(values)))
+    rounding = float(sum(0.5 * np.sqrt(np.mean(image.grid.spacing**2)) for image in target.voxels or ()))
+    return Tukey(max(TUKEY * spread, LEAST_CUTOFF), rounding)
+
+
+def _everywhere(target: SurfaceTarget) -> Correspondence:
+    """Every image point, until the model is near enough to choose."""
+    n = len(target.image_points)
+    return Correspondence(np.ones(n, dtype=bool), np.zeros(n), np.zeros(len(target.surface.rest)))
