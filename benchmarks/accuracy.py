@@ -13,40 +13,50 @@ import argparse
 import json
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from cramer_rao import cramer_rao, model_to_image
 from numpy.typing import NDArray
 
 from palpate.images.segmentation import segment
 from palpate.images.tissue import Role
-from palpate.inversion.conclude import Observed, conclude
-from palpate.inversion.continuation import Expansion, continued_at_finite_strain
-from palpate.inversion.cramer_rao import cramer_rao
-from palpate.inversion.grid_position import FittedState, voxel_errors
-from palpate.inversion.invert import invert
-from palpate.inversion.modulus_map import modulus_map
-from palpate.inversion.noise import NoiseLaw, fit_noise_law
-from palpate.inversion.problem import InverseProblem, Inversion, InversionSettings
-from palpate.inversion.surrogate import first_surrogate
-from palpate.inversion.weighting import objective_of
+from palpate.inversion import (
+    FittedState,
+    InverseProblem,
+    Inversion,
+    InversionSettings,
+    LaterState,
+    Objective,
+    Observed,
+    Place,
+    conclude,
+    continue_at_finite_strain,
+    exact_approximation,
+    invert,
+    parameter_map,
+)
+from palpate.inversion.uncertainty import imaging_errors
 from palpate.mechanics.boundary import outer_constraint
-from palpate.mechanics.equilibrium import from_linear
-from palpate.mechanics.first_order import expanded
-from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import linear_model
 from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.surface import triangle_normals
 from palpate.mesh.tetrahedralise import tetrahedralise
+from palpate.observation.noise_model import NoiseModel, fit_noise_model
 from palpate.observation.observed_surface import observed_surface
 from palpate.observation.prescribed_motion import prescribed_motion
+from palpate.observation.surface_distance import surface_distance
 from palpate.phantoms.exact_targets import exact_target
 from palpate.phantoms.pelvis import PelvisOptions, pelvis, pelvis_anatomy, pelvis_grid
 from palpate.phantoms.scene import Noise, Scene, reimaged, rescaled
 from palpate.study.body import Body, aligned, inverse_problem, make_body
 from palpate.study.case import Case, Mechanics, MeshSettings, Phantom
 from palpate.study.run import fitted_states, inversion_settings
+
+Result = dict[str, Any]  # a line of JSON
 
 NOISE = Noise(surface_sd_mm=0.3, correlation_length_mm=6.0)
 
@@ -138,17 +148,23 @@ def truth_of(row: Row, seed: int, draw: int, truths: Truths) -> tuple[Scene, Pel
     filling = float(np.random.default_rng([seed, 7]).uniform(6.0, 8.0))
     if row.law != "linear" and row.filling_mm is not None:
         filling = row.filling_mm
-    given = {"tumour": row.tumour, "law": row.law, "poisson_ratio": row.poisson_ratio}
-    given["truth_edge_mm"] = row.truth_edge_mm
-    key = (*given.values(), filling)
+    options = PelvisOptions(
+        seed=seed,
+        filling_mm=filling,
+        tumour=row.tumour,
+        law=row.law,
+        poisson_ratio=row.poisson_ratio,
+        truth_edge_mm=row.truth_edge_mm,
+    )
+    key = (row.tumour, row.law, row.poisson_ratio, row.truth_edge_mm, filling)
     if key not in truths:
         truths.clear()  # a truth is large
-        truths[key] = pelvis(PelvisOptions(seed=seed, filling_mm=filling, **given)), filling
+        truths[key] = pelvis(options), filling
     scene, made = truths[key]
     if row.filling_mm is not None and row.law == "linear":
         scene = rescaled(scene, row.filling_mm / made)
         filling = row.filling_mm
-    options = PelvisOptions(seed=seed, filling_mm=filling, spacing_mm=row.spacing_mm, noise=row.noise, **given)
+    options = replace(options, filling_mm=filling, spacing_mm=row.spacing_mm, noise=row.noise)
     return reimaged(replace(scene, seed=seed + 1000 * draw), pelvis_grid(options), noise=row.noise), options
 
 
@@ -173,14 +189,16 @@ def posed(row: Row, seed: int, draw: int, truths: Truths) -> Posed:
         mesh=MeshSettings(row.edge_mm),
         mechanics=Mechanics(row.law, "P2" if row.law == "linear" and row.poisson_ratio is None else "auto"),
     )
+    bodies: tuple[Body, ...] = ()
     if row.data == "voxels":
-        space, problem, bodies = from_voxels(scene, case)
+        problem, body = from_voxels(scene, case)
+        space, bodies = body.space, (body,)
     else:
-        space, problem, bodies = _from_surfaces(scene, case, options, same_mesh=row.data == "same mesh")
-    return Posed(scene, options.filling_mm, space, problem, inversion_settings(case, problem.modulus_map), bodies)
+        space, problem = _from_surfaces(scene, case, options, same_mesh=row.data == "same mesh")
+    return Posed(scene, options.filling_mm, space, problem, inversion_settings(case, problem.parameters), bodies)
 
 
-def _case(key: tuple[str, int, int], row: Row, truths: Truths) -> dict[str, object]:
+def _case(key: tuple[str, int, int], row: Row, truths: Truths) -> Result:
     """Make one scene, estimate it, and hold the estimate beside the truth."""
     name, seed, draw = key
     began = time.perf_counter()
@@ -190,7 +208,7 @@ def _case(key: tuple[str, int, int], row: Row, truths: Truths) -> dict[str, obje
     estimated = time.perf_counter()
     inversion = invert(problem, settings, progress=_silent)
     seconds = time.perf_counter() - estimated
-    result = {
+    result: Result = {
         "row": name,
         "seed": seed,
         "draw": draw,
@@ -200,11 +218,11 @@ def _case(key: tuple[str, int, int], row: Row, truths: Truths) -> dict[str, obje
         "scene_seconds": posed_seconds,
         "estimate_seconds": seconds,
         "outcome": inversion.minimum.outcome.name,
-        "starts": [int(group) for group in inversion.groups],
+        "starts": [start.candidate for start in inversion.starts],
     }
     result |= _errors(inversion, scene)
     if row.law != "linear":
-        linear = invert(replace(problem, finite_strain=()), settings, progress=_silent)
+        linear = invert(problem.linear(), settings, progress=_silent)
         result["linear_ln_error"] = _errors(linear, scene)["ln_error"]
         if seed % 5 == 1 and draw == 0 and row.noise is None:
             result["far_off_ln_error"] = _errors(_from_far_off(problem, linear, settings), scene)["ln_error"]
@@ -220,24 +238,30 @@ def _silent(message: str) -> None:
 
 def _from_far_off(problem: InverseProblem, linear: Inversion, settings: InversionSettings) -> Inversion:
     """The continuation from moduli that are three times too high and too low instead of the linear estimate's."""
-    n = linear.objective.n_parameters
+    n, best = linear.objective.n_parameters, linear.candidates[linear.best]
     unknowns = linear.minimum.unknowns.copy()
     unknowns[:n] += FAR_OFF[:n]
-    moved = replace(linear, minima=(replace(linear.minimum, unknowns=unknowns),), groups=(0,), best=0)
-    return continued_at_finite_strain(problem, moved, settings, progress=_silent)
+    pairs = zip(linear.objective.states, problem.states, strict=True)
+    states = tuple(replace(state, finite_strain=given.finite_strain) for state, given in pairs)
+    iterate = replace(
+        best.iterate,
+        objective=replace(linear.objective, states=states),
+        minimum=replace(linear.minimum, unknowns=unknowns),
+    )
+    moved = replace(linear, candidates=(replace(best, iterate=iterate),), best=0, starts=())
+    return continue_at_finite_strain(moved, settings, progress=_silent)
 
 
-def from_voxels(scene: Scene, case: Case) -> tuple[LagrangeSpace, InverseProblem, tuple[object, ...]]:
-    """Everything from the label images: the displacements' space, the inverse problem, the body it is made of."""
+def from_voxels(scene: Scene, case: Case) -> tuple[InverseProblem, Body]:
+    """Everything from the label images: the inverse problem, and the body that it is made of."""
     before, after = (segment(image, scene.tissues) for image in (scene.before, scene.after))
-    states = aligned(before, (after,), method="none")
-    body = make_body(states, case, progress=lambda _: None)
-    return body.space, inverse_problem(body, case, progress=lambda _: None), (body,)
+    body = make_body(aligned(before, (after,), method="none"), case, progress=_silent)
+    return inverse_problem(body, case, progress=_silent), body
 
 
 def _from_surfaces(
     scene: Scene, case: Case, options: PelvisOptions, *, same_mesh: bool
-) -> tuple[LagrangeSpace, InverseProblem, tuple[object, ...]]:
+) -> tuple[LagrangeSpace, InverseProblem]:
     """The truth's surfaces as targets; on the same mesh also a wall motion that the modes can make."""
     if same_mesh:
         space = lagrange_space(scene.mesh, "P2")
@@ -251,37 +275,42 @@ def _from_surfaces(
     model = linear_model(space, constraint)
     if same_mesh:
         rows = np.repeat(motion.prescribed, 3)
-        q = np.linalg.lstsq(motion.modes[rows], scene.displacement.ravel()[rows], rcond=None)[0]
-        moduli = np.array([t.youngs_modulus_kpa for t in scene.tissues if t.meshed])
+        q = np.asarray(np.linalg.lstsq(motion.modes[rows], scene.displacement.ravel()[rows])[0], dtype=np.float64)
+        moduli = np.array([scene.moduli_kpa[name] for name in model.names])
         scene = replace(scene, displacement=model.solve(moduli, q).displacement)
     observed = [i for i, t in enumerate(scene.tissues) if t.role in (Role.ESTIMATE, Role.DRIVER)]
-    targets = tuple(exact_target(scene, observed_surface(space, i)) for i in observed)
-    estimated = frozenset(t.name for t in scene.tissues if t.role is Role.ESTIMATE)
-    mapping = modulus_map(scene.tissues, model.regions)
-    return space, InverseProblem((model,), (targets,), mapping, estimated, walls=(motion.walls,)), ()
+    seen = tuple(surface_distance(exact_target(scene, observed_surface(space, i))) for i in observed)
+    mapping = parameter_map(scene.tissues, model.regions, [model.n_modes])
+    return space, InverseProblem((LaterState(model, seen, walls=motion.walls),), mapping)
 
 
-def _errors(inversion: Inversion, scene: Scene) -> dict[str, object]:
-    mapping = inversion.objective.modulus_map
-    theta = inversion.minimum.unknowns[: len(mapping.tissues)]
-    truth = np.array([scene.moduli_kpa[name] / scene.moduli_kpa[mapping.relative_to] for name in mapping.tissues])
+def _errors(inversion: Inversion, scene: Scene) -> Result:
+    mapping, noise = inversion.objective.parameters, inversion.objective.noise["surface distance"]
+    theta = inversion.minimum.unknowns[: mapping.n_parameters]
+    truth = true_ratios(inversion.objective, scene)
     return {
         "tissues": list(mapping.tissues),
         "truth_ratio": truth.tolist(),
         "ratio": np.exp(theta).tolist(),
         "ln_error": (theta - np.log(truth)).tolist(),
-        "law": {"sd_mm": inversion.law.sd, "correlation_area_mm2": inversion.law.correlation_area},
+        "law": {"sd_mm": noise.sd, "correlation_area_mm2": noise.correlation_area},
     }
+
+
+def true_ratios(objective: Objective, scene: Scene) -> NDArray[np.float64]:
+    """True moduli (n_parameters,) of what is estimated, to that of the tissue that holds the scale."""
+    mapping = objective.parameters
+    return np.array([scene.moduli_kpa[name] / scene.moduli_kpa[mapping.relative_to] for name in mapping.tissues])
 
 
 def _uncertainty(
     inversion: Inversion, problem: InverseProblem, body: Body, scene: Scene, settings: InversionSettings, row: Row
-) -> dict[str, object]:
+) -> Result:
     """Interval, spread of an exact model over grid positions, and the Cramer-Rao limit of this scene's noise."""
     images = tuple(image.index for image in body.states.after)
-    observed = Observed(body.space, fitted_states(inversion, body), images)
+    observed = Observed(fitted_states(inversion, body), images)
     estimation = conclude(inversion, settings, observed, truth=scene.moduli_kpa, seed=scene.seed)
-    found = {
+    found: Result = {
         "interval95": [e.ratio_interval95 for e in estimation.estimates],
         "verdict": [e.verdict for e in estimation.estimates],
         "sd": np.sqrt(np.diag(estimation.covariance)).tolist(),
@@ -293,61 +322,58 @@ def _uncertainty(
 
 
 def _cramer_rao_sd(inversion: Inversion, body: Body, scene: Scene, noise: Noise) -> list[float]:
-    """Of the log-moduli at an inversion's minimum; what is known before is the prior that the case states."""
+    """Of the log-moduli at an inversion's minimum."""
     rng = np.random.default_rng([scene.seed, 11])
-    law = true_law(inversion, body.space, fitted_states(inversion, body), noise, rng)
-    stated = replace(inversion.objective, prior=None).prior_precision()
-    evaluation = replace(inversion.minimum.evaluation, prior=stated)
+    model = true_noise(inversion, fitted_states(inversion, body), noise, rng)
     n, cell = inversion.objective.n_parameters, noise.correlation_length_mm
-    return np.sqrt(np.diag(cramer_rao(evaluation, law, n, cell_mm=cell))).tolist()
+    limit = cramer_rao(inversion.minimum.evaluation, model, n, cell_mm=cell)
+    return [float(sd) for sd in np.sqrt(np.diag(limit))]
 
 
 def at_truth(inversion: Inversion, problem: InverseProblem, scene: Scene) -> Inversion:
     """The same with the truth for its minimum: the true moduli, and the wall's motion that comes nearest to it.
 
-    A limit taken at the estimate would depend on the noise that moved it.
+    A limit taken at the estimate would depend on the noise that moved it. All residuals count, by the inversion's noise
+    model; what is known before is the prior that the case states.
     """
-    model, mapping = problem.models[0], problem.modulus_map
-    surface = next(t.surface for t in problem.targets[0] if t.surface.name in problem.drivers)
-    motion = scene.motions[surface.name].at(surface.rest).ravel() - model.constraint.offset[surface.dofs]
-    coefficients = np.linalg.lstsq(model.constraint.modes[surface.dofs], motion, rcond=None)[0]
-    truth = [np.log(scene.moduli_kpa[name] / scene.moduli_kpa[mapping.relative_to]) for name in mapping.tissues]
-    unknowns = np.concatenate([truth, coefficients])
-    surrogate = first_surrogate(model, mapping.moduli(np.array(truth)))
-    if problem.finite_strain:
-        there = from_linear(problem.finite_strain[0], surrogate.system, coefficients).refactorised()
-        local = expanded(there, names=there.model.names, moduli=there.moduli, coefficients=coefficients)
-        surrogate = Expansion(local, there, SolveCounts())
-    objective = objective_of(problem, (surrogate.reduced,), inversion.law).with_fresh_correspondence(unknowns)
-    minimum = replace(inversion.minimum, unknowns=unknowns, evaluation=objective(unknowns))
-    return replace(inversion, objective=objective, minima=(minimum,), groups=(0,), best=0, surrogates=(surrogate,))
+    state, mapping, noise = problem.states[0], problem.parameters, inversion.objective.noise
+    wall = next(observation for observation in state.observations if observation.of_driver)
+    rest, modes = state.model.space.points.ravel()[wall.dofs].reshape(-1, 3), state.constraint.modes[wall.dofs]
+    motion = scene.motions[wall.name].at(rest).ravel() - state.constraint.offset[wall.dofs]
+    coefficients = np.asarray(np.linalg.lstsq(modes, motion)[0], dtype=np.float64)
+    unknowns = np.concatenate([np.log(true_ratios(inversion.objective, scene)), coefficients])
+    exact = exact_approximation(state.model, state.finite_strain, Place(mapping.moduli(unknowns), coefficients))
+    objective = Objective(problem.states, mapping).under([exact])
+    objective = objective.with_observations([o.with_noise(noise[o.kind]) for o in objective.observations])
+    objective = objective.rematched(unknowns)
+    best = inversion.candidates[inversion.best]
+    minimum = replace(best.minimum, unknowns=unknowns, evaluation=objective(unknowns))
+    iterate = replace(best.iterate, objective=objective, minimum=minimum)
+    return replace(inversion, candidates=(replace(best, iterate=iterate),), best=0)
 
 
-def true_law(
-    inversion: Inversion,
-    space: LagrangeSpace,
-    fitted: tuple[FittedState, ...],
-    noise: Noise,
-    rng: np.random.Generator,
-) -> NoiseLaw:
+def true_noise(
+    inversion: Inversion, fitted: tuple[FittedState, ...], noise: Noise, rng: np.random.Generator
+) -> NoiseModel:
     """The noise that was put into both images, and that of the voxels on the model, over several places of the grid."""
-    errors = [error for _ in range(GRIDS) for error in voxel_errors(inversion, space, fitted, rng=rng)]
-    lines = GRIDS * inversion.minimum.evaluation.surfaces
-    sizes = [len(error) for error in errors]
-    voxels = fit_noise_law(
-        errors,
-        [line.residuals.places[:n] for line, n in zip(lines, sizes, strict=True)],
-        [line.residuals.normals[:n] for line, n in zip(lines, sizes, strict=True)],
+    objective, evaluation = inversion.objective, inversion.minimum.evaluation
+    errors = [error for _ in range(GRIDS) for error in imaging_errors(objective, evaluation, fitted, rng=rng)]
+    lines = GRIDS * evaluation.lines
+    rows = [model_to_image(line) for line in lines]
+    voxels = fit_noise_model(
+        [0.5 * error[of] for error, of in zip(errors, rows, strict=True)],  # it stands for both directions
+        [line.residuals.places[of] for line, of in zip(lines, rows, strict=True)],
+        [line.residuals.normals[of] for line, of in zip(lines, rows, strict=True)],
     )
     smooth = 2.0 * noise.surface_sd_mm**2
-    return NoiseLaw(np.append(voxels.variances, smooth), np.append(voxels.lengths, noise.correlation_length_mm))
+    return NoiseModel(np.append(voxels.variances, smooth), np.append(voxels.lengths, noise.correlation_length_mm))
 
 
-def _driver_error(inversion: Inversion, space: LagrangeSpace, scene: Scene) -> dict[str, object]:
+def _driver_error(inversion: Inversion, space: LagrangeSpace, scene: Scene) -> Result:
     """RMS error (mm) of the estimated wall motion, normal and tangential parts, area-weighted."""
-    objective, unknowns = inversion.objective, inversion.minimum.unknowns
-    moduli = objective.modulus_map.moduli(unknowns[: objective.n_parameters])
-    motion = inversion.surrogates[0].reduced.solve(moduli, objective.coefficients(unknowns)[0]).displacement
+    mapping, unknowns = inversion.objective.parameters, inversion.minimum.unknowns
+    moduli, coefficients = mapping.moduli(unknowns), mapping.coefficients(unknowns)
+    motion = inversion.objective.states[0].displacement(moduli, coefficients[0])
     index = next(i for i, t in enumerate(scene.tissues) if t.role is Role.DRIVER)
     surface = observed_surface(space, index)
     error = motion[surface.points] - scene.motions[scene.tissues[index].name].at(surface.rest)
@@ -362,9 +388,9 @@ def _driver_error(inversion: Inversion, space: LagrangeSpace, scene: Scene) -> d
     }
 
 
-def _summary(results: list[dict]) -> dict[str, object]:
+def _summary(results: Sequence[Result]) -> Result:
     errors = np.concatenate([r["ln_error"] for r in results])
-    found: dict[str, object] = {
+    found: Result = {
         "cases": len(results),
         "moduli": len(errors),
         "rms_ln_error": _rms(errors),
@@ -398,7 +424,7 @@ def _rms(values: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _line(result: dict) -> str:
+def _line(result: Result) -> str:
     errors = ", ".join(
         f"{name} {100 * error:+.2f} %" for name, error in zip(result["tissues"], result["ln_error"], strict=True)
     )
@@ -406,7 +432,7 @@ def _line(result: dict) -> str:
     return f"{result['row']} {result['seed']}: {errors} ({result['outcome']}, {result['dofs']} dof; {seconds})"
 
 
-def _table(summaries: dict[str, dict]) -> str:
+def _table(summaries: dict[str, Result]) -> str:
     """The rows as they stand in the docs."""
     lines = [
         "| row | cases, moduli | RMS ln-error | worst | mean | grid spread | Cramer-Rao | inside 95 % | linear law |",
@@ -423,7 +449,7 @@ def _table(summaries: dict[str, dict]) -> str:
     return "\n".join(lines)
 
 
-def _read(path: Path) -> dict[tuple[str, int, int], dict]:
+def _read(path: Path) -> dict[tuple[str, int, int], Result]:
     lines = path.read_text().splitlines() if path.exists() else []
     results = [json.loads(line) for line in lines]
     return {(result["row"], result["seed"], result.get("draw", 0)): result for result in results}

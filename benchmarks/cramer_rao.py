@@ -1,4 +1,4 @@
-"""The Cramer-Rao limit: what noise leaves open, whatever the method."""
+"""The Cramer-Rao limit of what surfaces tell of moduli: what noise leaves open, whatever the method."""
 
 from __future__ import annotations
 
@@ -10,45 +10,48 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial.distance import cdist
 
-from palpate.inversion.noise import NoiseLaw
-from palpate.inversion.objective import Evaluation, Linearisation
-from palpate.inversion.posterior import later_states
+from palpate.inversion import Evaluation
+from palpate.inversion.objective import Linearisation
+from palpate.observation.contract import Observation
+from palpate.observation.noise_model import NoiseModel
+from palpate.observation.surface_distance import SurfaceDistance
+from palpate.observation.target import SurfaceTarget
 
-__all__ = ["cramer_rao", "efficient_gain"]
+__all__ = ["cramer_rao", "efficient_gain", "model_to_image", "target_of"]
 
 RIDGE = 1e-4  # of the variance of a residual, on the cells' covariance
 ROWS = 64  # cells whose pairs are in memory at once
 
 
-def cramer_rao(evaluation: Evaluation, law: NoiseLaw, n_parameters: int, *, cell_mm: float) -> NDArray[np.float64]:
+def cramer_rao(evaluation: Evaluation, noise: NoiseModel, n_parameters: int, *, cell_mm: float) -> NDArray[np.float64]:
     """Smallest covariance (n_parameters, n_parameters) of the log-moduli that any unbiased estimate can have.
 
     Inverse of the Fisher information F = sum_states J^T C^-1 J + P of the model -> image residuals' means over cells of
     the surfaces, with the prior P of the driver's motion. Of several later states each is taken with a first image of
     its own.
 
-    `cell_mm`: the noise's correlation length. Within it a smooth law leaves next to no noise, so that single faces
-    would tell moduli from the differences of neighbours, which are rounding that no such law describes: a limit that
-    its own weights miss by far (benchmarks/noise_limit.py).
+    `cell_mm`: the noise's correlation length. Within it a smooth model leaves next to no noise, so that single
+    faces would tell moduli from the differences of neighbours, which are rounding that no such model describes: a limit
+    that its own weights miss by far (benchmarks/noise_limit.py).
     """
-    inverse = np.linalg.inv(_information(evaluation, _whitened_states(evaluation, law, cell_mm)))
+    inverse = np.linalg.inv(_information(evaluation, _whitened_states(evaluation, noise, cell_mm)))
     return np.asarray(inverse[:n_parameters, :n_parameters])
 
 
 def efficient_gain(
-    evaluation: Evaluation, law: NoiseLaw, n_parameters: int, *, cell_mm: float
+    evaluation: Evaluation, noise: NoiseModel, n_parameters: int, *, cell_mm: float
 ) -> tuple[NDArray[np.float64], ...]:
     """Derivative (n_parameters, n_q) of the log-moduli by each surface's model -> image residuals, 1/mm, at the limit.
 
     G = F^-1 J^T C^-1 on the cells' means: of all weights without bias those of least variance (Aitken 1935). Under
-    noise that obeys `law`, G C G^T with the prior's part is the limit of `cramer_rao`.
+    noise of this model, G C G^T with the prior's part is the limit of `cramer_rao`.
     """
-    states = _whitened_states(evaluation, law, cell_mm)
+    states = _whitened_states(evaluation, noise, cell_mm)
     inverse = np.linalg.inv(_information(evaluation, states))[:n_parameters]
     found: list[NDArray[np.float64]] = []
     for state in states:
         rows = np.asarray(inverse[:, state.lines[0].columns] @ state.weighted.T @ state.means)
-        found += np.split(rows, np.cumsum([len(line.target.area) for line in state.lines])[:-1], axis=1)
+        found += np.split(rows, np.cumsum([model_to_image(line).stop for line in state.lines])[:-1], axis=1)
     return tuple(found)
 
 
@@ -61,9 +64,21 @@ class _Whitened:
     means: sparse.csr_matrix[np.float64]
 
 
-def _whitened_states(evaluation: Evaluation, law: NoiseLaw, cell_mm: float) -> list[_Whitened]:
-    groups = later_states(evaluation)
-    return [_whitened([evaluation.surfaces[i] for i in group], law, cell_mm) for group in groups]
+def target_of(observation: Observation) -> SurfaceTarget:
+    """What a surface distance compares; raises `TypeError` for an observation of another kind."""
+    if not isinstance(observation, SurfaceDistance):
+        raise TypeError(f"the limit is that of surface distances; '{observation.name}' is a {observation.kind}")
+    return observation.target
+
+
+def model_to_image(line: Linearisation) -> slice:
+    """Rows of the residuals of the direction model -> image, one a quadrature point of the surface."""
+    return slice(0, len(target_of(line.observation).area))
+
+
+def _whitened_states(evaluation: Evaluation, noise: NoiseModel, cell_mm: float) -> list[_Whitened]:
+    states = dict.fromkeys(line.state for line in evaluation.lines)
+    return [_whitened([line for line in evaluation.lines if line.state == s], noise, cell_mm) for s in states]
 
 
 def _information(evaluation: Evaluation, states: Sequence[_Whitened]) -> NDArray[np.float64]:
@@ -76,10 +91,10 @@ def _information(evaluation: Evaluation, states: Sequence[_Whitened]) -> NDArray
     return information
 
 
-def _whitened(lines: Sequence[Linearisation], law: NoiseLaw, cell_mm: float) -> _Whitened:
+def _whitened(lines: Sequence[Linearisation], noise: NoiseModel, cell_mm: float) -> _Whitened:
     means = sparse.csr_matrix(sparse.block_diag([_cell_means(line, cell_mm) for line in lines]))
-    places = np.concatenate([line.residuals.places[: len(line.target.area)] for line in lines])
-    normals = np.concatenate([line.residuals.normals[: len(line.target.area)] for line in lines])
+    places = np.concatenate([line.residuals.places[model_to_image(line)] for line in lines])
+    normals = np.concatenate([line.residuals.normals[model_to_image(line)] for line in lines])
     covariance = np.zeros((means.shape[0],) * 2)
     for start in range(0, means.shape[0], ROWS):
         block = means[start : start + ROWS]
@@ -87,23 +102,24 @@ def _whitened(lines: Sequence[Linearisation], law: NoiseLaw, cell_mm: float) -> 
         distance2 = cdist(places[touched], places, "sqeuclidean")
         pairs = sum(
             variance * np.exp(-distance2 / (2.0 * length**2))
-            for variance, length in zip(law.variances, law.lengths, strict=True)
+            for variance, length in zip(noise.variances, noise.lengths, strict=True)
         ) * (normals[touched] @ normals.T)
         covariance[start : start + ROWS] = block[:, touched] @ (means @ pairs.T).T
-    covariance[np.diag_indices_from(covariance)] += RIDGE * law.sd**2
+    covariance[np.diag_indices_from(covariance)] += RIDGE * noise.sd**2
     weighted = np.linalg.solve(covariance, np.asarray(means @ _jacobian(lines)))
     return _Whitened(lines, np.asarray(weighted), means)
 
 
 def _jacobian(lines: Sequence[Linearisation]) -> NDArray[np.float64]:
     """Derivative (n_q, n_columns) of the surfaces' model -> image residuals, one surface after the other."""
-    return np.concatenate([line.jacobian[: len(line.target.area)] for line in lines])
+    return np.concatenate([line.jacobian[model_to_image(line)] for line in lines])
 
 
 def _cell_means(line: Linearisation, edge_mm: float) -> sparse.csr_matrix[np.float64]:
     """Matrix (n_cells, n_q) of means by area over cubes; what looks to other sides is kept apart."""
-    area = line.target.area
-    places, normals = line.residuals.places[: len(area)], line.residuals.normals[: len(area)]
+    area = target_of(line.observation).area
+    rows = model_to_image(line)
+    places, normals = line.residuals.places[rows], line.residuals.normals[rows]
     number = np.unique(np.column_stack([np.floor(places / edge_mm), normals > 0.0]), axis=0, return_inverse=True)[1]
     number = number.ravel()
     share = area / np.bincount(number, area)[number]

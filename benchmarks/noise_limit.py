@@ -16,17 +16,15 @@ from dataclasses import dataclass, replace
 
 import accuracy
 import numpy as np
+from cramer_rao import cramer_rao, efficient_gain, model_to_image, target_of
 from numpy.typing import NDArray
 
 from palpate.images.segmentation import segment
-from palpate.inversion.cramer_rao import cramer_rao, efficient_gain
-from palpate.inversion.invert import invert
-from palpate.inversion.noise import NoiseLaw
-from palpate.inversion.objective import Evaluation
-from palpate.inversion.posterior import gain
+from palpate.inversion import Evaluation, gain, invert
+from palpate.observation.noise_model import NoiseModel
 from palpate.phantoms.pelvis import pelvis_grid
 from palpate.phantoms.scene import reimaged
-from palpate.study.body import aligned, surface_targets
+from palpate.study.body import aligned, surface_observations
 from palpate.study.case import Case, Mechanics, MeshSettings, Phantom
 from palpate.study.run import fitted_states, inversion_settings
 
@@ -37,7 +35,7 @@ ALONE = 1e-3  # mm: a cell of one face
 
 @dataclass(frozen=True)
 class Weights:
-    """Derivative (n_parameters, n_residuals) of the log-moduli, and the covariance that the law promises (None: no)."""
+    """Derivative (n_parameters, n_residuals) of the log-moduli, and the covariance that is promised, if any."""
 
     name: str
     rows: NDArray[np.float64]
@@ -57,46 +55,45 @@ def main() -> int:
         mesh=MeshSettings(ROW.edge_mm),
         mechanics=Mechanics(ROW.law, "auto"),
     )
-    space, problem, (body, *_) = accuracy.from_voxels(scene, case)
-    inversion = invert(problem, inversion_settings(case, problem.modulus_map), progress=lambda _: None)
+    problem, body = accuracy.from_voxels(scene, case)
+    inversion = invert(problem, inversion_settings(case, problem.parameters), progress=lambda _: None)
     there = accuracy.at_truth(inversion, problem, scene)
-    fitted = fitted_states(inversion, body)
-    law = accuracy.true_law(there, space, fitted, ROW.noise, np.random.default_rng([arguments.seed, 11]))
-    stated = replace(there.objective, prior=None).prior_precision()
-    evaluation = replace(there.minimum.evaluation, prior=stated)
-    weights = _weights(evaluation, law, there.objective.n_parameters)
+    rng = np.random.default_rng([arguments.seed, 11])
+    noise = accuracy.true_noise(there, fitted_states(inversion, body), accuracy.NOISE, rng)
+    evaluation = there.minimum.evaluation
+    weights = _weights(evaluation, noise, there.objective.n_parameters)
     shifts: dict[str, list[NDArray[np.float64]]] = {w.name: [] for w in weights}
-    surfaces = [line.target.surface for line in evaluation.surfaces]
+    surfaces = [target_of(line.observation).surface for line in evaluation.lines]
     for draw in range(1, arguments.draws + 1):
-        noisy = replace(options, noise=ROW.noise)
-        imaged = reimaged(replace(scene, seed=scene.seed + 1000 * draw), pelvis_grid(noisy), noise=ROW.noise)
+        noisy = replace(options, noise=accuracy.NOISE)
+        imaged = reimaged(replace(scene, seed=scene.seed + 1000 * draw), pelvis_grid(noisy), noise=accuracy.NOISE)
         before, after = (segment(image, scene.tissues) for image in (imaged.before, imaged.after))
         states = aligned(before, (after,), method="none")
-        targets = surface_targets(replace(body, states=states), surfaces)[0]
+        targets = [target_of(o) for o in surface_observations(replace(body, states=states), surfaces)[0]]
         errors = np.concatenate(
             [
-                target.after.at(line.residuals.places[: len(target.area)]) - target.rest_distance
-                for line, target in zip(evaluation.surfaces, targets, strict=True)
+                target.after.at(line.residuals.places[model_to_image(line)]) - target.rest_distance
+                for line, target in zip(evaluation.lines, targets, strict=True)
             ]
         )
         for w in weights:
             shifts[w.name].append(w.rows @ errors)
         print(f"draw {draw} of {arguments.draws}", file=sys.stderr, flush=True)
-    names = problem.modulus_map.tissues
+    names = problem.parameters.tissues
     rows = [_row(w, np.array(shifts[w.name]), evaluation, names) for w in weights]
     print(json.dumps({"seed": arguments.seed, "draws": arguments.draws, "rows": rows}, indent=1))
     return 0
 
 
-def _weights(evaluation: Evaluation, law: NoiseLaw, n: int) -> list[Weights]:
+def _weights(evaluation: Evaluation, noise: NoiseModel, n: int) -> list[Weights]:
     found = []
     for cell in CELLS_MM:
         size = max(cell, ALONE)
-        rows = np.concatenate(efficient_gain(evaluation, law, n, cell_mm=size), axis=1)
-        found.append(Weights(f"limit, cells of {cell:g} mm", rows, cramer_rao(evaluation, law, n, cell_mm=size)))
-    pairs = zip(gain(evaluation, n), evaluation.surfaces, strict=True)
+        rows = np.concatenate(efficient_gain(evaluation, noise, n, cell_mm=size), axis=1)
+        found.append(Weights(f"limit, cells of {cell:g} mm", rows, cramer_rao(evaluation, noise, n, cell_mm=size)))
+    pairs = zip(gain(evaluation, n), evaluation.lines, strict=True)
     # half of the weight is on each direction of the distance, which see the same error
-    own = np.concatenate([2.0 * row[:, : len(line.target.area)] for row, line in pairs], axis=1)
+    own = np.concatenate([2.0 * row[:, model_to_image(line)] for row, line in pairs], axis=1)
     return [*found, Weights("the estimator's own", own, None)]
 
 
@@ -105,7 +102,7 @@ def _row(
 ) -> dict[str, object]:
     """Standard deviations of the log-moduli: as promised, and as the draws scatter, with the prior's part."""
     n = len(names)
-    jacobian = np.concatenate([line.jacobian[: len(line.target.area)] for line in evaluation.surfaces])
+    jacobian = np.concatenate([line.jacobian[model_to_image(line)] for line in evaluation.lines])
     by_modes = weights.rows @ jacobian[:, n:]  # modes that the weights do not keep out of the moduli
     by_prior = by_modes @ np.linalg.solve(evaluation.prior[n:, n:], by_modes.T)
     scatter = np.sqrt(np.diag(np.cov(shifts.T) + by_prior))
