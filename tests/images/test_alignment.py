@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from palpate.errors import InputDataError
-from palpate.images.alignment import RigidMotion, align, fit_rigid_motion, measure_rigid_motion, moved
+from palpate.images.alignment import RigidMotion, align, fit_rigid_motion, moved
 from palpate.images.distance import DistanceMap, distance_map
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
@@ -70,7 +70,7 @@ def test_the_motion_of_a_bone_is_found_to_hundredths_of_a_voxel() -> None:
         rng = np.random.default_rng(seed)
         pose, motion = motion_of(rng, degrees=15.0, mm=0.5), motion_of(rng, degrees=6.0, mm=4.0)
         grid = grid_of((100, 76, 66), rng)
-        found = measure_rigid_motion(map_of(grid, BONE, pose), map_of(grid, BONE, motion.compose(pose)))
+        found = fit_rigid_motion([(map_of(grid, BONE, pose), map_of(grid, BONE, motion.compose(pose)))]).motion
         error = found.compose(motion.inverse())
         centre = motion.compose(pose).apply(ORIGIN)
         shifts.append(np.linalg.norm(error.apply(centre) - centre))
@@ -85,7 +85,7 @@ def test_the_grids_of_the_two_images_may_differ() -> None:
     far = grid_of((60, 64, 34), rng, (1.6, 1.2, 2.0))
     far = VoxelGrid(far.shape, motion.matrix @ far.affine)
     before = map_of(grid_of((100, 70, 60), rng), BONE, RigidMotion.identity())
-    error = measure_rigid_motion(before, map_of(far, BONE, motion)).compose(motion.inverse())
+    error = fit_rigid_motion([(before, map_of(far, BONE, motion))]).motion.compose(motion.inverse())
     centre = motion.apply(ORIGIN)
     assert np.linalg.norm(error.apply(centre) - centre) < 0.05
     assert error.angle_deg < 0.2
@@ -97,7 +97,7 @@ def test_large_turns_are_found_too(degrees: float) -> None:
     motion = RigidMotion(Rotation.from_rotvec(np.deg2rad(degrees) * np.array([0.0, 0.6, 0.8])).as_matrix(), np.zeros(3))
     grid = grid_of((72, 72, 72), rng)
     axes = (28.0, 18.0, 12.0)
-    found = measure_rigid_motion(map_of(grid, axes, RigidMotion.identity()), map_of(grid, axes, motion))
+    found = fit_rigid_motion([(map_of(grid, axes, RigidMotion.identity()), map_of(grid, axes, motion))]).motion
     assert found.compose(motion.inverse()).angle_deg < 0.3
 
 
@@ -106,8 +106,8 @@ def test_a_bias_of_both_maps_changes_nothing() -> None:
     motion = motion_of(rng, degrees=4.0, mm=2.0)
     grid = grid_of((72, 56, 48), rng)
     before, after = map_of(grid, (28.0, 18.0, 12.0), RigidMotion.identity()), map_of(grid, (28.0, 18.0, 12.0), motion)
-    plain = measure_rigid_motion(before, after)
-    shifted = measure_rigid_motion(before.shifted(0.3), after.shifted(0.3))
+    plain = fit_rigid_motion([(before, after)]).motion
+    shifted = fit_rigid_motion([(before.shifted(0.3), after.shifted(0.3))]).motion
     np.testing.assert_allclose(shifted.apply(ORIGIN), plain.apply(ORIGIN), atol=0.03)
     assert shifted.compose(plain.inverse()).angle_deg < 0.15
 
@@ -137,7 +137,7 @@ def test_a_body_cut_by_the_image_does_not_pull_the_motion() -> None:
     grid = grid_of((60, 64, 56), rng)
     grid = VoxelGrid(grid.shape, grid.affine + np.array([[0, 0, 0, 25], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]))
     motion = RigidMotion(Rotation.from_euler("z", 3.0, degrees=True).as_matrix(), np.array([3.0, 1.0, -2.0]))
-    found = measure_rigid_motion(map_of(grid, BONE, RigidMotion.identity()), map_of(grid, BONE, motion))
+    found = fit_rigid_motion([(map_of(grid, BONE, RigidMotion.identity()), map_of(grid, BONE, motion))]).motion
     point = np.array([[25.0, 0.0, 0.0]])
     assert np.linalg.norm(found.apply(point) - motion.apply(point)) < 0.05
     assert found.compose(motion.inverse()).angle_deg < 0.3
@@ -194,4 +194,4 @@ def test_what_cannot_be_aligned_is_refused() -> None:
         align(soft, soft)
     tiny = map_of(grid, (1.2, 1.2, 1.2), RigidMotion.identity())
     with pytest.raises(InputDataError, match="surface points"):
-        measure_rigid_motion(tiny, tiny)
+        fit_rigid_motion([(tiny, tiny)])

@@ -122,7 +122,6 @@ def test_an_exact_factorisation_changes_the_price_and_not_the_tangent(model):
     exact = equilibrium.refactorised()
     assert exact.tangent_counts.factorisations == 0
     assert np.allclose(exact.tangent(), equilibrium.tangent(), atol=1e-9)
-    assert np.allclose(exact.modulus_tangents(), equilibrium.tangent()[:, :2], atol=1e-9)
 
 
 def test_derivatives_along_directions_need_no_factorisation(model):

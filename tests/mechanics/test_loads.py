@@ -13,7 +13,7 @@ from palpate.mechanics.laws.registry import LAWS
 from palpate.mechanics.linear_model import linear_model
 from palpate.mechanics.loads import boundary_named, gravity, pressure, traction
 from palpate.mechanics.newton import NewtonSettings
-from palpate.mechanics.reduced import reduce
+from palpate.mechanics.reduced import projection
 from palpate.mesh.space import lagrange_space
 
 SIZE = 20.0
@@ -211,7 +211,7 @@ def test_the_reduced_model_bears_the_loads_of_its_model(loaded):
     linear, _ = loaded
     places = [np.array([1.0, r]) for r in (0.5, 2.0, 8.0)]
     snapshots = np.concatenate([linear.responses(place)[:, -1:] for place in places], axis=1)
-    reduced = reduce(linear, linear.constraint.free.T @ snapshots)
+    reduced = projection(linear, linear.constraint.free.T @ snapshots).reduced
     still = np.zeros(0)
     for moduli in (np.array([1.0, 2.0]), np.array([3.0, 6.0])):
         assert reduced.solve(moduli, still).values == pytest.approx(linear.solve(moduli, still).values, abs=1e-9)

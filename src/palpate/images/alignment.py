@@ -25,7 +25,6 @@ __all__ = [
     "RigidMotion",
     "align",
     "fit_rigid_motion",
-    "measure_rigid_motion",
     "moved",
 ]
 
@@ -139,14 +138,6 @@ class _State:
     area: NDArray[np.float64]
     centre: NDArray[np.float64]
     radius: float
-
-
-def measure_rigid_motion(before: DistanceMap, after: DistanceMap) -> RigidMotion:
-    """Motion of one rigid tissue from its distance map in the before image to that in the after image.
-
-    Raises `InputDataError` when either image shows too little of its surface. See `fit_rigid_motion`.
-    """
-    return fit_rigid_motion([(before, after)]).motion
 
 
 def fit_rigid_motion(pairs: Sequence[tuple[DistanceMap, DistanceMap]]) -> RigidFit:

@@ -262,13 +262,6 @@ class FiniteStrainEquilibrium:
         lacking = -np.asarray(free.T @ (forces + stiffness @ prescribed)) - system.matrix @ known
         return np.asarray(free @ (known + system.solve(lacking, tolerance=LACKING))) + prescribed
 
-    def modulus_tangents(self) -> NDArray[np.float64]:
-        """Columns du / d ln E_r (n_dof, n_regions) mm alone; raises `NotConverged`."""
-        stiffness = self._stiffness()
-        forces = self.balance.region_forces(self.values, self.balance.moduli)
-        loads = -np.asarray(self.balance.free.T @ forces)
-        return np.asarray(self.balance.free @ self._system(stiffness, loads.shape[1]).solve(loads))
-
     def poisson_tangents(self) -> NDArray[np.float64]:
         """Columns du / d nu_r (n_dof, n_regions) mm; raises `NotConverged`."""
         stiffness = self._stiffness()

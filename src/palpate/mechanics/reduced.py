@@ -24,7 +24,6 @@ __all__ = [
     "ReducedSystem",
     "orthonormal_basis",
     "projection",
-    "reduce",
 ]
 
 RANK_TOLERANCE = 1e-10  # of the largest singular value of the normalised snapshots
@@ -227,11 +226,6 @@ def projection(model: LinearModel, snapshots: NDArray[np.float64]) -> Projection
     outputs = np.asarray(model.constraint.free @ vectors)
     reduced = ReducedModel(model.names, stiffness, _coupling(model, vectors), load, outputs, given)
     return Projection(model, vectors, reduced)
-
-
-def reduce(model: LinearModel, basis: NDArray[np.float64]) -> ReducedModel:
-    """Project `model` on the span of `basis` (n_free, k) mm: the reduced model alone, as of `projection`."""
-    return projection(model, basis).reduced
 
 
 def orthonormal_basis(snapshots: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -115,12 +115,6 @@ class Anatomy:
         chosen = [self.level_sets[i] for i in self.priority]
         return np.array([phi.at(points) for phi in chosen if phi is not None]).reshape(-1, len(points))
 
-    def tissue_at(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Index (n,) of the tissue that has each point (n, 3) in RAS mm."""
-        inside = self.values(points) < 0.0
-        order = np.array([*self.priority, self.filler])
-        return np.asarray(order[np.where(inside.any(axis=0), inside.argmax(axis=0), len(inside))])
-
 
 def anatomy_of(segmentation: Segmentation, *, box: Box, smoothing_mm: float) -> Anatomy:
     """Smooth level sets of the tissues of a label image.

@@ -51,13 +51,15 @@ def residual_svg(data: ReportData, model: ModelSurface, *, voxel_mm: float, name
 
 
 def objective_svg(data: ReportData, *, name: str) -> str:
-    """Misfit (mm^2) of every start against the iteration, as SVG."""
-    paths = [[_finite(value) for value in start["history_mm2"]] for start in data.document["starts"]]
+    """Misfit (mm^2) of every start against the iteration, then of the outer loop that they share, as SVG."""
+    histories = [start["history_mm2"] for start in data.document["starts"]]
+    histories.append(data.document["outer_iterations"]["history_mm2"])
+    paths = [[_finite(value) for value in history] for history in histories]
     return draw_svg(lambda figure: _paths(figure, paths, "misfit (mm²)"), size=SIZE, name=name)
 
 
 def modulus_svg(data: ReportData, estimate: int, *, name: str) -> str:
-    """Modulus of one estimate (its number) in every start against the iteration, with its interval, as SVG."""
+    """Modulus of one estimate (its number) against the iteration, as in `objective_svg`, with its interval, as SVG."""
     item = data.document["estimates"][estimate]
     paths = [list(path.get(item["tissue"], ())) for path in data.moduli_paths]
     in_kpa = item["unit"] == "kPa"
@@ -133,11 +135,16 @@ def _widen(axes: Axes, values: NDArray[np.float64]) -> None:
 
 
 def _paths(figure: Figure, paths: list[list[float]], label: str) -> None:
-    """One line a start on a logarithmic axis."""
+    """One line a start on a logarithmic axis; the last path, the outer loop's, goes on where the starts end."""
     axes = figure.add_axes((0.17, 0.2, 0.8, 0.74))
-    for number, path in enumerate(paths):
+    for number, path in enumerate(paths[:-1]):
         colour = START_COLOURS[number % len(START_COLOURS)]
         axes.plot(range(len(path)), path, color=colour, linewidth=1.6, marker="o", markersize=3.2)
+    first = max((len(path) for path in paths[:-1]), default=0)
+    for path in (path for path in paths[-1:] if path):
+        axes.plot(range(first, first + len(path)), path, color=INK, linewidth=1.6, marker="o", markersize=3.2)
+        axes.axvline(first - 0.5, color=INK, linewidth=0.8, linestyle=DASHED)
+        axes.text(first - 0.5, 1.0, " outer loop", transform=axes.get_xaxis_transform(), fontsize=7.5, va="bottom")
     axes.set_xlabel("iteration")
     axes.set_ylabel(label)
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))

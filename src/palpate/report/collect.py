@@ -181,9 +181,10 @@ def _tissues(tissues: tuple[Tissue, ...], moduli: NDArray[np.float64]) -> tuple[
 
 def _moduli_paths(result: CaseResult) -> tuple[Mapping[str, tuple[float, ...]], ...]:
     names = [estimate.tissue for estimate in result.estimation.estimates]
+    histories = [*(start.history for start in result.estimation.starts), result.estimation.outer_iterations]
     return tuple(
-        {name: tuple(float(step.moduli.get(name, math.nan)) for step in start.history) for name in names}
-        for start in result.estimation.starts
+        {name: tuple(float(step.moduli.get(name, math.nan)) for step in history) for name in names}
+        for history in histories
     )
 
 

@@ -145,9 +145,10 @@ class MeshPicture:
 class ReportData:
     """One case's report before it is drawn.
 
-    document: that of result.json; unit: of the moduli, "kPa" or "ratio"; moduli_paths: of each start, tissue -> moduli
-    by iteration; references: the reference states, that of the mesh first; later: their later images; missing: part of
-    the page ("mesh", or "slices", "surfaces", "background", "distances" of an image) -> why it is not there.
+    document: that of result.json; unit: of the moduli, "kPa" or "ratio"; moduli_paths: of each start, and last of the
+    outer loop, tissue -> moduli by iteration; references: the reference states, that of the mesh first; later: their
+    later images; missing: part of the page ("mesh", or "slices", "surfaces", "background", "distances" of an image) ->
+    why it is not there.
     """
 
     document: Mapping[str, Any]

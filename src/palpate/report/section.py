@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from palpate.images.label_image import VoxelGrid
 
-__all__ = ["VIEWS", "Plane", "View", "cut_image", "cut_surface", "joined"]
+__all__ = ["VIEWS", "Plane", "View", "cut_image", "joined"]
 
 PIXEL_MM = 0.8
 
@@ -81,13 +81,11 @@ def cut_image(values: NDArray[Any], grid: VoxelGrid, plane: Plane, *, order: Lit
     return np.asarray(np.where(outside, np.nan, sampled).reshape(points.shape[:2]))
 
 
-def cut_surface(points: NDArray[np.float64], triangles: NDArray[np.int64], plane: Plane) -> NDArray[np.float64]:
-    """Segments (n, 2, 2) mm, (across, up) of both ends, where triangles (n_faces, 3) of points (n, 3) mm cross it."""
-    return _cut(points, triangles, plane)[0]
-
-
 def joined(points: NDArray[np.float64], triangles: NDArray[np.int64], plane: Plane) -> list[NDArray[np.float64]]:
-    """The same as lines (n, 2) mm, each as long as it goes: closed ones end where they begin."""
+    """Lines (n, 2) mm, (across, up), where triangles (n_faces, 3) of points (n, 3) mm cross it, as long as they go.
+
+    Closed ones end where they begin.
+    """
     segments, keys = _cut(points, triangles, plane)
     neighbours: dict[int, list[int]] = {}
     for number, ends in enumerate(keys.tolist()):
