@@ -13,10 +13,10 @@ from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.segmentation import segment
 from palpate.images.tissue import Role
 from palpate.inversion.result import Estimation, Iteration, ModulusEstimate, Remark, Start, TissueFit
-from palpate.observation.contract import Fit
 from palpate.mesh.space import lagrange_space
 from palpate.mesh.tet_mesh import OUTER, TetMesh
 from palpate.mesh.tetrahedralise import boundary_of
+from palpate.observation.contract import Fit
 from palpate.study.case import Case, CaseTissue, Images
 from palpate.study.result import CaseResult, MeshSummary, Provenance
 

@@ -9,12 +9,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-import palpate.inversion
-from palpate.inversion.objective import Objective, State, Weighting
 from palpate.inversion.surrogate import first_surrogate, with_modulus_series
 from palpate.inversion.tukey import Tukey
 from palpate.observation.misfit import Correspondence
+
+import palpate.inversion
+from palpate.inversion.objective import Objective, State, Weighting
 
 NO_OUTLIERS = Tukey()
 MEMBERS = ("__call__", "value", "n_parameters", "n_unknowns")

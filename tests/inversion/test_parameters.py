@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from palpate.inversion.modulus_map import modulus_map
 
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role, Tissue
-from palpate.inversion.modulus_map import modulus_map
 
 GLAND, SAC = Tissue("gland", Role.ESTIMATE), Tissue("sac", Role.ESTIMATE)
 TUBE = Tissue("tube", Role.DRIVER)

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from palpate.inversion.directions import deciding_directions
 from palpate.inversion.surrogate import SERIES, enriched, first_surrogate, sharpened, with_modulus_series, with_offset
 from palpate.inversion.weighting import SEGMENTATION_LAW, objective_of
+
 from palpate.mechanics.linear_model import with_constraint
 
 

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from palpate.errors import ConfigurationError
 from palpate.inversion.gauss_newton import Bounds, gauss_newton
 from palpate.inversion.noise import NoiseLaw
-from palpate.inversion.sampling import frozen_posterior, sample_posterior
 from palpate.inversion.surrogate import first_surrogate, with_modulus_series
 from palpate.inversion.weighting import objective_of
+
+from palpate.errors import ConfigurationError
+from palpate.inversion.sampling import frozen_posterior, sample_posterior
 
 WIDE = Bounds(np.full(2, np.log(0.02)), np.full(2, np.log(200.0)))
 LAW = NoiseLaw(np.array([0.05**2]), np.array([3.0]))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
 from palpate.inversion.verdict import hull, log_interval, verdict
 
 

@@ -1,11 +1,11 @@
-"""The law of the residuals is found from the residuals, and its covariance is the double sum over all of them."""
+"""The noise model is found from the residuals, and its covariance is the double sum over all of them."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from palpate.inversion.noise import NoiseLaw, fit_noise_law
+from palpate.observation.noise_model import NoiseModel, fit_noise_model
 from palpate.phantoms.boundary_noise import smooth_field
 
 RADIUS = 20.0
@@ -28,9 +28,9 @@ def residuals(rng, sd, length, radius=RADIUS, count=6):
     return values, [places] * count, [normals] * count
 
 
-def dense(law, rows, places, normals):
+def dense(noise, rows, places, normals):
     distance2 = np.sum((places[:, None] - places[None]) ** 2, axis=2)
-    terms = zip(law.variances, law.lengths, strict=True)
+    terms = zip(noise.variances, noise.lengths, strict=True)
     correlation = sum(v * np.exp(-distance2 / (2.0 * length**2)) for v, length in terms)
     return rows @ (correlation * (normals @ normals.T)) @ rows.T
 
@@ -40,75 +40,75 @@ def dense(law, rows, places, normals):
     [(0.3, 3.0, 20.0, 6), (0.3, 6.0, 20.0, 6), (0.02, 4.5, 20.0, 6), (0.3, 5.0, 8.0, 60)],
 )
 def test_a_smooth_field_is_recognised(rng, sd, length, radius, count):
-    """On the small ball normals turn within a correlation length: the law is that of the field, not of the ball."""
-    law = fit_noise_law(*residuals(rng, sd, length, radius, count))
-    assert law.sd == pytest.approx(sd, rel=0.15)
-    assert np.sqrt(law.correlation_area / (2.0 * np.pi)) == pytest.approx(length, rel=0.25)
+    """On the small ball normals turn within a correlation length: the model is of the field, not of the ball."""
+    noise = fit_noise_model(*residuals(rng, sd, length, radius, count))
+    assert noise.sd == pytest.approx(sd, rel=0.15)
+    assert np.sqrt(noise.correlation_area / (2.0 * np.pi)) == pytest.approx(length, rel=0.25)
 
 
 def test_independent_residuals_have_no_correlation_length(rng):
     places, normals = sphere(3000)
-    law = fit_noise_law([0.2 * rng.standard_normal(3000)], [places], [normals])
-    assert law.sd == pytest.approx(0.2, rel=0.15)
-    assert law.correlation_area < 10.0
+    noise = fit_noise_model([0.2 * rng.standard_normal(3000)], [places], [normals])
+    assert noise.sd == pytest.approx(0.2, rel=0.15)
+    assert noise.correlation_area < 10.0
 
 
 def test_a_mixture_shows_both_of_its_parts(rng):
     values, places, normals = residuals(rng, 0.3, 6.0)
     rough = [v + 0.3 * rng.standard_normal(len(v)) for v in values]
-    law = fit_noise_law(rough, places, normals)
-    short = law.lengths < 2.0
-    assert np.sqrt(law.variances[short].sum()) == pytest.approx(0.3, rel=0.2)
-    assert np.sqrt(law.variances[~short].sum()) == pytest.approx(0.3, rel=0.2)
+    noise = fit_noise_model(rough, places, normals)
+    short = noise.lengths < 2.0
+    assert np.sqrt(noise.variances[short].sum()) == pytest.approx(0.3, rel=0.2)
+    assert np.sqrt(noise.variances[~short].sum()) == pytest.approx(0.3, rel=0.2)
 
 
-def test_the_law_does_not_jump_when_a_few_residuals_come_or_go(rng):
-    """More cells than are compared: those that are drawn stay drawn. New draws would move the law by 2 to 6 %."""
+def test_the_model_does_not_jump_when_a_few_residuals_come_or_go(rng):
+    """More cells than are compared: those that are drawn stay drawn. New draws would move it by 2 to 6 %."""
     places, normals = sphere(40000)
     values = 0.2 * rng.standard_normal(len(places))
-    whole = fit_noise_law([values], [places], [normals])
+    whole = fit_noise_model([values], [places], [normals])
     for hole in range(2000, 40000, 5000):
         kept = np.linalg.norm(places - places[hole], axis=1) > 1.2
-        without = fit_noise_law([values[kept]], [places[kept]], [normals[kept]])
+        without = fit_noise_model([values[kept]], [places[kept]], [normals[kept]])
         assert without.sd == pytest.approx(whole.sd, rel=4e-3)
 
 
 def test_how_far_residuals_are_correlated_does_not_depend_on_their_size(rng):
-    """Down to a few thousandths of a millimetre: no term of the law is raised on its own, however little it counts."""
+    """Down to a few thousandths of a millimetre: no term of the model is raised on its own, however little it counts."""
     values, places, normals = residuals(rng, 0.3, 1.5)
     rough = [value + 0.1 * rng.standard_normal(len(value)) for value in values]
-    law = fit_noise_law(rough, places, normals)
-    small = fit_noise_law([0.01 * value for value in rough], places, normals)
-    assert small.sd == pytest.approx(0.01 * law.sd)
-    assert small.correlation_area == pytest.approx(law.correlation_area)
+    noise = fit_noise_model(rough, places, normals)
+    small = fit_noise_model([0.01 * value for value in rough], places, normals)
+    assert small.sd == pytest.approx(0.01 * noise.sd)
+    assert small.correlation_area == pytest.approx(noise.correlation_area)
 
 
 def test_residuals_of_nothing_leave_the_floor():
     places, normals = sphere(200)
-    law = fit_noise_law([np.zeros(200)], [places], [normals])
-    assert law.sd == pytest.approx(1e-3)
+    noise = fit_noise_model([np.zeros(200)], [places], [normals])
+    assert noise.sd == pytest.approx(1e-3)
 
 
 @pytest.mark.parametrize("lengths", [(3.0,), (1.2, 9.5)])
 def test_the_covariance_is_the_double_sum(rng, lengths):
     places, normals = sphere(700)
     rows = np.stack([normals[:, 0], np.ones(700), places[:, 2] * normals[:, 1], rng.standard_normal(700)])
-    law = NoiseLaw(np.full(len(lengths), 0.04), np.array(lengths))
-    expected = dense(law, rows, places, normals)
+    noise = NoiseModel(np.full(len(lengths), 0.04), np.array(lengths))
+    expected = dense(noise, rows, places, normals)
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-    assert np.abs(law.covariance(rows, places, normals) - expected).max() < 0.06 * scale.max()
-    assert np.diag(law.covariance(rows, places, normals)) == pytest.approx(np.diag(expected), rel=0.06)
+    assert np.abs(noise.covariance(rows, places, normals) - expected).max() < 0.06 * scale.max()
+    assert np.diag(noise.covariance(rows, places, normals)) == pytest.approx(np.diag(expected), rel=0.06)
 
 
 def test_distant_residuals_are_independent_and_opposite_normals_count_negative():
-    law = NoiseLaw(np.array([0.09]), np.array([2.0]))
+    noise = NoiseModel(np.array([0.09]), np.array([2.0]))
     places = np.array([[0.0, 0.0, 0.0], [30.0, 0.0, 0.0], [1e-3, 0.0, 0.0]])
     normals = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
     one, two, both = np.eye(3)[:1], np.eye(3)[:2], np.array([[1.0, 0.0, 1.0]])
-    assert law.covariance(two, places, normals) == pytest.approx(0.09 * np.eye(2), abs=1e-12)
-    assert law.covariance(one, places, normals) == pytest.approx(0.09)
-    assert law.covariance(both, places, normals) == pytest.approx(0.0, abs=1e-7)
+    assert noise.covariance(two, places, normals) == pytest.approx(0.09 * np.eye(2), abs=1e-12)
+    assert noise.covariance(one, places, normals) == pytest.approx(0.09)
+    assert noise.covariance(both, places, normals) == pytest.approx(0.0, abs=1e-7)
 
 
 def test_the_correlation_area_of_one_gaussian():
-    assert NoiseLaw(np.array([0.5]), np.array([3.0])).correlation_area == pytest.approx(2.0 * np.pi * 9.0)
+    assert NoiseModel(np.array([0.5]), np.array([3.0])).correlation_area == pytest.approx(2.0 * np.pi * 9.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.inversion.tukey import Tukey
+from palpate.observation.robust_loss import Tukey
 
 
 @pytest.mark.parametrize("loss", [Tukey(), Tukey(0.7), Tukey(0.7, 0.4)])

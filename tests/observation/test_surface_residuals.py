@@ -12,8 +12,8 @@ from palpate.images.distance import distance_map
 from palpate.images.label_image import VoxelGrid
 from palpate.mesh.space import triangle_shape
 from palpate.mesh.surface import triangle_normals
-from palpate.observation.misfit import Correspondence, correspondence, surface_residuals
 from palpate.observation.observed_surface import SUBTRIANGLES, ObservedSurface
+from palpate.observation.surface_residuals import Correspondence, correspondence, surface_residuals
 from palpate.observation.target import surface_target, target_from
 from palpate.phantoms.shapes import Ellipsoid, ball, rotation_about
 
@@ -84,25 +84,25 @@ def test_the_jacobian_leaves_a_remainder_of_second_order(ball_surface, backwards
     assert np.all(np.diff(np.log(remainders)) / np.diff(np.log(STEPS)) > 1.9)
 
 
-def test_the_normal_jacobian_is_the_exact_one_of_a_smooth_surface(sphere, rng):
+def test_the_smooth_jacobian_is_the_exact_one_of_a_smooth_surface(sphere, rng):
     surface = surface_of(*sphere(4))
     before, after = ball(CENTRE, 10.0), ball(CENTRE, 10.7)
     points = CENTRE + 10.7 * directions(rng, 600)
     target = target_from(surface, before, after, level=0.0, image=(points, np.ones(600)))
     found = surface_residuals(target, np.zeros_like(surface.rest), everywhere(target))
-    smooth = np.stack([np.sin(surface.rest[:, 0] / 5.0), surface.rest[:, 1] / 9.0, np.ones(len(surface.rest))], axis=1)
-    exact, normal = (matrix @ smooth.ravel() for matrix in (found.jacobian, found.normal_jacobian))
+    motion = np.stack([np.sin(surface.rest[:, 0] / 5.0), surface.rest[:, 1] / 9.0, np.ones(len(surface.rest))], axis=1)
+    exact, normal = (matrix @ motion.ravel() for matrix in (found.jacobian, found.smooth_jacobian))
     n = len(target.area)
     assert np.linalg.norm((exact - normal)[:n]) < 0.02 * np.linalg.norm(exact[:n])
     assert np.linalg.norm((exact - normal)[n:]) < 0.05 * np.linalg.norm(exact[n:])
 
 
-def test_the_normal_jacobian_knows_no_sliding(sphere):
+def test_the_smooth_jacobian_knows_no_sliding(sphere):
     surface = surface_of(*sphere(4))
     spin = np.cross([0.0, 0.0, 0.2], surface.rest - CENTRE)
     target = smooth_target(surface, np.random.default_rng(1))
     found = surface_residuals(target, np.zeros_like(surface.rest), everywhere(target))
-    normal, exact = (np.linalg.norm(rows @ spin.ravel()) for rows in (found.normal_jacobian, found.jacobian))
+    normal, exact = (np.linalg.norm(rows @ spin.ravel()) for rows in (found.smooth_jacobian, found.jacobian))
     assert normal < 0.1 * exact
 
 

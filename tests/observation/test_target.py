@@ -8,8 +8,8 @@ import pytest
 from palpate.images.distance import distance_map
 from palpate.images.label_image import VoxelGrid
 from palpate.images.voxel_noise import terrace_noise
-from palpate.observation.misfit import correspondence
 from palpate.observation.observed_surface import ObservedSurface
+from palpate.observation.surface_residuals import correspondence
 from palpate.observation.target import surface_target, target_from
 from palpate.phantoms.shapes import ball
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from palpate.mesh.surface import vertex_normals
-from palpate.observation.misfit import Correspondence, SurfaceResiduals, surface_residuals
+from palpate.observation.contract import Residuals
 from palpate.observation.observed_surface import ObservedSurface
+from palpate.observation.surface_residuals import Correspondence, surface_residuals
 from palpate.observation.target import target_from
 from palpate.observation.wall_correction import wall_correction
 from palpate.phantoms.shapes import ball
@@ -32,7 +33,7 @@ def bump(wall):
     return 0.4 * np.exp(-distance2 / (2.0 * KERNEL_MM**2))[:, None] * normals
 
 
-def residuals_of(wall, displacement) -> SurfaceResiduals:
+def residuals_of(wall, displacement) -> Residuals:
     """The later image is the resting ball: a wall that has moved should go back."""
     still = ball(np.zeros(3), RADIUS)
     target = target_from(wall, still, still, level=0.0, image=(wall.rest[::4], np.full(len(wall.rest[::4]), 4.0)))

@@ -15,7 +15,7 @@ import pytest
 
 from palpate.errors import InputDataError, NotConverged
 from palpate.images.readers import write_scalar_image
-from palpate.inversion.estimation import Remark
+from palpate.inversion.result import Remark
 from palpate.report import collect as collect_module
 from palpate.report import page as page_module
 from palpate.report.case_report import rewrite_report, write_case_report, write_failure_report

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from palpate.inversion.conclude import Observed, conclude
 from palpate.inversion.gauss_newton import Outcome
 from palpate.inversion.grid_position import FittedState, grid_position_shifts

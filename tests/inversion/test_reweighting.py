@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from palpate.images.distance import distance_map
-from palpate.images.label_image import VoxelGrid
 from palpate.inversion.surrogate import first_surrogate
 from palpate.inversion.tukey import Tukey
 from palpate.inversion.weighting import EXACT_LAW, first_law, objective_of, robust_loss
+
+from palpate.images.distance import distance_map
+from palpate.images.label_image import VoxelGrid
 
 
 def test_surfaces_count_by_their_area(voxels):

@@ -7,12 +7,12 @@ from itertools import count
 
 import numpy as np
 import pytest
-
-from palpate.inversion import agreement
 from palpate.inversion.agreement import AGREED, agreed, left_since
 from palpate.inversion.gauss_newton import gauss_newton
 from palpate.inversion.invert import TO_REPORT, invert
 from palpate.inversion.weighting import weighed_anew
+
+from palpate.inversion import agreement
 from palpate.mechanics.first_order import expanded
 
 SAME = 1e-3  # of ln E: two ways, each to AGREED

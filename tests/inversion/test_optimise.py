@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
 from palpate.inversion.gauss_newton import FIRST_RADIUS, MAX_RADIUS, Bounds, Outcome, gauss_newton
 from palpate.inversion.lbfgs import lbfgs
 

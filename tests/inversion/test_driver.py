@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-
 from palpate.inversion.driver_prior import learned_prior
+
 from palpate.observation.wall_modes import Wall, wall_modes, wall_of
 
 N_MODES = 90

@@ -6,12 +6,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
 from palpate.inversion.cramer_rao import cramer_rao, efficient_gain
 from palpate.inversion.noise import NoiseLaw
-from palpate.inversion.objective import Evaluation, Linearisation
 from palpate.inversion.posterior import gain, sandwich_covariance
 from palpate.observation.misfit import SurfaceResiduals
+
+from palpate.inversion.objective import Evaluation, Linearisation
 from palpate.phantoms.boundary_noise import smooth_field
 
 SD = 0.3

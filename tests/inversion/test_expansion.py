@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from palpate.inversion import continuation
 from palpate.inversion.continuation import continued_at_finite_strain
 from palpate.inversion.directions import deciding_directions
 from palpate.inversion.invert import invert
+
+from palpate.inversion import continuation
 from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.laws.registry import law_named
 
