@@ -36,7 +36,7 @@ def equilibrium(
     """
     still = np.zeros(constraint.n_modes)
     system = linear_model(space, constraint, dilatation=dilatation, loads=loads).system(moduli)
-    if law.name == "linear":
+    if not law.finite:
         return system.solve(still)
     settings = NewtonSettings(tolerance=ACCURACY)
     model = finite_strain_model(space, constraint, law, dilatation=dilatation, loads=loads, settings=settings)

@@ -159,7 +159,7 @@ def _equilibrium(space: LagrangeSpace, motions: Mapping[str, WallMotion], law: L
     no_modes = np.zeros((offset.size, 0))
     constraint = outer_constraint(space, outer="fixed", modes=no_modes, offset=offset.ravel(), prescribed=walls)
     moduli = [tissue.youngs_modulus_kpa or np.nan for tissue in space.mesh.tissues if tissue.meshed]
-    dilatation = Dilatation.POINTWISE if law.name == "linear" else Dilatation.BLENDED
+    dilatation = Dilatation.BLENDED if law.finite else Dilatation.POINTWISE
     return equilibrium(space, constraint, np.array(moduli), law=law, dilatation=dilatation).displacement
 
 

@@ -12,22 +12,47 @@ determinant (for the small-strain law: 1 + div u), P = dW/dF the first Piola-Kir
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Law", "energy", "stress", "tangent"]
+__all__ = ["Law", "LawParameter", "energy", "stress", "tangent"]
 
 Array = NDArray[np.float64]
 
 
+@dataclass(frozen=True, slots=True)
+class LawParameter:
+    """What a case may say of a law under its `name` in [mechanics]: a number, dimensionless, within both ends."""
+
+    name: str
+    default: float
+    least: float
+    most: float
+    description: str
+
+
 class Law(Protocol):
-    """An elastic law, all its functions vectorised over n places and dimensionless."""
+    """An elastic law, all its functions vectorised over n places and dimensionless.
+
+    Its constructor takes its parameters by their names, and has their defaults.
+    """
 
     @property
     def name(self) -> str:
         """The law's name in `case.toml`."""
+        ...
+
+    @property
+    def description(self) -> str:
+        """What it is, as a methods section says it after "the tissues followed"."""
+        ...
+
+    @property
+    def parameters(self) -> tuple[LawParameter, ...]:
+        """What a case may say of it beside its name."""
         ...
 
     @property

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.mechanics.laws.contract import LawParameter
 from palpate.mechanics.laws.kinematics import IDENTITY4
 
 __all__ = ["Linear"]
@@ -24,6 +25,16 @@ class Linear:
     def name(self) -> str:
         """The law's name in `case.toml`."""
         return "linear"
+
+    @property
+    def description(self) -> str:
+        """For a methods section."""
+        return "isotropic linear elasticity at small strains"
+
+    @property
+    def parameters(self) -> tuple[LawParameter, ...]:
+        """None."""
+        return ()
 
     @property
     def finite(self) -> bool:

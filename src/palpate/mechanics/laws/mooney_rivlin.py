@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError
+from palpate.mechanics.laws.contract import LawParameter
 from palpate.mechanics.laws.finite import FiniteStrain
 from palpate.mechanics.laws.kinematics import IDENTITY4, cofactors, determinants, dyads, log_derivatives
 
@@ -19,12 +20,14 @@ __all__ = ["MooneyRivlin"]
 
 Array = NDArray[np.float64]
 
+C01_OVER_C10 = LawParameter("c01_over_c10", 0.25, 0.0, 1000.0, "ratio of the law's two constants; 0 is neo-hookean")
+
 
 @dataclass(frozen=True, slots=True)
 class MooneyRivlin(FiniteStrain):
     """Compressible Mooney-Rivlin law with the dimensionless ratio c01 / c10 >= 0; 0 is the neo-Hookean law."""
 
-    c01_over_c10: float = 0.25
+    c01_over_c10: float = C01_OVER_C10.default
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.c01_over_c10 < np.inf:
@@ -34,6 +37,16 @@ class MooneyRivlin(FiniteStrain):
     def name(self) -> str:
         """The law's name in `case.toml`."""
         return "mooney-rivlin"
+
+    @property
+    def description(self) -> str:
+        """For a methods section."""
+        return f"a compressible Mooney-Rivlin law (c01 / c10 = {self.c01_over_c10:g}) at finite strains"
+
+    @property
+    def parameters(self) -> tuple[LawParameter, ...]:
+        """The ratio of its two constants."""
+        return (C01_OVER_C10,)
 
     @property
     def coefficients(self) -> tuple[float, float]:

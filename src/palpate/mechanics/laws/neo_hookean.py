@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.mechanics.laws.contract import LawParameter
 from palpate.mechanics.laws.finite import FiniteStrain
 from palpate.mechanics.laws.kinematics import IDENTITY4, cofactors, determinants, log_derivatives
 
@@ -23,6 +24,16 @@ class NeoHookean(FiniteStrain):
     def name(self) -> str:
         """The law's name in `case.toml`."""
         return "neo-hookean"
+
+    @property
+    def description(self) -> str:
+        """For a methods section."""
+        return "a compressible neo-Hookean law at finite strains"
+
+    @property
+    def parameters(self) -> tuple[LawParameter, ...]:
+        """None."""
+        return ()
 
     def shear_energy(self, F: Array) -> Array:
         """Shear energy w = (I1 - 3) / 2 - ln J (n,) at F (n, 3, 3)."""

@@ -3,21 +3,35 @@
 from __future__ import annotations
 
 from palpate.errors import ConfigurationError
-from palpate.mechanics.laws.contract import Law
+from palpate.mechanics.laws.contract import Law, LawParameter
 from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
 from palpate.mechanics.laws.neo_hookean import NeoHookean
 
-__all__ = ["LAWS", "law_named"]
+__all__ = ["LAWS", "law_named", "law_parameters"]
 
-LAWS: dict[str, Law] = {law.name: law for law in (Linear(), NeoHookean(), MooneyRivlin())}
+REGISTERED = (Linear, NeoHookean, MooneyRivlin)  # a new law is a file, and its class here
+
+LAWS: dict[str, Law] = {law.name: law for law in (kind() for kind in REGISTERED)}
 
 
-def law_named(name: str, *, c01_over_c10: float = 0.25) -> Law:
-    """The law of that name; c01_over_c10 (dimensionless) is used by "mooney-rivlin" only.
+def law_named(name: str, **parameters: float) -> Law:
+    """The law of that name with its parameters (see `law_parameters`), by default its own.
 
-    Raises `ConfigurationError` for another name, and for an impossible ratio.
+    Raises `ConfigurationError` for another name, for a parameter that the law has not, and for an impossible value.
     """
     if name not in LAWS:
         raise ConfigurationError(f"law is '{name}'; it must be one of {sorted(LAWS)}")
-    return MooneyRivlin(c01_over_c10) if name == "mooney-rivlin" else LAWS[name]
+    own = {parameter.name for parameter in LAWS[name].parameters}
+    for key in parameters:
+        if key not in own:
+            owners = [law.name for law in LAWS.values() if key in {p.name for p in law.parameters}]
+            raise ConfigurationError(
+                f"the law '{name}' has no parameter '{key}'; it belongs to {' and '.join(map(repr, owners)) or 'none'}"
+            )
+    return type(LAWS[name])(**parameters)
+
+
+def law_parameters() -> dict[str, LawParameter]:
+    """The parameters of all laws, by their names in [mechanics] of a `case.toml`."""
+    return {parameter.name: parameter for law in LAWS.values() for parameter in law.parameters}
