@@ -56,6 +56,7 @@ from palpate.study.body import Body, aligned, inverse_problem, make_body
 from palpate.study.case import Case, Mechanics, MeshSettings, Phantom
 from palpate.study.run import fitted_states, inversion_settings
 
+Array = NDArray[np.float64]
 Result = dict[str, Any]  # a line of JSON
 
 NOISE = Noise(surface_sd_mm=0.3, correlation_length_mm=6.0)

@@ -16,6 +16,7 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from memory import peak_mb
@@ -114,7 +115,7 @@ def _write_images(folder: Path) -> None:
 
 def _one(run: Run, folder: Path) -> dict[str, object]:
     if run.solver == "superlu":
-        sys.modules["pypardiso"] = None  # as where it is not installed
+        sys.modules["pypardiso"] = None  # type: ignore[assignment]  # as where it is not installed
     path = DATA / "demo.toml" if run.body == "demo" else folder / run.body / "case.toml"
     settings = {
         "mesh.edge_length_mm": run.edge_mm,
@@ -147,7 +148,7 @@ COLUMNS = ("case", "edge, mm", "modes", "solver", *PAIRS)
 HEAD = (f"| {' | '.join(COLUMNS)} |", "|" + "---|" * len(COLUMNS))
 
 
-def _line(row: dict) -> str:
+def _line(row: dict[str, Any]) -> str:
     plain = {"linear": "", "neo-hookean": ", neo-Hookean"}[row["law"]] + (", P1" if row["element"] == "P1" else "")
     name = f"{row['body']}{plain}{'' if row['fitted'] else ', not fitted'}"
     cells = [name, f"{row['edge_mm']:g}", str(row["modes"]), row["solver"]]

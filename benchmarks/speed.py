@@ -18,26 +18,35 @@ import pstats
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import speed_peers as peers
 from memory import peak_mb
+from numpy.typing import NDArray
 
 from palpate.images.segmentation import segment
-from palpate.inversion.invert import invert
-from palpate.inversion.posterior import sandwich_covariance
-from palpate.inversion.problem import InverseProblem, Inversion, InversionSettings
-from palpate.inversion.sampling import sample_posterior
-from palpate.inversion.surrogate import first_surrogate, with_modulus_series
-from palpate.inversion.weighting import SEGMENTATION_LAW, objective_of
+from palpate.inversion import (
+    InverseProblem,
+    Inversion,
+    InversionSettings,
+    Objective,
+    ReducedBasis,
+    invert,
+    posterior_sd,
+    reduced_basis,
+    sample_posterior,
+    sandwich_covariance,
+)
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import linear_model
 from palpate.mechanics.solvers.registry import SOLVERS
 from palpate.mesh.space import lagrange_space
 from palpate.mesh.tetrahedralise import tetrahedralise
+from palpate.observation.noise_model import SEGMENTATION_NOISE
 from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.phantoms.pelvis import PelvisOptions, pelvis, pelvis_anatomy
 from palpate.phantoms.scene import Scene
@@ -87,7 +96,7 @@ def main() -> int:
     if arguments.sizes:
         sizes = replace(sizes, scaling=tuple(float(part) for part in arguments.sizes.split(",")))
     say = _silent if arguments.json else _say
-    result: dict[str, object] = {"machine": platform.processor() or platform.machine(), "solver": _solver()}
+    result: Result = {"machine": platform.processor() or platform.machine(), "solver": _solver()}
     for part in arguments.parts.split(","):
         say(f"{part} ...")
         result |= PART[part](sizes, arguments.seed, say)
@@ -97,6 +106,7 @@ def main() -> int:
 
 
 Say = Callable[[str], None]
+Result = dict[str, Any]  # of JSON
 
 
 def _say(message: str) -> None:
@@ -111,18 +121,32 @@ def _solver() -> str:
     return "pardiso" if SOLVERS["pardiso"].available() else "superlu"
 
 
-def problem_of(edge_mm: float, seed: int, law: str = "linear") -> tuple[InverseProblem, InversionSettings, np.ndarray]:
-    """The inverse problem of a pelvis at an edge length, five starts, and the true moduli (n_regions,) kPa."""
+@dataclass(frozen=True)
+class Posed:
+    """An inverse problem of one later state, five starts, and the true moduli (n_regions,) kPa."""
+
+    problem: InverseProblem
+    settings: InversionSettings
+    moduli: NDArray[np.float64]
+
+    @property
+    def n_dofs(self) -> int:
+        """Unknowns of the displacement."""
+        return 3 * len(self.problem.states[0].model.space.points)
+
+
+def problem_of(edge_mm: float, seed: int, law: str = "linear") -> Posed:
+    """What a simulated pelvis poses at an edge length."""
     scene = _scene(seed, law)
     mechanics = Mechanics(law, "P2" if law == "linear" else "auto")
     case = Case(f"speed-{seed}", phantom=Phantom("pelvis", seed), mesh=MeshSettings(edge_mm), mechanics=mechanics)
     before, after = (segment(image, scene.tissues) for image in (scene.before, scene.after))
     body = make_body(aligned(before, (after,), method="none"), case, progress=_silent)
     problem = inverse_problem(body, case, progress=_silent)
-    settings = inversion_settings(case, problem.modulus_map)
-    n = len(problem.modulus_map.tissues)
-    settings = replace(settings, starts=tuple(np.full(n, np.log(start)) for start in STARTS))
-    return problem, settings, np.array([scene.moduli_kpa[name] for name in problem.models[0].names])
+    n = problem.parameters.n_parameters
+    starts = tuple(np.full(n, np.log(start)) for start in STARTS)
+    settings = replace(inversion_settings(case, problem.parameters), starts=starts)
+    return Posed(problem, settings, np.array([scene.moduli_kpa[name] for name in problem.states[0].model.names]))
 
 
 @functools.lru_cache(maxsize=1)
@@ -130,112 +154,115 @@ def _scene(seed: int, law: str) -> Scene:
     return pelvis(PelvisOptions(seed=seed, truth_edge_mm=4.0, law=law))
 
 
-def timed(work: Callable[[], object]) -> tuple[float, object]:
-    """Seconds that `work` took, and what it gave."""
+def timed(work: Callable[[], object]) -> float:
+    """Seconds that `work` took."""
     began = time.perf_counter()
-    result = work()
-    return time.perf_counter() - began, result
+    work()
+    return time.perf_counter() - began
 
 
-def alternating(repeats: int, works: dict[str, Callable[[], object] | None]) -> dict[str, float | None]:
-    """Median seconds of each work, taken in turns; null for one that is not there."""
+def alternating(repeats: int, works: Mapping[str, Callable[[], object]]) -> dict[str, float]:
+    """Median seconds of each work, taken in turns."""
     seconds: dict[str, list[float]] = {name: [] for name in works}
     for _ in range(repeats):
         for name, work in works.items():
-            if work is not None:
-                seconds[name].append(timed(work)[0])
-    return {name: float(np.median(values)) if values else None for name, values in seconds.items()}
+            seconds[name].append(timed(work))
+    return {name: float(np.median(values)) for name, values in seconds.items()}
 
 
 def _estimate(problem: InverseProblem, settings: InversionSettings) -> Inversion:
     """From an assembled problem to moduli with linearised intervals."""
     inversion = invert(problem, settings, progress=_silent)
-    sandwich_covariance(inversion.minimum.evaluation, inversion.law, inversion.objective.n_parameters)
+    sandwich_covariance(inversion.objective, inversion.minimum.evaluation)
     return inversion
 
 
-def _linear(sizes: Sizes, seed: int, say: Say) -> dict[str, object]:
-    problem, settings, moduli = problem_of(sizes.linear, seed)
-    model = problem.models[0]
+def _linear(sizes: Sizes, seed: int, say: Say) -> Result:
+    posed = problem_of(sizes.linear, seed)
+    model, moduli = posed.problem.states[0].model, posed.moduli
     coefficients = np.random.default_rng(seed).standard_normal(model.n_modes)
-    say(f"{3 * len(model.space.points)} unknowns")
+    say(f"{posed.n_dofs} unknowns")
     model.solve(moduli, coefficients)  # the solver's library is loaded
     inversions: list[Inversion] = []
     seconds = alternating(
         sizes.repeats,
         {
             "forward_solve_s": lambda: model.solve(moduli, coefficients),
-            "estimate_s": lambda: inversions.append(_estimate(problem, settings)),
+            "estimate_s": lambda: inversions.append(_estimate(posed.problem, posed.settings)),
         },
     )
     inversion = inversions[-1]
-    theta = inversion.minimum.unknowns[: inversion.objective.n_parameters]
+    basis = inversion.objective.states[0].approximation
+    assert isinstance(basis, ReducedBasis)
     return {
-        "dofs": 3 * len(model.space.points),
+        "dofs": posed.n_dofs,
         **seconds,
         "estimate_over_forward": seconds["estimate_s"] / seconds["forward_solve_s"],
         "outcome": inversion.minimum.outcome.name,
-        "ratios": np.exp(theta).tolist(),
-        "basis": inversion.surrogates[0].reduced.n_basis,
+        "ratios": np.exp(inversion.minimum.unknowns[: inversion.objective.n_parameters]).tolist(),
+        "basis": basis.model.n_basis,
         "evaluations": inversion.evaluations,
         "factorisations": inversion.counts.factorisations,
         "peak_mb": peak_mb(),
     }
 
 
-def _nonlinear(sizes: Sizes, seed: int, say: Say) -> dict[str, object]:
-    problem, settings, moduli = problem_of(sizes.nonlinear, seed, "neo-hookean")
-    model = problem.finite_strain[0]
-    linear = invert(replace(problem, finite_strain=()), settings, progress=_silent)
-    coefficients = linear.objective.coefficients(linear.minimum.unknowns)[0]
-    say(f"{3 * len(model.space.points)} unknowns")
+def _nonlinear(sizes: Sizes, seed: int, say: Say) -> Result:
+    posed = problem_of(sizes.nonlinear, seed, "neo-hookean")
+    model = posed.problem.states[0].finite_strain
+    assert model is not None
+    linear = invert(posed.problem.linear(), posed.settings, progress=_silent)
+    coefficients = linear.objective.parameters.coefficients(linear.minimum.unknowns)[0]
+    say(f"{posed.n_dofs} unknowns")
     inversions: list[Inversion] = []
     seconds = alternating(
         1,
         {
-            "forward_solve_s": lambda: model.solve(moduli, coefficients),
-            "estimate_s": lambda: inversions.append(_estimate(problem, settings)),
+            "forward_solve_s": lambda: model.solve(posed.moduli, coefficients),
+            "estimate_s": lambda: inversions.append(_estimate(posed.problem, posed.settings)),
         },
     )
     found = {
-        "dofs": 3 * len(model.space.points),
+        "dofs": posed.n_dofs,
         "law": "neo-hookean",
         **seconds,
         "estimate_over_forward": seconds["estimate_s"] / seconds["forward_solve_s"],
+        "outcome": inversions[0].minimum.outcome.name,
         "factorisations": inversions[0].counts.factorisations,
     }
     return {"nonlinear": found}
 
 
-def _gradient(sizes: Sizes, seed: int, say: Say) -> dict[str, object]:
-    problem, settings, moduli = problem_of(sizes.gradient, seed)
-    model, mapping = problem.models[0], problem.modulus_map
-    say(f"{3 * len(model.space.points)} unknowns")
-    middle = mapping.moduli(np.median(np.stack(settings.starts), axis=0))
+def _gradient(sizes: Sizes, seed: int, say: Say) -> Result:
+    posed = problem_of(sizes.gradient, seed)
+    problem, model, mapping = posed.problem, posed.problem.states[0].model, posed.problem.parameters
+    say(f"{posed.n_dofs} unknowns")
+    middle = mapping.moduli(np.median(np.stack(posed.settings.starts), axis=0))
     coefficients = 0.3 * np.random.default_rng(seed).standard_normal(model.n_modes)
-
-    def offline() -> object:
-        return with_modulus_series(first_surrogate(model, middle), coefficients, mapping.columns)
-
-    offline_s, surrogate = timed(offline)
-    objective = objective_of(problem, (surrogate.reduced,), SEGMENTATION_LAW)
-    theta = np.log(moduli[mapping.columns] / mapping.scale_kpa)
+    began = time.perf_counter()
+    basis = reduced_basis(model, middle).with_modulus_series(coefficients, mapping.selection)
+    offline_s = time.perf_counter() - began
+    theta = np.log(posed.moduli[mapping.selection.argmax(axis=0)] / mapping.scale_kpa)
     unknowns = np.concatenate([theta, coefficients])
-    objective = objective.with_fresh_correspondence(unknowns)
+    objective = Objective(problem.states, mapping).under([basis])
+    objective = objective.with_observations([o.with_noise(SEGMENTATION_NOISE) for o in objective.observations])
+    objective = objective.rematched(unknowns)
     frozen = peers.frozen_misfit(objective, unknowns)
-    works = {
-        "gradient_s": lambda: [objective.value_and_gradient(unknowns) for _ in range(IN_A_ROW)],
+    others = {
         "torch_fem_gradient_s": peers.torch_fem(problem, frozen, unknowns),
         "scikit_fem_gradient_s": peers.scikit_fem(problem, frozen, unknowns),
     }
-    for name, work in works.items():
-        if work is not None and name != "gradient_s":
-            say(f"{name}: gradient off by {peers.disagreement(work(), frozen, surrogate, unknowns):.1e}")
+    there = {name: gradient for name, gradient in others.items() if gradient is not None}
+    for name, gradient in there.items():
+        say(f"{name}: gradient off by {peers.disagreement(gradient(), frozen, problem, unknowns):.1e}")
     objective.value_and_gradient(unknowns)
-    seconds = alternating(sizes.repeats, works)
+    works: dict[str, Callable[[], object]] = {
+        "gradient_s": lambda: [objective.value_and_gradient(unknowns) for _ in range(IN_A_ROW)]
+    }
+    seconds = alternating(sizes.repeats, works | there)
     seconds["gradient_s"] /= IN_A_ROW
     say(json.dumps(seconds))
-    few = replace(settings, starts=settings.starts[: sizes.starts_of_peers])
+    few = replace(posed.settings, starts=posed.settings.starts[: sizes.starts_of_peers])
     both = alternating(
         1,
         {
@@ -243,10 +270,11 @@ def _gradient(sizes: Sizes, seed: int, say: Say) -> dict[str, object]:
             "estimate_of_the_same_s": lambda: _estimate(problem, few),
         },
     )
-    torch = seconds["torch_fem_gradient_s"]
+    torch = seconds.get("torch_fem_gradient_s")
     return {
-        "gradient_dofs": 3 * len(model.space.points),
+        "gradient_dofs": posed.n_dofs,
         "offline_s": offline_s,
+        **dict.fromkeys(others),
         **seconds,
         "gradient_ratio": None if torch is None else seconds["gradient_s"] / torch,
         **both,
@@ -254,30 +282,31 @@ def _gradient(sizes: Sizes, seed: int, say: Say) -> dict[str, object]:
     }
 
 
-def _posterior(sizes: Sizes, seed: int, say: Say) -> dict[str, object]:
-    problem, settings, _ = problem_of(sizes.linear, seed)
-    inversion = _estimate(problem, settings)
+def _posterior(sizes: Sizes, seed: int, say: Say) -> Result:
+    posed = problem_of(sizes.linear, seed)
+    inversion = _estimate(posed.problem, posed.settings)
+    n = inversion.objective.n_parameters
     say("sampling")
-    seconds, samples = timed(
-        lambda: sample_posterior(
-            inversion.objective,
-            inversion.minimum.unknowns,
-            bounds=settings.bounds,
-            evaluations=sizes.evaluations,
-            rng=np.random.default_rng(seed),
-        )
+    began = time.perf_counter()
+    samples = sample_posterior(
+        inversion.objective,
+        inversion.minimum.unknowns,
+        bounds=posed.settings.bounds,
+        evaluations=sizes.evaluations,
+        rng=np.random.default_rng(seed),
     )
+    seconds = time.perf_counter() - began
     return {
         "posterior_100k_s": seconds * 100_000 / sizes.evaluations,
         "posterior_accepted": samples.accepted,
         "posterior_refreshed": samples.refreshed,
         "posterior_gap": samples.gap,
         "posterior_sd": samples.theta.std(axis=0).tolist(),
-        "gauss_newton_sd": np.sqrt(np.diag(np.linalg.inv(inversion.minimum.evaluation.matrix))[:2]).tolist(),
+        "gauss_newton_sd": posterior_sd(inversion.minimum, n).tolist(),
     }
 
 
-def _scaling(sizes: Sizes, seed: int, say: Say) -> dict[str, object]:
+def _scaling(sizes: Sizes, seed: int, say: Say) -> Result:
     """Each size in a process of its own, so that its peak memory is its own."""
     rows = []
     for edge in sizes.scaling:
@@ -289,13 +318,14 @@ def _scaling(sizes: Sizes, seed: int, say: Say) -> dict[str, object]:
     return {"scaling": rows, "scaling_exponent": exponent}
 
 
-def _one_size(edge_mm: float, seed: int) -> dict[str, object]:
+def _one_size(edge_mm: float, seed: int) -> Result:
     """Assembly, one forward solve and two modulus sensitivities with multigrid."""
     options = PelvisOptions(seed=seed)
     space = lagrange_space(tetrahedralise(pelvis_anatomy(options), edge_length_mm=edge_mm), "P2")
     motion = prescribed_motion(space, {}, n_modes=3, kernel_mm=20.0, prior_mm=5.0)
-    given = {"modes": motion.modes, "offset": motion.offset, "prescribed": motion.prescribed}
-    constraint = outer_constraint(space, outer="fixed", **given)
+    constraint = outer_constraint(
+        space, outer="fixed", modes=motion.modes, offset=motion.offset, prescribed=motion.prescribed
+    )
     before = peak_mb()
     began, cpu = time.perf_counter(), time.process_time()
     model = linear_model(space, constraint, solver="multigrid")
@@ -328,23 +358,23 @@ STAGES = {  # functions whose time, with all that they call, is a stage of its o
     "tetrahedra remeshed": ("remeshing.py", "remeshed"),
     "surfaces fitted, tetrahedra smoothed": ("tetrahedralise.py", "_fitted"),
     "mesh gate": ("quality.py", "check_mesh"),
-    "distance maps and targets": ("body.py", "surface_targets"),
+    "distance maps and targets": ("body.py", "surface_observations"),
     "wall modes": ("prescribed_motion.py", "prescribed_motion"),
     "stiffness assembled": ("linear_model.py", "linear_model"),
     "finite-strain model": ("finite_strain.py", "finite_strain_model"),
-    "responses and series": ("surrogate.py", "first_surrogate"),
-    "linear estimate": ("invert.py", "invert_with"),
-    "finite-strain estimate": ("continuation.py", "continued_at_finite_strain"),
-    "intervals and fits": ("conclude.py", "conclude"),
+    "responses and series": ("estimate.py", "_with_reduced_bases"),
+    "linear estimate": ("estimate.py", "_linear"),
+    "finite-strain estimate": ("estimate.py", "continue_at_finite_strain"),
+    "intervals and fits": ("result.py", "conclude"),
 }
 WITHIN = {  # parts of the stages above
-    "closest points": ("misfit.py", "_closest"),
+    "closest points": ("surface_residuals.py", "_closest"),
     "voxels of the model": ("voxelise.py", "voxelise"),
-    "noise law": ("noise.py", "fit_noise_law"),
+    "noise model": ("noise_model.py", "fit_noise_model"),
 }
 
 
-def _front_end(sizes: Sizes, seed: int, say: Say) -> dict[str, object]:
+def _front_end(sizes: Sizes, seed: int, say: Say) -> Result:
     """Where the time of a whole case goes, from label images in memory to intervals; under a profiler."""
     scene = _scene(seed, "neo-hookean")
     case = Case(f"speed-{seed}", phantom=Phantom("pelvis", seed), mesh=MeshSettings(sizes.nonlinear))
@@ -368,9 +398,12 @@ def _front_end(sizes: Sizes, seed: int, say: Say) -> dict[str, object]:
 
 
 def _cumulative(stats: pstats.Stats, file: str, function: str) -> float:
-    """Seconds in a function and what it calls."""
+    """Seconds in a function and what it calls; raises `KeyError` for one that was never called."""
     rows = stats.stats.items()  # type: ignore[attr-defined]
-    return float(sum(row[3] for (path, _, name), row in rows if name == function and Path(path).name == file))
+    called = [row[3] for (path, _, name), row in rows if name == function and Path(path).name == file]
+    if not called:
+        raise KeyError(f"{file}: {function} was never called; is it still the stage's name?")
+    return float(sum(called))
 
 
 PART = {
