@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from palpate.inversion.driver_prior import learned_prior
 
+from palpate.inversion import LaterState, Objective, ParameterMap, driver
 from palpate.observation.wall_modes import Wall, wall_modes, wall_of
 
 N_MODES = 90
@@ -47,11 +47,14 @@ def learned_precision(ball, motion, *, sd_mm, seen=None):
     data = modes.T @ modes / sd_mm**2
     score = -modes.T @ motion.ravel() / sd_mm**2  # at no motion
     prior = np.eye(len(data))
-    evaluation = SimpleNamespace(matrix=data + prior, prior=prior, score=score)
-    problem = SimpleNamespace(
-        walls=((ball.wall,),), models=(SimpleNamespace(n_modes=len(data)),), modulus_map=SimpleNamespace(tissues=())
-    )
-    return learned_prior(problem, evaluation, np.zeros(len(data)))
+    evaluation = SimpleNamespace(matrix=data + prior, prior=prior, score=score, prior_score=np.zeros(len(data)))
+    return driver.learned_precision(moved_by(ball.wall), evaluation, np.zeros(len(data)))
+
+
+def moved_by(*walls):
+    """An objective of no moduli and one state whose modes move the walls."""
+    parameters = ParameterMap(np.ones(1), np.zeros((1, 0)), (), "rest", True, (N_MODES,))
+    return Objective((LaterState(None, (), walls=walls),), parameters)
 
 
 def drawn(ball, *, sd_mm, kernel_mm, seed):
@@ -140,4 +143,4 @@ def test_what_is_not_seen_at_all_keeps_a_bounded_prior():
 
 
 def test_walls_that_are_not_given_keep_the_modes_own_prior():
-    assert learned_prior(SimpleNamespace(walls=()), None, np.zeros(3)) is None
+    assert driver.learned_precision(moved_by(), None, np.zeros(N_MODES)) is None

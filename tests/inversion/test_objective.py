@@ -9,37 +9,30 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from palpate.inversion.surrogate import first_surrogate, with_modulus_series
-from palpate.inversion.tukey import Tukey
-from palpate.observation.misfit import Correspondence
 
 import palpate.inversion
-from palpate.inversion.objective import Objective, State, Weighting
+from palpate.inversion import Objective, reduced_basis
+from palpate.observation.contract import Weighting
+from palpate.observation.robust_loss import Tukey
 
-NO_OUTLIERS = Tukey()
-MEMBERS = ("__call__", "value", "n_parameters", "n_unknowns")
+MEMBERS = ("__call__", "value", "value_and_gradient", "rematched")
+PRIOR_SD = np.array([0.5, 2.0])
+PRIOR_MEAN = np.array([0.3, -0.4])
 
 
-def surrogate_of(model, moduli, columns):
+def basis_of(model, moduli, parameters):
     """A reduced model exact at `moduli`, with series of the moduli along one motion of the driver."""
-    return with_modulus_series(first_surrogate(model, moduli), np.ones(model.n_modes), columns).reduced
+    return reduced_basis(model, moduli).with_modulus_series(np.ones(model.n_modes), parameters.selection)
 
 
-def everything(target):
+def objective_of(problem, *, loss=None, precision=30.0) -> Objective:
     """All image points count; the maps' smoothing draws nothing in."""
-    n = len(target.image_points)
-    return Correspondence(np.ones(n, bool), np.zeros(n), np.zeros(len(target.surface.rest)))
-
-
-def objective_of(problem, *, loss=NO_OUTLIERS, precision=30.0) -> Objective:
-    moduli = problem.modulus_map.moduli(np.zeros(2))
-    states, weighting = [], []
-    for model, targets in zip(problem.models, problem.targets, strict=True):
-        reduced = surrogate_of(model, moduli, problem.modulus_map.columns)
-        states.append(State(reduced.at(np.concatenate([t.surface.dofs for t in targets])), targets))
-        every = [everything(t) for t in targets]
-        weighting.append(tuple(Weighting(precision, loss, use) for use in every))
-    return Objective(tuple(states), problem.modulus_map, tuple(weighting))
+    parameters = problem.parameters
+    moduli = parameters.moduli(np.zeros(2))
+    bases = [basis_of(state.model, moduli, parameters) for state in problem.states]
+    objective = Objective(problem.states, parameters).under(bases)
+    weighting = Weighting(precision, loss or Tukey())
+    return objective.with_observations([replace(o, weighting=weighting) for o in objective.observations])
 
 
 def one_image(twins, twin):
@@ -54,7 +47,12 @@ def two_images(twins, twin):
     return objective_of(twins.voxel_problem(twin, twins.deformed(twin.model, seed=6)))
 
 
-FACTORIES = {"one image": one_image, "robust": robust, "two images": two_images}
+def with_prior(twins, twin):
+    objective = one_image(twins, twin)
+    return replace(objective, parameters=objective.parameters.with_prior(PRIOR_MEAN, PRIOR_SD))
+
+
+FACTORIES = {"one image": one_image, "robust": robust, "two images": two_images, "with a prior": with_prior}
 
 
 def test_every_objective_is_tested_here():
@@ -73,7 +71,7 @@ def objective(request, twins, twin):
 
 def place(objective, seed):
     rng = np.random.default_rng(seed)
-    return np.concatenate([rng.normal(size=2), 0.5 * rng.standard_normal(objective.n_unknowns - 2)])
+    return np.concatenate([rng.normal(size=2), 0.5 * rng.standard_normal(objective.parameters.n_unknowns - 2)])
 
 
 def whole(line, unknowns):
@@ -86,7 +84,7 @@ def whole(line, unknowns):
 @pytest.mark.parametrize("seed", [1, 2])
 def test_the_gradient_is_that_of_central_differences(objective, seed):
     unknowns, h = place(objective, seed), 1e-6
-    fresh = objective.with_fresh_correspondence(unknowns)
+    fresh = objective.rematched(unknowns)
     steps = h * np.eye(len(unknowns))
     differences = [(fresh.value(unknowns + s) - fresh.value(unknowns - s)) / (2.0 * h) for s in steps]
     gradient = fresh(unknowns).gradient
@@ -99,12 +97,20 @@ def test_a_trial_value_is_that_of_the_whole_evaluation(objective):
     assert objective.value(unknowns) == pytest.approx(objective(unknowns).value, rel=1e-12)
 
 
-def test_the_matrix_is_that_of_weighted_residuals_and_the_prior(objective):
-    unknowns = place(objective, 4)
+def test_matrix_and_score_are_those_of_weighted_residuals_and_the_prior(objective):
+    unknowns, parameters = place(objective, 4), objective.parameters
     now = objective(unknowns)
-    prior = np.diag(np.repeat([0.0, 1.0], [2, len(unknowns) - 2]))
-    rows = np.concatenate([np.sqrt(s.precision * s.weights)[:, None] * whole(s, unknowns) for s in now.surfaces])
+    stated = np.any(parameters.prior_precision != 0.0)
+    mean, precision = (PRIOR_MEAN, PRIOR_SD**-2.0) if stated else (np.zeros(2), np.zeros(2))
+    prior = np.diag(np.append(precision, np.ones(len(unknowns) - 2)))
+    roots = [np.sqrt(line.precision * line.weights) for line in now.lines]
+    rows = np.concatenate([r[:, None] * whole(s, unknowns) for r, s in zip(roots, now.lines, strict=True)])
+    values = np.concatenate([r * s.residuals.values for r, s in zip(roots, now.lines, strict=True)])
+    pull = prior @ (unknowns - np.append(mean, np.zeros(len(unknowns) - 2)))
+    assert now.prior == pytest.approx(prior)
+    assert now.prior_score == pytest.approx(pull)
     assert now.matrix == pytest.approx(rows.T @ rows + prior, rel=1e-10, abs=1e-8)
+    assert now.score == pytest.approx(rows.T @ values + pull, rel=1e-10, abs=1e-8)
     assert np.linalg.eigvalsh(now.matrix).min() > 0.0
 
 
@@ -112,15 +118,12 @@ def test_the_modes_of_one_image_do_not_move_the_other(twins, twin):
     objective = two_images(twins, twin)
     now = objective(place(objective, 5))
     n = twin.model.n_modes
-    assert all(s.columns.tolist() == [*range(2 + n)] for s in now.surfaces[:3])
-    assert all(s.columns.tolist() == [0, 1, *range(2 + n, 2 + 2 * n)] for s in now.surfaces[3:])
+    assert all(s.columns.tolist() == [*range(2 + n)] for s in now.lines[:3])
+    assert all(s.columns.tolist() == [0, 1, *range(2 + n, 2 + 2 * n)] for s in now.lines[3:])
 
 
 def test_at_the_truth_only_the_prior_pulls(twin, exact):
-    snapshots = surrogate_of(twin.model, twin.moduli, exact.modulus_map.columns)
-    objective = objective_of(exact)
-    outputs = np.concatenate([t.surface.dofs for t in exact.targets[0]])
-    objective = replace(objective, states=(State(snapshots.at(outputs), exact.targets[0]),))
+    objective = objective_of(exact).under([basis_of(twin.model, twin.moduli, exact.parameters)])
     now = objective(twin.unknowns)
     prior = np.concatenate([np.zeros(2), twin.coefficients])
     assert now.misfit_mm2 < 1e-16
@@ -132,16 +135,14 @@ def test_at_the_truth_only_the_prior_pulls(twin, exact):
 def test_residuals_beyond_the_cutoff_have_no_weight(twins, twin):
     objective = robust(twins, twin)
     now = objective(np.concatenate([[0.0, 0.0], -twin.coefficients]))
-    values = np.concatenate([s.residuals.values for s in now.surfaces])
-    weights = np.concatenate([s.weights for s in now.surfaces])
+    values = np.concatenate([line.residuals.values for line in now.lines])
+    weights = np.concatenate([line.weights for line in now.lines])
     assert np.any(np.abs(values) > 0.8)
     assert np.array_equal(weights == 0.0, np.abs(values) >= 0.8)
 
 
-@pytest.mark.parametrize("make", FACTORIES.values(), ids=FACTORIES.keys())
-def test_the_gradient_alone_is_that_of_the_whole_evaluation(twins, twin, make, rng):
-    objective = make(twins, twin)
-    unknowns = 0.3 * rng.standard_normal(objective.n_unknowns)
+def test_the_gradient_alone_is_that_of_the_whole_evaluation(objective, rng):
+    unknowns = 0.3 * rng.standard_normal(objective.parameters.n_unknowns)
     value, gradient = objective.value_and_gradient(unknowns)
     whole = objective(unknowns)
     assert value == pytest.approx(whole.value, rel=1e-12)

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from palpate.inversion.gauss_newton import FIRST_RADIUS, MAX_RADIUS, Bounds, Outcome, gauss_newton
-from palpate.inversion.lbfgs import lbfgs
+from scipy.optimize import OptimizeResult
+
+from palpate.inversion.optimise import FIRST_RADIUS, MAX_RADIUS, Bounds, Outcome, gauss_newton, lbfgs
 
 WIDE = Bounds(np.full(2, -5.0), np.full(2, 5.0))
 METHODS = {"gauss-newton": gauss_newton, "lbfgs": lbfgs}
@@ -101,6 +102,35 @@ def test_an_objective_that_no_step_reduces_is_stuck(toys, rng):
 def test_an_objective_that_is_no_number_says_so(toys):
     broken = toys.Quadratic(np.full((3, 3), np.nan), np.zeros(3))
     assert gauss_newton(broken, np.ones(3), bounds=WIDE).outcome is Outcome.NOT_FINITE
+
+
+def test_a_step_that_a_bound_cuts_short_is_judged_by_what_is_left_of_it(toys):
+    """A billionth of the way to the minimum is left: the whole step promises a hundred million times as much."""
+    objective = toys.Quadratic(np.eye(3), np.array([2.0, 0.1, 0.0]))
+    bounds = Bounds(np.full(2, -5.0), np.array([1e-9, 5.0]))
+    found = gauss_newton(objective, np.array([0.0, 0.1, 0.0]), bounds=bounds)
+    assert found.outcome is Outcome.CONVERGED
+    assert found.unknowns[0] == 1e-9
+    assert found.evaluations == 2
+
+
+def test_what_lbfgs_is_told_of_a_place_does_not_depend_on_what_it_asked_before(toys, rng, monkeypatch):
+    """The places are so near each other that the coefficients of one would pass for those of the other."""
+    objective, start = toys.coupled(rng), np.zeros(5)
+    places = {"a": np.array([2.0, -2.0]), "b": np.array([2.05, -2.0])}
+
+    def told(order):
+        found = {}
+
+        def ask(value_and_slope, first, **_options):
+            found.update({name: value_and_slope(places[name]) for name in order})
+            return OptimizeResult(x=first, success=True)
+
+        monkeypatch.setattr("palpate.inversion.optimise.optimize.minimize", ask)
+        lbfgs(objective, start, bounds=WIDE, tolerance=1e-2)
+        return {name: (value, slope.tolist()) for name, (value, slope) in found.items()}
+
+    assert told("ab") == told("ba") == told("abba")
 
 
 def test_the_start_is_not_written_into(minimise, toys, rng):

@@ -6,23 +6,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from palpate.inversion.gauss_newton import Bounds, gauss_newton
-from palpate.inversion.noise import NoiseLaw
-from palpate.inversion.surrogate import first_surrogate, with_modulus_series
-from palpate.inversion.weighting import objective_of
 
 from palpate.errors import ConfigurationError
-from palpate.inversion.sampling import frozen_posterior, sample_posterior
+from palpate.inversion import Bounds, gauss_newton, sample_posterior
+from palpate.inversion.sampling import frozen_posterior
+from palpate.observation.noise_model import NoiseModel
 
 WIDE = Bounds(np.full(2, np.log(0.02)), np.full(2, np.log(200.0)))
-LAW = NoiseLaw(np.array([0.05**2]), np.array([3.0]))
+NOISE = NoiseModel(np.array([0.05**2]), np.array([3.0]))
 
 
-@pytest.fixture(scope="module")
-def objective(twin, exact):
-    moduli = exact.modulus_map.moduli(np.zeros(2))
-    surrogate = with_modulus_series(first_surrogate(twin.model, moduli), twin.coefficients, exact.modulus_map.columns)
-    return objective_of(exact, (surrogate.reduced,), LAW).with_fresh_correspondence(twin.unknowns)
+@pytest.fixture(scope="module", params=["flat", "normal"])
+def objective(request, twins, twin):
+    """With a flat prior of the log-moduli, and with a normal one."""
+    found = twins.objective_of(twins.exact_problem(twin, noise=NOISE), twin.coefficients).rematched(twin.unknowns)
+    if request.param == "flat":
+        return found
+    return replace(found, parameters=found.parameters.with_prior(twins.TRUTH + 0.02, np.full(2, 0.02)))
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +77,6 @@ def test_where_the_frozen_posterior_is_off_the_closest_points_are_chosen_anew(ob
 
 
 def test_a_full_model_is_refused(objective, minimum, twin):
-    states = (replace(objective.states[0], model=twin.model),)
+    states = (replace(objective.states[0], observed=twin.model),)
     with pytest.raises(ConfigurationError, match="LinearModel"):
         frozen_posterior(replace(objective, states=states), minimum)

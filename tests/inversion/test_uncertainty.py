@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from palpate.inversion.cramer_rao import cramer_rao, efficient_gain
-from palpate.inversion.noise import NoiseLaw
-from palpate.inversion.posterior import gain, sandwich_covariance
-from palpate.observation.misfit import SurfaceResiduals
 
+from palpate.inversion import FittedState, LaterState, Objective, ParameterMap, gain, sandwich_covariance
 from palpate.inversion.objective import Evaluation, Linearisation
+from palpate.inversion.uncertainty import grid_position_shifts, hull, imaging_errors, log_interval, verdict
+from palpate.observation.contract import Residuals, Weighting
+from palpate.observation.noise_model import NoiseModel
+from palpate.observation.robust_loss import Tukey
 from palpate.phantoms.boundary_noise import smooth_field
 
 SD = 0.3
@@ -25,22 +26,45 @@ def sphere(n, radius):
     return radius * normals, normals
 
 
-def surface(places, normals, jacobian, *, precision, state=0, rest="a"):
+@dataclass(frozen=True)
+class Seen:
+    """An observation of which only its noise and its weight matter, in the state with this number."""
+
+    noise_model: NoiseModel
+    weighting: Weighting
+    state: int = 0
+    kind: str = "surface distance"
+
+
+def surface(places, normals, jacobian, *, precision, noise, state=0, kind="surface distance"):
     n = len(places)
     weights = np.full(n, 1.0 / n)
-    residuals = SurfaceResiduals(np.zeros(n), weights, places, normals, places, np.zeros(n), None, None)
-    columns, target = np.arange(jacobian.shape[1]), SimpleNamespace(area=np.ones(n), surface=rest)
-    return Linearisation(residuals, columns, jacobian, weights, precision, target, None, state)
+    residuals = Residuals(np.zeros(n), weights, places, normals, places, None, None)
+    columns = np.arange(jacobian.shape[1])
+    return Linearisation(
+        Seen(noise, Weighting(precision, Tukey()), state, kind), state, residuals, columns, jacobian, weights, None
+    )
 
 
-def evaluation(surfaces, n_parameters):
-    """The evaluation of surfaces with a prior of unit variance on all unknowns after the first ones."""
-    n = surfaces[0].jacobian.shape[1]
+def observed(*lines, n_parameters=2, rests=(0, 1)):
+    """Objective and evaluation of surfaces, with a prior of unit variance on all unknowns after the first ones."""
+    n = lines[0].jacobian.shape[1]
+    parameters = ParameterMap(np.ones(2), np.eye(2), ("a", "b")[:n_parameters], "c", True, (n - n_parameters,))
     prior = np.diag(np.where(np.arange(n) < n_parameters, 0.0, 1.0))
     matrix = prior.copy()
-    for line in surfaces:
+    for line in lines:
         matrix += line.precision * line.jacobian.T @ (line.weights[:, None] * line.jacobian)
-    return Evaluation(0.0, 0.0, np.zeros(n), np.zeros(n), matrix, tuple(surfaces), prior)
+    numbers = sorted({line.state for line in lines})
+    states = [
+        LaterState(None, tuple(line.observation for line in lines if line.state == s), reference=rests[s])
+        for s in numbers
+    ]
+    evaluation = Evaluation(0.0, 0.0, np.zeros(n), np.zeros(n), matrix, tuple(lines), prior, np.zeros(n))
+    return Objective(tuple(states), parameters), evaluation
+
+
+def noise_of(length, sd=SD):
+    return NoiseModel(np.array([sd**2]), np.array([length]))
 
 
 @pytest.fixture
@@ -56,23 +80,22 @@ def test_independent_residuals_give_the_usual_formula(rng):
     places = 10.0 * np.stack(np.meshgrid(*[np.arange(5.0)] * 3), axis=-1).reshape(-1, 3)
     normals = np.tile([[0.0, 0.0, 1.0]], (len(places), 1))
     jacobian = rng.standard_normal((len(places), 4))
-    now = evaluation([surface(places, normals, jacobian, precision=len(places) / SD**2)], 2)
-    law = NoiseLaw(np.array([SD**2]), np.array([0.5]))
-    assert sandwich_covariance(now, law, 2) == pytest.approx(np.linalg.inv(now.matrix)[:2, :2], rel=1e-9)
+    line = surface(places, normals, jacobian, precision=len(places) / SD**2, noise=noise_of(0.5))
+    objective, now = observed(line)
+    assert sandwich_covariance(objective, now) == pytest.approx(np.linalg.inv(now.matrix)[:2, :2], rel=1e-9)
 
 
 def test_the_gain_moves_the_estimate_as_a_normal_equation_does(smooth, rng):
-    places, normals, jacobian = smooth
-    now = evaluation([surface(places, normals, jacobian, precision=50.0)], 2)
-    errors = rng.standard_normal(len(places))
-    expected = np.linalg.solve(now.matrix, 50.0 / len(places) * jacobian.T @ errors)[:2]
+    _, now = observed(surface(*smooth, precision=50.0, noise=noise_of(5.0)))
+    errors = rng.standard_normal(len(smooth[0]))
+    expected = np.linalg.solve(now.matrix, 50.0 / len(errors) * smooth[2].T @ errors)[:2]
     assert gain(now, 2)[0] @ errors == pytest.approx(expected, rel=1e-9)
 
 
 def test_the_interval_covers_the_truth_of_repeated_experiments(smooth, rng):
     places, normals, jacobian = smooth
-    now = evaluation([surface(places, normals, jacobian, precision=200.0)], 2)
-    covariance = sandwich_covariance(now, NoiseLaw(np.array([SD**2]), np.array([5.0])), 2)
+    objective, now = observed(surface(*smooth, precision=200.0, noise=noise_of(5.0)))
+    covariance = sandwich_covariance(objective, now)
     draws = []
     for _ in range(400):
         field = smooth_field(rng, sd_mm=SD, correlation_mm=5.0, features=200)
@@ -87,10 +110,9 @@ def test_the_interval_covers_the_truth_of_repeated_experiments(smooth, rng):
 
 
 def test_correlated_residuals_tell_less(smooth):
-    places, normals, jacobian = smooth
-    now = evaluation([surface(places, normals, jacobian, precision=200.0)], 2)
     short, long = (
-        sandwich_covariance(now, NoiseLaw(np.array([SD**2]), np.array([length])), 2) for length in (0.8, 6.0)
+        sandwich_covariance(*observed(surface(*smooth, precision=200.0, noise=noise_of(length))))
+        for length in (0.8, 6.0)
     )
     assert np.all(np.diag(long) > 1.5 * np.diag(short))
 
@@ -101,75 +123,123 @@ def twice(smooth, *, sign, rests):
     modes, none = jacobian[:, 2:], np.zeros((len(places), 3))
     first = np.hstack([jacobian[:, :2], modes, none])
     second = np.hstack([sign * jacobian[:, :2], none, modes])
-    pairs = enumerate(zip((first, second), rests, strict=True))
-    return evaluation(
-        [surface(places, normals, rows, precision=200.0, state=i, rest=rest) for i, (rows, rest) in pairs], 2
-    )
+    given = {"precision": 200.0, "noise": noise_of(5.0)}
+    lines = [surface(places, normals, rows, state=i, **given) for i, rows in enumerate((first, second))]
+    return observed(*lines, rests=rests)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_second_pair_of_images_halves_the_variance(smooth, sign):
-    law = NoiseLaw(np.array([SD**2]), np.array([5.0]))
-    one = sandwich_covariance(evaluation([surface(*smooth, precision=200.0)], 2), law, 2)
-    two = sandwich_covariance(twice(smooth, sign=sign, rests="ab"), law, 2)
+    one = sandwich_covariance(*observed(surface(*smooth, precision=200.0, noise=noise_of(5.0))))
+    two = sandwich_covariance(*twice(smooth, sign=sign, rests=(0, 1)))
     assert two == pytest.approx(0.5 * one, rel=1e-6)
 
 
 def test_the_noise_of_a_shared_rest_state_is_not_averaged_away_by_a_like_motion_but_cancels_in_an_opposite_one(smooth):
-    law = NoiseLaw(np.array([SD**2]), np.array([5.0]))
-    pairs = sandwich_covariance(twice(smooth, sign=1.0, rests="ab"), law, 2)
-    alike = sandwich_covariance(twice(smooth, sign=1.0, rests="aa"), law, 2)
-    opposite = sandwich_covariance(twice(smooth, sign=-1.0, rests="aa"), law, 2)
+    pairs = sandwich_covariance(*twice(smooth, sign=1.0, rests=(0, 1)))
+    alike = sandwich_covariance(*twice(smooth, sign=1.0, rests=(0, 0)))
+    opposite = sandwich_covariance(*twice(smooth, sign=-1.0, rests=(0, 0)))
     assert np.all(np.diag(alike) > 1.2 * np.diag(pairs))
     assert np.all(np.diag(opposite) < 0.8 * np.diag(pairs))
 
 
-@pytest.fixture
-def observed(smooth):
-    """An evaluation on the smooth surface, and noise that is smooth over 5 mm."""
-    return evaluation([surface(*smooth, precision=200.0)], 2), NoiseLaw(np.array([SD**2]), np.array([5.0]))
+def test_each_kind_of_observation_has_the_noise_of_its_kind_and_errs_on_its_own(smooth):
+    """Two kinds that see the same: noise of theirs adds, each by its own size; of one kind it is the same noise."""
+    rough, fine = noise_of(5.0, 2.0 * SD), noise_of(5.0, SD)
+
+    def covariance(*seen):
+        lines = [surface(*smooth, precision=200.0, noise=noise, kind=kind) for kind, noise in seen]
+        objective, now = observed(*lines)
+        rest = np.linalg.solve(now.matrix, np.eye(5)[:, :2])
+        return sandwich_covariance(objective, now) - rest.T @ now.prior @ rest
+
+    both = covariance(("surface distance", rough), ("point", fine))
+    alike = covariance(("surface distance", fine), ("surface distance", fine))
+    assert both == pytest.approx((4.0 + 1.0) / 4.0 * alike, rel=1e-9)
 
 
-def test_no_estimate_beats_the_cramer_rao_limit(observed):
-    now, law = observed
-    limit = cramer_rao(now, law, 2, cell_mm=5.0)
-    assert np.linalg.eigvalsh(sandwich_covariance(now, law, 2) - 0.95 * limit).min() > 0.0
-    assert np.linalg.eigvalsh(limit).min() > 0.0
+@pytest.fixture(scope="module")
+def imaged(twins, twin, voxels):
+    """The objective of voxels and its evaluation at the truth."""
+    objective = twins.objective_of(voxels, twin.coefficients).rematched(twin.unknowns)
+    return objective, objective(twin.unknowns)
 
 
-def test_the_weights_of_the_limit_attain_it_under_noise_of_its_law(observed, rng):
-    now, law = observed
-    places, normals = now.surfaces[0].residuals.places, now.surfaces[0].residuals.normals
-    rows, *_ = efficient_gain(now, law, 2, cell_mm=5.0)
-    kept = np.eye(5)[:2] - rows @ now.surfaces[0].jacobian  # what is not seen of the unknowns comes from their prior
-    assert kept[:, :2] == pytest.approx(np.zeros((2, 2)), abs=1e-9)  # no bias in the log-moduli
-    draws = [
-        rows @ np.einsum("na,na->n", smooth_field(rng, sd_mm=SD, correlation_mm=5.0, features=200).at(places), normals)
-        for _ in range(400)
-    ]
-    found = np.cov(np.transpose(draws)) + kept[:, 2:] @ np.linalg.solve(now.prior[2:, 2:], kept[:, 2:].T)
-    limit = cramer_rao(now, law, 2, cell_mm=5.0)
-    assert np.sqrt(np.diag(found)) == pytest.approx(np.sqrt(np.diag(limit)), rel=0.12)
+def fitted(twins, twin, spacing):
+    grid = twins.centred_grid((44.0,) * 3, (spacing,) * 3)
+    return FittedState(twin.model.space, twin.scene.displacement, grid, grid)
 
 
-def test_cells_of_the_noises_length_lose_little(observed):
-    now, law = observed
-    fine, cells = (np.sqrt(np.diag(cramer_rao(now, law, 2, cell_mm=size))) for size in (2.0, 5.0))
-    assert np.all(cells >= fine * (1.0 - 1e-9))
-    assert np.all(cells < 1.1 * fine)
+def test_finer_voxels_leave_less_to_the_place_of_the_grid(twins, twin, imaged):
+    spread = []
+    for spacing in (3.0, 1.5):
+        states = (fitted(twins, twin, spacing),)
+        shifts = grid_position_shifts(*imaged, states, draws=6, rng=np.random.default_rng(2))
+        spread.append(np.sqrt(np.mean(shifts**2)))
+    assert 0.0 < spread[1] < 0.7 * spread[0]
 
 
-def test_roughness_of_single_faces_hardly_lowers_the_limit_of_cells(smooth, observed, rng):
-    """A derivative that is rough from face to face seems to tell the moduli from what smooth noise leaves alone.
+def test_later_states_of_one_rest_state_have_the_same_image_of_it(twins, twin, imaged):
+    """Two states that are alike err alike in what their rest states show, where that is one, and else not."""
+    objective, evaluation = imaged
+    state = fitted(twins, twin, 1.5)
 
-    Of cells with five faces each the limit falls by 6 %, of single faces to a fifteenth.
-    """
-    places, normals, jacobian = smooth
-    rough = jacobian * (1.0 + 0.05 * rng.standard_normal((len(places), 1)))
-    now, law = evaluation([surface(places, normals, rough, precision=200.0)], 2), observed[1]
-    single, cells, smooth_limit = (
-        np.sqrt(np.diag(cramer_rao(of, law, 2, cell_mm=size)))
-        for of, size in ((now, 0.1), (now, 5.0), (observed[0], 5.0))
-    )
-    assert np.all(cells > 0.8 * smooth_limit)
-    assert np.all(single < 0.4 * smooth_limit)
+    def errors(reference):
+        states = (objective.states[0], replace(objective.states[0], reference=reference))
+        lines = [*evaluation.lines, *(replace(line, state=1) for line in evaluation.lines)]
+        both = replace(evaluation, lines=tuple(lines))
+        found = imaging_errors(replace(objective, states=states), both, (state, state), rng=np.random.default_rng(3))
+        first, second = np.concatenate(found[:3]), np.concatenate(found[3:])
+        return np.corrcoef(first, second)[0, 1]
+
+    assert errors(0) > errors(1) + 0.2
+
+
+def test_the_interval_is_symmetric_in_the_logarithm():
+    low, high = log_interval(3.0, 0.2, lower=0.02, upper=200.0)
+    assert np.log(high / 3.0) == pytest.approx(1.96 * 0.2, rel=1e-4)
+    assert low * high == pytest.approx(9.0)
+
+
+@pytest.mark.parametrize(
+    ("centre", "open_low", "open_high"), [(0.05, True, False), (100.0, False, True), (2.0, False, False)]
+)
+def test_an_end_beyond_the_bounds_is_open(centre, open_low, open_high):
+    low, high = log_interval(centre, 0.5, lower=0.02, upper=200.0)
+    assert (low is None, high is None) == (open_low, open_high)
+
+
+@pytest.mark.parametrize(
+    ("interval", "absolute", "word"),
+    [
+        ((1.0, 2.0), True, "identified"),
+        ((1.0, 2.01), True, "weak"),
+        ((1.0, 10.0), True, "weak"),
+        ((1.0, 10.1), True, "not identified"),
+        ((None, 2.0), True, "not identified"),
+        ((1.0, None), True, "not identified"),
+        ((1.0, 1.5), False, "ratio only"),
+        ((1.0, 5.0), False, "ratio only"),
+        ((1.0, 11.0), False, "not identified"),
+        ((None, 1.5), False, "not identified"),
+    ],
+)
+def test_the_verdict_follows_from_the_width_of_the_interval(interval, absolute, word):
+    assert verdict(interval, at_bound=False, absolute=absolute)[0] == word
+
+
+def test_an_estimate_at_its_bound_is_not_identified_however_narrow():
+    word, why = verdict((1.0, 1.1), at_bound=True, absolute=True)
+    assert word == "not identified"
+    assert "bound" in why
+
+
+def test_every_verdict_states_its_figure():
+    for interval in ((1.0, 1.5), (1.0, 4.0), (1.0, 20.0)):
+        assert f"{interval[1]:.1f}" in verdict(interval, at_bound=False, absolute=True)[1]
+
+
+def test_the_hull_holds_every_interval_and_an_open_end_stays_open():
+    assert hull([(2.0, 4.0), (1.0, 3.0)]) == (1.0, 4.0)
+    assert hull([(2.0, 4.0), (None, 3.0)]) == (None, 4.0)
+    assert hull([(2.0, None)]) == (2.0, None)

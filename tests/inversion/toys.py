@@ -25,7 +25,9 @@ class Quadratic:
     def __call__(self, unknowns):
         slope = self.curvature @ (unknowns - self.centre)
         value = self.value(unknowns)
-        return Evaluation(value, value, slope, self.pull * slope, self.curvature.copy(), (), 0.0 * self.curvature)
+        return Evaluation(
+            value, value, slope, self.pull * slope, self.curvature.copy(), (), 0.0 * self.curvature, 0.0 * slope
+        )
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,8 @@ class Saturating:
         slope = np.exp(unknowns)
         score = slope * (slope - np.exp(self.truth))
         matrix = np.diag(slope**2)
-        return Evaluation(self.value(unknowns), self.value(unknowns), score, score, matrix, (), 0.0 * matrix)
+        value = self.value(unknowns)
+        return Evaluation(value, value, score, score, matrix, (), 0.0 * matrix, 0.0 * score)
 
 
 def coupled(rng, n=5, centre=None):

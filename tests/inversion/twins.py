@@ -9,7 +9,16 @@ import numpy as np
 from palpate.images.segmentation import segment
 from palpate.images.tissue import Role, Tissue
 from palpate.images.tissue_distance import tissue_distance_map
-from palpate.inversion import Bounds, InverseProblem, InversionSettings, LaterState, parameter_map
+from palpate.inversion import (
+    Bounds,
+    InverseProblem,
+    InversionSettings,
+    LaterState,
+    Objective,
+    parameter_map,
+    reduced_basis,
+    with_first_noise,
+)
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import LinearModel, linear_model
 from palpate.mesh.anatomy import Anatomy, Box
@@ -87,9 +96,9 @@ def exact_problem(*twins, noise=None) -> InverseProblem:
     return problem_of(twins, tuple(tuple(exact_target(t.scene, s) for s in t.surfaces) for t in twins), noise)
 
 
-def voxel_problem(*twins, bias=0.0) -> InverseProblem:
+def voxel_problem(*twins, bias=0.0, noise=None) -> InverseProblem:
     """The images are voxels; `bias` (mm) is added to every distance map."""
-    return problem_of(twins, tuple(tuple(voxel_target(t, s, bias) for s in t.surfaces) for t in twins))
+    return problem_of(twins, tuple(tuple(voxel_target(t, s, bias) for s in t.surfaces) for t in twins), noise)
 
 
 def voxel_target(twin, surface, bias=0.0):
@@ -97,6 +106,16 @@ def voxel_target(twin, surface, bias=0.0):
     width = SMOOTHING * float(states[0].grid.spacing.max())
     maps = [tissue_distance_map(state, surface.tissue, smoothing_mm=width).shifted(bias) for state in states]
     return surface_target(surface, *maps)
+
+
+def objective_of(problem, coefficients=None) -> Objective:
+    """By its first noise, on reduced bases of equal ratios, with series where the drivers move by coefficients."""
+    parameters = problem.parameters
+    moduli = parameters.moduli(np.zeros(parameters.n_parameters))
+    bases = [reduced_basis(state.model, moduli) for state in problem.states]
+    if coefficients is not None:
+        bases = [basis.with_modulus_series(coefficients, parameters.selection) for basis in bases]
+    return with_first_noise(Objective(problem.states, parameters).under(bases))
 
 
 def settings(*ratios, limits=(0.02, 200.0), **others) -> InversionSettings:
