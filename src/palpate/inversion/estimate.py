@@ -33,7 +33,7 @@ __all__ = ["Candidate", "Inversion", "StartRun", "continue_at_finite_strain", "i
 FIRST_STEPS = 2  # of the drivers' coefficients at a start's moduli, before these move
 START = 1e-2  # decrement to which a start is followed under the first noise model
 OTHER = 1e-4  # decrement of the minima that are not the best one
-SAME_MINIMUM, SAME_SD = 0.02, 0.1  # of ln E, and of a posterior standard deviation: minima no further apart are one
+SAME_MINIMUM, SAME_SD = 0.02, 0.3  # of ln E, and of a posterior standard deviation: minima no further apart are one
 LOWER = 0.5  # in units of log-likelihood: a minimum that is lower by less is as good
 REPORTED = StopRule()
 FIRST_GUESS = StopRule(step_sd=0.5, model_error=np.inf, derivatives=False, solve_above=0.1, passes=1, refinements=0)

@@ -113,13 +113,15 @@ class StopRule:
 class OuterIterate:
     """Where an outer iteration ended: a minimum under the objective that it was found with.
 
-    step: how far it moved a log-modulus, over the stop rule's tolerance.
+    step: how far it moved a log-modulus, over the stop rule's tolerance; stayed: whether no part of the step lowered the
+    objective, so that it ended where it began.
     """
 
     objective: Objective
     minimum: Minimum
     convergence: Convergence = Convergence()
     step: float = np.inf
+    stayed: bool = False
 
 
 def outer_loop(
@@ -143,7 +145,7 @@ def outer_loop(
         line = f"{title}, outer iteration {number}"
         progress(f"{line}: {ratios_in_words(now)}")
         now = _iteration(now, settings, rule, partial(_say, progress, line))
-        if now.minimum.outcome is Outcome.STUCK:
+        if now.stayed:
             return now
         if now.convergence.converged:
             done = refinements == rule.refinements or number == rule.iterations
@@ -268,7 +270,7 @@ def _line_search(now: OuterIterate, there: OuterIterate, *, near: bool) -> Outer
     outcome = Outcome.STALLED if there.step < 1.0 else Outcome.STUCK
     spent = there.minimum.evaluations + evaluations
     stayed = replace(there.minimum, unknowns=before, evaluation=here, outcome=outcome, evaluations=spent)
-    return replace(there, minimum=stayed)
+    return replace(there, minimum=stayed, stayed=True)
 
 
 def _lowers(now: Evaluation, there: Evaluation, step: NDArray[np.float64]) -> bool:

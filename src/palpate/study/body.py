@@ -20,7 +20,7 @@ from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_model
 from palpate.mechanics.laws.contract import Law
-from palpate.mechanics.laws.registry import law_named
+from palpate.mechanics.laws.registry import LAWS, law_named
 from palpate.mechanics.linear_model import LinearModel, linear_model, with_constraint
 from palpate.mechanics.newton import NewtonSettings
 from palpate.mesh.anatomy import Anatomy, Box, anatomy_of, domain_box, margin_box
@@ -242,7 +242,8 @@ def _finite_strain(models: tuple[LinearModel, ...], case: Case) -> Sequence[Fini
 
 def law_of(mechanics: Mechanics) -> Law:
     """The material law that a case names."""
-    return law_named(mechanics.law, c01_over_c10=mechanics.c01_over_c10)
+    own = {parameter.name: getattr(mechanics, parameter.name) for parameter in LAWS[mechanics.law].parameters}
+    return law_named(mechanics.law, **own)
 
 
 def _finite_strain_model(model: LinearModel, law: Law, case: Case) -> FiniteStrainModel:
