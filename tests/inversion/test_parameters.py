@@ -1,44 +1,87 @@
-"""From log-ratios to moduli: the scale is a known tissue's, and without one only ratios exist."""
+"""From unknowns to moduli and motion: a known tissue holds the scale, else only ratios exist; ties and priors."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from palpate.inversion.modulus_map import modulus_map
 
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role, Tissue
+from palpate.inversion import Bounds, gauss_newton, invert, parameter_map
+from palpate.inversion.optimise import posterior_sd
+from palpate.observation.noise_model import NoiseModel
 
 GLAND, SAC = Tissue("gland", Role.ESTIMATE), Tissue("sac", Role.ESTIMATE)
+NODE = Tissue("node", Role.ESTIMATE)
 TUBE = Tissue("tube", Role.DRIVER)
 FAT = Tissue("fat", Role.KNOWN, youngs_modulus_kpa=10.0)
 MUSCLE = Tissue("muscle", Role.KNOWN, youngs_modulus_kpa=40.0)
 
 
 def test_moduli_are_ratios_times_the_first_known_modulus():
-    mapping = modulus_map((GLAND, TUBE, MUSCLE, SAC, FAT), (0, 2, 3, 4))
+    mapping = parameter_map((GLAND, TUBE, MUSCLE, SAC, FAT), (0, 2, 3, 4), (7,))
     assert mapping.tissues == ("gland", "sac")
     assert (mapping.relative_to, mapping.scale_kpa, mapping.absolute) == ("muscle", 40.0, True)
     assert mapping.moduli(np.log([3.0, 0.5])) == pytest.approx([120.0, 40.0, 20.0, 10.0])
 
 
 def test_without_a_known_modulus_the_first_estimate_is_the_scale():
-    mapping = modulus_map((TUBE, GLAND, SAC), (1, 2))
+    mapping = parameter_map((TUBE, GLAND, SAC), (1, 2), (7,))
     assert not mapping.absolute
     assert (mapping.relative_to, mapping.tissues, mapping.scale_kpa) == ("gland", ("sac",), 1.0)
     assert mapping.moduli(np.log([4.0])) == pytest.approx([1.0, 4.0])
 
 
-def test_the_pullback_is_the_derivative_of_the_map(rng):
-    mapping = modulus_map((GLAND, FAT, SAC), (0, 1, 2))
-    theta, by_log_modulus, h = rng.normal(size=2), rng.normal(size=3), 1e-6
-    steps = h * np.eye(2)
-    slopes = [np.log(mapping.moduli(theta + s)) - np.log(mapping.moduli(theta - s)) for s in steps]
-    assert mapping.pullback(by_log_modulus) == pytest.approx(np.array(slopes) @ by_log_modulus / (2 * h), rel=1e-8)
+def mapping_of(*n_modes, tied=()):
+    """Gland, fat, sac and muscle as regions."""
+    return parameter_map((GLAND, FAT, SAC, MUSCLE), (0, 1, 2, 3), n_modes, tied=tied)
+
+
+TIED = [(), (("gland", "sac"),)]
+
+
+@pytest.mark.parametrize("tied", TIED)
+def test_derivatives_by_the_unknowns_are_those_by_region_through_the_map(rng, tied):
+    """by_unknowns is the chain rule d (ln E, q) / dx, whose matrix finite differences give."""
+    mapping = mapping_of(2, 3, tied=tied)
+    own = mapping.unknowns_of(1)
+    tangent, chain = rng.normal(size=(6, 4 + 3)), chain_of(mapping, 1, rng.normal(size=mapping.n_unknowns))
+    assert mapping.by_unknowns(tangent) == pytest.approx(tangent @ chain[:, own], rel=1e-8, abs=1e-9)
+    assert not np.delete(chain, own, axis=1).any()
+
+
+@pytest.mark.parametrize("tied", TIED)
+@pytest.mark.parametrize("state", [0, 1])
+def test_directions_and_metric_of_a_state_are_carried_by_the_same_matrix(rng, tied, state):
+    mapping = mapping_of(2, 3, tied=tied)
+    chain, directions = chain_of(mapping, state, np.zeros(mapping.n_unknowns)), rng.normal(size=(mapping.n_unknowns, 4))
+    metric = rng.normal(size=(mapping.n_unknowns,) * 2)
+    metric = metric @ metric.T
+    assert mapping.directions_of(state, directions) == pytest.approx(chain @ directions, rel=1e-8, abs=1e-9)
+    assert mapping.metric_of(state, metric) == pytest.approx(chain @ metric @ chain.T, rel=1e-8, abs=1e-8)
+
+
+def chain_of(mapping, state, unknowns):
+    """d (ln E, q) / d x of one state, (n_regions + n_modes, n_unknowns), by differences."""
+
+    def seen(x):
+        return np.concatenate([np.log(mapping.moduli(x)), mapping.coefficients(x)[state]])
+
+    steps = 1e-4 * np.eye(mapping.n_unknowns)
+    return np.stack([(seen(unknowns + step) - seen(unknowns - step)) / 2e-4 for step in steps], axis=1).round(9)
+
+
+def test_every_state_has_the_moduli_and_coefficients_of_its_own():
+    mapping = mapping_of(2, 3)
+    assert mapping.n_unknowns == 2 + 5
+    assert [mapping.unknowns_of(s).tolist() for s in (0, 1)] == [[0, 1, 2, 3], [0, 1, 4, 5, 6]]
+    assert [q.tolist() for q in mapping.coefficients(np.arange(7.0))] == [[2.0, 3.0], [4.0, 5.0, 6.0]]
 
 
 def test_the_base_is_not_written_into():
-    mapping = modulus_map((GLAND, FAT), (0, 1))
+    mapping = parameter_map((GLAND, FAT), (0, 1), (7,))
     mapping.moduli(np.ones(1))
     assert np.array_equal(mapping.base, [10.0, 10.0])
 
@@ -46,4 +89,85 @@ def test_the_base_is_not_written_into():
 @pytest.mark.parametrize("tissues", [(FAT, TUBE), (GLAND, TUBE)])
 def test_a_case_without_a_ratio_is_refused(tissues):
     with pytest.raises(ConfigurationError, match="only"):
-        modulus_map(tissues, (0,))
+        parameter_map(tissues, (0,), (7,))
+
+
+def test_tied_tissues_share_one_parameter_with_both_names():
+    mapping = parameter_map((GLAND, SAC, FAT, NODE), (0, 1, 2, 3), (7,), tied=(("gland", "node"),))
+    assert mapping.tissues == ("gland and node", "sac")
+    assert mapping.moduli(np.log([3.0, 0.5])) == pytest.approx([30.0, 5.0, 10.0, 30.0])
+
+
+def test_tied_tissues_may_hold_the_scale():
+    mapping = parameter_map((GLAND, SAC, NODE), (0, 1, 2), (7,), tied=(("gland", "sac"),))
+    assert (mapping.relative_to, mapping.tissues) == ("gland and sac", ("node",))
+    assert mapping.moduli(np.log([4.0])) == pytest.approx([1.0, 1.0, 4.0])
+
+
+@pytest.mark.parametrize("name", ["fat", "glnad"])
+def test_only_tissues_to_be_estimated_are_tied(name):
+    with pytest.raises(ConfigurationError, match=name):
+        mapping_of(3, tied=(("gland", name),))
+
+
+def test_an_estimate_of_tied_tissues_finds_the_modulus_that_they_share(twins):
+    twin = twins.make_twin(truth=np.log([2.5, 2.5]))
+    problem = twins.exact_problem(twin, tied=(("gland", "sac"),))
+    inversion = invert(problem, twins.settings(0.5, 8.0, n=1), progress=twins.silent)
+    assert inversion.minimum.converged
+    assert inversion.minimum.unknowns[0] == pytest.approx(np.log(2.5), abs=1e-4)
+
+
+def test_the_gradient_by_a_tied_modulus_is_the_sum_of_those_by_its_tissues(twins, twin):
+    free, tied = (twins.objective_of(twins.exact_problem(twin, tied=groups)) for groups in ((), (("gland", "sac"),)))
+    q = 0.5 * twin.coefficients
+    apart, together = free(np.append([0.3, 0.3], q)), tied(np.append([0.3], q))
+    assert together.value == pytest.approx(apart.value, rel=1e-8)
+    assert together.score[0] == pytest.approx(apart.score[:2].sum(), rel=1e-4)
+    assert together.matrix[0, 0] == pytest.approx(apart.matrix[:2, :2].sum(), rel=1e-4)
+
+
+@pytest.fixture(scope="module")
+def objective(twins, twin):
+    return twins.objective_of(twins.exact_problem(twin), twin.coefficients).rematched(twin.unknowns)
+
+
+def believed(objective, mean, sd):
+    return replace(objective, parameters=objective.parameters.with_prior(mean, sd))
+
+
+def test_a_prior_pulls_the_estimate_to_its_mean_the_more_the_stronger_it_is(twins, twin, objective):
+    mean, bounds = twins.TRUTH + np.array([0.4, -0.3]), twins.settings(1.0).bounds
+    sd = posterior_sd(gauss_newton(objective, twin.unknowns, bounds=bounds), 2)
+    away = []
+    for factor in (100.0, 1.0, 0.01):
+        found = gauss_newton(believed(objective, mean, factor * sd), twin.unknowns, bounds=bounds)
+        away.append(np.abs(found.unknowns[:2] - mean))
+    assert away[0] == pytest.approx(np.abs(twins.TRUTH - mean), rel=0.02)
+    assert np.all(away[1] < 0.9 * away[0])
+    assert np.all(away[2] < 1e-3)
+
+
+def test_a_flat_prior_changes_nothing(twin, objective):
+    plain, flat = (of(twin.unknowns + 0.1) for of in (objective, believed(objective, np.ones(2), np.full(2, np.inf))))
+    assert flat.value == plain.value
+    assert np.array_equal(flat.matrix, plain.matrix)
+    assert np.array_equal(flat.score, plain.score)
+
+
+def test_a_prior_may_be_of_one_tissue_alone(objective):
+    parameters = objective.parameters.with_prior(np.array([0.5, 7.0]), np.array([0.2, np.inf]))
+    assert parameters.prior_precision == pytest.approx(np.diag([25.0, 0.0]))
+    assert parameters.prior_centre[:2].tolist() == [0.5, 0.0]
+
+
+def test_where_images_tell_nothing_the_posterior_is_the_prior(twin, objective):
+    """All residuals count so little that the moduli's spread is what was believed before."""
+    sd, mean = np.array([0.3, 0.8]), np.array([0.2, -0.1])
+    vague = believed(objective, mean, sd)
+    blind = vague.with_observations(
+        [o.with_noise(NoiseModel(np.array([1e8]), np.array([3.0]))) for o in vague.observations]
+    )
+    found = gauss_newton(blind, twin.unknowns, bounds=Bounds(np.full(2, -4.0), np.full(2, 4.0)), tolerance=1e-9)
+    assert posterior_sd(found, 2) == pytest.approx(sd, rel=1e-4)
+    assert found.unknowns[:2] == pytest.approx(mean, abs=1e-3)

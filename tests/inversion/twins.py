@@ -57,7 +57,7 @@ class Twin:
         return np.concatenate([TRUTH, self.coefficients])
 
 
-def make_twin(*, element="P1", rest_kpa=10.0, voxel_mm=1.5, seed=5, edge_length_mm=6.0) -> Twin:
+def make_twin(*, element="P1", rest_kpa=10.0, voxel_mm=1.5, seed=5, edge_length_mm=6.0, truth=TRUTH) -> Twin:
     """The driver pushes gland and sac; where `rest_kpa` is None, the rest is to be estimated, too."""
     tissues = (
         Tissue("gland", Role.ESTIMATE, (1,)),
@@ -70,12 +70,12 @@ def make_twin(*, element="P1", rest_kpa=10.0, voxel_mm=1.5, seed=5, edge_length_
     motion = prescribed_motion(space, {}, n_modes=12, kernel_mm=12.0, prior_mm=WALL_MM)
     given = {"modes": motion.modes, "offset": motion.offset, "prescribed": motion.prescribed}
     model = linear_model(space, outer_constraint(space, outer="fixed", **given))
-    return deformed(model, voxel_mm=voxel_mm, seed=seed)
+    return deformed(model, voxel_mm=voxel_mm, seed=seed, truth=truth)
 
 
-def deformed(model, *, voxel_mm=1.5, seed=5) -> Twin:
+def deformed(model, *, voxel_mm=1.5, seed=5, truth=TRUTH) -> Twin:
     space = model.space
-    moduli = (space.mesh.tissues[3].youngs_modulus_kpa or 1.0) * np.append(np.exp(TRUTH), 1.0)
+    moduli = (space.mesh.tissues[3].youngs_modulus_kpa or 1.0) * np.append(np.exp(truth), 1.0)
     coefficients = np.random.default_rng(seed).standard_normal(model.n_modes)
     displacement = model.solve(moduli, coefficients).displacement
     grid = centred_grid((44.0,) * 3, (voxel_mm,) * 3)
@@ -83,17 +83,17 @@ def deformed(model, *, voxel_mm=1.5, seed=5) -> Twin:
     return Twin(model, Scene(space, displacement, before, after, {}, seed), moduli, coefficients)
 
 
-def problem_of(twins, targets, noise=None) -> InverseProblem:
+def problem_of(twins, targets, noise=None, tied=()) -> InverseProblem:
     models = [twin.model for twin in twins]
-    mapping = parameter_map(twins[0].scene.tissues, models[0].regions, [model.n_modes for model in models])
+    mapping = parameter_map(twins[0].scene.tissues, models[0].regions, [model.n_modes for model in models], tied=tied)
     observations = [tuple(surface_distance(t, stated_noise=noise) for t in of_state) for of_state in targets]
     states = [LaterState(m, o, reference=i) for i, (m, o) in enumerate(zip(models, observations, strict=True))]
     return InverseProblem(tuple(states), mapping)
 
 
-def exact_problem(*twins, noise=None) -> InverseProblem:
+def exact_problem(*twins, noise=None, tied=()) -> InverseProblem:
     """The images are the model's own triangles."""
-    return problem_of(twins, tuple(tuple(exact_target(t.scene, s) for s in t.surfaces) for t in twins), noise)
+    return problem_of(twins, tuple(tuple(exact_target(t.scene, s) for s in t.surfaces) for t in twins), noise, tied)
 
 
 def voxel_problem(*twins, bias=0.0, noise=None) -> InverseProblem:
@@ -118,10 +118,10 @@ def objective_of(problem, coefficients=None) -> Objective:
     return with_first_noise(Objective(problem.states, parameters).under(bases))
 
 
-def settings(*ratios, limits=(0.02, 200.0), **others) -> InversionSettings:
-    """Both unknowns start at each of `ratios`, between `limits`."""
-    starts = tuple(np.full(2, np.log(ratio)) for ratio in ratios)
-    return InversionSettings(starts, Bounds(*np.log(np.outer(limits, np.ones(2)))), **others)
+def settings(*ratios, limits=(0.02, 200.0), n=2, **others) -> InversionSettings:
+    """All n log-moduli start at each of `ratios`, between `limits`."""
+    starts = tuple(np.full(n, np.log(ratio)) for ratio in ratios)
+    return InversionSettings(starts, Bounds(*np.log(np.outer(limits, np.ones(n)))), **others)
 
 
 def silent(_message):

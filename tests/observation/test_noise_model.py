@@ -74,7 +74,7 @@ def test_the_model_does_not_jump_when_a_few_residuals_come_or_go(rng):
 
 
 def test_how_far_residuals_are_correlated_does_not_depend_on_their_size(rng):
-    """Down to a few thousandths of a millimetre: no term of the model is raised on its own, however little it counts."""
+    """Down to a few thousandths of a millimetre: no term is raised on its own, however little it counts."""
     values, places, normals = residuals(rng, 0.3, 1.5)
     rough = [value + 0.1 * rng.standard_normal(len(value)) for value in values]
     noise = fit_noise_model(rough, places, normals)

@@ -1,0 +1,176 @@
+"""The distance of surfaces as an observation: how its residuals count, and whose image points are compared."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from palpate.errors import EstimationError
+from palpate.images.distance import distance_map
+from palpate.images.label_image import VoxelGrid
+from palpate.observation.noise_model import EXACT_NOISE, NoiseModel
+from palpate.observation.observed_surface import ObservedSurface
+from palpate.observation.robust_loss import Tukey
+from palpate.observation.surface_distance import robust_loss, surface_distance
+from palpate.observation.target import surface_target, target_from
+from palpate.phantoms.shapes import ball
+
+STATED = NoiseModel(np.array([0.2**2]), np.array([4.0]))
+
+
+def surface_of(sphere, radius=9.0, *, driver=False):
+    vertices, triangles = sphere(3)
+    everywhere, rim = np.ones(len(triangles), dtype=bool), np.zeros((len(triangles), 3), dtype=bool)
+    points = np.arange(len(vertices))
+    return ObservedSurface(0, "ball", points, radius * vertices, triangles, everywhere, rim, 1.0, driver=driver)
+
+
+def voxels_of(radius):
+    grid = VoxelGrid((34, 34, 34), np.array([[1.0, 0, 0, -16.6], [0, 1, 0, -16.3], [0, 0, 1, -16.4], [0, 0, 0, 1.0]]))
+    centres = grid.world(np.indices(grid.shape).reshape(3, -1).T.astype(float))
+    inside = np.linalg.norm(centres, axis=1).reshape(grid.shape) < radius
+    return distance_map(inside, grid, smoothing_mm=0.6)
+
+
+def seen_of(sphere, radius=9.0, **others):
+    return surface_distance(surface_target(surface_of(sphere, radius), voxels_of(radius), voxels_of(radius)), **others)
+
+
+@pytest.fixture(scope="module")
+def seen(sphere):
+    """A ball in voxels that has not moved."""
+    return seen_of(sphere)
+
+
+def exact(sphere, *, radius=9.0, later=9.0, driver=False, **others):
+    """A ball that has grown, without voxels."""
+    surface = surface_of(sphere, radius, driver=driver)
+    points = later / radius * surface.rest
+    shapes = [ball(np.zeros(3), size) for size in (radius, later)]
+    target = target_from(surface, *shapes, level=0.0, image=(points, np.ones(len(points))))
+    return surface_distance(target, **others)
+
+
+def still(seen):
+    return seen.residuals(np.zeros(len(seen.dofs)))
+
+
+def test_surfaces_count_by_their_area(sphere):
+    """Under one noise model the precision of the mean square is that of so many independent residuals."""
+    small, large = seen_of(sphere, 6.0).with_noise(STATED), seen_of(sphere, 12.0).with_noise(STATED)
+    areas = [o.target.area.sum() for o in (small, large)]
+    assert areas[1] > 3.5 * areas[0]
+    assert small.weighting.precision / areas[0] == pytest.approx(large.weighting.precision / areas[1])
+    assert large.weighting.precision == pytest.approx(areas[1] / STATED.correlation_area / STATED.sd**2)
+
+
+def test_without_voxels_the_first_noise_is_that_of_exact_surfaces(sphere):
+    seen = exact(sphere)
+    assert seen.first_noise((seen,)) is EXACT_NOISE
+    assert seen.noise_model is EXACT_NOISE
+
+
+def test_stated_noise_holds_whatever_the_residuals_say(sphere):
+    for seen in (seen_of(sphere, stated_noise=STATED), exact(sphere, stated_noise=STATED)):
+        assert seen.noise_model is STATED
+        assert seen.first_noise((seen,)) is STATED
+        assert seen.fitted_noise([still(seen)]) is STATED
+
+
+def test_a_surface_that_fits_worse_than_the_noise_counts_by_its_own_mean_square(sphere):
+    """A driver whose modes cannot follow its wall: twice the distance, a quarter of the weight."""
+    fine = NoiseModel(np.array([0.01**2]), np.array([4.0]))
+    counts = []
+    for grown in (0.3, 0.6):
+        seen = exact(sphere, later=9.0 + grown).with_noise(fine)
+        counts.append(seen.reweighted(still(seen)).weighting.precision * grown**2)
+    assert counts[1] == pytest.approx(counts[0], rel=0.05)
+    near = exact(sphere).with_noise(STATED)
+    assert near.reweighted(still(near)).weighting.precision == near.weighting.precision
+
+
+def test_terraces_count_the_less_the_finer_the_noise(seen):
+    """Their own noise adds to what all residuals have; the sum of the weights stays."""
+    coarse, fine = (still(seen.with_noise(NoiseModel(np.array([v]), np.array([3.0])))) for v in (1.0, 1e-4))
+    n = len(seen.target.area)
+    rough = np.argsort(seen.target.terraces)[-20:]
+    plain = 0.5 * seen.target.area / seen.target.area.sum()
+    assert coarse.weights[:n] == pytest.approx(plain, rel=0.05)
+    assert np.all(fine.weights[rough] < 0.2 * plain[rough])
+    assert fine.weights.sum() == pytest.approx(1.0)
+
+
+def test_an_image_without_a_point_that_faces_the_model_is_refused_by_name(seen):
+    hidden = replace(seen.target.surface, observed=np.zeros(len(seen.target.surface.triangles), dtype=bool))
+    lost = replace(seen, target=replace(seen.target, surface=hidden))
+    with pytest.raises(EstimationError, match="'ball': none of the"):
+        lost.rematched(np.zeros(len(seen.dofs)))
+
+
+@pytest.mark.parametrize(("later", "driver", "asks"), [(9.6, True, True), (9.6, False, False), (9.0, True, False)])
+def test_only_a_drivers_wall_that_fits_worse_than_the_noise_asks_for_a_finer_motion(sphere, later, driver, asks):
+    seen = exact(sphere, later=later, driver=driver)
+    motion = seen.wall_motion(still(seen), present=np.zeros(len(seen.dofs)), kernel_mm=8.0)
+    assert (motion is not None) == asks
+    if motion is not None:
+        outwards = seen.target.surface.rest / 9.0
+        assert np.einsum("na,na->n", motion.reshape(-1, 3), outwards) == pytest.approx(later - 9.0, rel=0.15)
+
+
+def test_the_fit_is_by_area_and_overlap(sphere):
+    seen = exact(sphere, later=9.5)
+    index = np.zeros((2, 2, 2), dtype=np.int16)
+    other = index.copy()
+    other[0] = 1  # half of the voxels are not of tissue 0 there
+    fit = seen.fit(still(seen), index, other)
+    assert (fit.mean_mm, fit.rms_mm, fit.hd95_mm) == pytest.approx((0.5, 0.5, 0.5), abs=0.02)
+    assert fit.dice == pytest.approx(2.0 * 4 / (8 + 4))
+
+
+def test_the_first_noise_is_what_rounding_leaves_of_a_plane(seen):
+    """h^4 / (24 pi sigma^2) of two images: the scatter of voxelised planes of any direction, which lie anywhere."""
+    noise = seen.first_noise((seen,))
+    image = seen.target.voxels[0]
+    edge, width = float(image.grid.spacing[0]), image.smoothing_mm
+    assert noise.lengths == pytest.approx([np.sqrt(2.0) * width])
+    grid = VoxelGrid((24, 24, 24), np.diag([edge] * 3 + [1.0]))
+    centres = grid.world(np.indices(grid.shape).reshape(3, -1).T.astype(float))
+    rng, errors = np.random.default_rng(3), []
+    for _ in range(40):
+        normal = rng.standard_normal(3)
+        normal /= np.linalg.norm(normal)
+        depth = centres @ normal - centres.mean(axis=0) @ normal - edge * rng.uniform(-0.5, 0.5)
+        found = distance_map((depth < 0.0).reshape(grid.shape), grid, smoothing_mm=width).node_values().ravel()
+        inner = (np.abs(centres - centres.mean(axis=0)).max(axis=1) < 5.0 * edge) & (np.abs(depth) < 0.5 * edge)
+        errors.append(found[inner] - depth[inner])
+    rounding = 2.0 * float(np.mean(np.concatenate(errors) ** 2))  # of both images
+    assert rounding == pytest.approx(noise.variances[0], rel=0.5)
+
+
+def test_terraces_that_flip_as_a_whole_are_no_outliers(seen, rng):
+    """Surfaces along the grid that move by a fifth of a voxel: a fifth of them is seen one voxel further, the rest not.
+
+    The best motion is that fifth; with a cutoff by the quiet residuals alone it would be nearly zero.
+    """
+    target = seen.target
+    edge = float(target.voxels[0].grid.spacing[0])
+    seen = np.where(rng.random(4000) < 0.2, edge, 0.0) + 0.03 * edge * rng.standard_normal(4000)
+
+    def fitted(loss):
+        motions = np.linspace(-0.2, 0.6, 161) * edge
+        return motions[np.argmin([loss.rho(motion - seen).mean() for motion in motions])]
+
+    loss = robust_loss(seen, target)
+    assert fitted(loss) == pytest.approx(seen.mean(), abs=0.01 * edge)
+    assert abs(fitted(Tukey(loss.cutoff))) < 0.02 * edge
+
+
+def test_what_no_voxel_explains_counts_nothing(seen, rng):
+    target = seen.target
+    edge = float(target.voxels[0].grid.spacing[0])
+    values = np.append(0.1 * edge * rng.standard_normal(1000), [-2.0 * edge, 2.0 * edge])
+    loss = robust_loss(values, target)
+    assert loss.rejects(values).nonzero()[0].tolist() == [1000, 1001]
+    assert loss.weight(values[-2:]).tolist() == [0.0, 0.0]
