@@ -34,8 +34,8 @@ from palpate.inversion import (
     exact_approximation,
     fit_coefficients,
     invert,
-    outer_loop,
     posterior_sd,
+    run_outer_loop,
     with_first_noise,
 )
 
@@ -105,13 +105,13 @@ def plain_estimate(
     filled = fit_coefficients(objective, theta, bounds=settings.bounds)
     objective = objective.rematched(filled.unknowns)
     rule = replace(RULE, refinements=0) if problem.finite_strain else RULE
-    found = outer_loop(objective, filled, settings, rule, progress=progress, title="linear law")
+    found = run_outer_loop(objective, filled, settings, rule, progress=progress, title="linear law")
     if not problem.finite_strain:
         return found
     unknowns = found.minimum.unknowns
     objective = _exact(found.objective, unknowns, finite_strain=True).rematched(unknowns)
     start = replace(found.minimum, evaluation=objective(unknowns))
-    return outer_loop(objective, start, settings, RULE, progress=progress, title="finite strain")
+    return run_outer_loop(objective, start, settings, RULE, progress=progress, title="finite strain")
 
 
 def _exact(objective: Objective, unknowns: accuracy.Array, *, finite_strain: bool = False) -> Objective:

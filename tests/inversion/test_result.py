@@ -6,31 +6,40 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from palpate.inversion.conclude import Observed, conclude
-from palpate.inversion.gauss_newton import Outcome
-from palpate.inversion.grid_position import FittedState, grid_position_shifts
-from palpate.inversion.invert import invert
-from palpate.inversion.noise import NoiseLaw
-from palpate.inversion.posterior import sandwich_covariance
 
-LAW = NoiseLaw(np.array([0.03**2]), np.array([3.0]))
+from palpate.inversion import (
+    FittedState,
+    Inversion,
+    Observed,
+    Outcome,
+    OuterIterate,
+    conclude,
+    gauss_newton,
+    invert,
+    sandwich_covariance,
+)
+from palpate.inversion.estimate import Candidate
+from palpate.inversion.outer_loop import Convergence
+from palpate.mechanics.forward import SolveCounts
+from palpate.observation.noise_model import NoiseModel
+
+NOISE = NoiseModel(np.array([0.03**2]), np.array([3.0]))
 
 
 @pytest.fixture(scope="module")
 def settings(twins):
-    return twins.settings(0.5, 8.0, law=LAW)
+    return twins.settings(0.5, 8.0)
 
 
 @pytest.fixture(scope="module")
-def inversion(twins, exact, settings):
-    return invert(exact, settings, progress=twins.silent)
+def inversion(twins, twin, settings):
+    return invert(twins.exact_problem(twin, noise=NOISE), settings, progress=twins.silent)
 
 
-def observed_of(twin, grid=None):
-    grid = grid or twin.scene.before.grid
-    displacement = twin.scene.displacement
-    state = FittedState(displacement, grid, grid, 0.6 * float(grid.spacing.max()))
-    return Observed(twin.model.space, (state,), ((twin.scene.after.labels - 1).astype(np.int16),))
+def observed_of(twin):
+    grid = twin.scene.before.grid
+    state = FittedState(twin.model.space, twin.scene.displacement, grid, grid)
+    return Observed((state,), ((twin.scene.after.labels - 1).astype(np.int16),))
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +52,29 @@ def estimation(inversion, settings, observed):
     return conclude(inversion, settings, observed, truth={"gland": 30.0}, seed=1)
 
 
-def spoilt(inversion, outcome):
-    return replace(inversion, minima=tuple(replace(m, outcome=outcome) for m in inversion.minima))
+def stated(inversion, settings, observed):
+    return conclude(inversion, settings, observed, truth={}, seed=1)
+
+
+def codes(estimation):
+    return [remark.code for remark in estimation.remarks]
+
+
+def with_candidate(inversion, number=0, *, value=None, **changes):
+    """The inversion with one candidate's minimum, objective or convergence replaced."""
+    candidates = list(inversion.candidates)
+    now = candidates[number]
+    candidates[number] = Candidate(replace(now.iterate, **changes), now.value if value is None else value)
+    return replace(inversion, candidates=tuple(candidates))
+
+
+def spoilt(inversion, outcome, starts=(0, 1)):
+    """The inversion whose starts, and what came of them, ended with an outcome."""
+    ended = tuple(
+        replace(s, minimum=replace(s.minimum, outcome=outcome)) if i in starts else s
+        for i, s in enumerate(inversion.starts)
+    )
+    return replace(inversion, starts=ended)
 
 
 def test_moduli_are_stated_in_kpa_and_as_ratios(estimation):
@@ -64,11 +94,22 @@ def test_the_interval_is_that_of_the_covariance(estimation):
     assert np.diag(estimation.correlation) == pytest.approx(1.0)
 
 
-def test_the_place_of_the_grid_adds_to_the_residuals_law(estimation, inversion):
-    residuals = sandwich_covariance(inversion.minimum.evaluation, inversion.law, 2)
+def test_the_place_of_the_grid_adds_to_what_the_noise_leaves(twins, twin, voxels, settings, observed):
+    """Where the images are voxels, and of a converged estimate as of any other."""
+    objective = twins.objective_of(voxels, twin.coefficients).rematched(twin.unknowns)
+    minimum = gauss_newton(objective, twin.unknowns, bounds=settings.bounds, max_steps=3)
+    found = Inversion((Candidate(OuterIterate(objective, minimum), 0.0),), 0, (), minimum.evaluation, 0, SolveCounts())
+    estimation = stated(found, settings, observed)
+    residuals = sandwich_covariance(objective, minimum.evaluation)
     grid = estimation.covariance - residuals
+    assert grid == pytest.approx(estimation.grid_covariance)
     assert np.all(np.diag(grid) > 1e-3 * np.diag(residuals))
     assert np.linalg.eigvalsh(grid).min() > -1e-12
+
+
+def test_surfaces_without_voxels_leave_nothing_to_the_place_of_the_grid(estimation, inversion):
+    residuals = sandwich_covariance(inversion.objective, inversion.minimum.evaluation)
+    assert np.array_equal(estimation.covariance, residuals)
 
 
 def test_every_start_is_told(estimation):
@@ -78,6 +119,18 @@ def test_every_start_is_told(estimation):
     assert all(start.iterations > 1 for start in estimation.starts)
     assert "2 of 2 starts" in estimation.reason
     assert "1 distinct minimum" in estimation.reason
+
+
+def test_every_start_has_its_own_steps_and_the_outer_loop_stands_once(estimation, inversion):
+    """No step of one start is told as another's, and those that all starts share are told apart from them."""
+    gland = [[step.moduli["gland"] for step in start.history] for start in estimation.starts]
+    assert [start.start["gland"] for start in estimation.starts] == pytest.approx([steps[0] for steps in gland])
+    assert [start.end["gland"] for start in estimation.starts] == pytest.approx([steps[-1] for steps in gland])
+    assert not set(gland[0]) & set(gland[1])
+    outer = [step.moduli["gland"] for step in estimation.outer_loop]
+    assert len(outer) == len(inversion.minimum.history) > 1
+    assert outer[0] in pytest.approx([start.end["gland"] for start in estimation.starts])
+    assert outer[-1] == pytest.approx(estimation.estimates[0].value)
 
 
 def test_the_fit_gets_better_from_rest_to_the_estimate(estimation):
@@ -92,25 +145,28 @@ def test_the_fit_gets_better_from_rest_to_the_estimate(estimation):
 
 
 def test_what_did_not_converge_says_so(inversion, settings, observed):
-    result = conclude(spoilt(inversion, Outcome.STEPS), settings, observed, truth={}, seed=1)
+    ended = spoilt(with_candidate(inversion, minimum=replace(inversion.minimum, outcome=Outcome.STEPS)), Outcome.STEPS)
+    result = stated(ended, settings, observed)
     assert result.status == "not converged"
     assert "largest number of steps" in result.reason
     assert "0 of 2 starts" in result.reason
     assert {start.status for start in result.starts} == {"not converged"}
+    assert {(e.value, e.interval95, e.ratio, e.verdict) for e in result.estimates} == {
+        (None, None, None, "not identified")
+    }
 
 
 def test_one_start_that_converged_is_enough(inversion, settings, observed):
-    best = inversion.best
-    minima = tuple(m if i == best else replace(m, outcome=Outcome.STUCK) for i, m in enumerate(inversion.minima))
-    result = conclude(replace(inversion, minima=minima), settings, observed, truth={}, seed=1)
+    result = stated(spoilt(inversion, Outcome.STUCK, starts=(1,)), settings, observed)
     assert result.status == "converged"
     assert "1 of 2 starts" in result.reason
+    assert [start.status for start in result.starts] == ["converged", "not converged"]
 
 
-def test_an_estimate_at_its_bound_is_not_identified(twins, twin, exact):
-    settings = twins.settings(1.0, limits=(0.5, 2.5), law=LAW)
-    inversion = invert(exact, settings, progress=twins.silent)
-    result = conclude(inversion, settings, observed_of(twin), truth={}, seed=1)
+def test_an_estimate_at_its_bound_is_not_identified(twins, twin, observed):
+    settings = twins.settings(1.0, limits=(0.5, 2.5))
+    inversion = invert(twins.exact_problem(twin, noise=NOISE), settings, progress=twins.silent)
+    result = stated(inversion, settings, observed)
     gland = result.estimates[0]
     assert gland.value == pytest.approx(25.0)
     assert gland.verdict == "not identified"
@@ -119,55 +175,71 @@ def test_an_estimate_at_its_bound_is_not_identified(twins, twin, exact):
 
 
 def test_an_imprecise_image_identifies_nothing(inversion, settings, observed):
-    vague = replace(inversion, law=NoiseLaw(np.array([1.0]), np.array([6.0])))
-    verdicts = [e.verdict for e in conclude(vague, settings, observed, truth={}, seed=1).estimates]
+    rough, objective = NoiseModel(np.array([1.0]), np.array([6.0])), inversion.objective
+    vague = objective.with_observations([o.with_noise(rough) for o in objective.observations])
+    verdicts = [e.verdict for e in stated(with_candidate(inversion, objective=vague), settings, observed).estimates]
     assert "identified" not in verdicts
     assert "not identified" in verdicts
 
 
 def test_without_a_known_modulus_there_is_no_kpa(twins):
     twin = twins.make_twin(rest_kpa=None)
-    settings = twins.settings(1.0, law=LAW)
-    inversion = invert(twins.exact_problem(twin), settings, progress=twins.silent)
-    result = conclude(inversion, settings, observed_of(twin), truth={}, seed=1)
+    settings = twins.settings(1.0)
+    inversion = invert(twins.exact_problem(twin, noise=NOISE), settings, progress=twins.silent)
+    result = stated(inversion, settings, observed_of(twin))
     assert [e.tissue for e in result.estimates] == ["sac", "rest"]
     for estimate in result.estimates:
         assert (estimate.unit, estimate.relative_to) == ("ratio", "gland")
         assert (estimate.value, estimate.interval95) == (None, None)
         assert estimate.verdict in ("ratio only", "not identified")
     assert [e.ratio for e in result.estimates] == pytest.approx([2.0 / 3.0, 1.0 / 3.0], rel=0.02)
-    assert "ratio-only" in [remark.code for remark in result.remarks]
+    assert "ratio-only" in codes(result)
 
 
-def test_distinct_minima_are_remarked(inversion, settings, observed):
-    result = conclude(replace(inversion, groups=(0, 1)), settings, observed, truth={}, seed=1)
-    assert "several-minima" in [remark.code for remark in result.remarks]
+def doubled(inversion, **changes):
+    """Two candidates, the second start's own with changes of its iterate."""
+    first, second = inversion.candidates[0], Candidate(replace(inversion.candidates[0].iterate, **changes), 1e3)
+    starts = (inversion.starts[0], replace(inversion.starts[1], candidate=1))
+    return replace(inversion, candidates=(first, second), starts=starts)
+
+
+def test_distinct_minima_are_remarked(estimation, inversion, settings, observed):
+    result = stated(doubled(inversion), settings, observed)
+    assert "several-minima" in codes(result)
     assert "2 distinct minima" in result.reason
+    assert [start.minimum for start in result.starts] == [0, 1]
+    assert "several-minima" not in codes(estimation)
 
 
-def test_finer_voxels_leave_less_to_the_place_of_the_grid(twins, twin, inversion):
-    spread = []
-    for spacing in (3.0, 1.5):
-        grid = twins.centred_grid((44.0,) * 3, (spacing,) * 3)
-        states = observed_of(twin, grid).states
-        shifts = grid_position_shifts(inversion, twin.model.space, states, draws=6, rng=np.random.default_rng(2))
-        spread.append(np.sqrt(np.mean(shifts**2)))
-    assert 0.0 < spread[1] < 0.7 * spread[0]
+def test_a_minimum_without_equilibrium_is_remarked_and_no_minimum_to_compare_with(inversion, settings, observed):
+    lost = replace(inversion.minimum, outcome=Outcome.NO_EQUILIBRIUM)
+    result = stated(doubled(inversion, minimum=lost), settings, observed)
+    assert result.status == "converged"
+    assert "no-equilibrium" in codes(result)
+    assert "several-minima" not in codes(result)
+    assert "1 of which has no equilibrium" in result.reason
+
+
+def test_an_estimate_whose_outer_loop_ran_out_says_what_is_open(estimation, inversion, settings, observed):
+    assert "unsettled" not in codes(estimation)
+    result = stated(with_candidate(inversion, convergence=Convergence(2.0, 0.5, 0.1)), settings, observed)
+    (remark,) = (remark for remark in result.remarks if remark.code == "unsettled")
+    assert "still change each other" in remark.message
+    assert "linearised anew" not in remark.message
 
 
 def test_the_same_seed_gives_the_same_statement(inversion, settings, observed, estimation):
-    again = conclude(inversion, settings, observed, truth={"gland": 30.0}, seed=1)
+    again = stated(inversion, settings, observed)
     assert np.array_equal(again.covariance, estimation.covariance)
 
 
 @pytest.mark.parametrize(("worse_by", "counts"), [(0.01, True), (0.5, False)])
 def test_another_minimum_that_fits_as_well_is_within_the_interval(inversion, settings, observed, worse_by, counts):
-    best = inversion.minimum
-    far = best.unknowns.copy()
-    far[0] += 1.0
-    value = (1.0 + worse_by) * best.evaluation.value
-    other = replace(best, unknowns=far, evaluation=replace(best.evaluation, value=value))
-    both = replace(inversion, minima=(best, other), groups=(0, 1), best=0)
-    low, high = conclude(both, settings, observed, truth={}, seed=1).estimates[0].interval95
+    best = inversion.candidates[0]
+    far = best.minimum.unknowns + np.append(1.0, np.zeros(len(best.minimum.unknowns) - 1))
+    elsewhere = replace(best.iterate, minimum=replace(best.minimum, unknowns=far))
+    other = Candidate(elsewhere, (1.0 + worse_by) * best.value)
+    both = replace(inversion, candidates=(best, other))
+    low, high = stated(both, settings, observed).estimates[0].interval95
     assert low < 30.0
     assert (high > 30.0 * np.e) == counts

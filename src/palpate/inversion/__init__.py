@@ -6,7 +6,7 @@ from palpate.inversion.estimate import Inversion, continue_at_finite_strain, inv
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import Evaluation, Objective
 from palpate.inversion.optimise import Bounds, Minimum, Outcome, fit_coefficients, gauss_newton, posterior_sd
-from palpate.inversion.outer_loop import InversionSettings, OuterIterate, StopRule, outer_loop
+from palpate.inversion.outer_loop import InversionSettings, OuterIterate, StopRule, run_outer_loop
 from palpate.inversion.parameters import ParameterMap, parameter_map
 from palpate.inversion.reduced_basis import ReducedBasis, reduced_basis
 from palpate.inversion.result import Estimation, Observed, Remark, conclude
@@ -45,11 +45,11 @@ __all__ = [
     "gauss_newton",
     "invert",
     "log_interval",
-    "outer_loop",
     "parameter_map",
     "posterior_sd",
     "reduced_basis",
     "reweighted",
+    "run_outer_loop",
     "sample_posterior",
     "sandwich_covariance",
     "verdict",

@@ -131,7 +131,7 @@ class ExactApproximation:
 
     @property
     def derivatives_at(self) -> NDArray[np.float64]:
-        """Where the model was last solved: there all derivatives are exact."""
+        """Moduli (n_regions,) kPa where the model was last solved: there all derivatives are exact."""
         return self.place.moduli
 
     def update(self, at: Place) -> ExactApproximation:

@@ -21,7 +21,7 @@ from palpate.inversion.outer_loop import (
     OuterIterate,
     StopRule,
     minimised,
-    outer_loop,
+    run_outer_loop,
 )
 from palpate.inversion.reduced_basis import reduced_basis
 from palpate.inversion.reweighting import with_first_noise
@@ -164,7 +164,7 @@ def _linear(
     minima = _from_starts(objective, settings, fitted.unknowns[objective.n_parameters :], progress)
     groups = _groups(minima, objective.n_parameters)
     best = groups[_best(minima)]
-    followed = [outer_loop(objective, minima[_best(minima)], settings, rule, progress=progress, title="linear law")]
+    followed = [run_outer_loop(objective, minima[_best(minima)], settings, rule, progress=progress, title="linear law")]
     for group in dict.fromkeys(g for g in groups if g != best):
         member = min((m for m, g in zip(minima, groups, strict=True) if g == group), key=lambda m: m.evaluation.value)
         followed.append(_another(followed[0], member, settings, rule, progress))
@@ -203,7 +203,9 @@ def _another(
     start = np.concatenate([minimum.unknowns[:n], best.minimum.unknowns[n:]])
     found = minimised(best.objective, start, settings, tolerance=OTHER)
     if found.converged and found.evaluation.value < best.minimum.evaluation.value - LOWER:
-        return outer_loop(best.objective, found, settings, rule, progress=progress, title="linear law, another minimum")
+        return run_outer_loop(
+            best.objective, found, settings, rule, progress=progress, title="linear law, another minimum"
+        )
     return OuterIterate(best.objective, found, best.convergence)
 
 
@@ -218,14 +220,16 @@ def _at_finite_strain(linear: OuterIterate, settings: InversionSettings, progres
         first.append(expansion_near(state.finite_strain, state.approximation, place, tolerance=tolerance))
     objective = linear.objective.under(first).rematched(unknowns)
     start = replace(linear.minimum, evaluation=objective(unknowns))
-    end = outer_loop(objective, start, settings, REPORTED, progress=progress, title="finite strain")
+    end = run_outer_loop(objective, start, settings, REPORTED, progress=progress, title="finite strain")
     exact = []
     for state, place in _placed(end.objective, end.minimum.unknowns):
         assert isinstance(state.approximation, Expansion)
         exact.append(state.approximation.at_equilibrium(place, tolerance=ACCURACY))
     final = end.objective.under(exact)
     evaluation, spent = final(end.minimum.unknowns), end.minimum.evaluations + 2
-    return replace(end, objective=final, minimum=replace(end.minimum, evaluation=evaluation, evaluations=spent))
+    history = linear.minimum.history + end.minimum.history
+    minimum = replace(end.minimum, evaluation=evaluation, evaluations=spent, history=history)
+    return replace(end, objective=final, minimum=minimum)
 
 
 def _placed(objective: Objective, unknowns: NDArray[np.float64]) -> list[tuple[LaterState, Place]]:

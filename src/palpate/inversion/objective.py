@@ -98,7 +98,7 @@ class Objective:
         return replace(self, states=tuple(states))
 
     def value(self, unknowns: NDArray[np.float64]) -> float:
-        """J alone, for trial steps."""
+        """J alone at unknowns (n_unknowns,), for trial steps."""
         away = unknowns - self.parameters.prior_centre
         total = 0.5 * float(away @ self.parameters.prior_matrix @ away)
         for s, state in enumerate(self.states):

@@ -27,8 +27,8 @@ __all__ = [
     "OuterIterate",
     "StopRule",
     "minimised",
-    "outer_loop",
     "ratios_in_words",
+    "run_outer_loop",
     "updated",
 ]
 
@@ -113,8 +113,8 @@ class StopRule:
 class OuterIterate:
     """Where an outer iteration ended: a minimum under the objective that it was found with.
 
-    step: how far it moved a log-modulus, over the stop rule's tolerance; stayed: whether no part of the step lowered the
-    objective, so that it ended where it began.
+    step: how far it moved a log-modulus, over the stop rule's tolerance; stayed: whether no part of the step lowered
+    the objective, so that it ended where it began.
     """
 
     objective: Objective
@@ -124,7 +124,7 @@ class OuterIterate:
     stayed: bool = False
 
 
-def outer_loop(
+def run_outer_loop(
     objective: Objective,
     start: Minimum,
     settings: InversionSettings,

@@ -117,7 +117,7 @@ class Estimation:
 
     correlation (n, n) of the log-moduli; fits: the tissues of each later image; displacements: (n_points, 3) mm of
     each later image; covariance (n, n) of the log-moduli, grid_covariance (n, n) the part of the voxel grid's place;
-    outer_iterations: the steps from the best start's minimum to the estimate, which all starts of that minimum share.
+    outer_loop: the steps from the best start's minimum to the estimate, which all starts of that minimum share.
     """
 
     status: str
@@ -128,7 +128,7 @@ class Estimation:
     fits: tuple[tuple[TissueFit, ...], ...]
     displacements: tuple[NDArray[np.float64], ...]
     counts: Mapping[str, int]
-    outer_iterations: tuple[Iteration, ...] = ()
+    outer_loop: tuple[Iteration, ...] = ()
     remarks: tuple[Remark, ...] = ()
     grid_covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
 
@@ -174,7 +174,7 @@ def conclude(
             "factorisations": inversion.counts.factorisations,
             "evaluations": inversion.evaluations,
         },
-        outer_iterations=tuple(_iteration(inversion, iterate) for iterate in minimum.history),
+        outer_loop=tuple(_iteration(inversion, iterate) for iterate in minimum.history),
         remarks=(*_remarks(inversion, covariance), *_folds(observed)),
         grid_covariance=grid_part,
     )

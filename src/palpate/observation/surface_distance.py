@@ -141,7 +141,10 @@ class SurfaceDistance:
     def wall_motion(
         self, residuals: Residuals, *, present: NDArray[np.float64], kernel_mm: float
     ) -> NDArray[np.float64] | None:
-        """See `Observation` and `wall_correction`; the prior is as wide as the residuals' root mean square."""
+        """See `Observation` and `wall_correction`, for motions (n_dofs,) mm.
+
+        The prior is as wide as the residuals' root mean square.
+        """
         mean_square = float(np.average(np.square(residuals.values), weights=residuals.weights))
         if not self.of_driver or mean_square <= max(ROUGH_WALL * self.noise_model.sd**2, FINEST_WALL**2):
             return None
@@ -177,7 +180,7 @@ class SurfaceDistance:
         return errors
 
     def fit(self, residuals: Residuals, modelled: NDArray[np.int16], image: NDArray[np.int16]) -> Fit:
-        """Distances by area, and Dice's 2 |A and B| / (|A| + |B|) of the tissue's voxels in model and image."""
+        """Distances by area, and Dice's 2 |A and B| / (|A| + |B|) of the tissue in both indices (nx, ny, nz)."""
         distance, weights = np.abs(residuals.values), residuals.weights
         order = np.argsort(distance)
         share = np.cumsum(weights[order]) / float(weights.sum())

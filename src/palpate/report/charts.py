@@ -53,7 +53,7 @@ def residual_svg(data: ReportData, model: ModelSurface, *, voxel_mm: float, name
 def objective_svg(data: ReportData, *, name: str) -> str:
     """Misfit (mm^2) of every start against the iteration, then of the outer loop that they share, as SVG."""
     histories = [start["history_mm2"] for start in data.document["starts"]]
-    histories.append(data.document["outer_iterations"]["history_mm2"])
+    histories.append(data.document["outer_loop"]["history_mm2"])
     paths = [[_finite(value) for value in history] for history in histories]
     return draw_svg(lambda figure: _paths(figure, paths, "misfit (mm²)"), size=SIZE, name=name)
 

@@ -181,7 +181,7 @@ def _tissues(tissues: tuple[Tissue, ...], moduli: NDArray[np.float64]) -> tuple[
 
 def _moduli_paths(result: CaseResult) -> tuple[Mapping[str, tuple[float, ...]], ...]:
     names = [estimate.tissue for estimate in result.estimation.estimates]
-    histories = [*(start.history for start in result.estimation.starts), result.estimation.outer_iterations]
+    histories = [*(start.history for start in result.estimation.starts), result.estimation.outer_loop]
     return tuple(
         {name: tuple(float(step.moduli.get(name, math.nan)) for step in history) for name in names}
         for history in histories

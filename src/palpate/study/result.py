@@ -126,7 +126,7 @@ class CaseResult:
             "correlation": estimation.correlation.tolist(),
             "fit": [_fit(name, fits) for name, fits in zip(image_names(self.case), estimation.fits, strict=False)],
             "starts": [_start(start) for start in estimation.starts],
-            "outer_iterations": {"history_mm2": [step.objective_mm2 for step in estimation.outer_iterations]},
+            "outer_loop": {"history_mm2": [step.objective_mm2 for step in estimation.outer_loop]},
             "counts": dict(estimation.counts),
             "mesh": _plain(self.mesh_summary),
         }
@@ -201,7 +201,7 @@ def failure_document(case: Case, error: PalpateError) -> dict[str, Any]:
         "correlation": [],
         "fit": [],
         "starts": [],
-        "outer_iterations": {"history_mm2": []},
+        "outer_loop": {"history_mm2": []},
         "counts": {},
         "mesh": None,
         "note": "",
