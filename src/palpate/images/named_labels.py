@@ -25,10 +25,14 @@ class NamedLabel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelTable(Mapping[int, str]):
-    """A label table: itself the mapping label -> name; `colours`: label -> #rrggbb where the table has one."""
+    """A label table: itself the mapping label -> name; `colours`: label -> #rrggbb where the table has one.
+
+    `sha256`: digest (hexadecimal) of the file it was read from, empty when there is none.
+    """
 
     names: Mapping[int, str] = field(default_factory=dict)
     colours: Mapping[int, str] = field(default_factory=dict)
+    sha256: str = ""
 
     def __getitem__(self, label: int) -> str:
         return self.names[label]

@@ -234,10 +234,12 @@ def _later(drawing: _Drawing, after: int, box: SliceBox | None) -> LaterImage:
 
 def _background(drawing: _Drawing, box: SliceBox) -> Volume:
     """The earlier grey image, or the labels where there is none or it cannot be read, which the page then says."""
-    images, before = drawing.pair.result.case.images, drawing.pair.result.before
+    result = drawing.pair.result
+    images, before = result.case.images, result.before
     if images is not None and images.intensities_before is not None:
         try:
-            values, grid = read_intensities(images.intensities_before)
+            digest = result.provenance.inputs.get("intensities_before")
+            values, grid = read_intensities(images.intensities_before, sha256=digest)
             return grey_volume(values, grid, box, most_voxels=_most_voxels(images))
         except PalpateError as error:
             LOGGER.warning("the grey image is left out of the report: %s", error)
@@ -263,7 +265,8 @@ def _later_background(result: CaseResult, after: int, box: SliceBox | None) -> V
         return label_volume(result.after[after], box)
     if after >= len(images.intensities_after):
         return None
-    values, grid = read_intensities(images.intensities_after[after])
+    digest = result.provenance.inputs.get(f"intensities_after[{after}]")
+    values, grid = read_intensities(images.intensities_after[after], sha256=digest)
     if values.shape != aligned.shape or not np.allclose(grid.spacing, aligned.spacing, rtol=1e-3):
         raise ValueError("the later grey image is not on the grid of its label image")
     return grey_volume(values, aligned, box, most_voxels=_most_voxels(images))

@@ -16,6 +16,7 @@ from palpate.phantoms.scene import Scene
 from palpate.phantoms.spheres import SpheresOptions, spheres
 from palpate.study.body import ImagedStates, aligned
 from palpate.study.case import Case
+from palpate.study.provenance import file_digest
 
 __all__ = ["phantom_scene", "read_pairs", "read_segmentation", "read_states"]
 
@@ -33,14 +34,14 @@ def read_states(case: Case) -> ImagedStates:
         return aligned(segment(scene.before, scene.tissues), after, method=case.align, loaded=bool(case.loads))
     if case.images is None:
         raise ConfigurationError(f"case '{case.id}' has neither [images] nor [phantom]")
-    return _read_pair(case, case.images.before, case.images.after)
+    return _read_pair(case, case.images.before, case.images.after, key="")
 
 
 def read_pairs(case: Case) -> tuple[ImagedStates, ...]:
     """The same of each of the case's further [[pairs]]; their findings begin with the pair's number, from 2."""
     found = []
     for number, pair in enumerate(case.pairs, start=2):
-        states = _read_pair(case, pair.before, pair.after)
+        states = _read_pair(case, pair.before, pair.after, key=f"pairs[{number - 2}].")
         findings = tuple(replace(f, message=f"pair {number}: {f.message}") for f in states.findings)
         found.append(replace(states, findings=findings))
     return tuple(found)
@@ -69,9 +70,16 @@ def phantom_scene(case: Case) -> Scene:
     return pelvis(PelvisOptions(seed=case.phantom.seed, filling_mm=filling, law=law))
 
 
-def _read_pair(case: Case, before: Path, after: tuple[Path, ...]) -> ImagedStates:
+def _read_pair(case: Case, before: Path, after: tuple[Path, ...], *, key: str) -> ImagedStates:
+    """One pair; `key` begins the keys of its files' digests."""
     table = case.images.names if case.images else None
     names = read_label_table(table) if table else None
     reference = read_segmentation(case, before, names, None)
     later = tuple(read_segmentation(case, path, names, reference.tissues) for path in after)
-    return aligned(reference, later, method=case.align, loaded=bool(case.loads))
+    states = aligned(reference, later, method=case.align, loaded=bool(case.loads))
+    inputs = {"names": names.sha256} if names else {}
+    keys = (f"{key}before", *(f"{key}after[{i}]" for i in range(len(later))))
+    for name, image, path in zip(keys, (reference, *later), (before, *after), strict=True):
+        own, *voxels = image.digests or (file_digest(path),)  # a reader from elsewhere may not say what it read
+        inputs |= {name: own} | {f"{name}.voxels": digest for digest in voxels}
+    return replace(states, inputs=inputs)

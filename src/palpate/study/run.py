@@ -59,7 +59,7 @@ def estimate(case: Case, *, progress: Progress = silent, truth: Mapping[str, flo
     progress("reading and aligning the images")
     states, further = read_states(case), read_pairs(case)
     truth = _truth(states) if case.phantom else truth
-    inputs = input_digests(case)  # now, of the files as they were read: an estimate takes minutes
+    inputs = input_digests(case, states.inputs, *(pair.inputs for pair in further))
     seconds = time.perf_counter() - began
     result = estimate_states(states, case, progress=progress, truth=truth, read_seconds=seconds, further=further)
     return replace(result, provenance=replace(result.provenance, inputs=inputs))
@@ -116,7 +116,8 @@ def mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
     """Mesh the reference state of a case and pass it through the gate."""
     began = time.perf_counter()
     progress("reading and aligning the images")
-    states, inputs = read_states(case), input_digests(case)
+    states = read_states(case)
+    inputs = input_digests(case, states.inputs)
     body = make_body(states, case, progress=progress)
     seconds = {"total": round(time.perf_counter() - began, 3)}
     provenance = Provenance(seconds, inputs, software_versions())
