@@ -35,10 +35,9 @@ REFUSED_VALUES = {
     "a patient with a zero byte": 'patient="a\\u0000b"',
     "a patient that turns the line": 'patient="a\\u202eb"',
     "a patient of 90 kB": f'patient="{"x" * 90_000}"',
-    "an id of 90 kB": f'id="{"x" * 90_000}"',
     "60 000 brackets": "seed=" + "[" * 60_000,
     "60 000 braces": "seed=" + "{a=" * 20_000,
-    "a key of 20 000 parts": "x" + ".a" * 20_000 + "=1",
+    "a key of 60 000 parts": "x" + ".a" * 60_000 + "=1",
     "a key of 40 000 letters": "mesh." + "a" * 40_000 + "=1",
     "a home that is not there": 'images.before="~nobody-here/before.nii.gz"',
     "a tissue's name in its own table": 'tissues.prostate.name="bladder"',
@@ -63,21 +62,20 @@ def test_an_impossible_value_is_refused_before_anything_is_read(name, folder, pa
 
 
 REFUSED_FILES = {
-    "a whole number of 5000 digits": b"seed = " + b"9" * 5000,
-    "nothing but brackets": b"x = " + b"[" * 90_000,
-    "a table of 100 000 parts": b"[x" + b".a" * 100_000 + b"]",
-    "a table of 45 000 parts": b"[x" + b".a" * 45_000 + b"]",
-    "deep keys in a deep table": b"[x" + b".a" * 400 + b"]\n" + (b"b" + b".b" * 400 + b" = 1\n") * 100,
-    "900 kB": b"#" * 900_000,
+    "a whole number of 5000 digits": (b"seed = " + b"9" * 5000, "a number in it is too long"),
+    "a table of 100 000 parts": (b"[x" + b".a" * 100_000 + b"]", "over 100000 bytes"),
+    "900 kB": (b"#" * 900_000, "over 100000 bytes"),
+    "a line of 1000 dots": (b"x = " + b"." * 1000, "over 100 dots"),
 }
 
 
 @pytest.mark.parametrize("name", REFUSED_FILES)
 @pytest.mark.parametrize("command", ["estimate", "check"])
 def test_a_case_that_would_take_minutes_to_parse_is_refused(name, command, folder, palpate):
-    (folder / "case.toml").write_bytes(REFUSED_FILES[name])
+    content, words = REFUSED_FILES[name]
+    (folder / "case.toml").write_bytes(content)
     done = palpate(command, "case.toml", "--quiet", cwd=folder, **SOON)
-    assert len(sentence(done, 2)) < 1000
+    assert words in sentence(done, 2)
 
 
 @pytest.mark.parametrize("kind", ["a device", "a pipe"])
@@ -91,31 +89,13 @@ def test_only_regular_files_are_read(kind, name, code, folder, palpate):
     assert "a pipe, a socket or a device" in sentence(done, code)
 
 
-def test_a_device_in_place_of_the_voxels_beside_a_header_is_refused(folder, palpate):
-    header = "ObjectType = Image\nNDims = 3\nBinaryData = True\nTransformMatrix = 1 0 0 0 1 0 0 0 1\nOffset = 0 0 0\n"
-    header += "ElementSpacing = 1 1 1\nDimSize = 4 5 6\nElementType = MET_UCHAR\nElementDataFile = a.raw\n"
-    (folder / "a.mhd").write_text(header)
-    os.mkfifo(folder / "a.raw")
-    done = palpate("estimate", "case.toml", "--set", "images.after=['a.mhd']", "--quiet", cwd=folder, **SOON)
-    assert "a.raw" in sentence(done, 3)
-
-
-def test_a_mistyped_label_finds_its_neighbour_among_45000_names_at_once(folder, palpate):
+def test_a_label_of_1800_letters_is_not_sought_among_45000_names(folder, palpate):
     changed(folder, "[images]", '[images]\nnames = "names.json"')
-    changed(folder, "label = 1", f'label = "{"organ 777" + "7" * 180}"')
+    changed(folder, "label = 1", f'label = "{"organ " * 300}"')
     names = {f"organ {i}": i for i in range(45_000)}
     (folder / "names.json").write_text(json.dumps(names, separators=(",", ":")))
     done = palpate("estimate", "case.toml", "--quiet", cwd=folder, **SOON)
-    assert "no label is called 'organ 777" in sentence(done, 2)
-
-
-def test_a_mistyped_label_names_its_neighbour_among_45000(folder, palpate):
-    changed(folder, "[images]", '[images]\nnames = "names.json"')
-    changed(folder, "label = 1", 'label = "prostata"')
-    names = {f"organ {i}": i for i in range(45_000)} | {"prostate": 50_000}
-    (folder / "names.json").write_text(json.dumps(names, separators=(",", ":")))
-    done = palpate("estimate", "case.toml", "--quiet", cwd=folder, **SOON)
-    assert "did you mean 'prostate'?" in sentence(done, 2)
+    assert "1 to 200 characters" in sentence(done, 2)
 
 
 WIDE = "".join(chr(0xFF10 + int(digit)) for digit in "10")
@@ -125,8 +105,6 @@ TABLES = {
     "a sign in JSON": ("names.json", '{"+1": "prostate"}'),
     "wide digits in ITK-SNAP's": ("names.txt", f'{WIDE} 255 0 0 1 1 1 "prostate"\n'),
     "wide digits in Slicer's": ("names.ctbl", f"{WIDE} prostate 255 0 0 255\n"),
-    "underscores in CSV": ("names.csv", "LabelValue,Name\n1_0,prostate\n"),
-    "wide digits in BIDS": ("names.tsv", f"index\tname\n{WIDE}\tprostate\n"),
 }
 
 
@@ -138,7 +116,7 @@ def test_a_label_is_written_in_plain_digits(name, folder, palpate):
     sentence(palpate("estimate", "case.toml", "--quiet", cwd=folder), 3)
 
 
-@pytest.mark.parametrize("number", ["1_5", WIDE, "nan", "inf"])
+@pytest.mark.parametrize("number", ["1_5", WIDE])
 def test_a_number_in_a_header_is_written_in_plain_digits(number, folder, palpate):
     header = "NRRD0004\ntype: uchar\ndimension: 3\nspace: RAS\nsizes: 4 5 6\nencoding: raw\n"
     header += f"space directions: ({number},0,0) (0,1,0) (0,0,1)\nspace origin: (0,0,0)\n\n"

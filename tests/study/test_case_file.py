@@ -78,6 +78,24 @@ def test_a_name_missing_in_the_table_names_the_nearest(case_file):
         read_case(case_file).resolve_tissues({3: "rectum_wall", 2: "bladder"})
 
 
+def test_the_nearest_of_45000_names_is_found(case_file):
+    names = {i: f"organ {i}" for i in range(45_000)} | {50_000: "rectum_wall"}
+    with pytest.raises(ConfigurationError, match="did you mean 'rectum_wall'"):
+        read_case(case_file).resolve_tissues(names)
+
+
+def test_a_home_in_a_path_is_found_and_a_file_whose_name_looks_like_one_is_no_home(case_file, monkeypatch):
+    monkeypatch.setenv("HOME", "/home/somebody")
+    paths = [
+        read_case(case_file, [f"images.before='{name}'"]).images.before for name in ("~/a.nii", "./~b.nii", "~x/c.nii")
+    ]
+    assert [str(path) for path in paths] == [
+        "/home/somebody/a.nii",
+        str(case_file.parent / "~b.nii"),
+        str(case_file.parent / "~x" / "c.nii"),
+    ]
+
+
 def test_a_label_claimed_by_name_and_by_number_is_refused(case_file):
     with pytest.raises(ConfigurationError, match="claimed by tissue 'prostate' and by tissue 'rectum'"):
         read_case(case_file).resolve_tissues({1: "rectum"})

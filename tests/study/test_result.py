@@ -8,7 +8,7 @@ import json
 import numpy as np
 import pytest
 
-from palpate.errors import NotConverged, SolverError
+from palpate.errors import InputDataError, NotConverged, SolverError
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.result import MeshResult, Simulation, failure_document
 
@@ -85,12 +85,15 @@ def test_mesh_and_simulation_documents_are_strict_json(case_result):
     assert simulation.to_dict()["largest_displacement_mm"] == pytest.approx(largest)
 
 
-def test_digests_name_every_input(tmp_path, case_result):
+def test_digests_name_every_input_and_a_file_that_changed_between_two_readings_is_refused(tmp_path, case_result):
     (tmp_path / "b").write_bytes(b"abc")
-    images = dataclasses.replace(case_result.case.images, before=tmp_path / "b", after=(tmp_path / "b",))
-    digests = input_digests(dataclasses.replace(case_result.case, images=images))
-    assert set(digests) == {"before", "after[0]"}
-    assert digests["before"].startswith("ba7816bf")  # SHA-256 of "abc", FIPS 180-2, appendix B.1
+    images = dataclasses.replace(case_result.case.images, intensities_before=tmp_path / "b")
+    case = dataclasses.replace(case_result.case, images=images)
+    digests = input_digests(case, {"before": "1", "names": "2"}, {"pairs[0].before": "3", "names": "2"})
+    abc = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"  # FIPS 180-2, appendix B.1
+    assert digests == {"before": "1", "names": "2", "pairs[0].before": "3", "intensities_before": abc}
+    with pytest.raises(InputDataError, match="'names' was changed"):
+        input_digests(case, {"names": "1"}, {"names": "2"})
 
 
 def test_versions_name_python_and_palpate():
