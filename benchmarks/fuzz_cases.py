@@ -328,7 +328,7 @@ class Outcome:
 
 def outcome(read: Callable[[], object], codes: set[int]) -> Outcome:
     """Read one spoilt input; `codes`: the exit codes that its refusal may have."""
-    began = time.process_time()
+    began = time.thread_time()
     try:
         read()
     except PalpateError as error:
@@ -340,7 +340,7 @@ def outcome(read: Callable[[], object], codes: set[int]) -> Outcome:
         kind, flaw = f"foreign {type(error).__name__}", traceback.format_exc(limit=-3)[-2000:]
     else:
         kind, flaw = "read", ""
-    seconds = time.process_time() - began
+    seconds = time.thread_time() - began
     return Outcome(kind, seconds, flaw or ("slow" if seconds > SLOW_SECONDS else ""))
 
 

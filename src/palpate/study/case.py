@@ -180,7 +180,7 @@ class CaseLoad:
     pressure_kpa: float | None = field(default=None, metadata=rule(between=STRESSES_KPA))
     following: bool = True
     traction_kpa: tuple[float, float, float] | None = field(default=None, metadata=rule(between=STRESSES_KPA))
-    acceleration_m_s2: tuple[float, float, float] | None = field(default=None, metadata=rule(between=(-1e4, 1e4)))
+    acceleration_m_s2: tuple[float, float, float] | None = field(default=None, metadata=rule(between=(-100.0, 100.0)))
 
     def __post_init__(self) -> None:
         needed = {
@@ -212,7 +212,7 @@ class DriverMotion:
     `learn_prior`: the images say how far and how smoothly the wall moves; kernel and amplitude are the first guess.
     """
 
-    modes: int = field(default=90, metadata=rule(between=(1, 10_000)))
+    modes: int = field(default=90, metadata=rule(between=(3, 10_000)))
     kernel_mm: float = field(default=20.0, metadata=rule(between=(0.1, 1e3)))
     prior_mm: float = field(default=5.0, metadata=rule(between=(1e-3, 1e3)))
     learn_prior: bool = True

@@ -11,6 +11,7 @@ import typing
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -89,7 +90,7 @@ def read_table(kind: type[T], table: Mapping[str, object], *, where: str, folder
         if key not in fields:
             raise ConfigurationError(f"unknown key '{shortened(key)}' in {where}: {nearest(key, fields)}")
     _check_complete(fields.values(), table, where)
-    hints = typing.get_type_hints(kind)
+    hints = _hints(kind)
     values: dict[str, Any] = {}
     for key, value in table.items():
         place = _Place(key, where, folder)
@@ -99,6 +100,12 @@ def read_table(kind: type[T], table: Mapping[str, object], *, where: str, folder
         _check_value(bounds, converted, place)
         values[key] = converted
     return kind(**values)
+
+
+@cache
+def _hints(kind: type[Any]) -> Mapping[str, Any]:
+    """Types of the fields of a dataclass; to resolve them takes longer than to read its table."""
+    return typing.get_type_hints(kind)
 
 
 @dataclass(frozen=True, slots=True)
