@@ -125,6 +125,12 @@ def test_a_number_in_a_header_is_written_in_plain_digits(number, folder, palpate
     assert "space directions" in sentence(done, 3)
 
 
+def test_noise_that_drowns_all_motion_ends_as_an_estimation_without_a_result(folder, palpate):
+    done = palpate("estimate", "case.toml", "--set", "noise.surface_sd_mm=5", "--output", "out", "--quiet", cwd=folder)
+    assert "do not determine what is sought" in sentence(done, 5)
+    assert json.loads((folder / "out" / "result.json").read_text())["status"] == "failed"
+
+
 def test_steps_and_threads_are_counted_in_plain_digits(folder, palpate):
     done = palpate("simulate", "case.toml", "--steps", "1_0", cwd=folder)
     assert (done["code"], "no whole number from 1 to 1000" in done["err"]) == (2, True)

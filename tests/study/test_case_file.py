@@ -47,7 +47,7 @@ def test_defaults_are_those_of_the_schema(case_file):
     assert case.estimate.start_ratios == (0.5, 2.0, 8.0)
     assert case.estimate.bounds_ratio == (0.02, 200.0)
     assert (case.noise.surface_sd_mm, case.noise.correlation_length_mm) == (None, None)
-    assert case.tissues[0].poisson_ratio == 0.45
+    assert case.tissues[0].with_labels((1,)).poisson_ratio == 0.45
 
 
 def test_paths_are_relative_to_the_file(case_file):

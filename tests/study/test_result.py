@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from palpate.errors import InputDataError, NotConverged, SolverError
+from palpate.images.tissue import Role
+from palpate.report.collect import collect_failure
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.result import MeshResult, Simulation, failure_document
 
@@ -66,6 +68,14 @@ def test_an_error_still_makes_a_whole_document(case_result, error, status):
     assert (document["status"], document["reason"]) == (status, str(error))
     assert [(e["tissue"], e["value"]) for e in document["estimates"]] == [("prostate", None), ("bladder", None)]
     assert set(document["estimates"][0]) >= ESTIMATE_KEYS
+
+
+def test_a_failed_estimate_without_anything_known_speaks_of_ratios(case_result):
+    case = case_result.case
+    assert {e["unit"] for e in failure_document(case, SolverError("x"))["estimates"]} == {"kPa"}
+    free = dataclasses.replace(case, tissues=tuple(t for t in case.tissues if t.role is not Role.KNOWN))
+    assert {e["unit"] for e in failure_document(free, SolverError("x"))["estimates"]} == {"ratio"}
+    assert collect_failure(free, SolverError("x")).unit == "ratio"
 
 
 def test_stiffness_takes_known_and_estimated_moduli_and_leaves_hollows_out(case_result):

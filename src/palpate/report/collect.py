@@ -34,7 +34,7 @@ from palpate.report.report_data import (
 from palpate.report.surfaces import MOST_TRIANGLES, contour_width, image_surface, model_surface
 from palpate.report.volume import MOST_VOXELS, grey_volume, label_volume
 from palpate.study.case import Case, CaseLoad, Images
-from palpate.study.result import CaseResult, failure_document
+from palpate.study.result import CaseResult, failure_document, stated_unit
 
 __all__ = ["collect", "collect_failure"]
 
@@ -110,7 +110,7 @@ def collect_failure(case: Case, error: PalpateError) -> ReportData:
         created=_now(),
         settings=_settings(case),
         tissues=_tissues(tissues, np.full(len(tissues), np.nan)),
-        unit="kPa",
+        unit=stated_unit(case),
     )
 
 

@@ -37,6 +37,7 @@ LOW_HIGH = "[low, high] with low < high"
 LARGEST_SEED = 2**53 - 1  # the largest whole number that JSON keeps everywhere
 RATIOS = (1e-6, 1e6)
 KILOPASCALS = (1e-3, 1e9)  # of a modulus: from the softest gels to diamond
+POISSON_RATIO = 0.45
 POISSON_RATIOS = (-0.99, 0.4999)  # beyond, a solid loses its shape or its volume's give, and equations their digits
 STRESSES_KPA = (-1e4, 1e4)
 SEED = rule(between=(0, LARGEST_SEED))
@@ -106,13 +107,16 @@ class Domain:
 
 @dataclass(frozen=True, slots=True)
 class CaseTissue:
-    """A tissue as the case names it: `label` is a tuple of labels, a name of the label table, or "remaining"."""
+    """A tissue as the case names it: `label` is a tuple of labels, a name of the label table, or "remaining".
+
+    `poisson_ratio` None: 0.45, or what a phantom draws.
+    """
 
     name: str
     label: tuple[int, ...] | str = field(metadata=rule(convert=_label))
     role: Role
-    poisson_ratio: float = field(
-        default=0.45,
+    poisson_ratio: float | None = field(
+        default=None,
         metadata=rule(
             between=POISSON_RATIOS,
             wanted="an isotropic elastic solid needs -1 < nu < 0.5; soft tissue is usually given 0.40 to 0.49",
@@ -137,7 +141,8 @@ class CaseTissue:
 
     def with_labels(self, labels: tuple[int, ...]) -> Tissue:
         """The tissue with its labels; raises `ConfigurationError` when its constants are impossible."""
-        return Tissue(self.name, self.role, labels, self.poisson_ratio, self.youngs_modulus_kpa)
+        ratio = POISSON_RATIO if self.poisson_ratio is None else self.poisson_ratio
+        return Tissue(self.name, self.role, labels, ratio, self.youngs_modulus_kpa)
 
     def resolve(self, names: Mapping[int, str]) -> Tissue:
         """The tissue with the labels that `names` (label -> name) gives to its label's name.
@@ -225,6 +230,13 @@ class Noise:
     surface_sd_mm: float | None = field(default=None, metadata=rule(between=(1e-4, 100.0)))
     correlation_length_mm: float | None = field(default=None, metadata=rule(between=(0.01, 1e3)))
 
+    def __post_init__(self) -> None:
+        if self.correlation_length_mm is not None and self.surface_sd_mm is None:
+            raise ConfigurationError(
+                "[noise] has a correlation_length_mm without a surface_sd_mm, and would not be used: give both, or"
+                " neither, and both are estimated from the residuals"
+            )
+
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
@@ -263,7 +275,10 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class Phantom:
-    """A scene with a known truth instead of images; `law`: that of the truth (default: the case's)."""
+    """A scene with a known truth instead of images; `law`: that of the truth (default: the case's).
+
+    The truth's moduli and Poisson's ratios are those that the case's tissues state, else the phantom's own.
+    """
 
     kind: str = field(metadata=rule(choices=("pelvis", "spheres")))
     seed: int = field(default=1, metadata=SEED)
@@ -317,6 +332,10 @@ class Case:
         if self.pairs and self.images is None:
             raise ConfigurationError(
                 f"case '{self.id}' has [[pairs]] without [images]: name the first pair there, with the label table"
+            )
+        if self.phantom is not None and self.loads:
+            raise ConfigurationError(
+                f"case '{self.id}' has [[loads]] on a [phantom], whose walls alone move it; take the loads out"
             )
         self._check_tissues()
 

@@ -17,7 +17,7 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.inversion.estimation import Estimation, ModulusEstimate, Remark, Start, TissueFit
 from palpate.mesh.space import LagrangeSpace
-from palpate.study.case import Case
+from palpate.study.case import Case, CaseTissue
 
 __all__ = [
     "CaseResult",
@@ -30,6 +30,7 @@ __all__ = [
     "failure_document",
     "image_names",
     "json_object",
+    "stated_unit",
 ]
 
 SCHEMA = "palpate.result/1"
@@ -104,8 +105,7 @@ class CaseResult:
     @property
     def unit(self) -> str:
         """Unit of `stiffness`: "kPa", or "ratio" when neither a modulus nor a load is known."""
-        known = any(tissue.role is Role.KNOWN for tissue in self.tissues)
-        return "kPa" if known or self.case.loads else "ratio"
+        return _unit(self.case, self.tissues)
 
     @property
     def stiffness(self) -> NDArray[np.float64]:
@@ -190,8 +190,9 @@ def failure_document(case: Case, error: PalpateError) -> dict[str, Any]:
     why = f"the estimation ended with the status '{status}'"
     unknown = [tissue.name for tissue in case.tissues if tissue.role is Role.ESTIMATE]
     known = [tissue.name for tissue in case.tissues if tissue.role is Role.KNOWN]
+    unit = stated_unit(case)
     empty: dict[str, Any] = {
-        "estimates": [_estimate(_no_estimate(name, (known or unknown)[0], why), status) for name in unknown],
+        "estimates": [_estimate(_no_estimate(name, (known or unknown)[0], unit, why), status) for name in unknown],
         "correlation": [],
         "fit": [],
         "starts": [],
@@ -202,11 +203,21 @@ def failure_document(case: Case, error: PalpateError) -> dict[str, Any]:
     return json_object(_heading(case, status, str(error)) | empty | _closing(case, Provenance(), ()))
 
 
-def _no_estimate(tissue: str, relative_to: str, why: str) -> ModulusEstimate:
+def stated_unit(case: Case) -> str:
+    """Unit of the moduli that a case asks for: "kPa", or "ratio" when neither a modulus nor a load is known."""
+    return _unit(case, case.tissues)
+
+
+def _unit(case: Case, tissues: Sequence[Tissue | CaseTissue]) -> str:
+    known = any(tissue.role is Role.KNOWN for tissue in tissues)
+    return "kPa" if known or case.loads else "ratio"
+
+
+def _no_estimate(tissue: str, relative_to: str, unit: str, why: str) -> ModulusEstimate:
     return ModulusEstimate(
         tissue=tissue,
         parameter="youngs_modulus",
-        unit="kPa",
+        unit=unit,
         value=None,
         interval95=None,
         interval_kind="linearised",

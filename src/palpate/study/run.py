@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from palpate.errors import ConfigurationError
+from palpate.errors import ConfigurationError, EstimationError
 from palpate.images.tissue import Role
 from palpate.inversion.conclude import Observed, conclude
 from palpate.inversion.estimation import Estimation, Remark
@@ -86,11 +86,18 @@ def estimate_states(
     problem = joint_problem(bodies, case, progress=progress)
     clock.append(time.perf_counter())
     settings = inversion_settings(case, problem.modulus_map)
-    inversion = invert(problem, settings, progress=progress)
-    progress("intervals: residuals' correlation, grid position, driver")
-    images = tuple(image.index for pair in bodies for image in pair.states.after)
-    observed = Observed(body.space, fitted_states(inversion, *bodies), images)
-    estimation = conclude(inversion, settings, observed, truth=truth or {}, seed=case.seed)
+    try:
+        inversion = invert(problem, settings, progress=progress)
+        progress("intervals: residuals' correlation, grid position, driver")
+        images = tuple(image.index for pair in bodies for image in pair.states.after)
+        observed = Observed(body.space, fitted_states(inversion, *bodies), images)
+        estimation = conclude(inversion, settings, observed, truth=truth or {}, seed=case.seed)
+    except np.linalg.LinAlgError as error:
+        raise EstimationError(
+            f"the images do not determine what is sought ({error}): beside the noise ([noise] surface_sd_mm, or that of"
+            " the residuals) the driver's motion cannot be told from none; state the noise smaller, or use images in"
+            " which the organs move more"
+        ) from error
     clock.append(time.perf_counter())
     stages = np.diff(clock)
     seconds = {"read": read_seconds, "mesh": stages[0], "assemble": stages[1], "estimate": stages[2]}

@@ -90,7 +90,7 @@ def read_table(kind: type[T], table: Mapping[str, object], *, where: str, folder
         if key not in fields:
             raise ConfigurationError(f"unknown key '{shortened(key)}' in {where}: {nearest(key, fields)}")
     _check_complete(fields.values(), table, where)
-    hints = _hints(kind)
+    hints = _hints(typing.cast("Any", kind))
     values: dict[str, Any] = {}
     for key, value in table.items():
         place = _Place(key, where, folder)
