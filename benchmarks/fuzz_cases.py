@@ -4,7 +4,7 @@
 
 With a fixed seed. A run makes one spoilt input (`spoilt_cases.py`) and reads it with the functions that the command
 line calls. `--commands` cases go through `palpate check` itself, in a process of their own. A finding is an exception
-that is no `PalpateError`, an exit code of another class, a sentence with control characters, of several lines or of over
+that is no `PalpateError`, an exit code of another class, a sentence with control characters, of several lines or over
 2000 letters, a traceback, the request to report a bug, or more than 2 s of processor time. Prints JSON.
 """
 
