@@ -22,6 +22,7 @@ __all__ = ["Rule", "nearest", "read_table", "rule", "shortened", "shown"]
 
 MOST_LETTERS = 4096  # of a text: the longest path that systems take
 MOST_SHOWN = 80  # letters of a text in a sentence
+MOST_OTHERS = 15  # known names that a hint lists
 MOST_COMPARED = 300  # names that are compared letter by letter with a mistyped one
 
 T = TypeVar("T")
@@ -70,8 +71,8 @@ def nearest(word: str, known: Iterable[str]) -> str:
         MOST_COMPARED, names, key=lambda n: len(letters ^ set(n.lower())) + abs(len(n) - len(sought))
     )
     closest = max(alike, key=lambda name: difflib.SequenceMatcher(None, sought, name.lower()).ratio())
-    others = [shortened(name) for name in names if name != closest]
-    return f"did you mean '{closest}'?" + (f" (others: {', '.join(others[:15])})" if others else "")
+    others = [shortened(name) for name in names[: MOST_OTHERS + 1] if name != closest][:MOST_OTHERS]
+    return f"did you mean '{shortened(closest)}'?" + (f" (others: {', '.join(others)})" if others else "")
 
 
 def shortened(text: str) -> str:
