@@ -209,7 +209,7 @@ def stated_unit(case: Case) -> str:
 
 
 def _unit(case: Case, tissues: Sequence[Tissue | CaseTissue]) -> str:
-    known = any(tissue.role is Role.KNOWN for tissue in tissues)
+    known = any(tissue.role is Role.KNOWN for tissue in tissues) or case.phantom is not None  # whose surroundings are
     return "kPa" if known or case.loads else "ratio"
 
 
