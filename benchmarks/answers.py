@@ -103,7 +103,8 @@ def plain_estimate(
     still = np.concatenate([theta, np.zeros(sum(problem.parameters.n_modes))])
     objective = with_first_noise(_exact(Objective(problem.states, problem.parameters), still)).rematched(still)
     filled = fit_coefficients(objective, theta, bounds=settings.bounds)
-    objective = objective.rematched(filled.unknowns)
+    objective = _exact(objective, filled.unknowns).rematched(filled.unknowns)  # a body at rest shows no modulus
+    filled = replace(filled, evaluation=objective(filled.unknowns))
     rule = replace(RULE, refinements=0) if problem.finite_strain else RULE
     found = run_outer_loop(objective, filled, settings, rule, progress=progress, title="linear law")
     if not problem.finite_strain:

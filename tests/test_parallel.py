@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
+import palpate
 from palpate.parallel import mapped, processors
 
 
@@ -19,4 +22,16 @@ def test_what_a_call_raises_is_raised():
 
 def test_the_limit_of_the_linear_algebra_holds(monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    assert processors() == 1
+
+
+def test_nothing_else_counts_the_processors():
+    """What a queue or a container allows is known in one place."""
+    counting = [path.name for path in Path(palpate.__file__).parent.rglob("*.py") if "cpu_count" in path.read_text()]
+    assert counting == ["parallel.py"]
+
+
+def test_a_limit_that_is_no_plain_number_is_none(monkeypatch):
+    monkeypatch.setenv("MKL_NUM_THREADS", "1")
+    monkeypatch.setenv("OMP_NUM_THREADS", "\u00b2")
     assert processors() == 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
@@ -17,7 +18,7 @@ def processors() -> int:
     """Processors that this process may use, and that the linear algebra's own limit leaves."""
     seen = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     limits = [os.environ.get(name, "") for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")]
-    return min([seen, *(int(limit) for limit in limits if limit.isdigit() and int(limit) > 0)])
+    return min([seen, *(int(limit) for limit in limits if re.fullmatch("[1-9][0-9]{0,5}", limit))])
 
 
 def mapped(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:

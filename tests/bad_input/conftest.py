@@ -17,6 +17,7 @@ from bad_inputs import CASE, anatomy, save
 
 MEMORY_MB = 3000  # of address space
 SECONDS = 60  # of processor time
+WALL_SECONDS = 300
 
 ONE_THREAD = os.environ | dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 
@@ -31,7 +32,13 @@ class Limited:
         )
 
     def __call__(self, *argv: str, cwd: Path, **limits) -> dict:
-        request = {"argv": argv, "cwd": str(cwd), "memory_mb": MEMORY_MB, "seconds": SECONDS} | limits
+        request = {
+            "argv": argv,
+            "cwd": str(cwd),
+            "memory_mb": MEMORY_MB,
+            "seconds": SECONDS,
+            "wall_seconds": WALL_SECONDS,
+        } | limits
         self._process.stdin.write(json.dumps(request) + "\n")
         self._process.stdin.flush()
         return json.loads(self._process.stdout.readline())

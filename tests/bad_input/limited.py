@@ -1,11 +1,14 @@
 """Run by the tests of bad input: a warm process that forks one with limits for each command line it is given.
 
-Reads a JSON line {"argv", "cwd", "memory_mb", "seconds", "file_mb", "env", "interrupt"} and answers with one
-{"code", "out", "err", "seconds"}; a command that a signal ended has a negative code.
+Reads a JSON line {"argv", "cwd", "memory_mb", "seconds", "wall_seconds", "file_mb", "env", "interrupt",
+"narrow_pipes", "append_after_reading"} and answers with one {"code", "out", "err", "seconds"}; a command that a signal
+ended has a negative code.
 """
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
 import os
 import resource
@@ -22,6 +25,7 @@ import palpate.report.case_report
 import palpate.study.check
 import palpate.study.new_case
 import palpate.study.run
+from palpate.images.readers import read as readers
 
 
 def main() -> None:
@@ -58,9 +62,14 @@ def _child(request: dict, out: int, err: int) -> None:
         memory = request["memory_mb"] << 20
         resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
         resource.setrlimit(resource.RLIMIT_CPU, (request["seconds"], request["seconds"]))
+        signal.alarm(request["wall_seconds"])
         if request.get("file_mb") is not None:
             size = int(request["file_mb"] * 2**20)
             resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+        if request.get("narrow_pipes"):
+            _narrow_pipes()
+        if request.get("append_after_reading"):
+            _append_after_reading()
         try:
             code = palpate.cli.main(request["argv"])
         except SystemExit as stop:
@@ -69,6 +78,31 @@ def _child(request: dict, out: int, err: int) -> None:
         sys.stderr.flush()
     finally:
         os._exit(code)
+
+
+def _narrow_pipes() -> None:
+    """The system refuses to widen a pipe, as it does when a user's share of pipe memory is used up."""
+    real = fcntl.fcntl
+
+    def refusing(file, command, *argument):
+        if command == fcntl.F_SETPIPE_SZ:
+            raise PermissionError(errno.EPERM, "Operation not permitted")
+        return real(file, command, *argument)
+
+    fcntl.fcntl = refusing
+
+
+def _append_after_reading() -> None:
+    """Every image is changed as soon as it was read."""
+    real = readers.read_stored
+
+    def changing(path, *arguments):
+        stored = real(path, *arguments)
+        with path.open("ab") as file:
+            file.write(b"changed")
+        return stored
+
+    readers.read_stored = changing
 
 
 if __name__ == "__main__":

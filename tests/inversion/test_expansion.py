@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from palpate.inversion.continuation import continued_at_finite_strain
-from palpate.inversion.directions import deciding_directions
-from palpate.inversion.invert import invert
 
-from palpate.inversion import continuation
+from palpate.errors import NotConverged
+from palpate.inversion import Outcome, continue_at_finite_strain, estimate, expansion, invert
+from palpate.inversion.objective import deciding_directions
 from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.laws.registry import law_named
 
@@ -24,49 +23,119 @@ def body(twins):
     truth = model.solve(twin.moduli, 0.7 * twin.coefficients).displacement
     scene = replace(twin.scene, displacement=truth)
     moved = replace(twin, scene=scene, coefficients=0.7 * twin.coefficients)
-    return moved, twins.exact_problem(moved), model
+    problem = twins.exact_problem(moved)
+    states = tuple(replace(state, finite_strain=model) for state in problem.states)
+    return moved, replace(problem, states=states), model
 
 
 @pytest.fixture(scope="module")
-def linear(twins, body):
-    return invert(body[1], twins.settings(0.5, 8.0), progress=twins.silent)
+def settings(twins):
+    return twins.settings(0.5, 8.0)
+
+
+@pytest.fixture(scope="module")
+def linear(twins, body, settings):
+    """What the finite-strain law is begun from."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(estimate, "continue_at_finite_strain", lambda found, *_, **__: found)
+        return invert(body[1], settings, progress=twins.silent)
 
 
 @pytest.fixture(scope="module", params=[0, 1000], ids=["those that decide", "all"])
-def continued(request, twins, body, linear):
+def continued(request, twins, linear, settings):
     """With the derivatives that decide the moduli made those of each equilibrium, or all of them."""
-    _, problem, model = body
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(continuation, "FEW", request.param)
-        return continued_at_finite_strain(
-            replace(problem, finite_strain=(model,)), linear, twins.settings(0.5, 8.0), progress=twins.silent
-        )
+        patch.setattr(expansion, "FEW", request.param)
+        return continue_at_finite_strain(linear, settings, progress=twins.silent)
+
+
+def split(inversion):
+    """Moduli and coefficients of the estimate, and its approximation."""
+    unknowns, parameters = inversion.minimum.unknowns, inversion.objective.parameters
+    return parameters.moduli(unknowns), unknowns[2:], inversion.objective.states[0].approximation
 
 
 def test_the_law_that_made_the_data_finds_the_moduli(twins, linear, continued):
     assert np.abs(linear.minimum.unknowns[:2] - twins.TRUTH).max() > 0.03  # or there would be nothing to show
-    assert continued.minimum.outcome.converged
-    assert continued.settled
+    assert continued.minimum.converged
+    assert continued.convergence.converged
     assert np.abs(continued.minimum.unknowns[:2] - twins.TRUTH).max() < 1e-3
 
 
 def test_the_derivatives_that_decide_the_moduli_are_those_of_the_equilibrium(body, continued):
     """The other columns may be those of an earlier one."""
-    objective, unknowns = continued.objective, continued.minimum.unknowns
-    there = body[2].solve(objective.modulus_map.moduli(unknowns[:2]), unknowns[2:])
-    directions = deciding_directions(objective, continued.minimum.evaluation)[0]
-    exact, stated = there.tangent() @ directions, continued.surrogates[0].reduced.derivatives @ directions
+    moduli, q, approximation = split(continued)
+    there = body[2].solve(moduli, q)
+    directions = deciding_directions(continued.objective.parameters, continued.minimum.evaluation)[0]
+    exact, stated = there.tangent() @ directions, approximation.model.derivatives @ directions
     assert np.linalg.norm(stated - exact, axis=0) == pytest.approx(0.0, abs=0.02 * np.linalg.norm(exact))
 
 
 def test_the_displacement_reported_is_an_equilibrium(body, continued):
-    model = body[2]
-    objective, unknowns = continued.objective, continued.minimum.unknowns
-    moduli = objective.modulus_map.moduli(unknowns[:2])
-    stated = continued.surrogates[0].reduced.solve(moduli, unknowns[2:]).displacement
-    assert stated == pytest.approx(model.solve(moduli, unknowns[2:]).displacement, abs=1e-5)
+    moduli, q, _ = split(continued)
+    stated = continued.objective.states[0].displacement(moduli, q)
+    assert stated == pytest.approx(body[2].solve(moduli, q).displacement, abs=1e-5)
 
 
-def test_every_start_carries_its_whole_history(linear, continued):
-    for before, after in zip(linear.minima, continued.minima, strict=True):
-        assert after.history[: len(before.history)] == before.history
+def test_every_start_keeps_the_steps_and_the_verdict_that_it_had_under_the_linear_law(linear, continued):
+    for before, after in zip(linear.starts, continued.starts, strict=True):
+        assert after.minimum.history == before.minimum.history
+        assert after.minimum.outcome is before.minimum.outcome
+        assert np.array_equal(after.theta, before.theta)
+
+
+def test_the_steps_that_the_starts_share_lead_from_one_of_them_to_the_estimate(continued):
+    history = [iterate.theta for iterate in continued.minimum.history]
+    ends = [start.minimum.unknowns[:2] for start in continued.starts]
+    assert min(np.abs(history[0] - end).max() for end in ends) < 1e-12
+    assert np.abs(history[-1] - continued.minimum.unknowns[:2]).max() < 1e-3
+
+
+def test_what_both_laws_cost_is_counted(linear, continued):
+    assert continued.counts.forward > linear.counts.forward
+    assert continued.counts.factorisations > linear.counts.factorisations
+    assert continued.evaluations > linear.evaluations
+
+
+def test_a_motion_without_equilibrium_ends_the_estimate_where_it_is_the_best_one(twins, linear, settings, monkeypatch):
+    def lost(*_):
+        raise NotConverged("folded")
+
+    monkeypatch.setattr(estimate, "_at_finite_strain", lost)
+    with pytest.raises(NotConverged, match="folded"):
+        continue_at_finite_strain(linear, settings, progress=twins.silent)
+
+
+def test_a_secondary_minimum_without_equilibrium_does_not_end_a_good_estimate(twins, linear, settings, monkeypatch):
+    """It is left out of the comparison, though its linear value is the smaller one, and is said to have none."""
+    first = linear.candidates[0]
+    away = first.minimum.unknowns + np.append(1.0, np.zeros(len(first.minimum.unknowns) - 1))
+    elsewhere = replace(first.iterate, minimum=replace(first.minimum, unknowns=away))
+    starts = (linear.starts[0], replace(linear.starts[1], candidate=1))
+    both = replace(linear, candidates=(first, estimate.Candidate(elsewhere, first.value - 100.0)), starts=starts)
+    whole = estimate._at_finite_strain
+
+    def only_the_best(iterate, *others):
+        if iterate is elsewhere:
+            raise NotConverged("folded")
+        return whole(iterate, *others)
+
+    monkeypatch.setattr(estimate, "_at_finite_strain", only_the_best)
+    found = continue_at_finite_strain(both, settings, progress=twins.silent)
+    assert found.minimum.converged
+    assert np.abs(found.minimum.unknowns[:2] - twins.TRUTH).max() < 1e-3
+    assert [c.minimum.outcome is Outcome.NO_EQUILIBRIUM for c in found.candidates] == [False, True]
+    assert [start.candidate for start in found.starts] == [0, 1]
+
+
+def test_starts_that_merge_under_the_law_of_the_case_are_one_candidate(twins, linear, settings):
+    """Two linear minima, from which the law of the case leads to the same moduli."""
+    first = linear.candidates[0]
+    away = first.minimum.unknowns + np.append(0.2, np.zeros(len(first.minimum.unknowns) - 1))
+    elsewhere = replace(first.iterate, minimum=replace(first.minimum, unknowns=away))
+    starts = (linear.starts[0], replace(linear.starts[1], candidate=1))
+    both = replace(linear, candidates=(first, estimate.Candidate(elsewhere, first.value + 1.0)), starts=starts)
+    found = continue_at_finite_strain(both, settings, progress=twins.silent)
+    assert len(found.candidates) == 1
+    assert [start.candidate for start in found.starts] == [0, 0]
+    assert np.abs(found.minimum.unknowns[:2] - twins.TRUTH).max() < 1e-3

@@ -108,6 +108,7 @@ def test_the_place_of_the_grid_adds_to_what_the_noise_leaves(twins, twin, voxels
 
 
 def test_surfaces_without_voxels_leave_nothing_to_the_place_of_the_grid(estimation, inversion):
+    assert not estimation.grid_covariance.any()
     residuals = sandwich_covariance(inversion.objective, inversion.minimum.evaluation)
     assert np.array_equal(estimation.covariance, residuals)
 
@@ -128,8 +129,8 @@ def test_every_start_has_its_own_steps_and_the_outer_loop_stands_once(estimation
     assert [start.end["gland"] for start in estimation.starts] == pytest.approx([steps[-1] for steps in gland])
     assert not set(gland[0]) & set(gland[1])
     outer = [step.moduli["gland"] for step in estimation.outer_loop]
-    assert len(outer) == len(inversion.minimum.history) > 1
-    assert outer[0] in pytest.approx([start.end["gland"] for start in estimation.starts])
+    assert len(outer) == len(inversion.minimum.history) >= 1
+    assert any(outer[0] == pytest.approx(start.end["gland"]) for start in estimation.starts)
     assert outer[-1] == pytest.approx(estimation.estimates[0].value)
 
 

@@ -47,7 +47,7 @@ def test_defaults_are_those_of_the_schema(case_file):
     assert case.estimate.start_ratios == (0.5, 2.0, 8.0)
     assert case.estimate.bounds_ratio == (0.02, 200.0)
     assert (case.noise.surface_sd_mm, case.noise.correlation_length_mm) == (None, None)
-    assert case.tissues[0].poisson_ratio == 0.45
+    assert case.tissues[0].with_labels((1,)).poisson_ratio == 0.45
 
 
 def test_paths_are_relative_to_the_file(case_file):
@@ -78,6 +78,24 @@ def test_a_name_missing_in_the_table_names_the_nearest(case_file):
         read_case(case_file).resolve_tissues({3: "rectum_wall", 2: "bladder"})
 
 
+def test_the_nearest_of_45000_names_is_found(case_file):
+    names = {i: f"organ {i}" for i in range(45_000)} | {50_000: "rectum_wall"}
+    with pytest.raises(ConfigurationError, match="did you mean 'rectum_wall'"):
+        read_case(case_file).resolve_tissues(names)
+
+
+def test_a_home_in_a_path_is_found_and_a_file_whose_name_looks_like_one_is_no_home(case_file, monkeypatch):
+    monkeypatch.setenv("HOME", "/home/somebody")
+    paths = [
+        read_case(case_file, [f"images.before='{name}'"]).images.before for name in ("~/a.nii", "./~b.nii", "~x/c.nii")
+    ]
+    assert [str(path) for path in paths] == [
+        "/home/somebody/a.nii",
+        str(case_file.parent / "~b.nii"),
+        str(case_file.parent / "~x" / "c.nii"),
+    ]
+
+
 def test_a_label_claimed_by_name_and_by_number_is_refused(case_file):
     with pytest.raises(ConfigurationError, match="claimed by tissue 'prostate' and by tissue 'rectum'"):
         read_case(case_file).resolve_tissues({1: "rectum"})
@@ -103,7 +121,7 @@ BAD = {
     "tissues.surroundings.label=1": "claimed by tissue 'prostate' and by tissue 'surroundings'",
     "tissues.rectum.label=remaining": "only one can be the rest",
     "tissues.rectum.label=[]": "label is",
-    "tissues.rectum.label=true": "label is True",
+    "tissues.rectum.label=true": "label is true",
     "tissues.rectum.label=-1": "label is -1",
     "tissues.prostate.role=driver": 'no tissue with role = "estimate"',
     "tissues.prostate.role=known": "give its youngs_modulus_kpa",
@@ -111,8 +129,8 @@ BAD = {
     "images.after=[]": "at least one entry",
     "images.after='after.nii.gz'": "list in square brackets",
     "images=3": "must be a table",
-    "mesh.edge_length_mm=0": "greater than zero",
-    "mesh.edge_length_mm=nan": "finite",
+    "mesh.edge_length_mm=0": "must be a number from 0.01 to 1000",
+    "mesh.edge_length_mm=nan": "is nan, but it must be a number",
     "seed=true": "whole number",
     "seed=1.5": "whole number",
     "mechanics.law=hooke": "did you mean",

@@ -8,7 +8,9 @@ import json
 import numpy as np
 import pytest
 
-from palpate.errors import NotConverged, SolverError
+from palpate.errors import InputDataError, NotConverged, SolverError
+from palpate.images.tissue import Role
+from palpate.report.collect import collect_failure
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.result import MeshResult, Simulation, failure_document
 
@@ -68,6 +70,14 @@ def test_an_error_still_makes_a_whole_document(case_result, error, status):
     assert set(document["estimates"][0]) >= ESTIMATE_KEYS
 
 
+def test_a_failed_estimate_without_anything_known_speaks_of_ratios(case_result):
+    case = case_result.case
+    assert {e["unit"] for e in failure_document(case, SolverError("x"))["estimates"]} == {"kPa"}
+    free = dataclasses.replace(case, tissues=tuple(t for t in case.tissues if t.role is not Role.KNOWN))
+    assert {e["unit"] for e in failure_document(free, SolverError("x"))["estimates"]} == {"ratio"}
+    assert collect_failure(free, SolverError("x")).unit == "ratio"
+
+
 def test_stiffness_takes_known_and_estimated_moduli_and_leaves_hollows_out(case_result):
     assert case_result.unit == "kPa"
     np.testing.assert_array_equal(case_result.stiffness, [58.9, 31.2, np.nan, 10.0])
@@ -85,12 +95,15 @@ def test_mesh_and_simulation_documents_are_strict_json(case_result):
     assert simulation.to_dict()["largest_displacement_mm"] == pytest.approx(largest)
 
 
-def test_digests_name_every_input(tmp_path, case_result):
+def test_digests_name_every_input_and_a_file_that_changed_between_two_readings_is_refused(tmp_path, case_result):
     (tmp_path / "b").write_bytes(b"abc")
-    images = dataclasses.replace(case_result.case.images, before=tmp_path / "b", after=(tmp_path / "b",))
-    digests = input_digests(dataclasses.replace(case_result.case, images=images))
-    assert set(digests) == {"before", "after[0]"}
-    assert digests["before"].startswith("ba7816bf")  # SHA-256 of "abc", FIPS 180-2, appendix B.1
+    images = dataclasses.replace(case_result.case.images, intensities_before=tmp_path / "b")
+    case = dataclasses.replace(case_result.case, images=images)
+    digests = input_digests(case, {"before": "1", "names": "2"}, {"pairs[0].before": "3", "names": "2"})
+    abc = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"  # FIPS 180-2, appendix B.1
+    assert digests == {"before": "1", "names": "2", "pairs[0].before": "3", "intensities_before": abc}
+    with pytest.raises(InputDataError, match="'names' was changed"):
+        input_digests(case, {"names": "1"}, {"names": "2"})
 
 
 def test_versions_name_python_and_palpate():

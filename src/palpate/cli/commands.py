@@ -34,7 +34,9 @@ def check(arguments: argparse.Namespace, _: None, progress: Progress) -> Outcome
     from palpate.study.check import check_case
 
     found = check_case(arguments.case_file, arguments.set, progress=progress)
-    return Outcome(found.to_dict(), found.text(), found.exit_code)
+    refused = "\n".join(problem.message for problem in found.problems if problem.exit_code)
+    complaint = refused if arguments.quiet else ""  # what is refused is said even then, as by any other command
+    return Outcome(found.to_dict(), found.text(), found.exit_code, complaint)
 
 
 def mesh(arguments: argparse.Namespace, case: Case, progress: Progress) -> Outcome:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Callable
 
 from palpate.cli.outcome import Outcome, columns
+from palpate.parallel import processors
 
 __all__ = ["reproduce"]
 
@@ -17,7 +17,7 @@ def reproduce(arguments: argparse.Namespace, _: None, progress: Callable[[str], 
     """One of the paper's experiments, our numbers beside its own."""
     from palpate.experiments.reproduce.run import reproduce as run
 
-    workers = min(os.cpu_count() or 1, PROCESSES)
+    workers = min(processors(), PROCESSES)
     result = run(arguments.experiment, arguments.output, progress=progress, workers=workers)
     notes = "\n".join(result.document["notes"])
     files = ", ".join((f"{arguments.experiment}.json", result.figure.name))

@@ -52,12 +52,17 @@ class VoxelGrid:
 
 @dataclass(frozen=True, slots=True)
 class LabelImage:
-    """Labels (n_x, n_y, n_z) int on `grid`; `names`: label -> name and `colours`: label -> #rrggbb, where given."""
+    """Labels (n_x, n_y, n_z) int on `grid`; `names`: label -> name and `colours`: label -> #rrggbb, where given.
+
+    `digests`: SHA-256 (hexadecimal) of the file it was read from, and of the file beside it that holds its voxels, if
+    there is one.
+    """
 
     labels: NDArray[np.int32]
     grid: VoxelGrid
     names: Mapping[int, str] = field(default_factory=dict)
     colours: Mapping[int, str] = field(default_factory=dict)
+    digests: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         labels = np.array(self.labels, dtype=np.int32)

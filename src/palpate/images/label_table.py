@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from palpate.errors import InputDataError
+from palpate.images.input_file import read_input
 from palpate.images.named_labels import LabelTable, checked_table
 from palpate.images.readers.table_registry import read_rows, table_formats
 
@@ -21,20 +23,25 @@ def read_label_table(path: Path | str) -> LabelTable:
     """
     path = Path(path)
     candidates = table_formats(path)
-    table = checked_table(read_rows(_text(path), path, candidates), path)
+    content, sha256 = _content(path)
+    table = checked_table(read_rows(_text(content, path), path, candidates), path)
     if not table:
         raise InputDataError(f"the label table '{path}' names no label; is it another file?")
-    return table
+    return replace(table, sha256=sha256)
 
 
-def _text(path: Path) -> str:
+def _content(path: Path) -> tuple[bytes, str]:
+    """The file's bytes and their digest."""
     try:
-        with path.open("rb") as file:
-            content = file.read(MAX_BYTES + 1)
+        content, sha256 = read_input(path, MAX_BYTES)
     except (OSError, ValueError) as error:
         raise InputDataError(f"the label table '{path}' cannot be read ({error}); check the path") from error
     if len(content) > MAX_BYTES:
         raise InputDataError(f"the label table '{path}' is larger than {MAX_BYTES} bytes; is it another file?")
+    return content, sha256
+
+
+def _text(content: bytes, path: Path) -> str:
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

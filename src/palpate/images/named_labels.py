@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from palpate.errors import InputDataError
 
-__all__ = ["MAX_LABEL", "MAX_NAME", "LabelTable", "NamedLabel", "checked_table", "hex_colour", "printable"]
+__all__ = [
+    "MAX_LABEL",
+    "MAX_NAME",
+    "LabelTable",
+    "NamedLabel",
+    "checked_table",
+    "computed_by_spreadsheets",
+    "hex_colour",
+    "printable",
+]
 
 MAX_LABEL = 65535
 MAX_NAME = 200
+FORMULA = ("=", "+", "-", "@")  # a spreadsheet would compute a cell that begins so
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,10 +36,14 @@ class NamedLabel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelTable(Mapping[int, str]):
-    """A label table: itself the mapping label -> name; `colours`: label -> #rrggbb where the table has one."""
+    """A label table: itself the mapping label -> name; `colours`: label -> #rrggbb where the table has one.
+
+    `sha256`: digest (hexadecimal) of the file it was read from, empty when there is none.
+    """
 
     names: Mapping[int, str] = field(default_factory=dict)
     colours: Mapping[int, str] = field(default_factory=dict)
+    sha256: str = ""
 
     def __getitem__(self, label: int) -> str:
         return self.names[label]
@@ -70,6 +85,15 @@ def _checked(row: NamedLabel, path: Path) -> NamedLabel:
 def printable(text: str) -> str:
     """`text` for a terminal, a page or a file name: what could command one (control, bidirectional) becomes "?"."""
     return "".join(letter if letter.isprintable() else "?" for letter in text)
+
+
+def computed_by_spreadsheets(name: str) -> bool:
+    """Whether a spreadsheet could take `name` in a CSV file for a formula, also where it splits cells at semicolons.
+
+    Wide letters count as their plain ones, and blanks are passed over, as some spreadsheets do.
+    """
+    parts = unicodedata.normalize("NFKC", name).split(";")
+    return any(part.strip().lstrip("'\"").startswith(FORMULA) for part in parts)
 
 
 def hex_colour(red: float, green: float, blue: float, *, top: float) -> str | None:

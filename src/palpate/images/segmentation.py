@@ -16,11 +16,12 @@ __all__ = ["Segmentation", "first_labels", "segment"]
 
 @dataclass(frozen=True, slots=True)
 class Segmentation:
-    """`index` (n_x, n_y, n_z) int16: which of `tissues` a voxel of `grid` belongs to."""
+    """`index` (n_x, n_y, n_z) int16: which of `tissues` a voxel of `grid` belongs to; `digests`: as of `LabelImage`."""
 
     index: NDArray[np.int16]
     grid: VoxelGrid
     tissues: tuple[Tissue, ...]
+    digests: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         index = np.array(self.index, dtype=np.int16)
@@ -64,7 +65,7 @@ def segment(image: LabelImage, tissues: tuple[Tissue, ...]) -> Segmentation:
         )
     table = np.array([owner.get(int(label), rest[0] if rest else -1) for label in labels], dtype=np.int16)
     described = tuple(_described(tissue, image) for tissue in tissues)
-    return Segmentation(table[inverse].reshape(image.labels.shape), image.grid, described)
+    return Segmentation(table[inverse].reshape(image.labels.shape), image.grid, described, image.digests)
 
 
 def _described(tissue: Tissue, image: LabelImage) -> Tissue:

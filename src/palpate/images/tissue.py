@@ -44,7 +44,7 @@ class Tissue:
                 " -1 < nu < 0.5; soft tissue is usually given 0.40 to 0.49"
             )
         modulus = self.youngs_modulus_kpa
-        if modulus is not None and not 0.0 < modulus < 1e9:
+        if modulus is not None and not 0.0 < modulus <= 1e9:
             raise ConfigurationError(
                 f"tissue '{self.name}': youngs_modulus_kpa is {modulus}; give a positive number in kPa"
                 " (soft tissue: 0.5 to 1000 kPa)"

@@ -30,8 +30,8 @@ class PelvisOptions:
 
     `filling_mm`: the rectum's wall moves so far where it moves most; `moduli_kpa` by tissue (default: prostate and
     bladder 15 to 60 kPa, a tumour 2 to 3 times its gland; the surroundings have 10 kPa); `poisson_ratio` of all
-    tissues (default 0.40 to 0.45 each); `bone_motion_mm` and as many degrees move each bone as a rigid body;
-    `law`: the tissues' (see `make_scene`).
+    tissues or by tissue (default 0.40 to 0.45 each); `bone_motion_mm` and as many degrees move each bone as a rigid
+    body; `law` and `c01_over_c10`: the tissues' (see `make_scene`).
     """
 
     seed: int
@@ -40,12 +40,13 @@ class PelvisOptions:
     field_mm: tuple[float, float, float] = (110.0, 120.0, 120.0)
     truth_edge_mm: float = 2.7
     moduli_kpa: Mapping[str, float] | None = None
-    poisson_ratio: float | None = None
+    poisson_ratio: float | Mapping[str, float] | None = None
     noise: Noise | None = None
     bones: bool = False
     bone_motion_mm: float = 0.0
     tumour: bool = False
     law: str = "linear"
+    c01_over_c10: float = 0.25
 
 
 def pelvis(options: PelvisOptions) -> Scene:
@@ -68,6 +69,7 @@ def pelvis(options: PelvisOptions) -> Scene:
         noise=options.noise,
         seed=options.seed,
         law=options.law,
+        c01_over_c10=options.c01_over_c10,
     )
 
 
@@ -101,6 +103,8 @@ def _parts(body: PelvisShapes, options: PelvisOptions) -> dict[str, LevelSet | N
 def _tissues(names: tuple[str, ...], options: PelvisOptions, rng: np.random.Generator) -> tuple[Tissue, ...]:
     moduli = _moduli(options, rng)
     ratios = dict(zip(moduli, rng.uniform(0.40, 0.45, len(moduli)), strict=True))
+    given = options.poisson_ratio or {}
+    ratios |= given if isinstance(given, Mapping) else dict.fromkeys(ratios, given)
     roles = {"rectum": Role.DRIVER, "left bone": Role.RIGID, "right bone": Role.RIGID, "surroundings": Role.KNOWN}
     tissues = []
     for label, name in enumerate(names, start=1):
@@ -108,8 +112,7 @@ def _tissues(names: tuple[str, ...], options: PelvisOptions, rng: np.random.Gene
         if name not in moduli:
             tissues.append(Tissue(name, role, (label,)))
             continue
-        ratio = ratios[name] if options.poisson_ratio is None else options.poisson_ratio
-        tissues.append(Tissue(name, role, (label,), float(ratio), float(moduli[name])))
+        tissues.append(Tissue(name, role, (label,), float(ratios[name]), float(moduli[name])))
     return tuple(tissues)
 
 

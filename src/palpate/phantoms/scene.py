@@ -87,15 +87,17 @@ def make_scene(
     noise: Noise | None,
     seed: int,
     law: str = "linear",
+    c01_over_c10: float = 0.25,
 ) -> Scene:
     """Mesh the anatomy, move the walls of its hollow tissues (outer border held), image both states.
 
-    `law`: the tissues', by its name in `case.toml`; finite strain on elements that do not lock.
+    `law`: the tissues', by its name in `case.toml`; finite strain on elements that do not lock; `c01_over_c10`: of
+    "mooney-rivlin".
     Every meshed tissue of the anatomy needs its `youngs_modulus_kpa`. `edge_length_mm` is the mesh's at the surfaces;
     `seed` only draws the noise. Raises `GeometryError` where the truth folds over or cannot be meshed.
     """
     space = lagrange_space(tetrahedralise(anatomy, edge_length_mm=edge_length_mm), "P2")
-    displacement = _equilibrium(space, motions, law_named(law))
+    displacement = _equilibrium(space, motions, law_named(law, c01_over_c10=c01_over_c10))
     smallest = float(deformation_determinants(space, displacement).min())
     if smallest <= 0.0:
         raise GeometryError(

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError
+from palpate.images.label_image import VoxelGrid
 from palpate.images.tissue import Role, Tissue
 from palpate.mesh.anatomy import Anatomy, LevelSet
 from palpate.phantoms.boundary_noise import smooth_field
@@ -16,7 +17,7 @@ from palpate.phantoms.motion import AffineMotion, Swelling, WallMotion
 from palpate.phantoms.scene import Noise, Scene, centred_grid, grid_box, make_scene
 from palpate.phantoms.shapes import Complement, ball
 
-__all__ = ["SPHERES_KINDS", "SpheresOptions", "spheres"]
+__all__ = ["SPHERES_KINDS", "SpheresOptions", "spheres", "spheres_anatomy"]
 
 SPHERES_KINDS = ("squeezed", "pushed", "tumour")
 CORE, SHELL, OUTSIDE = 10.0, 20.0, 30.0  # radii, mm
@@ -34,7 +35,8 @@ class SpheresOptions:
     is squeezed by a random stretch; "tumour", the same with a tumour out of the organ's centre; "pushed", a hollow
     core, the driver `cavity`, that grows in the shell, in a box of surroundings that is held. `push_mm`: the wall
     moves so far where it moves most. `moduli_kpa` by tissue (default: core 60, shell or organ 30, tumour 75,
-    surroundings 10); `law`: the tissues' (see `make_scene`).
+    surroundings 10); `poisson_ratio` of all or by tissue (default 0.45); `law` and `c01_over_c10`: the tissues' (see
+    `make_scene`).
     """
 
     seed: int
@@ -43,9 +45,10 @@ class SpheresOptions:
     spacing_mm: tuple[float, float, float] = (1.0, 1.0, 1.0)
     truth_edge_mm: float = 2.5
     moduli_kpa: Mapping[str, float] | None = None
-    poisson_ratio: float = 0.45
+    poisson_ratio: float | Mapping[str, float] = 0.45
     noise: Noise | None = None
     law: str = "linear"
+    c01_over_c10: float = 0.25
 
 
 def spheres(options: SpheresOptions) -> Scene:
@@ -53,22 +56,37 @@ def spheres(options: SpheresOptions) -> Scene:
 
     Raises `ConfigurationError` for an unknown kind or tissue, `GeometryError` when the truth folds over.
     """
-    if options.kind not in SPHERES_KINDS:
-        raise ConfigurationError(f"kind is '{options.kind}'; it must be one of {list(SPHERES_KINDS)}")
-    rng = np.random.default_rng(options.seed)
-    grid = centred_grid((2.0 * (OUTSIDE + MARGIN_MM),) * 3, options.spacing_mm)
-    centre = rng.uniform(-0.5, 0.5, 3) * grid.spacing
-    parts, motions = (_pushed if options.kind == "pushed" else _squeezed)(options, centre, rng)
-    anatomy = Anatomy(_tissues(tuple(parts), options), tuple(parts.values()), grid_box(grid))
+    anatomy, motions = _body(options)
     return make_scene(
         anatomy,
         motions,
-        grid,
+        _grid(options),
         edge_length_mm=options.truth_edge_mm,
         noise=options.noise,
         seed=options.seed,
         law=options.law,
+        c01_over_c10=options.c01_over_c10,
     )
+
+
+def spheres_anatomy(options: SpheresOptions) -> Anatomy:
+    """The analytic balls, tissues and true moduli of `options`; raises `ConfigurationError` as `spheres` does."""
+    return _body(options)[0]
+
+
+def _grid(options: SpheresOptions) -> VoxelGrid:
+    return centred_grid((2.0 * (OUTSIDE + MARGIN_MM),) * 3, options.spacing_mm)
+
+
+def _body(options: SpheresOptions) -> tuple[Anatomy, dict[str, WallMotion]]:
+    """The anatomy, and how its walls move."""
+    if options.kind not in SPHERES_KINDS:
+        raise ConfigurationError(f"kind is '{options.kind}'; it must be one of {list(SPHERES_KINDS)}")
+    rng = np.random.default_rng(options.seed)
+    grid = _grid(options)
+    centre = rng.uniform(-0.5, 0.5, 3) * grid.spacing
+    parts, motions = (_pushed if options.kind == "pushed" else _squeezed)(options, centre, rng)
+    return Anatomy(_tissues(tuple(parts), options), tuple(parts.values()), grid_box(grid)), motions
 
 
 Parts = dict[str, LevelSet | None]
@@ -112,7 +130,9 @@ def _tissues(names: tuple[str, ...], options: SpheresOptions) -> tuple[Tissue, .
         raise ConfigurationError(f"moduli_kpa names {unknown}; these spheres have {list(names)}")
     moduli = MODULI_KPA | given
     roles = {"frame": Role.DRIVER, "cavity": Role.DRIVER, "surroundings": Role.KNOWN}
+    stated = options.poisson_ratio
+    ratios = dict(stated) if isinstance(stated, Mapping) else dict.fromkeys(names, stated)
     return tuple(
-        Tissue(name, roles.get(name, Role.ESTIMATE), (label,), options.poisson_ratio, moduli.get(name))
+        Tissue(name, roles.get(name, Role.ESTIMATE), (label,), ratios.get(name, 0.45), moduli.get(name))
         for label, name in enumerate(names, start=1)
     )

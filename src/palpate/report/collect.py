@@ -34,7 +34,7 @@ from palpate.report.report_data import (
 from palpate.report.surfaces import MOST_TRIANGLES, contour_width, image_surface, model_surface
 from palpate.report.volume import MOST_VOXELS, grey_volume, label_volume
 from palpate.study.case import Case, CaseLoad, Images
-from palpate.study.result import CaseResult, failure_document
+from palpate.study.result import CaseResult, failure_document, stated_unit
 
 __all__ = ["collect", "collect_failure"]
 
@@ -110,7 +110,7 @@ def collect_failure(case: Case, error: PalpateError) -> ReportData:
         created=_now(),
         settings=_settings(case),
         tissues=_tissues(tissues, np.full(len(tissues), np.nan)),
-        unit="kPa",
+        unit=stated_unit(case),
     )
 
 
@@ -235,10 +235,12 @@ def _later(drawing: _Drawing, after: int, box: SliceBox | None) -> LaterImage:
 
 def _background(drawing: _Drawing, box: SliceBox) -> Volume:
     """The earlier grey image, or the labels where there is none or it cannot be read, which the page then says."""
-    images, before = drawing.pair.result.case.images, drawing.pair.result.before
+    result = drawing.pair.result
+    images, before = result.case.images, result.before
     if images is not None and images.intensities_before is not None:
         try:
-            values, grid = read_intensities(images.intensities_before)
+            digest = result.provenance.inputs.get("intensities_before")
+            values, grid = read_intensities(images.intensities_before, sha256=digest)
             return grey_volume(values, grid, box, most_voxels=_most_voxels(images))
         except PalpateError as error:
             LOGGER.warning("the grey image is left out of the report: %s", error)
@@ -264,7 +266,8 @@ def _later_background(result: CaseResult, after: int, box: SliceBox | None) -> V
         return label_volume(result.after[after], box)
     if after >= len(images.intensities_after):
         return None
-    values, grid = read_intensities(images.intensities_after[after])
+    digest = result.provenance.inputs.get(f"intensities_after[{after}]")
+    values, grid = read_intensities(images.intensities_after[after], sha256=digest)
     if values.shape != aligned.shape or not np.allclose(grid.spacing, aligned.spacing, rtol=1e-3):
         raise ValueError("the later grey image is not on the grid of its label image")
     return grey_volume(values, aligned, box, most_voxels=_most_voxels(images))

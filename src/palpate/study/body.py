@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -58,12 +58,16 @@ STATED = ("motion-below-noise", "sides-exchanged")  # findings on contacts stand
 
 @dataclass(frozen=True, slots=True)
 class ImagedStates:
-    """The reference state and the later states, brought to it; `bones`: each later state's motions by tissue index."""
+    """The reference state and the later states, brought to it; `bones`: each later state's motions by tissue index.
+
+    `inputs`: SHA-256 of each file that was read for them, by its key in `result.json`.
+    """
 
     before: Segmentation
     after: tuple[Segmentation, ...]
     bones: tuple[Mapping[int, RigidMotion], ...]
     findings: tuple[Finding, ...]
+    inputs: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from palpate.errors import ConfigurationError
+from palpate.images.named_labels import MAX_LABEL, MAX_NAME, computed_by_spreadsheets
 from palpate.images.tissue import Role, Tissue
-from palpate.study.schema import nearest, rule
+from palpate.study.schema import nearest, rule, shown
 
 __all__ = [
     "REMAINING",
@@ -25,29 +26,26 @@ __all__ = [
     "Noise",
     "Pair",
     "Phantom",
+    "is_tissue_name",
 ]
 
 REMAINING = "remaining"
 LAW_NAMES = ("linear", "neo-hookean", "mooney-rivlin")
 
-ALL_POSITIVE = "a list of positive numbers"
-LOW_HIGH = "[low, high] with 0 < low < high"
-
-
-def _above_zero(value: float) -> bool:
-    return value > 0
-
-
-def _all_above_zero(values: tuple[float, ...]) -> bool:
-    return len(values) > 0 and min(values) > 0
+POSITIVE_NUMBERS = "a list of positive numbers"
+LOW_HIGH = "[low, high] with low < high"
+LARGEST_SEED = 2**53 - 1  # the largest whole number that JSON keeps everywhere
+RATIOS = (1e-6, 1e6)
+KILOPASCALS = (1e-3, 1e9)  # of a modulus: from the softest gels to diamond
+POISSON_RATIO = 0.45
+POISSON_RATIOS = (-0.99, 0.4999)  # beyond, a solid loses its shape or its volume's give, and equations their digits
+STRESSES_KPA = (-1e4, 1e4)
+SEED = rule(between=(0, LARGEST_SEED))
+NOT_EMPTY = rule(test=bool, wanted="a list with at least one entry")
 
 
 def _ordered(bounds: tuple[float, float]) -> bool:
-    return 0 < bounds[0] < bounds[1]
-
-
-POSITIVE = rule(test=_above_zero, wanted="greater than zero")
-NOT_EMPTY = rule(test=bool, wanted="a list with at least one entry")
+    return bounds[0] < bounds[1]
 
 
 def _label(value: object) -> tuple[int, ...] | str:
@@ -55,12 +53,24 @@ def _label(value: object) -> tuple[int, ...] | str:
     if isinstance(value, str) and value:
         return value
     items = value if isinstance(value, list) else [value]
-    if not items or not all(isinstance(item, int) and not isinstance(item, bool) and item >= 0 for item in items):
+    whole = [item for item in items if isinstance(item, int) and not isinstance(item, bool)]
+    if not items or whole != items or not 0 <= min(whole) <= max(whole) <= MAX_LABEL:
         raise ConfigurationError(
-            f"a tissue's label is {value!r}; it must be an integer >= 0, a list of them, a name of the label table,"
-            f" or '{REMAINING}'"
+            f"a tissue's label is {shown(value)}; it must be an integer from 0 to {MAX_LABEL}, a list of them, a name"
+            f" of the label table, or '{REMAINING}'"
         )
     return tuple(items)
+
+
+def refuse_name(name: str, of: str) -> None:
+    """Raise `ConfigurationError` when `name` is no printable name of 1 to 200 characters; `of`: what it is of."""
+    if not name.isprintable() or not name.strip() or len(name) > MAX_NAME:
+        raise ConfigurationError(f"{of} is {shown(name)}; give a printable name of 1 to {MAX_NAME} characters")
+
+
+def is_tissue_name(name: str) -> bool:
+    """Whether a printable name may be a tissue's: our files list it beside other keys and in a table of cells."""
+    return name != "after" and name == name.strip() and not computed_by_spreadsheets(name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,29 +101,48 @@ class Domain:
     """What is meshed, and how its outer border is held."""
 
     extent: str = field(default="image", metadata=rule(choices=("image", "margin")))
-    margin_mm: float = field(default=40.0, metadata=POSITIVE)
+    margin_mm: float = field(default=40.0, metadata=rule(between=(0.1, 1e4)))
     outer_boundary: str = field(default="fixed", metadata=rule(choices=("fixed", "sliding", "free")))
 
 
 @dataclass(frozen=True, slots=True)
 class CaseTissue:
-    """A tissue as the case names it: `label` is a tuple of labels, a name of the label table, or "remaining"."""
+    """A tissue as the case names it: `label` is a tuple of labels, a name of the label table, or "remaining".
+
+    `poisson_ratio` None: 0.45, or what a phantom draws.
+    """
 
     name: str
     label: tuple[int, ...] | str = field(metadata=rule(convert=_label))
     role: Role
-    poisson_ratio: float = 0.45
-    youngs_modulus_kpa: float | None = None
-    density_kg_m3: float = field(default=1000.0, metadata=POSITIVE)
+    poisson_ratio: float | None = field(
+        default=None,
+        metadata=rule(
+            between=POISSON_RATIOS,
+            wanted="an isotropic elastic solid needs -1 < nu < 0.5; soft tissue is usually given 0.40 to 0.49",
+        ),
+    )
+    youngs_modulus_kpa: float | None = field(
+        default=None,
+        metadata=rule(between=KILOPASCALS, wanted="a positive number in kPa (soft tissue: 0.5 to 1000 kPa)"),
+    )
+    density_kg_m3: float = field(default=1000.0, metadata=rule(between=(0.1, 3e4)))
 
     def __post_init__(self) -> None:
-        if self.name == "after" or not self.name.isprintable() or not self.name.strip():
-            raise ConfigurationError(f"a tissue cannot be called {self.name!r}; choose another name for it")
+        refuse_name(self.name, "the name of a tissue")
+        if not is_tissue_name(self.name):
+            raise ConfigurationError(
+                f"a tissue cannot be called {shown(self.name)}; choose another name for it: not 'after', no blanks"
+                " around it, and nothing that spreadsheets compute, which begins with =, +, - or @ (also after a ;)"
+            )
+        if isinstance(self.label, str):
+            refuse_name(self.label, f"the label of tissue '{self.name}'")
         self.with_labels(())  # a tissue's constants are checked by the tissue itself
 
     def with_labels(self, labels: tuple[int, ...]) -> Tissue:
         """The tissue with its labels; raises `ConfigurationError` when its constants are impossible."""
-        return Tissue(self.name, self.role, labels, self.poisson_ratio, self.youngs_modulus_kpa)
+        ratio = POISSON_RATIO if self.poisson_ratio is None else self.poisson_ratio
+        return Tissue(self.name, self.role, labels, ratio, self.youngs_modulus_kpa)
 
     def resolve(self, names: Mapping[int, str]) -> Tissue:
         """The tissue with the labels that `names` (label -> name) gives to its label's name.
@@ -139,7 +168,7 @@ class Mechanics:
 
     law: str = field(default="neo-hookean", metadata=rule(choices=LAW_NAMES))
     element: str = field(default="auto", metadata=rule(choices=("P1", "P2", "P2-P0", "auto")))
-    c01_over_c10: float = field(default=0.25, metadata=rule(test=lambda value: value >= 0, wanted="zero or more"))
+    c01_over_c10: float = field(default=0.25, metadata=rule(between=(0.0, 1e3)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,10 +182,10 @@ class CaseLoad:
 
     kind: str = field(metadata=rule(choices=("pressure", "traction", "gravity")))
     surface: str | None = None
-    pressure_kpa: float | None = None
+    pressure_kpa: float | None = field(default=None, metadata=rule(between=STRESSES_KPA))
     following: bool = True
-    traction_kpa: tuple[float, float, float] | None = None
-    acceleration_m_s2: tuple[float, float, float] | None = None
+    traction_kpa: tuple[float, float, float] | None = field(default=None, metadata=rule(between=STRESSES_KPA))
+    acceleration_m_s2: tuple[float, float, float] | None = field(default=None, metadata=rule(between=(-100.0, 100.0)))
 
     def __post_init__(self) -> None:
         needed = {
@@ -178,7 +207,7 @@ class CaseLoad:
 class MeshSettings:
     """Edge length (mm) of the tetrahedra at the organs."""
 
-    edge_length_mm: float = field(default=4.0, metadata=POSITIVE)
+    edge_length_mm: float = field(default=4.0, metadata=rule(between=(0.01, 1e3)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,9 +217,9 @@ class DriverMotion:
     `learn_prior`: the images say how far and how smoothly the wall moves; kernel and amplitude are the first guess.
     """
 
-    modes: int = field(default=90, metadata=POSITIVE)
-    kernel_mm: float = field(default=20.0, metadata=POSITIVE)
-    prior_mm: float = field(default=5.0, metadata=POSITIVE)
+    modes: int = field(default=90, metadata=rule(between=(3, 10_000)))
+    kernel_mm: float = field(default=20.0, metadata=rule(between=(0.1, 1e3)))
+    prior_mm: float = field(default=5.0, metadata=rule(between=(1e-3, 1e3)))
     learn_prior: bool = True
 
 
@@ -198,8 +227,15 @@ class DriverMotion:
 class Noise:
     """Error of the segmented surfaces, mm; None: estimated from the residuals."""
 
-    surface_sd_mm: float | None = field(default=None, metadata=POSITIVE)
-    correlation_length_mm: float | None = field(default=None, metadata=POSITIVE)
+    surface_sd_mm: float | None = field(default=None, metadata=rule(between=(1e-4, 100.0)))
+    correlation_length_mm: float | None = field(default=None, metadata=rule(between=(0.01, 1e3)))
+
+    def __post_init__(self) -> None:
+        if self.correlation_length_mm is not None and self.surface_sd_mm is None:
+            raise ConfigurationError(
+                "[noise] has a correlation_length_mm without a surface_sd_mm, and would not be used: give both, or"
+                " neither, and both are estimated from the residuals"
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,14 +247,17 @@ class Estimate:
         default=("youngs_modulus",), metadata=rule(choices=("youngs_modulus",), later=("poisson_ratio",))
     )
     start_ratios: tuple[float, ...] = field(
-        default=(0.5, 2.0, 8.0), metadata=rule(test=_all_above_zero, wanted=ALL_POSITIVE)
+        default=(0.5, 2.0, 8.0), metadata=rule(between=RATIOS, test=bool, wanted=POSITIVE_NUMBERS)
     )
     starts_kpa: tuple[float, ...] | None = field(
-        default=None, metadata=rule(instead_of="start_ratios", test=_all_above_zero, wanted=ALL_POSITIVE)
+        default=None,
+        metadata=rule(instead_of="start_ratios", between=KILOPASCALS, test=bool, wanted=POSITIVE_NUMBERS),
     )
-    bounds_ratio: tuple[float, float] = field(default=(0.02, 200.0), metadata=rule(test=_ordered, wanted=LOW_HIGH))
+    bounds_ratio: tuple[float, float] = field(
+        default=(0.02, 200.0), metadata=rule(between=RATIOS, test=_ordered, wanted=LOW_HIGH)
+    )
     bounds_kpa: tuple[float, float] | None = field(
-        default=None, metadata=rule(instead_of="bounds_ratio", test=_ordered, wanted=LOW_HIGH)
+        default=None, metadata=rule(instead_of="bounds_ratio", between=KILOPASCALS, test=_ordered, wanted=LOW_HIGH)
     )
 
     def __post_init__(self) -> None:
@@ -229,17 +268,20 @@ class Estimate:
             outside = [start for start in starts or () if bounds and not bounds[0] < start < bounds[1]]
             if outside:
                 raise ConfigurationError(
-                    f"[estimate] {name}: {outside} do not lie between the bounds {list(bounds or ())}; move the start"
-                    " or widen the bounds"
+                    f"[estimate] {name}: {shown(outside)} do not lie between the bounds {list(bounds or ())}; move the"
+                    " start or widen the bounds"
                 )
 
 
 @dataclass(frozen=True, slots=True)
 class Phantom:
-    """A scene with a known truth instead of images; `law`: that of the truth (default: the case's)."""
+    """A scene with a known truth instead of images; `law`: that of the truth (default: the case's).
+
+    The truth's moduli and Poisson's ratios are those that the case's tissues state, else the phantom's own.
+    """
 
     kind: str = field(metadata=rule(choices=("pelvis", "spheres")))
-    seed: int = 1
+    seed: int = field(default=1, metadata=SEED)
     law: str | None = field(default=None, metadata=rule(choices=LAW_NAMES))
 
 
@@ -247,7 +289,7 @@ class Phantom:
 class Motion:
     """The driver's motion in a simulation: how far its wall moves outwards, mm."""
 
-    filling_mm: float = 7.0
+    filling_mm: float = field(default=7.0, metadata=rule(between=(-100.0, 100.0)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,8 +301,8 @@ class Case:
 
     id: str
     patient: str = ""
-    stage: int | None = None
-    seed: int = 0
+    stage: int | None = field(default=None, metadata=rule(between=(0, 1000)))
+    seed: int = field(default=0, metadata=SEED)
     images: Images | None = None
     pairs: tuple[Pair, ...] = ()
     phantom: Phantom | None = None
@@ -275,9 +317,9 @@ class Case:
     estimate: Estimate = Estimate()
 
     def __post_init__(self) -> None:
-        if not self.id.isprintable() or not self.id.strip() or len(self.id) > 200:
-            raise ConfigurationError(f"the case's id is {self.id[:50]!r}; give a printable name of 1 to 200 characters")
         object.__setattr__(self, "patient", self.patient or self.id)
+        refuse_name(self.id, "the case's id")
+        refuse_name(self.patient, "the case's patient")
         if (self.images is None) == (self.phantom is None):
             raise ConfigurationError(
                 f"case '{self.id}' needs either [images] (with before and after) or [phantom], and not both"
@@ -290,6 +332,10 @@ class Case:
         if self.pairs and self.images is None:
             raise ConfigurationError(
                 f"case '{self.id}' has [[pairs]] without [images]: name the first pair there, with the label table"
+            )
+        if self.phantom is not None and self.loads:
+            raise ConfigurationError(
+                f"case '{self.id}' has [[loads]] on a [phantom], whose walls alone move it; take the loads out"
             )
         self._check_tissues()
 
@@ -318,7 +364,9 @@ class Case:
             )
         remaining = [tissue.name for tissue in self.tissues if tissue.label == REMAINING]
         if len(remaining) > 1:
-            raise ConfigurationError(f"tissues {remaining} all have label = '{REMAINING}'; only one can be the rest")
+            raise ConfigurationError(
+                f"tissues {shown(remaining)} all have label = '{REMAINING}'; only one can be the rest"
+            )
         _check_claims([(t.name, (t.label,) if isinstance(t.label, str) else t.label) for t in self.tissues])
 
 

@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from palpate.errors import ConfigurationError
+from palpate.images.input_file import read_input
 from palpate.study.case import Case
-from palpate.study.schema import read_table
+from palpate.study.schema import read_table, shortened
 
 __all__ = ["read_case"]
 
-LARGEST_FILE = 1_000_000  # bytes; a case is a page of text
+LARGEST_FILE = 100_000  # bytes; a case is a page of text, and one of a hundred tissues has 40 000
+MOST_DOTS = 100  # in a line: keys of thousands of parts would take the parser minutes
 
 
 def read_case(path: Path, overrides: Sequence[str] = ()) -> Case:
@@ -37,35 +39,49 @@ def read_case(path: Path, overrides: Sequence[str] = ()) -> Case:
 
 def _read_text(path: Path) -> str:
     try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise ConfigurationError(
-                f"{path} is {path.stat().st_size} bytes long: this is no case file; give a case.toml"
-            )
-        return path.read_text(encoding="utf-8-sig")
+        content, _ = read_input(path, LARGEST_FILE)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise ConfigurationError(f"cannot read the case file {path}: {reason}; check its path") from error
+    if len(content) > LARGEST_FILE:
+        raise ConfigurationError(f"{path} is over {LARGEST_FILE} bytes long: this is no case file; give a case.toml")
+    try:
+        return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ConfigurationError(
             f"{path} is not UTF-8 text (byte {error.start}): give a case.toml saved as UTF-8"
         ) from error
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise ConfigurationError(f"cannot read the case file {path}: {reason}; check its path") from error
 
 
 def _parse(text: str, where: str) -> dict[str, Any]:
+    if max(line.count(".") for line in text.split("\n")) > MOST_DOTS:
+        raise ConfigurationError(
+            f"{where} has a line with over {MOST_DOTS} dots, and keys are not read that deep; break a long list into"
+            " several lines"
+        )
     try:
         return tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise ConfigurationError(f"{where} is not valid TOML: {error}") from error
+    except RecursionError as error:
+        raise ConfigurationError(f"{where} is not valid TOML: its brackets are nested too deep") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigurationError(f"{where} is not valid TOML: {shortened(str(error))}") from error
+    except ValueError as error:  # Python's own, on whole numbers of over 4300 digits
+        raise ConfigurationError(f"{where} is not valid TOML: a number in it is too long") from error
 
 
 def _parse_override(override: str) -> dict[str, Any]:
     key, equals, value = override.partition("=")
+    shown = f"--set {shortened(override)}"
     if not equals or not key.strip():
-        raise ConfigurationError(f"--set {override}: write key.path=value, as in --set mesh.edge_length_mm=3")
+        raise ConfigurationError(f"{shown}: write key.path=value, as in --set mesh.edge_length_mm=3")
+    if len(override) > LARGEST_FILE:
+        raise ConfigurationError(f"{shown} is longer than a case file may be")
     try:
-        return tomllib.loads(f"{key} = {value}")
-    except tomllib.TOMLDecodeError:
-        return _parse(f"{key} = {json.dumps(value.strip())}", f"--set {override}")
+        return _parse(f"{key} = {value}", shown)
+    except ConfigurationError as error:
+        if not isinstance(error.__cause__, tomllib.TOMLDecodeError):
+            raise
+        return _parse(f"{key} = {json.dumps(value.strip())}", shown)  # text may go without quotes
 
 
 def _merged(table: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:

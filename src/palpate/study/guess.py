@@ -10,7 +10,9 @@ import numpy as np
 
 from palpate.errors import InputDataError
 from palpate.images.label_image import LabelImage
+from palpate.images.named_labels import MAX_NAME
 from palpate.images.tissue import Role
+from palpate.study.case import is_tissue_name
 from palpate.study.plausibility import usual_modulus
 
 __all__ = ["GuessedTissue", "guess_tissues"]
@@ -199,15 +201,17 @@ def _order(guess: GuessedTissue) -> int:
 
 
 def _renamed(guesses: Sequence[GuessedTissue]) -> list[GuessedTissue]:
-    """Known tissues after the surroundings; every name once, and none that the case file reserves."""
+    """Known tissues after the surroundings; every name once, and none that a case file does not take for a tissue."""
     known = [g for g in guesses if g.role is Role.KNOWN and g.name != SURROUNDINGS]
     rest = [g for g in guesses if g.name == SURROUNDINGS]
     others = [g for g in guesses if g.role not in (Role.KNOWN, Role.VOID)]
     outside = [g for g in guesses if g.role is Role.VOID]
     found: list[GuessedTissue] = []
-    taken = {"after"}
+    taken: set[str] = set()
     for guess in [*others, *rest, *known, *outside]:
-        name = guess.name if guess.name not in taken else f"{guess.name} {guess.labels[0] if guess.labels else 'rest'}"
+        number = guess.labels[0] if guess.labels else "rest"
+        name = guess.name if is_tissue_name(guess.name) else f"label {number}"
+        name = name if name not in taken else f"{name[: MAX_NAME - 10]} {number}"
         taken.add(name)
         found.append(replace(guess, name=name))
     return found

@@ -2,35 +2,38 @@
 
 from __future__ import annotations
 
-import hashlib
 import platform
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 
 from palpate.errors import InputDataError
+from palpate.images.input_file import open_input
 from palpate.study.case import Case
 
-__all__ = ["input_digests", "software_versions"]
+__all__ = ["file_digest", "input_digests", "software_versions"]
 
 PACKAGES = ("palpate", "numpy", "scipy", "mmgpy", "libigl", "nibabel", "pyamg", "pypardiso", "matplotlib")
 
 
-def input_digests(case: Case) -> dict[str, str]:
-    """SHA-256 (hexadecimal) of every input file of the case, by its key: before, after[0], names, ...
+def input_digests(case: Case, *pairs: Mapping[str, str]) -> dict[str, str]:
+    """SHA-256 (hexadecimal) of the input files, by key: before, after[0], names, pairs[0].before, ...
 
-    Raises `InputDataError` when a file cannot be read.
+    `pairs`: those of each pair's files, of the bytes that were read; "before.voxels" is of the file beside a header.
+    Grey images, which only the report reads, are digested here, and held against this when they are read.
+    Raises `InputDataError` when a file cannot be read, or was changed between two readings.
     """
+    found: dict[str, str] = {}
+    for digests in pairs:
+        for key, digest in digests.items():
+            if found.setdefault(key, digest) != digest:
+                raise InputDataError(f"the file of '{key}' was changed while the case was read; run it again")
     images = case.images
     if images is None:
-        return {}
-    files = {"before": images.before} | {f"after[{i}]": path for i, path in enumerate(images.after)}
-    for number, pair in enumerate(case.pairs):
-        files |= {f"pairs[{number}].before": pair.before}
-        files |= {f"pairs[{number}].after[{i}]": path for i, path in enumerate(pair.after)}
-    files |= {"names": images.names} if images.names else {}
-    files |= {"intensities_before": images.intensities_before} if images.intensities_before else {}
-    files |= {f"intensities_after[{i}]": path for i, path in enumerate(images.intensities_after)}
-    return {key: _sha256(path) for key, path in files.items()}
+        return found
+    grey = {"intensities_before": images.intensities_before} if images.intensities_before else {}
+    grey |= {f"intensities_after[{i}]": path for i, path in enumerate(images.intensities_after)}
+    return found | {key: file_digest(path) for key, path in grey.items()}
 
 
 def software_versions() -> dict[str, str]:
@@ -44,9 +47,11 @@ def software_versions() -> dict[str, str]:
     return found
 
 
-def _sha256(path: Path) -> str:
+def file_digest(path: Path) -> str:
+    """SHA-256 (hexadecimal) of the file at `path`; raises `InputDataError` when it cannot be read."""
     try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise InputDataError(f"cannot read {path}: {error.strerror or error}; check the path in the case") from error
+        with open_input(path) as file:
+            return file.sha256()
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputDataError(f"cannot read {path}: {reason}; check the path in the case") from error

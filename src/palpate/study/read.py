@@ -11,15 +11,15 @@ from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_label_image
 from palpate.images.segmentation import Segmentation, segment
 from palpate.images.tissue import Tissue
-from palpate.phantoms.pelvis import PelvisOptions, pelvis
+from palpate.phantoms.pelvis import PelvisOptions, pelvis, pelvis_anatomy
 from palpate.phantoms.scene import Scene
-from palpate.phantoms.spheres import SpheresOptions, spheres
+from palpate.phantoms.spheres import SpheresOptions, spheres, spheres_anatomy
 from palpate.study.body import ImagedStates, aligned
-from palpate.study.case import Case
+from palpate.study.case import Case, CaseTissue
+from palpate.study.provenance import file_digest
+from palpate.study.schema import nearest, shown
 
 __all__ = ["phantom_scene", "read_pairs", "read_segmentation", "read_states"]
-
-FILLING_MM = 7.0
 
 
 def read_states(case: Case) -> ImagedStates:
@@ -33,14 +33,14 @@ def read_states(case: Case) -> ImagedStates:
         return aligned(segment(scene.before, scene.tissues), after, method=case.align, loaded=bool(case.loads))
     if case.images is None:
         raise ConfigurationError(f"case '{case.id}' has neither [images] nor [phantom]")
-    return _read_pair(case, case.images.before, case.images.after)
+    return _read_pair(case, case.images.before, case.images.after, key="")
 
 
 def read_pairs(case: Case) -> tuple[ImagedStates, ...]:
     """The same of each of the case's further [[pairs]]; their findings begin with the pair's number, from 2."""
     found = []
     for number, pair in enumerate(case.pairs, start=2):
-        states = _read_pair(case, pair.before, pair.after)
+        states = _read_pair(case, pair.before, pair.after, key=f"pairs[{number - 2}].")
         findings = tuple(replace(f, message=f"pair {number}: {f.message}") for f in states.findings)
         found.append(replace(states, findings=findings))
     return tuple(found)
@@ -59,19 +59,53 @@ def read_segmentation(
 
 
 def phantom_scene(case: Case) -> Scene:
-    """The scene of a case's [phantom] and [motion]; raises `ConfigurationError` when it has no phantom."""
+    """The scene of a case's [phantom] and [motion], its truth as the case's tissues state it.
+
+    Raises `ConfigurationError` when the case has no phantom, or tissues that its phantom has not.
+    """
     if case.phantom is None:
         raise ConfigurationError(f"case '{case.id}' has no [phantom]")
-    filling = case.motion.filling_mm if case.motion else FILLING_MM
-    law = case.phantom.law or case.mechanics.law
-    if case.phantom.kind == "spheres":
-        return spheres(SpheresOptions(seed=case.phantom.seed, law=law))
-    return pelvis(PelvisOptions(seed=case.phantom.seed, filling_mm=filling, law=law))
+    pelvic = case.phantom.kind == "pelvis"
+    options = PelvisOptions(case.phantom.seed) if pelvic else SpheresOptions(case.phantom.seed)
+    meshed = _phantom_tissues(case, options)
+    options = replace(
+        options,
+        law=case.phantom.law or case.mechanics.law,
+        c01_over_c10=case.mechanics.c01_over_c10,
+        moduli_kpa={t.name: t.youngs_modulus_kpa for t in meshed if t.youngs_modulus_kpa is not None},
+        poisson_ratio={t.name: t.poisson_ratio for t in meshed if t.poisson_ratio is not None},
+    )
+    if isinstance(options, PelvisOptions):
+        return pelvis(replace(options, filling_mm=case.motion.filling_mm) if case.motion else options)
+    return spheres(replace(options, push_mm=case.motion.filling_mm) if case.motion else options)
 
 
-def _read_pair(case: Case, before: Path, after: tuple[Path, ...]) -> ImagedStates:
+def _phantom_tissues(case: Case, options: PelvisOptions | SpheresOptions) -> tuple[CaseTissue, ...]:
+    """Those of the case's tissues that its phantom meshes; raises `ConfigurationError` for one that it has not so."""
+    anatomy = pelvis_anatomy(options) if isinstance(options, PelvisOptions) else spheres_anatomy(options)
+    own = {tissue.name: tissue for tissue in anatomy.tissues}
+    for tissue in case.tissues:
+        if tissue.name not in own:
+            raise ConfigurationError(f"the phantom has no tissue '{tissue.name}': {nearest(tissue.name, own)}")
+        role = own[tissue.name].role
+        if tissue.role is not role or tissue.label != tissue.name:
+            raise ConfigurationError(
+                f"the phantom's tissue '{tissue.name}' has the role {role} and that name for its label; the case cannot"
+                f" give it the role {tissue.role} and the label {shown(tissue.label)}"
+            )
+    return tuple(tissue for tissue in case.tissues if own[tissue.name].meshed)
+
+
+def _read_pair(case: Case, before: Path, after: tuple[Path, ...], *, key: str) -> ImagedStates:
+    """One pair; `key` begins the keys of its files' digests."""
     table = case.images.names if case.images else None
     names = read_label_table(table) if table else None
     reference = read_segmentation(case, before, names, None)
     later = tuple(read_segmentation(case, path, names, reference.tissues) for path in after)
-    return aligned(reference, later, method=case.align, loaded=bool(case.loads))
+    states = aligned(reference, later, method=case.align, loaded=bool(case.loads))
+    inputs = {"names": names.sha256} if names else {}
+    keys = (f"{key}before", *(f"{key}after[{i}]" for i in range(len(later))))
+    for name, image, path in zip(keys, (reference, *later), (before, *after), strict=True):
+        own, *voxels = image.digests or (file_digest(path),)  # a reader from elsewhere may not say what it read
+        inputs |= {name: own} | {f"{name}.voxels": digest for digest in voxels}
+    return replace(states, inputs=inputs)

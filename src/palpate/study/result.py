@@ -18,7 +18,7 @@ from palpate.images.tissue import Role, Tissue
 from palpate.inversion import Estimation, Remark
 from palpate.inversion.result import ModulusEstimate, Start, TissueFit, no_estimate
 from palpate.mesh.space import LagrangeSpace
-from palpate.study.case import Case
+from palpate.study.case import Case, CaseTissue
 
 __all__ = [
     "CaseResult",
@@ -31,6 +31,7 @@ __all__ = [
     "failure_document",
     "image_names",
     "json_object",
+    "stated_unit",
 ]
 
 SCHEMA = "palpate.result/1"
@@ -105,8 +106,7 @@ class CaseResult:
     @property
     def unit(self) -> str:
         """Unit of `stiffness`: "kPa", or "ratio" when neither a modulus nor a load is known."""
-        known = any(tissue.role is Role.KNOWN for tissue in self.tissues)
-        return "kPa" if known or self.case.loads else "ratio"
+        return _unit(self.case, self.tissues)
 
     @property
     def stiffness(self) -> NDArray[np.float64]:
@@ -192,7 +192,7 @@ def failure_document(case: Case, error: PalpateError) -> dict[str, Any]:
     why = f"the estimation ended with the status '{status}'"
     unknown = [tissue.name for tissue in case.tissues if tissue.role is Role.ESTIMATE]
     known = [tissue.name for tissue in case.tissues if tissue.role is Role.KNOWN]
-    absolute = bool(known or case.loads or case.phantom)
+    absolute = stated_unit(case) == "kPa"
     empty: dict[str, Any] = {
         "estimates": [
             _estimate(no_estimate(name, absolute=absolute, relative_to=(known or unknown)[0], why=why), status)
@@ -207,6 +207,16 @@ def failure_document(case: Case, error: PalpateError) -> dict[str, Any]:
         "note": "",
     }
     return json_object(_heading(case, status, str(error)) | empty | _closing(case, Provenance(), ()))
+
+
+def stated_unit(case: Case) -> str:
+    """Unit of the moduli that a case asks for: "kPa", or "ratio" when neither a modulus nor a load is known."""
+    return _unit(case, case.tissues)
+
+
+def _unit(case: Case, tissues: Sequence[Tissue | CaseTissue]) -> str:
+    known = any(tissue.role is Role.KNOWN for tissue in tissues) or case.phantom is not None  # whose surroundings are
+    return "kPa" if known or case.loads else "ratio"
 
 
 def json_object(mapping: Mapping[str, Any]) -> dict[str, Any]:

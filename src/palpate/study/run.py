@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from palpate.errors import ConfigurationError
+from palpate.errors import ConfigurationError, EstimationError
 from palpate.images.tissue import Role
 from palpate.inversion import (
     Bounds,
@@ -63,7 +63,7 @@ def estimate(case: Case, *, progress: Progress = silent, truth: Mapping[str, flo
     progress("reading and aligning the images")
     states, further = read_states(case), read_pairs(case)
     truth = _truth(states) if case.phantom else truth
-    inputs = input_digests(case)  # now, of the files as they were read: an estimate takes minutes
+    inputs = input_digests(case, states.inputs, *(pair.inputs for pair in further))
     seconds = time.perf_counter() - began
     result = estimate_states(states, case, progress=progress, truth=truth, read_seconds=seconds, further=further)
     return replace(result, provenance=replace(result.provenance, inputs=inputs))
@@ -90,11 +90,18 @@ def estimate_states(
     problem = joint_problem(bodies, case, progress=progress)
     clock.append(time.perf_counter())
     settings = inversion_settings(case, problem.parameters)
-    inversion = invert(problem, settings, progress=progress)
-    progress("intervals: residuals' correlation, grid position, driver")
-    images = tuple(image.index for pair in bodies for image in pair.states.after)
-    observed = Observed(fitted_states(inversion, *bodies), images)
-    estimation = conclude(inversion, settings, observed, truth=truth or {}, seed=case.seed)
+    try:
+        inversion = invert(problem, settings, progress=progress)
+        progress("intervals: residuals' correlation, grid position, driver")
+        images = tuple(image.index for pair in bodies for image in pair.states.after)
+        observed = Observed(fitted_states(inversion, *bodies), images)
+        estimation = conclude(inversion, settings, observed, truth=truth or {}, seed=case.seed)
+    except np.linalg.LinAlgError as error:
+        raise EstimationError(
+            f"the images do not determine what is sought ({error}): beside the noise ([noise] surface_sd_mm, or that of"
+            " the residuals) the driver's motion cannot be told from none; state the noise smaller, or use images in"
+            " which the organs move more"
+        ) from error
     clock.append(time.perf_counter())
     stages = np.diff(clock)
     seconds = {"read": read_seconds, "mesh": stages[0], "assemble": stages[1], "estimate": stages[2]}
@@ -120,7 +127,8 @@ def mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
     """Mesh the reference state of a case and pass it through the gate."""
     began = time.perf_counter()
     progress("reading and aligning the images")
-    states, inputs = read_states(case), input_digests(case)
+    states = read_states(case)
+    inputs = input_digests(case, states.inputs)
     body = make_body(states, case, progress=progress)
     seconds = {"total": round(time.perf_counter() - began, 3)}
     provenance = Provenance(seconds, inputs, software_versions())

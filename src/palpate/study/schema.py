@@ -4,18 +4,26 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import math
+import heapq
+import os
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
 from palpate.errors import ConfigurationError
+from palpate.images.named_labels import printable
 
-__all__ = ["Rule", "nearest", "read_table", "rule"]
+__all__ = ["Rule", "nearest", "read_table", "rule", "shortened", "shown"]
+
+MOST_LETTERS = 4096  # of a text: the longest path that systems take
+MOST_SHOWN = 80  # letters of a text in a sentence
+MOST_OTHERS = 15  # known names that a hint lists
+MOST_COMPARED = 300  # names that are compared letter by letter with a mistyped one
 
 T = TypeVar("T")
 
@@ -25,12 +33,14 @@ class Rule:
     """What a key's value must be beyond its type.
 
     choices: the values it may have; later: values of the schema that this version does not offer yet;
-    test and wanted: a condition and its wording; instead_of: the key that may not stand beside this one;
-    convert: reads a value whose type alone does not say how.
+    between: the least and the largest number, either of which it may be; test: a condition; wanted: what it must be,
+    in words, beside the numbers; instead_of: the key that may not stand beside this one; convert: reads a value whose
+    type alone does not say how.
     """
 
     choices: tuple[str, ...] = ()
     later: tuple[str, ...] = ()
+    between: tuple[float, float] | None = None
     test: Callable[[Any], bool] | None = None
     wanted: str = ""
     instead_of: str = ""
@@ -41,21 +51,34 @@ def rule(
     *,
     choices: tuple[str, ...] = (),
     later: tuple[str, ...] = (),
+    between: tuple[float, float] | None = None,
     test: Callable[[Any], bool] | None = None,
     wanted: str = "",
     instead_of: str = "",
     convert: Callable[[object], object] | None = None,
 ) -> dict[str, Rule]:
     """The metadata of a dataclass field that carries a `Rule`; arguments as there."""
-    return {"rule": Rule(choices, later, test, wanted, instead_of, convert)}
+    return {"rule": Rule(choices, later, between, test, wanted, instead_of, convert)}
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
     """A hint that names the known word closest to `word`, and the others; `known` has at least one."""
     names = sorted(set(known))
-    closest = max(names, key=lambda name: difflib.SequenceMatcher(None, word.lower(), name.lower()).ratio())
-    others = [name for name in names if name != closest]
-    return f"did you mean '{closest}'?" + (f" (others: {', '.join(others[:15])})" if others else "")
+    sought = word[:MOST_SHOWN].lower()
+    letters = set(sought)
+    # Comparing letter by letter is slow: only names of like length that share most letters are, where there are many.
+    alike = heapq.nsmallest(
+        MOST_COMPARED, names, key=lambda n: len(letters ^ set(n.lower())) + abs(len(n) - len(sought))
+    )
+    closest = max(alike, key=lambda name: difflib.SequenceMatcher(None, sought, name.lower()).ratio())
+    others = [shortened(name) for name in names[: MOST_OTHERS + 1] if name != closest][:MOST_OTHERS]
+    return f"did you mean '{shortened(closest)}'?" + (f" (others: {', '.join(others)})" if others else "")
+
+
+def shortened(text: str) -> str:
+    """`text` for a sentence: its beginning, printable."""
+    shown = printable(text[:MOST_SHOWN])
+    return shown if len(text) <= MOST_SHOWN else f"{shown}... ({len(text)} characters)"
 
 
 def read_table(kind: type[T], table: Mapping[str, object], *, where: str, folder: Path) -> T:
@@ -66,17 +89,24 @@ def read_table(kind: type[T], table: Mapping[str, object], *, where: str, folder
     fields = {field.name: field for field in dataclasses.fields(typing.cast("Any", kind))}
     for key in table:
         if key not in fields:
-            raise ConfigurationError(f"unknown key '{key}' in {where}: {nearest(key, fields)}")
+            raise ConfigurationError(f"unknown key '{shortened(key)}' in {where}: {nearest(key, fields)}")
     _check_complete(fields.values(), table, where)
-    hints = typing.get_type_hints(kind)
+    hints = _hints(typing.cast("Any", kind))
     values: dict[str, Any] = {}
     for key, value in table.items():
         place = _Place(key, where, folder)
         bounds: Rule = fields[key].metadata.get("rule", Rule())
+        _check_range(bounds, value, place)
         converted = bounds.convert(value) if bounds.convert else _convert(hints[key], value, place)
         _check_value(bounds, converted, place)
         values[key] = converted
     return kind(**values)
+
+
+@cache
+def _hints(kind: type[Any]) -> Mapping[str, Any]:
+    """Types of the fields of a dataclass; to resolve them takes longer than to read its table."""
+    return typing.get_type_hints(kind)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,13 +118,13 @@ class _Place:
     folder: Path
 
     def __str__(self) -> str:
-        return f"'{self.key}' in {self.where}"
+        return f"'{shortened(self.key)}' in {self.where}"
 
     @property
     def table(self) -> str:
         """The table of that name, as it is written in TOML."""
         inner = self.where[1:-1] + "." if self.where.startswith("[") else ""
-        return f"[{inner}{self.key}]"
+        return f"[{inner}{shortened(self.key)}]"
 
 
 def _check_complete(fields: Iterable[dataclasses.Field[Any]], table: Mapping[str, object], where: str) -> None:
@@ -107,6 +137,19 @@ def _check_complete(fields: Iterable[dataclasses.Field[Any]], table: Mapping[str
             raise ConfigurationError(f"'{field.name}' and '{other}' in {where} say the same thing; give one of them")
 
 
+def _check_range(bounds: Rule, value: object, place: _Place) -> None:
+    """Numbers are checked as they stand in the file: one of 400 digits is no float, and none of 5000 can be shown."""
+    if bounds.between is None:
+        return
+    low, high = bounds.between
+    for item in value if isinstance(value, list) else (value,):
+        if isinstance(item, int | float) and not isinstance(item, bool) and not low <= item <= high:  # NaN fails, too
+            words = f": {bounds.wanted}" if bounds.wanted else ""
+            raise ConfigurationError(
+                f"{place} is {shown(item)}, but it must be a number from {low:.16g} to {high:.16g}{words}"
+            )
+
+
 def _check_value(bounds: Rule, value: object, place: _Place) -> None:
     for item in value if isinstance(value, tuple) else (value,):
         if item in bounds.later:
@@ -114,9 +157,9 @@ def _check_value(bounds: Rule, value: object, place: _Place) -> None:
                 f"{place} is '{item}', which this version of Palpate does not offer yet; use {_either(bounds.choices)}"
             )
         if bounds.choices and item not in bounds.choices:
-            raise ConfigurationError(f"{place} is {item!r}: {nearest(str(item), bounds.choices)}")
+            raise ConfigurationError(f"{place} is {shown(item)}: {nearest(str(item), bounds.choices)}")
     if bounds.test is not None and value is not None and not bounds.test(value):
-        raise ConfigurationError(f"{place} is {_shown(value)}, but it must be {bounds.wanted}")
+        raise ConfigurationError(f"{place} is {shown(value)}, but it must be {bounds.wanted}")
 
 
 def _convert(hint: Any, value: object, place: _Place) -> object:
@@ -130,11 +173,12 @@ def _convert(hint: Any, value: object, place: _Place) -> object:
     if dataclasses.is_dataclass(hint):
         return _convert_table(hint, value, place)
     if hint is Path:
-        return place.folder / Path(_expect(value, str, "a path in quotes", place=place)).expanduser()
+        text = _expect(value, str, "a path in quotes", place=place)
+        return place.folder / os.path.expanduser(text)  # noqa: PTH111 - a Path has forgotten that "./~x" is no home
     if issubclass(hint, StrEnum):
         word = _expect(value, str, "a word in quotes", place=place)
         if word not in list(hint):
-            raise ConfigurationError(f"{place} is '{word}': {nearest(word, list(hint))}")
+            raise ConfigurationError(f"{place} is '{shortened(word)}': {nearest(word, list(hint))}")
         return hint(word)
     return _convert_plain(hint, value, place)
 
@@ -144,9 +188,7 @@ def _convert_plain(hint: Any, value: object, place: _Place) -> object:
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if hint is not bool and isinstance(value, bool):  # to Python, true is the number 1
-        raise ConfigurationError(f"{place} is {_shown(value)}, but it must be {wanted}")
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ConfigurationError(f"{place} is {value}, but it must be a finite number")
+        raise ConfigurationError(f"{place} is {shown(value)}, but it must be {wanted}")
     return _expect(value, hint, wanted, place=place)
 
 
@@ -159,23 +201,32 @@ def _convert_tuple(arms: tuple[Any, ...], value: object, place: _Place) -> objec
     if dataclasses.is_dataclass(kind) and isinstance(value, dict):  # [tissues.NAME]: the key is the name
         places = {name: _Place(name, place.table, place.folder) for name in value}
         tables = {name: _expect(table, dict, "a table", place=places[name]) for name, table in value.items()}
+        for name, table in tables.items():
+            if "name" in table:
+                raise ConfigurationError(f"unknown key 'name' in {places[name].table}: the table's own name is it")
         return tuple(_convert_table(kind, {**table, "name": name}, places[name]) for name, table in tables.items())
     items = _expect(value, list, "a list in square brackets", place=place)
     if arms[-1] is not Ellipsis and len(items) != len(arms):
-        raise ConfigurationError(f"{place} is {_shown(items)}, but it must hold {len(arms)} values")
+        raise ConfigurationError(f"{place} is {shown(items)}, but it must hold {len(arms)} values")
     return tuple(_convert(kind, item, place) for item in items)
 
 
 def _expect(value: object, kind: type[Any], wanted: str, *, place: _Place) -> Any:
+    if isinstance(value, str) and len(value) > MOST_LETTERS:
+        raise ConfigurationError(f"{place} is text of {len(value)} characters; at most {MOST_LETTERS} are taken")
     if not isinstance(value, kind):
-        raise ConfigurationError(f"{place} is {_shown(value)}, but it must be {wanted}")
+        raise ConfigurationError(f"{place} is {shown(value)}, but it must be {wanted}")
     return value
 
 
-def _shown(value: object) -> str:
-    if isinstance(value, tuple):
-        return str(list(value))
-    return {True: "true", False: "false"}[value] if isinstance(value, bool) else repr(value)
+def shown(value: object) -> str:
+    """A value of a TOML file for a sentence: as it would be written, or its beginning."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    try:
+        return shortened(repr(list(value) if isinstance(value, tuple) else value))
+    except ValueError:  # Python does not write out whole numbers of over 4300 digits
+        return "a number too long to be shown"
 
 
 def _either(words: tuple[str, ...]) -> str:

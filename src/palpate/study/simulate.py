@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +44,7 @@ def simulate(case: Case, *, progress: Progress, steps: int = 1) -> Simulation:
     an `estimate` tissue has no modulus, `NotConverged` where a finite-strain path ends early.
     """
     began = time.perf_counter()
-    inputs = input_digests(case)
+    inputs: Mapping[str, str] = {}
     if case.phantom is not None:
         scene = phantom_scene(case)
         space, tissues = scene.space, scene.tissues
@@ -53,6 +53,7 @@ def simulate(case: Case, *, progress: Progress, steps: int = 1) -> Simulation:
     else:
         progress("reading and aligning the images")
         states = read_states(case)
+        inputs = input_digests(case, states.inputs)
         tissues = states.before.tissues
         _refuse_unknown(tissues)
         body = make_body(states, case, progress=progress)

@@ -17,6 +17,7 @@ from typing import Any
 
 from palpate.errors import ResourceError
 from palpate.experiments.reproduce.ledger import Ledger, Part
+from palpate.parallel import processors
 
 __all__ = ["Job", "Progress", "compute"]
 
@@ -66,7 +67,7 @@ def _made_by(jobs: Sequence[Job], workers: int, progress: Progress) -> Iterator[
     pipes = [context.Pipe() for _ in range(min(workers, len(jobs)))]
     processes = [context.Process(target=_work, args=(theirs,), daemon=True) for _, theirs in pipes]
     try:
-        with _threads(max(1, (os.cpu_count() or 1) // len(pipes))):
+        with _threads(max(1, processors() // len(pipes))):
             for process in processes:
                 process.start()
         for _, theirs in pipes:

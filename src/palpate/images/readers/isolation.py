@@ -14,7 +14,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -27,12 +27,16 @@ from palpate.images.named_labels import NamedLabel, printable
 from palpate.images.readers.registry import ImageFormat, StoredImage
 from palpate.images.readers.voxel_stream import MAX_VOXELS, read_exactly
 
+if sys.platform == "linux":
+    import fcntl
+
 __all__ = ["GREETING", "ReadLimits", "read_stored"]
 
 GREETING = b"palpate reads\n"
 PIPE = 2**20  # bytes that the pipe holds, where the system lets us choose
 MAX_ANSWER = 2**24  # bytes of the line that goes before the voxels
 DTYPE = re.compile(r"[<>|][iuf][1248]")
+DIGEST = re.compile(r"[0-9a-f]{64}")
 ERRORS: Mapping[str, type[PalpateError]] = {
     error.__name__: error for error in (ConfigurationError, InputDataError, ResourceError)
 }
@@ -93,16 +97,24 @@ def _reader(
 
 def _started(command: list[str], path: Path) -> subprocess.Popen[bytes]:
     try:
-        return subprocess.Popen(  # noqa: S603 - our own interpreter and module, no shell
+        process = subprocess.Popen(  # noqa: S603 - our own interpreter and module, no shell
             command,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             env=_environment(),
-            pipesize=PIPE,
         )
     except OSError as error:
         raise _not_started(path) from error
+    _widen(cast("BinaryIO", process.stdout))
+    return process
+
+
+def _widen(pipe: BinaryIO) -> None:
+    """Let the pipe hold more at once; the system may refuse, when its share for this user is used up."""
+    if sys.platform == "linux":
+        with suppress(OSError):
+            fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, PIPE)
 
 
 def _not_started(path: Path) -> ResourceError:
@@ -143,7 +155,9 @@ def _stored(answer: Mapping[str, Any], pipe: BinaryIO, path: Path) -> StoredImag
         shape = tuple(int(n) for n in answer["shape"])
         affine = np.array(answer["affine"], dtype=np.float64)
         names = tuple(NamedLabel(int(k), str(name), None if c is None else str(c)) for k, name, c in answer["names"])
-        valid = len(shape) == 3 and min(shape) > 0 and affine.shape == (4, 4) and DTYPE.fullmatch(answer["dtype"])
+        digests = tuple(str(digest) for digest in answer.get("digests", ()))
+        placed = len(shape) == 3 and min(shape) > 0 and affine.shape == (4, 4)
+        valid = placed and DTYPE.fullmatch(answer["dtype"]) and all(map(DIGEST.fullmatch, digests))
     except (KeyError, TypeError, ValueError):
         valid = None
     if not valid or math.prod(shape) > MAX_VOXELS:
@@ -151,7 +165,7 @@ def _stored(answer: Mapping[str, Any], pipe: BinaryIO, path: Path) -> StoredImag
             f"the process that read '{path}' gave an answer that cannot be used; export the image again"
         )
     values = _received(pipe, shape, np.dtype(answer["dtype"]), path)
-    return None if values is None else StoredImage(values, affine, names)
+    return None if values is None else StoredImage(values, affine, names, digests)
 
 
 def _received(pipe: BinaryIO, shape: tuple[int, ...], dtype: np.dtype[Any], path: Path) -> NDArray[Any] | None:

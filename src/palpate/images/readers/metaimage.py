@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
+from palpate.images.input_file import open_input
 from palpate.images.named_labels import printable
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
 from palpate.images.readers.text_header import beside, counts, header_line, numbers
@@ -53,15 +54,18 @@ def read_metaimage(path: Path) -> StoredImage:
     """Read one image of three axes from `path`; raises `InputDataError` with a sentence for whatever is wrong."""
     try:
         with ExitStack() as stack:
-            file = stack.enter_context(path.open("rb"))
+            file = stack.enter_context(open_input(path))
+            files = [file]
             header = _header(file, path)
             block, affine = _block(header, path), _affine(header, path)
             if header[LAST].upper() != "LOCAL":
-                file = stack.enter_context(beside(path, header[LAST]).open("rb"))
+                file = stack.enter_context(open_input(beside(path, header[LAST])))
+                files.append(file)
             values = read_block(file, block, path)
+            digests = tuple(each.sha256() for each in files)
     except (OSError, EOFError, zlib.error) as error:
         raise damaged(path, error) from error
-    return StoredImage(values.reshape(block.shape[:3], order="F"), affine)
+    return StoredImage(values.reshape(block.shape[:3], order="F"), affine, digests=digests)
 
 
 def _header(file: BinaryIO, path: Path) -> dict[str, str]:

@@ -22,6 +22,7 @@ from nibabel.spatialimages import HeaderDataError
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, InputDataError, ResourceError
+from palpate.images.input_file import open_input
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
 from palpate.images.readers.voxel_stream import MAX_OFFSET, check_end, check_size, damaged, read_exactly
@@ -53,18 +54,20 @@ class _Layout:
 def read_nifti(path: Path) -> StoredImage:
     """Read one image of three axes from `path`; raises `InputDataError` with a sentence for whatever is wrong."""
     try:
-        with path.open("rb") as file:
+        with open_input(path) as file:
             stream = _uncompressed(file, path)
             header, used = _header(stream, path)
             layout = _layout(header, path)
-            size = os.fstat(file.fileno()).st_size
-            check_size(layout.shape, layout.offset + layout.n_bytes, path, available=size, packed=stream is not file)
+            packed = stream is not file
+            check_size(layout.shape, layout.offset + layout.n_bytes, path, available=file.n_bytes, packed=packed)
             read_exactly(stream, layout.offset - used, path)
             values = read_exactly(stream, layout.n_bytes, path).view(layout.dtype)
             check_end(stream, layout.n_bytes, path)
+            digests = (file.sha256(),)
     except (OSError, EOFError, zlib.error) as error:
         raise damaged(path, error) from error
-    return StoredImage(_scaled(values.reshape(layout.shape, order="F"), layout), layout.affine)
+    values = _scaled(values.reshape(layout.shape, order="F"), layout)
+    return StoredImage(values, layout.affine, digests=digests)
 
 
 def _uncompressed(file: BinaryIO, path: Path) -> BinaryIO:

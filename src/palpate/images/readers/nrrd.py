@@ -10,7 +10,7 @@ import re
 import zlib
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
+from palpate.images.input_file import open_input
 from palpate.images.named_labels import printable
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
 from palpate.images.readers.segments import flattened, segments_of
@@ -91,17 +92,20 @@ def read_nrrd(path: Path) -> StoredImage:
     """
     try:
         with ExitStack() as stack:
-            file = stack.enter_context(path.open("rb"))
+            file = stack.enter_context(open_input(path))
+            files = [file]
             header = _header(file, path)
             block, place = _block(header), _place(header)
             name = header.fields.get("data file")
             if name is not None:
-                file = stack.enter_context(beside(path, name).open("rb"))
+                file = stack.enter_context(open_input(beside(path, name)))
+                files.append(file)
             _skip_lines(file, header)
             values = read_block(file, block, path)
+            digests = tuple(each.sha256() for each in files)
     except (OSError, EOFError, zlib.error) as error:
         raise damaged(path, error) from error
-    return _image(values, header, place)
+    return replace(_image(values, header, place), digests=digests)
 
 
 def _header(file: BinaryIO, path: Path) -> _Header:

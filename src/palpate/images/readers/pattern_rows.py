@@ -10,7 +10,7 @@ from palpate.images.named_labels import NamedLabel, hex_colour
 
 __all__ = ["COLOURS", "begins_with", "pattern_rows"]
 
-COLOURS = r"(?P<red>\d{1,3})\s+(?P<green>\d{1,3})\s+(?P<blue>\d{1,3})"
+COLOURS = r"(?P<red>[0-9]{1,3})\s+(?P<green>[0-9]{1,3})\s+(?P<blue>[0-9]{1,3})"
 
 
 def pattern_rows(text: str, path: Path, pattern: re.Pattern[str], *, form: str) -> list[NamedLabel]:

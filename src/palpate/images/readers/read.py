@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import stat
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -36,15 +37,20 @@ def read_label_image(
     stored, grid = _read(path, "labels", limits)
     own = checked_table(stored.names, path)
     table = own or (names if isinstance(names, LabelTable) else LabelTable(names or {}))
-    return LabelImage(stored.values, grid, table.names, table.colours)
+    return LabelImage(stored.values, grid, table.names, table.colours, stored.digests)
 
 
-def read_intensities(path: Path | str, *, limits: ReadLimits | None = LIMITS) -> tuple[NDArray[np.float32], VoxelGrid]:
+def read_intensities(
+    path: Path | str, *, limits: ReadLimits | None = LIMITS, sha256: str | None = None
+) -> tuple[NDArray[np.float32], VoxelGrid]:
     """Read a grey image: intensities (n_x, n_y, n_z) float32 as the header scales them, and their grid (RAS mm).
 
-    Raises as `read_label_image` does.
+    `sha256`: the digest of the file that is meant. Raises as `read_label_image` does, and `InputDataError` when the
+    file has another digest.
     """
     stored, grid = _read(Path(path), "intensities", limits)
+    if sha256 is not None and stored.digests and stored.digests[0] != sha256:
+        raise InputDataError(f"'{path}' was changed after this run began; run it again with the file as it is now")
     return stored.values, grid
 
 
@@ -61,14 +67,12 @@ def _read(path: Path, kind: str, limits: ReadLimits | None) -> tuple[StoredImage
             f"'{path}' does not fit into the memory of this machine; crop the image to the organs of the case"
         ) from error
     grid = VoxelGrid((values.shape[0], values.shape[1], values.shape[2]), affine)
-    return StoredImage(values, affine, stored.names), grid
+    return StoredImage(values, affine, stored.names, stored.digests), grid
 
 
 def _check_file(path: Path) -> None:
     try:
-        if path.is_dir():
-            raise InputDataError(f"'{path}' is a folder, not an image; name the file in it")
-        size = path.stat().st_size
+        found = path.stat()
     except FileNotFoundError as error:
         raise InputDataError(
             f"there is no file '{path}'; check the path, which is relative to the case file"
@@ -77,7 +81,11 @@ def _check_file(path: Path) -> None:
         raise InputDataError(
             f"'{path}' cannot be opened ({error}); check the path and your right to read it"
         ) from error
-    if size == 0:
+    if stat.S_ISDIR(found.st_mode):
+        raise InputDataError(f"'{path}' is a folder, not an image; name the file in it")
+    if not stat.S_ISREG(found.st_mode):
+        raise InputDataError(f"'{path}' is a pipe, a socket or a device; save the image as a file")
+    if found.st_size == 0:
         raise InputDataError(f"'{path}' is empty (0 bytes); export or copy the image again")
 
 

@@ -20,12 +20,14 @@ __all__ = ["ImageFormat", "StoredImage", "format_of", "register"]
 class StoredImage:
     """A file's voxels as they are stored: `values` (n_1, n_2, n_3) integers or floats, `affine` (4, 4) index -> RAS mm.
 
-    `names`: what the file itself says of its labels.
+    `names`: what the file itself says of its labels; `digests`: SHA-256 (hexadecimal) of the file as it was read, and
+    of the file beside it that holds the voxels, where there is one; empty when the reader does not say.
     """
 
     values: NDArray[Any]
     affine: NDArray[np.float64]
     names: tuple[NamedLabel, ...] = ()
+    digests: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

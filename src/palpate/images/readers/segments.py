@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
 from palpate.images.named_labels import MAX_LABEL, MAX_NAME, NamedLabel, hex_colour, printable
+from palpate.images.readers.text_header import NUMBER
 
 __all__ = ["Segment", "flattened", "segments_of"]
 
-KEY = re.compile(r"Segment(\d{1,5})_(\w+)")
+KEY = re.compile(r"Segment([0-9]{1,5})_(\w+)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,11 +74,11 @@ def _whole(text: str, path: Path, *, low: int) -> int:
 
 
 def _colour(text: str) -> str | None:
-    try:
-        parts = [float(word) for word in text.split()]
-    except ValueError:
+    words = text.split()
+    if len(words) != 3 or not all(NUMBER.fullmatch(word) for word in words):
         return None
-    return hex_colour(*parts, top=1.0) if len(parts) == 3 else None
+    red, green, blue = (float(word) for word in words)
+    return hex_colour(red, green, blue, top=1.0)
 
 
 def flattened(

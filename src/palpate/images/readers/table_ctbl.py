@@ -11,7 +11,7 @@ from palpate.images.readers.table_registry import TableFormat, register_table
 
 __all__ = ["read_ctbl_table"]
 
-ROW = re.compile(r"\s*(?P<label>\d{1,9})\s+(?P<name>\S+)\s+" + COLOURS + r"(?:\s+[\d.]{1,20})?\s*")
+ROW = re.compile(r"\s*(?P<label>[0-9]{1,9})\s+(?P<name>\S+)\s+" + COLOURS + r"(?:\s+[0-9.]{1,20})?\s*")
 
 
 def read_ctbl_table(text: str, path: Path) -> list[NamedLabel]:

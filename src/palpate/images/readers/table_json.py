@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,9 @@ from palpate.images.named_labels import MAX_LABEL, MAX_NAME, NamedLabel
 from palpate.images.readers.table_registry import TableFormat, register_table
 
 __all__ = ["read_json_table"]
+
+
+DIGITS = re.compile(r"[0-9]{1,9}")  # not what int() takes besides: blanks, signs, 1_0, digits of other scripts
 
 
 class _Pairs(list[tuple[str, Any]]):
@@ -35,12 +39,11 @@ def read_json_table(text: str, path: Path) -> list[NamedLabel]:
 def _entry(key: str, value: Any, path: Path) -> NamedLabel:
     """One member, whichever side holds the number."""
     number, name = (value, key) if isinstance(value, int) and not isinstance(value, bool) else (key, value)
-    try:
-        label = int(str(number))
-    except ValueError:
-        label = -1
+    plain = isinstance(number, int) or (isinstance(number, str) and DIGITS.fullmatch(number))
+    label = int(number) if plain else -1
     if not 0 <= label <= MAX_LABEL or not isinstance(name, str) or not name.strip() or len(name) > MAX_NAME:
-        shown = "an object" if isinstance(value, list) else repr(str(value)[:50])
+        kind = {_Pairs: "an object", list: "a list", int: "a number"}.get(type(value), "")
+        shown = kind or repr(str(value)[:50])
         raise InputDataError(
             f"the label table '{path}' has the entry {key[:50]!r}: {shown}; it must be a label from 0"
             f" to {MAX_LABEL} and a name of 1 to {MAX_NAME} characters"

@@ -8,14 +8,13 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from palpate.errors import InputDataError
-from palpate.images.named_labels import NamedLabel, hex_colour
+from palpate.images.named_labels import NamedLabel, computed_by_spreadsheets, hex_colour
 from palpate.images.readers.delimited import column_names, delimited_rows, whole_number
 from palpate.images.readers.table_registry import TableFormat, register_table
 
 __all__ = ["read_slicer_table", "slicer_table"]
 
 COLUMNS = ("LabelValue", "Name", "Color_R", "Color_G", "Color_B", "Color_A")
-FORMULA = ("=", "+", "-", "@")  # a spreadsheet would compute a cell that begins so
 
 
 def read_slicer_table(text: str, path: Path) -> list[NamedLabel]:
@@ -43,14 +42,14 @@ def slicer_table(rows: Iterable[NamedLabel]) -> str:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
     for row in rows:
-        name = f"'{row.name}" if row.name.startswith(FORMULA) else row.name
+        name = f"'{row.name}" if computed_by_spreadsheets(row.name) else row.name
         parts = [] if row.colour is None else [*bytes.fromhex(row.colour[1:]), 255]
         writer.writerow([row.label, name, *(parts or [""] * 4)])
     return text.getvalue()
 
 
 def _unquoted(name: str) -> str:
-    return name[1:] if name.startswith("'") and name[1:].startswith(FORMULA) else name
+    return name[1:] if name.startswith("'") and computed_by_spreadsheets(name[1:]) else name
 
 
 def _colour(parts: list[str]) -> str | None:

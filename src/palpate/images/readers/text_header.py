@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import BinaryIO
 
@@ -12,8 +13,10 @@ from numpy.typing import NDArray
 from palpate.errors import InputDataError
 from palpate.images.named_labels import printable
 
-__all__ = ["beside", "counts", "header_line", "numbers"]
+__all__ = ["NUMBER", "beside", "counts", "header_line", "numbers"]
 
+# Not what float() takes besides: nan, inf, 1_0, digits of other scripts.
+NUMBER = re.compile(r"[+-]?([0-9]{1,400}\.?[0-9]{0,400}|\.[0-9]{1,400})([eE][+-]?[0-9]{1,9})?")
 MAX_LINE = 2**16
 MAX_NUMBER = 1e30  # far beyond any length in mm; products of three stay finite
 MAX_HEADER = 2**22  # bytes; a segmentation of a thousand segments has some 400 kB
@@ -37,11 +40,10 @@ def numbers(text: str, n: int, path: Path, *, field: str) -> NDArray[np.float64]
 
     Raises `InputDataError` when it holds anything else.
     """
-    try:
-        values = np.array([float(word) for word in text.split()])
-    except ValueError:
-        values = np.zeros(0)
-    if len(values) != n or not (np.abs(values) < MAX_NUMBER).all():  # NaN fails too
+    words = text.split()
+    plain = len(words) == n and all(NUMBER.fullmatch(word) for word in words)
+    values = np.array([float(word) for word in words]) if plain else np.zeros(0)
+    if len(values) != n or not (np.abs(values) < MAX_NUMBER).all():
         raise InputDataError(
             f"the header of '{path}' has '{field}: {printable(text[:60])}', but {n} numbers under {MAX_NUMBER:g} are"
             " needed; export the image again"

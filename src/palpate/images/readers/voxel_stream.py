@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
+from palpate.images.input_file import InputFile
 
 __all__ = ["MAX_OFFSET", "MAX_VOXELS", "VoxelBlock", "check_end", "check_size", "damaged", "read_block", "read_exactly"]
 
@@ -44,18 +45,19 @@ class VoxelBlock:
         return math.prod(self.shape) * self.dtype.itemsize
 
 
-def read_block(file: BinaryIO, block: VoxelBlock, path: Path) -> NDArray[Any]:
+def read_block(file: InputFile, block: VoxelBlock, path: Path) -> NDArray[Any]:
     """The voxels (n_1, n_2, n_3), or with more axes, in the machine's byte order, from where `file` stands.
 
     `path` is for messages, for voxels may lie in a file beside the header.
     Raises `InputDataError` when the file cannot hold them or goes on for long after them.
     """
     start = file.tell()
-    available = file.seek(0, io.SEEK_END) - start
+    available = file.n_bytes - start
     check_size(
         block.shape, max(block.skip, 0) + block.n_bytes, path, available=available, packed=block.packing != "raw"
     )
-    file.seek(start if block.skip >= 0 else start + available - block.n_bytes)
+    if block.skip < 0:
+        file.seek(file.n_bytes - block.n_bytes)
     stream = _UNPACKED[block.packing](file)
     read_exactly(stream, max(block.skip, 0), path)
     values = read_exactly(stream, block.n_bytes, path).view(block.dtype)

@@ -5,7 +5,6 @@ Li, ACM TOMS 31 (2005) 302-325.
 
 from __future__ import annotations
 
-import os
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 
@@ -17,6 +16,7 @@ from scipy.sparse.linalg import MatrixRankWarning, splu
 from palpate.errors import SolverError
 from palpate.mechanics.solvers.contract import Factorisation, Hints, Solver, always
 from palpate.mechanics.solvers.pattern import nested_dissection
+from palpate.parallel import processors
 
 __all__ = ["SOLVER"]
 
@@ -65,7 +65,7 @@ class SuperluFactorisation:
             ordered = np.asfortranarray(rhs[self._permutation, block])
             solution[self._permutation, block] = self._factors.solve(ordered)
 
-        with ThreadPoolExecutor(min(MAX_THREADS, os.cpu_count() or 1)) as threads:
+        with ThreadPoolExecutor(min(MAX_THREADS, processors())) as threads:
             list(threads.map(solve_block, range(0, rhs.shape[1], BLOCK)))
         return solution
 

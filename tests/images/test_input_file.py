@@ -1,0 +1,70 @@
+"""Files are opened without waiting and digested as they are read, in whatever order."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.errors import InputDataError
+from palpate.images.input_file import open_input, read_input
+from palpate.images.label_image import VoxelGrid
+from palpate.images.readers import read_intensities, write_scalar_image
+
+CONTENT = np.random.default_rng(1).bytes(3_000_000)
+DIGEST = hashlib.sha256(CONTENT).hexdigest()
+
+READINGS = {
+    "nothing": lambda file: file.seek(0),
+    "all at once": lambda file: file.read(),
+    "lines": lambda file: [file.readline() for _ in range(5)],
+    "back and forth": lambda file: [
+        file.seek(place) + len(file.read(70_000)) for place in (0, 2_900_000, 5, 1_000_000)
+    ],
+    "the end": lambda file: file.seek(2_999_999) + len(file.read()),
+}
+
+
+@pytest.mark.parametrize("name", READINGS)
+def test_the_digest_is_that_of_the_whole_file_however_it_was_read(name, tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(CONTENT)
+    with open_input(tmp_path / "a") as file:
+        READINGS[name](file)
+        place = file.tell()
+        assert file.sha256() == DIGEST
+        assert file.tell() == place
+        assert file.read(9) == CONTENT[place : place + 9]
+
+
+def test_the_digest_is_of_the_bytes_that_were_read_though_the_file_changes(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(CONTENT)
+    with open_input(tmp_path / "a") as file:
+        assert file.read() == CONTENT
+        (tmp_path / "a").write_bytes(CONTENT[::-1])
+        assert file.sha256() == DIGEST
+
+
+def test_no_more_is_read_than_the_limit_and_a_byte(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(CONTENT)
+    assert read_input(tmp_path / "a", 100) == (CONTENT[:101], hashlib.sha256(CONTENT[:101]).hexdigest())
+    assert read_input(tmp_path / "a", 3_000_000) == (CONTENT, DIGEST)
+
+
+def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", tmp_path, Path("/dev/zero")):
+        with pytest.raises(OSError, match="not a file"):
+            open_input(path)
+
+
+def test_a_grey_image_that_changed_since_the_run_began_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.nii"
+    write_scalar_image(path, np.zeros((3, 4, 5)), VoxelGrid((3, 4, 5), np.eye(4)))
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    assert read_intensities(path, sha256=digest)[0].shape == (3, 4, 5)
+    write_scalar_image(path, np.ones((3, 4, 5)), VoxelGrid((3, 4, 5), np.eye(4)))
+    with pytest.raises(InputDataError, match="changed after this run began"):
+        read_intensities(path, sha256=digest)

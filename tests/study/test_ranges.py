@@ -1,0 +1,86 @@
+"""Every number of a case has a plausible range, which docs/case-file.md states."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import typing
+from pathlib import Path
+
+import pytest
+
+from palpate.errors import ConfigurationError
+from palpate.images.named_labels import MAX_LABEL
+from palpate.study.case import Case, CaseTissue
+from palpate.study.case_file import read_case
+
+PAGE = Path(__file__).parents[2] / "docs" / "case-file.md"
+CASE = """
+images = { before = "before.nii.gz", after = ["after.nii.gz"] }
+[tissues.prostate]
+label = 1
+role = "estimate"
+"""
+NEEDED = {
+    "pressure_kpa": 'loads=[{kind="pressure", surface="outer", pressure_kpa=VALUE}]',
+    "traction_kpa": 'loads=[{kind="traction", surface="outer", traction_kpa=[VALUE, 0.0, 0.0]}]',
+    "acceleration_m_s2": 'loads=[{kind="gravity", acceleration_m_s2=[VALUE, 0.0, 0.0]}]',
+    "start_ratios": "estimate={start_ratios=[VALUE], bounds_ratio=[2e-6, 9e5]}",
+    "starts_kpa": "estimate={starts_kpa=[VALUE], bounds_kpa=[2e-3, 9e8]}",
+    "bounds_ratio": "estimate={bounds_ratio=[1e-6, VALUE]}",
+    "bounds_kpa": "estimate={bounds_kpa=[1e-3, VALUE]}",
+}
+
+
+def numbers(kind: type, where: str = ""):
+    """Place (key.path with * for a name) and field of every number in the tree of tables."""
+    hints = typing.get_type_hints(kind)
+    for item in dataclasses.fields(kind):
+        flat = [hints[item.name], *typing.get_args(hints[item.name])]
+        flat += [arm for kind_of in flat for arm in typing.get_args(kind_of)]
+        tables = [arm for arm in flat if dataclasses.is_dataclass(arm)]
+        name = {CaseTissue: ".*"}.get(tables[0], "") if tables else ""
+        for table in dict.fromkeys(tables):
+            yield from numbers(table, f"{where}{item.name}{name}.")
+        if {int, float} & set(flat) and item.name != "label":
+            yield f"{where}{item.name}", item
+
+
+NUMBERS = dict(numbers(Case))
+
+
+def test_the_walk_finds_the_numbers():
+    assert {"seed", "stage", "mesh.edge_length_mm", "tissues.*.poisson_ratio", "estimate.bounds_kpa"} <= set(NUMBERS)
+    assert len(NUMBERS) > 20
+
+
+@pytest.mark.parametrize("place", NUMBERS)
+def test_every_number_has_a_range_that_holds_its_default(place):
+    item = NUMBERS[place]
+    low, high = item.metadata["rule"].between
+    assert low < high
+    default = item.default if isinstance(item.default, tuple) else (item.default,)
+    assert all(low <= value <= high for value in default if isinstance(value, int | float))
+
+
+def test_the_page_states_every_range():
+    rows = re.findall(r"^\| `([\w.*]+)` \| (\S+) \| (\S+) \|", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    stated = {key: (float(low), float(high)) for key, low, high in rows}
+    assert stated.pop("tissues.*.label") == (0, MAX_LABEL)
+    assert stated == {place: tuple(item.metadata["rule"].between) for place, item in NUMBERS.items()}
+
+
+@pytest.mark.parametrize("place", NUMBERS)
+@pytest.mark.parametrize("end", [0, 1])
+def test_what_lies_beyond_a_range_is_refused_with_the_range(place, end, tmp_path):
+    path = tmp_path / "case.toml"
+    path.write_text(CASE)
+    bound = NUMBERS[place].metadata["rule"].between[end]
+    beyond = bound + (bound * 1e-3 or 1e-3) * (-1 if (end == 0) == (bound >= 0) else 1)
+    key = place.rpartition(".")[2]
+    whole = isinstance(NUMBERS[place].default, int) or key == "stage"
+    value = str(bound + (1, -1)[end == 0]) if whole else repr(beyond)
+    override = NEEDED.get(key, f"{place.replace('*', 'prostate')}=VALUE").replace("VALUE", value)
+    more = {"phantom.seed": ["phantom.kind=spheres"]}.get(place, [])
+    with pytest.raises(ConfigurationError, match=f"'{key}' in .* must be a number from"):
+        read_case(path, [override, *more])
