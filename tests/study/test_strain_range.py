@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from palpate.mechanics.laws.registry import LAWS
 from palpate.study.body import Body, ImagedStates
 from palpate.study.case import Mechanics
 from palpate.study.run import strain_warnings
@@ -27,23 +28,23 @@ def stretched(space, amount, share=1.0):
 
 
 def test_large_strains_under_the_linear_law_are_warned_of(space):
-    (remark,) = linear_strain_warnings("linear", (space, [stretched(space, 0.2)]), images=["late.nii"])
+    (remark,) = linear_strain_warnings(LAWS["linear"], (space, [stretched(space, 0.2)]), images=["late.nii"])
     assert remark.code == "linear-strains"
     for words in ("late.nii: 100.0 %", "99th percentile 22 %", 'law = "neo-hookean"'):  # (1.2^2 - 1) / 2 = 0.22
         assert words in remark.message
 
 
 def test_small_strains_pass(space):
-    assert linear_strain_warnings("linear", (space, [stretched(space, 0.09)]), images=["a"]) == ()
+    assert linear_strain_warnings(LAWS["linear"], (space, [stretched(space, 0.09)]), images=["a"]) == ()
 
 
 @pytest.mark.parametrize("law", ["neo-hookean", "mooney-rivlin"])
 def test_finite_strain_laws_pass(space, law):
-    assert linear_strain_warnings(law, (space, [stretched(space, 0.5)]), images=["a"]) == ()
+    assert linear_strain_warnings(LAWS[law], (space, [stretched(space, 0.5)]), images=["a"]) == ()
 
 
 def test_the_share_is_that_of_the_volume(space):
-    (remark,) = linear_strain_warnings("linear", (space, [stretched(space, 0.3, share=0.3)]), images=["a"])
+    (remark,) = linear_strain_warnings(LAWS["linear"], (space, [stretched(space, 0.3, share=0.3)]), images=["a"])
     volumes, height = space.mesh.volumes, space.mesh.nodes[:, 2]
     below = height[space.mesh.tets].max(axis=1) <= height.min() + 0.3 * np.ptp(height) + 1e-9
     assert f"a: {100 * volumes[below].sum() / volumes.sum():.1f} %" in remark.message
@@ -58,7 +59,7 @@ def test_the_image_that_strains_most_is_named(space):
 
 
 def test_nothing_fitted_is_nothing_strained(space):
-    assert linear_strain_warnings("linear", (space, []), images=["a"]) == ()
+    assert linear_strain_warnings(LAWS["linear"], (space, []), images=["a"]) == ()
 
 
 def test_every_pair_of_images_meets_its_own_mesh_and_displacements(case_result):

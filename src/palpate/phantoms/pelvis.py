@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from palpate.errors import ConfigurationError
 from palpate.images.label_image import VoxelGrid
 from palpate.images.tissue import Role, Tissue
+from palpate.mechanics.laws.registry import law_from
 from palpate.mesh.anatomy import Anatomy, LevelSet
 from palpate.phantoms.boundary_noise import smooth_field
 from palpate.phantoms.motion import AffineMotion, WallMotion, filling_of
@@ -31,7 +32,7 @@ class PelvisOptions:
     `filling_mm`: the rectum's wall moves so far where it moves most; `moduli_kpa` by tissue (default: prostate and
     bladder 15 to 60 kPa, a tumour 2 to 3 times its gland; the surroundings have 10 kPa); `poisson_ratio` of all
     tissues or by tissue (default 0.40 to 0.45 each); `bone_motion_mm` and as many degrees move each bone as a rigid
-    body; `law` and `c01_over_c10`: the tissues' (see `make_scene`).
+    body; `law` and `law_parameters`: the tissues' (see `make_scene`).
     """
 
     seed: int
@@ -46,7 +47,7 @@ class PelvisOptions:
     bone_motion_mm: float = 0.0
     tumour: bool = False
     law: str = "linear"
-    c01_over_c10: float = 0.25
+    law_parameters: Mapping[str, float] = field(default_factory=dict)
 
 
 def pelvis(options: PelvisOptions) -> Scene:
@@ -68,8 +69,7 @@ def pelvis(options: PelvisOptions) -> Scene:
         edge_length_mm=options.truth_edge_mm,
         noise=options.noise,
         seed=options.seed,
-        law=options.law,
-        c01_over_c10=options.c01_over_c10,
+        law=law_from(options.law, options.law_parameters),
     )
 
 

@@ -16,7 +16,6 @@ from palpate.mechanics.deformation import deformation_determinants
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.equilibrium import equilibrium
 from palpate.mechanics.laws.contract import Law
-from palpate.mechanics.laws.registry import law_named
 from palpate.mesh.anatomy import Anatomy, Box
 from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.tet_mesh import TetMesh
@@ -86,18 +85,16 @@ def make_scene(
     edge_length_mm: float,
     noise: Noise | None,
     seed: int,
-    law: str = "linear",
-    c01_over_c10: float = 0.25,
+    law: Law,
 ) -> Scene:
     """Mesh the anatomy, move the walls of its hollow tissues (outer border held), image both states.
 
-    `law`: the tissues', by its name in `case.toml`; finite strain on elements that do not lock; `c01_over_c10`: of
-    "mooney-rivlin".
+    `law`: the tissues'; finite strain on elements that do not lock.
     Every meshed tissue of the anatomy needs its `youngs_modulus_kpa`. `edge_length_mm` is the mesh's at the surfaces;
     `seed` only draws the noise. Raises `GeometryError` where the truth folds over or cannot be meshed.
     """
     space = lagrange_space(tetrahedralise(anatomy, edge_length_mm=edge_length_mm), "P2")
-    displacement = _equilibrium(space, motions, law_named(law, c01_over_c10=c01_over_c10))
+    displacement = _equilibrium(space, motions, law)
     smallest = float(deformation_determinants(space, displacement).min())
     if smallest <= 0.0:
         raise GeometryError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from palpate.errors import ConfigurationError
 from palpate.images.label_image import VoxelGrid
 from palpate.images.tissue import Role, Tissue
+from palpate.mechanics.laws.registry import law_from
 from palpate.mesh.anatomy import Anatomy, LevelSet
 from palpate.phantoms.boundary_noise import smooth_field
 from palpate.phantoms.motion import AffineMotion, Swelling, WallMotion
@@ -35,7 +36,7 @@ class SpheresOptions:
     is squeezed by a random stretch; "tumour", the same with a tumour out of the organ's centre; "pushed", a hollow
     core, the driver `cavity`, that grows in the shell, in a box of surroundings that is held. `push_mm`: the wall
     moves so far where it moves most. `moduli_kpa` by tissue (default: core 60, shell or organ 30, tumour 75,
-    surroundings 10); `poisson_ratio` of all or by tissue (default 0.45); `law` and `c01_over_c10`: the tissues' (see
+    surroundings 10); `poisson_ratio` of all or by tissue (default 0.45); `law` and `law_parameters`: the tissues' (see
     `make_scene`).
     """
 
@@ -48,7 +49,7 @@ class SpheresOptions:
     poisson_ratio: float | Mapping[str, float] = 0.45
     noise: Noise | None = None
     law: str = "linear"
-    c01_over_c10: float = 0.25
+    law_parameters: Mapping[str, float] = field(default_factory=dict)
 
 
 def spheres(options: SpheresOptions) -> Scene:
@@ -64,8 +65,7 @@ def spheres(options: SpheresOptions) -> Scene:
         edge_length_mm=options.truth_edge_mm,
         noise=options.noise,
         seed=options.seed,
-        law=options.law,
-        c01_over_c10=options.c01_over_c10,
+        law=law_from(options.law, options.law_parameters),
     )
 
 

@@ -130,6 +130,7 @@ def _settings(case: Case) -> tuple[tuple[str, str], ...]:
     return (
         *loads,
         ("material law", mechanics.law),
+        *((p.name, f"{mechanics.law_parameters.get(p.name, p.default):g}") for p in mechanics.material_law.parameters),
         ("element", mechanics.element),
         ("edge length at the organs", f"{case.mesh.edge_length_mm:g} mm"),
         ("outer boundary", f"{domain.outer_boundary}; domain: {domain.extent}{margin}"),

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from palpate.mechanics.laws.contract import Law
+from palpate.mechanics.laws.registry import LAWS, law_from, law_parameters
 from palpate.report.report_data import ReportData
 
 __all__ = ["Methods", "methods_text"]
@@ -26,11 +28,6 @@ SOURCES = {
     " 2016.",
     "white": "White H. A heteroskedasticity-consistent covariance matrix estimator and a direct test for"
     " heteroskedasticity. Econometrica 48 (1980) 817-838.",
-}
-LAWS = {
-    "linear": "isotropic linear elasticity at small strains",
-    "neo-hookean": "a compressible neo-Hookean law at finite strains",
-    "mooney-rivlin": "a compressible Mooney-Rivlin law at finite strains",
 }
 ELEMENTS = {
     "P1": "linear tetrahedra",
@@ -96,7 +93,7 @@ def _model(data: ReportData, cite: _Citations) -> str:
     )
     loads = [words for key, words in data.settings if key == "known load"]
     acted = f" Known loads acted on the later states: {'; '.join(loads)}." if loads else ""
-    settings = dict(data.settings)
+    settings, law = dict(data.settings), _law(data)
     ratios = sorted({f"{t.poisson_ratio:g}" for t in data.tissues if t.role in ("estimate", "known")})
     return (
         "The label images were turned into signed distance maps by Gaussian smoothing and the probit of the smoothed"
@@ -104,7 +101,7 @@ def _model(data: ReportData, cite: _Citations) -> str:
         f" A conforming mesh{size} (edge length {settings['edge length at the organs']} at the organs) was cut along"
         f" their"
         f" zero levels and improved with Mmg {cite('mmg')}.{more} The tissues followed"
-        f" {LAWS.get(document['law'], 'the law ' + str(document['law']))} in"
+        f" {law.description if law else 'the law ' + document['law']} in"
         f" {ELEMENTS.get(document['element'], str(document['element']))}, with"
         f" Poisson's"
         f" ratios of {_list(ratios)}; the outer boundary: {settings['outer boundary']}. The motion of the drivers'"
@@ -115,10 +112,18 @@ def _model(data: ReportData, cite: _Citations) -> str:
     )
 
 
+def _law(data: ReportData) -> Law | None:
+    """The material law with its parameters; None for one that this version has not."""
+    settings = dict(data.settings)
+    stated = {name: float(settings[name]) for name in law_parameters() if name in settings}
+    return law_from(data.document["law"], stated) if data.document["law"] in LAWS else None
+
+
 def _fit(data: ReportData, cite: _Citations) -> str:
     optimiser, source = OPTIMISERS.get(data.document["method"], (str(data.document["method"]), "nocedal"))
     starts = len(data.document["starts"])
-    finite = data.document["law"] != "linear"
+    law = _law(data)
+    finite = law is not None and law.finite
     onwards = " The linear law gave the start; the fit then went on over expansions around finite-strain equilibria."
     return (
         "The misfit was the symmetric surface distance between model and later image, taken as a difference to the rest"

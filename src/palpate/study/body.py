@@ -20,7 +20,6 @@ from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_model
 from palpate.mechanics.laws.contract import Law
-from palpate.mechanics.laws.registry import LAWS, law_named
 from palpate.mechanics.linear_model import LinearModel, linear_model, with_constraint
 from palpate.mechanics.newton import NewtonSettings
 from palpate.mesh.anatomy import Anatomy, Box, anatomy_of, domain_box, margin_box
@@ -35,7 +34,7 @@ from palpate.observation.surface_distance import surface_distance
 from palpate.observation.target import surface_target
 from palpate.observation.wall_modes import Wall
 from palpate.parallel import mapped
-from palpate.study.case import Case, Mechanics
+from palpate.study.case import Case
 from palpate.study.case_loads import case_loads
 from palpate.study.contacts import every_finding
 from palpate.study.refusals import refuse_lost, refuse_unmeshable
@@ -234,7 +233,7 @@ def _models(body: Body, case: Case) -> list[tuple[LinearModel, tuple[Wall, ...]]
 
 def _finite_strain(models: tuple[LinearModel, ...], case: Case) -> Sequence[FiniteStrainModel | None]:
     """The same bodies under the case's law; None where that is the linear one."""
-    law = law_of(case.mechanics)
+    law = case.mechanics.material_law
     if not law.finite:
         return [None] * len(models)
     found: list[FiniteStrainModel] = []
@@ -242,12 +241,6 @@ def _finite_strain(models: tuple[LinearModel, ...], case: Case) -> Sequence[Fini
         like = next((other for other in found if other.space is model.space), None)
         found.append(like.under(model.constraint) if like else _finite_strain_model(model, law, case))
     return found
-
-
-def law_of(mechanics: Mechanics) -> Law:
-    """The material law that a case names."""
-    own = {parameter.name: getattr(mechanics, parameter.name) for parameter in LAWS[mechanics.law].parameters}
-    return law_named(mechanics.law, **own)
 
 
 def _finite_strain_model(model: LinearModel, law: Law, case: Case) -> FiniteStrainModel:

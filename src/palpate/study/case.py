@@ -9,6 +9,8 @@ from pathlib import Path
 from palpate.errors import ConfigurationError
 from palpate.images.named_labels import MAX_LABEL, MAX_NAME, computed_by_spreadsheets
 from palpate.images.tissue import Role, Tissue
+from palpate.mechanics.laws.contract import Law
+from palpate.mechanics.laws.registry import LAWS, law_from, law_parameters
 from palpate.study.schema import nearest, rule, shown
 
 __all__ = [
@@ -30,7 +32,7 @@ __all__ = [
 ]
 
 REMAINING = "remaining"
-LAW_NAMES = ("linear", "neo-hookean", "mooney-rivlin")
+LAW_NAMES = tuple(LAWS)
 
 POSITIVE_NUMBERS = "a list of positive numbers"
 LOW_HIGH = "[low, high] with low < high"
@@ -164,11 +166,22 @@ class CaseTissue:
 
 @dataclass(frozen=True, slots=True)
 class Mechanics:
-    """Material law and finite element (`palpate.mechanics.laws`, `palpate.mechanics.dilatation`)."""
+    """Material law and finite element (`palpate.mechanics.laws`, `palpate.mechanics.dilatation`).
+
+    law_parameters: what the case states under the names of the laws' parameters; each law takes its own.
+    """
 
     law: str = field(default="neo-hookean", metadata=rule(choices=LAW_NAMES))
     element: str = field(default="auto", metadata=rule(choices=("P1", "P2", "P2-P0", "auto")))
-    c01_over_c10: float = field(default=0.25, metadata=rule(between=(0.0, 1e3)))
+    law_parameters: Mapping[str, float] = field(
+        default_factory=dict,
+        metadata=rule(collects={name: (p.least, p.most) for name, p in law_parameters().items()}),
+    )
+
+    @property
+    def material_law(self) -> Law:
+        """The law with its parameters."""
+        return law_from(self.law, self.law_parameters)
 
 
 @dataclass(frozen=True, slots=True)

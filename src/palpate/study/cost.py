@@ -65,7 +65,7 @@ def expected_cost(case: Case, before: Segmentation, after: tuple[Segmentation, .
     modes = (drivers * case.driver.modes + OVERHEAD_MODES) / (USUAL_MODES + OVERHEAD_MODES)
     work = unknowns * modes * max(len(after), 1)
     slower = 0.0 if solver == "pardiso" else 1.0
-    finite = case.mechanics.law != "linear"
+    finite = case.mechanics.material_law.finite
     solving = SECONDS_AN_UNKNOWN * work + slower * SUPERLU[0] * (unknowns / SUPERLU[1]) ** SUPERLU[2]
     seconds = solving + SECONDS_A_CUT * tets * (len(before.tissues) - 1)
     gigabytes = GB_AN_UNKNOWN * work + slower * SUPERLU_GB_AN_UNKNOWN * unknowns

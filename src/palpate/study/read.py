@@ -71,7 +71,7 @@ def phantom_scene(case: Case) -> Scene:
     options = replace(
         options,
         law=case.phantom.law or case.mechanics.law,
-        c01_over_c10=case.mechanics.c01_over_c10,
+        law_parameters=case.mechanics.law_parameters,
         moduli_kpa={t.name: t.youngs_modulus_kpa for t in meshed if t.youngs_modulus_kpa is not None},
         poisson_ratio={t.name: t.poisson_ratio for t in meshed if t.poisson_ratio is not None},
     )

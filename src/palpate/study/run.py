@@ -173,7 +173,7 @@ def strain_warnings(case: Case, bodies: tuple[Body, ...], estimation: Estimation
     """What `linear_strain_warnings` says of the fitted displacements, those of the first body's images first."""
     motions = iter(estimation.displacements)
     moved = [(body.space, [next(motions) for _ in body.states.after]) for body in bodies]
-    return linear_strain_warnings(case.mechanics.law, *moved, images=image_names(case))
+    return linear_strain_warnings(case.mechanics.material_law, *moved, images=image_names(case))
 
 
 def refuse_what_cannot_be_estimated(case: Case) -> None:

@@ -35,7 +35,7 @@ class Rule:
     choices: the values it may have; later: values of the schema that this version does not offer yet;
     between: the least and the largest number, either of which it may be; test: a condition; wanted: what it must be,
     in words, beside the numbers; instead_of: the key that may not stand beside this one; convert: reads a value whose
-    type alone does not say how.
+    type alone does not say how; collects: keys of the same table, with their ranges, whose numbers the field holds.
     """
 
     choices: tuple[str, ...] = ()
@@ -45,6 +45,7 @@ class Rule:
     wanted: str = ""
     instead_of: str = ""
     convert: Callable[[object], object] | None = None
+    collects: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
 
 
 def rule(
@@ -56,9 +57,10 @@ def rule(
     wanted: str = "",
     instead_of: str = "",
     convert: Callable[[object], object] | None = None,
+    collects: Mapping[str, tuple[float, float]] | None = None,
 ) -> dict[str, Rule]:
     """The metadata of a dataclass field that carries a `Rule`; arguments as there."""
-    return {"rule": Rule(choices, later, between, test, wanted, instead_of, convert)}
+    return {"rule": Rule(choices, later, between, test, wanted, instead_of, convert, collects or {})}
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
@@ -87,15 +89,22 @@ def read_table(kind: type[T], table: Mapping[str, object], *, where: str, folder
     Raises `ConfigurationError` on an unknown or missing key, a wrong type, a value that the key's `Rule` forbids.
     """
     fields = {field.name: field for field in dataclasses.fields(typing.cast("Any", kind))}
+    rules = {name: field.metadata.get("rule", Rule()) for name, field in fields.items()}
+    collected = {key: name for name, bounds in rules.items() for key in bounds.collects}
+    keys = [*collected, *(name for name in fields if not rules[name].collects)]
     for key in table:
-        if key not in fields:
-            raise ConfigurationError(f"unknown key '{shortened(key)}' in {where}: {nearest(key, fields)}")
+        if key not in keys:
+            raise ConfigurationError(f"unknown key '{shortened(key)}' in {where}: {nearest(key, keys)}")
     _check_complete(fields.values(), table, where)
     hints = _hints(typing.cast("Any", kind))
     values: dict[str, Any] = {}
     for key, value in table.items():
         place = _Place(key, where, folder)
-        bounds: Rule = fields[key].metadata.get("rule", Rule())
+        if key in collected:
+            _check_range(Rule(between=rules[collected[key]].collects[key]), value, place)
+            values.setdefault(collected[key], {})[key] = _convert(float, value, place)
+            continue
+        bounds = rules[key]
         _check_range(bounds, value, place)
         converted = bounds.convert(value) if bounds.convert else _convert(hints[key], value, place)
         _check_value(bounds, converted, place)

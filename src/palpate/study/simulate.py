@@ -22,7 +22,7 @@ from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.phantoms.wall_filling import wall_filling
-from palpate.study.body import Body, inverse_problem, law_of, make_body
+from palpate.study.body import Body, inverse_problem, make_body
 from palpate.study.case import Case, Mechanics
 from palpate.study.case_loads import case_loads
 from palpate.study.provenance import input_digests, software_versions
@@ -102,7 +102,7 @@ def filled(
         space,
         constraint,
         _moduli(tissues),
-        law=law_of(mechanics),
+        law=mechanics.material_law,
         dilatation=choose_element(mechanics.element).dilatation,
         loads=loads,
     )
@@ -115,7 +115,7 @@ def _steps(body: Body, case: Case, steps: int, progress: Progress) -> tuple[NDAr
     if case.motion is None and body.states.after:
         problem = inverse_problem(body, case, progress=progress)
         return fit_driver(problem, _moduli(body.space.mesh.tissues), shares=shares)[-1]
-    if case.mechanics.law == "linear":
+    if not case.mechanics.material_law.finite:
         whole = _moved(body, case, 1.0)
         return tuple(whole * share for share in shares)
     return tuple(_moved(body, case, share) for share in shares)

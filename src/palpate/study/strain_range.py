@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from palpate.inversion import Remark
 from palpate.mechanics.deformation import largest_strains
+from palpate.mechanics.laws.contract import Law
 from palpate.mesh.space import LagrangeSpace
 
 __all__ = ["LINEAR_RANGE", "linear_strain_warnings"]
@@ -18,14 +19,14 @@ MOST_BEYOND = 0.01  # share of the meshed volume
 
 
 def linear_strain_warnings(
-    law: str, *moved: tuple[LagrangeSpace, Sequence[NDArray[np.float64]]], images: Sequence[str]
+    law: Law, *moved: tuple[LagrangeSpace, Sequence[NDArray[np.float64]]], images: Sequence[str]
 ) -> tuple[Remark, ...]:
     """A warning when the linear `law` was used where more than 1 % of the meshed volume strains by more than 10 %.
 
     moved: each body's space with its displacements (n_points, 3) mm, one a later image; images: a name of each later
     image, body after body. The strain is that of `largest_strains`. The image with the largest share is told of.
     """
-    if law != "linear":
+    if law.finite:
         return ()
     strained = [_share_and_tail(space, motion) for space, motions in moved for motion in motions]
     names = [*images, *["a later image"] * len(strained)]  # states that come from no file may have none

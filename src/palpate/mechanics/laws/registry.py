@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from palpate.errors import ConfigurationError
 from palpate.mechanics.laws.contract import Law, LawParameter
 from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
 from palpate.mechanics.laws.neo_hookean import NeoHookean
 
-__all__ = ["LAWS", "law_named", "law_parameters"]
+__all__ = ["LAWS", "law_from", "law_named", "law_parameters"]
 
 REGISTERED = (Linear, NeoHookean, MooneyRivlin)  # a new law is a file, and its class here
 
@@ -30,6 +32,12 @@ def law_named(name: str, **parameters: float) -> Law:
                 f"the law '{name}' has no parameter '{key}'; it belongs to {' and '.join(map(repr, owners)) or 'none'}"
             )
     return type(LAWS[name])(**parameters)
+
+
+def law_from(name: str, stated: Mapping[str, float]) -> Law:
+    """The law of that name with those of the `stated` parameters that are its own; raises as `law_named`."""
+    own = {parameter.name for parameter in LAWS[name].parameters} if name in LAWS else set()
+    return law_named(name, **{key: value for key, value in stated.items() if key in own})
 
 
 def law_parameters() -> dict[str, LawParameter]:
