@@ -13,7 +13,17 @@ import pytest
 @pytest.fixture(scope="session")
 def twins():
     """The module `twins`, loaded by its path: tests are no package."""
-    spec = importlib.util.spec_from_file_location("inversion_twins", Path(__file__).with_name("twins.py"))
+    return loaded("inversion_twins", Path(__file__).with_name("twins.py"))
+
+
+@pytest.fixture(scope="session")
+def point_motion():
+    """The module `point_motion` of the observations' tests: a second kind of observation."""
+    return loaded("point_motion", Path(__file__).parents[1] / "observation" / "point_motion.py")
+
+
+def loaded(name, path):
+    spec = importlib.util.spec_from_file_location(name, path)
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses look their module up
     spec.loader.exec_module(module)

@@ -7,7 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.inversion import Bounds, InversionSettings, fit_driver, invert
+from palpate.inversion import (
+    Bounds,
+    FittedState,
+    InversionSettings,
+    Observed,
+    OuterIterate,
+    conclude,
+    estimate,
+    fit_driver,
+    gauss_newton,
+    invert,
+    posterior_sd,
+    sandwich_covariance,
+)
 from palpate.observation.noise_model import NoiseModel
 
 SHARP = NoiseModel(np.array([1e-6]), np.array([3.0]))
@@ -110,3 +123,135 @@ def test_every_step_is_reported(twins, twin):
     invert(twins.exact_problem(twin, noise=SHARP), twins.settings(1.0), progress=lines.append)
     assert any("gland" in line for line in lines)
     assert any("start 1 of 1" in line for line in lines)
+
+
+STATED = NoiseModel(np.array([0.03**2]), np.array([3.0]))
+
+
+@pytest.fixture(scope="module")
+def with_points(twins, twin, point_motion):
+    """A problem of surfaces with and without the motion of three points within the organs, all with a stated noise."""
+    problem = twins.exact_problem(twin, noise=STATED)
+    points, state = twin.model.space.points, problem.states[0]
+    middles = [shape.centre for shape in twins.BALLS[:2]] + [np.array([10.0, -10.0, 5.0])]
+    numbers = [int(np.argmin(np.linalg.norm(points - middle, axis=1))) for middle in middles]
+    seen = [point_motion.point_motion(n, points[n], twin.scene.displacement[n], sd_mm=0.05) for n in numbers]
+    more = replace(state, observations=(*state.observations, *seen))
+    return problem, replace(problem, states=(more,))
+
+
+@pytest.fixture(scope="module")
+def with_and_without(twins, with_points):
+    return [invert(problem, twins.settings(0.5, 8.0), progress=twins.silent) for problem in with_points]
+
+
+def test_a_second_kind_of_observation_is_estimated_from_together_with_the_surfaces(twins, with_and_without):
+    """The estimate stays at the truth, and what more has been seen leaves less open."""
+    surfaces, together = with_and_without
+    assert together.minimum.converged
+    assert np.abs(together.minimum.unknowns[:2] - twins.TRUTH).max() < 1e-3
+    assert set(together.objective.noise) == {"surface distance", "point motion"}
+    sds = [posterior_sd(found.minimum, 2) for found in (surfaces, together)]
+    assert np.all(sds[1] < 0.999 * sds[0])
+    spreads = [np.sqrt(np.diag(sandwich_covariance(f.objective, f.minimum.evaluation))) for f in (surfaces, together)]
+    assert np.all(spreads[1] <= spreads[0])
+
+
+def test_a_second_kind_of_observation_is_stated_with_its_fit(twins, twin, with_and_without):
+    grid, space = twin.scene.before.grid, twin.model.space
+    images = ((twin.scene.after.labels - 1).astype(np.int16),)
+    observed = Observed((FittedState(space, twin.scene.displacement, grid, grid),), images)
+    result = conclude(with_and_without[1], twins.settings(0.5, 8.0), observed, truth={}, seed=1)
+    assert [fit.tissue for fit in result.fits[0]] == ["gland", "sac", "tube", "landmark", "landmark", "landmark"]
+    assert all(fit.end.rms_mm < 0.1 * fit.start.rms_mm for fit in result.fits[0])
+
+
+@pytest.fixture(scope="module")
+def imaged(twins, twin, voxels):
+    """An objective of voxels and its minimum near the truth."""
+    objective = twins.objective_of(voxels, twin.coefficients).rematched(twin.unknowns)
+    return objective, gauss_newton(objective, twin.unknowns, bounds=twins.settings(1.0).bounds)
+
+
+def believing(objective, factor):
+    """The objective with noise of `factor` times the size."""
+    noise = objective.noise["surface distance"]
+    larger = replace(noise, variances=factor**2 * noise.variances)
+    return objective.with_observations([o.with_noise(larger) for o in objective.observations])
+
+
+def worse(objective, minimum, by):
+    """A minimum elsewhere, where another objective has one: gland and sac held apart from where they fit."""
+    theta = minimum.unknowns[:2] + by
+    held = Bounds(theta - 1e-3, theta + 1e-3)
+    return gauss_newton(objective, np.concatenate([theta, minimum.unknowns[2:]]), bounds=held)
+
+
+def concluded(twins, *iterates, settings=None):
+    starts = tuple(estimate.StartRun(np.zeros(2), it.minimum, i) for i, it in enumerate(iterates))
+    return estimate._concluded(iterates, starts, iterates[0].minimum.evaluation, settings or twins.settings(1.0), 0)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_worse_fit_does_not_win_because_its_noise_is_believed_to_be_larger(twins, imaged, order, monkeypatch):
+    """Its own value is the smaller one; under one noise model it is the larger one, whichever was sought first."""
+    objective, minimum = imaged
+    rough = believing(objective, 3.0)
+    elsewhere = worse(rough, minimum, 0.7)
+    assert elsewhere.evaluation.misfit_mm2 > 1.2 * minimum.evaluation.misfit_mm2
+    assert elsewhere.evaluation.value < minimum.evaluation.value
+    hold(monkeypatch)
+    good, bad = OuterIterate(objective, minimum), OuterIterate(rough, elsewhere)
+    found = concluded(twins, *(good, bad)[::order])
+    assert found.minimum.unknowns == pytest.approx(minimum.unknowns)
+    assert found.candidates[found.best].value < found.candidates[1 - found.best].value
+
+
+def hold(monkeypatch):
+    """Minima stay where they are when they are compared: the objective has no second one there."""
+
+    def here(objective, start, settings, **_):
+        return gauss_newton(objective, start, bounds=settings.bounds, hold_theta=True)
+
+    monkeypatch.setattr(estimate, "minimised", here)
+
+
+def test_iterates_that_met_are_one_candidate_of_which_the_one_sought_first_stands(twins, imaged):
+    objective, minimum = imaged
+    near = replace(minimum, unknowns=minimum.unknowns + np.append([0.01, -0.01], np.zeros(len(minimum.unknowns) - 2)))
+    found = concluded(twins, OuterIterate(objective, minimum), OuterIterate(objective, near))
+    assert len(found.candidates) == 1
+    assert [start.candidate for start in found.starts] == [0, 0]
+    assert found.minimum is minimum
+
+
+def test_minima_further_apart_than_their_own_uncertainty_are_candidates_of_their_own(twins, imaged):
+    objective, minimum = imaged
+    far = worse(objective, minimum, 0.7)
+    found = concluded(twins, OuterIterate(objective, minimum), OuterIterate(objective, far))
+    assert len(found.candidates) == 2
+    assert [start.candidate for start in found.starts] == [0, 1]
+
+
+def test_a_minimum_that_did_not_converge_is_not_the_best_one_while_another_did(twins, imaged, monkeypatch):
+    objective, minimum = imaged
+    hold(monkeypatch)
+    far = worse(objective, minimum, 0.7)
+    failed = OuterIterate(objective, replace(minimum, outcome=estimate.Outcome.STUCK))
+    found = concluded(twins, failed, OuterIterate(objective, far))
+    assert found.best == 1
+    assert found.minimum.converged
+
+
+def test_every_start_keeps_its_own_steps_and_verdict_and_the_shared_ones_stand_once(twins, twin):
+    """Starts of one minimum share what was done after it: no step of one is told as another's."""
+    problem = twins.voxel_problem(twin)
+    found = invert(problem, twins.settings(0.5, 8.0), progress=twins.silent)
+    first, second = (start.minimum.history for start in found.starts)
+    for start, history in zip(found.starts, (first, second), strict=True):
+        assert np.array_equal(history[0].theta, start.theta)
+        assert np.array_equal(history[-1].theta, start.minimum.unknowns[:2])
+    assert not {tuple(i.theta) for i in first} & {tuple(i.theta) for i in second}
+    shared = {tuple(iterate.theta) for iterate in found.minimum.history[1:]}
+    assert len(shared) > 1
+    assert not shared & {tuple(iterate.theta) for history in (first, second) for iterate in history}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -45,3 +46,13 @@ def geodesic(subdivisions):
         triangles = np.concatenate([np.stack(child, axis=1) for child in children])
         vertices = np.concatenate([vertices, middle / np.linalg.norm(middle, axis=1, keepdims=True)])
     return vertices, triangles
+
+
+@pytest.fixture(scope="session")
+def point_motion():
+    """The module `point_motion`, loaded by its path."""
+    spec = importlib.util.spec_from_file_location("point_motion", Path(__file__).with_name("point_motion.py"))
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module

@@ -1,0 +1,72 @@
+"""A second observation, which only tests know: one point of the body whose displacement has been seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import sparse
+
+from palpate.observation.contract import Fit, Residuals, Weighting
+from palpate.observation.noise_model import NoiseModel
+from palpate.observation.robust_loss import Tukey
+
+APART = 0.5  # mm: correlation length; the three axes of a point are independent anyway
+
+
+@dataclass(frozen=True, slots=True)
+class PointMotion:
+    """Displacement seen (3,) mm of the point with a number, at rest (3,) mm, with a stated noise; an `Observation`."""
+
+    point: int
+    rest: np.ndarray
+    seen: np.ndarray
+    stated_noise: NoiseModel
+    noise_model: NoiseModel
+    weighting: Weighting
+    name: str = "landmark"
+    kind: str = "point motion"
+    of_driver: bool = False
+    observed_share: float = 1.0
+
+    @property
+    def dofs(self):
+        return 3 * self.point + np.arange(3)
+
+    def residuals(self, displacement):
+        identity = sparse.csr_matrix(np.eye(3))
+        places = np.tile(self.rest + displacement, (3, 1))
+        material = np.tile(self.rest, (3, 1))
+        weights = np.full(3, 1.0 / 3.0)
+        return Residuals(displacement - self.seen, weights, places, np.eye(3), material, identity, identity)
+
+    def rematched(self, _displacement):
+        return self
+
+    def with_noise(self, noise):
+        return replace(self, noise_model=noise, weighting=Weighting(3.0 / noise.sd**2, Tukey()))
+
+    def reweighted(self, _residuals):
+        return self
+
+    def first_noise(self, _peers):
+        return self.stated_noise
+
+    def fitted_noise(self, _residuals):
+        return self.stated_noise
+
+    def wall_motion(self, _residuals, *, present, kernel_mm):  # noqa: ARG002
+        return None
+
+    def imaging_error(self, _residuals, _before, _after):
+        return np.zeros(3)
+
+    def fit(self, residuals, _modelled, _image):
+        length = float(np.linalg.norm(residuals.values))
+        return Fit(length, length, length, None)
+
+
+def point_motion(point, rest, seen, *, sd_mm) -> PointMotion:
+    """The observation of one point by its number, with noise of sd_mm."""
+    noise = NoiseModel(np.array([sd_mm**2]), np.array([APART]))
+    return PointMotion(point, rest, seen, noise, noise, Weighting(1.0, Tukey())).with_noise(noise)

@@ -1,0 +1,213 @@
+"""The contract of observations: every class that has its members keeps it, without a test of its own."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import pkgutil
+from dataclasses import FrozenInstanceError, dataclass, fields, is_dataclass
+
+import numpy as np
+import pytest
+
+import palpate.observation
+from palpate.images.distance import distance_map
+from palpate.images.label_image import VoxelGrid
+from palpate.observation.contract import Observation
+from palpate.observation.noise_model import NoiseModel
+from palpate.observation.observed_surface import ObservedSurface
+from palpate.observation.surface_distance import SurfaceDistance, surface_distance
+from palpate.observation.target import surface_target, target_from
+from palpate.phantoms.shapes import Ellipsoid, rotation_about
+
+MEMBERS = [name for name in vars(Observation) if not name.startswith("_")]
+STEPS = np.array([1e-2, 1e-3, 1e-4])
+NOISE = NoiseModel(np.array([0.2**2]), np.array([4.0]))
+
+
+def implementations():
+    """All classes of the observations that have every member of the contract."""
+    found = set()
+    for module in pkgutil.walk_packages(palpate.observation.__path__, "palpate.observation."):
+        for _, kind in inspect.getmembers(importlib.import_module(module.name), inspect.isclass):
+            own = kind.__module__ == module.name and kind is not Observation
+            if own and all(hasattr(kind, member) for member in MEMBERS):
+                found.add(kind)
+    return found
+
+
+def ball(sphere, *, driver):
+    vertices, triangles = sphere(2)
+    everywhere, rim = np.ones(len(triangles), dtype=bool), np.zeros((len(triangles), 3), dtype=bool)
+    points = np.arange(len(vertices))
+    return ObservedSurface(0, "ball", points, 10.0 * vertices, triangles, everywhere, rim, 1.0, driver=driver)
+
+
+def of_smooth_surfaces(sphere, _point_motion):
+    """Two ellipsoids that are neither the model nor each other, without voxels."""
+    turned = rotation_about(np.array([1.0, 2.0, 3.0]), 30.0)
+    before = Ellipsoid(np.zeros(3), np.array([10.6, 9.7, 10.2]), turned)
+    after = Ellipsoid(np.array([0.8, -0.5, 0.3]), np.array([9.4, 10.9, 10.4]), turned)
+    towards = np.random.default_rng(3).standard_normal((400, 3))
+    points = after.surface(towards / np.linalg.norm(towards, axis=1, keepdims=True))
+    target = target_from(ball(sphere, driver=True), before, after, level=0.1, image=(points, np.full(400, 3.0)))
+    return surface_distance(target)
+
+
+def of_voxels(sphere, _point_motion, bias=0.0):
+    """A ball that has shifted and shrunk, in voxels whose distance maps have a bias."""
+    grid = VoxelGrid((34, 34, 34), np.array([[1.0, 0, 0, -16.6], [0, 1, 0, -16.3], [0, 0, 1, -16.4], [0, 0, 0, 1.0]]))
+    centres = grid.world(np.indices(grid.shape).reshape(3, -1).T.astype(float))
+    maps = []
+    for middle, radius in ((np.zeros(3), 10.3), (np.array([1.2, 0.0, 0.0]), 10.0)):
+        inside = np.linalg.norm(centres - middle, axis=1).reshape(grid.shape) < radius
+        maps.append(distance_map(inside, grid, smoothing_mm=0.6).shifted(bias))
+    return surface_distance(surface_target(ball(sphere, driver=False), *maps))
+
+
+def of_point(_sphere, point_motion):
+    return point_motion.point_motion(4, np.array([1.0, 2.0, 3.0]), np.array([0.3, -0.2, 0.5]), sd_mm=0.1)
+
+
+MAKERS = {SurfaceDistance: {"smooth surfaces": of_smooth_surfaces, "voxels": of_voxels}}
+TOY = {"toy": of_point}
+CASES = {f"{kind.__name__}-{name}": make for kind, makers in MAKERS.items() for name, make in makers.items()} | TOY
+
+
+def test_every_implementation_is_tested_here(point_motion):
+    assert implementations() == set(MAKERS)
+    assert all(hasattr(point_motion.PointMotion, member) for member in MEMBERS)
+
+
+@dataclass(frozen=True)
+class Case:
+    """An observation, and a displacement (n_dofs,) mm at which it is asked."""
+
+    seen: Observation
+    place: np.ndarray
+
+    @property
+    def residuals(self):
+        return self.seen.residuals(self.place)
+
+
+@pytest.fixture(params=CASES)
+def case(request, sphere, point_motion, rng):
+    seen = CASES[request.param](sphere, point_motion)
+    return Case(seen, 0.3 * rng.standard_normal(len(seen.dofs)))
+
+
+def test_residuals_have_the_shapes_that_are_promised(case):
+    found, n = case.residuals, len(case.residuals.values)
+    assert found.weights.shape == (n,)
+    for triple in (found.places, found.normals, found.material):
+        assert triple.shape == (n, 3)
+    assert np.linalg.norm(found.normals, axis=1) == pytest.approx(np.ones(n))
+    for jacobian in (found.jacobian, found.smooth_jacobian):
+        assert jacobian.shape == (n, len(case.seen.dofs))
+    assert case.seen.kind
+    assert case.seen.name
+    assert 0.0 < case.seen.observed_share <= 1.0
+
+
+@pytest.mark.parametrize("make", [of_smooth_surfaces, of_point])
+def test_the_exact_jacobian_leaves_a_remainder_of_second_order(make, sphere, point_motion, rng):
+    """Of nine residuals in ten: of the others the closest point jumps to another triangle."""
+    seen = make(sphere, point_motion)
+    place, direction = 0.3 * rng.standard_normal((2, len(seen.dofs)))
+    start = seen.residuals(place)
+    slope = start.jacobian @ direction
+    remainders = [
+        np.quantile(np.abs(seen.residuals(place + h * direction).values - start.values - h * slope), 0.9) for h in STEPS
+    ]
+    if max(remainders) < 1e-14:  # linear
+        return
+    assert np.all(np.diff(np.log(remainders)) / np.diff(np.log(STEPS)) > 1.9)
+
+
+def test_a_changed_jacobian_would_leave_one_of_first_order(sphere, point_motion, rng):
+    """The law above can fail."""
+    seen = of_smooth_surfaces(sphere, point_motion)
+    place, direction = 0.3 * rng.standard_normal((2, len(seen.dofs)))
+    start = seen.residuals(place)
+    slope = 1.001 * (start.jacobian @ direction)
+    remainders = [
+        np.quantile(np.abs(seen.residuals(place + h * direction).values - start.values - h * slope), 0.9) for h in STEPS
+    ]
+    assert np.diff(np.log(remainders))[-1] / np.diff(np.log(STEPS))[-1] < 1.9
+
+
+def test_the_jacobians_and_their_transposes_are_adjoint(case, rng):
+    found = case.residuals
+    for jacobian in (found.jacobian, found.smooth_jacobian):
+        motion, pull = rng.standard_normal(jacobian.shape[1]), rng.standard_normal(jacobian.shape[0])
+        assert (jacobian @ motion) @ pull == pytest.approx(motion @ (jacobian.T @ pull), rel=1e-10)
+
+
+def test_weights_sum_to_one_whatever_has_been_done(case):
+    seen, found = case.seen, case.residuals
+    others = [seen.rematched(case.place), seen.with_noise(NOISE), seen.with_noise(NOISE).reweighted(found)]
+    for one in (seen, *others):
+        weights = one.residuals(case.place).weights
+        assert weights.sum() == pytest.approx(1.0)
+        assert np.all(weights >= 0.0)
+
+
+def test_nothing_that_it_is_asked_changes_it(case):
+    seen, before = case.seen, case.residuals
+    held = {member.name: getattr(seen, member.name) for member in fields(seen)}
+    others = [seen.rematched(case.place), seen.with_noise(NOISE), seen.reweighted(before)]
+    seen.fitted_noise([before])
+    seen.wall_motion(before, present=np.zeros(len(seen.dofs)), kernel_mm=8.0)
+    assert all(type(one) is type(seen) for one in others)
+    assert all(getattr(seen, name) is value for name, value in held.items())
+    assert np.array_equal(case.residuals.values, before.values)
+    assert np.array_equal(case.residuals.weights, before.weights)
+    assert is_dataclass(seen)
+    for name in held:
+        with pytest.raises(FrozenInstanceError):
+            setattr(seen, name, None)
+
+
+def test_residuals_count_by_the_variance_of_their_noise(case):
+    fine, rough = (case.seen.with_noise(NoiseModel(np.array([v]), np.array([4.0]))) for v in (0.01, 0.04))
+    assert fine.noise_model.sd == pytest.approx(0.1)
+    assert fine.weighting.precision == pytest.approx(4.0 * rough.weighting.precision)
+    assert not fine.weighting.loss.rejects(np.array([-1e3, 1e3])).any()
+
+
+def test_noise_is_known_before_residuals_tell_and_after(case):
+    first, fitted = case.seen.first_noise((case.seen, case.seen)), case.seen.fitted_noise([case.residuals])
+    assert first.sd > 0.0
+    assert fitted.sd > 0.0
+    assert case.seen.noise_model.sd == pytest.approx(first.sd)
+
+
+def test_only_a_drivers_wall_has_a_finer_motion(case):
+    motion = case.seen.wall_motion(case.residuals, present=np.zeros(len(case.seen.dofs)), kernel_mm=8.0)
+    assert (motion is not None) == case.seen.of_driver
+    if motion is not None:
+        assert motion.shape == case.seen.dofs.shape
+
+
+def test_the_fit_is_a_length_and_an_overlap(case):
+    index = np.zeros((3, 3, 3), dtype=np.int16)
+    fit = case.seen.fit(case.residuals, index, index)
+    assert 0.0 < fit.mean_mm <= fit.rms_mm <= fit.hd95_mm
+    assert fit.dice in (None, 1.0)
+
+
+@pytest.mark.parametrize("make", [make for make in CASES.values() if "bias" in inspect.signature(make).parameters])
+def test_a_bias_of_both_distance_maps_changes_nothing(make, sphere, point_motion, rng):
+    """Of every observation that is made of them."""
+    plain, biased = (make(sphere, point_motion, bias) for bias in (0.0, 0.35))
+    place = 0.3 * rng.standard_normal(len(plain.dofs)) + np.tile([1.0, 0.0, 0.0], len(plain.dofs) // 3)
+    for change in (lambda o: o, lambda o: o.rematched(place), lambda o: o.reweighted(o.residuals(place))):
+        found = [change(seen).residuals(place) for seen in (plain, biased)]
+        assert found[1].values == pytest.approx(found[0].values, abs=1e-9)
+        assert found[1].weights == pytest.approx(found[0].weights, abs=1e-9)
+        assert abs(found[1].jacobian - found[0].jacobian).max() < 1e-9
+        assert np.std(found[0].values) > 0.1
+    assert biased.reweighted(found[1]).weighting.precision == pytest.approx(
+        plain.reweighted(found[0]).weighting.precision, rel=1e-6
+    )
