@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 FORCING = 0.1  # of the last outer iteration's step: to which the next one's weights and estimate agree
-INNER = 6.0  # a minimum is found to so small a part of what a reweighting may still change
+INNER = 20.0  # a minimum is found to so small a part of what a reweighting may still change
 POLISH = 1e-5  # decrement of a minimum by a method that does not tell how far the log-moduli are from it
 NEAR = 0.5  # posterior standard deviations: a step that is shorter ends where derivatives are worth making exact
 ROUGH_SURFACE = 1.0 / 3.0  # mm, of a residual: below that a model must be as much more exact
