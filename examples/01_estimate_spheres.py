@@ -10,8 +10,8 @@ import tempfile
 from pathlib import Path
 
 import palpate
-from palpate.images.readers import write_label_image
-from palpate.phantoms.spheres import SpheresOptions, spheres
+from palpate.images import write_label_image
+from palpate.phantoms import SpheresOptions, spheres
 
 TRUTH_KPA = {"core": 60.0, "shell": 30.0}
 CASE = """

@@ -12,10 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.images.label_image import LabelImage, VoxelGrid
-from palpate.images.readers import write_label_image
-from palpate.study.case_file import read_case
-from palpate.study.run import mesh
+from palpate.images import LabelImage, VoxelGrid, write_label_image
+from palpate.study import mesh, read_case
 
 RADIUS, VOXEL = 15.0, 2.0
 CASE = """

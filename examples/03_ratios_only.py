@@ -9,13 +9,10 @@ import sys
 
 import numpy as np
 
-from palpate.images.tissue import Role, Tissue
-from palpate.mechanics.boundary import outer_constraint
-from palpate.mechanics.linear_model import linear_model
-from palpate.mesh.anatomy import Anatomy, Box
-from palpate.mesh.space import lagrange_space
-from palpate.mesh.tetrahedralise import tetrahedralise
-from palpate.phantoms.shapes import ball
+from palpate.images import Role, Tissue
+from palpate.mechanics import linear_model, outer_constraint
+from palpate.mesh import Anatomy, Box, lagrange_space, tetrahedralise
+from palpate.phantoms import ball
 
 TISSUES = (
     Tissue("cavity", Role.DRIVER, (1,)),

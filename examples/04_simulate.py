@@ -12,10 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.images.label_image import LabelImage, VoxelGrid
-from palpate.images.readers import write_label_image
-from palpate.study.case_file import read_case
-from palpate.study.run import simulate
+from palpate import simulate
+from palpate.images import LabelImage, VoxelGrid, write_label_image
+from palpate.study import read_case
 
 CASE = """
 images = { before = "before.nii.gz", after = ["shifted.nii.gz"] }

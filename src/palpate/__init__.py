@@ -9,15 +9,16 @@ if TYPE_CHECKING:
     from palpate.study.case import Case
     from palpate.study.case_file import read_case
     from palpate.study.result import CaseResult
-    from palpate.study.run import estimate
+    from palpate.study.run import estimate, simulate
 
-__all__ = ["Case", "CaseResult", "estimate", "read_case"]
+__all__ = ["Case", "CaseResult", "estimate", "read_case", "simulate"]
 
 _HOMES = {
     "Case": "palpate.study.case",
     "CaseResult": "palpate.study.result",
     "estimate": "palpate.study.run",
     "read_case": "palpate.study.case_file",
+    "simulate": "palpate.study.run",
 }
 
 

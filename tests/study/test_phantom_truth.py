@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 
 import pytest
 
 from palpate.errors import ConfigurationError
 from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
-from palpate.phantoms import pelvis, spheres
 from palpate.phantoms.scene import make_scene
 from palpate.study import read
 from palpate.study.case_file import read_case
@@ -22,6 +22,7 @@ c01_over_c10 = 1.5
 [motion]
 filling_mm = 2.5
 """
+PELVIS, SPHERES = (importlib.import_module(f"palpate.phantoms.{name}") for name in ("pelvis", "spheres"))
 TISSUES = {
     "spheres": {
         "core": ("estimate", 70.0, 0.49),
@@ -41,8 +42,8 @@ def asked(monkeypatch):
         assert set(options) <= set(inspect.signature(make_scene).parameters)
         found.update(options, anatomy=anatomy, motions=motions)
 
-    monkeypatch.setattr(spheres, "make_scene", scene)
-    monkeypatch.setattr(pelvis, "make_scene", scene)
+    monkeypatch.setattr(SPHERES, "make_scene", scene)
+    monkeypatch.setattr(PELVIS, "make_scene", scene)
     return found
 
 

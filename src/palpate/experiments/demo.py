@@ -7,10 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from palpate.experiments.simulated_pelvis import DATA, FILLING_MM, TISSUES, TRUTH_EDGE_MM
-from palpate.images.tissue import Role
-from palpate.study.case_file import read_case
-from palpate.study.result import CaseResult
-from palpate.study.run import estimate
+from palpate.images import Role
+from palpate.study import CaseResult, estimate, read_case
 
 __all__ = ["run_demo"]
 

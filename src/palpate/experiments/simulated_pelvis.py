@@ -15,19 +15,30 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.images.distance import smoothing_width
-from palpate.images.label_image import LabelImage, VoxelGrid
-from palpate.images.label_table import read_label_table
-from palpate.images.readers import read_label_image, write_label_image
-from palpate.images.segmentation import Segmentation, segment
-from palpate.images.tissue import Role, Tissue
-from palpate.mesh.anatomy import Box, anatomy_of, domain_box, margin_box
-from palpate.mesh.quality import check_mesh
-from palpate.mesh.space import LagrangeSpace, lagrange_space
-from palpate.mesh.tetrahedralise import tetrahedralise
-from palpate.phantoms.scene import imaged
-from palpate.study.case import Mechanics
-from palpate.study.simulate import filled
+from palpate.images import (
+    LabelImage,
+    Role,
+    Segmentation,
+    Tissue,
+    VoxelGrid,
+    read_label_image,
+    read_label_table,
+    segment,
+    smoothing_width,
+    write_label_image,
+)
+from palpate.mesh import (
+    Box,
+    LagrangeSpace,
+    anatomy_of,
+    check_mesh,
+    domain_box,
+    lagrange_space,
+    margin_box,
+    tetrahedralise,
+)
+from palpate.phantoms import imaged
+from palpate.study import Mechanics, filled
 
 __all__ = ["DATA", "TISSUES", "SimulatedPelvis", "simulate_pelvis"]
 

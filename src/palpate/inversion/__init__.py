@@ -4,7 +4,7 @@ from palpate.inversion.approximation import Approximation, ExactApproximation, P
 from palpate.inversion.driver_fit import fit_driver
 from palpate.inversion.estimate import Inversion, continue_at_finite_strain, invert
 from palpate.inversion.later_state import InverseProblem, LaterState
-from palpate.inversion.objective import Evaluation, Objective
+from palpate.inversion.objective import Evaluation, Linearisation, Objective
 from palpate.inversion.optimise import Bounds, Minimum, Outcome, fit_coefficients, gauss_newton, posterior_sd
 from palpate.inversion.outer_loop import InversionSettings, OuterIterate, StopRule, run_outer_loop
 from palpate.inversion.parameters import ParameterMap, parameter_map
@@ -12,9 +12,19 @@ from palpate.inversion.reduced_basis import ReducedBasis, reduced_basis
 from palpate.inversion.result import Estimation, Observed, Remark, conclude
 from palpate.inversion.reweighting import reweighted, with_first_noise
 from palpate.inversion.sampling import sample_posterior
-from palpate.inversion.uncertainty import FittedState, Interval, gain, log_interval, sandwich_covariance, verdict
+from palpate.inversion.uncertainty import (
+    NORMAL_95,
+    FittedState,
+    Interval,
+    gain,
+    imaging_errors,
+    log_interval,
+    sandwich_covariance,
+    verdict,
+)
 
 __all__ = [
+    "NORMAL_95",
     "Approximation",
     "Bounds",
     "Estimation",
@@ -26,6 +36,7 @@ __all__ = [
     "Inversion",
     "InversionSettings",
     "LaterState",
+    "Linearisation",
     "Minimum",
     "Objective",
     "Observed",
@@ -43,6 +54,7 @@ __all__ = [
     "fit_driver",
     "gain",
     "gauss_newton",
+    "imaging_errors",
     "invert",
     "log_interval",
     "parameter_map",

@@ -1,1 +1,29 @@
 """Conforming tetrahedra of several tissues, their surfaces, spaces and voxels."""
+
+from palpate.mesh.anatomy import Anatomy, Box, LevelSet, anatomy_of, domain_box, margin_box
+from palpate.mesh.constraint import Constraint
+from palpate.mesh.quality import check_mesh
+from palpate.mesh.space import LagrangeSpace, lagrange_space, triangle_shape
+from palpate.mesh.surface import triangle_normals
+from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh
+from palpate.mesh.tetrahedralise import boundary_of, tetrahedralise
+
+__all__ = [
+    "FACES",
+    "OUTER",
+    "Anatomy",
+    "Box",
+    "Constraint",
+    "LagrangeSpace",
+    "LevelSet",
+    "TetMesh",
+    "anatomy_of",
+    "boundary_of",
+    "check_mesh",
+    "domain_box",
+    "lagrange_space",
+    "margin_box",
+    "tetrahedralise",
+    "triangle_normals",
+    "triangle_shape",
+]

@@ -1,1 +1,85 @@
 """One case: what it says, what came out of it."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from palpate.study.body import Body, ImagedStates, aligned, inverse_problem, make_body, surface_observations
+    from palpate.study.case import Case, Domain, DriverMotion, Mechanics, MeshSettings, Phantom
+    from palpate.study.case_file import read_case
+    from palpate.study.cost import expected_cost
+    from palpate.study.outputs import make_folder, whole_file, write_json, write_text
+    from palpate.study.provenance import software_versions
+    from palpate.study.read import read_states
+    from palpate.study.result import CaseResult
+    from palpate.study.run import estimate, estimate_states, fitted_states, inversion_settings, mesh
+    from palpate.study.simulate import filled
+
+__all__ = [
+    "Body",
+    "Case",
+    "CaseResult",
+    "Domain",
+    "DriverMotion",
+    "ImagedStates",
+    "Mechanics",
+    "MeshSettings",
+    "Phantom",
+    "aligned",
+    "estimate",
+    "estimate_states",
+    "expected_cost",
+    "filled",
+    "fitted_states",
+    "inverse_problem",
+    "inversion_settings",
+    "make_body",
+    "make_folder",
+    "mesh",
+    "read_case",
+    "read_states",
+    "software_versions",
+    "surface_observations",
+    "whole_file",
+    "write_json",
+    "write_text",
+]
+
+_HOMES = {
+    "Body": "palpate.study.body",
+    "Case": "palpate.study.case",
+    "CaseResult": "palpate.study.result",
+    "Domain": "palpate.study.case",
+    "DriverMotion": "palpate.study.case",
+    "ImagedStates": "palpate.study.body",
+    "Mechanics": "palpate.study.case",
+    "MeshSettings": "palpate.study.case",
+    "Phantom": "palpate.study.case",
+    "aligned": "palpate.study.body",
+    "estimate": "palpate.study.run",
+    "estimate_states": "palpate.study.run",
+    "expected_cost": "palpate.study.cost",
+    "filled": "palpate.study.simulate",
+    "fitted_states": "palpate.study.run",
+    "inverse_problem": "palpate.study.body",
+    "inversion_settings": "palpate.study.run",
+    "make_body": "palpate.study.body",
+    "make_folder": "palpate.study.outputs",
+    "mesh": "palpate.study.run",
+    "read_case": "palpate.study.case_file",
+    "read_states": "palpate.study.read",
+    "software_versions": "palpate.study.provenance",
+    "surface_observations": "palpate.study.body",
+    "whole_file": "palpate.study.outputs",
+    "write_json": "palpate.study.outputs",
+    "write_text": "palpate.study.outputs",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a name when it is first used: a part of this layer is often wanted alone, and quickly."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'palpate.study' has no attribute '{name}'")
+    return getattr(import_module(_HOMES[name]), name)

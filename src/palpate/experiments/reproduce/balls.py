@@ -13,16 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from palpate.images.label_image import VoxelGrid
-from palpate.images.tissue import Role, Tissue
-from palpate.mechanics.element import barycentric_gradients, shape_derivatives
-from palpate.mechanics.loads import DeadLoad, boundary_named, pressure
-from palpate.mesh.anatomy import Anatomy
-from palpate.mesh.constraint import Constraint
-from palpate.mesh.space import LagrangeSpace, lagrange_space
-from palpate.mesh.tetrahedralise import tetrahedralise
-from palpate.phantoms.scene import centred_grid, grid_box
-from palpate.phantoms.shapes import Complement, ball, rotation_about
+from palpate.images import Role, Tissue, VoxelGrid
+from palpate.mechanics import DeadLoad, barycentric_gradients, boundary_named, pressure, shape_derivatives
+from palpate.mesh import Anatomy, Constraint, LagrangeSpace, lagrange_space, tetrahedralise
+from palpate.phantoms import Complement, ball, centred_grid, grid_box, rotation_about
 
 __all__ = [
     "AIR",

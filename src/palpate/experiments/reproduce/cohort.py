@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.images.tissue import Role, Tissue
+from palpate.images import Role, Tissue
 from palpate.inversion import (
     Bounds,
     InverseProblem,
@@ -21,21 +21,20 @@ from palpate.inversion import (
     parameter_map,
     reduced_basis,
 )
-from palpate.mechanics.boundary import outer_constraint
-from palpate.mechanics.linear_model import LinearModel, LinearSystem, linear_model, with_constraint
-from palpate.mesh.anatomy import Anatomy, Box
-from palpate.mesh.space import LagrangeSpace, lagrange_space
-from palpate.mesh.tetrahedralise import tetrahedralise
-from palpate.observation.noise_model import NoiseModel
-from palpate.observation.observed_surface import observed_surface
-from palpate.observation.prescribed_motion import prescribed_motion
-from palpate.observation.surface_distance import surface_distance
-from palpate.phantoms.boundary_noise import smooth_field
-from palpate.phantoms.exact_targets import target_of_truth
-from palpate.phantoms.motion import filling_of
-from palpate.phantoms.pelvis_shapes import PelvisShapes, draw_pelvis
-from palpate.phantoms.scene import Noise, centred_grid, grid_box
-from palpate.study.case import DriverMotion
+from palpate.mechanics import LinearModel, LinearSystem, linear_model, outer_constraint, with_constraint
+from palpate.mesh import Anatomy, Box, LagrangeSpace, lagrange_space, tetrahedralise
+from palpate.observation import NoiseModel, observed_surface, prescribed_motion, surface_distance
+from palpate.phantoms import (
+    Noise,
+    PelvisShapes,
+    centred_grid,
+    draw_pelvis,
+    filling_of,
+    grid_box,
+    smooth_field,
+    target_of_truth,
+)
+from palpate.study import DriverMotion
 
 __all__ = ["ORGANS", "CohortSettings", "PatientResult", "estimate_patient", "true_moduli"]
 

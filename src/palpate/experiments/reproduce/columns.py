@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.experiments.reproduce.table import Entry
-from palpate.images.label_image import VoxelGrid
-from palpate.images.segmentation import segment
+from palpate.images import VoxelGrid, segment
 from palpate.inversion import (
     Bounds,
     Inversion,
@@ -22,10 +21,9 @@ from palpate.inversion import (
     sandwich_covariance,
     verdict,
 )
-from palpate.mesh.space import LagrangeSpace
-from palpate.phantoms.scene import imaged
-from palpate.study.body import Body, ImagedStates, aligned
-from palpate.study.run import fitted_states
+from palpate.mesh import LagrangeSpace
+from palpate.phantoms import imaged
+from palpate.study import Body, ImagedStates, aligned, fitted_states
 
 __all__ = [
     "entries_from_surfaces",

@@ -26,18 +26,20 @@ from palpate.experiments.reproduce.columns import from_half
 from palpate.experiments.reproduce.jobs import Job, Progress, compute
 from palpate.experiments.reproduce.ledger import Ledger
 from palpate.inversion import InverseProblem, Inversion, LaterState, invert, parameter_map
-from palpate.mechanics.dilatation import Dilatation
-from palpate.mechanics.equilibrium import ACCURACY, equilibrium
-from palpate.mechanics.finite_strain import finite_strain_model
-from palpate.mechanics.laws.registry import law_named
-from palpate.mechanics.linear_model import LinearModel, linear_model
-from palpate.mechanics.newton import NewtonSettings
-from palpate.mechanics.stiffness import lame_parameters
-from palpate.mesh.constraint import Constraint
-from palpate.mesh.space import LagrangeSpace
-from palpate.observation.observed_surface import observed_surface
-from palpate.observation.surface_distance import surface_distance
-from palpate.phantoms.exact_targets import target_of_truth
+from palpate.mechanics import (
+    ACCURACY,
+    Dilatation,
+    LinearModel,
+    NewtonSettings,
+    equilibrium,
+    finite_strain_model,
+    lame_parameters,
+    law_named,
+    linear_model,
+)
+from palpate.mesh import Constraint, LagrangeSpace
+from palpate.observation import observed_surface, surface_distance
+from palpate.phantoms import target_of_truth
 
 __all__ = ["Figure4", "Figure4Settings", "Point", "figure4", "nominal_stress"]
 

@@ -14,7 +14,7 @@ from palpate.experiments.reproduce.balls import BODIES
 from palpate.experiments.reproduce.figure4 import LAW, LEAVE_PERCENT, Figure4
 from palpate.experiments.reproduce.staging import Staging
 from palpate.experiments.reproduce.table import COLUMNS, Table, TableRow
-from palpate.study.outputs import whole_file
+from palpate.study import whole_file
 
 __all__ = ["draw_figure4", "draw_staging", "draw_table"]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.errors import ResourceError
-from palpate.study.outputs import make_folder
+from palpate.study import make_folder
 
 __all__ = ["Ledger", "Part"]
 

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from palpate.mechanics.linear_model import LinearModel
-from palpate.mesh.space import LagrangeSpace
-from palpate.observation.observed_surface import ObservedSurface, observed_surface
+from palpate.mechanics import LinearModel
+from palpate.mesh import LagrangeSpace
+from palpate.observation import ObservedSurface, observed_surface
 
 __all__ = ["PaperFit", "PaperTarget", "paper_estimate", "paper_target"]
 

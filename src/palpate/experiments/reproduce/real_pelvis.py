@@ -8,15 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.experiments.simulated_pelvis import DATA, MARGIN_MM, TISSUES
-from palpate.images.label_image import VoxelGrid
-from palpate.images.label_table import read_label_table
-from palpate.images.readers import read_label_image
-from palpate.images.segmentation import Segmentation, segment
-from palpate.images.tissue import Role
-from palpate.mesh.anatomy import Anatomy, Box, anatomy_of, domain_box, margin_box
-from palpate.mesh.space import LagrangeSpace, lagrange_space
-from palpate.mesh.tetrahedralise import tetrahedralise
-from palpate.phantoms.wall_filling import wall_filling
+from palpate.images import Role, Segmentation, VoxelGrid, read_label_image, read_label_table, segment
+from palpate.mesh import Anatomy, Box, LagrangeSpace, anatomy_of, domain_box, lagrange_space, margin_box, tetrahedralise
+from palpate.phantoms import wall_filling
 
 __all__ = ["ORGANS", "SMOOTHING_MM", "RealPelvis", "grid_within", "real_pelvis"]
 

@@ -17,7 +17,7 @@ from palpate.experiments.reproduce.ledger import Ledger
 from palpate.experiments.reproduce.staging import staging
 from palpate.experiments.reproduce.table1 import Table1Settings, table1
 from palpate.experiments.reproduce.table2 import Table2Settings, table2
-from palpate.study.outputs import write_json
+from palpate.study import write_json
 
 __all__ = ["EXPERIMENTS", "Reproduction", "Settings", "reproduce"]
 

@@ -32,14 +32,11 @@ from palpate.experiments.reproduce.paper import PAPER_TABLE1
 from palpate.experiments.reproduce.paper_method import paper_estimate, paper_target
 from palpate.experiments.reproduce.table import COLUMNS, Entry, Table, TableRow, as_part, entries_of
 from palpate.inversion import InverseProblem, Inversion, InversionSettings, LaterState, invert, parameter_map
-from palpate.mechanics.linear_model import LinearModel, linear_model, with_constraint
-from palpate.mesh.space import LagrangeSpace
-from palpate.observation.contract import Observation
-from palpate.observation.observed_surface import observed_surface
-from palpate.observation.surface_distance import surface_distance
-from palpate.phantoms.exact_targets import target_of_truth
-from palpate.study.body import make_body, surface_observations
-from palpate.study.case import Case, Mechanics, MeshSettings, Phantom
+from palpate.mechanics import LinearModel, linear_model, with_constraint
+from palpate.mesh import LagrangeSpace
+from palpate.observation import Observation, observed_surface, surface_distance
+from palpate.phantoms import target_of_truth
+from palpate.study import Case, Mechanics, MeshSettings, Phantom, make_body, surface_observations
 
 __all__ = ["Table1Settings", "table1"]
 

@@ -29,24 +29,30 @@ from palpate.experiments.reproduce.real_pelvis import (
     real_pelvis,
 )
 from palpate.experiments.reproduce.table import COLUMNS, Entry, Table, TableRow, as_part, entries_of
-from palpate.images.distance import observation_width, smoothing_width
-from palpate.images.label_image import VoxelGrid
-from palpate.images.tissue import Role
+from palpate.images import Role, VoxelGrid, observation_width, smoothing_width
 from palpate.inversion import InverseProblem, LaterState, ReducedBasis, invert, parameter_map, reduced_basis
-from palpate.mechanics.boundary import outer_constraint
-from palpate.mechanics.dilatation import choose_element
-from palpate.mechanics.linear_model import LinearModel, linear_model, weighted_sum
-from palpate.mechanics.linearised import LinearisedSystem
-from palpate.mesh.anatomy import anatomy_of
-from palpate.mesh.quality import check_mesh
-from palpate.mesh.space import LagrangeSpace, lagrange_space
-from palpate.mesh.tetrahedralise import tetrahedralise
-from palpate.observation.observed_surface import observed_surface
-from palpate.observation.prescribed_motion import prescribed_motion
-from palpate.observation.surface_distance import surface_distance
-from palpate.phantoms.exact_targets import target_of_truth
-from palpate.study.body import Body, inverse_problem, surface_observations
-from palpate.study.case import Case, Domain, DriverMotion, Mechanics, MeshSettings, Phantom
+from palpate.mechanics import (
+    LinearisedSystem,
+    LinearModel,
+    choose_element,
+    linear_model,
+    outer_constraint,
+    weighted_sum,
+)
+from palpate.mesh import LagrangeSpace, anatomy_of, check_mesh, lagrange_space, tetrahedralise
+from palpate.observation import observed_surface, prescribed_motion, surface_distance
+from palpate.phantoms import target_of_truth
+from palpate.study import (
+    Body,
+    Case,
+    Domain,
+    DriverMotion,
+    Mechanics,
+    MeshSettings,
+    Phantom,
+    inverse_problem,
+    surface_observations,
+)
 
 __all__ = ["SURROUNDINGS_KPA", "Table2Settings", "table2"]
 

@@ -17,13 +17,8 @@ from scipy.spatial import cKDTree
 from palpate.experiments.verification.conditions import all_prescribed
 from palpate.experiments.verification.problem import Check, Problem
 from palpate.experiments.verification.structured_meshes import box_mesh, known, make_mesh
-from palpate.mechanics.boundary import outer_constraint
-from palpate.mechanics.dilatation import Dilatation
-from palpate.mechanics.element import shape_functions
-from palpate.mechanics.finite_strain import finite_strain_model
-from palpate.mechanics.laws.registry import LAWS
-from palpate.mechanics.linear_model import linear_model
-from palpate.mesh.space import LagrangeSpace, lagrange_space
+from palpate.mechanics import LAWS, Dilatation, finite_strain_model, linear_model, outer_constraint, shape_functions
+from palpate.mesh import LagrangeSpace, lagrange_space
 
 __all__ = ["BEADS_PROBLEMS", "Beads", "best_poisson_ratio", "prediction_errors", "read_beads"]
 

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from palpate.experiments.verification.conditions import mean_radial, prescribe
 from palpate.experiments.verification.problem import Check, Problem
 from palpate.experiments.verification.structured_meshes import known, octant_mesh
-from palpate.mechanics.boundary import outer_constraint
-from palpate.mechanics.linear_model import LinearModel, linear_model
-from palpate.mesh.space import lagrange_space
+from palpate.mechanics import LinearModel, linear_model, outer_constraint
+from palpate.mesh import lagrange_space
 
 __all__ = ["CONCENTRIC_PROBLEMS", "SENSITIVITIES", "hollow_spheres", "radial", "solid_spheres"]
 

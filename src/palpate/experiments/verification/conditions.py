@@ -8,15 +8,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
-from palpate.mechanics.boundary import outer_constraint
-from palpate.mechanics.dilatation import Dilatation
-from palpate.mechanics.element import barycentric_gradients, shape_derivatives
-from palpate.mechanics.linear_model import linear_model, weighted_sum
-from palpate.mechanics.solvers.registry import factorise
-from palpate.mesh.constraint import Constraint
-from palpate.mesh.space import LagrangeSpace
-from palpate.mesh.surface import triangle_normals
-from palpate.mesh.tet_mesh import FACES, TetMesh
+from palpate.mechanics import (
+    Dilatation,
+    barycentric_gradients,
+    factorise,
+    linear_model,
+    outer_constraint,
+    shape_derivatives,
+    weighted_sum,
+)
+from palpate.mesh import FACES, Constraint, LagrangeSpace, TetMesh, triangle_normals
 
 __all__ = [
     "Prescription",

@@ -14,12 +14,8 @@ from numpy.typing import NDArray
 from palpate.experiments.verification.conditions import held_components
 from palpate.experiments.verification.problem import Check, Problem
 from palpate.experiments.verification.structured_meshes import known, kuhn_tets, make_mesh
-from palpate.mechanics.dilatation import ElementChoice, choose_element
-from palpate.mechanics.finite_strain import finite_strain_model
-from palpate.mechanics.laws.registry import LAWS
-from palpate.mechanics.loads import traction
-from palpate.mesh.space import lagrange_space
-from palpate.mesh.tet_mesh import TetMesh
+from palpate.mechanics import LAWS, ElementChoice, choose_element, finite_strain_model, traction
+from palpate.mesh import TetMesh, lagrange_space
 
 __all__ = ["COOK_PROBLEMS", "INCOMPRESSIBLE", "deflection", "panel"]
 

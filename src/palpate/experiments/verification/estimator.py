@@ -11,6 +11,7 @@ from palpate.experiments.verification.problem import Check, Problem
 from palpate.experiments.verification.structured_meshes import known, octant_mesh
 from palpate.experiments.verification.twin import TRUTH, noise_of, settings_from, twin_model, twin_problem
 from palpate.inversion import (
+    NORMAL_95,
     Inversion,
     InversionSettings,
     Objective,
@@ -21,12 +22,10 @@ from palpate.inversion import (
     verdict,
     with_first_noise,
 )
-from palpate.inversion.uncertainty import NORMAL_95
-from palpate.mechanics.forward import ForwardModel
-from palpate.mechanics.linear_model import LinearModel
-from palpate.mesh.space import lagrange_space
-from palpate.observation.noise_model import NoiseModel
-from palpate.phantoms.boundary_noise import smooth_field
+from palpate.mechanics import ForwardModel, LinearModel
+from palpate.mesh import lagrange_space
+from palpate.observation import NoiseModel
+from palpate.phantoms import smooth_field
 
 __all__ = ["ESTIMATOR_PROBLEMS", "coverage", "gradient_error", "recovered"]
 

@@ -12,11 +12,8 @@ import numpy as np
 from palpate.experiments.verification.conditions import held_components
 from palpate.experiments.verification.problem import Check, Problem
 from palpate.experiments.verification.structured_meshes import box_mesh, known
-from palpate.mechanics.finite_strain import finite_strain_model
-from palpate.mechanics.laws.contract import Law, stress
-from palpate.mechanics.laws.registry import law_named
-from palpate.mechanics.stiffness import lame_parameters
-from palpate.mesh.space import lagrange_space
+from palpate.mechanics import Law, finite_strain_model, lame_parameters, law_named, stress
+from palpate.mesh import lagrange_space
 
 __all__ = ["HOMOGENEOUS_PROBLEMS", "nominal_stress"]
 

@@ -22,11 +22,8 @@ from palpate.experiments.verification.conditions import (
 )
 from palpate.experiments.verification.problem import Check, Problem
 from palpate.experiments.verification.structured_meshes import VOID, known, octant_mesh
-from palpate.mechanics.boundary import outer_constraint
-from palpate.mechanics.linear_model import LinearModel, linear_model
-from palpate.mechanics.stiffness import lame_parameters
-from palpate.mesh.space import LagrangeSpace, lagrange_space
-from palpate.mesh.surface import triangle_normals
+from palpate.mechanics import LinearModel, lame_parameters, linear_model, outer_constraint
+from palpate.mesh import LagrangeSpace, lagrange_space, triangle_normals
 
 __all__ = ["INCLUSION_PROBLEMS", "ball_in_matrix", "cavity_stress", "strain_factors"]
 

@@ -13,11 +13,8 @@ from numpy.typing import NDArray
 from palpate.experiments.verification.conditions import held_components, loaded
 from palpate.experiments.verification.problem import Check, Problem
 from palpate.experiments.verification.structured_meshes import known, octant_mesh
-from palpate.mechanics.element import triangle_quadrature
-from palpate.mechanics.linear_model import linear_model
-from palpate.mesh.constraint import Constraint
-from palpate.mesh.space import LagrangeSpace, lagrange_space, triangle_shape
-from palpate.mesh.surface import triangle_normals
+from palpate.mechanics import linear_model, triangle_quadrature
+from palpate.mesh import Constraint, LagrangeSpace, lagrange_space, triangle_normals, triangle_shape
 
 __all__ = ["INDENTATION_PROBLEMS", "half_space", "hertz_depth", "indenting_force", "point_force_depth"]
 

@@ -16,12 +16,8 @@ from numpy.typing import NDArray
 from palpate.experiments.verification.conditions import held_components
 from palpate.experiments.verification.problem import Check, Problem
 from palpate.experiments.verification.structured_meshes import known, octant_mesh, quarter_ring_mesh
-from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_model
-from palpate.mechanics.laws.contract import Law
-from palpate.mechanics.laws.registry import law_named
-from palpate.mechanics.loads import pressure
-from palpate.mesh.space import LagrangeSpace, lagrange_space
-from palpate.mesh.tet_mesh import TetMesh
+from palpate.mechanics import FiniteStrainModel, Law, finite_strain_model, law_named, pressure
+from palpate.mesh import LagrangeSpace, TetMesh, lagrange_space
 
 __all__ = ["BALLOON", "INFLATION_PROBLEMS", "NU", "bore_of", "inflated_model", "wall_pressures", "youngs"]
 

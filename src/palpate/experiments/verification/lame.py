@@ -19,8 +19,8 @@ from palpate.experiments.verification.conditions import (
 )
 from palpate.experiments.verification.problem import Check, Problem
 from palpate.experiments.verification.structured_meshes import known, octant_mesh, quarter_ring_mesh
-from palpate.mechanics.dilatation import Dilatation
-from palpate.mesh.space import lagrange_space
+from palpate.mechanics import Dilatation
+from palpate.mesh import lagrange_space
 
 __all__ = ["LAME_PROBLEMS", "glued_spheres", "thick_cylinder", "thick_sphere"]
 

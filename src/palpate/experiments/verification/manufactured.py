@@ -14,15 +14,19 @@ from numpy.typing import NDArray
 from palpate.experiments.verification.conditions import held_components, loaded
 from palpate.experiments.verification.problem import Check, Problem
 from palpate.experiments.verification.structured_meshes import box_mesh, known
-from palpate.mechanics.dilatation import Dilatation
-from palpate.mechanics.element import barycentric_gradients, quadrature, shape_derivatives, shape_functions
-from palpate.mechanics.finite_strain import finite_strain_model
-from palpate.mechanics.laws.contract import stress
-from palpate.mechanics.laws.registry import LAWS
-from palpate.mechanics.loads import DeadLoad
-from palpate.mechanics.stiffness import lame_parameters
-from palpate.mesh.constraint import Constraint
-from palpate.mesh.space import LagrangeSpace, lagrange_space
+from palpate.mechanics import (
+    LAWS,
+    DeadLoad,
+    Dilatation,
+    barycentric_gradients,
+    finite_strain_model,
+    lame_parameters,
+    quadrature,
+    shape_derivatives,
+    shape_functions,
+    stress,
+)
+from palpate.mesh import Constraint, LagrangeSpace, lagrange_space
 
 __all__ = ["MANUFACTURED_PROBLEMS", "linear_errors", "neo_hookean_errors", "observed_orders"]
 

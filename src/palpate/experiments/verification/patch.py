@@ -8,13 +8,17 @@ from numpy.typing import NDArray
 from palpate.experiments.verification.conditions import all_prescribed
 from palpate.experiments.verification.problem import Check, Problem
 from palpate.experiments.verification.structured_meshes import box_mesh, known
-from palpate.mechanics.boundary import outer_constraint
-from palpate.mechanics.dilatation import Dilatation
-from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_model
-from palpate.mechanics.laws.contract import Law
-from palpate.mechanics.laws.registry import LAWS
-from palpate.mechanics.linear_model import LinearModel, linear_model
-from palpate.mesh.space import LagrangeSpace, lagrange_space
+from palpate.mechanics import (
+    LAWS,
+    Dilatation,
+    FiniteStrainModel,
+    Law,
+    LinearModel,
+    finite_strain_model,
+    linear_model,
+    outer_constraint,
+)
+from palpate.mesh import LagrangeSpace, lagrange_space
 
 __all__ = ["GRADIENT", "PATCH_PROBLEMS", "affine_error", "finite_affine_error", "moved", "rotation", "rotation_effect"]
 

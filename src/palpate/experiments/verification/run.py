@@ -11,8 +11,7 @@ from typing import Any
 from palpate.errors import PalpateError
 from palpate.experiments.verification.page import page
 from palpate.experiments.verification.problem import Check, Problem, RowDict, as_row
-from palpate.study.outputs import write_json, write_text
-from palpate.study.provenance import software_versions
+from palpate.study import software_versions, write_json, write_text
 
 __all__ = ["document_of", "rows_of", "verify"]
 

@@ -8,8 +8,8 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.images.tissue import Role, Tissue
-from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh
+from palpate.images import Role, Tissue
+from palpate.mesh import FACES, OUTER, TetMesh
 
 __all__ = [
     "VOID",

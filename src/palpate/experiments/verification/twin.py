@@ -13,16 +13,17 @@ from numpy.typing import NDArray
 from palpate.experiments.verification.conditions import held_components, sphere_faces
 from palpate.experiments.verification.structured_meshes import known, octant_mesh, unknown
 from palpate.inversion import Bounds, InverseProblem, InversionSettings, LaterState, parameter_map
-from palpate.mechanics.element import triangle_quadrature
-from palpate.mechanics.linear_model import LinearModel, linear_model
-from palpate.mesh.anatomy import LevelSet
-from palpate.mesh.space import lagrange_space
-from palpate.mesh.surface import triangle_normals
-from palpate.observation.noise_model import NoiseModel
-from palpate.observation.observed_surface import ObservedSurface, observed_surface
-from palpate.observation.surface_distance import surface_distance
-from palpate.observation.target import SurfaceTarget, target_from
-from palpate.phantoms.boundary_noise import SmoothField
+from palpate.mechanics import LinearModel, linear_model, triangle_quadrature
+from palpate.mesh import LevelSet, lagrange_space, triangle_normals
+from palpate.observation import (
+    NoiseModel,
+    ObservedSurface,
+    SurfaceTarget,
+    observed_surface,
+    surface_distance,
+    target_from,
+)
+from palpate.phantoms import SmoothField
 
 __all__ = ["TRUTH", "SphericalShell", "Warped", "noise_of", "settings_from", "twin_model", "twin_problem"]
 
