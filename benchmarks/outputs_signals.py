@@ -1,0 +1,173 @@
+"""Signals at random moments of a run: the output folder holds the old files or the new ones, and a rerun succeeds.
+
+    python benchmarks/outputs_signals.py [--runs 104] [--seed 1] [--workers 2] [--folder DIR]
+
+For each of SIGKILL, SIGTERM, SIGINT and SIGHUP, `--runs` runs of `palpate estimate`, `mesh`, `report` and `init` into a
+folder with another patient's outputs. A third of the signals come at a moment drawn over the whole run, a third
+while files are staged, a third while they take their places. SIGINT and SIGHUP reach the whole process group, as from
+a terminal. A run that SIGKILL cut is first completed as the next run would; where the old files are left, the same
+command runs again and must give what it gives undisturbed. Prints counts as JSON; `failures` must be empty.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from outputs_case import PALPATE, Bench, leftovers, make_bench, recovered, run, state
+
+SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+SHARES = {"estimate": 1, "mesh": 3, "report": 3, "init": 6}  # a quick command is run more often
+MOMENTS = ("any", "staging", "renames")
+FIRST_LINE = 0.25  # s; before its first line Palpate has no say in what a signal does
+PATIENCE = 300.0
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One run: which command, which signal, when (`share`: of the run's or the stage's duration), and its number."""
+
+    number: int
+    command: str
+    signal: signal.Signals
+    moment: str
+    share: float
+
+
+def trials(runs: int, seed: int) -> list[Trial]:
+    """The same for each seed."""
+    rng = random.Random(seed)
+    found = []
+    for kind in SIGNALS:
+        weights = [command for command, weight in SHARES.items() for _ in range(weight)]
+        for k in range(runs):
+            command = weights[k % len(weights)]
+            found.append(Trial(len(found), command, kind, MOMENTS[(k // len(weights)) % 3], rng.random()))
+    return found
+
+
+def attempt(bench: Bench, trial: Trial, seconds: dict[str, float]) -> dict[str, str]:
+    """Run it; what was seen, with the key `failure` where a law is broken."""
+    folder = bench.root / "trials" / f"{trial.number}"
+    shutil.copytree(bench.old(trial.command), folder)
+    command = [PALPATE, *bench.arguments(trial.command, folder)]
+    began = time.monotonic()
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, process_group=0)
+    wait_for(trial, process, folder, seconds[trial.command])
+    sent = time.monotonic() - began
+    running = process.poll() is None
+    if running:
+        whole_group = trial.signal in (signal.SIGINT, signal.SIGHUP)
+        (os.killpg if whole_group else os.kill)(process.pid, trial.signal)
+    out, err = process.communicate(timeout=PATIENCE)
+    seen = {"signal": trial.signal.name, "command": trial.command, "moment": trial.moment}
+    seen["journal"] = str(recovered(folder)) if trial.signal is signal.SIGKILL else "False"
+    seen["state"] = state(bench, trial.command, folder)
+    seen["end"] = end_of(process.returncode, err, sent, running=running)
+    flaw = flaw_of(trial, seen, out, err, process.returncode)
+    if not flaw and seen["state"] == "old":
+        again = run(bench.arguments(trial.command, folder))
+        if again.returncode or state(bench, trial.command, folder) != "new" or leftovers(folder):
+            flaw = f"the rerun ended with {again.returncode}, {leftovers(folder)}: {again.stderr[-500:]}"
+    if flaw:
+        seen["failure"] = f"trial {trial.number}: {flaw}"
+    else:
+        shutil.rmtree(folder)
+    return seen
+
+
+def wait_for(trial: Trial, process: subprocess.Popen[str], folder: Path, seconds: float) -> None:
+    """Until the moment of the signal."""
+    hidden = folder / ".writing-outputs"
+    if trial.moment == "any":
+        time.sleep(trial.share * seconds)
+        return
+    watched = hidden if trial.moment == "staging" else hidden / "journal.json"
+    while process.poll() is None and not watched.exists():
+        time.sleep(0.0002)
+    longest = {"estimate": 0.4 * seconds, "mesh": 0.05, "report": 0.02, "init": 0.005}[trial.command]
+    time.sleep(trial.share**2 * longest if trial.moment == "staging" else trial.share * 0.002)
+
+
+def end_of(code: int, err: str, sent: float, *, running: bool) -> str:
+    """How the run ended, in a word."""
+    if not running or code == 0:
+        return "finished"
+    if code == 130:
+        return "interrupted, new files" if "taken their places" in err or "is written" in err else "interrupted"
+    started = "palpate/cli" in err or sent > FIRST_LINE
+    return "killed" if code == -signal.SIGKILL else f"code {code}" if started else "before the first line"
+
+
+def flaw_of(trial: Trial, seen: dict[str, str], out: str, err: str, code: int) -> str:
+    """What is wrong with the end of a run; empty when nothing is."""
+    lines = err.strip().splitlines()
+    wanted = {
+        "finished": ("new",),
+        "interrupted": ("old",),
+        "interrupted, new files": ("new",),
+        "killed": ("old", "new"),
+    }
+    if seen["end"] == "before the first line":
+        return "" if seen["state"] == "old" else f"{seen['state']} before the first line"
+    if seen["end"] not in wanted or (seen["end"] == "killed") != (trial.signal is signal.SIGKILL and code != 0):
+        return f"ended with {seen['end']}: {err[-500:]}"
+    if seen["state"] not in wanted[seen["end"]]:
+        return f"{seen['end']}, but the folder is {seen['state']}: {err[-500:]}"
+    if code == 130 and (out or len(lines) != 1 or not lines[0].startswith("palpate: interrupted")):
+        return f"not one sentence: {err[-500:]}"
+    return f"a traceback: {err[-500:]}" if "Traceback" in err or "bug" in err else ""
+
+
+def main() -> None:
+    """Print the counts."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=int, default=104)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--folder", type=Path)
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        bench = make_bench((arguments.folder or Path(temporary)) / "signals")
+        seconds = {}
+        for command in SHARES:
+            folder = shutil.copytree(bench.old(command), bench.root / "timed" / command)
+            began = time.monotonic()
+            run(bench.arguments(command, folder))
+            seconds[command] = time.monotonic() - began
+        chosen = trials(arguments.runs, arguments.seed)
+        random.Random(arguments.seed).shuffle(chosen)
+        with ThreadPoolExecutor(arguments.workers) as pool:
+            seen = list(pool.map(lambda trial: attempt(bench, trial, seconds), chosen))
+    print(json.dumps(summary(seen), indent=1))
+
+
+def summary(seen: list[dict[str, str]]) -> dict[str, object]:
+    """Counts by signal and by command."""
+
+    def counts(key: str) -> dict[str, dict[str, int]]:
+        """By what `key` says: the runs, how they ended, and what the folder held."""
+        groups: dict[str, Counter[str]] = {}
+        for one in seen:
+            group = groups.setdefault(one[key], Counter())
+            group.update(["runs", one["end"], f"folder {one['state']}"])
+            group.update(["journal found"] if one["journal"] == "True" else [])
+        return {name: dict(sorted(group.items())) for name, group in sorted(groups.items())}
+
+    failures = [one["failure"] for one in seen if "failure" in one]
+    return {"runs": len(seen), "signals": counts("signal"), "commands": counts("command"), "failures": failures}
+
+
+if __name__ == "__main__":
+    main()
