@@ -60,6 +60,18 @@ def test_a_signal_while_modules_are_imported_ends_with_130_and_a_sentence(signal
     assert line.startswith("palpate: interrupted; files that were already there are as they were")
 
 
+def test_a_signal_that_something_makes_another_exception_of_is_still_one():
+    """A class body wraps what its descriptors raise; so does a library."""
+    wrapped = THREADS.replace(
+        "    import pathlib",
+        "    import os, signal\n    try:\n        os.kill(os.getpid(), signal.SIGTERM)\n"
+        "    except KeyboardInterrupt as stop:\n        raise RuntimeError('Error calling __set_name__') from stop\n"
+        "    import pathlib",
+    )
+    done = script(wrapped)
+    assert (done.returncode, "interrupted" in done.stderr, "bug" in done.stderr) == (130, True, False)
+
+
 @pytest.mark.parametrize("signal", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_a_signal_after_the_last_word_changes_nothing(signal):
     done = script(ENDING, signal=signal)
@@ -70,7 +82,7 @@ def test_what_the_process_was_told_to_ignore_it_ignores():
     done = script(IMPORTS.replace("sys.meta_path", "signal.signal(signal.SIGHUP, signal.SIG_IGN)\nsys.meta_path"),
                   module="palpate.study.check", signal="SIGHUP")  # fmt: skip
     assert done.returncode == 2
-    assert "nowhere.toml" in done.stderr
+    assert "nowhere.toml" in done.stdout + done.stderr
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="threads are told of in /proc")

@@ -17,17 +17,17 @@ from palpate.images.readers import write_label_image
 from palpate.study.case_file import read_case
 
 
-def ball(radius: float) -> LabelImage:
+def ball(place: float) -> LabelImage:
     places = np.stack(np.meshgrid(*[np.arange(16.0)] * 3, indexing="ij"), axis=-1)
-    return LabelImage((np.linalg.norm(places - 8.0, axis=-1) < radius).astype(int), VoxelGrid((16, 16, 16), np.eye(4)))
+    return LabelImage((np.linalg.norm(places - place, axis=-1) < 4).astype(int), VoxelGrid((16, 16, 16), np.eye(4)))
 
 
 @pytest.fixture
 def images(tmp_path, monkeypatch):
     """The working folder with the two images that `init` needs."""
     monkeypatch.chdir(tmp_path)
-    for name, radius in (("before", 3.0), ("after", 4.0)):
-        write_label_image(tmp_path / f"{name}.nii.gz", ball(radius))
+    for name, place in (("before", 7.0), ("after", 8.0)):
+        write_label_image(tmp_path / f"{name}.nii.gz", ball(place))
     return ["before.nii.gz", "after.nii.gz"]
 
 
@@ -44,15 +44,19 @@ def test_a_folder_whose_name_is_too_long_ends_with_6(estimate, tmp_path, capsys,
     assert "File name too long" in sentence(capsys)
 
 
+AS_NOBODY = """
+import os, sys
+from palpate.cli import main
+import palpate.cli.entry, palpate.study.new_case, scipy.linalg
+os.getuid() or os.setuid(65534)
+sys.exit(main(sys.argv[1:]))
+"""
+
+
 def test_a_parent_that_may_not_be_searched_ends_with_6(images, tmp_path):
     (tmp_path / "closed" / "out").mkdir(parents=True)
     (tmp_path / "closed").chmod(0o600)
-    code = "import os, sys; os.getuid() or os.setuid(65534); from palpate.cli import main; sys.exit(main(sys.argv[1:]))"
-    tmp_path.chmod(0o755)
-    command = [sys.executable, "-c", code, "init", *images, "--output", "closed/out", "--quiet"]
-    for parent in tmp_path.parents:  # the other user must come as far as here
-        if parent.owner() == tmp_path.owner() and str(parent).startswith("/tmp/"):
-            parent.chmod(0o755)
+    command = [sys.executable, "-c", AS_NOBODY, "init", *images, "--output", "closed/out", "--quiet"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 6, done.stderr
     assert "Permission denied" in done.stderr
@@ -66,10 +70,11 @@ def test_a_case_written_through_a_link_leads_to_its_images(images, tmp_path):
     assert read_case(tmp_path / "deep" / "er" / "case.toml").images.before.resolve() == tmp_path / "before.nii.gz"
 
 
-def test_names_that_begin_as_homes_do_are_no_homes(images, tmp_path):
+@pytest.mark.usefixtures("images")
+def test_names_that_begin_as_homes_do_are_no_homes(tmp_path):
     (tmp_path / "~root").mkdir()
     for name in ("~before.nii.gz", "~root/after.nii.gz"):
-        write_label_image(tmp_path / name, ball(3.0 if "before" in name else 4.0))
+        write_label_image(tmp_path / name, ball(7.0 if "before" in name else 8.0))
     for folder in (".", "~root", "~new/~one"):
         assert main(["init", "~before.nii.gz", "~root/after.nii.gz", "--output", folder, "--quiet"]) == 0
         found = read_case(tmp_path / folder / "case.toml").images
@@ -100,4 +105,4 @@ def test_modules_of_the_working_folder_are_not_run(tmp_path):
     command = [sys.executable, "-m", "palpate", "check", "nowhere.toml"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 2, done.stderr
-    assert "nowhere.toml" in done.stderr
+    assert "nowhere.toml" in done.stdout + done.stderr

@@ -144,23 +144,32 @@ def _interrupted(outputs: OutputFolder) -> str:
 
 
 @contextmanager
-def interruptible(signals: Sequence[signal.Signals], mask: Iterable[int]) -> Iterator[None]:
+def interruptible(signals: Sequence[signal.Signals], mask: Iterable[int]) -> Iterator[list[int]]:
     """While the block works, each of the `signals`, blocked until now, interrupts it; `mask`: what stays blocked.
 
-    What the process was told to ignore (by nohup, say) it ignores.
+    Gives the list of those that came: what they interrupt may make another exception of it, as class bodies do. What
+    the process was told to ignore (by nohup, say) it ignores.
     """
+    came: list[int] = []
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        """End what is being done."""
+        del frame
+        came.append(number)
+        raise KeyboardInterrupt
+
     if threading.current_thread() is not threading.main_thread():
-        yield
+        yield came
         return
     earlier = {number: signal.getsignal(number) for number in signals}
     ours = [number for number in signals if earlier[number] not in (signal.SIG_IGN, None)]
     try:
         for number in ours:
-            signal.signal(number, _interrupt)
+            signal.signal(number, interrupt)
         if hasattr(signal, "pthread_sigmask"):
             _start_threads()
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        yield
+        yield came
     finally:
         if hasattr(signal, "pthread_sigmask"):
             signal.pthread_sigmask(signal.SIG_BLOCK, signals)
@@ -176,11 +185,6 @@ def _start_threads() -> None:
     import scipy.linalg
 
     del scipy
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    del number, frame
-    raise KeyboardInterrupt
 
 
 class _LogFile(logging.StreamHandler[TextIO]):

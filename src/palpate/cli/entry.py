@@ -36,8 +36,8 @@ def run(argv: Sequence[str] | None, signals: Sequence[signal.Signals], mask: Ite
     arguments = make_parser().parse_args(argv)
     outcome = None
     try:
-        with interruptible(signals, mask):
-            outcome = _outcome(arguments)
+        with interruptible(signals, mask) as came:
+            outcome = _outcome(arguments, came)
             return _speak(outcome, arguments)
     except KeyboardInterrupt:
         if outcome is None or outcome.exit_code != Interrupted.exit_code:
@@ -45,24 +45,31 @@ def run(argv: Sequence[str] | None, signals: Sequence[signal.Signals], mask: Ite
         return Interrupted.exit_code
 
 
-def _outcome(arguments: argparse.Namespace) -> Outcome:
-    """What the command has to say, errors among it; its log is closed."""
+def _outcome(arguments: argparse.Namespace, came: Sequence[int]) -> Outcome:
+    """What the command has to say, errors among it; `came`: the signals so far. Its log is closed."""
     try:
         return _run(arguments)
-    except PalpateError as error:
-        return _failure(type(error).__name__, str(error), error.exit_code)
-    except MemoryError:
-        advice = "memory is short; make mesh.edge_length_mm larger or the images smaller"
-        return _failure("ResourceError", advice, ResourceError.exit_code)
+    except Interrupted as error:
+        return _failure("Interrupted", str(error), error.exit_code)
+    except Exception as error:
+        return _failure("Interrupted", UNTOUCHED, Interrupted.exit_code) if came else _failed(error, arguments)
     except KeyboardInterrupt:
         return _failure("Interrupted", UNTOUCHED, Interrupted.exit_code)
-    except Exception as error:  # a bug: the traceback belongs into the log, not on the terminal
-        hint = _log_hint(arguments)
-        LOGGER.exception("unexpected error")
-        sentence = f"unexpected {type(error).__name__}: {error}. This is a bug; please report it{hint}"
-        return _failure(type(error).__name__, sentence, UNEXPECTED)
     finally:
         close_log()
+
+
+def _failed(error: Exception, arguments: argparse.Namespace) -> Outcome:
+    """The sentence and the exit code of an error."""
+    if isinstance(error, PalpateError):
+        return _failure(type(error).__name__, str(error), error.exit_code)
+    if isinstance(error, MemoryError):
+        advice = "memory is short; make mesh.edge_length_mm larger or the images smaller"
+        return _failure("ResourceError", advice, ResourceError.exit_code)
+    hint = _log_hint(arguments)
+    LOGGER.error("unexpected error", exc_info=error)  # a bug: the traceback belongs into the log, not on the terminal
+    sentence = f"unexpected {type(error).__name__}: {error}. This is a bug; please report it{hint}"
+    return _failure(type(error).__name__, sentence, UNEXPECTED)
 
 
 def _run(arguments: argparse.Namespace) -> Outcome:
