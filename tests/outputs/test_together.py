@@ -219,3 +219,22 @@ def test_an_output_never_replaces_an_input(tmp_path, capsys):
     assert main(["simulate", str(tmp_path / "case.toml"), "--output", str(tmp_path), "--quiet"]) == 2
     assert "before.nii.gz is an input of this run" in capsys.readouterr().err
     assert contents(tmp_path) == before
+
+
+def test_a_disk_that_refuses_every_rename_leaves_all_to_the_next_run(estimate, out, monkeypatch, capsys):
+    assert estimate("anna", "--quiet") == 0
+    first, calls = Path.replace, []
+
+    def refused(path, target):
+        calls.extend([target] if among_the_renames(out) else [])
+        if len(calls) > 3:
+            raise NO_SPACE
+        return first(path, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", refused)
+        assert estimate("bert", "--quiet") == 6
+    assert "the next command with this folder completes them" in capsys.readouterr().err
+    assert main(["report", str(out), "--quiet"]) == 0
+    assert (result(out)["id"], (out / "report.html").read_text()) == ("bert", "the page of bert")
+    assert {path.name for path in out.iterdir()} == FILES

@@ -128,7 +128,7 @@ def _commit(staging: Staging, document: dict[str, Any]) -> None:
             write_json(staging.area / DOCUMENT, document)
             return staging.commit(retired=earlier.retired, aside=earlier.aside)
         except ResourceError as error:
-            if PAGE not in document["files"]:
+            if PAGE not in document["files"] or staging.unfinished:
                 raise
             LOGGER.warning("the report is left out: %s", error)
             own = [*own, _no_report(error)]

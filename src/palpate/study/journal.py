@@ -19,7 +19,17 @@ from types import FrameType
 
 from palpate.errors import InputDataError, ResourceError
 
-__all__ = ["STAGING", "Renames", "carry_out", "clear", "interrupts_deferred", "is_inside", "recover", "sync_folder"]
+__all__ = [
+    "STAGING",
+    "Renames",
+    "carry_out",
+    "clear",
+    "interrupts_deferred",
+    "is_inside",
+    "is_unfinished",
+    "recover",
+    "sync_folder",
+]
 
 Renames = Sequence[tuple[str, str]]  # (from, to), relative to the folder, with slashes
 
@@ -74,11 +84,15 @@ def recover(folder: Path) -> None:
         ) from error
 
 
+def is_unfinished(folder: Path) -> bool:
+    """Whether there are renames to complete or to undo."""
+    return any((folder / STAGING / name).exists() for name in (JOURNAL, UNDO))
+
+
 def clear(folder: Path) -> None:
     """Remove the hidden folder, unless it still holds a journal."""
-    area = folder / STAGING
-    if not any((area / name).exists() for name in (JOURNAL, UNDO)):
-        shutil.rmtree(area, ignore_errors=True)
+    if not is_unfinished(folder):
+        shutil.rmtree(folder / STAGING, ignore_errors=True)
 
 
 def is_inside(folder: Path, name: str) -> bool:

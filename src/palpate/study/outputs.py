@@ -14,7 +14,16 @@ from pathlib import Path
 from typing import Any
 
 from palpate.errors import InputDataError, ResourceError
-from palpate.study.journal import STAGING, carry_out, clear, interrupts_deferred, is_inside, recover, sync_folder
+from palpate.study.journal import (
+    STAGING,
+    carry_out,
+    clear,
+    interrupts_deferred,
+    is_inside,
+    is_unfinished,
+    recover,
+    sync_folder,
+)
 
 __all__ = [
     "Digests",
@@ -53,6 +62,11 @@ class Staging:
         """The folder to write into; a sub-folder of it becomes one of the output folder."""
         return self.folder / STAGING / NEW
 
+    @property
+    def unfinished(self) -> bool:
+        """Whether a `commit` that failed is left to the next run in the folder, for it could not be undone either."""
+        return is_unfinished(self.folder)
+
     def names(self) -> tuple[str, ...]:
         """The staged files, relative to the folder, with slashes; sorted."""
         files = [path for path in self.area.rglob("*") if path.is_file()]
@@ -71,7 +85,7 @@ class Staging:
         """Put all staged files in place at once; `retired` files vanish, those `aside` get another name.
 
         Killed in between, the next run in the folder completes it. Raises `ResourceError` when the disk refuses, with
-        everything as it was: it may be tried again.
+        everything as it was, unless it is left `unfinished`: else it may be tried again.
         """
         names = self.names()
         _refuse_improper(self.folder, (*names, *(f"{name}{ASIDE}" for name in aside)))
