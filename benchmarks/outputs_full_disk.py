@@ -30,7 +30,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from outputs_case import COMMANDS, UNSETTLED, Bench, leftovers, make_bench, recovered, state
+from outputs_case import COMMANDS, UNSETTLED, Bench, contents, leftovers, make_bench, recovered, state
 
 import palpate.cli.entry
 from palpate.report import case_report
@@ -205,16 +205,18 @@ def refused_operations(bench: Bench, folder: Path) -> Iterator[dict[str, Any]]:
                 shutil.copytree(bench.old(command), folder)
                 seen = attempt(bench, command, folder, Disk(str(folder), turn, alone))
                 if turn < 0:
-                    seen["unseen_bytes"] = max(size_of(folder) - seen["written"], 0)
+                    seen["unseen_bytes"] = max(size_of(folder, bench.old(command)) - seen["written"], 0)
                 yield seen | {"command": command, "kind": "alone" if alone else "with all after it"}
-                turn += 1
-                if turn >= seen["operations"]:
+                if turn >= 0 and not seen["refused"]:
                     break
+                turn += 1
 
 
-def size_of(folder: Path) -> int:
-    """Bytes of the files that a run has written."""
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+def size_of(folder: Path, old: Path | None = None) -> int:
+    """Bytes of the files in a folder that are not as they were in `old`."""
+    earlier = contents(old) if old else {}
+    names = [name for name, digest in contents(folder).items() if earlier.get(name) != digest]
+    return sum((folder / name).stat().st_size for name in names)
 
 
 def small_disks(bench: Bench, folder: Path, runs: int, seed: int) -> Iterator[dict[str, Any]]:

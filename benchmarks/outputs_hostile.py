@@ -77,7 +77,7 @@ def kinds(outside: Path) -> dict[str, Callable[[Path], object]]:
 
 def attempt(bench: Bench, command: str, folder: Path, outside: Path) -> tuple[int, str, str]:
     """Run the command in a process of its own: its code, its words, and what is wrong (nothing: empty)."""
-    before, there = contents(outside), contents(folder) if folder.is_dir() else {}
+    before, there = contents(outside), contents(folder) if is_folder(folder) else {}
     with tempfile.TemporaryFile() as words:
         pid = os.fork()
         if pid == 0:
@@ -99,11 +99,19 @@ def attempt(bench: Bench, command: str, folder: Path, outside: Path) -> tuple[in
         flaw = "no sentence"
     elif code and len(text.strip().splitlines()) != 1:
         flaw = "not one sentence"
-    elif code and folder.is_dir() and contents(folder) != there:
+    elif code and is_folder(folder) and contents(folder) != there:
         flaw = "a refused run has changed the folder"
     elif code == 0 and (set(leftovers(folder)) - {".palpate.lock"} or state(bench, command, folder) == "mixed"):
         flaw = f"the folder is {state(bench, command, folder)}"
     return code, text, flaw
+
+
+def is_folder(place: Path) -> bool:
+    """Whether there is a folder of that name, which may be one that no folder can have."""
+    try:
+        return place.is_dir()
+    except OSError:
+        return False
 
 
 def spoilt(bench: Bench, command: str, runs: int, rng: random.Random) -> list[dict[str, Any]]:

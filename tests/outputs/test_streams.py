@@ -32,7 +32,7 @@ def init(images: Path, folder: Path, *, flags: str = "", after: str = "", **vari
     """`palpate init`, which talks on both streams, with the code of Palpate itself where it stands in a pipe."""
     arguments = f"init before.nii.gz after.nii.gz --labels names.json --output {shlex.quote(str(folder))} {flags}"
     command = f"{PALPATE} {arguments} {after}; exit ${{PIPESTATUS[0]}}"
-    environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")} | variables
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONIOENCODING"} | variables
     return subprocess.run(
         ["bash", "-c", command], cwd=images, capture_output=True, text=True, env=environment, check=False
     )
