@@ -77,6 +77,9 @@ def test_a_kill_at_any_operation_leaves_what_the_next_run_makes_whole(tmp_path, 
             calls = fails(patch, turn, Killed(), only=False)
             with suppress(Killed):
                 replace(folder)
+        visible = {name: text for name, text in content(folder).items() if not name.startswith(journal.STAGING)}
+        assert visible.get("result.json") is None or visible in (OLD, NEW)  # where the document is, its files are
+        assert not {"old", "new"} <= {visible.get(name) for name in ("mesh.vtu", "sub/a", "sub/b")}
         journal.recover(folder)
         assert content(folder) in (OLD, NEW), turn
         seen.append(content(folder) == NEW)

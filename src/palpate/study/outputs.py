@@ -68,9 +68,9 @@ class Staging:
         return is_unfinished(self.folder)
 
     def names(self) -> tuple[str, ...]:
-        """The staged files, relative to the folder, with slashes; sorted."""
-        files = [path for path in self.area.rglob("*") if path.is_file()]
-        return tuple(sorted(path.relative_to(self.area).as_posix() for path in files))
+        """The staged files, relative to the folder, with slashes; sorted, documents that list others last."""
+        names = [path.relative_to(self.area).as_posix() for path in self.area.rglob("*") if path.is_file()]
+        return tuple(sorted(names, key=lambda name: (name.endswith(".json"), name)))
 
     def digests(self) -> dict[str, dict[str, str]]:
         """SHA-256 of each staged file, which tells a run's own files from an earlier run's."""
@@ -89,7 +89,7 @@ class Staging:
         """
         names = self.names()
         _refuse_improper(self.folder, (*names, *(f"{name}{ASIDE}" for name in aside)))
-        leaving = [name for name in (*names, *retired) if (self.folder / name).exists()]
+        leaving = [name for name in (*reversed(names), *retired) if (self.folder / name).exists()]
         renames = [(name, f"{STAGING}/{OLD}/{name}") for name in leaving]
         for name in aside:
             if (self.folder / f"{name}{ASIDE}").exists():
@@ -122,10 +122,9 @@ class OutputFolder:
         _refuse_improper(self.path, names)
 
     def same_files(self, names: Iterable[str], files: Iterable[Path]) -> list[str]:
-        """Those of `names` in the folder that are one of `files`."""
-        there = [name for name in names if (self.path / name).exists()]
-        others = [file for file in files if file.exists()]
-        return [name for name in there if any((self.path / name).samefile(file) for file in others)]
+        """Those of `names` in the folder that are one of `files`, of which some may not exist."""
+        others = list(files)
+        return [name for name in names if any(_is_same(self.path / name, file) for file in others)]
 
     @contextmanager
     def staged(self) -> Iterator[Staging]:
@@ -217,6 +216,13 @@ def sha256_of(path: Path) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise _refused(path, error) from error
+
+
+def _is_same(path: Path, other: Path) -> bool:
+    try:
+        return path.samefile(other)
+    except (OSError, ValueError):
+        return False
 
 
 def _refuse_improper(folder: Path, names: Iterable[str]) -> None:
