@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
 
+TYPE_CHECKING = False  # the module typing takes longer to import than all that is needed here
 if TYPE_CHECKING:
+    from typing import Any
+
     from palpate.study.case import Case
     from palpate.study.case_file import read_case
     from palpate.study.result import CaseResult

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from palpate.cli import main
+import sys
 
 if __name__ == "__main__":
+    if not sys.flags.safe_path:  # Python has put the working folder first: its numpy.py is not ours to run
+        del sys.path[0]
+    from palpate.cli import main
+
     raise SystemExit(main())

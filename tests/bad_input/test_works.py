@@ -152,7 +152,7 @@ def test_memory_that_runs_out_ends_with_6(folder, palpate):
     assert "Traceback" not in done["err"]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_an_interrupt_ends_with_130_and_leaves_earlier_files_whole(number, folder, palpate):
     (folder / "out").mkdir()
     (folder / "out" / "result.json").write_text("earlier")

@@ -1,34 +1,158 @@
-"""Outputs appear whole or not at all."""
+"""Outputs take their places all together or not at all, whatever happens in between."""
 
 from __future__ import annotations
 
+import errno
+import itertools
+import json
+import os
+import signal
+from contextlib import suppress
+from pathlib import Path
+
 import pytest
 
-from palpate.errors import ResourceError
-from palpate.study.outputs import make_folder, whole_file, write_json, write_text
+from palpate.errors import InputDataError, ResourceError
+from palpate.study import journal
+from palpate.study.outputs import make_folder, staged, write_json, write_text
+
+OLD = {"result.json": "old", "mesh.vtu": "old", "sub/a": "old", "page": "old", "page.earlier": "older", "mine": "mine"}
+NEW = {"result.json": "new", "mesh.vtu": "new", "sub/b": "new", "page.earlier": "old", "mine": "mine"}
 
 
-def test_a_file_that_fails_half_way_leaves_the_earlier_one(tmp_path):
-    path = tmp_path / "result.json"
-    write_text(path, "earlier")
+class Killed(BaseException):
+    """The end of the process: nothing catches it."""
 
-    def fail():
-        with whole_file(path) as temporary:
-            temporary.write_text("half")
-            raise RuntimeError
 
-    with pytest.raises(RuntimeError):
-        fail()
-    assert path.read_text() == "earlier"
-    assert [item.name for item in tmp_path.iterdir()] == ["result.json"]
+def put(folder: Path, content: dict[str, str]) -> None:
+    for name, text in content.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+
+
+def content(folder: Path) -> dict[str, str]:
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {path.relative_to(folder).as_posix(): path.read_text() for path in files}
+
+
+def replace(folder: Path) -> None:
+    with staged(folder) as staging:
+        put(staging.area, dict.fromkeys(("result.json", "mesh.vtu", "sub/b"), "new"))
+        staging.commit(retired=["sub/a"], aside=["page"])
+
+
+def fails(monkeypatch, turn: int, error: BaseException, *, only: bool) -> list[int]:
+    """Let the operation of that number (from 0) that changes the folder's names fail, or it and all after it."""
+    count = itertools.count()
+    calls = []
+
+    def wrapped(function):
+        def call(*arguments, **options):
+            number = next(count)
+            calls.append(number)
+            if number == turn or (number > turn and not only):
+                raise error
+            return function(*arguments, **options)
+
+        return call
+
+    for module, name in ((Path, "replace"), (Path, "unlink"), (os, "fsync")):
+        monkeypatch.setattr(module, name, wrapped(getattr(module, name)))
+    return calls
+
+
+def test_files_take_their_places_together(tmp_path):
+    put(tmp_path, OLD)
+    replace(tmp_path)
+    assert content(tmp_path) == NEW
+
+
+def test_a_kill_at_any_operation_leaves_what_the_next_run_makes_whole(tmp_path, monkeypatch):
+    seen = []
+    for turn in range(60):
+        folder = tmp_path / str(turn)
+        put(folder, OLD)
+        with monkeypatch.context() as patch:
+            patch.setattr("palpate.study.outputs.clear", lambda _: None)  # nobody clears up after a kill
+            calls = fails(patch, turn, Killed(), only=False)
+            with suppress(Killed):
+                replace(folder)
+        visible = {name: text for name, text in content(folder).items() if not name.startswith(journal.STAGING)}
+        assert visible.get("result.json") is None or visible in (OLD, NEW)  # where the document is, its files are
+        assert not {"old", "new"} <= {visible.get(name) for name in ("mesh.vtu", "sub/a", "sub/b")}
+        journal.recover(folder)
+        assert content(folder) in (OLD, NEW), turn
+        seen.append(content(folder) == NEW)
+        if len(calls) <= turn:
+            break
+    assert not seen[0]
+    assert seen[-1]
+    assert sorted(seen) == seen  # once it is decided, it stays decided
+    assert len(seen) > 15
+
+
+@pytest.mark.parametrize("only", [True, False])
+def test_a_refused_operation_leaves_the_old_files_or_the_new_ones(tmp_path, monkeypatch, only):
+    for turn in range(60):
+        folder = tmp_path / str(turn)
+        put(folder, OLD)
+        with monkeypatch.context() as patch:
+            calls = fails(patch, turn, OSError(errno.ENOSPC, "No space left on device"), only=only)
+            try:
+                replace(folder)
+                done = True
+            except ResourceError:
+                done = False
+        if not (folder / journal.STAGING).exists():
+            assert content(folder) == (NEW if done else OLD), turn
+        journal.recover(folder)
+        assert content(folder) in (OLD, NEW), turn
+        assert not done or content(folder) == NEW
+        if len(calls) <= turn:
+            break
+    assert turn > 15
+
+
+def test_an_interrupt_waits_until_the_files_have_their_places(tmp_path, monkeypatch):
+    put(tmp_path, OLD)
+    first = Path.replace
+
+    def interrupted(path, target):
+        signal.raise_signal(signal.SIGINT)
+        return first(path, target)
+
+    monkeypatch.setattr(Path, "replace", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        replace(tmp_path)
+    assert content(tmp_path) == NEW
+
+
+def test_what_is_not_committed_is_gone(tmp_path):
+    put(tmp_path, OLD)
+    with staged(tmp_path) as staging:
+        write_text(staging.area / "result.json", "half")
+    assert content(tmp_path) == OLD
+    assert not (tmp_path / journal.STAGING).exists()
+
+
+def test_a_journal_made_by_others_moves_nothing_out_of_the_folder(tmp_path):
+    area = tmp_path / "out" / journal.STAGING
+    area.mkdir(parents=True)
+    (tmp_path / "mine").write_text("mine")
+    moves = ["../mine", "taken"], ["/etc/hostname", "taken"], ["a"], [1, 2], ["a", ""], ["a", "./b"], ["a\0", "b"]
+    for pairs in ("x", {"a": "b"}, *([move] for move in moves)):
+        (area / journal.JOURNAL).write_text(json.dumps(pairs))
+        with pytest.raises(InputDataError, match="is not what Palpate writes"):
+            journal.recover(tmp_path / "out")
+    assert (tmp_path / "mine").read_text() == "mine"
 
 
 def test_a_full_disk_is_a_resource_error(tmp_path):
     def fill():
-        with whole_file(tmp_path / "mesh.vtu"):
+        with staged(tmp_path):
             raise OSError(28, "No space left on device")
 
-    with pytest.raises(ResourceError, match=r"mesh\.vtu: No space left on device; free some space"):
+    with pytest.raises(ResourceError, match="No space left on device; free some space"):
         fill()
     assert list(tmp_path.iterdir()) == []
 

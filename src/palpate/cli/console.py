@@ -1,27 +1,53 @@
-"""Where a run talks while it works: progress on stderr, details in the log, standard output kept free."""
+"""Where a run talks while it works: progress on stderr, details in the log, standard output kept free.
+
+What is said to a person never decides a run: a terminal that is closed, a full disk or a reader that has left takes the
+words and nothing else.
+"""
 
 from __future__ import annotations
 
 import ctypes
+import errno
 import logging
 import os
 import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
+from typing import TextIO
 
-from palpate.errors import ConfigurationError, InputDataError, ResourceError
+from palpate.errors import ConfigurationError, InputDataError, PalpateError
 from palpate.images.named_labels import printable
+from palpate.study.journal import recover
+from palpate.study.lock import folder_lock, own_file
+from palpate.study.outputs import OutputFolder, make_folder
 
-__all__ = ["LOGGER", "Console", "close_log", "interruptible", "output_folder"]
+__all__ = [
+    "LOGGER",
+    "Console",
+    "Interrupted",
+    "close_log",
+    "close_streams",
+    "interruptible",
+    "log_is_open",
+    "output_folder",
+    "tell",
+]
 
 LOGGER = logging.getLogger("palpate")
 LOGGER.addHandler(logging.NullHandler())  # before there is a log file, messages reach the user as sentences only
+UNLOCKED = "the file system of %s knows no locks: a second run in the folder would not be noticed, so start none there"
+
+
+class Interrupted(PalpateError):  # noqa: N818 - an end that was asked for, no error
+    """The user or the system asked the run to end."""
+
+    exit_code = 130
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,70 +61,165 @@ class Console:
         """Tell what happens now, with the seconds since the start."""
         LOGGER.info(message)
         if not self.quiet:
-            print(f"[{time.monotonic() - self.began:6.1f} s] {printable(message)}", file=sys.stderr, flush=True)
+            tell(f"[{time.monotonic() - self.began:6.1f} s] {printable(message)}", sys.stderr)
+
+
+def tell(text: str, stream: TextIO | None) -> OSError | None:
+    """Print lines on a standard stream; letters that it cannot hold are escaped. Gives why they were not printed."""
+    if stream is None:  # closed from the start
+        return OSError(errno.EBADF, "it is closed")
+    encoding = getattr(stream, "encoding", None) or "utf-8"
+    try:
+        stream.write(text.encode(encoding, "backslashreplace").decode(encoding) + "\n")
+        stream.flush()
+    except (OSError, ValueError) as error:  # ValueError: closed meanwhile
+        _give_up(stream)
+        return error if isinstance(error, OSError) else OSError(errno.EBADF, str(error))
+    return None
+
+
+def close_streams() -> None:
+    """Empty the standard streams, so that their end at the interpreter's hand cannot fail."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            if stream is not None:
+                stream.flush()
+        except (OSError, ValueError):
+            _give_up(stream)
+
+
+def _give_up(stream: TextIO) -> None:
+    """What a stream still holds leads nowhere."""
+    with suppress(OSError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
 
 
 @contextmanager
-def output_folder(folder: Path, heading: str) -> Iterator[None]:
-    """Make and lock `folder`, and log there while the block works; `heading` is the log's first line.
+def output_folder(folder: Path, heading: str, *, logs: bool) -> Iterator[OutputFolder]:
+    """Make and hold `folder` and, if it `logs`, write a log there while the block works, `heading` its first line.
 
     A case or an input that is refused leaves the folder as it was, log and all: its sentence says everything.
     """
-    from palpate.study.lock import folder_lock
-    from palpate.study.outputs import make_folder
-
-    made = [path for path in (folder, *folder.parents) if not path.exists()]
+    made = _missing(folder)
     make_folder(folder)
-    log = folder / "log.txt"
-    size = log.stat().st_size if log.exists() else None
     try:
-        with folder_lock(folder):
-            _open_log(log)
-            LOGGER.info(heading)
+        with folder_lock(folder) as locked:
+            outputs = OutputFolder(folder)
+            recover(folder)
             try:
-                with _stdout_kept_free(log):
-                    yield
-            except (ConfigurationError, InputDataError):
-                close_log()
-                _restore(log, size)
-                raise
+                if logs:
+                    with _logged(folder / "log.txt", heading):
+                        yield _warned(outputs, locked=locked)
+                else:
+                    yield _warned(outputs, locked=locked)
+            except KeyboardInterrupt as stop:
+                raise Interrupted(_interrupted(outputs)) from stop
     finally:
         for path in made:
             with suppress(OSError):  # not empty: something was written
                 path.rmdir()
 
 
-@contextmanager
-def interruptible() -> Iterator[None]:
-    """While the block works, a request to terminate ends it as an interrupt from the keyboard does."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    earlier = signal.signal(signal.SIGTERM, _interrupt)
+def _missing(folder: Path) -> list[Path]:
+    """Those of `folder` and its parents that are not there yet, the deepest first."""
     try:
-        yield
+        return [path for path in (folder, *folder.parents) if not path.exists()]
+    except OSError:  # a name too long, a folder that may not be searched: making it says so
+        return []
+
+
+def _warned(outputs: OutputFolder, *, locked: bool) -> OutputFolder:
+    if not locked and sys.platform != "win32":
+        LOGGER.warning(UNLOCKED, outputs.path)
+        tell(f"palpate: warning: {UNLOCKED % outputs.path}", sys.stderr)
+    return outputs
+
+
+def _interrupted(outputs: OutputFolder) -> str:
+    if outputs.written:
+        return f"interrupted after these files had taken their places: {', '.join(outputs.written)}"
+    return "interrupted; files that were already there are as they were; the same command starts anew"
+
+
+@contextmanager
+def interruptible(signals: Sequence[signal.Signals], mask: Iterable[int]) -> Iterator[list[int]]:
+    """While the block works, each of the `signals`, blocked until now, interrupts it; `mask`: what stays blocked.
+
+    Gives the list of those that came: what they interrupt may make another exception of it, as class bodies do. What
+    the process was told to ignore (by nohup, say) it ignores.
+    """
+    came: list[int] = []
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        """End what is being done."""
+        del frame
+        came.append(number)
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield came
+        return
+    earlier = {number: signal.getsignal(number) for number in signals}
+    ours = [number for number in signals if earlier[number] not in (signal.SIG_IGN, None)]
+    try:
+        for number in ours:
+            signal.signal(number, interrupt)
+        if hasattr(signal, "pthread_sigmask"):
+            _start_threads()
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        yield came
     finally:
-        signal.signal(signal.SIGTERM, earlier)
+        if hasattr(signal, "pthread_sigmask"):
+            signal.pthread_sigmask(signal.SIG_BLOCK, signals)
+        for number in ours:
+            signal.signal(number, earlier[number])
 
 
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    del number, frame
-    raise KeyboardInterrupt
+def _start_threads() -> None:
+    """Let the linear algebra start its threads while the signals are blocked: so they are for ever, for these threads.
+
+    A signal then reaches the main thread, or waits where that blocks it (`mesh.interrupts`).
+    """
+    import scipy.linalg
+
+    del scipy
 
 
-class _LogFile(logging.FileHandler):
+class _LogFile(logging.StreamHandler[TextIO]):
     """A log that falls silent when the disk is full: the outputs will say so in a sentence."""
 
     def handleError(self, record: logging.LogRecord) -> None:
         """Say nothing."""
 
 
-def _open_log(path: Path) -> None:
-    """Send what the library logs, and warnings of others, to `path`, after what stands there."""
+@contextmanager
+def _logged(path: Path, heading: str) -> Iterator[None]:
+    """Log to `path`, after what stands there; a case or an input that is refused leaves it as it was."""
+    there = path.exists()
+    file = own_file(path)
+    size = os.fstat(file).st_size
+    _open_log(file)
+    LOGGER.info(heading)
     try:
-        handler = _LogFile(path, encoding="utf-8", errors="backslashreplace")
-    except OSError as error:
-        raise ResourceError(f"cannot write {path}: {error.strerror}; choose another --output folder") from error
+        with _stdout_kept_free(file):
+            yield
+    except (ConfigurationError, InputDataError):
+        close_log()
+        with suppress(OSError):
+            os.ftruncate(file, size)
+            if not there:
+                path.unlink()
+        raise
+    finally:
+        os.close(file)
+
+
+def _open_log(file: int) -> None:
+    """Send what the library logs, and warnings of others, to a copy of the open `file`."""
+    stream = os.fdopen(os.dup(file), "a", encoding="utf-8", errors="backslashreplace")
+    handler = _LogFile(stream)
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     logging.captureWarnings(capture=True)
     for logger in (LOGGER, logging.getLogger("py.warnings")):
@@ -107,34 +228,31 @@ def _open_log(path: Path) -> None:
     LOGGER.setLevel(logging.INFO)
 
 
+def log_is_open() -> bool:
+    """Whether there is a log that takes the details of what happens now."""
+    return any(isinstance(handler, _LogFile) for handler in LOGGER.handlers)
+
+
 def close_log() -> None:
     """Let go of the log file."""
     logging.captureWarnings(capture=False)
     for logger in (LOGGER, logging.getLogger("py.warnings")):
-        for handler in [handler for handler in logger.handlers if isinstance(handler, logging.FileHandler)]:
+        for handler in [handler for handler in logger.handlers if isinstance(handler, _LogFile)]:
             logger.removeHandler(handler)
             with suppress(OSError):
-                handler.close()
+                handler.stream.close()
         logger.propagate = True
 
 
-def _restore(log: Path, size: int | None) -> None:
-    with suppress(OSError):
-        if size is None:
-            log.unlink()
-        else:
-            os.truncate(log, size)
-
-
 @contextmanager
-def _stdout_kept_free(log: Path) -> Iterator[None]:
-    """While a command works, what C libraries print on the process's standard output goes to the log."""
-    sys.stdout.flush()
+def _stdout_kept_free(log: int) -> Iterator[None]:
+    """While a command works, what C libraries print on the process's standard output goes to the open file `log`."""
+    with suppress(OSError, ValueError, AttributeError):
+        sys.stdout.flush()
     saved = os.dup(1)
     try:
-        with log.open("ab") as file:
-            os.dup2(file.fileno(), 1)
-            yield
+        os.dup2(log, 1)
+        yield
     finally:
         with suppress(OSError, AttributeError, TypeError):  # no C library to ask: nothing of it is buffered either
             ctypes.CDLL(None).fflush(None)

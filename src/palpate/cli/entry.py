@@ -3,64 +3,89 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import json
+import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TextIO
 
-from palpate.cli.console import LOGGER, Console, close_log, interruptible, output_folder
+from palpate.cli.console import LOGGER, Console, Interrupted, close_log, interruptible, log_is_open, output_folder, tell
 from palpate.cli.outcome import Outcome, printable_lines
 from palpate.cli.parser import make_parser, version
-from palpate.errors import PalpateError, ResourceError
+from palpate.errors import ConfigurationError, InputDataError, PalpateError, ResourceError
 
 # Heavy layers are imported by the sub-command that needs them, so that `palpate --help` answers at once.
 if TYPE_CHECKING:
     from palpate.study.case import Case
+    from palpate.study.outputs import OutputFolder
 
-__all__ = ["main"]
+__all__ = ["run"]
 
-INTERRUPTED = 130
 UNEXPECTED = 1
+UNTOUCHED = "interrupted; files that were already there are as they were; the same command starts anew"
+SPEAKING = "interrupted while its outcome was printed; what it had to write is written"
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run `palpate` with the arguments `argv` (default: those of the process) and return its exit code."""
+def run(argv: Sequence[str] | None, signals: Sequence[signal.Signals], mask: Iterable[int]) -> int:
+    """Run the command of `argv` (None: of the process) and return its exit code.
+
+    signals: those that interrupt it, blocked now; mask: the signals that stay blocked while it works.
+    """
     arguments = make_parser().parse_args(argv)
+    outcome = None
     try:
-        with interruptible():
-            outcome = _run(arguments)
-    except PalpateError as error:
-        outcome = _failure(type(error).__name__, str(error), error.exit_code)
-    except MemoryError:
-        advice = "memory is short; make mesh.edge_length_mm larger or the images smaller"
-        outcome = _failure("ResourceError", advice, ResourceError.exit_code)
+        with interruptible(signals, mask) as came:
+            outcome = _outcome(arguments, came)
+            return _speak(outcome, arguments)
     except KeyboardInterrupt:
-        sentence = "interrupted; files that were already there are as they were; the same command starts anew"
-        outcome = _failure("Interrupted", sentence, INTERRUPTED)
-    except Exception as error:  # a bug: the traceback belongs into the log, not on the terminal
-        LOGGER.exception("unexpected error")
-        sentence = f"unexpected {type(error).__name__}: {error}. This is a bug; please report it{_log_hint(arguments)}"
-        outcome = _failure(type(error).__name__, sentence, UNEXPECTED)
+        if outcome is None or outcome.exit_code != Interrupted.exit_code:
+            tell(f"palpate: {UNTOUCHED if outcome is None else SPEAKING}", sys.stderr)
+        return Interrupted.exit_code
+
+
+def _outcome(arguments: argparse.Namespace, came: Sequence[int]) -> Outcome:
+    """What the command has to say, errors among it; `came`: the signals so far. Its log is closed."""
+    try:
+        return _run(arguments)
+    except Interrupted as error:
+        return _failure("Interrupted", str(error), error.exit_code)
+    except Exception as error:
+        return _failure("Interrupted", UNTOUCHED, Interrupted.exit_code) if came else _failed(error, arguments)
+    except KeyboardInterrupt:
+        return _failure("Interrupted", UNTOUCHED, Interrupted.exit_code)
     finally:
         close_log()
-    _speak(outcome, arguments)
-    return outcome.exit_code
+
+
+def _failed(error: Exception, arguments: argparse.Namespace) -> Outcome:
+    """The sentence and the exit code of an error."""
+    if isinstance(error, PalpateError):
+        return _failure(type(error).__name__, str(error), error.exit_code)
+    if isinstance(error, MemoryError):
+        advice = "memory is short; make mesh.edge_length_mm larger or the images smaller"
+        return _failure("ResourceError", advice, ResourceError.exit_code)
+    hint = _log_hint(arguments)
+    LOGGER.error("unexpected error", exc_info=error)  # a bug: the traceback belongs into the log, not on the terminal
+    sentence = f"unexpected {type(error).__name__}: {error}. This is a bug; please report it{hint}"
+    return _failure(type(error).__name__, sentence, UNEXPECTED)
 
 
 def _run(arguments: argparse.Namespace) -> Outcome:
     """Read the case, if the command has one, before anything is written; then work, with a log if it writes."""
+    command: Callable[..., Outcome] = arguments.command
     case = _case(arguments)
     progress = Console(arguments.quiet).progress
-    if not arguments.logs:
-        return _outcome(arguments, case, progress)
-    with output_folder(arguments.output, f"palpate {version()}: {' '.join(sys.argv[1:])}"):
-        return _outcome(arguments, case, progress)
-
-
-def _outcome(arguments: argparse.Namespace, case: Case | None, progress: Callable[[str], None]) -> Outcome:
-    command: Callable[..., Outcome] = arguments.command
-    return command(arguments, case, progress)
+    if arguments.output is None:
+        return command(arguments, case, None, progress)
+    if not arguments.makes_folder and not arguments.output.is_dir():
+        raise InputDataError(f"there is no folder {arguments.output}; name the output folder of an estimate")
+    heading = f"palpate {version()}: {' '.join(sys.argv[1:])}"
+    with output_folder(arguments.output, heading, logs=arguments.logs) as outputs:
+        outputs.require(arguments.targets)
+        _spare_inputs(arguments, case, outputs)
+        return command(arguments, case, outputs, progress)
 
 
 def _case(arguments: argparse.Namespace) -> Case | None:
@@ -72,23 +97,53 @@ def _case(arguments: argparse.Namespace) -> Case | None:
     return None if path is None else read_case(path, arguments.set)
 
 
+def _spare_inputs(arguments: argparse.Namespace, case: Case | None, outputs: OutputFolder) -> None:
+    """Refuse to write an output in the place of an input."""
+    inputs: list[Path | None] = [*getattr(arguments, "inputs", ()), getattr(arguments, "labels", None)]
+    if case is not None and case.images is not None:
+        images = case.images
+        inputs += [images.before, *images.after, images.names, images.intensities_before, *images.intensities_after]
+        inputs += [path for pair in case.pairs for path in (pair.before, *pair.after)]
+    names = outputs.same_files(arguments.targets, [path for path in inputs if path is not None])
+    if names:
+        raise ConfigurationError(
+            f"{outputs.path / names[0]} is an input of this run, and would be replaced by its output of that name:"
+            " choose another --output folder"
+        )
+
+
 def _failure(kind: str, message: str, exit_code: int) -> Outcome:
     LOGGER.error("%s: %s", kind, message)
     document = {"schema": "palpate.error/1", "error": kind, "message": message, "exit_code": exit_code}
     return Outcome(document, "", exit_code, message)
 
 
-def _speak(outcome: Outcome, arguments: argparse.Namespace) -> None:
-    """The last words of a run; with --json, the document is all that stdout ever sees."""
+def _speak(outcome: Outcome, arguments: argparse.Namespace) -> int:
+    """The last words of a run, and its exit code; with --json, the document is all that stdout ever sees."""
     if outcome.complaint:
-        print(f"palpate: {printable_lines(outcome.complaint)}", file=sys.stderr)
-    if arguments.json:
-        text = json.dumps(outcome.document, indent=1, ensure_ascii=False, allow_nan=False)
-        print(text.encode("utf-8", errors="replace").decode("utf-8"))
-    elif outcome.text and not arguments.quiet:
-        print(printable_lines(outcome.text))
+        tell(f"palpate: {printable_lines(outcome.complaint)}", sys.stderr)
+    if not arguments.json:
+        if outcome.text and not arguments.quiet:
+            tell(printable_lines(outcome.text), sys.stdout)
+        return outcome.exit_code
+    refused = tell(_json(outcome, sys.stdout), sys.stdout)
+    if refused is None or refused.errno == errno.EPIPE:  # a reader that has left wants no more
+        return outcome.exit_code
+    reason = refused.strerror or str(refused)
+    where = f"; what the run had to write is whole in {arguments.output}" if arguments.output else ""
+    tell(f"palpate: the document of --json could not be written to standard output ({reason}){where}", sys.stderr)
+    return outcome.exit_code or ResourceError.exit_code
+
+
+def _json(outcome: Outcome, stream: TextIO | None) -> str:
+    """The document as text that the stream can hold: letters that it lacks as JSON's own escapes."""
+    text = json.dumps(outcome.document, indent=1, ensure_ascii=False, allow_nan=False)
+    try:
+        text.encode(getattr(stream, "encoding", None) or "utf-8")
+    except ValueError:
+        return json.dumps(outcome.document, indent=1, ensure_ascii=True, allow_nan=False)
+    return text
 
 
 def _log_hint(arguments: argparse.Namespace) -> str:
-    log = arguments.output / "log.txt" if arguments.logs else None
-    return f" with {log}, which holds the details" if log and log.exists() else ""
+    return f" with {arguments.output / 'log.txt'}, which holds the details" if log_is_open() else ""

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from palpate.cli.console import log_is_open
 from palpate.images.named_labels import printable
 
-__all__ = ["Outcome", "columns", "estimates_table", "printable_lines", "warning_lines"]
+if TYPE_CHECKING:
+    from palpate.study.outputs import OutputFolder
+
+__all__ = ["Outcome", "columns", "estimates_table", "listed", "printable_lines", "warning_lines"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +49,13 @@ def estimates_table(document: Mapping[str, Any]) -> str:
         rows = [row[:-1] for row in rows]
     note = [document["note"]] if document.get("note") else []
     return "\n".join([columns(rows), *note])
+
+
+def listed(outputs: OutputFolder) -> str:
+    """Where the files are that the run has written, and which; those of a sub-folder by its name."""
+    names = dict.fromkeys(name.split("/")[0] + ("/" if "/" in name else "") for name in outputs.written)
+    log = ["log.txt"] if log_is_open() else []
+    return f"written to {outputs.path}: {', '.join([*names, *log])}"
 
 
 def columns(rows: Sequence[Sequence[str]]) -> str:

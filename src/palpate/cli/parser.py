@@ -35,16 +35,19 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"palpate {version()}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True)
-    demo = _command(subparsers, "demo", written.demo, what="the whole way on the pelvis that Palpate brings along")
-    demo.set_defaults(output=Path("palpate-demo"))
+    what = "the whole way on the pelvis that Palpate brings along"
+    demo = _command(subparsers, "demo", written.demo, what=what, folder="palpate-demo")
+    demo.set_defaults(targets=written.TARGETS)
     _add_init(subparsers)
     _add_check(subparsers)
     mesh = _command(subparsers, "mesh", commands.mesh, what="make the tetrahedra of a case and write them")
     _add_case(mesh)
+    mesh.set_defaults(targets=commands.MESH_TARGETS)
     what = "deform the organs of a case with given moduli and write the later state"
     simulate = _command(subparsers, "simulate", commands.simulate, what=what)
     _add_case(simulate)
     simulate.add_argument("--steps", type=_count, default=1, metavar="N", help="write N steps to animate")
+    simulate.set_defaults(targets=commands.SIMULATION_TARGETS)
     _add_estimate(subparsers)
     _add_report(subparsers)
     _add_reproduce(subparsers)
@@ -56,12 +59,12 @@ def _add_init(subparsers: Any) -> None:
     command = _command(subparsers, "init", commands.init, what="write a case.toml for images, roles guessed from names")
     command.add_argument("images", type=Path, nargs="+", metavar="IMAGE", help="label images: before, then after ...")
     command.add_argument("--labels", type=Path, metavar="TABLE", help="label table: which number is which organ")
-    command.set_defaults(logs=False)
+    command.set_defaults(logs=False, targets=("case.toml",))
 
 
 def _add_check(subparsers: Any) -> None:
     command = _command(
-        subparsers, "check", commands.check, what="list every problem of a case without computing", writes=False
+        subparsers, "check", commands.check, what="list every problem of a case without computing", folder=None
     )
     command.add_argument("case_file", type=Path, metavar="CASE.TOML", help=CASE_HELP)
     _add_set(command)
@@ -78,26 +81,27 @@ def _add_estimate(subparsers: Any) -> None:
         help="CASE.TOML, or label images BEFORE AFTER ... for which a case is written first",
     )
     command.add_argument("--labels", type=Path, metavar="TABLE", help="label table, with images")
+    command.set_defaults(targets=written.TARGETS)
     _add_set(command)
 
 
 def _add_report(subparsers: Any) -> None:
-    command = _command(subparsers, "report", written.report, what="draw report.html of an estimate again", writes=False)
-    command.add_argument("folder", type=Path, metavar="DIR", help="the output folder of an estimate")
+    what = "draw report.html of an estimate again"
+    command = _command(subparsers, "report", written.report, what=what, folder=None)
+    command.add_argument("output", type=Path, metavar="DIR", help="the output folder of an estimate")
+    command.set_defaults(makes_folder=False, targets=(written.DOCUMENT, written.PAGE))
 
 
 def _add_reproduce(subparsers: Any) -> None:
     what = "compute one of the paper's experiments, its numbers beside ours; goes on where it was interrupted"
-    command = _command(subparsers, "reproduce", studies.reproduce, what=what)
+    command = _command(subparsers, "reproduce", studies.reproduce, what=what, folder="palpate-reproduce")
     command.add_argument("experiment", choices=("table1", "table2", "figure4", "staging"))
-    command.set_defaults(output=Path("palpate-reproduce"))
 
 
 def _add_verify(subparsers: Any) -> None:
     what = "compute the problems with known answers and hold our numbers beside them"
-    command = _command(subparsers, "verify", verification.verify, what=what)
+    command = _command(subparsers, "verify", verification.verify, what=what, folder="palpate-verification")
     command.add_argument("--quick", action="store_true", help="leave out the slow problems")
-    command.set_defaults(output=Path("palpate-verification"))
 
 
 def _add_case(command: argparse.ArgumentParser) -> None:
@@ -112,18 +116,17 @@ def _add_set(command: argparse.ArgumentParser) -> None:
 
 
 def _command(
-    subparsers: Any, name: str, function: Callable[..., Outcome], *, what: str, writes: bool = True
+    subparsers: Any, name: str, function: Callable[..., Outcome], *, what: str, folder: str | None = "palpate-output"
 ) -> argparse.ArgumentParser:
-    """A sub-command with the common flags; one that `writes` has an output folder, with a log there."""
+    """A sub-command with the common flags; `folder`: where it writes by default, with a log; None: nowhere."""
     command: argparse.ArgumentParser = subparsers.add_parser(
         name, help=what, description=what[0].upper() + what[1:] + "."
     )
-    if writes:
-        folder = Path("palpate-output")
-        command.add_argument("--output", type=Path, default=folder, metavar="DIR", help="default: %(default)s")
+    command.set_defaults(command=function, logs=folder is not None, output=None, makes_folder=True, targets=())
+    if folder is not None:
+        command.add_argument("--output", type=Path, default=Path(folder), metavar="DIR", help="default: %(default)s")
     command.add_argument("--json", action="store_true", help="print one JSON document on stdout, and nothing else")
     command.add_argument("--quiet", action="store_true", help="no progress, no table")
-    command.set_defaults(command=function, logs=writes)
     return command
 
 

@@ -23,6 +23,8 @@ from palpate.study.result import CaseResult, MeshResult, Simulation
 
 __all__ = ["file_name", "write_estimate_files", "write_mesh_files", "write_simulation_files"]
 
+MOST_BYTES = 60  # of a tissue's name in a file's: file systems count bytes, not letters
+
 
 def write_estimate_files(result: CaseResult, folder: Path) -> tuple[Path, ...]:
     """Write mesh.vtu (displacement of the last image), stiffness.nii.gz (`result.unit`) and labels.csv to `folder`.
@@ -95,9 +97,9 @@ def write_simulation_files(result: Simulation, folder: Path) -> tuple[Path, ...]
 
 
 def file_name(name: str) -> str:
-    """A tissue's name as a part of a file name: letters, digits, hyphen and underscore only."""
+    """A tissue's name as a part of a file name: letters, digits, hyphen and underscore only, of 60 bytes at most."""
     plain = "".join(letter if letter.isalnum() or letter in "-_" else "_" for letter in name)
-    return plain[:60] or "tissue"
+    return plain.encode("utf-8")[:MOST_BYTES].decode("utf-8", errors="ignore") or "tissue"
 
 
 def _write_series(result: Simulation, cells: Mapping[str, NDArray[Any]], folder: Path) -> tuple[Path, ...]:

@@ -15,15 +15,15 @@ __all__ = ["interrupts_held"]
 def interrupts_held() -> Iterator[None]:
     """Hold SIGINT and SIGTERM while the block works, then let them reach the handlers that were there before.
 
-    Mmg installs handlers of its own, which leave the process at once, and leaves them behind. With other threads in the
-    process, which could take the signal, it is not held: Mmg then ends the process, with exit code 1. Does nothing in
-    other than the main thread.
+    Mmg installs handlers of its own, which leave the process at once, and leaves them behind. Where another thread of
+    the process could take the signal, it is not held: Mmg then ends the process, with exit code 1. The command line
+    starts the threads of the linear algebra so that they never take one. Does nothing in other than the main thread.
     """
     if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "pthread_sigmask"):
         yield
         return
     numbers = (signal.SIGINT, signal.SIGTERM)
-    earlier = signal.pthread_sigmask(signal.SIG_BLOCK, numbers if _alone() else ())
+    earlier = signal.pthread_sigmask(signal.SIG_BLOCK, numbers if _others_take_none(numbers) else ())
     handlers = {number: signal.getsignal(number) for number in numbers}
     try:
         yield
@@ -34,9 +34,17 @@ def interrupts_held() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, earlier)
 
 
-def _alone() -> bool:
-    """Whether this is the process's only thread, libraries' own included; False where the system does not tell."""
+def _others_take_none(numbers: tuple[signal.Signals, ...]) -> bool:
+    """Whether every other thread, libraries' own included, blocks the signals; False where the system cannot tell."""
+    mask = sum(1 << (number - 1) for number in numbers)
     try:
-        return len(list(Path("/proc/self/task").iterdir())) == 1
-    except OSError:
+        others = [task for task in Path("/proc/self/task").iterdir() if task.name != str(threading.get_native_id())]
+        return all(_blocked(task) & mask == mask for task in others)
+    except (OSError, ValueError):
         return False
+
+
+def _blocked(task: Path) -> int:
+    """The signals that a thread blocks, a bit each."""
+    status = (task / "status").read_text(encoding="ascii", errors="replace")
+    return int(next(line for line in status.splitlines() if line.startswith("SigBlk:")).split()[1], 16)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import io
 import json
 import math
@@ -17,20 +18,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
-from palpate.study.outputs import write_bytes
+from palpate.images.named_labels import printable
+from palpate.study.outputs import read_regular, write_bytes
 
 __all__ = ["read_archive", "write_archive"]
 
 T = TypeVar("T")
 
 FORMAT = "palpate.report-data/3"
+LARGEST_FILE = 1 << 30  # bytes
 MOST_BYTES = 1 << 30  # of all arrays together, unpacked
 MOST_ARRAYS = 4096
-DAMAGED = (KeyError, TypeError, ValueError, OSError, EOFError, RecursionError, zipfile.BadZipFile, NotImplementedError)
 
 
 def write_archive(value: Any, path: Path) -> None:
-    """Write a dataclass instance to `path`, whole or not at all.
+    """Write a dataclass instance to `path`.
 
     Raises `ResourceError` when the disk refuses, `TypeError` for a value that JSON does not know.
     """
@@ -42,27 +44,36 @@ def write_archive(value: Any, path: Path) -> None:
     write_bytes(path, memory.getvalue())
 
 
-def read_archive(kind: type[T], path: Path) -> T:
-    """The instance of dataclass `kind` in `path`; raises `InputDataError` when there is none to be had."""
+def read_archive(kind: type[T], path: Path, *, sha256: str | None = None) -> T:
+    """The instance of dataclass `kind` in `path`.
+
+    Raises `InputDataError` when there is none to be had, or when the file has another SHA-256 than it should.
+    """
+    content = read_regular(path, most_bytes=LARGEST_FILE)
+    if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
+        raise InputDataError(
+            f"{path} is not of the run that the result beside it tells of (its SHA-256 is another): run the estimate"
+            " again, or draw the report where its files came from"
+        )
     try:
-        arrays = _arrays(path)
+        arrays = _arrays(content)
         plain = json.loads(arrays["json"].tobytes())
         if plain["format"] != FORMAT:
             raise ValueError(f"its format is {str(plain['format'])[:40]!r}, not '{FORMAT}'")
         return typing.cast("T", _decode(kind, plain["value"], arrays))
-    except FileNotFoundError as error:
-        raise InputDataError(f"there is no {path}; run the estimate first, which writes it") from error
-    except DAMAGED as error:
+    except MemoryError:
+        raise
+    except Exception as error:  # whatever another's file makes of our reading: it is no report's data
         raise InputDataError(
-            f"{path} does not hold the data of a report ({type(error).__name__}: {str(error)[:200]}); run the estimate"
-            " again"
+            f"{path} does not hold the data of a report ({type(error).__name__}: {printable(str(error)[:200])}); run"
+            " the estimate again"
         ) from error
 
 
-def _arrays(path: Path) -> dict[str, NDArray[Any]]:
+def _arrays(content: bytes) -> dict[str, NDArray[Any]]:
     """The arrays of the file, after what it declares was found to fit the file and our limits."""
     found: dict[str, NDArray[Any]] = {}
-    with zipfile.ZipFile(path) as archive:
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
         members = archive.infolist()
         if len(members) > MOST_ARRAYS or sum(member.file_size for member in members) > MOST_BYTES:
             raise ValueError("it declares more data than a report has")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from palpate.errors import PalpateError
+from palpate.errors import InputDataError, PalpateError
+from palpate.images.named_labels import printable
 from palpate.report.collect import collect, collect_failure
 from palpate.report.page import render
 from palpate.report.report_data import ReportData
@@ -12,14 +13,14 @@ from palpate.study.case import Case
 from palpate.study.outputs import write_text
 from palpate.study.result import CaseResult
 
-__all__ = ["DATA_NAME", "PAGE_NAME", "rewrite_report", "write_case_report", "write_failure_report"]
+__all__ = ["redrawn_page", "write_case_report", "write_failure_report"]
 
 PAGE_NAME = "report.html"
 DATA_NAME = "report-data.npz"
 
 
 def write_case_report(result: CaseResult, folder: Path) -> Path:
-    """Write report.html and report-data.npz to `folder`, each whole or not at all, and return the page's path.
+    """Write report.html and report-data.npz to `folder` and return the page's path.
 
     A figure that cannot be drawn leaves a sentence in its place. Raises `ResourceError` when the disk refuses.
     """
@@ -31,15 +32,22 @@ def write_failure_report(case: Case, error: PalpateError, folder: Path) -> Path:
     return _write(collect_failure(case, error), folder)
 
 
-def rewrite_report(folder: Path) -> Path:
-    """Make `folder`/report.html again from the data beside it, and return its path.
+def redrawn_page(folder: Path, *, sha256: str | None = None) -> str:
+    """The page made again from report-data.npz in `folder`, which must have the SHA-256 that is given.
 
-    Raises `InputDataError` when report-data.npz is missing or damaged, `ResourceError` when the disk refuses.
+    Raises `InputDataError` when the data are missing, damaged, of another run, or cannot be drawn.
     """
-    data = ReportData.load(folder / DATA_NAME)
-    path = folder / PAGE_NAME
-    write_text(path, render(data))
-    return path
+    path = folder / DATA_NAME
+    data = ReportData.load(path, sha256=sha256)
+    try:
+        return render(data)
+    except MemoryError:
+        raise
+    except Exception as error:  # the page was drawn from them once: they are not what was written then
+        raise InputDataError(
+            f"{path} holds data of which no page can be made ({type(error).__name__}:"
+            f" {printable(str(error)[:200])}); run the estimate again"
+        ) from error
 
 
 def _write(data: ReportData, folder: Path) -> Path:

@@ -163,10 +163,13 @@ class ReportData:
     missing: Mapping[str, str] = field(default_factory=dict)
 
     def save(self, path: Path) -> None:
-        """Write everything to `path` (.npz without pickles), whole or not at all; `ResourceError` when it cannot."""
+        """Write everything to `path` (.npz without pickles); `ResourceError` when the disk refuses."""
         write_archive(self, path)
 
     @classmethod
-    def load(cls, path: Path) -> ReportData:
-        """Read what `save` wrote; raises `InputDataError` when the file is missing, damaged, too large or another."""
-        return read_archive(cls, path)
+    def load(cls, path: Path, *, sha256: str | None = None) -> ReportData:
+        """Read what `save` wrote.
+
+        Raises `InputDataError` when the file is missing, damaged, too large, another, or has not the SHA-256 given.
+        """
+        return read_archive(cls, path, sha256=sha256)

@@ -10,10 +10,13 @@ if TYPE_CHECKING:
     from palpate.study.case import Case, Domain, DriverMotion, Mechanics, MeshSettings, Phantom
     from palpate.study.case_file import read_case
     from palpate.study.cost import expected_cost
-    from palpate.study.outputs import make_folder, whole_file, write_json, write_text
+    from palpate.study.earlier import strange_files
+    from palpate.study.journal import recover
+    from palpate.study.lock import own_file
+    from palpate.study.outputs import make_folder, staged, write_json, write_text
     from palpate.study.provenance import software_versions
     from palpate.study.read import read_states
-    from palpate.study.result import CaseResult
+    from palpate.study.result import CaseResult, failure_document
     from palpate.study.run import estimate, estimate_states, fitted_states, inversion_settings, mesh
     from palpate.study.simulate import filled
 
@@ -31,6 +34,7 @@ __all__ = [
     "estimate",
     "estimate_states",
     "expected_cost",
+    "failure_document",
     "filled",
     "fitted_states",
     "inverse_problem",
@@ -38,11 +42,14 @@ __all__ = [
     "make_body",
     "make_folder",
     "mesh",
+    "own_file",
     "read_case",
     "read_states",
+    "recover",
     "software_versions",
+    "staged",
+    "strange_files",
     "surface_observations",
-    "whole_file",
     "write_json",
     "write_text",
 ]
@@ -61,6 +68,7 @@ _HOMES = {
     "estimate": "palpate.study.run",
     "estimate_states": "palpate.study.run",
     "expected_cost": "palpate.study.cost",
+    "failure_document": "palpate.study.result",
     "filled": "palpate.study.simulate",
     "fitted_states": "palpate.study.run",
     "inverse_problem": "palpate.study.body",
@@ -68,11 +76,14 @@ _HOMES = {
     "make_body": "palpate.study.body",
     "make_folder": "palpate.study.outputs",
     "mesh": "palpate.study.run",
+    "own_file": "palpate.study.lock",
     "read_case": "palpate.study.case_file",
     "read_states": "palpate.study.read",
+    "recover": "palpate.study.journal",
     "software_versions": "palpate.study.provenance",
+    "staged": "palpate.study.outputs",
+    "strange_files": "palpate.study.earlier",
     "surface_observations": "palpate.study.body",
-    "whole_file": "palpate.study.outputs",
     "write_json": "palpate.study.outputs",
     "write_text": "palpate.study.outputs",
 }

@@ -1,73 +1,97 @@
-"""One run at a time in an output folder."""
+"""One run at a time in an output folder, and files there that are opened only if they are the folder's own."""
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO
 
 from palpate.errors import ResourceError
 
 if sys.platform != "win32":
     import fcntl
 
-__all__ = ["folder_lock"]
+__all__ = ["folder_lock", "own_file"]
 
 NAME = ".palpate.lock"
+FLAGS = ("O_CREAT", "O_APPEND", "O_NOFOLLOW", "O_NONBLOCK", "O_NOCTTY", "O_CLOEXEC")  # Windows lacks some
+NO_FILE = "is no regular file of that folder alone (a link, a pipe, a folder ...) and is left alone: remove it"
 
 
 @contextmanager
-def folder_lock(folder: Path) -> Iterator[None]:
+def folder_lock(folder: Path) -> Iterator[bool]:
     """Hold `folder`, which exists, for this process; the lock dies with the process, however that ends.
 
-    Raises `ResourceError` when another run works in the folder, or nothing can be written there.
+    Gives False where the file system knows no locks: another run would not be noticed. Raises `ResourceError` when
+    another run works in the folder, nothing can be written there, or the lock's name is taken by something else.
     """
     if sys.platform == "win32":  # no POSIX locks: two runs in a folder are not noticed there
-        yield
+        yield False
         return
     path = folder / NAME
-    file = _locked(path)
+    file, locked = _locked(path)
     try:
-        yield
+        yield locked
     finally:
         with suppress(OSError):
             path.unlink()
-        file.close()
+        os.close(file)
 
 
-def _locked(path: Path) -> BinaryIO:
-    """The lock's file, held; one that its last owner has removed meanwhile is left alone."""
+def own_file(path: Path) -> int:
+    """A descriptor to read `path` and to append to it; the file is made when it is missing.
+
+    Raises `ResourceError` for anything but a regular file with one name: what is written must stay in its folder.
+    """
+    flags = os.O_RDWR
+    for name in FLAGS:
+        flags |= getattr(os, name, 0)
+    try:
+        file = os.open(path, flags, 0o666)
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
+            raise _refused(path, NO_FILE) from error
+        raise _refused(path, f"cannot be written ({error.strerror or error})") from error
+    status = os.fstat(file)
+    if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
+        os.close(file)
+        raise _refused(path, NO_FILE)
+    return file
+
+
+def _locked(path: Path) -> tuple[int, bool]:
+    """The lock's file, and whether it is held; one that its last owner has removed meanwhile is left alone."""
     while True:
-        try:
-            file = path.open("a+b")
-        except OSError as error:
-            raise ResourceError(
-                f"cannot write in {path.parent}: {error.strerror or error}; choose another --output folder"
-            ) from error
+        file = own_file(path)
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            file.seek(0)
-            owner = file.read(20).decode("ascii", errors="replace").strip()
-            file.close()
+            if error.errno != errno.EWOULDBLOCK:
+                return file, False
+            owner = os.pread(file, 20, 0).decode("ascii", errors="replace").strip()
+            os.close(file)
             raise ResourceError(
                 f"another run of palpate{f' (process {owner})' if owner.isdigit() else ''} works in {path.parent}: wait"
                 " until it has ended, or choose another --output folder"
             ) from error
         if _same(file, path):
             with suppress(OSError):  # who holds the lock is a courtesy; a full disk must not cost the run here
-                file.truncate(0)
-                file.write(str(os.getpid()).encode())
-                file.flush()
-            return file
-        file.close()
+                os.ftruncate(file, 0)
+                os.write(file, str(os.getpid()).encode())
+            return file, True
+        os.close(file)
 
 
-def _same(file: BinaryIO, path: Path) -> bool:
+def _same(file: int, path: Path) -> bool:
     try:
-        return path.stat().st_ino == os.fstat(file.fileno()).st_ino
+        return path.stat().st_ino == os.fstat(file).st_ino
     except OSError:
         return False
+
+
+def _refused(path: Path, why: str) -> ResourceError:
+    return ResourceError(f"{path} {why}, or choose another --output folder")

@@ -19,10 +19,12 @@ from palpate.images.readers import read_label_image
 from palpate.images.tissue import Role
 from palpate.study.case import REMAINING
 from palpate.study.guess import GuessedTissue, guess_tissues
-from palpate.study.outputs import write_text
+from palpate.study.outputs import OutputFolder, read_regular, write_text
 
 __all__ = ["CaseImages", "NewCase", "new_case", "write_new_case"]
 
+CASE_NAME = "case.toml"
+LARGEST_CASE = 1_000_000  # bytes
 MARGIN_MM = 40.0
 CROP_BELOW = 0.6  # a domain of the margin's box is proposed when it saves so much of the image
 EDGES_MM = (3.0, 8.0)
@@ -64,23 +66,34 @@ class NewCase:
         }
 
 
-def write_new_case(images: Sequence[Path], table: Path | None, folder: Path) -> tuple[Path, NewCase]:
-    """Write `folder`/case.toml for label images (before, after ...), unless it is there and says something else.
+def write_new_case(images: Sequence[Path], table: Path | None, outputs: OutputFolder) -> tuple[Path, NewCase]:
+    """Write case.toml for label images (before, after ...), unless it is there and says something else.
 
     Raises `ConfigurationError` when fewer than two images are given or another case.toml is in the way, else as
     `new_case` does.
     """
     if len(images) < 2:
         raise ConfigurationError("name the label image before, then one or more after")
-    case = new_case(CaseImages(images[0], tuple(images[1:]), table), folder)
-    path = folder / "case.toml"
-    if path.exists() and path.read_text(encoding="utf-8", errors="replace") != case.text:
+    outputs.require([CASE_NAME])
+    case = new_case(CaseImages(images[0], tuple(images[1:]), table), outputs.path)
+    path = outputs.path / CASE_NAME
+    if path.exists() and _content(path) != case.text.encode("utf-8"):
         raise ConfigurationError(
             f"there is a case already, {path}, and it is not replaced: estimate it with 'palpate estimate {path}', or"
             " choose another --output"
         )
-    write_text(path, case.text)
+    with outputs.staged() as staging:
+        write_text(staging.area / CASE_NAME, case.text)
+        staging.commit()
     return path, case
+
+
+def _content(path: Path) -> bytes:
+    """The bytes of a case; nothing of what is too large to be one."""
+    try:
+        return read_regular(path, most_bytes=LARGEST_CASE)
+    except InputDataError:
+        return b""
 
 
 def new_case(images: CaseImages, folder: Path) -> NewCase:
@@ -188,11 +201,17 @@ def _mesh(before: LabelImage, tissues: Sequence[GuessedTissue]) -> str:
 
 
 def _path(path: Path, folder: Path) -> str:
-    """A path relative to the folder, with slashes, as a TOML string."""
+    """A path relative to the folder, with slashes, as a TOML string.
+
+    Links on the way to both are followed first: `..` leads out of the folder that a link leads to.
+    """
+    place, real = path.absolute().parent.resolve() / path.name, folder.resolve()
     try:
-        relative = os.path.relpath(path.absolute(), folder.absolute())
+        relative = os.path.relpath(place, real)
     except ValueError:  # another drive
-        relative = str(path.absolute())
+        relative = str(place)
+    if relative.startswith("~"):  # a case's reader takes that for somebody's home
+        relative = str(Path("..", real.name, relative))
     return _text(Path(relative).as_posix())
 
 

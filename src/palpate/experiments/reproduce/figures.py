@@ -14,7 +14,7 @@ from palpate.experiments.reproduce.balls import BODIES
 from palpate.experiments.reproduce.figure4 import LAW, LEAVE_PERCENT, Figure4
 from palpate.experiments.reproduce.staging import Staging
 from palpate.experiments.reproduce.table import COLUMNS, Table, TableRow
-from palpate.study import whole_file
+from palpate.study import staged
 
 __all__ = ["draw_figure4", "draw_staging", "draw_table"]
 
@@ -123,5 +123,6 @@ def _save(draw: Callable[[Figure], None], path: Path, *, width: float) -> None:
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(width, 4.0), layout="constrained")
         draw(figure)
-        with whole_file(path) as temporary:
-            figure.savefig(temporary, format="svg", metadata={"Date": None})
+        with staged(path.parent) as staging:
+            figure.savefig(staging.area / path.name, format="svg", metadata={"Date": None})
+            staging.commit()

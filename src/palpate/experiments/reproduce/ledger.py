@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from palpate.errors import ResourceError
-from palpate.study import make_folder
+from palpate.study import make_folder, own_file
 
 __all__ = ["Ledger", "Part"]
 
@@ -33,8 +34,8 @@ class Ledger:
         make_folder(self.path.parent)
         cut = self.path.exists() and not self.path.read_bytes().endswith(b"\n")  # an earlier run was killed here
         try:
-            with self.path.open("a", encoding="utf-8") as file:
-                file.write(("\n" if cut else "") + line + "\n")
+            with os.fdopen(own_file(self.path), "ab") as file:
+                file.write((("\n" if cut else "") + line + "\n").encode("utf-8"))
         except OSError as error:
             raise ResourceError(
                 f"cannot write {self.path}: {error.strerror}; choose another --output folder"

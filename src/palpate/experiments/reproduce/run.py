@@ -17,7 +17,7 @@ from palpate.experiments.reproduce.ledger import Ledger
 from palpate.experiments.reproduce.staging import staging
 from palpate.experiments.reproduce.table1 import Table1Settings, table1
 from palpate.experiments.reproduce.table2 import Table2Settings, table2
-from palpate.study import write_json
+from palpate.study import staged, write_json
 
 __all__ = ["EXPERIMENTS", "Reproduction", "Settings", "reproduce"]
 
@@ -63,7 +63,9 @@ def reproduce(
     if experiment not in makers:
         raise ConfigurationError(f"the experiment is '{experiment}'; it must be one of {list(EXPERIMENTS)}")
     result = makers[experiment]()
-    write_json(folder / f"{experiment}.json", result.document)
+    with staged(folder) as new:
+        write_json(new.area / f"{experiment}.json", result.document)
+        new.commit()
     return result
 
 

@@ -11,7 +11,7 @@ from typing import Any
 from palpate.errors import PalpateError
 from palpate.experiments.verification.page import page
 from palpate.experiments.verification.problem import Check, Problem, RowDict, as_row
-from palpate.study import software_versions, write_json, write_text
+from palpate.study import software_versions, staged, write_json, write_text
 
 __all__ = ["document_of", "rows_of", "verify"]
 
@@ -33,12 +33,15 @@ def verify(problems: Sequence[Problem], folder: Path, *, progress: Callable[[str
             continue
         progress(f"{problem.id} ({number} of {len(problems)}): {problem.title}")
         done[problem.id] = rows_of(problem)
-        write_json(folder / UNFINISHED, {"versions": versions, "done": done})
+        with staged(folder) as staging:
+            write_json(staging.area / UNFINISHED, {"versions": versions, "done": done})
+            staging.commit()
     document = document_of([row for problem in problems for row in done[problem.id]])
-    write_json(folder / "verification.json", document)
     slow = [problem.id for problem in problems if not problem.quick]
-    write_text(folder / "verification.md", page(document["problems"], slow))
-    (folder / UNFINISHED).unlink(missing_ok=True)
+    with staged(folder) as staging:
+        write_json(staging.area / "verification.json", document)
+        write_text(staging.area / "verification.md", page(document["problems"], slow))
+        staging.commit(retired=[UNFINISHED])
     return document
 
 

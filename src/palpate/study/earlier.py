@@ -1,0 +1,88 @@
+"""What an earlier run left in an output folder: which run a file is of, and what becomes of it."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from palpate.errors import InputDataError
+from palpate.study.journal import is_inside
+from palpate.study.outputs import Digests, read_json, sha256_of
+
+__all__ = ["Earlier", "earlier_files", "strange_files", "vouched"]
+
+RESULT = "result.json"
+DOCUMENTS = (RESULT, "mesh.json", "simulation.json")  # each lists the files of its run
+PAGE_FILES = ("report-data.npz", "report.html")
+RESULT_FILES = (*PAGE_FILES, "labels.csv", "mesh.vtu", "stiffness.nii.gz")
+FURTHER_MESH = re.compile(r"mesh_\d+\.vtu")
+
+
+@dataclass(frozen=True, slots=True)
+class Earlier:
+    """Files of earlier runs: `retired` leave with the document that lists them, `aside` get another name.
+
+    warnings: on what stays and could be taken for a file of the new run, or lists a file that the new run replaces.
+    """
+
+    retired: tuple[str, ...]
+    aside: tuple[str, ...]
+    warnings: tuple[dict[str, str], ...]
+
+
+def earlier_files(folder: Path, document: str, files: Digests) -> Earlier:
+    """What becomes of the files in `folder` when a run's `document` with its `files` takes its place there.
+
+    A page that no file vouches for is set aside: it would be read as that of the new result.
+    """
+    others = {other: _listed(folder, other) for other in DOCUMENTS if other != document}
+    shared = {name for listed in others.values() for name in listed}
+    retired = tuple(name for name in vouched(folder, document) if name not in files and name not in shared)
+    strange = [name for name in strange_files(folder, files) if name not in files and name not in retired]
+    aside = tuple(name for name in strange if name in PAGE_FILES) if document == RESULT else ()
+    left = [name for name in strange if name not in aside] if document == RESULT else []
+    warnings = []
+    if left:
+        words = "in the output folder are of an earlier run and do not belong to this result"
+        warnings.append(_warning(f"{', '.join(left)} {words}"))
+    if aside:
+        names = " and ".join(f"{name} as {name}.earlier" for name in aside)
+        warnings.append(_warning(f"files of an earlier run were set aside: {names}"))
+    for other, listed in others.items():
+        replaced = [name for name, sha256 in listed.items() if name in files and files[name]["sha256"] != sha256]
+        if replaced:
+            words = f"tells of an earlier run, whose {', '.join(replaced)} this run has replaced"
+            warnings.append(_warning(f"{other} in the output folder {words}"))
+    return Earlier(retired, aside, tuple(warnings))
+
+
+def vouched(folder: Path, document: str) -> tuple[str, ...]:
+    """Names of the files in `folder` that are, byte by byte, those of the run that `document` there tells of."""
+    return tuple(name for name, sha256 in _listed(folder, document).items() if _is_file(folder / name, sha256))
+
+
+def strange_files(folder: Path, files: Digests) -> list[str]:
+    """Names of result files in `folder` that are not those of `files`, as `Staging.digests` gives them; sorted."""
+    further = [path for path in folder.glob("mesh_*.vtu") if FURTHER_MESH.fullmatch(path.name)]
+    present = sorted({*further, *(folder / name for name in RESULT_FILES)})
+    digests = {name: entry["sha256"] for name, entry in files.items()}
+    return [path.name for path in present if path.is_file() and not _is_file(path, digests.get(path.name))]
+
+
+def _listed(folder: Path, document: str) -> dict[str, str]:
+    """Name -> SHA-256 of the files that a document lists; nothing when there is none that could be read."""
+    try:
+        files: dict[str, Any] = read_json(folder / document).get("files", {})
+    except InputDataError:
+        return {}
+    return {name: entry["sha256"] for name, entry in files.items() if is_inside(folder, name)}
+
+
+def _is_file(path: Path, sha256: str | None) -> bool:
+    return path.is_file() and not path.is_symlink() and sha256 == sha256_of(path)
+
+
+def _warning(message: str) -> dict[str, str]:
+    return {"code": "earlier-files", "message": message}

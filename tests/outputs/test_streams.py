@@ -1,0 +1,109 @@
+"""What is said to a person never decides a run; each case here is a process of its own with a stream that fails."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import pytest
+
+PALPATE = shlex.quote(str(Path(sys.executable).with_name("palpate")))
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("images")
+    places = np.stack(np.meshgrid(*[np.arange(16.0)] * 3, indexing="ij"), axis=-1)
+    for name, radius in (("before", 3.0), ("after", 4.0)):
+        labels = (np.linalg.norm(places - 8.0, axis=-1) < radius).astype(np.uint8)
+        nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), folder / f"{name}.nii.gz")
+    (folder / "names.json").write_text(json.dumps({"1": "größe 前立腺"}), encoding="utf-8")
+    return folder
+
+
+def init(images: Path, folder: Path, *, flags: str = "", after: str = "", **variables: str):
+    """`palpate init`, which talks on both streams, with the code of Palpate itself where it stands in a pipe."""
+    arguments = f"init before.nii.gz after.nii.gz --labels names.json --output {shlex.quote(str(folder))} {flags}"
+    command = f"{PALPATE} {arguments} {after}; exit ${{PIPESTATUS[0]}}"
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONIOENCODING"} | variables
+    return subprocess.run(
+        ["bash", "-c", command], cwd=images, capture_output=True, text=True, env=environment, check=False
+    )
+
+
+@pytest.mark.parametrize(
+    "after",
+    [
+        ">/dev/full",
+        "2>/dev/full",
+        ">/dev/full 2>&1",
+        "2>&1 | head -0",
+        "| true",
+        ">&-",
+        "2>&-",
+        ">&- 2>&-",
+        "<&- >&- 2>&-",
+    ],
+)
+def test_a_stream_that_fails_costs_no_run(images, tmp_path, after):
+    done = init(images, tmp_path / "out", after=after)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "Exception" not in done.stderr
+    assert "größe" in (tmp_path / "out" / "case.toml").read_text(encoding="utf-8")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["case.toml"]
+
+
+def test_a_terminal_that_is_closed_costs_no_run(images, tmp_path):
+    ours, theirs = pty.openpty()
+    command = [PALPATE, "init", "before.nii.gz", "after.nii.gz", "--output", str(tmp_path / "out")]
+    process = subprocess.Popen(command, cwd=images, stdout=theirs, stderr=theirs, stdin=theirs)
+    os.close(theirs)
+    os.close(ours)
+    assert process.wait(60) == 0
+    assert (tmp_path / "out" / "case.toml").exists()
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "utf-16"])
+def test_letters_that_a_stream_lacks_are_escaped(images, tmp_path, encoding):
+    done = init(images, tmp_path / "text", PYTHONIOENCODING=encoding, after="| cat -v")
+    assert (done.returncode, "Traceback" in done.stderr) == (0, False)
+    with (tmp_path / "document").open("wb") as file:
+        command = f"{PALPATE} init before.nii.gz after.nii.gz --labels names.json --output {tmp_path / 'json'} --json"
+        variables = os.environ | {"PYTHONIOENCODING": encoding}
+        subprocess.run(shlex.split(command), cwd=images, stdout=file, env=variables, check=True)
+    document = json.loads((tmp_path / "document").read_bytes().decode(encoding))
+    assert "größe 前立腺" in [tissue["tissue"] for tissue in document["tissues"]]
+
+
+def test_a_document_whose_reader_has_left_is_no_failure(images, tmp_path):
+    done = init(images, tmp_path / "out", flags="--json --quiet", after="| true")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "out" / "case.toml").exists()
+
+
+@pytest.mark.parametrize(("after", "reason"), [(">/dev/full", "No space left on device"), (">&-", "it is closed")])
+def test_a_document_that_cannot_be_written_ends_with_6_after_all_else_is_done(images, tmp_path, after, reason):
+    done = init(images, tmp_path / "out", flags="--json --quiet", after=after)
+    assert done.returncode == 6
+    (line,) = done.stderr.strip().splitlines()
+    assert f"could not be written to standard output ({reason}); what the run had to write is whole in" in line
+    assert (tmp_path / "out" / "case.toml").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "after"),
+    [("--help", ">/dev/full"), ("--help", "| true"), ("--version", ">&-"), ("estimate", "2>/dev/full")],
+)
+def test_help_and_usage_need_no_stream_either(arguments, after):
+    command = ["bash", "-c", f"{PALPATE} {arguments} {after}; exit ${{PIPESTATUS[0]}}"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == (0 if arguments.startswith("--") else 2)
+    assert done.stderr == ""
