@@ -36,7 +36,7 @@ def _routine(module: Any, name: str) -> Callable[..., None]:
 _ROUTINES = {
     (kind, np.dtype(dtype)): _routine(module, letter + kind)
     for letter, dtype in (("s", np.float32), ("d", np.float64))
-    for kind, module in (("potrf", cython_lapack), ("trsm", cython_blas), ("syrk", cython_blas), ("gemm", cython_blas))
+    for kind, module in [("potrf", cython_lapack), *((k, cython_blas) for k in ("trsm", "syrk", "gemm", "trsv", "gemv"))]
 }
 _ONE = {np.dtype(t): np.array([1.0], dtype=t) for t in (np.float32, np.float64)}
 _CONSTANT = {(dtype, value): np.array([value], dtype=dtype) for dtype in _ONE for value in (-1.0, 0.0, 1.0)}
@@ -95,4 +95,19 @@ def subtract_product(c: Matrix, a: Matrix, b: Matrix, *, transposed: bool = True
     _ROUTINES["gemm", c.dtype](
         b"N", b"T" if transposed else b"N", _dimension(c.shape[0]), _dimension(c.shape[1]), _dimension(a.shape[1]),
         _scalar(c.dtype, -1.0), _at(a), _leading(a), _at(b), _leading(b), _scalar(c.dtype, keep), _at(c), _leading(c),
+    )  # fmt: skip
+
+
+def solve_vector(lower: Matrix, x: Matrix, *, transposed: bool) -> None:
+    """L^-1 x, or L^-T x, in place of x (n,)."""
+    _ROUTINES["trsv", x.dtype](
+        b"L", b"T" if transposed else b"N", b"N", _dimension(len(x)), _at(lower), _leading(lower), _at(x), _dimension(1)
+    )
+
+
+def subtract_from_vector(y: Matrix, a: Matrix, x: Matrix, *, transposed: bool) -> None:
+    """y - A x, or y - A^T x, in place of y; A (m, n)."""
+    _ROUTINES["gemv", x.dtype](
+        b"T" if transposed else b"N", _dimension(a.shape[0]), _dimension(a.shape[1]), _scalar(x.dtype, -1.0),
+        _at(a), _leading(a), _at(x), _dimension(1), _scalar(x.dtype, 1.0), _at(y), _dimension(1),
     )  # fmt: skip

@@ -63,12 +63,12 @@ def elimination_tree(lower: sparse.csr_matrix[np.float64]) -> Integers:
 def postorder(parent: Integers, weight: Integers | None = None) -> Integers:
     """Order (n,) in which every node follows all of its descendants; children by `weight` (n,), the largest first."""
     n = len(parent)
-    ranked = np.arange(n) if weight is None else np.argsort(weight, kind="stable")
+    ranked = np.arange(n) if weight is None else np.argsort(-weight, kind="stable")
     by_parent = ranked[np.argsort(parent[ranked], kind="stable")]
     bounds = np.searchsorted(parent[by_parent], np.arange(-1, n + 1)).tolist()
     children = by_parent.tolist()
     stack, preorder = children[: bounds[1]], []
-    while stack:  # node, then its last child with all below it: backwards, that is a postorder
+    while stack:  # a node, then its last child with all below that: backwards, it is a postorder
         node = stack.pop()
         preorder.append(node)
         stack += children[bounds[node + 1] : bounds[node + 2]]

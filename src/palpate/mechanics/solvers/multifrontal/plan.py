@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +15,7 @@ __all__ = ["Front", "Plan", "Step", "make_plan"]
 
 Integers = NDArray[np.int64]
 
-SHARE = 0.25  # of a thread's part of the operations: subtrees up to it are eliminated side by side, each by one thread
+SHARE = 0.03  # of a thread's part of the operations: subtrees up to it are eliminated side by side, each by one thread
 AHEAD = 2  # such subtrees a thread, that are eliminated before the fronts above them
 
 
@@ -169,64 +168,71 @@ def _steps(parent: Integers, work: NDArray[np.float64], threads: int) -> tuple[S
 def _places(parent: Integers, sizes: list[int], steps: tuple[Step, ...]) -> tuple[list[int], int]:
     """Where (n,) in the working memory each front's contribution of `sizes` (n,) numbers lies, and all that it needs.
 
-    Each lives from its front to its parent's; subtrees of one step have places of their own, as do their roots'.
+    Each lives from its front to its parent's. The subtrees of a step have a block each for all but their roots.
     """
-    above = parent.tolist()
-    children = _children(parent)
-    places = [0] * len(above)
-    live: list[tuple[int, int]] = []
-    most = 0
+    places, within = [0] * len(parent), {}
+    needs: list[tuple[int, int, int]] = []  # size, first and last moment
+    owners: list[int] = []
+    moment = 0
+    born: dict[int, int] = {}
     for step in steps:
-        blocks = []
         for subtree in step.subtrees:
-            inner, needed = _places_within(subtree, above, children, sizes)
-            block = _reserved(live, needed)
-            for s, place in inner.items():
-                places[s] = block[0] + place
-            blocks.append(block)
-        for subtree in step.subtrees:
-            if above[subtree[-1]] >= 0:
-                places[subtree[-1]] = _reserved(live, sizes[subtree[-1]])[0]
-        most = max(most, live[-1][1] if live else 0)
-        for block in blocks:
-            live.remove(block)
+            within[subtree[-1]], needed = _stacked([*subtree][:-1], parent, sizes)
+            needs.append((needed, moment, moment))
+            owners.append(-1 - subtree[-1])
+            born[subtree[-1]] = moment
         for s in step.then:
-            places[s] = _reserved(live, sizes[s])[0]
-            most = max(most, live[-1][1])
-            for child in children[s]:
-                live.remove((places[child], places[child] + max(sizes[child], 1)))
+            moment += 1
+            born[s] = moment
+        moment += 1
+    for s, begin in born.items():
+        needs.append((sizes[s], begin, born[int(parent[s])] if parent[s] >= 0 else begin))
+        owners.append(s)
+    offsets, most = _shared(needs)
+    for owner, offset in zip(owners, offsets, strict=True):
+        if owner >= 0:
+            places[owner] = offset
+        else:
+            for s, place in within[-1 - owner].items():
+                places[s] = offset + place
     return places, most
 
 
-def _places_within(
-    subtree: range, above: list[int], children: list[tuple[int, ...]], sizes: list[int]
-) -> tuple[dict[int, int], int]:
-    """Places of all contributions of a subtree but its root's, from 0 on, and how many numbers they need."""
-    live: list[tuple[int, int]] = []
-    places: dict[int, int] = {}
-    most = 0
-    for s in subtree:
-        if s != subtree[-1]:
-            places[s] = _reserved(live, sizes[s])[0]
-            most = max(most, live[-1][1])
-        for child in children[s]:
-            live.remove((places[child], places[child] + max(sizes[child], 1)))
-        if above[s] < 0 and s != subtree[-1]:
-            live.remove((places[s], places[s] + max(sizes[s], 1)))
-    return places, most
+def _shared(needs: list[tuple[int, int, int]]) -> tuple[list[int], int]:
+    """Places for needs of (size, first moment, last moment), the largest first, each in the first gap of its time."""
+    places = [0] * len(needs)
+    placed: list[int] = []
+    for i in sorted(range(len(needs)), key=lambda i: -needs[i][0]):
+        size, begin, end = needs[i]
+        taken = [(places[j], places[j] + needs[j][0]) for j in placed if needs[j][1] <= end and begin <= needs[j][2]]
+        for start, stop in sorted(taken):
+            if start - places[i] >= size:
+                break
+            places[i] = max(places[i], stop)
+        placed.append(i)
+    return places, max((place + need[0] for place, need in zip(places, needs, strict=True)), default=0)
 
 
-def _reserved(live: list[tuple[int, int]], size: int) -> tuple[int, int]:
-    """The first gap of `size` numbers between the sorted `live` ranges, which it then joins."""
-    begin = 0
-    for start, stop in live:
-        if start - begin >= max(size, 1):
-            break
-        begin = stop
-    block = (begin, begin + max(size, 1))
-    live.append(block)
-    live.sort()
-    return block
+def _stacked(fronts: list[int], parent: Integers, sizes: list[int]) -> tuple[dict[int, int], int]:
+    """Places from 0 on of the contributions of `fronts`, in postorder, and how many numbers they need.
+
+    Two stacks grow towards each other, a front's contribution on the other one than its children's, which it uses up.
+    """
+    depth = [0] * len(parent)
+    for s in range(len(parent) - 1, -1, -1):
+        depth[s] = depth[parent[s]] + 1 if parent[s] >= 0 else 0
+    chosen = set(fronts)
+    used = {s: 0 for s in fronts}  # of each front's children
+    tops, most, begin = [0, 0], 0, {}
+    for s in fronts:
+        side = depth[s] % 2
+        begin[s] = tops[side]
+        tops[side] += sizes[s]
+        most = max(most, sum(tops))
+        tops[1 - side] -= used[s]
+        if parent[s] in chosen:
+            used[int(parent[s])] += sizes[s]
+    return {s: place if depth[s] % 2 == 0 else most - place - sizes[s] for s, place in begin.items()}, most
 
 
 def _entries(

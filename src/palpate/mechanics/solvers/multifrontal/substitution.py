@@ -38,3 +38,26 @@ def substituted(plan: Plan, factor: Matrix, rhs: NDArray[np.float64]) -> Matrix:
     result = np.empty_like(x)
     result[plan.order] = x
     return result
+
+
+def substituted_vector(plan: Plan, factor: Matrix, rhs: NDArray[np.float64]) -> Matrix:
+    """x (n,) of L L^T x = rhs (n,), in the type of the factor."""
+    x = rhs[plan.order].astype(factor.dtype, copy=False)
+    panels = [factor[f.panel : f.panel + f.size * f.width].reshape(f.width, f.size).T for f in plan.fronts]
+    for front, panel in zip(plan.fronts, panels, strict=True):
+        w = front.width
+        own = x[front.first : front.first + w]
+        dense.solve_vector(panel[:w], own, transposed=False)
+        if len(front.rows):
+            below = x[front.rows]
+            dense.subtract_from_vector(below, panel[w:], own, transposed=False)
+            x[front.rows] = below
+    for front, panel in zip(plan.fronts[::-1], panels[::-1], strict=True):
+        w = front.width
+        own = x[front.first : front.first + w]
+        if len(front.rows):
+            dense.subtract_from_vector(own, panel[w:], x[front.rows], transposed=True)
+        dense.solve_vector(panel[:w], own, transposed=True)
+    result = np.empty_like(x)
+    result[plan.order] = x
+    return result
