@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from palpate.errors import SolverError
 from palpate.mechanics.solvers.multifrontal import dense
 from palpate.mechanics.solvers.multifrontal.dense import Matrix
-from palpate.mechanics.solvers.multifrontal.plan import Front, Plan
+from palpate.mechanics.solvers.multifrontal.plan import Front, Plan, panel_of
 
 __all__ = ["factorised"]
 
@@ -29,10 +29,6 @@ class _Work:
     data: NDArray[np.float64]
     factor: Matrix
     memory: Matrix
-
-    def panel(self, front: Front) -> Matrix:
-        """Columns of the factor (size, width) of a front."""
-        return self.factor[front.panel : front.panel + front.size * front.width].reshape(front.width, front.size).T
 
     def contribution(self, front: Front) -> Matrix:
         """What a front adds to its parent (below, below), lower triangle."""
@@ -133,7 +129,7 @@ def _parts(low: int, high: int, size: int, threads: int) -> list[tuple[int, int]
 
 def _assembled(work: _Work, front: Front) -> Matrix:
     """The front's columns with the matrix' entries alone."""
-    panel = work.panel(front)
+    panel = panel_of(work.factor, front)
     plan, entries = work.plan, front.entries
     flat = work.factor[front.panel : front.panel + front.size * front.width]
     flat[plan.target[entries]] = work.data[plan.source[entries]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from scipy import sparse
 from palpate.mechanics.solvers.multifrontal.elimination import Supernodes, supernodes
 from palpate.mechanics.solvers.pattern import dissection, node_graph, twin_rows
 
-__all__ = ["Front", "Plan", "Step", "make_plan"]
+__all__ = ["Front", "Plan", "Step", "make_plan", "panel_of"]
 
 Integers = NDArray[np.int64]
 
@@ -68,6 +69,11 @@ class Plan:
     factor_size: int
     work_size: int
     operations: float
+
+
+def panel_of(factor: NDArray[Any], front: Front) -> NDArray[Any]:
+    """The factor's columns (size, width) of a front, in Fortran's order."""
+    return factor[front.panel : front.panel + front.size * front.width].reshape(front.width, front.size).T
 
 
 def make_plan(matrix: sparse.csr_matrix[np.float64], threads: int) -> Plan:
