@@ -35,6 +35,8 @@ def _of_group(limit: str, use: str, caches: str) -> float | None:
     try:
         lines = Path(limit).with_name("memory.stat").read_text(encoding="ascii").splitlines()
         given_back = next((float(line.split()[1]) for line in lines if line.split()[0] == caches), 0.0)
-        return float(Path(limit).read_text(encoding="ascii")) - float(Path(use).read_text(encoding="ascii")) + given_back
+        return (
+            float(Path(limit).read_text(encoding="ascii")) - float(Path(use).read_text(encoding="ascii")) + given_back
+        )
     except (OSError, ValueError, IndexError):  # "max": no limit
         return None

@@ -25,9 +25,7 @@ def twin_rows(matrix: sparse.csr_matrix[np.float64]) -> NDArray[np.int64]:
     return np.concatenate([[0], np.cumsum(different)])
 
 
-def node_graph(
-    matrix: sparse.csr_matrix[np.float64], group: NDArray[np.int64]
-) -> sparse.csr_matrix[np.float64]:
+def node_graph(matrix: sparse.csr_matrix[np.float64], group: NDArray[np.int64]) -> sparse.csr_matrix[np.float64]:
     """Which of the nodes (n, n), groups (n_rows,) of twin rows, share an entry; symmetric, without loops, sorted."""
     first = np.flatnonzero(np.diff(group, prepend=-1))
     n = len(first)

@@ -16,8 +16,10 @@ from palpate.mechanics.solvers.products import times
 
 __all__ = ["SOLVERS", "factorise"]
 
-SOLVERS = {solver.name: solver for solver in (
-        multifrontal.SOLVER, multifrontal.MIXED,pardiso.SOLVER, superlu.SOLVER, multigrid.SOLVER)}
+SOLVERS = {
+    solver.name: solver
+    for solver in (multifrontal.SOLVER, multifrontal.MIXED, pardiso.SOLVER, superlu.SOLVER, multigrid.SOLVER)
+}
 TOLERANCE = 1e-8  # of a residual, relative to its right-hand side
 LARGEST_CONDITION = 1e13  # beyond it a direct solution has lost three digits of four to rounding
 LARGEST_SUPERLU = 250_000  # unknowns; above, its factors outgrow a desktop's memory

@@ -36,7 +36,10 @@ def _routine(module: Any, name: str) -> Callable[..., None]:
 _ROUTINES = {
     (kind, np.dtype(dtype)): _routine(module, letter + kind)
     for letter, dtype in (("s", np.float32), ("d", np.float64))
-    for kind, module in [("potrf", cython_lapack), *((k, cython_blas) for k in ("trsm", "syrk", "gemm", "trsv", "gemv"))]
+    for kind, module in [
+        ("potrf", cython_lapack),
+        *((k, cython_blas) for k in ("trsm", "syrk", "gemm", "trsv", "gemv")),
+    ]
 }
 _ONE = {np.dtype(t): np.array([1.0], dtype=t) for t in (np.float32, np.float64)}
 _CONSTANT = {(dtype, value): np.array([value], dtype=dtype) for dtype in _ONE for value in (-1.0, 0.0, 1.0)}

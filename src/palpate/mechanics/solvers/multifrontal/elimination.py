@@ -93,7 +93,9 @@ def column_counts(lower: sparse.csr_matrix[np.float64], parent: Integers, weight
     row = np.repeat(np.arange(n), counts)
     delta = np.bincount(lower.indices, weight[row], minlength=n)
     same = np.flatnonzero(np.diff(row) == 0)
-    meet = _lowest_common_ancestors(parent, lower.indices[same].astype(np.int64), lower.indices[same + 1].astype(np.int64))
+    meet = _lowest_common_ancestors(
+        parent, lower.indices[same].astype(np.int64), lower.indices[same + 1].astype(np.int64)
+    )
     delta -= np.bincount(meet, weight[row[same]], minlength=n)
     delta -= np.where(counts > 0, weight, 0)
     sums = np.concatenate([[0.0], np.cumsum(delta)])
@@ -231,9 +233,7 @@ def _allowed(width: int) -> float:
     return next(share for limit, share in ZEROS if width <= limit)
 
 
-def _structures(
-    lower: sparse.csc_matrix[np.float64], member: Integers, parent: Integers
-) -> list[Integers]:
+def _structures(lower: sparse.csc_matrix[np.float64], member: Integers, parent: Integers) -> list[Integers]:
     """For each supernode the nodes that it fills outside itself; member (n_nodes,), parent (n,)."""
     n = len(parent)
     by_member = np.argsort(member, kind="stable")

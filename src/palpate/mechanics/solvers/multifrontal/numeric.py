@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from palpate.errors import SolverError
 from palpate.mechanics.solvers.multifrontal import dense
 from palpate.mechanics.solvers.multifrontal.dense import Matrix
-from palpate.mechanics.solvers.multifrontal.plan import Front, Plan, panel_of
+from palpate.mechanics.solvers.multifrontal.plan import Front, Plan, blocks_of, panel_of
 
 __all__ = ["factorised"]
 
@@ -29,11 +30,6 @@ class _Work:
     data: NDArray[np.float64]
     factor: Matrix
     memory: Matrix
-
-    def contribution(self, front: Front) -> Matrix:
-        """What a front adds to its parent (below, below), lower triangle."""
-        m = len(front.rows)
-        return self.memory[front.contribution : front.contribution + m * m].reshape(m, m).T
 
 
 def factorised(plan: Plan, data: NDArray[np.float64], dtype: type, threads: int) -> Matrix:
@@ -67,54 +63,45 @@ def _eliminate_subtree(work: _Work, subtree: range) -> None:
 def _eliminate(work: _Work, front: Front) -> None:
     """One front by one thread."""
     panel, w = _assembled(work, front), front.width
-    children = [work.plan.fronts[child] for child in front.children]
-    for child in children:
-        _add(panel, work.contribution(child), child.runs, 0, w, 0)
+    _add_children(work, front, panel, (0, w))
     _check(work, front, dense.factor(panel[:w]))
-    if not len(front.rows):
-        return
-    dense.solve_transposed(panel[:w], panel[w:])
-    rest = work.contribution(front)
-    dense.subtract_square(rest, panel[w:], keep=0.0)
-    for child in children:
-        _add(rest, work.contribution(child), child.runs, w, front.size, w)
+    if len(front.rows):
+        dense.solve_transposed(panel[:w], panel[w:])
+    for low, high, block in blocks_of(work.memory, front):
+        _update(block, panel[w + low :], high - low, 0.0)
+        _add_children(work, front, block, (w + low, w + high))
 
 
 def _eliminate_large(work: _Work, front: Front, threads: int, everywhere: Everywhere) -> None:
     """One front by all threads: blocks of columns in turn, each part of what is right of them by another thread."""
     panel, w, size = _assembled(work, front), front.width, front.size
-    children = [work.plan.fronts[child] for child in front.children]
-
-    def add(matrix: Matrix, part: tuple[int, int], shift: int) -> None:
-        for child in children:
-            _add(matrix, work.contribution(child), child.runs, *part, shift)
-
-    everywhere(lambda part: add(panel, part, 0), _parts(0, w, size, threads))
+    everywhere(
+        lambda part: _add_children(work, front, panel[part[0] :, part[0] : part[1]], part), _parts(0, w, size, threads)
+    )
     for begin in range(0, w, BLOCK):
         end = min(begin + BLOCK, w)
         pivot = panel[begin:end, begin:end]
         _check(work, front, dense.factor(pivot), begin)
         rows = np.linspace(end, size, threads + 1).astype(int).tolist()
-        slices = [slice(a, b) for a, b in zip(rows[:-1], rows[1:], strict=True) if b > a]
-        everywhere(lambda rows: dense.solve_transposed(pivot, panel[rows, begin:end]), slices)
+        everywhere(lambda part: dense.solve_transposed(pivot, panel[slice(*part), begin:end]), pairwise(rows))
         done = panel[:, begin:end]
-        everywhere(lambda part: _update(panel, done, *part, 0, 1.0), _parts(end, w, size, threads))
-    if size > w:
-        rest = work.contribution(front)
+        everywhere(
+            lambda part: _update(panel[part[0] :, part[0] : part[1]], done[part[0] :], part[1] - part[0], 1.0),
+            _parts(end, w, size, threads),
+        )
 
-        def remainder(part: tuple[int, int]) -> None:
-            _update(rest, panel, *part, w, 0.0)
-            add(rest, part, w)
+    def remainder(block: tuple[int, int, Matrix]) -> None:
+        _update(block[2], panel[w + block[0] :], block[1] - block[0], 0.0)
+        _add_children(work, front, block[2], (w + block[0], w + block[1]))
 
-        everywhere(remainder, _parts(w, size, size, threads))
+    everywhere(remainder, blocks_of(work.memory, front))
 
 
-def _update(matrix: Matrix, done: Matrix, low: int, high: int, shift: int, keep: float) -> None:
-    """Columns low to high of a front less the product of the columns that are `done`, below the diagonal."""
-    columns = slice(low - shift, high - shift)
-    dense.subtract_square(matrix[columns, columns], done[low:high], keep=keep)
-    if high < len(done):
-        dense.subtract_product(matrix[high - shift :, columns], done[high:], done[low:high], keep=keep)
+def _update(matrix: Matrix, done: Matrix, width: int, keep: float) -> None:
+    """keep C - D D_1^T in place of C (n, width) from its diagonal on; D (n, k), D_1 its first `width` rows."""
+    dense.subtract_square(matrix[:width], done[:width], keep=keep)
+    if width < len(done):
+        dense.subtract_product(matrix[width:], done[width:], done[:width], keep=keep)
 
 
 def _parts(low: int, high: int, size: int, threads: int) -> list[tuple[int, int]]:
@@ -136,17 +123,35 @@ def _assembled(work: _Work, front: Front) -> Matrix:
     return panel
 
 
-def _add(matrix: Matrix, contribution: Matrix, runs: tuple[tuple[int, int, int], ...], low: int, high: int, shift: int) -> None:
-    """Add to columns low to high of a front what a child contributes to them; matrix: the front from `shift` on."""
+def _add_children(work: _Work, front: Front, matrix: Matrix, columns: tuple[int, int]) -> None:
+    """Add to `columns` (first, last) of a front, and to the rows from the first one on, what its children contribute."""
+    for number in front.children:
+        child = work.plan.fronts[number]
+        for low, high, block in blocks_of(work.memory, child):
+            _add(matrix, columns, block, (low, high), child.runs)
+
+
+def _add(
+    matrix: Matrix,
+    columns: tuple[int, int],
+    block: Matrix,
+    own: tuple[int, int],
+    runs: tuple[tuple[int, int, int], ...],
+) -> None:
+    """Add columns `own` of a contribution to those of a front among `columns`, run by run; both from the diagonal on."""
     for number, (start, there, length) in enumerate(runs):
-        begin, end = max(there, low), min(there + length, high)
+        ahead = there - start
+        begin = max(start, own[0], columns[0] - ahead)
+        end = min(start + length, own[1], columns[1] - ahead)
         if begin >= end:
             continue
-        columns = slice(start + begin - there, start + end - there)
-        target = matrix[:, begin - shift : end - shift]
+        target = matrix[:, begin + ahead - columns[0] : end + ahead - columns[0]]
+        source = block[:, begin - own[0] : end - own[0]]
         for row, row_there, count in runs[number:]:
-            part = target[row_there - shift : row_there - shift + count]
-            np.add(part, contribution[row : row + count, columns], out=part)
+            first = max(row, begin)
+            place = row_there + first - row - columns[0]
+            part = target[place : place + row + count - first]
+            np.add(part, source[first - own[0] : row + count - own[0]], out=part)
 
 
 def _check(work: _Work, front: Front, pivot: int, before: int = 0) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,12 @@ from scipy import sparse
 from palpate.mechanics.solvers.multifrontal.elimination import Supernodes, supernodes
 from palpate.mechanics.solvers.pattern import dissection, node_graph, twin_rows
 
-__all__ = ["Front", "Plan", "Step", "make_plan", "panel_of"]
+__all__ = ["Front", "Plan", "Step", "block_bounds", "blocks_of", "make_plan", "panel_of"]
 
 Integers = NDArray[np.int64]
 
 SHARE = 0.03  # of a thread's part of the operations: subtrees up to it are eliminated side by side, each by one thread
+BLOCK = 192  # columns of a contribution that are kept together with what lies above the diagonal among them
 AHEAD = 2  # such subtrees a thread, that are eliminated before the fronts above them
 
 
@@ -24,8 +26,8 @@ AHEAD = 2  # such subtrees a thread, that are eliminated before the fronts above
 class Front:
     """The dense matrix of one supernode: its own `width` unknowns, from place `first` on, and those at `rows` (below,).
 
-    panel: where its columns of the factor begin; contribution: where it leaves what it adds to its parent (below,
-    below) in the working memory; children: fronts; runs: own rows (start, length) and their start in the parent's front
+    panel: where its columns of the factor begin; contribution: where the columns of what it adds to its parent (below,
+    below) begin in the working memory, see `blocks_of`; children: fronts; runs: own rows (start, length) and their start in the parent's front
     as (start, start there, length); entries: those of the matrix that belong to its columns.
     """
 
@@ -76,6 +78,23 @@ def panel_of(factor: NDArray[Any], front: Front) -> NDArray[Any]:
     return factor[front.panel : front.panel + front.size * front.width].reshape(front.width, front.size).T
 
 
+def block_bounds(below: int) -> list[tuple[int, int]]:
+    """Ranges of columns in which a contribution (below, below) is kept, each from its diagonal downwards."""
+    number = max(round(below / BLOCK), 1)
+    ends = [below * k // number for k in range(number + 1)]
+    return list(pairwise(ends))
+
+
+def blocks_of(memory: NDArray[Any], front: Front) -> list[tuple[int, int, NDArray[Any]]]:
+    """First and last column of each block of a front's contribution, and the block, rows from the first column on."""
+    begin, m, found = front.contribution, len(front.rows), []
+    for low, high in block_bounds(m):
+        size = (m - low) * (high - low)
+        found.append((low, high, memory[begin : begin + size].reshape(high - low, m - low).T))
+        begin += size
+    return found
+
+
 def make_plan(matrix: sparse.csr_matrix[np.float64], threads: int) -> Plan:
     """The plan for matrices with the pattern of `matrix` (n, n), sorted and without duplicates."""
     group = twin_rows(matrix)
@@ -90,7 +109,7 @@ def make_plan(matrix: sparse.csr_matrix[np.float64], threads: int) -> Plan:
     width = np.diff(offset[nodes.start])
     work = _operations(width, np.array(below))
     steps = _steps(nodes.parent, work, threads)
-    places, work_size = _places(nodes.parent, [m * m for m in below], steps)
+    places, work_size = _places(nodes.parent, [_kept(m) for m in below], steps)
     source, target, bounds = _entries(matrix, nodes, group, first, weight)
     panel = np.concatenate([[0], np.cumsum(width * (width + below))])
     children = _children(nodes.parent)
@@ -108,6 +127,11 @@ def make_plan(matrix: sparse.csr_matrix[np.float64], threads: int) -> Plan:
         for s in range(len(nodes.parent))
     )
     return Plan(order, fronts, source, target, steps, int(panel[-1]), work_size, float(work.sum()))
+
+
+def _kept(below: int) -> int:
+    """Numbers that a contribution (below, below) takes."""
+    return sum((below - low) * (high - low) for low, high in block_bounds(below))
 
 
 def _spread(first: Integers, count: Integers) -> Integers:
