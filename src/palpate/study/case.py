@@ -29,6 +29,7 @@ __all__ = [
 
 REMAINING = "remaining"
 LAW_NAMES = ("linear", "neo-hookean", "mooney-rivlin")
+SOLVER_NAMES = ("auto", "multifrontal", "multifrontal-single", "multigrid")
 
 ALL_POSITIVE = "a list of positive numbers"
 LOW_HIGH = "[low, high] with 0 < low < high"
@@ -135,11 +136,12 @@ class CaseTissue:
 
 @dataclass(frozen=True, slots=True)
 class Mechanics:
-    """Material law and finite element (`palpate.mechanics.laws`, `palpate.mechanics.dilatation`)."""
+    """Material law, finite element and linear solver (`palpate.mechanics.laws`, `.dilatation`, `.solvers.registry`)."""
 
     law: str = field(default="neo-hookean", metadata=rule(choices=LAW_NAMES))
     element: str = field(default="auto", metadata=rule(choices=("P1", "P2", "P2-P0", "auto")))
     c01_over_c10: float = field(default=0.25, metadata=rule(test=lambda value: value >= 0, wanted="zero or more"))
+    solver: str = field(default="auto", metadata=rule(choices=SOLVER_NAMES))
 
 
 @dataclass(frozen=True, slots=True)

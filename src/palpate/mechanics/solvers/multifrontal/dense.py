@@ -14,7 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cython_blas, cython_lapack
 
-__all__ = ["Matrix", "factor", "solve_left", "solve_right", "solve_transposed", "subtract_product", "subtract_square"]
+__all__ = [
+    "Matrix",
+    "factor",
+    "solve_right",
+    "solve_transposed",
+    "solve_vector",
+    "subtract_from_vector",
+    "subtract_product",
+    "subtract_square",
+]
 
 Matrix = NDArray[Any]  # float32 or float64, all arguments of a call alike
 
@@ -86,7 +95,7 @@ def solve_right(lower: Matrix, b: Matrix) -> None:
 
 
 def subtract_square(c: Matrix, a: Matrix, *, keep: float = 1.0) -> None:
-    """keep C - A A^T in place of the lower triangle of C (n, n), A (n, k); keep: 0 or 1."""
+    """Keep C - A A^T in place of the lower triangle of C (n, n), A (n, k); keep: 0 or 1."""
     _ROUTINES["syrk", c.dtype](
         b"L", b"N", _dimension(a.shape[0]), _dimension(a.shape[1]), _scalar(c.dtype, -1.0), _at(a), _leading(a),
         _scalar(c.dtype, keep), _at(c), _leading(c),
@@ -94,7 +103,7 @@ def subtract_square(c: Matrix, a: Matrix, *, keep: float = 1.0) -> None:
 
 
 def subtract_product(c: Matrix, a: Matrix, b: Matrix, *, transposed: bool = True, keep: float = 1.0) -> None:
-    """keep C - A B^T in place of C (m, n), A (m, k), B (n, k), or with A B, B (k, n); keep: 0 or 1."""
+    """Keep C - A B^T in place of C (m, n), A (m, k), B (n, k), or with A B, B (k, n); keep: 0 or 1."""
     _ROUTINES["gemm", c.dtype](
         b"N", b"T" if transposed else b"N", _dimension(c.shape[0]), _dimension(c.shape[1]), _dimension(a.shape[1]),
         _scalar(c.dtype, -1.0), _at(a), _leading(a), _at(b), _leading(b), _scalar(c.dtype, keep), _at(c), _leading(c),
@@ -109,7 +118,7 @@ def solve_vector(lower: Matrix, x: Matrix, *, transposed: bool) -> None:
 
 
 def subtract_from_vector(y: Matrix, a: Matrix, x: Matrix, *, transposed: bool) -> None:
-    """y - A x, or y - A^T x, in place of y; A (m, n)."""
+    """The difference y - A x, or y - A^T x, in place of y; A (m, n)."""
     _ROUTINES["gemv", x.dtype](
         b"T" if transposed else b"N", _dimension(a.shape[0]), _dimension(a.shape[1]), _scalar(x.dtype, -1.0),
         _at(a), _leading(a), _at(x), _dimension(1), _scalar(x.dtype, 1.0), _at(y), _dimension(1),

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import minimum_spanning_tree
 
-__all__ = ["Supernodes", "supernodes"]
+from palpate.mechanics.solvers.multifrontal.refinement import refined_order
+
+__all__ = ["Supernodes", "children_of", "supernodes"]
 
 Integers = NDArray[np.int64]
 
@@ -73,6 +75,15 @@ def postorder(parent: Integers, weight: Integers | None = None) -> Integers:
         preorder.append(node)
         stack += children[bounds[node + 1] : bounds[node + 2]]
     return np.array(preorder[::-1], dtype=np.int64)
+
+
+def children_of(parent: Integers) -> list[list[int]]:
+    """Children of each node of a tree."""
+    found: list[list[int]] = [[] for _ in range(len(parent))]
+    for node, above in enumerate(parent.tolist()):
+        if above >= 0:
+            found[above].append(node)
+    return found
 
 
 def _relabelled(parent: Integers, order: Integers) -> Integers:
@@ -138,7 +149,7 @@ def _lowest_common_ancestors(parent: Integers, first: Integers, last: Integers) 
 
 
 def supernodes(graph: sparse.csr_matrix[np.float64], order: Integers, weight: Integers) -> Supernodes:
-    """Supernodes of a symmetric graph (n, n) whose nodes, of `weight` (n,) unknowns, are eliminated as in order (n,)."""
+    """Supernodes of a symmetric graph (n, n) of nodes of `weight` (n,) unknowns each, eliminated along `order`."""
     nodes = order[postorder(elimination_tree(_reordered(graph, order)))]
     lower = _reordered(graph, nodes)
     tree, own = elimination_tree(lower), weight[nodes]
@@ -172,7 +183,7 @@ def _in_order(
     by_member = np.argsort(place[member], kind="stable")
     start = np.searchsorted(place[member][by_member], np.arange(len(order) + 1))
     below = _renumbered(below, by_member)
-    refined = refined_order(start, parent, below)
+    refined = refined_order(start, children_of(parent), below)
     return Supernodes(nodes[by_member][refined], start, parent, tuple(_renumbered(below, refined)))
 
 
@@ -184,16 +195,13 @@ def _renumbered(sets: list[Integers], order: Integers) -> list[Integers]:
 
 def _priority(parent: Integers, kept: Integers) -> Integers:
     """For each tree node what its subtree needs at most beyond what it leaves, `kept` (n,); the neediest go first."""
-    peak, children = kept.tolist(), [[] for _ in range(len(parent))]
-    left = kept.tolist()
-    for s, above in enumerate(parent.tolist()):
+    peak, left = kept.tolist(), kept.tolist()
+    for s, children in enumerate(children_of(parent)):
         held, most = 0, 0
-        for child in sorted(children[s], key=lambda c: left[c] - peak[c]):
+        for child in sorted(children, key=lambda c: left[c] - peak[c]):
             most = max(most, held + peak[child])
             held += left[child]
         peak[s] = max(most, held + left[s])
-        if above >= 0:
-            children[above].append(s)
     return np.array(peak, dtype=np.int64) - kept
 
 
@@ -250,61 +258,3 @@ def _structures(lower: sparse.csc_matrix[np.float64], member: Integers, parent: 
         if parent[s] >= 0:
             inherited[parent[s]].append(below)
     return found
-
-
-def refined_order(start: Integers, parent: Integers, below: list[Integers]) -> Integers:
-    """Order (n_nodes,) inside supernodes such that what descendants fill there lies in few runs.
-
-    The nodes of a supernode are divided by whether its first child fills them, each part by its next one, and so on
-    down the tree; neighbouring parts meet with the sides that are filled. Partition refinement: Jacquelin, Ng &
-    Peyton, SIAM Workshop on Combinatorial Scientific Computing (2018) 1-10.
-    """
-    children: list[list[int]] = [[] for _ in range(len(parent))]
-    for s, above in enumerate(parent.tolist()):
-        if above >= 0:
-            children[above].append(s)
-    part = np.zeros(int(start[-1]), dtype=np.int64)
-    for s in range(len(parent)):
-        low, high = int(start[s]), int(start[s + 1])
-        part[low:high] = _refined(low, high, children, below, s)
-    return np.lexsort((part, np.repeat(np.arange(len(parent)), np.diff(start))))
-
-
-def _refined(low: int, high: int, children: list[list[int]], below: list[Integers], s: int) -> Integers:
-    """Parts (high - low,), numbered in their order, of the nodes low to high of supernode s."""
-    part, n_parts, queue = np.zeros(high - low, dtype=np.int64), 1, children[s]
-    while queue and n_parts < high - low:
-        following: list[int] = []
-        for child in sorted(queue, key=lambda c: -len(below[c])):
-            rows = below[child]
-            hit = rows[np.searchsorted(rows, low) : np.searchsorted(rows, high)] - low
-            if 0 < len(hit):
-                following += children[child]
-                if len(hit) < high - low:
-                    part, n_parts = _divided(part, n_parts, hit)
-        queue = following
-    return part
-
-
-def _divided(part: Integers, n_parts: int, hit: Integers) -> tuple[Integers, int]:
-    """Each part (n,) divided by whether its nodes are among `hit` (m,), and how many parts there are then."""
-    inside = np.zeros(len(part), dtype=np.int64)
-    inside[hit] = 1
-    hits = np.bincount(part[hit], minlength=n_parts)
-    mixed = (hits > 0) & (hits < np.bincount(part, minlength=n_parts))
-    if not mixed.any():
-        return part, n_parts
-    # From left to right: whether the part's end towards the next one is filled; a divided one turns it round.
-    filled_first = np.zeros(n_parts, dtype=np.int64)
-    filled = False
-    for number in np.flatnonzero(hits).tolist():
-        if number and not hits[number - 1]:
-            filled = False
-        if mixed[number]:
-            filled_first[number] = filled
-            filled = not filled
-        else:
-            filled = True
-    ahead = np.cumsum(mixed) - mixed
-    second = mixed[part] & (inside != filled_first[part])
-    return part + ahead[part] + second, n_parts + int(mixed.sum())

@@ -73,32 +73,39 @@ def _eliminate(work: _Work, front: Front) -> None:
 
 
 def _eliminate_large(work: _Work, front: Front, threads: int, everywhere: Everywhere) -> None:
-    """One front by all threads: blocks of columns in turn, each part of what is right of them by another thread."""
-    panel, w, size = _assembled(work, front), front.width, front.size
-    everywhere(
-        lambda part: _add_children(work, front, panel[part[0] :, part[0] : part[1]], part), _parts(0, w, size, threads)
-    )
-    for begin in range(0, w, BLOCK):
-        end = min(begin + BLOCK, w)
-        pivot = panel[begin:end, begin:end]
-        _check(work, front, dense.factor(pivot), begin)
-        rows = np.linspace(end, size, threads + 1).astype(int).tolist()
-        everywhere(lambda part: dense.solve_transposed(pivot, panel[slice(*part), begin:end]), pairwise(rows))
-        done = panel[:, begin:end]
-        everywhere(
-            lambda part: _update(panel[part[0] :, part[0] : part[1]], done[part[0] :], part[1] - part[0], 1.0),
-            _parts(end, w, size, threads),
-        )
+    """One front by all threads."""
+    panel, w = _assembled(work, front), front.width
+
+    def add(part: tuple[int, int]) -> None:
+        _add_children(work, front, panel[part[0] :, part[0] : part[1]], part)
 
     def remainder(block: tuple[int, int, Matrix]) -> None:
-        _update(block[2], panel[w + block[0] :], block[1] - block[0], 0.0)
-        _add_children(work, front, block[2], (w + block[0], w + block[1]))
+        low, high, matrix = block
+        _update(matrix, panel[w + low :], high - low, 0.0)
+        _add_children(work, front, matrix, (w + low, w + high))
 
+    everywhere(add, _parts(0, w, front.size, threads))
+    for begin in range(0, w, BLOCK):
+        pivot = _eliminate_columns(panel, begin, min(begin + BLOCK, w), threads, everywhere)
+        _check(work, front, pivot, begin)
     everywhere(remainder, blocks_of(work.memory, front))
 
 
+def _eliminate_columns(panel: Matrix, begin: int, end: int, threads: int, everywhere: Everywhere) -> int:
+    """Columns begin to end of a front (size, width), of which those right of them then hear; as `dense.factor`."""
+    pivot, done, (size, width) = panel[begin:end, begin:end], panel[:, begin:end], panel.shape
+    failed = dense.factor(pivot)
+    if failed:
+        return failed
+    rows = pairwise(np.linspace(end, size, threads + 1).astype(int).tolist())
+    everywhere(lambda part: dense.solve_transposed(pivot, done[slice(*part)]), rows)
+    parts = _parts(end, width, size, threads)
+    everywhere(lambda part: _update(panel[part[0] :, slice(*part)], done[part[0] :], part[1] - part[0], 1.0), parts)
+    return 0
+
+
 def _update(matrix: Matrix, done: Matrix, width: int, keep: float) -> None:
-    """keep C - D D_1^T in place of C (n, width) from its diagonal on; D (n, k), D_1 its first `width` rows."""
+    """Keep C - D D_1^T in place of C (n, width) from its diagonal on; D (n, k), D_1 its first `width` rows."""
     dense.subtract_square(matrix[:width], done[:width], keep=keep)
     if width < len(done):
         dense.subtract_product(matrix[width:], done[width:], done[:width], keep=keep)
@@ -111,7 +118,7 @@ def _parts(low: int, high: int, size: int, threads: int) -> list[tuple[int, int]
     area = np.cumsum(size - np.arange(low, high))
     bounds = np.searchsorted(area, area[-1] * np.arange(1, threads) / threads)
     ends = [low, *(low + bounds).tolist(), high]
-    return [(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True) if b > a]
+    return [(a, b) for a, b in pairwise(ends) if b > a]
 
 
 def _assembled(work: _Work, front: Front) -> Matrix:
@@ -124,7 +131,7 @@ def _assembled(work: _Work, front: Front) -> Matrix:
 
 
 def _add_children(work: _Work, front: Front, matrix: Matrix, columns: tuple[int, int]) -> None:
-    """Add to `columns` (first, last) of a front, and to the rows from the first one on, what its children contribute."""
+    """Add what a front's children contribute to its columns (first, last), from the diagonal on."""
     for number in front.children:
         child = work.plan.fronts[number]
         for low, high, block in blocks_of(work.memory, child):
@@ -138,7 +145,7 @@ def _add(
     own: tuple[int, int],
     runs: tuple[tuple[int, int, int], ...],
 ) -> None:
-    """Add columns `own` of a contribution to those of a front among `columns`, run by run; both from the diagonal on."""
+    """Add columns `own` of a contribution to those among `columns` of a front, run by run; all from the diagonal on."""
     for number, (start, there, length) in enumerate(runs):
         ahead = there - start
         begin = max(start, own[0], columns[0] - ahead)

@@ -10,16 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from palpate.mechanics.solvers.multifrontal.elimination import Supernodes, supernodes
+from palpate.mechanics.solvers.multifrontal.elimination import Supernodes, children_of, supernodes
+from palpate.mechanics.solvers.multifrontal.schedule import Step, elimination_steps, memory_places
 from palpate.mechanics.solvers.pattern import dissection, node_graph, twin_rows
 
-__all__ = ["Front", "Plan", "Step", "block_bounds", "blocks_of", "make_plan", "panel_of"]
+__all__ = ["Front", "Plan", "blocks_of", "make_plan", "panel_of"]
 
 Integers = NDArray[np.int64]
 
-SHARE = 0.03  # of a thread's part of the operations: subtrees up to it are eliminated side by side, each by one thread
 BLOCK = 192  # columns of a contribution that are kept together with what lies above the diagonal among them
-AHEAD = 2  # such subtrees a thread, that are eliminated before the fronts above them
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,8 +26,8 @@ class Front:
     """The dense matrix of one supernode: its own `width` unknowns, from place `first` on, and those at `rows` (below,).
 
     panel: where its columns of the factor begin; contribution: where the columns of what it adds to its parent (below,
-    below) begin in the working memory, see `blocks_of`; children: fronts; runs: own rows (start, length) and their start in the parent's front
-    as (start, start there, length); entries: those of the matrix that belong to its columns.
+    below) begin in the working memory, see `blocks_of`; children: fronts; runs: (start among its rows, start in the
+    parent's front, length) of each; entries: those of the matrix that belong to its columns.
     """
 
     first: int
@@ -44,14 +43,6 @@ class Front:
     def size(self) -> int:
         """Rows of its columns."""
         return self.width + len(self.rows)
-
-
-@dataclass(frozen=True, slots=True)
-class Step:
-    """Ranges of fronts, subtrees that may be eliminated side by side, and then fronts (m,) one after the other."""
-
-    subtrees: tuple[range, ...]
-    then: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +69,7 @@ def panel_of(factor: NDArray[Any], front: Front) -> NDArray[Any]:
     return factor[front.panel : front.panel + front.size * front.width].reshape(front.width, front.size).T
 
 
-def block_bounds(below: int) -> list[tuple[int, int]]:
+def _block_bounds(below: int) -> list[tuple[int, int]]:
     """Ranges of columns in which a contribution (below, below) is kept, each from its diagonal downwards."""
     number = max(round(below / BLOCK), 1)
     ends = [below * k // number for k in range(number + 1)]
@@ -88,7 +79,7 @@ def block_bounds(below: int) -> list[tuple[int, int]]:
 def blocks_of(memory: NDArray[Any], front: Front) -> list[tuple[int, int, NDArray[Any]]]:
     """First and last column of each block of a front's contribution, and the block, rows from the first column on."""
     begin, m, found = front.contribution, len(front.rows), []
-    for low, high in block_bounds(m):
+    for low, high in _block_bounds(m):
         size = (m - low) * (high - low)
         found.append((low, high, memory[begin : begin + size].reshape(high - low, m - low).T))
         begin += size
@@ -108,11 +99,11 @@ def make_plan(matrix: sparse.csr_matrix[np.float64], threads: int) -> Plan:
     below = [int(own[rows].sum()) for rows in nodes.rows]
     width = np.diff(offset[nodes.start])
     work = _operations(width, np.array(below))
-    steps = _steps(nodes.parent, work, threads)
-    places, work_size = _places(nodes.parent, [_kept(m) for m in below], steps)
+    steps = elimination_steps(nodes.parent, work, threads)
+    places, work_size = memory_places(nodes.parent, [_kept(m) for m in below], steps)
     source, target, bounds = _entries(matrix, nodes, group, first, weight)
     panel = np.concatenate([[0], np.cumsum(width * (width + below))])
-    children = _children(nodes.parent)
+    children = children_of(nodes.parent)
     fronts = tuple(
         Front(
             first=int(offset[nodes.start[s]]),
@@ -120,7 +111,7 @@ def make_plan(matrix: sparse.csr_matrix[np.float64], threads: int) -> Plan:
             rows=_spread(offset[nodes.rows[s]], own[nodes.rows[s]]).astype(np.int32),
             panel=int(panel[s]),
             contribution=places[s],
-            children=children[s],
+            children=tuple(children[s]),
             runs=_runs(nodes, own, s),
             entries=slice(int(bounds[s]), int(bounds[s + 1])),
         )
@@ -131,7 +122,7 @@ def make_plan(matrix: sparse.csr_matrix[np.float64], threads: int) -> Plan:
 
 def _kept(below: int) -> int:
     """Numbers that a contribution (below, below) takes."""
-    return sum((below - low) * (high - low) for low, high in block_bounds(below))
+    return sum((below - low) * (high - low) for low, high in _block_bounds(below))
 
 
 def _spread(first: Integers, count: Integers) -> Integers:
@@ -144,14 +135,6 @@ def _operations(width: Integers, below: Integers) -> NDArray[np.float64]:
     """Multiplications and additions (n,) of each front."""
     w, m = width.astype(np.float64), below.astype(np.float64)
     return w**3 / 3.0 + w**2 * m + w * m**2
-
-
-def _children(parent: Integers) -> list[tuple[int, ...]]:
-    found: list[list[int]] = [[] for _ in range(len(parent))]
-    for s, above in enumerate(parent.tolist()):
-        if above >= 0:
-            found[above].append(s)
-    return [tuple(children) for children in found]
 
 
 def _runs(nodes: Supernodes, own: Integers, s: int) -> tuple[tuple[int, int, int], ...]:
@@ -169,100 +152,6 @@ def _runs(nodes: Supernodes, own: Integers, s: int) -> tuple[tuple[int, int, int
     ends = np.append(breaks, len(rows))
     table = np.stack([here[starts], there[place[starts]], here[ends] - here[starts]], axis=1)
     return tuple((a, b, c) for a, b, c in table.tolist())
-
-
-def _steps(parent: Integers, work: NDArray[np.float64], threads: int) -> tuple[Step, ...]:
-    """Subtrees small enough for one of several threads, each as soon as it is its turn, and the fronts above them."""
-    n = len(parent)
-    if threads == 1:
-        return (Step((range(n),), ()),)
-    below = work.copy()
-    first = np.arange(n)
-    for s, above in enumerate(parent.tolist()):
-        if above >= 0:
-            below[above] += below[s]
-            first[above] = min(first[above], first[s])
-    small = below <= SHARE * work.sum() / threads
-    roots = np.flatnonzero(small & ~np.append(small, False)[parent])
-    subtrees = [range(int(first[s]), int(s) + 1) for s in roots]
-    steps = []
-    for begin in range(0, max(len(subtrees), 1), AHEAD * threads):
-        batch = subtrees[begin : begin + AHEAD * threads]
-        following = begin + AHEAD * threads
-        done = batch[0].start if begin and batch else 0
-        ready = subtrees[following].start if following < len(subtrees) else n
-        steps.append(Step(tuple(batch), tuple(int(s) for s in np.flatnonzero(~small[done:ready]) + done)))
-    return tuple(steps)
-
-
-def _places(parent: Integers, sizes: list[int], steps: tuple[Step, ...]) -> tuple[list[int], int]:
-    """Where (n,) in the working memory each front's contribution of `sizes` (n,) numbers lies, and all that it needs.
-
-    Each lives from its front to its parent's. The subtrees of a step have a block each for all but their roots.
-    """
-    places, within = [0] * len(parent), {}
-    needs: list[tuple[int, int, int]] = []  # size, first and last moment
-    owners: list[int] = []
-    moment = 0
-    born: dict[int, int] = {}
-    for step in steps:
-        for subtree in step.subtrees:
-            within[subtree[-1]], needed = _stacked([*subtree][:-1], parent, sizes)
-            needs.append((needed, moment, moment))
-            owners.append(-1 - subtree[-1])
-            born[subtree[-1]] = moment
-        for s in step.then:
-            moment += 1
-            born[s] = moment
-        moment += 1
-    for s, begin in born.items():
-        needs.append((sizes[s], begin, born[int(parent[s])] if parent[s] >= 0 else begin))
-        owners.append(s)
-    offsets, most = _shared(needs)
-    for owner, offset in zip(owners, offsets, strict=True):
-        if owner >= 0:
-            places[owner] = offset
-        else:
-            for s, place in within[-1 - owner].items():
-                places[s] = offset + place
-    return places, most
-
-
-def _shared(needs: list[tuple[int, int, int]]) -> tuple[list[int], int]:
-    """Places for needs of (size, first moment, last moment), the largest first, each in the first gap of its time."""
-    places = [0] * len(needs)
-    placed: list[int] = []
-    for i in sorted(range(len(needs)), key=lambda i: -needs[i][0]):
-        size, begin, end = needs[i]
-        taken = [(places[j], places[j] + needs[j][0]) for j in placed if needs[j][1] <= end and begin <= needs[j][2]]
-        for start, stop in sorted(taken):
-            if start - places[i] >= size:
-                break
-            places[i] = max(places[i], stop)
-        placed.append(i)
-    return places, max((place + need[0] for place, need in zip(places, needs, strict=True)), default=0)
-
-
-def _stacked(fronts: list[int], parent: Integers, sizes: list[int]) -> tuple[dict[int, int], int]:
-    """Places from 0 on of the contributions of `fronts`, in postorder, and how many numbers they need.
-
-    Two stacks grow towards each other, a front's contribution on the other one than its children's, which it uses up.
-    """
-    depth = [0] * len(parent)
-    for s in range(len(parent) - 1, -1, -1):
-        depth[s] = depth[parent[s]] + 1 if parent[s] >= 0 else 0
-    chosen = set(fronts)
-    used = {s: 0 for s in fronts}  # of each front's children
-    tops, most, begin = [0, 0], 0, {}
-    for s in fronts:
-        side = depth[s] % 2
-        begin[s] = tops[side]
-        tops[side] += sizes[s]
-        most = max(most, sum(tops))
-        tops[1 - side] -= used[s]
-        if parent[s] in chosen:
-            used[int(parent[s])] += sizes[s]
-    return {s: place if depth[s] % 2 == 0 else most - place - sizes[s] for s, place in begin.items()}, most
 
 
 def _entries(

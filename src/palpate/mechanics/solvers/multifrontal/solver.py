@@ -7,6 +7,7 @@ alone is kept for the next matrix with the same one.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import threading
 from collections import OrderedDict
@@ -17,19 +18,21 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from palpate.errors import ResourceError, SolverError
-from palpate.memory import available_memory
 from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
-from palpate.mechanics.solvers.contract import Factorisation, Hints, Solver, always
+from palpate.mechanics.solvers.contract import Expectation, Factorisation, Factoriser, Hints, Solver
 from palpate.mechanics.solvers.multifrontal.dense import Matrix
+from palpate.mechanics.solvers.multifrontal.expectation import PRODUCT, expected, expected_of_size
 from palpate.mechanics.solvers.multifrontal.numeric import factorised
 from palpate.mechanics.solvers.multifrontal.plan import Plan, make_plan
 from palpate.mechanics.solvers.multifrontal.substitution import substituted
 from palpate.mechanics.solvers.multifrontal.threads import blas_on_one_thread
+from palpate.memory import available_memory
 from palpate.parallel import processors
 
-__all__ = ["MIXED", "SOLVER", "expected_bytes", "plan_of"]
+__all__ = ["MIXED", "SOLVER", "plan_of"]
 
 KEPT_PLANS = 2  # of a linear and a finite-strain model of one mesh
+HOPELESS = 4.0  # times the free memory; a pattern of such a size is not analysed to know more exactly
 TOLERANCE = 1e-10  # of the residual, relative, to which solutions by single-precision factors are refined
 MAX_REFINEMENTS = 8  # steps of conjugate gradients; where they do not suffice, double precision costs less
 
@@ -63,7 +66,7 @@ class MixedFactorisation:
         sizes = np.maximum(np.abs(rhs).max(axis=0, initial=0.0), np.finfo(np.float64).tiny)  # single has a small range
         with blas_on_one_thread():
             rough = substituted(self.plan, self.factor, rhs / sizes, processors())
-        return rough * (sizes / self.scale)
+        return np.asarray(rough * (sizes / self.scale))
 
     def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
         """Solution X (n, m) of A X = rhs (n, m) to a relative residual of 1e-10; raises `SolverError`."""
@@ -83,7 +86,7 @@ class _Plans:
     def of(self, matrix: sparse.csr_matrix[np.float64], threads: int) -> Plan:
         """The plan for a canonical matrix, kept or new."""
         digest = hashlib.blake2b(matrix.indptr.tobytes())
-        digest.update(matrix.indices)
+        digest.update(matrix.indices.tobytes())
         key = digest.digest(), threads
         with self.lock:
             plan = self.kept.pop(key, None) or make_plan(matrix, threads)
@@ -101,11 +104,6 @@ def plan_of(matrix: sparse.csr_matrix[np.float64]) -> Plan:
     return _plans.of(_canonical(matrix), processors())
 
 
-def expected_bytes(plan: Plan, itemsize: int) -> float:
-    """Memory that a factorisation in numbers of `itemsize` bytes takes beside its plan."""
-    return float(plan.factor_size + plan.work_size) * itemsize
-
-
 def _canonical(matrix: sparse.csr_matrix[np.float64]) -> sparse.csr_matrix[np.float64]:
     if matrix.has_canonical_format:
         return matrix
@@ -116,11 +114,12 @@ def _canonical(matrix: sparse.csr_matrix[np.float64]) -> sparse.csr_matrix[np.fl
 
 def _factor(matrix: sparse.csr_matrix[np.float64], plan: Plan, dtype: type, scale: float = 1.0) -> Matrix:
     """The factor of a canonical matrix over `scale`; raises `SolverError`, `ResourceError`."""
-    needed, free = expected_bytes(plan, np.dtype(dtype).itemsize), available_memory()
+    needed = float(plan.factor_size + plan.work_size) * np.dtype(dtype).itemsize
+    free = available_memory()
     if free is not None and needed > free:
         raise ResourceError(
-            f"the factor of {matrix.shape[0]} unknowns needs {needed / 1e9:.2g} GB and {free / 1e9:.2g} GB are free: use"
-            " a coarser mesh or solver 'multigrid', or end other programs"
+            f"the factor of {matrix.shape[0]} unknowns needs {needed / 1e9:.2g} GB and {free / 1e9:.2g} GB are free:"
+            " use a coarser mesh or solver 'multigrid', or end other programs"
         )
     with blas_on_one_thread():
         return factorised(plan, matrix.data / scale, dtype, processors())
@@ -146,5 +145,20 @@ def _factorise_mixed(matrix: sparse.csr_matrix[np.float64], hints: Hints) -> Fac
     return mixed
 
 
-SOLVER = Solver("multifrontal", _factorise, True, always)
-MIXED = Solver("multifrontal-single", _factorise_mixed, True, always)
+def _expect(matrix: sparse.csr_matrix[np.float64], hints: Hints, dtype: type) -> Expectation:
+    """From the plan, which the factorisation then finds ready."""
+    free, rough = available_memory(), expected_of_size(matrix.shape[0], hints.right_hand_sides, dtype)
+    if free is not None and rough.bytes > HOPELESS * free:
+        return rough
+    plan = plan_of(matrix)
+    sizes = (plan.operations, plan.factor_size, plan.work_size)
+    return expected(*sizes, hints.right_hand_sides, dtype, PRODUCT * matrix.nnz)
+
+
+def _solver(name: str, factorise: Factoriser, dtype: type) -> Solver:
+    expect, of_size = functools.partial(_expect, dtype=dtype), functools.partial(expected_of_size, dtype=dtype)
+    return Solver(name, factorise, True, expect, of_size)
+
+
+SOLVER = _solver("multifrontal", _factorise, np.float64)
+MIXED = _solver("multifrontal-single", _factorise_mixed, np.float32)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -38,7 +39,7 @@ def substituted(plan: Plan, factor: Matrix, rhs: NDArray[np.float64], threads: i
         result[plan.order, begin:end] = x
 
     if threads == 1 or blocks == 1:
-        for begin, end in zip(bounds[:-1], bounds[1:], strict=True):
+        for begin, end in pairwise(bounds):
             solve(begin, end)
     else:
         with ThreadPoolExecutor(threads) as pool:
