@@ -63,9 +63,7 @@ def expected_cost(case: Case, before: Segmentation, after: tuple[Segmentation, .
     modes = (drivers * case.driver.modes + OVERHEAD_MODES) / (USUAL_MODES + OVERHEAD_MODES)
     work = unknowns * modes * max(len(after), 1)
     finite = case.mechanics.law != "linear"
-    seconds = (
-        solving.seconds * processors() + SECONDS_AN_UNKNOWN * work + SECONDS_A_CUT * tets * (len(before.tissues) - 1)
-    )
+    seconds = SECONDS_AN_UNKNOWN * work + SECONDS_A_CUT * tets * (len(before.tissues) - 1)
     gigabytes = GB_AN_UNKNOWN * work + solving.bytes / 1e9
     gigabytes *= FINITE_STRAIN_GB if finite else 1.0
     count = processors()
@@ -74,7 +72,7 @@ def expected_cost(case: Case, before: Segmentation, after: tuple[Segmentation, .
         tets=n_pairs * tets,
         unknowns=n_pairs * unknowns,
         memory_gb=FIXED_GB + n_pairs * gigabytes,
-        seconds=(FIXED_S + n_pairs * seconds) * shorter,
+        seconds=(FIXED_S + n_pairs * seconds) * shorter + n_pairs * solving.seconds,
         solver=solver,
         processors=count,
     )

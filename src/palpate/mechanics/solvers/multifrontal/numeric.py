@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -15,6 +14,7 @@ from palpate.errors import SolverError
 from palpate.mechanics.solvers.multifrontal import dense
 from palpate.mechanics.solvers.multifrontal.dense import Matrix
 from palpate.mechanics.solvers.multifrontal.plan import Front, Plan, blocks_of, panel_of
+from palpate.mechanics.solvers.multifrontal.threads import pool_of
 
 __all__ = ["factorised"]
 
@@ -42,7 +42,7 @@ def factorised(plan: Plan, data: NDArray[np.float64], dtype: type, threads: int)
             for s in step.then:
                 _eliminate(work, plan.fronts[s])
         return work.factor
-    with ThreadPoolExecutor(threads) as pool:
+    with pool_of(threads) as pool:
 
         def everywhere(function: Callable[[Any], None], items: Iterable[Any]) -> None:
             """All calls done, by all threads."""

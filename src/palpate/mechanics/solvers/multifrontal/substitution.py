@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import Any
 
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from palpate.mechanics.solvers.multifrontal import dense
 from palpate.mechanics.solvers.multifrontal.dense import Matrix
 from palpate.mechanics.solvers.multifrontal.plan import Plan, panel_of
+from palpate.mechanics.solvers.multifrontal.threads import pool_of
 
 __all__ = ["substituted"]
 
@@ -42,7 +42,7 @@ def substituted(plan: Plan, factor: Matrix, rhs: NDArray[np.float64], threads: i
         for begin, end in pairwise(bounds):
             solve(begin, end)
     else:
-        with ThreadPoolExecutor(threads) as pool:
+        with pool_of(threads) as pool:
             list(pool.map(solve, bounds[:-1], bounds[1:]))
     return result
 

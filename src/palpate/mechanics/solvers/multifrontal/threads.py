@@ -5,11 +5,14 @@ from __future__ import annotations
 import functools
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
 import threadpoolctl
 
-__all__ = ["blas_on_one_thread"]
+__all__ = ["blas_on_one_thread", "pool_of"]
+
+_turn = threading.RLock()
 
 
 @functools.cache
@@ -17,33 +20,22 @@ def _libraries() -> threadpoolctl.ThreadpoolController:
     return threadpoolctl.ThreadpoolController()
 
 
-class _Users:
-    """How many calls rely on the limit at the moment; the first sets it, the last lifts it."""
-
-    def __init__(self) -> None:
-        self.lock = threading.Lock()
-        self.number = 0
-        self.limit: threadpoolctl.threadpool_limits | None = None
-
-
-_users = _Users()
-
-
 @contextmanager
 def blas_on_one_thread() -> Iterator[None]:
-    """While this lasts, in any thread, BLAS computes each call on one thread; afterwards as before.
+    """While this lasts BLAS computes each call on one thread; afterwards as before. One caller at a time, others wait.
 
-    OpenBLAS takes longer to share the small products of a factorisation than to compute them.
+    OpenBLAS takes longer to share the small products of a factorisation than to compute them. Its limit is one for the
+    whole process: callers side by side would lift each other's, and each of them occupies all processors anyway.
     """
-    with _users.lock:
-        if _users.number == 0:
-            _users.limit = _libraries().limit(limits=1, user_api="blas")
-        _users.number += 1
-    try:
+    with _turn, _libraries().limit(limits=1, user_api="blas"):
         yield
-    finally:
-        with _users.lock:
-            _users.number -= 1
-            if _users.number == 0 and _users.limit is not None:
-                _users.limit.restore_original_limits()
-                _users.limit = None
+
+
+def _limit_here() -> None:
+    """For a BLAS on OpenMP, whose limits are a thread's own; the thread ends before anybody else computes on it."""
+    _libraries().limit(limits=1, user_api="blas")
+
+
+def pool_of(threads: int) -> ThreadPoolExecutor:
+    """Threads of ours, for calls inside `blas_on_one_thread`."""
+    return ThreadPoolExecutor(threads, initializer=_limit_here)
