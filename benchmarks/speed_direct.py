@@ -98,16 +98,6 @@ SOLVERS = {
 }
 CLOCKS = ("factor", "again", "solve")
 KEYS = ("unknowns", *(f"{name}{unit}" for name in CLOCKS for unit in ("_s", "_cpu_s")), "residual", "peak_mb")
-    "unknowns",
-    "factor_s",
-    "factor_cpu_s",
-    "again_s",
-    "again_cpu_s",
-    "solve_s",
-    "solve_cpu_s",
-    "residual",
-    "peak_mb",
-)
 
 
 def in_a_process(name: str, path: Path) -> dict[str, float | None]:
