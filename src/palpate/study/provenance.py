@@ -12,7 +12,7 @@ from palpate.study.case import Case
 
 __all__ = ["input_digests", "software_versions"]
 
-PACKAGES = ("palpate", "numpy", "scipy", "mmgpy", "libigl", "nibabel", "pyamg", "pypardiso", "matplotlib")
+PACKAGES = ("palpate", "numpy", "scipy", "mmgpy", "libigl", "nibabel", "pyamg", "pymetis", "matplotlib")
 
 
 def input_digests(case: Case) -> dict[str, str]:
