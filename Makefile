@@ -12,15 +12,16 @@ $(VENV)/.installed: pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev]"
 	touch $@
 
+# Intel's PARDISO alone, which benchmarks/speed.py --parts solver compares our solver with; nothing else uses it.
 pardiso: install
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[pardiso]"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check "pypardiso>=0.4.6"
 
-# The peers that benchmarks/speed.py compares with, and PARDISO. A torch for processors alone is a tenth of the size:
+# All peers that benchmarks/speed.py compares with. A torch for processors alone is a tenth of the size:
 # make benchmark-setup TORCH=torch==2.13.0+cpu, where the package index has one.
 TORCH ?= torch
 benchmark-setup: install
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check "$(TORCH)"
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[pardiso,benchmark]"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[benchmark]"
 
 demo: install
 	$(BIN)/palpate demo --output demo-output

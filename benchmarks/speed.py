@@ -1,10 +1,10 @@
 """How fast: an estimate in forward solves, the online gradient beside its peers, the posterior, the cost by mesh size.
 
-    python benchmarks/speed.py [--parts linear,nonlinear,gradient,posterior,...] [--quick] [--json]
+    python benchmarks/speed.py [--parts solver,linear,nonlinear,gradient,...] [--quick] [--json]
 
 The body is a simulated pelvis with prostate and bladder to estimate, seen through voxels, with 90 modes of the rectum's
 wall. What is compared is measured in one run, alternating. A peer that is not installed gives null; `make
-benchmark-setup` installs them and PARDISO, with which alone the ratios count. Simulated data.
+benchmark-setup` installs them. Simulated data.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import platform
 import pstats
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -24,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import speed_direct as direct
 import speed_peers as peers
 from memory import peak_mb
 from numpy.typing import NDArray
@@ -43,7 +45,7 @@ from palpate.inversion import (
 )
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import linear_model
-from palpate.mechanics.solvers.registry import SOLVERS
+from palpate.mechanics.solvers.registry import expected_of_size
 from palpate.mesh.space import lagrange_space
 from palpate.mesh.tetrahedralise import tetrahedralise
 from palpate.observation.noise_model import SEGMENTATION_NOISE
@@ -54,7 +56,7 @@ from palpate.study.body import aligned, inverse_problem, make_body
 from palpate.study.case import Case, Mechanics, MeshSettings, Phantom
 from palpate.study.run import estimate_states, inversion_settings
 
-PARTS = ("linear", "nonlinear", "gradient", "posterior", "scaling", "front_end")
+PARTS = ("solver", "linear", "nonlinear", "gradient", "posterior", "scaling", "front_end")
 IN_A_ROW = 20  # gradients, as an optimiser asks for them
 STARTS = (0.5, 1.0, 2.0, 4.0, 8.0)  # moduli to the surroundings'
 SCALING_EDGES = (9.0, 6.0, 4.0, 2.7, 1.85, 1.65)  # mm: 30 k to 1 M unknowns
@@ -64,6 +66,7 @@ SCALING_EDGES = (9.0, 6.0, 4.0, 2.7, 1.85, 1.65)  # mm: 30 k to 1 M unknowns
 class Sizes:
     """Edge lengths (mm) at the organs, repetitions, evaluations."""
 
+    solver: float = 4.5  # 122 k unknowns, 111 k of them free
     linear: float = 4.5  # 130 k unknowns
     nonlinear: float = 4.5
     gradient: float = 8.5  # 28 k unknowns
@@ -73,7 +76,7 @@ class Sizes:
     starts_of_peers: int = 1
 
 
-QUICK = Sizes(9.0, 9.0, 10.0, (12.0, 9.0), 1, 5_000)
+QUICK = Sizes(10.0, 9.0, 9.0, 10.0, (12.0, 9.0), 1, 5_000)
 
 
 def main() -> int:
@@ -96,7 +99,7 @@ def main() -> int:
     if arguments.sizes:
         sizes = replace(sizes, scaling=tuple(float(part) for part in arguments.sizes.split(",")))
     say = _silent if arguments.json else _say
-    result: Result = {"machine": platform.processor() or platform.machine(), "solver": _solver()}
+    result: Result = {"machine": platform.processor() or platform.machine(), "solver": _solver(130_000)}
     for part in arguments.parts.split(","):
         say(f"{part} ...")
         result |= PART[part](sizes, arguments.seed, say)
@@ -117,8 +120,8 @@ def _silent(message: str) -> None:
     del message
 
 
-def _solver() -> str:
-    return "pardiso" if SOLVERS["pardiso"].available() else "superlu"
+def _solver(unknowns: int) -> str:
+    return expected_of_size(unknowns, 120)[0]
 
 
 @dataclass(frozen=True)
@@ -406,7 +409,28 @@ def _cumulative(stats: pstats.Stats, file: str, function: str) -> float:
     return float(sum(called))
 
 
+def _solvers(sizes: Sizes, seed: int, say: Say) -> dict[str, object]:
+    """Direct solvers on one stiffness, each in processes of its own, in turns: medians of seconds, and peak memory."""
+    rows: dict[str, list[dict]] = {name: [] for name in direct.SOLVERS}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "stiffness.npz"
+        direct.write_stiffness(path, sizes.solver, seed)
+        for turn in range(sizes.repeats):
+            for name, found in rows.items():
+                if turn == 0 or name != "superlu":
+                    found.append(direct.in_a_process(name, path))
+                    say(json.dumps({"solver": name, **found[-1]}))
+    middle = {name: {key: _median(found, key) for key in found[0]} for name, found in rows.items()}
+    return {"solver_of_rows": middle, "solver_ratio": direct.ratios(middle)}
+
+
+def _median(found: list[dict], key: str) -> float | None:
+    values = [row[key] for row in found if row[key] is not None]
+    return float(np.median(values)) if values else None
+
+
 PART = {
+    "solver": _solvers,
     "linear": _linear,
     "nonlinear": _nonlinear,
     "gradient": _gradient,

@@ -8,6 +8,8 @@ import pytest
 
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role
+from palpate.mechanics.solvers.registry import SOLVERS
+from palpate.study.case import SOLVER_NAMES
 from palpate.study.case_file import read_case
 
 SMALL = """
@@ -65,6 +67,12 @@ def test_an_override_replaces_one_value_and_keeps_the_rest(case_file):
     assert case.mechanics.element == "P1"
     assert [path.name for path in case.images.after] == ["a.nii", "b.nii"]
     assert case.images.before.name == "before.nii.gz"
+
+
+@pytest.mark.parametrize("name", ["auto", *SOLVERS])
+def test_every_solver_can_be_asked_for_by_its_name(case_file, name):
+    assert read_case(case_file, [f'mechanics.solver="{name}"']).mechanics.solver == name
+    assert set(SOLVER_NAMES) == {"auto", *SOLVERS}
 
 
 def test_names_are_resolved_with_the_label_table(case_file):

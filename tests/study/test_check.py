@@ -8,6 +8,7 @@ import json
 import pytest
 
 from palpate.cli import main
+from palpate.mechanics.solvers import registry
 from palpate.study import check, cost
 from palpate.study.check import check_case
 from palpate.study.cost import expected_cost, expected_tets
@@ -62,6 +63,18 @@ def test_cost_grows_with_modes_images_and_pairs_and_shrinks_with_processors(case
     assert expected_cost(case, before, after, n_pairs=2).unknowns == 2 * plain.unknowns
     monkeypatch.setattr(cost, "processors", lambda: 2 * plain.processors)
     assert expected_cost(case, before, after, n_pairs=1).seconds < plain.seconds
+
+
+def test_cost_is_that_of_the_solver_that_will_run(case_result, monkeypatch):
+    case, before, after = case_result.case, case_result.before, case_result.after
+    plain = expected_cost(case, before, after, n_pairs=1)
+    asked = dataclasses.replace(case, mechanics=dataclasses.replace(case.mechanics, solver="multigrid"))
+    iterated = expected_cost(asked, before, after, n_pairs=1)
+    assert plain.solver.startswith("multifrontal")
+    assert iterated.solver == "multigrid"
+    assert iterated.seconds > plain.seconds
+    monkeypatch.setattr(registry, "available_memory", lambda: 1.0)
+    assert expected_cost(case, before, after, n_pairs=1).solver != "multifrontal"
 
 
 @pytest.mark.parametrize(("share", "code"), [(100.0, None), (1.0, 0), (0.1, 6)])

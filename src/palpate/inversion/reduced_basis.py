@@ -168,7 +168,7 @@ class _Near:
     def solve(self, rhs: NDArray[np.float64], tolerance: float) -> NDArray[np.float64]:
         """Solution (n_free, k) mm to a relative residual; raises `SolverError`."""
         solution, _ = conjugate_gradients(
-            self.matrix, rhs, self.system.factorisation.solve, tolerance=tolerance, max_iterations=MAX_ITERATIONS
+            self.matrix, rhs, self.system.factorisation.nearly, tolerance=tolerance, max_iterations=MAX_ITERATIONS
         )
         return solution
 

@@ -27,6 +27,8 @@ from palpate.parallel import mapped
 
 __all__ = ["LinearEquilibrium", "LinearModel", "LinearSystem", "linear_model", "weighted_sum", "with_constraint"]
 
+FURTHER = 10  # right-hand sides a modulus, beside one for each mode: sensitivities, series
+
 
 @dataclass(frozen=True, slots=True)
 class LinearModel:
@@ -79,6 +81,7 @@ class LinearModel:
                 solver=self.solver,
                 near_nullspace=np.asarray(near_nullspace),
                 coarser=linear_displacements(self.space, self.constraint),
+                right_hand_sides=FURTHER * self.n_regions + self.n_modes + 1,
             ),
         )
 

@@ -37,14 +37,18 @@ class LinearisedSystem:
         if not self.symmetric:
             return np.stack([self._unsymmetric(column, tolerance) for column in rhs.T], axis=1)
         solution, _ = conjugate_gradients(
-            self.matrix, rhs, self.nearby.solve, tolerance=tolerance, max_iterations=MAX_ITERATIONS
+            self.matrix, rhs, self.nearby.nearly, tolerance=tolerance, max_iterations=MAX_ITERATIONS
         )
         return solution
+
+    def nearly(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Nearly A^-1 rhs (n, m): with the factorisation alone."""
+        return self.nearby.nearly(rhs)
 
     def _unsymmetric(self, rhs: NDArray[np.float64], tolerance: float) -> NDArray[np.float64]:
         """GMRES: Saad & Schultz, SIAM J. Sci. Stat. Comput. 7 (1986) 856-869."""
         n = len(rhs)
-        inverse = LinearOperator((n, n), matvec=lambda r: self.nearby.solve(r.reshape(-1, 1))[:, 0], dtype=np.float64)
+        inverse = LinearOperator((n, n), matvec=lambda r: self.nearby.nearly(r.reshape(-1, 1))[:, 0], dtype=np.float64)
         solution, _ = gmres(self.matrix, rhs, rtol=tolerance, restart=MAX_ITERATIONS, maxiter=1, M=inverse)
         share = float(np.linalg.norm(rhs - self.matrix @ solution) / (np.linalg.norm(rhs) or 1.0))
         if not share <= max(ACCEPTED, tolerance):

@@ -256,7 +256,7 @@ def _solved(
     balance, column = way.balance, load[:, None]
     try:
         if path.factorisation is not None and balance.symmetric:
-            matrix, nearby = balance.restricted(stiffness), path.factorisation.solve
+            matrix, nearby = balance.restricted(stiffness), path.factorisation.nearly
             with contextlib.suppress(SolverError):
                 free, n = conjugate_gradients(matrix, column, nearby, tolerance=forcing, max_iterations=MAX_GRADIENTS)
                 return free[:, 0], path.solved(n)

@@ -225,7 +225,7 @@ def _models(body: Body, case: Case) -> list[tuple[LinearModel, tuple[Wall, ...]]
         made = (
             with_constraint(models[0][0], constraint)
             if models
-            else linear_model(body.space, constraint, dilatation=dilatation, loads=loads)
+            else linear_model(body.space, constraint, dilatation=dilatation, loads=loads, solver=case.mechanics.solver)
         )
         models.append((made, motion.walls))
     return models
@@ -245,7 +245,7 @@ def _finite_strain(models: tuple[LinearModel, ...], case: Case) -> Sequence[Fini
 
 def _finite_strain_model(model: LinearModel, law: Law, case: Case) -> FiniteStrainModel:
     dilatation = choose_element(case.mechanics.element).dilatation
-    settings = NewtonSettings(tolerance=ACCURACY)
+    settings = NewtonSettings(tolerance=ACCURACY, solver=case.mechanics.solver)
     return finite_strain_model(
         model.space,
         model.constraint,

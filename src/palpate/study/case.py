@@ -11,6 +11,7 @@ from palpate.images.named_labels import MAX_LABEL, MAX_NAME, computed_by_spreads
 from palpate.images.tissue import Role, Tissue
 from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.laws.registry import LAWS, law_from, law_parameters
+from palpate.mechanics.solvers.registry import SOLVERS
 from palpate.study.schema import nearest, rule, shown
 
 __all__ = [
@@ -33,6 +34,7 @@ __all__ = [
 
 REMAINING = "remaining"
 LAW_NAMES = tuple(LAWS)
+SOLVER_NAMES = ("auto", *SOLVERS)
 
 POSITIVE_NUMBERS = "a list of positive numbers"
 LOW_HIGH = "[low, high] with low < high"
@@ -166,13 +168,14 @@ class CaseTissue:
 
 @dataclass(frozen=True, slots=True)
 class Mechanics:
-    """Material law and finite element (`palpate.mechanics.laws`, `palpate.mechanics.dilatation`).
+    """Material law, finite element and linear solver (`palpate.mechanics.laws`, `.dilatation`, `.solvers.registry`).
 
     law_parameters: what the case states under the names of the laws' parameters; each law takes its own.
     """
 
     law: str = field(default="neo-hookean", metadata=rule(choices=LAW_NAMES))
     element: str = field(default="auto", metadata=rule(choices=("P1", "P2", "P2-P0", "auto")))
+    solver: str = field(default="auto", metadata=rule(choices=SOLVER_NAMES))
     law_parameters: Mapping[str, float] = field(
         default_factory=dict,
         metadata=rule(collects={name: (p.least, p.most) for name, p in law_parameters().items()}),

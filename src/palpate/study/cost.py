@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +10,8 @@ from scipy import ndimage
 
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
-from palpate.mechanics.solvers.registry import SOLVERS
+from palpate.mechanics.solvers.registry import expected_of_size
+from palpate.memory import available_memory
 from palpate.mesh.anatomy import Box
 from palpate.parallel import processors
 from palpate.study.body import case_domain
@@ -29,15 +29,13 @@ UNKNOWNS_A_TET = {"P1": 0.62, "P2": 4.4}
 FIXED_S = 24.0  # start, first solves, intervals, report
 SECONDS_AN_UNKNOWN = 1.1e-4  # with 90 modes a driver, for each later image; a finite-strain law takes no longer
 SECONDS_A_CUT = 1.4e-4  # of meshing, for each tetrahedron and each tissue that is cut out
-SUPERLU = (3.3, 26_000.0, 1.7)  # seconds more than with PARDISO at so many unknowns, and their power
 PARALLEL_SHARE = 0.3  # of the time, that more processors shorten
 FIXED_GB = 0.5
 GB_AN_UNKNOWN = 2.3e-5  # with 90 modes
-SUPERLU_GB_AN_UNKNOWN = 1.0e-5
 FINITE_STRAIN_GB = 1.2  # times the memory: an expansion and a tangent factorisation at once
 USUAL_MODES = 90
 OVERHEAD_MODES = 10  # what an unknown costs without any mode, in modes
-LARGEST_SUPERLU = 250_000  # unknowns, as in the registry
+SERIES = 30  # right-hand sides beside the modes
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,15 +58,13 @@ def expected_cost(case: Case, before: Segmentation, after: tuple[Segmentation, .
     """
     tets = expected_tets(case, before, after)
     unknowns = int(tets * UNKNOWNS_A_TET.get(case.mechanics.element, UNKNOWNS_A_TET["P2"]))
-    solver = "pardiso" if SOLVERS["pardiso"].available() else "superlu" if unknowns <= LARGEST_SUPERLU else "multigrid"
+    solver, solving = expected_of_size(unknowns, case.driver.modes + SERIES, solver=case.mechanics.solver)
     drivers = max(sum(tissue.role is Role.DRIVER for tissue in before.tissues), 1)
     modes = (drivers * case.driver.modes + OVERHEAD_MODES) / (USUAL_MODES + OVERHEAD_MODES)
     work = unknowns * modes * max(len(after), 1)
-    slower = 0.0 if solver == "pardiso" else 1.0
     finite = case.mechanics.material_law.finite
-    solving = SECONDS_AN_UNKNOWN * work + slower * SUPERLU[0] * (unknowns / SUPERLU[1]) ** SUPERLU[2]
-    seconds = solving + SECONDS_A_CUT * tets * (len(before.tissues) - 1)
-    gigabytes = GB_AN_UNKNOWN * work + slower * SUPERLU_GB_AN_UNKNOWN * unknowns
+    seconds = SECONDS_AN_UNKNOWN * work + SECONDS_A_CUT * tets * (len(before.tissues) - 1)
+    gigabytes = GB_AN_UNKNOWN * work + solving.bytes / 1e9
     gigabytes *= FINITE_STRAIN_GB if finite else 1.0
     count = processors()
     shorter = 1.0 - PARALLEL_SHARE + PARALLEL_SHARE / count
@@ -76,7 +72,7 @@ def expected_cost(case: Case, before: Segmentation, after: tuple[Segmentation, .
         tets=n_pairs * tets,
         unknowns=n_pairs * unknowns,
         memory_gb=FIXED_GB + n_pairs * gigabytes,
-        seconds=(FIXED_S + n_pairs * seconds) * shorter,
+        seconds=(FIXED_S + n_pairs * seconds) * shorter + n_pairs * solving.seconds,
         solver=solver,
         processors=count,
     )
@@ -102,11 +98,8 @@ def expected_tets(case: Case, before: Segmentation, after: tuple[Segmentation, .
 
 def free_memory_gb() -> float | None:
     """Memory that is free on this machine, GB; None where the system does not tell."""
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        return next(float(line.split()[1]) for line in lines if line.startswith("MemAvailable:")) / 1e6
-    except (OSError, StopIteration, ValueError):
-        return None
+    free = available_memory()
+    return None if free is None else free / 1e9
 
 
 def _rank(before: Segmentation, tissue: int) -> tuple[bool, float]:

@@ -13,7 +13,7 @@ from palpate.study.case import Case
 
 __all__ = ["file_digest", "input_digests", "software_versions"]
 
-PACKAGES = ("palpate", "numpy", "scipy", "mmgpy", "libigl", "nibabel", "pyamg", "pypardiso", "matplotlib")
+PACKAGES = ("palpate", "numpy", "scipy", "mmgpy", "libigl", "nibabel", "pyamg", "pymetis", "matplotlib")
 
 
 def input_digests(case: Case, *pairs: Mapping[str, str]) -> dict[str, str]:

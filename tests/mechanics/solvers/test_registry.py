@@ -9,20 +9,20 @@ import pytest
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from palpate.errors import ConfigurationError, ResourceError, SolverError
+from palpate.errors import ConfigurationError, SolverError
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.coarser import linear_displacements
 from palpate.mechanics.linear_model import linear_model, weighted_sum
 from palpate.mechanics.rigid import rigid_modes
 from palpate.mechanics.solvers import registry
 from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
-from palpate.mechanics.solvers.contract import Solver, always
+from palpate.mechanics.solvers.contract import Expectation, Hints, Solver
 from palpate.mechanics.solvers.pattern import nested_dissection, twin_rows
 from palpate.mechanics.solvers.registry import SOLVERS, factorise
 from palpate.mechanics.stiffness import tissue_stiffness
 from palpate.mesh.space import lagrange_space
 
-AVAILABLE = [name for name, solver in SOLVERS.items() if solver.available()]
+AVAILABLE = list(SOLVERS)
 
 
 @pytest.fixture(params=["fixed", "sliding"])
@@ -98,7 +98,7 @@ def test_a_solver_that_misses_its_tolerance_is_found_out(monkeypatch):
         def solve(self, rhs):
             return 0.4 * rhs
 
-    solver = Solver("sloppy", lambda *_: Sloppy(), direct=False, available=always)
+    solver = Solver("sloppy", lambda *_: Sloppy(), False, lambda *_: Expectation(0.0, 0.0), SOLVERS["multigrid"].expect)
     monkeypatch.setitem(registry.SOLVERS, "sloppy", solver)
     with pytest.raises(SolverError, match="'sloppy' left a relative residual of"):
         factorise(laplacian(10), solver="sloppy").solve(np.ones((10, 1)))
@@ -115,16 +115,64 @@ def test_a_body_with_no_free_point_is_refused():
 
 
 def test_an_unknown_solver_is_refused_with_the_known_ones():
-    with pytest.raises(ConfigurationError, match="superlu"):
+    with pytest.raises(ConfigurationError, match="multifrontal"):
         factorise(laplacian(5), solver="magic")
 
 
-def test_a_solver_that_is_not_installed_says_how_to_install_it(monkeypatch):
-    absent = Solver("pardiso", SOLVERS["pardiso"].factorise, True, lambda: False, "install it with: pip")
-    monkeypatch.setitem(registry.SOLVERS, "pardiso", absent)
-    with pytest.raises(ResourceError, match="pip"):
-        factorise(laplacian(5), solver="pardiso")
-    assert factorise(laplacian(5)).solver == "superlu"
+def expecting(monkeypatch, **expected):
+    """As if the solvers took so many (seconds, bytes)."""
+    for name, (seconds, needed) in expected.items():
+        full = name.replace("_", "-")
+        known = SOLVERS[full]
+        said = Expectation(seconds, needed)
+        other = Solver(full, known.factorise, known.direct, lambda *_, said=said: said, lambda *_, said=said: said)
+        monkeypatch.setitem(registry.SOLVERS, full, other)
+
+
+@pytest.mark.parametrize(
+    ("free", "chosen"), [(1e9, "multifrontal"), (0.9e9, "multifrontal-single"), (2e6, "multigrid"), (1.0, "multigrid")]
+)
+def test_the_fastest_solver_that_finds_its_memory_is_chosen(monkeypatch, free, chosen):
+    expecting(monkeypatch, multifrontal=(1.0, 0.8e9), multifrontal_single=(2.0, 0.4e9), multigrid=(9.0, 1e6))
+    monkeypatch.setattr(registry, "available_memory", lambda: free)
+    assert factorise(laplacian(5)).solver == chosen
+    assert registry.expected_of_size(5, 1)[0] == chosen
+    assert factorise(laplacian(5), solver="multigrid").solver == "multigrid"
+
+
+def test_small_bodies_are_factorised_in_double_and_many_solutions_never_iterated():
+    assert factorise(laplacian(500)).solver == "multifrontal"
+    assert registry.expected_of_size(120_000, 130)[0].startswith("multifrontal")
+    assert registry.expected_of_size(3_000_000, 1)[0] == "multigrid"
+
+
+@pytest.mark.parametrize("solver", AVAILABLE)
+def test_what_is_expected_grows_with_the_matrix_and_the_solutions(solver):
+    small, large, more = (
+        SOLVERS[solver].expect(matrix, Hints(right_hand_sides=m))
+        for matrix, m in ((laplacian(100), 1), (laplacian(4000), 1), (laplacian(4000), 50))
+    )
+    assert small.seconds < large.seconds < more.seconds
+    assert small.bytes < large.bytes <= more.bytes
+
+
+@pytest.mark.parametrize("solver", ["multifrontal", "multifrontal-single"])
+def test_sizes_from_unknowns_alone_are_near_those_of_a_mesh(solver, meshes):
+    space = lagrange_space(meshes.box_mesh(8, distortion=0.2), "P2")
+    constraint = outer_constraint(space, outer="fixed", **meshes.prescribe(space, np.zeros(0, int), np.zeros((0, 3))))
+    matrix = weighted_sum(np.array([1.0]), linear_model(space, constraint).free_stiffness)
+    exact = SOLVERS[solver].expect(matrix, Hints())
+    rough = SOLVERS[solver].expect_of_size(matrix.shape[0], 100)
+    assert 0.4 < rough.seconds / exact.seconds < 2.5
+    assert 0.4 < rough.bytes / exact.bytes < 2.5
+
+
+@pytest.mark.parametrize("solver", AVAILABLE)
+def test_a_rough_solution_preconditions_conjugate_gradients(problem, solver):
+    matrix, motions, loads, coarser = problem
+    ready = factorise(matrix, solver=solver, near_nullspace=motions, coarser=coarser)
+    _, steps = conjugate_gradients(1.3 * matrix, loads, ready.nearly, tolerance=1e-10, max_iterations=50)
+    assert steps <= 3
 
 
 def test_twin_rows_are_the_unknowns_of_one_node(problem, meshes):

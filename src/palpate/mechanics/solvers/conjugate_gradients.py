@@ -54,7 +54,7 @@ def conjugate_gradients(
     worst = float(np.max(np.linalg.norm(residual, axis=0) / norms[active]))
     raise SolverError(
         f"conjugate gradients stopped at a relative residual of {worst:.2g} (tolerance {tolerance:g}) after"
-        f" {max_iterations} steps for {len(rhs)} unknowns: use a direct solver ('pardiso' or 'superlu') or a Poisson's"
+        f" {max_iterations} steps for {len(rhs)} unknowns: use the direct solver ('multifrontal') or a Poisson's"
         " ratio further from 0.5"
     )
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-__all__ = ["Coarser", "Factorisation", "Factoriser", "Hints", "Solver", "always"]
+__all__ = ["Coarser", "Expectation", "Factorisation", "Factoriser", "Hints", "Solver"]
 
 
 class Factorisation(Protocol):
@@ -18,6 +18,10 @@ class Factorisation(Protocol):
 
     def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
         """Solution X (n, m) of A X = rhs (n, m); raises `SolverError` when it misses its tolerance."""
+        ...
+
+    def nearly(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A^-1 rhs (n, m) as exactly as is cheap: for iterations that it preconditions and that check themselves."""
         ...
 
 
@@ -37,11 +41,20 @@ class Hints:
     """What is known of a matrix beside its entries, for solvers that can use it.
 
     near_nullspace (n, k), mm: displacements of little energy (the rigid motions); coarser: linear displacements among
-    quadratic ones.
+    quadratic ones; right_hand_sides: how many solutions will be asked for, roughly.
     """
 
     near_nullspace: NDArray[np.float64] | None = None
     coarser: Coarser | None = None
+    right_hand_sides: int = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Expectation:
+    """What factorising a matrix and solving for all right-hand sides will take on this machine: seconds and memory."""
+
+    seconds: float
+    bytes: float
 
 
 Factoriser = Callable[[sparse.csr_matrix[np.float64], Hints], Factorisation]
@@ -51,18 +64,14 @@ Factoriser = Callable[[sparse.csr_matrix[np.float64], Hints], Factorisation]
 class Solver:
     """A registered solver.
 
-    factorise(matrix (n, n), hints) makes the factorisation and raises `SolverError`;
-    `direct`: whether it eliminates (its result is then probed for singularity);
-    `available()`: whether its library is installed; `missing`: what to do when it is not.
+    factorise(matrix (n, n), hints) makes the factorisation and raises `SolverError`, or `ResourceError` for want of
+    memory; expect(matrix, hints) says what that will take, expect_of_size(unknowns, right_hand_sides) what it will of
+    quadratic tetrahedra; `direct`: whether it eliminates (its result is then probed
+    for singularity).
     """
 
     name: str
     factorise: Factoriser
     direct: bool
-    available: Callable[[], bool]
-    missing: str = ""
-
-
-def always() -> bool:
-    """Whether a solver that needs nothing beyond the core installation is available: it is."""
-    return True
+    expect: Callable[[sparse.csr_matrix[np.float64], Hints], Expectation]
+    expect_of_size: Callable[[int, int], Expectation]

@@ -7,7 +7,7 @@ import pymetis
 from numpy.typing import NDArray
 from scipy import sparse
 
-__all__ = ["nested_dissection", "twin_rows"]
+__all__ = ["dissection", "nested_dissection", "node_graph", "twin_rows"]
 
 
 def twin_rows(matrix: sparse.csr_matrix[np.float64]) -> NDArray[np.int64]:
@@ -25,22 +25,32 @@ def twin_rows(matrix: sparse.csr_matrix[np.float64]) -> NDArray[np.int64]:
     return np.concatenate([[0], np.cumsum(different)])
 
 
-def nested_dissection(matrix: sparse.csr_matrix[np.float64]) -> NDArray[np.int64]:
-    """Fill-reducing order (n,) of the unknowns of a symmetric pattern; those of one node, its twins, stay together.
-
-    METIS on the graph of the nodes: Karypis & Kumar, SIAM J. Sci. Comput. 20 (1998) 359-392.
-    """
-    group = twin_rows(matrix)
+def node_graph(matrix: sparse.csr_matrix[np.float64], group: NDArray[np.int64]) -> sparse.csr_matrix[np.float64]:
+    """Which of the nodes (n, n), groups (n_rows,) of twin rows, share an entry; symmetric, without loops, sorted."""
     first = np.flatnonzero(np.diff(group, prepend=-1))
     n = len(first)
     seen = matrix[first]
-    half = sparse.csr_matrix((np.ones(seen.nnz, dtype=np.int32), group[seen.indices], seen.indptr), shape=(n, n))
+    half = sparse.csr_matrix((np.ones(seen.nnz), group[seen.indices], seen.indptr), shape=(n, n))
+    half.setdiag(0.0)
     graph = sparse.csr_matrix(half + half.T)  # an entry that rounding cancelled on one side only is there on both
-    rows = np.repeat(np.arange(n), np.diff(graph.indptr))
-    keep = graph.indices != rows
-    starts = np.append(0, np.cumsum(np.bincount(rows[keep], minlength=n)))
-    adjacency = pymetis.CSRAdjacency(adj_starts=starts.astype(np.int32), adjacent=graph.indices[keep].astype(np.int32))
-    order, _ = pymetis.nested_dissection(adjacency)
-    place = np.empty(n, dtype=np.int64)
-    place[np.asarray(order)] = np.arange(n)
-    return np.asarray(np.argsort(place[group], kind="stable"))
+    graph.eliminate_zeros()
+    graph.sort_indices()
+    return graph
+
+
+def dissection(graph: sparse.csr_matrix[np.float64]) -> NDArray[np.int64]:
+    """Fill-reducing order (n,) of the nodes of a symmetric graph (n, n) without loops.
+
+    METIS: Karypis & Kumar, SIAM J. Sci. Comput. 20 (1998) 359-392.
+    """
+    if graph.nnz == 0:  # METIS wants an edge
+        return np.arange(graph.shape[0])
+    starts, adjacent = graph.indptr.astype(np.int32), graph.indices.astype(np.int32)
+    order, _ = pymetis.nested_dissection(pymetis.CSRAdjacency(adj_starts=starts, adjacent=adjacent))
+    return np.asarray(order, dtype=np.int64)
+
+
+def nested_dissection(matrix: sparse.csr_matrix[np.float64]) -> NDArray[np.int64]:
+    """Fill-reducing order (n,) of the unknowns of a symmetric pattern; those of one node, its twins, stay together."""
+    group = twin_rows(matrix)
+    return np.asarray(np.argsort(np.argsort(dissection(node_graph(matrix, group)))[group], kind="stable"))

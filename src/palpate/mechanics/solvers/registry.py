@@ -8,17 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from palpate.errors import ConfigurationError, ResourceError, SolverError
-from palpate.mechanics.solvers import multigrid, pardiso, superlu
-from palpate.mechanics.solvers.contract import Coarser, Factorisation, Hints, Solver
+from palpate.errors import ConfigurationError, SolverError
+from palpate.mechanics.solvers import multigrid
+from palpate.mechanics.solvers.contract import Coarser, Expectation, Factorisation, Hints
+from palpate.mechanics.solvers.multifrontal import solver as multifrontal
 from palpate.mechanics.solvers.products import times
+from palpate.memory import available_memory
 
-__all__ = ["SOLVERS", "factorise"]
+__all__ = ["SOLVERS", "expected_of_size", "factorise"]
 
-SOLVERS = {solver.name: solver for solver in (pardiso.SOLVER, superlu.SOLVER, multigrid.SOLVER)}
+SOLVERS = {solver.name: solver for solver in (multifrontal.SOLVER, multifrontal.MIXED, multigrid.SOLVER)}
 TOLERANCE = 1e-8  # of a residual, relative to its right-hand side
 LARGEST_CONDITION = 1e13  # beyond it a direct solution has lost three digits of four to rounding
-LARGEST_SUPERLU = 250_000  # unknowns; above, its factors outgrow a desktop's memory
+USABLE = 0.8  # of the memory that is free: the rest is for what comes with the solutions
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +48,10 @@ class CheckedFactorisation:
             )
         return solution
 
+    def nearly(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A^-1 rhs (n, m), unchecked: for iterations that it preconditions."""
+        return self.inner.nearly(rhs)
+
     def _residual(self, rhs: NDArray[np.float64], solution: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         residual = rhs - times(self.matrix, solution)
         norms = np.linalg.norm(rhs, axis=0)
@@ -60,43 +66,54 @@ def factorise(
     solver: str = "auto",
     near_nullspace: NDArray[np.float64] | None = None,
     coarser: Coarser | None = None,
+    right_hand_sides: int = 100,
 ) -> Factorisation:
     """Make the symmetric positive definite `matrix` (n, n), mN/mm, ready to be solved with.
 
-    solver: a name of `SOLVERS`, or "auto": PARDISO where it is installed, else SuperLU up to 250 000 unknowns, else
-    multigrid. near_nullspace (n, k), mm: displacements of little energy (the rigid motions), which multigrid needs to
-    converge fast; coarser: the linear displacements among quadratic ones, which halve its iterations. Raises
-    `SolverError` for a singular or indefinite matrix, `ConfigurationError` for an unknown name, `ResourceError` for a
-    solver that is not installed.
+    solver: a name of `SOLVERS`, or "auto": the one that is expected to take the least time for the factorisation and
+    for `right_hand_sides`, among those whose memory is free. near_nullspace (n, k), mm: displacements of little energy
+    (the rigid motions), which multigrid needs to converge fast; coarser: the linear displacements among quadratic ones,
+    which halve its iterations. Raises `SolverError` for a singular or indefinite matrix, `ConfigurationError` for an
+    unknown name, `ResourceError` where memory does not suffice.
     """
-    chosen = _choose(solver, matrix.shape[0])
+    if solver != "auto" and solver not in SOLVERS:
+        raise ConfigurationError(f"solver is '{solver}'; it must be 'auto' or one of {sorted(SOLVERS)}")
     if matrix.shape[0] == 0:
         raise SolverError("no displacement is free: every point of the mesh is prescribed, nothing is left to solve")
     if not np.all(np.isfinite(matrix.data)):
         raise SolverError("the stiffness is not finite: check the moduli and the mesh's volumes")
-    checked = CheckedFactorisation(matrix, chosen.factorise(matrix, Hints(near_nullspace, coarser)), chosen.name)
+    hints = Hints(near_nullspace, coarser, right_hand_sides)
+    if solver == "auto":
+        solver = _fastest({name: known.expect(matrix, hints) for name, known in SOLVERS.items()})
+    chosen = SOLVERS[solver]
+    checked = CheckedFactorisation(matrix, chosen.factorise(matrix, hints), chosen.name)
     if chosen.direct:
         _refuse_singular(checked)
     return checked
 
 
-def _choose(name: str, n: int) -> Solver:
-    if name == "auto":
-        if SOLVERS["pardiso"].available():
-            return SOLVERS["pardiso"]
-        return SOLVERS["superlu" if n <= LARGEST_SUPERLU else "multigrid"]
-    if name not in SOLVERS:
-        raise ConfigurationError(f"solver is '{name}'; it must be 'auto' or one of {sorted(SOLVERS)}")
-    if not SOLVERS[name].available():
-        raise ResourceError(f"solver '{name}' is not installed; {SOLVERS[name].missing}")
-    return SOLVERS[name]
+def expected_of_size(unknowns: int, right_hand_sides: int, *, solver: str = "auto") -> tuple[str, Expectation]:
+    """The solver that quadratic tetrahedra of so many unknowns will have on this machine, and what it will take."""
+    expected = {name: known.expect_of_size(unknowns, right_hand_sides) for name, known in SOLVERS.items()}
+    chosen = _fastest(expected) if solver == "auto" else solver
+    return chosen, expected[chosen]
+
+
+def _fastest(expected: dict[str, Expectation]) -> str:
+    """The solver of least expected time whose memory is free; where none is, the one that takes least."""
+    free = available_memory()
+    room = np.inf if free is None else USABLE * free
+    fitting = [name for name in expected if expected[name].bytes <= room]
+    if not fitting:
+        return min(expected, key=lambda name: expected[name].bytes)
+    return min(fitting, key=lambda name: expected[name].seconds)
 
 
 def _refuse_singular(checked: CheckedFactorisation) -> None:
     """Probe the condition: |A| |x| / |b| for a random b is a lower estimate; a floating body makes it 1e16."""
     n = checked.matrix.shape[0]
     probe = np.random.default_rng(0).standard_normal((n, 1))
-    response = checked.inner.solve(probe)
+    response = checked.inner.nearly(probe)
     size = float(np.max(abs(checked.matrix).sum(axis=1)))
     condition = size * float(np.linalg.norm(response) / np.linalg.norm(probe))
     if not condition < LARGEST_CONDITION:

@@ -1,0 +1,176 @@
+"""Direct solvers beside each other: ours in double and single precision, PARDISO, SuperLU; one stiffness, 91 solutions.
+
+Each runs in a process of its own, so that its peak memory is its own; all get the order that METIS finds on the graph
+of the nodes. What precedes the first factorisation (libraries loaded, a tiny system solved) is not timed.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from memory import peak_mb
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from palpate.mechanics.boundary import outer_constraint
+from palpate.mechanics.linear_model import linear_model, weighted_sum
+from palpate.mechanics.solvers import registry
+from palpate.mechanics.solvers.contract import Hints
+from palpate.mechanics.solvers.pattern import nested_dissection
+from palpate.mesh.space import lagrange_space
+from palpate.mesh.tetrahedralise import tetrahedralise
+from palpate.observation.prescribed_motion import prescribed_motion
+from palpate.phantoms.pelvis import PelvisOptions, pelvis_anatomy
+
+__all__ = ["SOLVERS", "in_a_process", "ratios", "write_stiffness"]
+
+Matrix = sparse.csr_matrix
+Solve = Callable[[np.ndarray], np.ndarray]
+N_RHS = 91
+
+
+def write_stiffness(path: Path, edge_mm: float, seed: int) -> None:
+    """The stiffness of a pelvis of quadratic tetrahedra whose wall is held, moduli 4 to 1, mN/mm."""
+    anatomy = pelvis_anatomy(PelvisOptions(seed=seed))
+    space = lagrange_space(tetrahedralise(anatomy, edge_length_mm=edge_mm), "P2")
+    motion = prescribed_motion(space, {}, n_modes=3, kernel_mm=20.0, prior_mm=5.0)
+    given = {"modes": motion.modes, "offset": motion.offset, "prescribed": motion.prescribed}
+    model = linear_model(space, outer_constraint(space, outer="fixed", **given))
+    moduli = np.array([{"known": 10.0}.get(t.role.value, 40.0) for t in space.mesh.tissues if t.meshed])
+    sparse.save_npz(path, weighted_sum(moduli, model.free_stiffness), compressed=False)
+
+
+def _ours(name: str) -> Callable[[Matrix], Solve]:
+    return lambda matrix: registry.SOLVERS[name].factorise(matrix, Hints()).solve
+
+
+def _pardiso(matrix: Matrix) -> Solve:
+    """Symmetric positive definite, our order, without its own refinement, which trebles the price of a solution."""
+    _tell_where_mkl_is()
+    pypardiso = importlib.import_module("pypardiso")
+    upper = sparse.csr_matrix(sparse.triu(matrix, format="csr"))
+    upper.sort_indices()
+    solver = pypardiso.PyPardisoSolver(mtype=2, size_limit_storage=np.inf)
+    for number, value in {1: 1, 5: 1, 8: 0}.items():
+        solver.set_iparm(number, value)
+    solver.perm = (nested_dissection(matrix) + 1).astype(np.int32)
+    solver.factorize(upper)
+    solver.factorized_A = upper  # the wrapper would keep a copy to compare with
+    return lambda rhs: np.asarray(solver.solve(upper, np.asfortranarray(rhs)))
+
+
+def _tell_where_mkl_is() -> None:
+    """Set pypardiso's own variable: without it every factorisation searches the whole environment for MKL."""
+    files = importlib.metadata.files("mkl") or []
+    found = [path for file in files if "mkl_rt" in file.name and (path := Path(str(file.locate())).resolve()).exists()]
+    if found:
+        os.environ.setdefault("PYPARDISO_MKL_RT", str(found[0]))
+
+
+def _superlu(matrix: Matrix) -> Solve:
+    """In its symmetric mode, without pivoting."""
+    order = nested_dissection(matrix)
+    options = {"permc_spec": "NATURAL", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+    factors = splu(matrix[order][:, order].tocsc(), **options)
+
+    def solve(rhs: np.ndarray) -> np.ndarray:
+        solution = np.empty_like(rhs)
+        solution[order] = factors.solve(np.asfortranarray(rhs[order]))
+        return solution
+
+    return solve
+
+
+SOLVERS = {
+    "multifrontal": _ours("multifrontal"),
+    "multifrontal-single": _ours("multifrontal-single"),
+    "pardiso": _pardiso,
+    "superlu": _superlu,
+}
+CLOCKS = ("factor", "again", "solve")
+KEYS = ("unknowns", *(f"{name}{unit}" for name in CLOCKS for unit in ("_s", "_cpu_s")), "residual", "peak_mb")
+
+
+def in_a_process(name: str, path: Path) -> dict[str, float | None]:
+    """What one solver takes, from a new process; null where it is not installed."""
+    command = [sys.executable, __file__, name, str(path)]
+    return dict(json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout))
+
+
+def ratios(rows: dict[str, dict[str, float | None]]) -> dict[str, object]:
+    """Ours over PARDISO's (factor, 91 solutions, both, memory), and over SuperLU's factor; wall and processor time."""
+    found: dict[str, object] = {}
+    for name, clock in (("", "_s"), ("_cpu", "_cpu_s")):
+        for ours, suffix in (("multifrontal", ""), ("multifrontal-single", "_single")):
+            both = [f"factor{clock}", f"solve{clock}"]
+            found[f"factor{suffix}{name}"] = _ratio(rows, ours, "pardiso", both[:1])
+            found[f"solve{suffix}{name}"] = _ratio(rows, ours, "pardiso", both[1:])
+            found[f"both{suffix}{name}"] = _ratio(rows, ours, "pardiso", both)
+        found[f"superlu_factor{name}"] = _ratio(rows, "multifrontal", "superlu", [f"factor{clock}"])
+    for ours, suffix in (("multifrontal", ""), ("multifrontal-single", "_single")):
+        found[f"memory{suffix}"] = _ratio(rows, ours, "pardiso", ["peak_mb"])
+    return found
+
+
+def _ratio(rows: dict[str, dict[str, float | None]], ours: str, other: str, keys: list[str]) -> float | None:
+    if any(rows[name][key] is None for name in (ours, other) for key in keys):
+        return None
+    return sum(rows[ours][key] for key in keys) / sum(rows[other][key] for key in keys)  # type: ignore[misc]
+
+
+def _measured(name: str, path: Path) -> dict[str, float | None]:
+    if name == "pardiso" and not _installed("pypardiso"):
+        return dict.fromkeys(KEYS)
+    matrix = sparse.csr_matrix(sparse.load_npz(path))
+    rhs = np.random.default_rng(0).standard_normal((matrix.shape[0], N_RHS))
+    SOLVERS[name](sparse.csr_matrix(np.diag(np.arange(1.0, 9.0))))(np.ones((8, 1)))
+    clocks = [_clock()]
+    solve = SOLVERS[name](matrix)
+    clocks.append(_clock())
+    solution = solve(rhs)
+    clocks.append(_clock())
+    peak = peak_mb()
+    residual = float(np.linalg.norm(matrix @ solution - rhs) / np.linalg.norm(rhs))
+    del solve, solution
+    clocks.append(_clock())
+    if name != "superlu":
+        SOLVERS[name](matrix)
+    clocks.append(_clock())
+    steps = np.diff(np.array(clocks), axis=0)
+    return {
+        "unknowns": matrix.shape[0],
+        "factor_s": steps[0, 0],
+        "factor_cpu_s": steps[0, 1],
+        "again_s": steps[3, 0],
+        "again_cpu_s": steps[3, 1],
+        "solve_s": steps[1, 0],
+        "solve_cpu_s": steps[1, 1],
+        "residual": residual,
+        "peak_mb": peak,
+    }
+
+
+def _clock() -> tuple[float, float]:
+    """On the wall, and of the processors in this program (not of the kernel, which gives it memory)."""
+    return time.perf_counter(), os.times().user
+
+
+def _installed(module: str) -> bool:
+    try:
+        importlib.import_module(module)
+    except (ImportError, OSError):  # the package, or MKL itself
+        return False
+    return True
+
+
+if __name__ == "__main__":
+    print(json.dumps(_measured(sys.argv[1], Path(sys.argv[2]))))

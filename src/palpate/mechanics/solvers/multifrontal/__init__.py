@@ -1,0 +1,1 @@
+"""Multifrontal Cholesky factorisation on dense kernels of LAPACK."""

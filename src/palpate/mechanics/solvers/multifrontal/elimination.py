@@ -1,0 +1,260 @@
+"""Which unknowns are eliminated together, in which order, and where that fills the factor.
+
+The elimination tree, column counts and supernodes are found on the graph of the nodes (groups of unknowns with equal
+columns), in time nearly linear in its edges: Liu, SIAM Review 34 (1992) 82-109; Gilbert, Ng & Peyton, SIAM J. Matrix
+Anal. Appl. 15 (1994) 1075-1091; supernodes with few explicit zeros are merged as by Ashcraft & Grimes, ACM TOMS 15
+(1989) 291-309.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import minimum_spanning_tree
+
+from palpate.mechanics.solvers.multifrontal.refinement import refined_order
+
+__all__ = ["Supernodes", "children_of", "supernodes"]
+
+Integers = NDArray[np.int64]
+
+SMALL = 48  # unknowns, up to which supernodes are merged whatever zeros that makes
+ZEROS = ((96, 0.5), (256, 0.2), (1 << 40, 0.05))  # share of explicit zeros allowed up to so many unknowns
+
+
+@dataclass(frozen=True, slots=True)
+class Supernodes:
+    """Supernodes in an order in which each comes after its children, its descendants right before it.
+
+    order (n_nodes,): nodes in the order of elimination; start (n + 1,): place of each supernode's first node in it;
+    parent (n,): supernode or -1; rows: for each the places in `order` of the nodes below its own that it fills, sorted.
+    """
+
+    order: Integers
+    start: Integers
+    parent: Integers
+    rows: tuple[Integers, ...]
+
+
+def elimination_tree(lower: sparse.csr_matrix[np.float64]) -> Integers:
+    """Parent (n,), or -1, of each column; lower (n, n): strictly lower triangle of the pattern in elimination order.
+
+    The tree depends on which of the first i columns hang together, for every i, and a spanning forest that is minimal
+    for max(row, column) keeps exactly that: so Liu's algorithm runs over n - 1 edges.
+    """
+    n = lower.shape[0]
+    rows = np.repeat(np.arange(n), np.diff(lower.indptr))
+    weighted = sparse.csr_matrix((rows.astype(np.float64), lower.indices, lower.indptr), shape=lower.shape)
+    forest = sparse.coo_matrix(minimum_spanning_tree(weighted))
+    ends = np.stack([forest.row, forest.col])
+    first, last = ends.min(axis=0), ends.max(axis=0)
+    by_last = np.argsort(last, kind="stable")
+    parent, ancestor = [-1] * n, [-1] * n
+    for k, i in zip(first[by_last].tolist(), last[by_last].tolist(), strict=True):
+        node = k
+        while ancestor[node] != -1 and ancestor[node] != i:
+            ancestor[node], node = i, ancestor[node]
+        if ancestor[node] == -1:
+            ancestor[node] = parent[node] = i
+    return np.array(parent, dtype=np.int64)
+
+
+def postorder(parent: Integers, weight: Integers | None = None) -> Integers:
+    """Order (n,) in which every node follows all of its descendants; children by `weight` (n,), the largest first."""
+    n = len(parent)
+    ranked = np.arange(n) if weight is None else np.argsort(-weight, kind="stable")
+    by_parent = ranked[np.argsort(parent[ranked], kind="stable")]
+    bounds = np.searchsorted(parent[by_parent], np.arange(-1, n + 1)).tolist()
+    children = by_parent.tolist()
+    stack, preorder = children[: bounds[1]], []
+    while stack:  # a node, then its last child with all below that: backwards, it is a postorder
+        node = stack.pop()
+        preorder.append(node)
+        stack += children[bounds[node + 1] : bounds[node + 2]]
+    return np.array(preorder[::-1], dtype=np.int64)
+
+
+def children_of(parent: Integers) -> list[list[int]]:
+    """Children of each node of a tree."""
+    found: list[list[int]] = [[] for _ in range(len(parent))]
+    for node, above in enumerate(parent.tolist()):
+        if above >= 0:
+            found[above].append(node)
+    return found
+
+
+def _relabelled(parent: Integers, order: Integers) -> Integers:
+    """The tree `parent` with its nodes numbered along `order`."""
+    place = np.empty(len(order) + 1, dtype=np.int64)
+    place[order], place[-1] = np.arange(len(order)), -1
+    return place[parent[order]]
+
+
+def column_counts(lower: sparse.csr_matrix[np.float64], parent: Integers, weight: Integers) -> Integers:
+    """Unknowns (n,) in each column of the factor, its own included, of a postordered tree; weight (n,) of each row.
+
+    Row i fills the paths from its entries up to i. The length of their union: +1 where a path begins, -1 where two of
+    them, neighbours in postorder, meet, summed over subtrees.
+    """
+    n = len(parent)
+    counts = np.diff(lower.indptr)
+    row = np.repeat(np.arange(n), counts)
+    delta = np.bincount(lower.indices, weight[row], minlength=n)
+    same = np.flatnonzero(np.diff(row) == 0)
+    meet = _lowest_common_ancestors(
+        parent, lower.indices[same].astype(np.int64), lower.indices[same + 1].astype(np.int64)
+    )
+    delta -= np.bincount(meet, weight[row[same]], minlength=n)
+    delta -= np.where(counts > 0, weight, 0)
+    sums = np.concatenate([[0.0], np.cumsum(delta)])
+    below = sums[1:] - sums[np.arange(n) + 1 - _subtree_sizes(parent)]
+    return np.asarray(np.rint(below).astype(np.int64) + weight)
+
+
+def _subtree_sizes(parent: Integers) -> Integers:
+    sizes = [1] * len(parent)
+    for node, above in enumerate(parent.tolist()):
+        if above >= 0:
+            sizes[above] += sizes[node]
+    return np.array(sizes, dtype=np.int64)
+
+
+def _depths(parent: Integers) -> Integers:
+    depths = [0] * len(parent)
+    above = parent.tolist()
+    for node in range(len(above) - 1, -1, -1):
+        if above[node] >= 0:
+            depths[node] = depths[above[node]] + 1
+    return np.array(depths, dtype=np.int64)
+
+
+def _lowest_common_ancestors(parent: Integers, first: Integers, last: Integers) -> Integers:
+    """Lowest common ancestors (m,) of first < last (m,) in a postordered tree.
+
+    Of the nodes from first to last the leftmost of least depth is `last` itself, if it is above `first`, and else a
+    child of the ancestor; least depths come from a table of those of 1, 2, 4 ... nodes.
+    """
+    n = len(parent)
+    table = [_depths(parent) * n + np.arange(n)]
+    while 2 ** len(table) <= n:
+        before, half = table[-1], 2 ** (len(table) - 1)
+        table.append(np.minimum(before, before[np.minimum(np.arange(n) + half, n - 1)]))
+    level = np.frexp((last - first + 1).astype(np.float64))[1] - 1
+    levels = np.stack(table)
+    least = np.minimum(levels[level, first], levels[level, last + 1 - 2**level]) % n
+    return np.where(least == last, last, parent[least])
+
+
+def supernodes(graph: sparse.csr_matrix[np.float64], order: Integers, weight: Integers) -> Supernodes:
+    """Supernodes of a symmetric graph (n, n) of nodes of `weight` (n,) unknowns each, eliminated along `order`."""
+    nodes = order[postorder(elimination_tree(_reordered(graph, order)))]
+    lower = _reordered(graph, nodes)
+    tree, own = elimination_tree(lower), weight[nodes]
+    counts = column_counts(lower, tree, own)
+    # A column continues the supernode of the one before if it is its parent and fills the same rows.
+    begins = (tree[:-1] != np.arange(1, len(tree))) | (counts[:-1] != counts[1:] + own[:-1])
+    member = np.concatenate([[0], np.cumsum(begins)])
+    first = np.flatnonzero(np.diff(member, prepend=-1))
+    parent = _above(tree, member, np.append(first[1:], len(tree)) - 1)
+    width = np.bincount(member, own).astype(np.int64)
+    into = _merged(parent, width, counts[first])
+    kept, number = np.unique(into, return_inverse=True)
+    parent = np.where(parent[kept] >= 0, number[parent[kept]], -1)
+    return _in_order(lower, nodes, own, number[member], parent)
+
+
+def _above(tree: Integers, member: Integers, last: Integers) -> Integers:
+    """Supernode (n,), or -1, of the parent of each supernode's last node (n,)."""
+    return np.where(tree[last] >= 0, member[tree[last]], -1)
+
+
+def _in_order(
+    lower: sparse.csr_matrix[np.float64], nodes: Integers, weight: Integers, member: Integers, parent: Integers
+) -> Supernodes:
+    """Supernodes in the postorder of least memory, and their nodes where contributions come in long runs."""
+    below = _structures(sparse.csc_matrix(lower), member, parent)
+    sizes = np.array([int(weight[rows].sum()) for rows in below])
+    order = postorder(parent, _priority(parent, sizes * sizes))
+    parent, below = _relabelled(parent, order), [below[s] for s in order]
+    place = np.argsort(order)
+    by_member = np.argsort(place[member], kind="stable")
+    start = np.searchsorted(place[member][by_member], np.arange(len(order) + 1))
+    below = _renumbered(below, by_member)
+    refined = refined_order(start, children_of(parent), below)
+    return Supernodes(nodes[by_member][refined], start, parent, tuple(_renumbered(below, refined)))
+
+
+def _renumbered(sets: list[Integers], order: Integers) -> list[Integers]:
+    """Sets of numbers after those have been put in `order`, sorted."""
+    place = np.argsort(order)
+    return [np.sort(place[numbers]) for numbers in sets]
+
+
+def _priority(parent: Integers, kept: Integers) -> Integers:
+    """For each tree node what its subtree needs at most beyond what it leaves, `kept` (n,); the neediest go first."""
+    peak, left = kept.tolist(), kept.tolist()
+    for s, children in enumerate(children_of(parent)):
+        held, most = 0, 0
+        for child in sorted(children, key=lambda c: left[c] - peak[c]):
+            most = max(most, held + peak[child])
+            held += left[child]
+        peak[s] = max(most, held + left[s])
+    return np.array(peak, dtype=np.int64) - kept
+
+
+def _reordered(graph: sparse.csr_matrix[np.float64], order: Integers) -> sparse.csr_matrix[np.float64]:
+    """Strictly lower triangle of the graph with its nodes along `order`, columns sorted."""
+    lower = sparse.tril(graph[order][:, order], -1, format="csr")
+    lower.sort_indices()
+    return lower
+
+
+def _merged(parent: Integers, width: Integers, front: Integers) -> Integers:
+    """Supernode (n,) into which each is merged, itself or a later one; parent, width, front (n,): in unknowns.
+
+    Merging a child with its parent makes its columns as long as the front of both: explicit zeros, of which a bounded
+    share is allowed.
+    """
+    n = len(parent)
+    widths, fronts, zeros = width.tolist(), front.tolist(), [0] * n
+    into = list(range(n))
+    children: list[list[int]] = [[] for _ in range(n)]
+    for s, above in enumerate(parent.tolist()):
+        for child in sorted(children[s], key=lambda c: widths[c] * (fronts[s] - fronts[c])):
+            both = widths[child] + widths[s]
+            empty = zeros[child] + zeros[s] + widths[child] * (widths[child] + fronts[s] - fronts[child])
+            size = both * (widths[child] + fronts[s]) - both * both // 2
+            if both <= SMALL or empty <= _allowed(both) * size:
+                into[child], widths[s], zeros[s] = s, both, empty
+                fronts[s] += widths[child]
+        if above >= 0:
+            children[above].append(s)
+    for s in range(n - 1, -1, -1):
+        into[s] = into[into[s]]
+    return np.array(into, dtype=np.int64)
+
+
+def _allowed(width: int) -> float:
+    return next(share for limit, share in ZEROS if width <= limit)
+
+
+def _structures(lower: sparse.csc_matrix[np.float64], member: Integers, parent: Integers) -> list[Integers]:
+    """For each supernode the nodes that it fills outside itself; member (n_nodes,), parent (n,)."""
+    n = len(parent)
+    by_member = np.argsort(member, kind="stable")
+    bounds = np.searchsorted(member[by_member], np.arange(n + 1))
+    ordered = sparse.csc_matrix(lower[:, by_member])
+    inherited: list[list[Integers]] = [[] for _ in range(n)]
+    found = []
+    for s in range(n):
+        direct = ordered.indices[ordered.indptr[bounds[s]] : ordered.indptr[bounds[s + 1]]]
+        reached = np.unique(np.concatenate([direct, *inherited[s]]))
+        below = reached[member[reached] != s]
+        inherited[s] = []
+        found.append(below)
+        if parent[s] >= 0:
+            inherited[parent[s]].append(below)
+    return found

@@ -1,0 +1,204 @@
+"""What a factorisation does and where it puts it, known from the pattern alone: fronts, places in memory, steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from palpate.mechanics.solvers.multifrontal.elimination import Supernodes, children_of, supernodes
+from palpate.mechanics.solvers.multifrontal.schedule import Step, elimination_steps, memory_places
+from palpate.mechanics.solvers.pattern import dissection, node_graph, twin_rows
+
+__all__ = ["Front", "Plan", "blocks_of", "make_plan", "panel_of"]
+
+Integers = NDArray[np.int64]
+
+BLOCK = 192  # columns of a contribution that are kept together with what lies above the diagonal among them
+
+
+@dataclass(frozen=True, slots=True)
+class Front:
+    """The dense matrix of one supernode: its own `width` unknowns, from place `first` on, and those at `rows` (below,).
+
+    panel: where its columns of the factor begin; contribution: where the columns of what it adds to its parent (below,
+    below) begin in the working memory, see `blocks_of`; children: fronts; runs: (start among its rows, start in the
+    parent's front, length) of each; entries: those of the matrix that belong to its columns.
+    """
+
+    first: int
+    width: int
+    rows: NDArray[np.int32]
+    panel: int
+    contribution: int
+    children: tuple[int, ...]
+    runs: tuple[tuple[int, int, int], ...]
+    entries: slice
+
+    @property
+    def size(self) -> int:
+        """Rows of its columns."""
+        return self.width + len(self.rows)
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """For all matrices of one pattern.
+
+    order (n,): unknown that is eliminated at each place; source (m,): entries of the matrix, target (m,): their places
+    in their front's columns; factor_size, work_size: numbers that the factor and the working memory hold;
+    operations: of one factorisation.
+    """
+
+    order: Integers
+    fronts: tuple[Front, ...]
+    source: NDArray[np.int32]
+    target: NDArray[np.int32]
+    steps: tuple[Step, ...]
+    factor_size: int
+    work_size: int
+    operations: float
+
+
+def panel_of(factor: NDArray[Any], front: Front) -> NDArray[Any]:
+    """The factor's columns (size, width) of a front, in Fortran's order."""
+    return factor[front.panel : front.panel + front.size * front.width].reshape(front.width, front.size).T
+
+
+def _block_bounds(below: int) -> list[tuple[int, int]]:
+    """Ranges of columns in which a contribution (below, below) is kept, each from its diagonal downwards."""
+    number = max(round(below / BLOCK), 1)
+    ends = [below * k // number for k in range(number + 1)]
+    return list(pairwise(ends))
+
+
+def blocks_of(memory: NDArray[Any], front: Front) -> list[tuple[int, int, NDArray[Any]]]:
+    """First and last column of each block of a front's contribution, and the block, rows from the first column on."""
+    begin, m, found = front.contribution, len(front.rows), []
+    for low, high in _block_bounds(m):
+        size = (m - low) * (high - low)
+        found.append((low, high, memory[begin : begin + size].reshape(high - low, m - low).T))
+        begin += size
+    return found
+
+
+def make_plan(matrix: sparse.csr_matrix[np.float64], threads: int) -> Plan:
+    """The plan for matrices with the pattern of `matrix` (n, n), sorted and without duplicates."""
+    group = twin_rows(matrix)
+    first = np.flatnonzero(np.diff(group, prepend=-1))
+    weight = np.bincount(group).astype(np.int64)
+    graph = node_graph(matrix, group)
+    nodes = supernodes(graph, dissection(graph), weight)
+    own = weight[nodes.order]
+    offset = np.concatenate([[0], np.cumsum(own)])
+    order = _spread(first[nodes.order], own)
+    below = [int(own[rows].sum()) for rows in nodes.rows]
+    width = np.diff(offset[nodes.start])
+    work = _operations(width, np.array(below))
+    steps = elimination_steps(nodes.parent, work, threads)
+    places, work_size = memory_places(nodes.parent, [_kept(m) for m in below], steps)
+    source, target, bounds = _entries(matrix, nodes, group, first, weight)
+    panel = np.concatenate([[0], np.cumsum(width * (width + below))])
+    children = children_of(nodes.parent)
+    fronts = tuple(
+        Front(
+            first=int(offset[nodes.start[s]]),
+            width=int(width[s]),
+            rows=_spread(offset[nodes.rows[s]], own[nodes.rows[s]]).astype(np.int32),
+            panel=int(panel[s]),
+            contribution=places[s],
+            children=tuple(children[s]),
+            runs=_runs(nodes, own, s),
+            entries=slice(int(bounds[s]), int(bounds[s + 1])),
+        )
+        for s in range(len(nodes.parent))
+    )
+    return Plan(order, fronts, source, target, steps, int(panel[-1]), work_size, float(work.sum()))
+
+
+def _kept(below: int) -> int:
+    """Numbers that a contribution (below, below) takes."""
+    return sum((below - low) * (high - low) for low, high in _block_bounds(below))
+
+
+def _spread(first: Integers, count: Integers) -> Integers:
+    """first, first + 1 ... (count of them) for each of first (n,), count (n,)."""
+    ends = np.cumsum(count)
+    return np.repeat(first - ends + count, count) + np.arange(int(ends[-1]) if len(ends) else 0)
+
+
+def _operations(width: Integers, below: Integers) -> NDArray[np.float64]:
+    """Multiplications and additions (n,) of each front."""
+    w, m = width.astype(np.float64), below.astype(np.float64)
+    return w**3 / 3.0 + w**2 * m + w * m**2
+
+
+def _runs(nodes: Supernodes, own: Integers, s: int) -> tuple[tuple[int, int, int], ...]:
+    """Where the rows of supernode s, of `own` (n_nodes,) unknowns each, lie in its parent's front."""
+    parent, rows = int(nodes.parent[s]), nodes.rows[s]
+    if parent < 0 or not len(rows):
+        return ()
+    columns = np.arange(nodes.start[parent], nodes.start[parent + 1])
+    front = np.concatenate([columns, nodes.rows[parent]])
+    there = np.concatenate([[0], np.cumsum(own[front])])
+    here = np.concatenate([[0], np.cumsum(own[rows])])
+    place = np.searchsorted(front, rows)
+    breaks = np.flatnonzero((np.diff(place) != 1) | (place[1:] == len(columns))) + 1
+    starts = np.concatenate([[0], breaks])
+    ends = np.append(breaks, len(rows))
+    table = np.stack([here[starts], there[place[starts]], here[ends] - here[starts]], axis=1)
+    return tuple((a, b, c) for a, b, c in table.tolist())
+
+
+def _entries(
+    matrix: sparse.csr_matrix[np.float64], nodes: Supernodes, group: Integers, first: Integers, weight: Integers
+) -> tuple[NDArray[np.int32], NDArray[np.int32], Integers]:
+    """Entries of the matrix (m,) in the factor's columns, their places (m,) in their front, and bounds by front.
+
+    Column j of the lower triangle is read from row j of the symmetric matrix. The rows of a node have the same columns.
+    """
+    n = len(first)
+    own = weight[nodes.order]
+    offset = np.concatenate([[0], np.cumsum(own)])
+    place = np.argsort(nodes.order)
+    rows = first[nodes.order]  # of each node in turn, its first
+    lengths = matrix.indptr[rows + 1] - matrix.indptr[rows]
+    entry = _spread(matrix.indptr[rows].astype(np.int64), lengths.astype(np.int64))
+    node = np.repeat(np.arange(n), lengths)
+    column = matrix.indices[entry]
+    other = place[group[column]]
+    kept = np.flatnonzero(other >= node)
+    entry, node, column, other = entry[kept], node[kept], column[kept], other[kept]
+    member = np.repeat(np.arange(len(nodes.parent)), np.diff(nodes.start))
+    row = _local_rows(nodes, own, offset, member[node], other) + column - first[group[column]]
+    size = np.diff(offset[nodes.start]) + [int(own[below].sum()) for below in nodes.rows]
+    here = member[node]
+    target = (offset[node] - offset[nodes.start[here]]) * size[here] + row
+    count = own[node]  # the node's other rows have the same columns
+    further = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
+    target = np.repeat(target, count) + further * np.repeat(size[here], count)
+    stride = np.repeat(lengths[node], count)
+    source = np.repeat(entry, count) + further * stride
+    bounds = np.searchsorted(np.repeat(here, count), np.arange(len(nodes.parent) + 1))
+    return source.astype(np.int32), target.astype(np.int32), bounds
+
+
+def _local_rows(nodes: Supernodes, own: Integers, offset: Integers, member: Integers, other: Integers) -> Integers:
+    """First row (m,) in the front of supernode `member` (m,) of the node at place `other` (m,)."""
+    n = len(own)
+    inside = other < nodes.start[member + 1]
+    result = offset[other] - offset[nodes.start[member]]
+    counts = [len(rows) for rows in nodes.rows]
+    keys = np.repeat(np.arange(len(counts)) * n, counts) + np.concatenate(nodes.rows)
+    sums = np.concatenate([[0], np.cumsum(own[keys % n])])
+    begins = np.concatenate([[0], np.cumsum(counts)])[:-1]
+    outside = np.flatnonzero(~inside)
+    s = member[outside]
+    found = np.searchsorted(keys, s * n + other[outside])
+    width = offset[nodes.start[s + 1]] - offset[nodes.start[s]]
+    result[outside] = width + sums[found] - sums[begins[s]]
+    return result

@@ -1,0 +1,42 @@
+"""Memory that a computation may still take."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+__all__ = ["available_memory"]
+
+# Control groups, version 2 and 1, as a container sees its own: limit, use, and the line of its caches in memory.stat.
+CGROUPS = (
+    ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current", "inactive_file"),
+    (
+        "/sys/fs/cgroup/memory/memory.limit_in_bytes",
+        "/sys/fs/cgroup/memory/memory.usage_in_bytes",
+        "total_inactive_file",
+    ),
+)
+
+
+def available_memory() -> float | None:
+    """Bytes that are free on this machine and under its control group's limit; None where the system does not tell."""
+    found = [_of_machine(), *(_of_group(*paths) for paths in CGROUPS)]
+    return min((amount for amount in found if amount is not None), default=None)
+
+
+def _of_machine() -> float | None:
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        return next(float(line.split()[1]) for line in lines if line.startswith("MemAvailable:")) * 1024.0
+    except (OSError, StopIteration, ValueError):
+        return None
+
+
+def _of_group(limit: str, use: str, caches: str) -> float | None:
+    try:
+        lines = Path(limit).with_name("memory.stat").read_text(encoding="ascii").splitlines()
+        given_back = next((float(line.split()[1]) for line in lines if line.split()[0] == caches), 0.0)
+        return (
+            float(Path(limit).read_text(encoding="ascii")) - float(Path(use).read_text(encoding="ascii")) + given_back
+        )
+    except (OSError, ValueError, IndexError):  # "max": no limit
+        return None

@@ -1,0 +1,356 @@
+"""The multifrontal solver: right for every pattern, on any number of threads, within the memory that it announces."""
+
+from __future__ import annotations
+
+import threading
+import tracemalloc
+
+import numpy as np
+import pytest
+import threadpoolctl
+from scipy import sparse
+
+from palpate.errors import ResourceError, SolverError
+from palpate.mechanics.solvers.contract import Hints
+from palpate.mechanics.solvers.multifrontal import elimination, plan, solver
+from palpate.mechanics.solvers.multifrontal.numeric import factorised
+from palpate.mechanics.solvers.multifrontal.plan import make_plan
+from palpate.mechanics.solvers.multifrontal.refinement import refined_order
+from palpate.mechanics.solvers.multifrontal.substitution import substituted
+from palpate.mechanics.solvers.multifrontal.threads import blas_on_one_thread
+
+NOTHING = Hints()
+
+
+def stiffness(pairs, sizes, seed, *, shift=0.1):
+    """A positive definite matrix of nodes with `sizes` unknowns, with full blocks where `pairs` (m, 2) are joined."""
+    rng = np.random.default_rng(seed)
+    offset = np.concatenate([[0], np.cumsum(sizes)])
+    rows, columns, data = [np.arange(offset[-1])], [np.arange(offset[-1])], [np.full(offset[-1], shift)]
+    for i, j in [*pairs, *((k, k) for k in range(len(sizes)))]:
+        members = np.unique(np.concatenate([np.arange(offset[i], offset[i + 1]), np.arange(offset[j], offset[j + 1])]))
+        root = rng.standard_normal((len(members), len(members)))
+        rows.append(np.repeat(members, len(members)))
+        columns.append(np.tile(members, len(members)))
+        data.append((root @ root.T).ravel())
+    n = int(offset[-1])
+    return sparse.csr_matrix((np.concatenate(data), (np.concatenate(rows), np.concatenate(columns))), shape=(n, n))
+
+
+def cube(n):
+    """Neighbours of a grid of n^3 nodes, diagonals of cells included."""
+    index = np.arange(n**3).reshape(n, n, n)
+    steps = [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (1, 1, 1)]
+    found = [np.stack([index[: n - a, : n - b, : n - c].ravel(), index[a:, b:, c:].ravel()], 1) for a, b, c in steps]
+    return np.concatenate(found)
+
+
+def mixed_blocks(n, seed):
+    """Nodes with one, two or three unknowns, as sliding boundaries leave them."""
+    return np.random.default_rng(seed).integers(1, 4, n)
+
+
+def scattered(n, m, seed):
+    """Random pairs, many nodes alone or in small components."""
+    return np.random.default_rng(seed).integers(0, n, (m, 2))
+
+
+PATTERNS = {
+    "one unknown": lambda: stiffness([], [1], 0),
+    "one node": lambda: stiffness([], [3], 0),
+    "no couplings": lambda: stiffness([], np.ones(30, int), 0),
+    "full": lambda: stiffness([(0, j) for j in range(30)] + [(i, j) for i in range(30) for j in range(i)], [3] * 30, 1),
+    "a dense row": lambda: stiffness([(7, j) for j in range(60)], np.ones(60, int), 2),
+    "a chain": lambda: stiffness([(i, i + 1) for i in range(400)], np.full(401, 2), 3),
+    "components": lambda: stiffness(scattered(300, 200, 4), mixed_blocks(300, 4), 4),
+    "random": lambda: stiffness(scattered(200, 500, 5), mixed_blocks(200, 5), 5),
+    "a cube": lambda: stiffness(cube(7), np.full(343, 3), 6),
+    "a sliding cube": lambda: stiffness(cube(6), mixed_blocks(216, 7), 7),
+    "two cubes": lambda: stiffness(np.concatenate([cube(5), cube(5) + 125]), np.full(250, 3), 8),
+}
+
+
+@pytest.fixture(params=list(PATTERNS), scope="module")
+def matrix(request):
+    return PATTERNS[request.param]()
+
+
+@pytest.fixture(scope="module")
+def body():
+    return PATTERNS["a cube"]()
+
+
+def relative_residual(matrix, found, rhs):
+    return np.max(np.linalg.norm(matrix @ found - rhs, axis=0) / np.linalg.norm(rhs, axis=0))
+
+
+def with_threads(monkeypatch, threads):
+    monkeypatch.setattr(solver, "processors", lambda: threads)
+
+
+@pytest.mark.parametrize(("threads", "columns"), [(1, 1), (2, 7), (5, 91)])
+def test_every_pattern_is_solved_to_rounding(matrix, threads, columns, monkeypatch):
+    with_threads(monkeypatch, threads)
+    rhs = np.random.default_rng(1).standard_normal((matrix.shape[0], columns))
+    before = rhs.copy()
+    found = solver.SOLVER.factorise(matrix, NOTHING).solve(rhs)
+    assert relative_residual(matrix, found, rhs) < 1e-12
+    assert np.array_equal(rhs, before)
+
+
+def test_single_precision_is_refined_to_its_tolerance(matrix):
+    rhs = np.random.default_rng(2).standard_normal((matrix.shape[0], 3)) * [1.0, 1e-60, 1e60]
+    ready = solver.MIXED.factorise(matrix, NOTHING)
+    assert relative_residual(matrix, ready.solve(rhs), rhs) < 1e-9
+
+
+def test_single_precision_alone_is_near(body):
+    ready = solver.MIXED.factorise(1e30 * body, NOTHING)
+    assert isinstance(ready, solver.MixedFactorisation)
+    rhs = np.ones((body.shape[0], 2))
+    assert 1e-9 < relative_residual(1e30 * body, ready.nearly(rhs), rhs) < 1e-2
+
+
+def test_what_single_precision_cannot_factorise_is_factorised_in_double():
+    pairs = [(i, i + 1) for i in range(2000)]
+    chain = stiffness(pairs, np.ones(2001, int), 9)
+    ends = sparse.diags_array(np.where(np.arange(2001) % 2, 1e5, 1e-1))
+    uneven = sparse.csr_matrix(ends @ chain @ ends)
+    ladder = sparse.diags_array([-np.ones(1999), np.full(2000, 2.0), -np.ones(1999)], offsets=[-1, 0, 1]).tocsr()
+    for hard in (sparse.csr_matrix(ladder @ ladder), uneven):
+        rhs = hard @ np.ones((hard.shape[0], 1))
+        assert relative_residual(hard, solver.MIXED.factorise(hard, NOTHING).solve(rhs), rhs) < 1e-9
+    ready = solver.MIXED.factorise(sparse.csr_matrix(ladder @ ladder), NOTHING)
+    assert isinstance(ready, solver.MultifrontalFactorisation)
+
+
+def test_threads_change_nothing_but_rounding(body):
+    rhs = np.random.default_rng(3).standard_normal((body.shape[0], 20))
+    found = []
+    for threads in (1, 2, 3, 8):
+        steps = make_plan(body, threads)
+        found.append(substituted(steps, factorised(steps, body.data, np.float64, threads), rhs, threads))
+    for other in found[1:]:
+        assert np.allclose(other, found[0], rtol=1e-11, atol=1e-13 * np.abs(found[0]).max())
+
+
+def test_the_same_threads_give_the_same_bits(body):
+    steps = make_plan(body, 3)
+    first, second = (factorised(steps, body.data, np.float64, 3) for _ in range(2))
+    assert np.array_equal(first, second)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("threads", [1, 4])
+def test_an_indefinite_matrix_is_refused_with_its_pivot(body, dtype, threads):
+    steps = make_plan(body, threads)
+    shifted = body.copy()
+    shifted.setdiag(body.diagonal() - 20.0)
+    with pytest.raises(SolverError, match=r"pivot \d+ of elimination is not positive; hold the body"):
+        factorised(steps, shifted.data, dtype, threads)
+
+
+def test_one_pattern_is_analysed_once(body, monkeypatch):
+    made = []
+    monkeypatch.setattr(solver, "_plans", solver._Plans())
+    monkeypatch.setattr(solver, "make_plan", lambda *given: made.append(1) or make_plan(*given))
+    rhs = np.ones((body.shape[0], 1))
+    for factor in (1.0, 2.0):
+        found = solver.SOLVER.factorise(factor * body, NOTHING).solve(rhs)
+        assert relative_residual(factor * body, found, rhs) < 1e-12
+    assert len(made) == 1
+    solver.SOLVER.factorise(PATTERNS["random"](), NOTHING)
+    assert len(made) == 2
+
+
+def test_an_entry_that_is_missing_on_one_side_is_taken_from_neither_or_both(body):
+    far = np.flatnonzero(np.abs(body.data) < 1e-2)[:40]
+    lost = body.copy()
+    lost.data[far[::2]] = 0.0
+    lost.eliminate_zeros()
+    rhs = np.ones((body.shape[0], 1))
+    found = solver.SOLVER.factorise(lost, NOTHING).solve(rhs)
+    assert relative_residual(body, found, rhs) < 0.1
+
+
+def test_entries_in_any_order_and_in_parts_are_summed():
+    matrix = PATTERNS["random"]()
+    entries = sparse.coo_matrix(matrix)
+    order = np.random.default_rng(4).permutation(2 * entries.nnz)
+    rows, columns = np.tile(entries.row, 2)[order], np.tile(entries.col, 2)[order]
+    bounds = np.searchsorted(np.sort(rows), np.arange(matrix.shape[0] + 1))
+    by_row = np.argsort(rows, kind="stable")
+    parts = (np.tile(0.5 * entries.data, 2)[order][by_row], columns[by_row], bounds)
+    rhs = np.ones((matrix.shape[0], 1))
+    found = solver.SOLVER.factorise(sparse.csr_matrix(parts, shape=matrix.shape), NOTHING).solve(rhs)
+    assert relative_residual(matrix, found, rhs) < 1e-12
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_the_memory_announced_is_the_memory_taken(threads, monkeypatch):
+    matrix = stiffness(cube(12), np.full(1728, 3), 10)
+    with_threads(monkeypatch, threads)
+    needed = solver.SOLVER.expect(matrix, NOTHING).bytes  # analyses the pattern
+    tracemalloc.start()
+    try:
+        ready = solver.SOLVER.factorise(matrix, NOTHING)
+        taken = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert needed < taken < 1.15 * needed
+    assert ready.factor.nbytes < needed
+
+
+def test_memory_that_is_not_there_is_refused_before_it_is_taken(monkeypatch):
+    matrix = stiffness(cube(9), np.full(729, 3), 11)
+    needed = solver.SOLVER.expect(matrix, NOTHING).bytes
+    monkeypatch.setattr(solver, "available_memory", lambda: 0.9 * needed)
+    tracemalloc.start()
+    try:
+        with pytest.raises(ResourceError, match=r"2187 unknowns needs [\d.]+ GB and [\d.]+ GB are free"):
+            solver.SOLVER.factorise(matrix, NOTHING)
+        assert tracemalloc.get_traced_memory()[1] < 0.2 * needed
+    finally:
+        tracemalloc.stop()
+
+
+def blas_threads():
+    return [library["num_threads"] for library in threadpoolctl.threadpool_info() if library["user_api"] == "blas"]
+
+
+def test_no_changed_number_of_blas_threads_is_left_behind(body):
+    with threadpoolctl.threadpool_limits(2, user_api="blas"):  # this thread's, so the limits below are nested
+        before = blas_threads()
+        assert set(before) == {2}
+        factorisation = solver.SOLVER.factorise(body, NOTHING)
+        factorisation.solve(np.ones((body.shape[0], 4)))
+        with pytest.raises(SolverError):
+            solver.SOLVER.factorise(-body, NOTHING)
+        assert blas_threads() == before
+
+
+def test_overlapping_calls_wait_for_each_other_and_restore_the_number_of_blas_threads():
+    with threadpoolctl.threadpool_limits(2, user_api="blas"):
+        before = blas_threads()
+    seen, inside, most = [], [], []
+
+    def work():
+        with blas_on_one_thread():
+            inside.append(1)
+            most.append(len(inside))
+            seen.extend(blas_threads())
+            inside.pop()
+
+    workers = [threading.Thread(target=work) for _ in range(8)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    assert set(seen) == {1}
+    assert max(most) == 1
+    with threadpoolctl.threadpool_limits(2, user_api="blas"):
+        assert blas_threads() == before
+
+
+def eliminated(matrix):
+    """Pattern (n, n) of the factor, by elimination step by step."""
+    filled = np.tril(matrix.toarray() != 0.0)
+    for j in range(len(filled)):
+        below = np.flatnonzero(filled[:, j])
+        below = below[below > j]
+        filled[np.ix_(below, below)] |= np.tril(np.ones((len(below), len(below)), bool))
+    return filled
+
+
+def test_tree_and_counts_are_those_of_elimination():
+    matrix = PATTERNS["random"]()
+    lower = sparse.csr_matrix(sparse.tril(matrix, -1))
+    filled = eliminated(matrix)
+    n = matrix.shape[0]
+    below = [np.flatnonzero(filled[j + 1 :, j]) + j + 1 for j in range(n)]
+    parent = elimination.elimination_tree(lower)
+    assert parent.tolist() == [int(rows[0]) if len(rows) else -1 for rows in below]
+    order = elimination.postorder(parent)
+    again = sparse.csr_matrix(sparse.tril(matrix[order][:, order], -1))
+    again.sort_indices()
+    tree = elimination.elimination_tree(again)
+    weight = np.random.default_rng(5).integers(1, 4, n)
+    expected = (eliminated(matrix[order][:, order]) * weight[:, None]).sum(axis=0)
+    assert np.array_equal(elimination.column_counts(again, tree, weight), expected)
+
+
+def test_fronts_hold_all_that_elimination_fills_and_little_more():
+    matrix = PATTERNS["a cube"]()
+    steps = make_plan(matrix, 1)
+    filled = eliminated(matrix[steps.order][:, steps.order])
+    held = np.zeros_like(filled)
+    for front in steps.fronts:
+        columns = np.arange(front.first, front.first + front.width)
+        held[np.ix_(np.concatenate([columns, front.rows]), columns)] = True
+    assert not np.any(filled & ~held)
+    assert np.tril(held).sum() < 1.6 * filled.sum()
+
+
+def test_supernodes_come_after_their_children_with_each_node_once():
+    graph = sparse.csr_matrix(stiffness(cube(6), np.ones(216, int), 12))
+    graph.setdiag(0.0)
+    graph.eliminate_zeros()
+    found = elimination.supernodes(graph, np.random.default_rng(6).permutation(216), np.full(216, 3))
+    assert np.array_equal(np.sort(found.order), np.arange(216))
+    parents = found.parent
+    assert all(above == -1 or above > s for s, above in enumerate(parents))
+    for s, rows in enumerate(found.rows):
+        assert np.all(rows >= found.start[s + 1])
+        if parents[s] >= 0:
+            above = np.concatenate(
+                [np.arange(found.start[parents[s]], found.start[parents[s] + 1]), found.rows[parents[s]]]
+            )
+            assert np.isin(rows, above).all()
+
+
+def test_refinement_lays_what_descendants_fill_side_by_side():
+    rng = np.random.default_rng(7)
+    places = rng.permutation(40)
+    halves = [np.sort(4 + places[low : low + 20]) for low in (0, 15)]
+    quarter = np.sort(4 + places[2:9])
+    below = [quarter, halves[0], halves[1], np.zeros(0, int)]
+    below[0] = np.sort(np.concatenate([[1], quarter]))
+    start = np.array([0, 1, 2, 4, 44])
+    order = refined_order(start, [[], [0], [], [1, 2]], below)
+    assert np.array_equal(np.sort(order[4:]), np.arange(4, 44))
+    for rows in (halves[0], halves[1], quarter):
+        found = np.sort(np.argsort(order)[rows])
+        assert np.all(np.diff(found) == 1)
+
+
+def test_subtrees_and_the_fronts_above_are_each_eliminated_once_and_in_order():
+    matrix = stiffness(cube(9), np.full(729, 3), 13)
+    for threads in (1, 2, 4):
+        steps = make_plan(matrix, threads)
+        seen = []
+        for step in steps.steps:
+            for number in [*(s for subtree in step.subtrees for s in subtree), *step.then]:
+                assert set(steps.fronts[number].children) <= set(seen)
+                seen.append(number)
+        assert sorted(seen) == list(range(len(steps.fronts)))
+        assert threads == 1 or any(len(step.subtrees) > 1 for step in steps.steps)
+
+
+def test_contributions_never_share_memory_while_they_live():
+    matrix = stiffness(cube(9), np.full(729, 3), 14)
+    for threads in (1, 2, 4):
+        steps = make_plan(matrix, threads)
+        owner = np.full(steps.work_size, -1)
+        for step in steps.steps:
+            for number in [*(s for subtree in step.subtrees for s in subtree), *step.then]:
+                front = steps.fronts[number]
+                size = plan._kept(len(front.rows))
+                for child in front.children:
+                    low = steps.fronts[child].contribution
+                    kept = owner[low : low + plan._kept(len(steps.fronts[child].rows))]
+                    assert np.all(kept == child)
+                low = front.contribution
+                assert low + size <= steps.work_size
+                overwritten = set(owner[low : low + size].tolist()) - {-1}
+                assert not overwritten & set(front.children)
+                owner[low : low + size] = number
