@@ -35,6 +35,7 @@ __all__ = [
 FORCING = 0.1  # of the last outer iteration's step: to which the next one's weights and estimate agree
 INNER = 20.0  # a minimum is found to so small a part of what a reweighting may still change
 POLISH = 1e-5  # decrement of a minimum by a method that does not tell how far the log-moduli are from it
+WIDTH = 0.05  # of a posterior standard deviation, by which a reweighting may still change it
 NEAR = 0.5  # posterior standard deviations: a step that is shorter ends where derivatives are worth making exact
 ROUGH_SURFACE = 1.0 / 3.0  # mm, of a residual: below that a model must be as much more exact
 LEAST_SD = 0.03  # of ln E, see `_linearisation`
@@ -222,21 +223,28 @@ def _reweighted_minimum(
 ) -> tuple[Objective, Minimum, float]:
     """Iteratively reweighted minimisation on the present approximations, and what its last pass changed.
 
-    Weights and estimate agree to the tolerance, or to a tenth of the last outer iteration's step where that is more.
-    The log-moduli go no further than the approximations reach.
+    First the minimum under the present weights: what an updated model misses elsewhere would pass for noise. Weights and
+    estimate agree to the tolerance, standard deviations to `WIDTH`, or to a tenth of the last outer iteration's step
+    where that is more. The log-moduli go no further than the approximations reach.
     """
-    n, objective, minimum = now.objective.n_parameters, now.objective, now.minimum
+    n, objective = now.objective.n_parameters, now.objective
     reach = min(_approximation(objective, s).reach for s in range(len(objective.states)))
-    theta, bounds = minimum.unknowns[:n], settings.bounds
+    theta, bounds = now.minimum.unknowns[:n], settings.bounds
     near = Bounds(np.maximum(bounds.lower, theta - reach), np.minimum(bounds.upper, theta + reach))
     forcing, change = max(1.0, FORCING * now.step), np.inf
+
+    def found_from(objective: Objective, start: Minimum) -> Minimum:
+        """The minimum under an objective from another one."""
+        within = forcing * rule.tolerance(start, n) / INNER
+        return minimised(objective, start.unknowns, replace(settings, bounds=near), within=within).after(start)
+
+    minimum = found_from(objective, now.minimum)
     for number in range(1, rule.passes + 1):
         objective = reweighted(objective, minimum)
-        before, within = minimum, forcing * rule.tolerance(minimum, n) / INNER
-        found = minimised(objective, before.unknowns, replace(settings, bounds=near), within=within)
-        minimum = found.after(before)
-        moved = np.abs(minimum.unknowns - before.unknowns)[:n]
-        change = float(np.max(moved / rule.tolerance(minimum, n), initial=0.0))
+        before, minimum = minimum, found_from(objective, minimum)
+        moved = np.abs(minimum.unknowns - before.unknowns)[:n] / rule.tolerance(minimum, n)
+        widened = np.abs(np.log(posterior_sd(minimum, n) / posterior_sd(before, n))) / WIDTH
+        change = float(np.max([moved, np.where(rule.tolerance(minimum, n) > rule.floor, widened, 0.0)], initial=0.0))
         if change < forcing:
             break
         progress(f"reweighting {number}: {ratios_in_words(OuterIterate(objective, minimum))}")
