@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import palpate.study
 from palpate.cli import main
 from palpate.export.case_files import file_name
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers import write_label_image
 from palpate.study.case_file import read_case
+from palpate.study.result import MeshResult
 
 
 def ball(place: float) -> LabelImage:
@@ -46,6 +50,7 @@ def test_a_folder_whose_name_is_too_long_ends_with_6(estimate, tmp_path, capsys,
 
 AS_NOBODY = """
 import os, sys
+import palpate.study
 from palpate.cli import main
 import palpate.cli.entry, palpate.study.new_case, palpate.study.case_file, scipy.linalg
 os.getuid() or os.setuid(65534)
@@ -97,6 +102,21 @@ def test_file_names_made_of_tissues_have_bytes_to_spare(tmp_path, letter):
     name = file_name(600 * letter)
     assert 0 < len(name.encode()) <= 60
     (tmp_path / f"00_{name}_before.vtp").touch()
+
+
+def test_a_tissue_of_sixty_letters_of_four_bytes_has_its_surface(tmp_path, monkeypatch, case_result):
+    mesh = case_result.space.mesh
+    named = dataclasses.replace(mesh, tissues=(dataclasses.replace(mesh.tissues[0], name=60 * "𝒜"), *mesh.tissues[1:]))
+    space = dataclasses.replace(case_result.space, mesh=named)
+    module = types.ModuleType("palpate.study.run")
+    module.mesh = lambda case, **_: MeshResult(
+        case, space, case_result.mesh_summary, case_result.before, case_result.provenance
+    )
+    monkeypatch.setitem(sys.modules, "palpate.study.run", module)
+    monkeypatch.setattr(palpate.study, "run", module, raising=False)
+    (tmp_path / "case.toml").write_text('id = "a"\n[phantom]\nkind = "spheres"\n')
+    assert main(["mesh", str(tmp_path / "case.toml"), "--output", str(tmp_path / "out"), "--quiet"]) == 0
+    assert [path.name for path in (tmp_path / "out" / "surfaces").glob("00_*")] == [f"00_{15 * '𝒜'}_before.vtp"]
 
 
 def test_modules_of_the_working_folder_are_not_run(tmp_path):
