@@ -223,9 +223,9 @@ def _reweighted_minimum(
 ) -> tuple[Objective, Minimum, float]:
     """Iteratively reweighted minimisation on the present approximations, and what its last pass changed.
 
-    First the minimum under the present weights: what an updated model misses elsewhere would pass for noise. Weights and
-    estimate agree to the tolerance, standard deviations to `WIDTH`, or to a tenth of the last outer iteration's step
-    where that is more. The log-moduli go no further than the approximations reach.
+    First the minimum under the present weights: what an updated model misses elsewhere would pass for noise. Weights
+    and estimate agree to the tolerance, standard deviations to `WIDTH`, or to a tenth of the last outer iteration's
+    step where that is more. The log-moduli go no further than the approximations reach.
     """
     n, objective = now.objective.n_parameters, now.objective
     reach = min(_approximation(objective, s).reach for s in range(len(objective.states)))
