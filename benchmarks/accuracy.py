@@ -14,85 +14,38 @@ import json
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from accuracy_rows import ROWS, Row, Truths, posed
 from cramer_rao import cramer_rao, model_to_image
 from numpy.typing import NDArray
 
-from palpate.images.segmentation import segment
-from palpate.images.tissue import Role
+from palpate.images import Role
 from palpate.inversion import (
     FittedState,
     InverseProblem,
     Inversion,
     InversionSettings,
-    LaterState,
     Objective,
     Observed,
     Place,
     conclude,
     continue_at_finite_strain,
     exact_approximation,
+    imaging_errors,
     invert,
-    parameter_map,
 )
-from palpate.inversion.uncertainty import imaging_errors
-from palpate.mechanics.boundary import outer_constraint
-from palpate.mechanics.linear_model import linear_model
-from palpate.mesh.space import LagrangeSpace, lagrange_space
-from palpate.mesh.surface import triangle_normals
-from palpate.mesh.tetrahedralise import tetrahedralise
-from palpate.observation.noise_model import NoiseModel, fit_noise_model
-from palpate.observation.observed_surface import observed_surface
-from palpate.observation.prescribed_motion import prescribed_motion
-from palpate.observation.surface_distance import surface_distance
-from palpate.phantoms.exact_targets import exact_target
-from palpate.phantoms.pelvis import PelvisOptions, pelvis, pelvis_anatomy, pelvis_grid
-from palpate.phantoms.scene import Noise, Scene, reimaged, rescaled
-from palpate.study.body import Body, aligned, inverse_problem, make_body
-from palpate.study.case import Case, Mechanics, MeshSettings, Phantom
-from palpate.study.run import fitted_states, inversion_settings
+from palpate.mesh import LagrangeSpace, triangle_normals
+from palpate.observation import NoiseModel, fit_noise_model, observed_surface
+from palpate.phantoms import Noise, Scene
+from palpate.study import Body, fitted_states
 
 Array = NDArray[np.float64]
 Result = dict[str, Any]  # a line of JSON
 
-NOISE = Noise(surface_sd_mm=0.3, correlation_length_mm=6.0)
-
-
-@dataclass(frozen=True)
-class Row:
-    """One row of the table: how scenes are drawn, and what is shown to the estimate."""
-
-    cases: int
-    filling_mm: float | None = None  # None: 6 to 8 mm at random
-    spacing_mm: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    noise: Noise | None = None
-    tumour: bool = False
-    data: str = "voxels"
-    edge_mm: float = 4.0
-    truth_edge_mm: float = 2.7
-    draws: int = 1  # of the noise, for each pelvis
-    law: str = "linear"  # of the truth and of the estimate
-    poisson_ratio: float | None = None  # None: 0.40 to 0.45 at random
-
-
-ROWS = {
-    "same-mesh": Row(2, data="same mesh", truth_edge_mm=4.0),
-    "other-mesh": Row(4, data="surfaces"),
-    "clean": Row(8),
-    "clean-3mm": Row(4, filling_mm=3.0),
-    "noise": Row(8, spacing_mm=(1.0, 1.0, 2.5), noise=NOISE, edge_mm=6.0, draws=3),
-    "tumour": Row(3, tumour=True),
-    "nu-0.49": Row(4, poisson_ratio=0.49),
-    "finite-clean": Row(6, law="neo-hookean", edge_mm=5.0, truth_edge_mm=3.4),
-    "finite-clean-3mm": Row(3, law="neo-hookean", edge_mm=5.0, truth_edge_mm=3.4, filling_mm=3.0),
-    "finite-noise": Row(
-        6, law="neo-hookean", edge_mm=6.0, truth_edge_mm=3.4, spacing_mm=(1.0, 1.0, 2.5), noise=NOISE, draws=2
-    ),
-}
 GRIDS = 6  # that the voxels' part of the Cramer-Rao limit's noise is measured on: one alone moves the limit threefold
 FAR_OFF = np.log([3.0, 1.0 / 3.0, 3.0])  # from the linear estimate: another start of the continuation
 
@@ -136,67 +89,6 @@ def main() -> int:
 def max_cases(names: list[str]) -> int:
     """Largest number of cases of the rows."""
     return max(ROWS[name].cases for name in names)
-
-
-Truths = dict[tuple[object, ...], tuple[Scene, float]]
-
-
-def truth_of(row: Row, seed: int, draw: int, truths: Truths) -> tuple[Scene, PelvisOptions]:
-    """The scene of a row; rows of one seed share the truth where they can, but not the images.
-
-    A linear truth is linear in the filling; a finite-strain one is made anew.
-    """
-    filling = float(np.random.default_rng([seed, 7]).uniform(6.0, 8.0))
-    if row.law != "linear" and row.filling_mm is not None:
-        filling = row.filling_mm
-    options = PelvisOptions(
-        seed=seed,
-        filling_mm=filling,
-        tumour=row.tumour,
-        law=row.law,
-        poisson_ratio=row.poisson_ratio,
-        truth_edge_mm=row.truth_edge_mm,
-    )
-    key = (row.tumour, row.law, row.poisson_ratio, row.truth_edge_mm, filling)
-    if key not in truths:
-        truths.clear()  # a truth is large
-        truths[key] = pelvis(options), filling
-    scene, made = truths[key]
-    if row.filling_mm is not None and row.law == "linear":
-        scene = rescaled(scene, row.filling_mm / made)
-        filling = row.filling_mm
-    options = replace(options, filling_mm=filling, spacing_mm=row.spacing_mm, noise=row.noise)
-    return reimaged(replace(scene, seed=seed + 1000 * draw), pelvis_grid(options), noise=row.noise), options
-
-
-@dataclass(frozen=True)
-class Posed:
-    """One case of a row: the scene, what is asked of it, and the body it was made of where images are seen."""
-
-    scene: Scene
-    filling_mm: float
-    space: LagrangeSpace
-    problem: InverseProblem
-    settings: InversionSettings
-    bodies: tuple[Body, ...]
-
-
-def posed(row: Row, seed: int, draw: int, truths: Truths) -> Posed:
-    """The scene of a row, and the inverse problem that its images or surfaces pose."""
-    scene, options = truth_of(row, seed, draw, truths)
-    case = Case(
-        f"seed-{seed}",
-        phantom=Phantom("pelvis", seed),
-        mesh=MeshSettings(row.edge_mm),
-        mechanics=Mechanics(row.law, "P2" if row.law == "linear" and row.poisson_ratio is None else "auto"),
-    )
-    bodies: tuple[Body, ...] = ()
-    if row.data == "voxels":
-        problem, body = from_voxels(scene, case)
-        space, bodies = body.space, (body,)
-    else:
-        space, problem = _from_surfaces(scene, case, options, same_mesh=row.data == "same mesh")
-    return Posed(scene, options.filling_mm, space, problem, inversion_settings(case, problem.parameters), bodies)
 
 
 def _case(key: tuple[str, int, int], row: Row, truths: Truths) -> Result:
@@ -251,38 +143,6 @@ def _from_far_off(problem: InverseProblem, linear: Inversion, settings: Inversio
     )
     moved = replace(linear, candidates=(replace(best, iterate=iterate),), best=0, starts=())
     return continue_at_finite_strain(moved, settings, progress=_silent)
-
-
-def from_voxels(scene: Scene, case: Case) -> tuple[InverseProblem, Body]:
-    """Everything from the label images: the inverse problem, and the body that it is made of."""
-    before, after = (segment(image, scene.tissues) for image in (scene.before, scene.after))
-    body = make_body(aligned(before, (after,), method="none"), case, progress=_silent)
-    return inverse_problem(body, case, progress=_silent), body
-
-
-def _from_surfaces(
-    scene: Scene, case: Case, options: PelvisOptions, *, same_mesh: bool
-) -> tuple[LagrangeSpace, InverseProblem]:
-    """The truth's surfaces as targets; on the same mesh also a wall motion that the modes can make."""
-    if same_mesh:
-        space = lagrange_space(scene.mesh, "P2")
-    else:
-        space = lagrange_space(tetrahedralise(pelvis_anatomy(options), edge_length_mm=case.mesh.edge_length_mm), "P2")
-    driver = case.driver
-    motion = prescribed_motion(space, {}, n_modes=driver.modes, kernel_mm=driver.kernel_mm, prior_mm=driver.prior_mm)
-    constraint = outer_constraint(
-        space, outer="fixed", modes=motion.modes, offset=motion.offset, prescribed=motion.prescribed
-    )
-    model = linear_model(space, constraint)
-    if same_mesh:
-        rows = np.repeat(motion.prescribed, 3)
-        q = np.asarray(np.linalg.lstsq(motion.modes[rows], scene.displacement.ravel()[rows])[0], dtype=np.float64)
-        moduli = np.array([scene.moduli_kpa[name] for name in model.names])
-        scene = replace(scene, displacement=model.solve(moduli, q).displacement)
-    observed = [i for i, t in enumerate(scene.tissues) if t.role in (Role.ESTIMATE, Role.DRIVER)]
-    seen = tuple(surface_distance(exact_target(scene, observed_surface(space, i))) for i in observed)
-    mapping = parameter_map(scene.tissues, model.regions, [model.n_modes])
-    return space, InverseProblem((LaterState(model, seen, walls=motion.walls),), mapping)
 
 
 def _errors(inversion: Inversion, scene: Scene) -> Result:

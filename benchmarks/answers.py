@@ -21,8 +21,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import accuracy
 import numpy as np
+from accuracy import Array, Result, true_ratios
+from accuracy_rows import ROWS, Posed, Truths, posed
 
 from palpate.inversion import (
     InverseProblem,
@@ -46,7 +47,7 @@ SAME_PERCENT, SAME_SD = 0.1, 0.05
 def main() -> int:
     """Run the rows that were asked for and print by how much the two estimates differ."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rows", default=",".join(accuracy.ROWS))
+    parser.add_argument("--rows", default=",".join(ROWS))
     parser.add_argument("--cases", type=int, default=1, help="cases a row")
     parser.add_argument("--first-seed", type=int, default=101)
     parser.add_argument("--edge", type=float, help="edge length (mm) instead of the row's own")
@@ -57,12 +58,12 @@ def main() -> int:
     arguments = parser.parse_args()
     found = []
     for seed in range(arguments.first_seed, arguments.first_seed + arguments.cases):
-        truths: accuracy.Truths = {}
+        truths: Truths = {}
         for name in arguments.rows.split(","):
-            row = accuracy.ROWS[name]
+            row = ROWS[name]
             if arguments.edge:
                 row = replace(row, edge_mm=arguments.edge)
-            found.append({"row": name, "seed": seed, **_both(accuracy.posed(row, seed, 0, truths))})
+            found.append({"row": name, "seed": seed, **_both(posed(row, seed, 0, truths))})
             with arguments.output.open("a") as file:
                 file.write(json.dumps(found[-1]) + "\n")
             _say(_line(found[-1]))
@@ -70,13 +71,13 @@ def main() -> int:
     return 0 if all(all(case["same"]) for case in found) else 1
 
 
-def _both(case: accuracy.Posed) -> accuracy.Result:
+def _both(case: Posed) -> Result:
     """The product's estimate and the plain one of the same inverse problem."""
     began = time.perf_counter()
     product = invert(case.problem, case.settings, progress=lambda line: _say(f"  product: {line}"))
     ended = time.perf_counter()
     plain = plain_estimate(case.problem, case.settings, progress=lambda line: _say(f"  plain: {line}"))
-    n, truth = product.objective.n_parameters, np.log(accuracy.true_ratios(product.objective, case.scene))
+    n, truth = product.objective.n_parameters, np.log(true_ratios(product.objective, case.scene))
     theta, other, sd = product.minimum.unknowns[:n], plain.minimum.unknowns[:n], posterior_sd(plain.minimum, n)
     percent = 100.0 * np.expm1(theta - other)
     return {
@@ -115,7 +116,7 @@ def plain_estimate(
     return run_outer_loop(objective, start, settings, RULE, progress=progress, title="finite strain")
 
 
-def _exact(objective: Objective, unknowns: accuracy.Array, *, finite_strain: bool = False) -> Objective:
+def _exact(objective: Objective, unknowns: Array, *, finite_strain: bool = False) -> Objective:
     """The objective on full models that are solved at unknowns (n_unknowns,), linear ones or the states' others."""
     moduli, coefficients = objective.parameters.moduli(unknowns), objective.parameters.coefficients(unknowns)
     models = [(state.model, state.finite_strain if finite_strain else None) for state in objective.states]
@@ -132,7 +133,7 @@ COLUMNS = ("row", "seed", "tissue", "error, %", "plainly, %", "difference, %", "
 HEAD = (f"| {' | '.join(COLUMNS)} |", "|" + "---|" * len(COLUMNS))
 
 
-def _line(case: accuracy.Result) -> str:
+def _line(case: Result) -> str:
     keys = ("tissues", "ln_error", "plain_ln_error", "difference_percent", "difference_sd", "sd", "same")
     return "\n".join(
         f"| `{case['row']}` | {case['seed']} | {name} | {100 * a:+.3f} | {100 * b:+.3f} | {d:+.3f} | {of_sd:+.3f}"

@@ -22,14 +22,9 @@ import numpy as np
 from memory import peak_mb
 
 from palpate.experiments.simulated_pelvis import DATA
-from palpate.images.readers import write_label_image
-from palpate.images.tissue import Role
-from palpate.phantoms.pelvis import PelvisOptions, pelvis
-from palpate.phantoms.spheres import SpheresOptions, spheres
-from palpate.study.case_file import read_case
-from palpate.study.cost import expected_cost
-from palpate.study.read import read_states
-from palpate.study.run import estimate
+from palpate.images import Role, write_label_image
+from palpate.phantoms import PelvisOptions, SpheresOptions, pelvis, spheres
+from palpate.study import estimate, expected_cost, read_case, read_states
 
 
 @dataclass(frozen=True)

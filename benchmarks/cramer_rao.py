@@ -10,12 +10,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial.distance import cdist
 
-from palpate.inversion import Evaluation
-from palpate.inversion.objective import Linearisation
-from palpate.observation.contract import Observation
-from palpate.observation.noise_model import NoiseModel
-from palpate.observation.surface_distance import SurfaceDistance
-from palpate.observation.target import SurfaceTarget
+from palpate.inversion import Evaluation, Linearisation
+from palpate.observation import NoiseModel, Observation, SurfaceDistance, SurfaceTarget
 
 __all__ = ["cramer_rao", "efficient_gain", "model_to_image", "target_of"]
 

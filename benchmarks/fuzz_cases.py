@@ -33,8 +33,8 @@ from spoilt_cases import CASES, NAMES, override, spoilt_case, spoilt_table, toml
 import palpate.study.check  # noqa: F401 - before processes are forked that would import it each
 from palpate.cli import main as palpate_command
 from palpate.errors import PalpateError
-from palpate.images.label_table import read_label_table
-from palpate.study.case_file import read_case
+from palpate.images import read_label_table
+from palpate.study import read_case
 
 MEMORY_BYTES = 2 * 2**30
 MOST_FINDINGS = 20

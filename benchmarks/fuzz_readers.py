@@ -31,8 +31,7 @@ import nibabel
 import numpy as np
 
 from palpate.errors import PalpateError
-from palpate.images.label_table import read_label_table
-from palpate.images.readers import read_intensities, read_label_image
+from palpate.images import read_intensities, read_label_image, read_label_table
 
 SHAPE = (4, 5, 6)
 MEMORY_BYTES = 2 * 2**30

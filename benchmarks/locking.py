@@ -20,13 +20,9 @@ from scipy import sparse
 from scipy.optimize import brentq
 from scipy.spatial import cKDTree
 
-from palpate.images.tissue import Role, Tissue
-from palpate.mechanics.dilatation import ELEMENTS
-from palpate.mechanics.linear_model import LinearModel, linear_model
-from palpate.mesh.constraint import Constraint
-from palpate.mesh.space import LagrangeSpace, lagrange_space
-from palpate.mesh.tet_mesh import TetMesh
-from palpate.mesh.tetrahedralise import boundary_of
+from palpate.images import Role, Tissue
+from palpate.mechanics import ELEMENTS, LinearModel, linear_model
+from palpate.mesh import Constraint, LagrangeSpace, TetMesh, boundary_of, lagrange_space
 
 TRUTH = np.array([1.0, 3.0, 0.4])
 TINY = 1e-9

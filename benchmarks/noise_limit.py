@@ -14,21 +14,28 @@ import json
 import sys
 from dataclasses import dataclass, replace
 
-import accuracy
 import numpy as np
+from accuracy import at_truth, true_noise
+from accuracy_rows import NOISE, ROWS, from_voxels, truth_of
 from cramer_rao import cramer_rao, efficient_gain, model_to_image, target_of
 from numpy.typing import NDArray
 
-from palpate.images.segmentation import segment
+from palpate.images import segment
 from palpate.inversion import Evaluation, gain, invert
-from palpate.observation.noise_model import NoiseModel
-from palpate.phantoms.pelvis import pelvis_grid
-from palpate.phantoms.scene import reimaged
-from palpate.study.body import aligned, surface_observations
-from palpate.study.case import Case, Mechanics, MeshSettings, Phantom
-from palpate.study.run import fitted_states, inversion_settings
+from palpate.observation import NoiseModel
+from palpate.phantoms import pelvis_grid, reimaged
+from palpate.study import (
+    Case,
+    Mechanics,
+    MeshSettings,
+    Phantom,
+    aligned,
+    fitted_states,
+    inversion_settings,
+    surface_observations,
+)
 
-ROW = accuracy.ROWS["finite-noise"]
+ROW = ROWS["finite-noise"]
 CELLS_MM = (0.0, 2.0, 4.0, 6.0, 8.0)
 ALONE = 1e-3  # mm: a cell of one face
 
@@ -48,25 +55,25 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=320)
     parser.add_argument("--draws", type=int, default=30)
     arguments = parser.parse_args()
-    scene, options = accuracy.truth_of(replace(ROW, noise=None), arguments.seed, 0, {})
+    scene, options = truth_of(replace(ROW, noise=None), arguments.seed, 0, {})
     case = Case(
         "noise-limit",
         phantom=Phantom("pelvis", arguments.seed),
         mesh=MeshSettings(ROW.edge_mm),
         mechanics=Mechanics(ROW.law, "auto"),
     )
-    problem, body = accuracy.from_voxels(scene, case)
+    problem, body = from_voxels(scene, case)
     inversion = invert(problem, inversion_settings(case, problem.parameters), progress=lambda _: None)
-    there = accuracy.at_truth(inversion, problem, scene)
+    there = at_truth(inversion, problem, scene)
     rng = np.random.default_rng([arguments.seed, 11])
-    noise = accuracy.true_noise(there, fitted_states(inversion, body), accuracy.NOISE, rng)
+    noise = true_noise(there, fitted_states(inversion, body), NOISE, rng)
     evaluation = there.minimum.evaluation
     weights = _weights(evaluation, noise, there.objective.n_parameters)
     shifts: dict[str, list[NDArray[np.float64]]] = {w.name: [] for w in weights}
     surfaces = [target_of(line.observation).surface for line in evaluation.lines]
     for draw in range(1, arguments.draws + 1):
-        noisy = replace(options, noise=accuracy.NOISE)
-        imaged = reimaged(replace(scene, seed=scene.seed + 1000 * draw), pelvis_grid(noisy), noise=accuracy.NOISE)
+        noisy = replace(options, noise=NOISE)
+        imaged = reimaged(replace(scene, seed=scene.seed + 1000 * draw), pelvis_grid(noisy), noise=NOISE)
         before, after = (segment(image, scene.tissues) for image in (imaged.before, imaged.after))
         states = aligned(before, (after,), method="none")
         targets = [target_of(o) for o in surface_observations(replace(body, states=states), surfaces)[0]]

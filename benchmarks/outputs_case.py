@@ -22,11 +22,7 @@ import numpy as np
 
 from palpate.errors import NotConverged
 from palpate.report.case_report import write_failure_report
-from palpate.study.case_file import read_case
-from palpate.study.earlier import strange_files
-from palpate.study.journal import recover
-from palpate.study.outputs import write_json
-from palpate.study.result import failure_document
+from palpate.study import failure_document, read_case, recover, strange_files, write_json
 
 PALPATE = str(Path(sys.executable).with_name("palpate"))
 COMMANDS = ("estimate", "mesh", "report", "init")
@@ -176,7 +172,7 @@ def _anatomy(shift: float, radius: float) -> np.ndarray[Any, np.dtype[np.uint8]]
     places = np.stack(np.meshgrid(*[np.arange(26) * SPACING] * 3, indexing="ij"), axis=-1)
     labels = (np.linalg.norm(places - [19.0, 25.0 + shift, 19.0], axis=-1) < 10.0).astype(np.uint8)
     labels[np.linalg.norm(places[..., :2] - [19.0, 9.0], axis=-1) < radius] = 2
-    return labels
+    return np.asarray(labels)
 
 
 def _failed_estimate(bench: Bench, folder: Path) -> None:

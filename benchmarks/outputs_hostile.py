@@ -68,11 +68,17 @@ def kinds(outside: Path) -> dict[str, Callable[[Path], object]]:
         "socket": a_socket,
         "folder": Path.mkdir,
         "folder that holds something": lambda place: (place / "deep").mkdir(parents=True),
-        "file that may not be written": lambda place: (place.write_text("mine"), place.chmod(0o400)),
+        "file that may not be written": a_file_that_may_not_be_written,
     }
     if os.getuid() == 0:
         found["device"] = lambda place: os.mknod(place, 0o020666, os.makedev(1, 7))  # /dev/full
     return found
+
+
+def a_file_that_may_not_be_written(place: Path) -> None:
+    """What only its owner may read."""
+    place.write_text("mine")
+    place.chmod(0o400)
 
 
 def attempt(bench: Bench, command: str, folder: Path, outside: Path) -> tuple[int, str, str]:

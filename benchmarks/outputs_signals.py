@@ -53,7 +53,7 @@ class Trial:
 def trials(runs: int, seed: int) -> list[Trial]:
     """The same for each seed."""
     rng = random.Random(seed)
-    found = []
+    found = list[Trial]()
     for kind in SIGNALS:
         weights = [command for command, weight in SHARES.items() for _ in range(weight)]
         for k in range(runs):

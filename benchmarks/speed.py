@@ -30,7 +30,7 @@ import speed_peers as peers
 from memory import peak_mb
 from numpy.typing import NDArray
 
-from palpate.images.segmentation import segment
+from palpate.images import segment
 from palpate.inversion import (
     InverseProblem,
     Inversion,
@@ -43,18 +43,22 @@ from palpate.inversion import (
     sample_posterior,
     sandwich_covariance,
 )
-from palpate.mechanics.boundary import outer_constraint
-from palpate.mechanics.linear_model import linear_model
+from palpate.mechanics import linear_model, outer_constraint
 from palpate.mechanics.solvers.registry import expected_of_size
-from palpate.mesh.space import lagrange_space
-from palpate.mesh.tetrahedralise import tetrahedralise
-from palpate.observation.noise_model import SEGMENTATION_NOISE
-from palpate.observation.prescribed_motion import prescribed_motion
-from palpate.phantoms.pelvis import PelvisOptions, pelvis, pelvis_anatomy
-from palpate.phantoms.scene import Scene
-from palpate.study.body import aligned, inverse_problem, make_body
-from palpate.study.case import Case, Mechanics, MeshSettings, Phantom
-from palpate.study.run import estimate_states, inversion_settings
+from palpate.mesh import lagrange_space, tetrahedralise
+from palpate.observation import SEGMENTATION_NOISE, prescribed_motion
+from palpate.phantoms import PelvisOptions, Scene, pelvis, pelvis_anatomy
+from palpate.study import (
+    Case,
+    Mechanics,
+    MeshSettings,
+    Phantom,
+    aligned,
+    estimate_states,
+    inverse_problem,
+    inversion_settings,
+    make_body,
+)
 
 PARTS = ("solver", "linear", "nonlinear", "gradient", "posterior", "scaling", "front_end")
 IN_A_ROW = 20  # gradients, as an optimiser asks for them
@@ -409,9 +413,9 @@ def _cumulative(stats: pstats.Stats, file: str, function: str) -> float:
     return float(sum(called))
 
 
-def _solvers(sizes: Sizes, seed: int, say: Say) -> dict[str, object]:
+def _solvers(sizes: Sizes, seed: int, say: Say) -> Result:
     """Direct solvers on one stiffness, each in processes of its own, in turns: medians of seconds, and peak memory."""
-    rows: dict[str, list[dict]] = {name: [] for name in direct.SOLVERS}
+    rows: dict[str, list[dict[str, float | None]]] = {name: [] for name in direct.SOLVERS}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "stiffness.npz"
         direct.write_stiffness(path, sizes.solver, seed)
@@ -424,8 +428,8 @@ def _solvers(sizes: Sizes, seed: int, say: Say) -> dict[str, object]:
     return {"solver_of_rows": middle, "solver_ratio": direct.ratios(middle)}
 
 
-def _median(found: list[dict], key: str) -> float | None:
-    values = [row[key] for row in found if row[key] is not None]
+def _median(found: list[dict[str, float | None]], key: str) -> float | None:
+    values = [value for row in found if (value := row[key]) is not None]
     return float(np.median(values)) if values else None
 
 

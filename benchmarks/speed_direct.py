@@ -21,15 +21,13 @@ from memory import peak_mb
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from palpate.mechanics.boundary import outer_constraint
-from palpate.mechanics.linear_model import linear_model, weighted_sum
-from palpate.mechanics.solvers import registry
+from palpate.mechanics import SOLVERS as OURS
+from palpate.mechanics import linear_model, outer_constraint, weighted_sum
 from palpate.mechanics.solvers.contract import Hints
 from palpate.mechanics.solvers.pattern import nested_dissection
-from palpate.mesh.space import lagrange_space
-from palpate.mesh.tetrahedralise import tetrahedralise
-from palpate.observation.prescribed_motion import prescribed_motion
-from palpate.phantoms.pelvis import PelvisOptions, pelvis_anatomy
+from palpate.mesh import lagrange_space, tetrahedralise
+from palpate.observation import prescribed_motion
+from palpate.phantoms import PelvisOptions, pelvis_anatomy
 
 __all__ = ["SOLVERS", "in_a_process", "ratios", "write_stiffness"]
 
@@ -43,14 +41,16 @@ def write_stiffness(path: Path, edge_mm: float, seed: int) -> None:
     anatomy = pelvis_anatomy(PelvisOptions(seed=seed))
     space = lagrange_space(tetrahedralise(anatomy, edge_length_mm=edge_mm), "P2")
     motion = prescribed_motion(space, {}, n_modes=3, kernel_mm=20.0, prior_mm=5.0)
-    given = {"modes": motion.modes, "offset": motion.offset, "prescribed": motion.prescribed}
-    model = linear_model(space, outer_constraint(space, outer="fixed", **given))
+    constraint = outer_constraint(
+        space, outer="fixed", modes=motion.modes, offset=motion.offset, prescribed=motion.prescribed
+    )
+    model = linear_model(space, constraint)
     moduli = np.array([{"known": 10.0}.get(t.role.value, 40.0) for t in space.mesh.tissues if t.meshed])
     sparse.save_npz(path, weighted_sum(moduli, model.free_stiffness), compressed=False)
 
 
 def _ours(name: str) -> Callable[[Matrix], Solve]:
-    return lambda matrix: registry.SOLVERS[name].factorise(matrix, Hints()).solve
+    return lambda matrix: OURS[name].factorise(matrix, Hints()).solve
 
 
 def _pardiso(matrix: Matrix) -> Solve:
@@ -79,8 +79,8 @@ def _tell_where_mkl_is() -> None:
 def _superlu(matrix: Matrix) -> Solve:
     """In its symmetric mode, without pivoting."""
     order = nested_dissection(matrix)
-    options = {"permc_spec": "NATURAL", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
-    factors = splu(matrix[order][:, order].tocsc(), **options)
+    ordered = sparse.csc_matrix(matrix[order][:, order])
+    factors = splu(ordered, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
     def solve(rhs: np.ndarray) -> np.ndarray:
         solution = np.empty_like(rhs)

@@ -17,8 +17,8 @@ from scipy.optimize import least_squares
 from scipy.sparse.linalg import splu
 
 from palpate.inversion import InverseProblem, InversionSettings, Objective
-from palpate.mechanics.linear_model import LinearSystem
-from palpate.observation.noise_model import SEGMENTATION_NOISE
+from palpate.mechanics import LinearSystem
+from palpate.observation import SEGMENTATION_NOISE
 
 Array = NDArray[np.float64]
 Gradient = Callable[[], Array]
