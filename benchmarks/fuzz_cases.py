@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import faulthandler
+import importlib
 import json
 import os
 import random
@@ -30,11 +31,12 @@ import nibabel
 import numpy as np
 from spoilt_cases import CASES, NAMES, override, spoilt_case, spoilt_table, toml_of
 
-import palpate.study.check  # noqa: F401 - before processes are forked that would import it each
 from palpate.cli import main as palpate_command
 from palpate.errors import PalpateError
 from palpate.images import read_label_table
 from palpate.study import read_case
+
+importlib.import_module("palpate.study.check")  # before processes are forked that would import it each
 
 MEMORY_BYTES = 2 * 2**30
 MOST_FINDINGS = 20

@@ -10,14 +10,11 @@ benchmark-setup` installs them. Simulated data.
 from __future__ import annotations
 
 import argparse
-import cProfile
 import functools
 import json
 import platform
-import pstats
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -29,6 +26,7 @@ import speed_direct as direct
 import speed_peers as peers
 from memory import peak_mb
 from numpy.typing import NDArray
+from speed_stages import shares_of_stages
 
 from palpate.images import segment
 from palpate.inversion import (
@@ -54,7 +52,6 @@ from palpate.study import (
     MeshSettings,
     Phantom,
     aligned,
-    estimate_states,
     inverse_problem,
     inversion_settings,
     make_body,
@@ -358,79 +355,16 @@ def _one_size(edge_mm: float, seed: int) -> Result:
     }
 
 
-STAGES = {  # functions whose time, with all that they call, is a stage of its own
-    "images checked and aligned": ("body.py", "aligned"),
-    "level sets": ("anatomy.py", "anatomy_of"),
-    "tetrahedra cut": ("tetrahedralise.py", "_cut_grid"),
-    "tetrahedra remeshed": ("remeshing.py", "remeshed"),
-    "surfaces fitted, tetrahedra smoothed": ("tetrahedralise.py", "_fitted"),
-    "mesh gate": ("quality.py", "check_mesh"),
-    "distance maps and targets": ("body.py", "surface_observations"),
-    "wall modes": ("prescribed_motion.py", "prescribed_motion"),
-    "stiffness assembled": ("linear_model.py", "linear_model"),
-    "finite-strain model": ("finite_strain.py", "finite_strain_model"),
-    "responses and series": ("estimate.py", "_with_reduced_bases"),
-    "linear estimate": ("estimate.py", "_linear"),
-    "finite-strain estimate": ("estimate.py", "continue_at_finite_strain"),
-    "intervals and fits": ("result.py", "conclude"),
-}
-WITHIN = {  # parts of the stages above
-    "closest points": ("surface_residuals.py", "_closest"),
-    "voxels of the model": ("voxelise.py", "voxelise"),
-    "noise model": ("noise_model.py", "fit_noise_model"),
-}
-
-
 def _front_end(sizes: Sizes, seed: int, say: Say) -> Result:
     """Where the time of a whole case goes, from label images in memory to intervals; under a profiler."""
-    scene = _scene(seed, "neo-hookean")
     case = Case(f"speed-{seed}", phantom=Phantom("pelvis", seed), mesh=MeshSettings(sizes.nonlinear))
-    profile = cProfile.Profile()
-    profile.enable()
-    before, after = (segment(image, scene.tissues) for image in (scene.before, scene.after))
-    result = estimate_states(aligned(before, (after,), method="none"), case)
-    profile.disable()
-    known = pstats.Stats(profile)
-    total = known.total_tt  # type: ignore[attr-defined]
-    spent = {name: _cumulative(known, *of) for name, of in (STAGES | WITHIN).items()}
-    say(f"{total:.0f} s for {3 * len(result.space.points)} unknowns")
-    return {
-        "front_end": {
-            "dofs": 3 * len(result.space.points),
-            "total_s": total,
-            "shares": {name: spent[name] / total for name in STAGES},
-            "within": {name: spent[name] / total for name in WITHIN},
-        }
-    }
-
-
-def _cumulative(stats: pstats.Stats, file: str, function: str) -> float:
-    """Seconds in a function and what it calls; raises `KeyError` for one that was never called."""
-    rows = stats.stats.items()  # type: ignore[attr-defined]
-    called = [row[3] for (path, _, name), row in rows if name == function and Path(path).name == file]
-    if not called:
-        raise KeyError(f"{file}: {function} was never called; is it still the stage's name?")
-    return float(sum(called))
+    found = shares_of_stages(_scene(seed, "neo-hookean"), case)
+    say(f"{found['total_s']:.0f} s for {found['dofs']} unknowns")
+    return {"front_end": found}
 
 
 def _solvers(sizes: Sizes, seed: int, say: Say) -> Result:
-    """Direct solvers on one stiffness, each in processes of its own, in turns: medians of seconds, and peak memory."""
-    rows: dict[str, list[dict[str, float | None]]] = {name: [] for name in direct.SOLVERS}
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "stiffness.npz"
-        direct.write_stiffness(path, sizes.solver, seed)
-        for turn in range(sizes.repeats):
-            for name, found in rows.items():
-                if turn == 0 or name != "superlu":
-                    found.append(direct.in_a_process(name, path))
-                    say(json.dumps({"solver": name, **found[-1]}))
-    middle = {name: {key: _median(found, key) for key in found[0]} for name, found in rows.items()}
-    return {"solver_of_rows": middle, "solver_ratio": direct.ratios(middle)}
-
-
-def _median(found: list[dict[str, float | None]], key: str) -> float | None:
-    values = [value for row in found if (value := row[key]) is not None]
-    return float(np.median(values)) if values else None
+    return direct.beside_each_other(sizes.solver, seed, repeats=sizes.repeats, say=say)
 
 
 PART = {

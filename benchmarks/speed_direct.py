@@ -12,9 +12,11 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from memory import peak_mb
@@ -29,14 +31,14 @@ from palpate.mesh import lagrange_space, tetrahedralise
 from palpate.observation import prescribed_motion
 from palpate.phantoms import PelvisOptions, pelvis_anatomy
 
-__all__ = ["SOLVERS", "in_a_process", "ratios", "write_stiffness"]
+__all__ = ["beside_each_other"]
 
 Matrix = sparse.csr_matrix
 Solve = Callable[[np.ndarray], np.ndarray]
 N_RHS = 91
 
 
-def write_stiffness(path: Path, edge_mm: float, seed: int) -> None:
+def _write_stiffness(path: Path, edge_mm: float, seed: int) -> None:
     """The stiffness of a pelvis of quadratic tetrahedra whose wall is held, moduli 4 to 1, mN/mm."""
     anatomy = pelvis_anatomy(PelvisOptions(seed=seed))
     space = lagrange_space(tetrahedralise(anatomy, edge_length_mm=edge_mm), "P2")
@@ -100,13 +102,28 @@ CLOCKS = ("factor", "again", "solve")
 KEYS = ("unknowns", *(f"{name}{unit}" for name in CLOCKS for unit in ("_s", "_cpu_s")), "residual", "peak_mb")
 
 
-def in_a_process(name: str, path: Path) -> dict[str, float | None]:
+def beside_each_other(edge_mm: float, seed: int, *, repeats: int, say: Callable[[str], None]) -> dict[str, Any]:
+    """All on one stiffness, each in processes of its own, in turns: medians of seconds, and peak memory; of JSON."""
+    rows: dict[str, list[dict[str, float | None]]] = {name: [] for name in SOLVERS}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "stiffness.npz"
+        _write_stiffness(path, edge_mm, seed)
+        for turn in range(repeats):
+            for name, found in rows.items():
+                if turn == 0 or name != "superlu":
+                    found.append(_in_a_process(name, path))
+                    say(json.dumps({"solver": name, **found[-1]}))
+    middle = {name: {key: _median(found, key) for key in found[0]} for name, found in rows.items()}
+    return {"solver_of_rows": middle, "solver_ratio": _ratios(middle)}
+
+
+def _in_a_process(name: str, path: Path) -> dict[str, float | None]:
     """What one solver takes, from a new process; null where it is not installed."""
     command = [sys.executable, __file__, name, str(path)]
     return dict(json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout))
 
 
-def ratios(rows: dict[str, dict[str, float | None]]) -> dict[str, object]:
+def _ratios(rows: dict[str, dict[str, float | None]]) -> dict[str, object]:
     """Ours over PARDISO's (factor, 91 solutions, both, memory), and over SuperLU's factor; wall and processor time."""
     found: dict[str, object] = {}
     for name, clock in (("", "_s"), ("_cpu", "_cpu_s")):
@@ -119,6 +136,11 @@ def ratios(rows: dict[str, dict[str, float | None]]) -> dict[str, object]:
     for ours, suffix in (("multifrontal", ""), ("multifrontal-single", "_single")):
         found[f"memory{suffix}"] = _ratio(rows, ours, "pardiso", ["peak_mb"])
     return found
+
+
+def _median(found: list[dict[str, float | None]], key: str) -> float | None:
+    values = [value for row in found if (value := row[key]) is not None]
+    return float(np.median(values)) if values else None
 
 
 def _ratio(rows: dict[str, dict[str, float | None]], ours: str, other: str, keys: list[str]) -> float | None:
