@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from palpate.mechanics.laws.registry import law_parameters
 from palpate.study.case import Domain, DriverMotion, Estimate, Mechanics, MeshSettings
 from palpate.study.case_file import read_case
 
@@ -33,7 +34,9 @@ def test_the_schema_in_the_docs_shows_the_defaults(tmp_path):
     path = tmp_path / "case.toml"
     path.write_text(EXAMPLE)
     case = read_case(path)
-    assert (case.domain, case.mechanics, case.mesh) == (Domain(), Mechanics(), MeshSettings())
+    of_laws = {name: parameter.default for name, parameter in law_parameters().items()}
+    assert case.mechanics == Mechanics(law_parameters=of_laws)
+    assert (case.domain, case.mesh) == (Domain(), MeshSettings())
     assert (case.driver, case.estimate, case.seed) == (DriverMotion(), Estimate(), 0)
     assert (case.tissues[0].poisson_ratio, case.tissues[1].density_kg_m3) == (0.45, 1000.0)
 
