@@ -388,7 +388,7 @@ def _solvers(sizes: Sizes, seed: int, say: Say) -> dict[str, object]:
                     found.append(direct.in_a_process(name, path))
                     say(json.dumps({"solver": name, **found[-1]}))
     middle = {name: {key: _median(found, key) for key in found[0]} for name, found in rows.items()}
-    return {"solver_of_rows": middle, "solver_ratio": direct.ratios(middle)}
+    return {"solvers": middle, "solver_ratio": direct.ratios(middle)}
 
 
 def _median(found: list[dict], key: str) -> float | None:
