@@ -14,6 +14,7 @@ from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.laws.registry import LAWS
 from palpate.mechanics.linear_model import linear_model
 from palpate.mechanics.newton import NewtonSettings
+from palpate.mechanics.solvers.registry import SOLVERS
 from palpate.mesh.space import lagrange_space
 
 MODULI = np.array([3.0, 12.0])
@@ -122,6 +123,19 @@ def test_an_exact_factorisation_changes_the_price_and_not_the_tangent(model):
     exact = equilibrium.refactorised()
     assert exact.tangent_counts.factorisations == 0
     assert np.allclose(exact.tangent(), equilibrium.tangent(), atol=1e-9)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("dilatation", Dilatation)
+def test_no_solver_changes_equilibrium_or_tangent(meshes, solver, dilatation):
+    space, constraint = block(meshes, n=2)
+    found = []
+    for name in ("multifrontal", solver):
+        settings = NewtonSettings(tolerance=1e-11, solver=name)
+        model = finite_strain_model(space, constraint, LAWS["neo-hookean"], dilatation=dilatation, settings=settings)
+        found.append(model.solve(MODULI, np.array([5.0, 2.0])))
+    assert np.allclose(found[1].values, found[0].values, atol=1e-8)
+    assert np.allclose(found[1].tangent(), found[0].tangent(), atol=1e-8)
 
 
 def test_derivatives_along_directions_need_no_factorisation(model):
