@@ -145,13 +145,13 @@ def mistyped(word: str, rng: random.Random) -> str:
 
 def change(tree: dict[str, Any], rng: random.Random) -> None:
     """One change of structure."""
-    container, key = rng.choice(places(tree) or [(tree, "x")])
+    container, key = rng.choice(places(tree) or [(tree, "x")])  # an empty tree has no place yet, and None there
     value = container[key] if isinstance(container, list) else container.get(key)
     kind = rng.choice(("value", "value", "number", "drop", "rename", "copy", "wrap", "add", "swap", "many"))
     if kind == "number" and isinstance(value, int | float):
         small = -1e300 < value < 1e300 and rng.random() < 0.5
         container[key] = value * 10.0 ** rng.randrange(-320, 300) if small else rng.choice(NUMBERS)
-    elif kind == "drop":
+    elif kind == "drop" and value is not None:
         del container[key]
     elif kind == "rename" and isinstance(container, dict):
         container[rng.choice((mistyped(str(key), rng), rng.choice(WORDS)))] = container.pop(key, None) or 1
@@ -162,7 +162,7 @@ def change(tree: dict[str, Any], rng: random.Random) -> None:
         container[key] = rng.choice(([value], {str(key): value}, [[value]], [value, copy.deepcopy(value)]))
     elif kind == "add" and isinstance(value, dict):
         value[rng.choice(WORDS)] = random_value(rng)
-    elif kind == "swap":
+    elif kind == "swap" and value is not None:
         target, other = rng.choice(places(tree) or [(tree, "x")])
         container[key], target[other] = copy.deepcopy(target[other]), copy.deepcopy(container[key])
     elif kind == "many" and isinstance(value, dict) and rng.random() < 0.1:
