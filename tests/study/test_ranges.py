@@ -13,6 +13,7 @@ from palpate.errors import ConfigurationError
 from palpate.images.named_labels import MAX_LABEL
 from palpate.study.case import Case, CaseTissue
 from palpate.study.case_file import read_case
+from palpate.study.schema import Rule, rule
 
 PAGE = Path(__file__).parents[2] / "docs" / "case-file.md"
 CASE = """
@@ -42,7 +43,9 @@ def numbers(kind: type, where: str = ""):
         name = {CaseTissue: ".*"}.get(tables[0], "") if tables else ""
         for table in dict.fromkeys(tables):
             yield from numbers(table, f"{where}{item.name}{name}.")
-        if {int, float} & set(flat) and item.name != "label":
+        for key, between in item.metadata.get("rule", Rule()).collects.items():
+            yield f"{where}{key}", dataclasses.field(metadata=rule(between=between), default=between[0])
+        if {int, float} & set(flat) and item.name not in ("label", "law_parameters"):
             yield f"{where}{item.name}", item
 
 

@@ -53,7 +53,7 @@ def test_the_share_is_that_of_the_volume(space):
 def test_the_image_that_strains_most_is_named(space):
     motions = [stretched(space, amount, share) for amount, share in ((0.2, 0.5), (0.2, 1.0), (0.0, 1.0))]
     (remark,) = linear_strain_warnings(
-        "linear", (space, motions[:1]), (space, motions[1:]), images=["one", "two", "three"]
+        LAWS["linear"], (space, motions[:1]), (space, motions[1:]), images=["one", "two", "three"]
     )
     assert remark.message.startswith("two:")
 

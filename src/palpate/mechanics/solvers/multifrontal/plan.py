@@ -65,7 +65,7 @@ class Plan:
 
 
 def panel_of(factor: NDArray[Any], front: Front) -> NDArray[Any]:
-    """The factor's columns (size, width) of a front, in Fortran's order."""
+    """The factor's columns (n_rows, n_columns) of a front, in Fortran's order; factor (n,): all fronts' entries."""
     return factor[front.panel : front.panel + front.size * front.width].reshape(front.width, front.size).T
 
 
@@ -77,7 +77,10 @@ def _block_bounds(below: int) -> list[tuple[int, int]]:
 
 
 def blocks_of(memory: NDArray[Any], front: Front) -> list[tuple[int, int, NDArray[Any]]]:
-    """First and last column of each block of a front's contribution, and the block, rows from the first column on."""
+    """First and last column of each block of a front's contribution, and the block (n_rows, n_columns) in `memory`.
+
+    Its rows begin at the first column. memory (n,): where contributions lie.
+    """
     begin, m, found = front.contribution, len(front.rows), []
     for low, high in _block_bounds(m):
         size = (m - low) * (high - low)

@@ -24,7 +24,10 @@ class Step:
 
 
 def elimination_steps(parent: Integers, work: NDArray[np.float64], threads: int) -> tuple[Step, ...]:
-    """Subtrees small enough for one of several threads, each as soon as it is its turn, and the fronts above them."""
+    """Subtrees small enough for one of several threads, each as soon as it is its turn, and the fronts above them.
+
+    parent (n,): each front's, -1 for a root; work (n,): operations of each front.
+    """
     n = len(parent)
     if threads == 1:
         return (Step((range(n),), ()),)
