@@ -21,7 +21,7 @@ import nibabel
 import numpy as np
 
 from palpate.errors import NotConverged
-from palpate.report.case_report import write_failure_report
+from palpate.report import write_failure_report
 from palpate.study import failure_document, read_case, recover, strange_files, write_json
 
 PALPATE = str(Path(sys.executable).with_name("palpate"))

@@ -41,8 +41,7 @@ from palpate.inversion import (
     sample_posterior,
     sandwich_covariance,
 )
-from palpate.mechanics import linear_model, outer_constraint
-from palpate.mechanics.solvers.registry import expected_of_size
+from palpate.mechanics import expected_of_size, linear_model, outer_constraint
 from palpate.mesh import lagrange_space, tetrahedralise
 from palpate.observation import SEGMENTATION_NOISE, prescribed_motion
 from palpate.phantoms import PelvisOptions, Scene, pelvis, pelvis_anatomy

@@ -24,9 +24,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from palpate.mechanics import SOLVERS as OURS
-from palpate.mechanics import linear_model, outer_constraint, weighted_sum
-from palpate.mechanics.solvers.contract import Hints
-from palpate.mechanics.solvers.pattern import nested_dissection
+from palpate.mechanics import Hints, linear_model, nested_dissection, outer_constraint, weighted_sum
 from palpate.mesh import lagrange_space, tetrahedralise
 from palpate.observation import prescribed_motion
 from palpate.phantoms import PelvisOptions, pelvis_anatomy

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import signal
 from itertools import permutations
 from pathlib import Path
 
@@ -22,6 +23,11 @@ from palpate.study.result import CaseResult, MeshSummary, Provenance
 
 EDGE = 4.0
 CELLS = 10
+
+# The command line leaves alone what its process was told to ignore (by nohup, or a shell's background), and so do its
+# children: the tests of interrupts begin as from a terminal, however they were started.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 def tissue_at(points: np.ndarray) -> np.ndarray:

@@ -18,7 +18,9 @@ from palpate.mechanics.linear_model import LinearModel, LinearSystem, linear_mod
 from palpate.mechanics.linearised import LinearisedSystem
 from palpate.mechanics.loads import DeadLoad, boundary_named, pressure, traction
 from palpate.mechanics.newton import NewtonSettings
-from palpate.mechanics.solvers.registry import SOLVERS, factorise
+from palpate.mechanics.solvers.contract import Hints
+from palpate.mechanics.solvers.pattern import nested_dissection
+from palpate.mechanics.solvers.registry import SOLVERS, expected_of_size, factorise
 from palpate.mechanics.stiffness import lame_parameters
 
 __all__ = [
@@ -31,6 +33,7 @@ __all__ = [
     "ElementChoice",
     "FiniteStrainModel",
     "ForwardModel",
+    "Hints",
     "Law",
     "LinearModel",
     "LinearSystem",
@@ -40,11 +43,13 @@ __all__ = [
     "boundary_named",
     "choose_element",
     "equilibrium",
+    "expected_of_size",
     "factorise",
     "finite_strain_model",
     "lame_parameters",
     "law_named",
     "linear_model",
+    "nested_dissection",
     "outer_constraint",
     "pressure",
     "quadrature",
