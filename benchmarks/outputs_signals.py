@@ -34,7 +34,6 @@ import palpate.cli
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 SHARES = {"estimate": 1, "mesh": 3, "report": 3, "init": 6}  # a quick command is run more often
 MOMENTS = ("any", "staging", "renames")
-FIRST_LINE = 0.25  # s; before its first line Palpate has no say in what a signal does
 PATIENCE = 300.0
 WRITING = 0.5  # s of an estimate whose numbers and page are known
 
@@ -66,10 +65,8 @@ def attempt(bench: Bench, trial: Trial, seconds: dict[str, float]) -> dict[str, 
     """Run it; what was seen, with the key `failure` where a law is broken."""
     folder = bench.root / "trials" / f"{trial.number}"
     shutil.copytree(bench.old(trial.command), folder)
-    began = time.monotonic()
     process = Run(bench.arguments(trial.command, folder), writes_only=trial.moment != "any")
     wait_for(trial, process, folder, seconds[trial.command])
-    sent = time.monotonic() - began
     running = process.code is None
     if running:
         process.send(trial.signal)
@@ -77,7 +74,7 @@ def attempt(bench: Bench, trial: Trial, seconds: dict[str, float]) -> dict[str, 
     seen = {"signal": trial.signal.name, "command": trial.command, "moment": trial.moment}
     seen["journal"] = str(recovered(folder)) if trial.signal is signal.SIGKILL else "False"
     seen["state"] = state(bench, trial.command, folder)
-    seen["end"] = end_of(code, err, sent, running=running)
+    seen["end"] = end_of(trial, code, err, running=running)
     flaw = flaw_of(trial, seen, out, err, code)
     if not flaw and seen["state"] == "old":
         again, _, err = Run(bench.arguments(trial.command, folder), writes_only=trial.moment != "any").end()
@@ -152,14 +149,17 @@ def wait_for(trial: Trial, process: Run, folder: Path, seconds: float) -> None:
     time.sleep(trial.share**2 * longest if trial.moment == "staging" else trial.share * 0.002)
 
 
-def end_of(code: int, err: str, sent: float, *, running: bool) -> str:
+def end_of(trial: Trial, code: int, err: str, *, running: bool) -> str:
     """How the run ended, in a word."""
     if not running or code == 0:
         return "finished"
     if code == 130:
         return "interrupted, new files" if "taken their places" in err or "is written" in err else "interrupted"
-    started = "palpate/cli" in err or sent > FIRST_LINE
-    return "killed" if code == -signal.SIGKILL else f"code {code}" if started else "before the first line"
+    if code == -signal.SIGKILL:
+        return "killed"
+    # From its first line on Palpate blocks the signals, then answers them: none can end it as the system does.
+    as_any_program = code == -trial.signal and (not err or trial.signal is signal.SIGINT) and ", in main" not in err
+    return "before the first line" if as_any_program else f"code {code}"
 
 
 def flaw_of(trial: Trial, seen: dict[str, str], out: str, err: str, code: int) -> str:
