@@ -126,9 +126,18 @@ def contents(folder: Path) -> dict[str, str]:
     return found
 
 
-def state(bench: Bench, command: str, folder: Path, *, left_out: tuple[str, ...] = ()) -> str:
-    """`old`, `new`, or `mixed`; `left_out`: files of an undisturbed run that the run said it had to leave out."""
+def state(
+    bench: Bench, command: str, folder: Path, *, left_out: tuple[str, ...] = (), others: dict[str, str] | None = None
+) -> str:
+    """`old`, `new`, or `mixed`.
+
+    `left_out`: files of an undisturbed run that the run said it had to leave out; `others`: what lay in the folder and
+    is no run's, which a run leaves as it was.
+    """
     here = contents(folder)
+    strange = (others or {}).keys() - contents(bench.old(command)).keys() - contents(bench.new(command)).keys()
+    if any(here.pop(name, None) != (others or {})[name] for name in strange):
+        return "mixed"
     if here == contents(bench.old(command)):
         return "old"
     wanted = {name: digest for name, digest in contents(bench.new(command)).items() if name not in left_out}

@@ -107,8 +107,10 @@ def attempt(bench: Bench, command: str, folder: Path, outside: Path) -> tuple[in
         flaw = "not one sentence"
     elif code and is_folder(folder) and contents(folder) != there:
         flaw = "a refused run has changed the folder"
-    elif code == 0 and (set(leftovers(folder)) - {".palpate.lock"} or state(bench, command, folder) == "mixed"):
-        flaw = f"the folder is {state(bench, command, folder)}"
+    elif code == 0 and set(leftovers(folder)) - {".palpate.lock"}:
+        flaw = f"left behind: {leftovers(folder)}"
+    elif code == 0 and state(bench, command, folder, others=there) != "new":
+        flaw = f"the folder is {state(bench, command, folder, others=there)}"
     return code, text, flaw
 
 
