@@ -33,7 +33,7 @@ THREADS = """
 import sys
 from palpate.cli import entry, main
 from palpate.cli.outcome import Outcome
-def run(_):
+def run(*_):
     import pathlib, signal, palpate.study.run
     from palpate.mesh.interrupts import _others_take_none
     threads = len(list(pathlib.Path("/proc/self/task").iterdir()))

@@ -147,6 +147,23 @@ def test_a_signal_among_the_renames_finds_all_done_and_says_so(estimate, out, mo
     assert (out / "report.html").read_text() == "the page of bert"
 
 
+def test_a_signal_after_the_renames_says_that_they_are_done(estimate, out, monkeypatch, capsys):
+    assert estimate("anna", "--quiet") == 0
+    unlink = Path.unlink
+
+    def interrupted(path, *options, **named):
+        if path.name == ".palpate.lock":  # the last thing that a run does in its folder
+            os.kill(os.getpid(), signal.SIGTERM)
+        return unlink(path, *options, **named)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", interrupted)
+        assert estimate("bert", "--quiet") == 130
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "interrupted after these files had taken their places: " in line
+    assert result(out)["id"] == "bert"
+
+
 def test_a_signal_before_the_renames_finds_none_done_and_says_so(estimate, out, capsys):
     assert estimate("anna", "--quiet") == 0
     before = contents(out)

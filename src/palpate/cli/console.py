@@ -15,13 +15,13 @@ import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 from typing import TextIO
 
-from palpate.errors import ConfigurationError, InputDataError, PalpateError
+from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.named_labels import printable
 from palpate.study.journal import recover
 from palpate.study.lock import folder_lock, own_file
@@ -30,7 +30,6 @@ from palpate.study.outputs import OutputFolder, make_folder
 __all__ = [
     "LOGGER",
     "Console",
-    "Interrupted",
     "close_log",
     "close_streams",
     "interruptible",
@@ -42,12 +41,6 @@ __all__ = [
 LOGGER = logging.getLogger("palpate")
 LOGGER.addHandler(logging.NullHandler())  # before there is a log file, messages reach the user as sentences only
 UNLOCKED = "the file system of %s knows no locks: a second run in the folder would not be noticed, so start none there"
-
-
-class Interrupted(PalpateError):  # noqa: N818 - an end that was asked for, no error
-    """The user or the system asked the run to end."""
-
-    exit_code = 130
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,25 +90,20 @@ def _give_up(stream: TextIO) -> None:
 
 
 @contextmanager
-def output_folder(folder: Path, heading: str, *, logs: bool) -> Iterator[OutputFolder]:
-    """Make and hold `folder` and, if it `logs`, write a log there while the block works, `heading` its first line.
+def output_folder(outputs: OutputFolder, heading: str, *, logs: bool) -> Iterator[None]:
+    """Make and hold the folder and, if it `logs`, write a log there while the block works, `heading` its first line.
 
     A case or an input that is refused leaves the folder as it was, log and all: its sentence says everything.
     """
+    folder = outputs.path
     made = _missing(folder)
     make_folder(folder)
     try:
         with folder_lock(folder) as locked:
-            outputs = OutputFolder(folder)
             recover(folder)
-            try:
-                if logs:
-                    with _logged(folder / "log.txt", heading):
-                        yield _warned(outputs, locked=locked)
-                else:
-                    yield _warned(outputs, locked=locked)
-            except KeyboardInterrupt as stop:
-                raise Interrupted(_interrupted(outputs)) from stop
+            with _logged(folder / "log.txt", heading) if logs else nullcontext():
+                _warn_of(folder, locked=locked)
+                yield
     finally:
         for path in made:
             with suppress(OSError):  # not empty: something was written
@@ -130,17 +118,10 @@ def _missing(folder: Path) -> list[Path]:
         return []
 
 
-def _warned(outputs: OutputFolder, *, locked: bool) -> OutputFolder:
+def _warn_of(folder: Path, *, locked: bool) -> None:
     if not locked and sys.platform != "win32":
-        LOGGER.warning(UNLOCKED, outputs.path)
-        tell(f"palpate: warning: {UNLOCKED % outputs.path}", sys.stderr)
-    return outputs
-
-
-def _interrupted(outputs: OutputFolder) -> str:
-    if outputs.written:
-        return f"interrupted after these files had taken their places: {', '.join(outputs.written)}"
-    return "interrupted; files that were already there are as they were; the same command starts anew"
+        LOGGER.warning(UNLOCKED, folder)
+        tell(f"palpate: warning: {UNLOCKED % folder}", sys.stderr)
 
 
 @contextmanager

@@ -11,20 +11,22 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
-from palpate.cli.console import LOGGER, Console, Interrupted, close_log, interruptible, log_is_open, output_folder, tell
+from palpate.cli.console import LOGGER, Console, close_log, interruptible, log_is_open, output_folder, tell
 from palpate.cli.outcome import Outcome, printable_lines
 from palpate.cli.parser import make_parser, version
 from palpate.errors import ConfigurationError, InputDataError, PalpateError, ResourceError
+from palpate.study.outputs import OutputFolder
 
 # Heavy layers are imported by the sub-command that needs them, so that `palpate --help` answers at once.
 if TYPE_CHECKING:
     from palpate.study.case import Case
-    from palpate.study.outputs import OutputFolder
 
 __all__ = ["run"]
 
 UNEXPECTED = 1
+INTERRUPTED = 130  # as a shell has it
 UNTOUCHED = "interrupted; files that were already there are as they were; the same command starts anew"
+REPLACED = "interrupted after these files had taken their places: {}"
 SPEAKING = "interrupted while its outcome was printed; what it had to write is written"
 
 
@@ -34,29 +36,32 @@ def run(argv: Sequence[str] | None, signals: Sequence[signal.Signals], mask: Ite
     signals: those that interrupt it, blocked now; mask: the signals that stay blocked while it works.
     """
     arguments = make_parser().parse_args(argv)
+    written: list[str] = []  # what has taken its place, which a signal cannot undo wherever in the run it comes
     outcome = None
     try:
         with interruptible(signals, mask) as came:
-            outcome = _outcome(arguments, came)
+            outcome = _outcome(arguments, came, written)
             return _speak(outcome, arguments)
     except KeyboardInterrupt:
-        if outcome is None or outcome.exit_code != Interrupted.exit_code:
-            tell(f"palpate: {UNTOUCHED if outcome is None else SPEAKING}", sys.stderr)
-        return Interrupted.exit_code
+        if outcome is None or outcome.exit_code != INTERRUPTED:
+            tell(f"palpate: {_interrupted(written) if outcome is None else SPEAKING}", sys.stderr)
+        return INTERRUPTED
 
 
-def _outcome(arguments: argparse.Namespace, came: Sequence[int]) -> Outcome:
+def _outcome(arguments: argparse.Namespace, came: Sequence[int], written: list[str]) -> Outcome:
     """What the command has to say, errors among it; `came`: the signals so far. Its log is closed."""
     try:
-        return _run(arguments)
-    except Interrupted as error:
-        return _failure("Interrupted", str(error), error.exit_code)
+        return _run(arguments, written)
     except Exception as error:
-        return _failure("Interrupted", UNTOUCHED, Interrupted.exit_code) if came else _failed(error, arguments)
+        return _failure("Interrupted", _interrupted(written), INTERRUPTED) if came else _failed(error, arguments)
     except KeyboardInterrupt:
-        return _failure("Interrupted", UNTOUCHED, Interrupted.exit_code)
+        return _failure("Interrupted", _interrupted(written), INTERRUPTED)
     finally:
         close_log()
+
+
+def _interrupted(written: Sequence[str]) -> str:
+    return REPLACED.format(", ".join(written)) if written else UNTOUCHED
 
 
 def _failed(error: Exception, arguments: argparse.Namespace) -> Outcome:
@@ -72,8 +77,11 @@ def _failed(error: Exception, arguments: argparse.Namespace) -> Outcome:
     return _failure(type(error).__name__, sentence, UNEXPECTED)
 
 
-def _run(arguments: argparse.Namespace) -> Outcome:
-    """Read the case, if the command has one, before anything is written; then work, with a log if it writes."""
+def _run(arguments: argparse.Namespace, written: list[str]) -> Outcome:
+    """Read the case, if the command has one, before anything is written; then work, with a log if it writes.
+
+    `written` gets the names of the files that take their places.
+    """
     command: Callable[..., Outcome] = arguments.command
     case = _case(arguments)
     progress = Console(arguments.quiet).progress
@@ -82,7 +90,8 @@ def _run(arguments: argparse.Namespace) -> Outcome:
     if not arguments.makes_folder and not arguments.output.is_dir():
         raise InputDataError(f"there is no folder {arguments.output}; name the output folder of an estimate")
     heading = f"palpate {version()}: {' '.join(sys.argv[1:])}"
-    with output_folder(arguments.output, heading, logs=arguments.logs) as outputs:
+    outputs = OutputFolder(arguments.output, written)
+    with output_folder(outputs, heading, logs=arguments.logs):
         outputs.require(arguments.targets)
         _spare_inputs(arguments, case, outputs)
         return command(arguments, case, outputs, progress)
