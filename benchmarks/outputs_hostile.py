@@ -153,9 +153,9 @@ def lay_in(place: Path, lay: Callable[[Path], object]) -> None:
         shutil.rmtree(place)
     elif os.path.lexists(place):
         place.unlink()
-    if not place.parent.exists():
+    if not os.path.lexists(place.parent):
         place.parent.mkdir()
-    if place.parent.is_dir():
+    if place.parent.is_dir() and not place.parent.is_symlink():
         lay(place)
 
 
