@@ -1,9 +1,11 @@
 """A later state for the real pelvis: simulated, for the scan that Palpate ships has one state only.
 
 The labels of a real male pelvis CT (3 mm voxels; Wasserthal et al. 2023, doi 10.1148/ryai.230024) become a mesh that is
-finer than the one that inverts it; the rectum is filled, linear elasticity moves the rest under known moduli, and both
-states of that mesh are turned into label images of 1 mm voxels. Run `python -m palpate.experiments.simulated_pelvis`
-to make the two images again.
+finer than the one that inverts it; the rectum is filled, a neo-Hookean body follows under known moduli, and both states
+of that mesh are turned into label images of 1 mm voxels. The scan ends inside the prostate: below its last slice the
+prostate is completed by the mirror image of its upper part, the rest by the last slice. Surfaces are smoothed more than
+the scan's voxels ask for, as else its stairs of 3 mm would stand in both images. Run
+`python -m palpate.experiments.simulated_pelvis` to make the two images again.
 """
 
 from __future__ import annotations
@@ -24,7 +26,6 @@ from palpate.images import (
     read_label_image,
     read_label_table,
     segment,
-    smoothing_width,
     write_label_image,
 )
 from palpate.mesh import (
@@ -43,8 +44,12 @@ from palpate.study import Mechanics, filled
 __all__ = ["DATA", "TISSUES", "SimulatedPelvis", "simulate_pelvis"]
 
 DATA = Path(__file__).parent / "data"
-FILLING_MM = 6.5
+FILLING_MM = 8.0
+LAW = "neo-hookean"
 MARGIN_MM = 12.0
+PROSTATE, REST = 1, 20  # labels of the scan
+BELOW = 7  # slices that are added below the scan
+SMOOTHING_MM = 4.0  # of the truth's surfaces: no stairs of the scan's 3 mm are left that run along every later grid
 TRUTH_EDGE_MM = 5.0
 VOXEL_MM = 1.0
 
@@ -52,11 +57,7 @@ TISSUES = (
     Tissue("prostate", Role.ESTIMATE, (1,), 0.45, 30.0),
     Tissue("bladder", Role.ESTIMATE, (2,), 0.45, 20.0),
     Tissue("rectum", Role.DRIVER, (3,)),
-    Tissue("sacrum", Role.RIGID, (6,)),
-    Tissue("right hip", Role.RIGID, (7,)),
-    Tissue("left hip", Role.RIGID, (8,)),
-    Tissue("right femur", Role.RIGID, (9,)),
-    Tissue("left femur", Role.RIGID, (10,)),
+    Tissue("bones", Role.RIGID, (6, 7, 8, 9, 10)),
     Tissue("outside", Role.VOID, (0,)),
     Tissue("surroundings", Role.KNOWN, (), 0.45, 10.0),
 )
@@ -73,24 +74,36 @@ class SimulatedPelvis:
 
 
 def simulate_pelvis(progress: Callable[[str], None]) -> SimulatedPelvis:
-    """Make the truth and its two images; about two minutes."""
+    """Make the truth and its two images; some minutes."""
     names = read_label_table(DATA / "labels.json")
-    scan = segment(read_label_image(DATA / "labels.nii.gz", names=names), TISSUES)
+    scan = segment(_completed(read_label_image(DATA / "labels.nii.gz", names=names)), TISSUES)
     box = _field(scan)
-    anatomy = anatomy_of(scan, box=box, smoothing_mm=smoothing_width(scan.grid))
+    anatomy = anatomy_of(scan, box=box, smoothing_mm=SMOOTHING_MM)
     progress(f"meshing {np.round(box.lengths).astype(int).tolist()} mm at {TRUTH_EDGE_MM:g} mm")
     mesh = tetrahedralise(anatomy, edge_length_mm=TRUTH_EDGE_MM)
     check_mesh(mesh, anatomy)
     space = lagrange_space(mesh, "P2")
     progress(f"solving {3 * len(space.points)} unknowns")
-    displacement = filled(
-        space, scan, filling_mm=FILLING_MM, outer="fixed", mechanics=Mechanics(law="linear", element="P2")
-    )
+    mechanics = Mechanics(law=LAW, element="P2")
+    displacement = filled(space, scan, filling_mm=FILLING_MM, outer="fixed", mechanics=mechanics)
     progress("turning both states into voxels")
     grid = _grid(box)
     still = np.zeros_like(displacement)
     before, after = (_labelled(imaged(space, motion, grid)) for motion in (still, displacement))
     return SimulatedPelvis(space, displacement, before, after)
+
+
+def _completed(scan: LabelImage) -> LabelImage:
+    """The scan with slices below it: the prostate's are those above its widest one, mirrored, the rest's the last."""
+    prostate = scan.labels == PROSTATE
+    widest = int(np.argmax(prostate.sum(axis=(0, 1))))
+    below = np.where(prostate[:, :, :1], REST, scan.labels[:, :, :1]).repeat(BELOW, axis=2)
+    for depth in range(1, BELOW + 1):
+        below[:, :, BELOW - depth][prostate[:, :, 2 * widest + depth]] = PROSTATE
+    affine = scan.grid.affine.copy()
+    affine[:3, 3] -= BELOW * affine[:3, 2]
+    labels = np.concatenate([below, scan.labels], axis=2)
+    return LabelImage(labels, VoxelGrid((labels.shape[0], labels.shape[1], labels.shape[2]), affine), scan.names)
 
 
 def _field(scan: Segmentation) -> Box:
@@ -111,8 +124,8 @@ def _grid(box: Box) -> VoxelGrid:
 
 
 def _labelled(image: LabelImage) -> LabelImage:
-    """The image with the labels of the scan instead of the tissues' numbers; the rest is 20, as in the scan."""
-    table = np.array([0] + [tissue.labels[0] if tissue.labels else 20 for tissue in TISSUES], dtype=np.int32)
+    """The image with the labels of the scan instead of the tissues' numbers; all bones have the first one's."""
+    table = np.array([0] + [tissue.labels[0] if tissue.labels else REST for tissue in TISSUES], dtype=np.int32)
     names = {int(table[i + 1]): tissue.name for i, tissue in enumerate(TISSUES)}
     return LabelImage(table[image.labels], image.grid, names)
 
