@@ -114,6 +114,17 @@ def test_a_step_that_a_bound_cuts_short_is_judged_by_what_is_left_of_it(toys):
     assert found.evaluations == 2
 
 
+def test_a_step_that_a_bound_bends_uphill_is_not_taken(toys):
+    """The step leads out of the bound, though the slope there leads in: what is left of it promises a larger value."""
+    objective = toys.Quadratic(np.array([[1.0, 0.95], [0.95, 1.0]]), np.array([0.5, -0.5]), height=1e-6)
+    bounds = Bounds(np.full(2, -5.0), np.array([0.0, 5.0]))
+    found = gauss_newton(objective, np.array([0.0, 0.2]), bounds=bounds, tolerance=1e-8)
+    values = [iterate.value for iterate in found.history]
+    assert np.all(np.diff(values) <= 0.0)
+    assert found.outcome.converged
+    assert found.unknowns == pytest.approx([0.0, -0.025], abs=1e-3)
+
+
 def test_what_lbfgs_is_told_of_a_place_does_not_depend_on_what_it_asked_before(toys, rng, monkeypatch):
     """The places are so near each other that the coefficients of one would pass for those of the other."""
     objective, start = toys.coupled(rng), np.zeros(5)

@@ -161,6 +161,31 @@ def test_a_prior_may_be_of_one_tissue_alone(objective):
     assert parameters.prior_centre[:2].tolist() == [0.5, 0.0]
 
 
+@pytest.mark.parametrize("sd", [0.0, -0.1, np.nan, -np.inf])
+def test_a_prior_without_a_spread_is_refused(sd):
+    with pytest.raises(ConfigurationError, match="'sac'.*positive"):
+        mapping_of(3).with_prior(np.zeros(2), np.array([0.2, sd]))
+
+
+@pytest.mark.parametrize("mean", [np.nan, np.inf])
+def test_the_mean_of_a_prior_must_be_a_number_where_it_counts(mean):
+    with pytest.raises(ConfigurationError, match="'gland'"):
+        mapping_of(3).with_prior(np.array([mean, 0.0]), np.array([0.2, 0.2]))
+    flat = mapping_of(3).with_prior(np.array([mean, 0.0]), np.array([np.inf, 0.2]))
+    assert flat.prior_mean.tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (4, 4), (3,)])
+def test_a_drivers_prior_of_another_size_is_refused_and_not_replaced(shape):
+    with pytest.raises(ConfigurationError, match="driver_precision"):
+        mapping_of(3).with_driver_precision(np.ones(shape))
+
+
+def test_a_prior_of_another_number_of_moduli_is_refused():
+    with pytest.raises(ConfigurationError, match="prior_mean"):
+        mapping_of(3).with_prior(np.zeros(3), np.ones(3))
+
+
 def test_where_images_tell_nothing_the_posterior_is_the_prior(twin, objective):
     """All residuals count so little that the moduli's spread is what was believed before."""
     sd, mean = np.array([0.3, 0.8]), np.array([0.2, -0.1])

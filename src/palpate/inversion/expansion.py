@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
-from palpate.inversion.approximation import Approximation, Place
+from palpate.inversion.approximation import Approximation, Place, corrected_error
 from palpate.mechanics.equilibrium import from_start
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
 from palpate.mechanics.first_order import FirstOrderModel
@@ -74,22 +74,17 @@ class Expansion:
             return there
         return _with_derivatives(there, np.eye(len(at.directions)) if few else at.directions, at.metric)
 
-    def error(self, at: Place) -> float:
-        """Estimated relative error in energy of the displacement: of one correction r^T K^-1 r by its residual r.
+    @property
+    def error_counts(self) -> SolveCounts:
+        """One right-hand side with the factorisation that is there."""
+        return SolveCounts(forward=1)
 
-        K is the stiffness at hand, not the one there. Without a factorisation, infinite but at its own equilibrium.
-        """
+    def error(self, at: Place) -> float:
+        """An estimate (see `corrected_error`); nothing at its own equilibrium."""
         if at.same_as(self.place):
             return 0.0
-        if self.factorisation is None:
-            return np.inf
-        balance = self.equilibrium.model.balance(at.moduli)
         displacement = self.model.solve(at.moduli, at.coefficients).values
-        residual = np.asarray(balance.free.T @ balance.residual(displacement)[0])
-        correction = self.factorisation.solve(residual[:, None])[:, 0]
-        internal = balance.region_forces(displacement, balance.moduli).sum(axis=1)
-        squared = abs(residual @ correction) / max(abs(float(internal @ displacement)), np.finfo(float).tiny)
-        return float(np.sqrt(squared)) if np.isfinite(squared) else np.inf
+        return corrected_error(self.equilibrium, at.moduli, displacement)
 
     def with_constraint(self, constraint: Constraint) -> Expansion:
         """The expansion around the equilibrium that another offset of what is prescribed leads to; `NotConverged`."""

@@ -173,7 +173,8 @@ def _search(
         step, there = trial - unknowns, objective(trial)
         promised = -now.score @ step - 0.5 * step @ now.matrix @ step
         gain = now.value - there.value
-        if gain > 1e-4 * promised or _decrement(there, free) < 0.9 * before:
+        progress = gain > 1e-4 * promised or _decrement(there, free) < 0.9 * before
+        if promised > 0.0 and progress:  # what a bound leaves of a step may lead uphill
             return (trial, there, region.larger() if gain > 0.25 * promised else region), trials
         region = region.smaller()
     return None, SEARCHES

@@ -28,6 +28,7 @@ class ParameterMap:
 
     The prior is normal: theta with `prior_mean` (n_parameters,) and `prior_precision` (n_parameters, n_parameters),
     flat by default, the coefficients with mean 0 and `driver_precision` (n_coefficients, n_coefficients), by default 1.
+    Raises `ConfigurationError` for a prior of another shape.
     """
 
     base: NDArray[np.float64]
@@ -41,12 +42,21 @@ class ParameterMap:
     driver_precision: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __post_init__(self) -> None:
-        n, n_coefficients = len(self.tissues), sum(self.n_modes)
-        if not len(self.prior_mean):
-            object.__setattr__(self, "prior_mean", np.zeros(n))
-            object.__setattr__(self, "prior_precision", np.zeros((n, n)))
-        if len(self.driver_precision) != n_coefficients:
-            object.__setattr__(self, "driver_precision", np.eye(n_coefficients))
+        n = len(self.tissues)
+        defaults = {
+            "prior_mean": np.zeros(n),
+            "prior_precision": np.zeros((n, n)),
+            "driver_precision": np.eye(sum(self.n_modes)),
+        }
+        for name, default in defaults.items():
+            given = getattr(self, name)
+            if not given.size:
+                object.__setattr__(self, name, default)
+            elif given.shape != default.shape:
+                raise ConfigurationError(
+                    f"{name} has the shape {given.shape}; {n} log-moduli and {sum(self.n_modes)} driver coefficients"
+                    f" need {default.shape}"
+                )
 
     @property
     def by_load(self) -> bool:
@@ -113,7 +123,17 @@ class ParameterMap:
         return np.concatenate([self.selection @ rows[: self.n_parameters], rows[self.n_parameters :]])
 
     def with_prior(self, mean: NDArray[np.float64], sd: NDArray[np.float64]) -> ParameterMap:
-        """The same with a normal prior of theta: mean and standard deviation (n_parameters,), inf where it is flat."""
+        """The same with a normal prior of theta: mean and standard deviation (n_parameters,), inf where it is flat.
+
+        Raises `ConfigurationError` unless every sd is positive and every mean that counts is a number.
+        """
+        wrong = ~(sd > 0.0) | (np.isfinite(sd) & ~np.isfinite(mean))
+        if wrong.any():
+            first = int(np.flatnonzero(wrong)[0])
+            raise ConfigurationError(
+                f"the prior of ln E of '{self.tissues[first]}' has the mean {mean[first]} and the standard deviation"
+                f" {sd[first]}; give a number and a positive one (inf: no prior), or hold the modulus as a `known` one"
+            )
         return replace(self, prior_mean=np.where(np.isfinite(sd), mean, 0.0), prior_precision=np.diag(sd**-2.0))
 
     def with_driver_precision(self, precision: NDArray[np.float64]) -> ParameterMap:

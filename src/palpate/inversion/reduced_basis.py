@@ -87,6 +87,11 @@ class ReducedBasis:
         rest = near.solve(loads - near.matrix @ known, TANGENT)
         return replace(_extended(sharper, rest, SolveCounts(tangent=rest.shape[1])), place=at)
 
+    @property
+    def error_counts(self) -> SolveCounts:
+        """One right-hand side with the last factorisation."""
+        return SolveCounts(forward=1)
+
     def error(self, at: Place) -> float:
         """Upper bound of the displacement's relative error in energy (see `LinearSystem.error_bound`)."""
         displacement = self.model.solve(at.moduli, at.coefficients).values

@@ -70,7 +70,7 @@ class PosteriorSamples:
 
 
 def frozen_posterior(objective: Objective, unknowns: NDArray[np.float64]) -> FrozenPosterior:
-    """The posterior with the closest points and weights at `unknowns` (n,); the moduli's own prior is flat.
+    """The posterior with the closest points and weights at `unknowns` (n,), under the objective's own prior of them.
 
     Residuals are point-to-plane, r + n.(u - u_0), as in the Gauss-Newton matrix. Raises `ConfigurationError` for
     models that are not reduced ones.
