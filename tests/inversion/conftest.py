@@ -17,6 +17,12 @@ def twins():
 
 
 @pytest.fixture(scope="session")
+def toys():
+    """The module `toys`: objectives whose minimum is known by hand."""
+    return loaded("inversion_toys", Path(__file__).with_name("toys.py"))
+
+
+@pytest.fixture(scope="session")
 def point_motion():
     """The module `point_motion` of the observations' tests: a second kind of observation."""
     return loaded("point_motion", Path(__file__).parents[1] / "observation" / "point_motion.py")

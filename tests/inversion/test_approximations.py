@@ -15,8 +15,8 @@ from palpate.inversion import Approximation, ExactApproximation, Place, ReducedB
 from palpate.inversion.expansion import Expansion, expansion_near
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_model
-from palpate.mechanics.laws.registry import law_named
 from palpate.mechanics.forward import SolveCounts
+from palpate.mechanics.laws.registry import law_named
 from palpate.mechanics.linear_model import LinearModel, with_constraint
 from palpate.mechanics.solvers.registry import CheckedFactorisation
 

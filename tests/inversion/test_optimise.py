@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.optimize import OptimizeResult
@@ -14,15 +10,6 @@ from palpate.inversion.optimise import FIRST_RADIUS, MAX_RADIUS, Bounds, Outcome
 
 WIDE = Bounds(np.full(2, -5.0), np.full(2, 5.0))
 METHODS = {"gauss-newton": gauss_newton, "lbfgs": lbfgs}
-
-
-@pytest.fixture(scope="module")
-def toys():
-    spec = importlib.util.spec_from_file_location("inversion_toys", Path(__file__).with_name("toys.py"))
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture(params=sorted(METHODS))

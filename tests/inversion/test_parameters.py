@@ -163,7 +163,7 @@ def test_a_prior_may_be_of_one_tissue_alone(objective):
 
 @pytest.mark.parametrize("sd", [0.0, -0.1, np.nan, -np.inf])
 def test_a_prior_without_a_spread_is_refused(sd):
-    with pytest.raises(ConfigurationError, match="'sac'.*positive"):
+    with pytest.raises(ConfigurationError, match=r"'sac'.*positive"):
         mapping_of(3).with_prior(np.zeros(2), np.array([0.2, sd]))
 
 

@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from palpate.errors import EstimationError
 from palpate.inversion import FittedState, LaterState, Objective, ParameterMap, gain, sandwich_covariance
-from palpate.inversion.objective import Evaluation, Linearisation
+from palpate.inversion.objective import Evaluation, Linearisation, deciding_directions
+from palpate.inversion.optimise import Minimum, Outcome, posterior_sd
 from palpate.inversion.uncertainty import grid_position_shifts, hull, imaging_errors, log_interval, verdict
 from palpate.observation.contract import Residuals, Weighting
 from palpate.observation.noise_model import NoiseModel
@@ -44,6 +46,19 @@ def surface(places, normals, jacobian, *, precision, noise, state=0, kind="surfa
     return Linearisation(
         Seen(noise, Weighting(precision, Tukey()), state, kind), state, residuals, columns, jacobian, weights, None
     )
+
+
+def test_what_neither_images_nor_prior_determine_ends_as_an_estimation_that_says_so(toys):
+    """Two log-moduli that only their sum moves."""
+    evaluation = toys.Quadratic(np.ones((2, 2)), np.zeros(2))(np.ones(2))
+    minimum = Minimum(np.ones(2), evaluation, Outcome.CONVERGED, ())
+    for of in (
+        lambda: posterior_sd(minimum, 2),
+        lambda: gain(evaluation, 2),
+        lambda: deciding_directions(ParameterMap(np.ones(2), np.eye(2), ("a", "b"), "c", True, (0,)), evaluation),
+    ):
+        with pytest.raises(EstimationError, match="do not determine"):
+            of()
 
 
 def observed(*lines, n_parameters=2, rests=(0, 1)):

@@ -151,7 +151,7 @@ class ExactApproximation:
         return SolveCounts(forward=1)
 
     def error(self, at: Place) -> float:
-        """Of the linear law a bound (see `LinearSystem.error_bound`), of another an estimate (see `corrected_error`)."""
+        """A bound under the linear law (see `LinearSystem.error_bound`), else an estimate (see `corrected_error`)."""
         if at.same_as(self.place):
             return 0.0
         displacement = self.model.solve(at.moduli, at.coefficients).values

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, optimize
 
-from palpate.inversion.objective import Evaluation, Objective
+from palpate.inversion.objective import Evaluation, Objective, determined
 from palpate.mesh.constraint import Constraint
 
 __all__ = ["learned_precision", "refined_walls"]
@@ -70,7 +70,8 @@ def learned_precision(
     and standard deviations of their own. With the residuals linear around `unknowns` x (n_unknowns,), A = J^T W J and
     b = A x - J^T W r, the log-evidence of P is 1/2 (b^T (A + P)^-1 b - ln det(A + P) + ln det P) up to a constant
     (MacKay 1992, Neural Computation 4, 415-447, section 4). Of kernels whose evidence is as good as equal, those that
-    leave the log-moduli the widest posterior.
+    leave the log-moduli the widest posterior. Raises `EstimationError` where images and prior leave a wall's motion
+    open.
     """
     if not any(state.walls for state in objective.states):
         return None
@@ -81,11 +82,13 @@ def learned_precision(
         own = objective.parameters.unknowns_of(s)[n_parameters:]
         for wall in state.walls:
             places = own[wall.columns]
-            seen = _seen(data + prior, data, pull, places)
-            beliefs = [_most_evident(pair, seen) for pair in product(wall.drifts, wall.swellings)]
-            best = max(belief.evidence for belief in beliefs)
-            alike = [(b.evidence, _with(prior, places, b.covariance)) for b in beliefs if b.evidence > best - ALIKE]
-            prior = max(alike, key=lambda pair: (_width(data + pair[1], n_parameters), pair[0]))[1]
+            with determined():
+                seen = _seen(data + prior, data, pull, places)
+                beliefs = [_most_evident(pair, seen) for pair in product(wall.drifts, wall.swellings)]
+                best = max(belief.evidence for belief in beliefs)
+                alike = [b for b in beliefs if b.evidence > best - ALIKE]
+                priors = [(b.evidence, _with(prior, places, np.linalg.inv(b.covariance))) for b in alike]
+                prior = max(priors, key=lambda pair: (_width(data + pair[1], n_parameters), pair[0]))[1]
     return prior[n_parameters:, n_parameters:]
 
 
@@ -157,12 +160,10 @@ def _most_evident(parts: Sequence[NDArray[np.float64]], seen: _Seen) -> _Belief:
     return _Belief((basis * sum(shares(best.x))) @ basis.T, -float(best.fun))
 
 
-def _with(
-    prior: NDArray[np.float64], places: NDArray[np.int64], covariance: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """The precision of all unknowns (n, n) with that of one wall's coefficients from their covariance."""
+def _with(prior: NDArray[np.float64], places: NDArray[np.int64], precision: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The precision of all unknowns (n, n) with that of one wall's coefficients."""
     changed = prior.copy()
-    changed[np.ix_(places, places)] = np.linalg.inv(covariance)
+    changed[np.ix_(places, places)] = precision
     return changed
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
 from palpate.inversion.approximation import Approximation, Place, corrected_error
+from palpate.inversion.objective import determined
 from palpate.mechanics.equilibrium import from_start
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
 from palpate.mechanics.first_order import FirstOrderModel
@@ -139,7 +140,8 @@ def _with_derivatives(near: Expansion, directions: NDArray[np.float64], metric: 
     """
     before = near.model.derivatives @ directions
     change = near.equilibrium.tangent_along(directions, before) - before
-    share = np.linalg.pinv(directions.T @ metric @ directions, hermitian=True) @ (directions.T @ metric)
+    with determined():
+        share = np.linalg.pinv(directions.T @ metric @ directions, hermitian=True) @ (directions.T @ metric)
     sharper = replace(near.model, derivatives=near.model.derivatives + change @ share)
     spent = near.counts + SolveCounts(tangent=directions.shape[1])
     return replace(near, model=sharper, counts=spent, derivatives_at=near.equilibrium.moduli)

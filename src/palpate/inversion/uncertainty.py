@@ -49,7 +49,7 @@ def gain(evaluation: Evaluation, n_parameters: int) -> tuple[NDArray[np.float64]
 
     G = H^-1 J^T W: a change e of the data moves the estimate by -G e; H is the Gauss-Newton matrix with the prior.
     """
-    rows = np.linalg.solve(evaluation.matrix, np.eye(len(evaluation.matrix))[:, :n_parameters]).T
+    rows = evaluation.covariance_columns(n_parameters).T
     return tuple(rows[:, s.columns] @ (s.precision * s.weights[:, None] * s.jacobian).T for s in evaluation.lines)
 
 
@@ -63,7 +63,7 @@ def sandwich_covariance(objective: Objective, evaluation: Evaluation) -> NDArray
     that move alike do not average it away, opposite ones do.
     """
     n = objective.n_parameters
-    inverse = np.linalg.solve(evaluation.matrix, np.eye(len(evaluation.matrix))[:, :n])
+    inverse = evaluation.covariance_columns(n)
     data = np.zeros((n, n))
     pairs = list(zip(evaluation.lines, gain(evaluation, n), strict=True))
     for kind, noise in objective.noise.items():
