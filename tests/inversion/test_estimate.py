@@ -11,9 +11,7 @@ from palpate.inversion import (
     Bounds,
     FittedState,
     InversionSettings,
-    Observed,
     OuterIterate,
-    conclude,
     estimate,
     fit_driver,
     gauss_newton,
@@ -22,6 +20,7 @@ from palpate.inversion import (
     sandwich_covariance,
 )
 from palpate.observation.noise_model import NoiseModel
+from palpate.study.estimation import Observed, conclude
 
 SHARP = NoiseModel(np.array([1e-6]), np.array([3.0]))
 

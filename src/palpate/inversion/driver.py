@@ -87,7 +87,7 @@ def learned_precision(
                 beliefs = [_most_evident(pair, seen) for pair in product(wall.drifts, wall.swellings)]
                 best = max(belief.evidence for belief in beliefs)
                 alike = [b for b in beliefs if b.evidence > best - ALIKE]
-                priors = [(b.evidence, _with(prior, places, np.linalg.inv(b.covariance))) for b in alike]
+                priors = [(b.evidence, _with(prior, places, np.asarray(np.linalg.inv(b.covariance)))) for b in alike]
                 prior = max(priors, key=lambda pair: (_width(data + pair[1], n_parameters), pair[0]))[1]
     return prior[n_parameters:, n_parameters:]
 

@@ -10,20 +10,10 @@ import numpy as np
 
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role
-from palpate.inversion import (
-    Bounds,
-    Estimation,
-    FittedState,
-    Inversion,
-    InversionSettings,
-    Observed,
-    ParameterMap,
-    Remark,
-    conclude,
-    invert,
-)
+from palpate.inversion import Bounds, FittedState, Inversion, InversionSettings, ParameterMap, invert
 from palpate.study.body import Body, ImagedStates, joint_problem, make_body
 from palpate.study.case import Case
+from palpate.study.estimation import Estimation, Observed, Remark, conclude
 from palpate.study.plausibility import estimate_warnings, unit_warnings
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.read import read_pairs, read_states

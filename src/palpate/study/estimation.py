@@ -1,19 +1,21 @@
-"""What an inversion states: moduli with interval and verdict, every start, the fit of everything observed."""
+"""What is stated of an inversion: moduli with interval and verdict, every start, the fit of everything observed."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inversion.estimate import Inversion, StartRun
-from palpate.inversion.optimise import Iterate, Outcome
-from palpate.inversion.outer_loop import InversionSettings
-from palpate.inversion.uncertainty import (
+from palpate.inversion import (
     FittedState,
     Interval,
+    Inversion,
+    InversionSettings,
+    Iterate,
+    Outcome,
+    StartRun,
     grid_position_shifts,
     hull,
     log_interval,
@@ -117,7 +119,8 @@ class Estimation:
 
     correlation (n, n) of the log-moduli; fits: the tissues of each later image; displacements: (n_points, 3) mm of
     each later image; covariance (n, n) of the log-moduli, grid_covariance (n, n) the part of the voxel grid's place;
-    outer_loop: the steps from the best start's minimum to the estimate, which all starts of that minimum share.
+    outer_loop: the steps from the best start's minimum to the estimate, which all starts of that minimum share;
+    counts: of all starts and minima together; observations: what was compared, in words, by its kind.
     """
 
     status: str
@@ -131,6 +134,7 @@ class Estimation:
     outer_loop: tuple[Iteration, ...] = ()
     remarks: tuple[Remark, ...] = ()
     grid_covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    observations: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def correlation(self) -> NDArray[np.float64]:
@@ -177,6 +181,7 @@ def conclude(
         outer_loop=tuple(_iteration(inversion, iterate) for iterate in minimum.history),
         remarks=(*_remarks(inversion, covariance), *_folds(observed)),
         grid_covariance=grid_part,
+        observations={observation.kind: observation.description for observation in objective.observations},
     )
 
 
@@ -214,20 +219,20 @@ def _reason(inversion: Inversion) -> str:
 def _estimates(
     inversion: Inversion, settings: InversionSettings, covariance: NDArray[np.float64], truth: Mapping[str, float]
 ) -> tuple[ModulusEstimate, ...]:
-    mapping = inversion.objective.parameters
-    theta = inversion.minimum.unknowns[: mapping.n_parameters]
-    bounds = settings.bounds
-    scale = mapping.scale_kpa
-    if not inversion.minimum.converged:
-        why = f"the estimation did not converge: {inversion.minimum.outcome.value}"
-        return tuple(
-            no_estimate(
-                name, absolute=mapping.absolute, relative_to=mapping.relative_to, why=why, truth=truth.get(name)
-            )
-            for name in mapping.tissues
-        )
+    mapping, bounds = inversion.objective.parameters, settings.bounds
+    theta, scale = inversion.minimum.unknowns[: mapping.n_parameters], mapping.scale_kpa
     found = []
     for i, name in enumerate(mapping.tissues):
+        none = no_estimate(
+            name,
+            absolute=mapping.absolute,
+            relative_to=mapping.relative_to,
+            why=f"the estimation did not converge: {inversion.minimum.outcome.value}",
+            truth=truth.get(name),
+        )
+        if not inversion.minimum.converged:
+            found.append(none)
+            continue
         ratio = float(np.exp(theta[i]))
         limits = {"lower": float(np.exp(bounds.lower[i])), "upper": float(np.exp(bounds.upper[i]))}
         sd = float(np.sqrt(covariance[i, i]))
@@ -236,18 +241,14 @@ def _estimates(
         word, why = verdict(interval, at_bound=at_bound, absolute=mapping.absolute)
         low, high = interval
         found.append(
-            ModulusEstimate(
-                tissue=name,
-                unit="kPa" if mapping.absolute else "ratio",
+            replace(
+                none,
                 value=ratio * scale if mapping.absolute else None,
                 interval95=(low and low * scale, high and high * scale) if mapping.absolute else None,
-                interval_kind="linearised",
-                relative_to=mapping.relative_to,
                 ratio=None if mapping.by_load else ratio,
                 ratio_interval95=None if mapping.by_load else interval,
                 verdict=word,
                 why=why,
-                truth=truth.get(name),
             )
         )
     return tuple(found)

@@ -10,10 +10,8 @@ import pytest
 from palpate.inversion import (
     FittedState,
     Inversion,
-    Observed,
     Outcome,
     OuterIterate,
-    conclude,
     gauss_newton,
     invert,
     sandwich_covariance,
@@ -22,6 +20,7 @@ from palpate.inversion.estimate import Candidate
 from palpate.inversion.outer_loop import Convergence
 from palpate.mechanics.forward import SolveCounts
 from palpate.observation.noise_model import NoiseModel
+from palpate.study.estimation import Observed, conclude
 
 NOISE = NoiseModel(np.array([0.03**2]), np.array([3.0]))
 
