@@ -55,7 +55,7 @@ def test_what_neither_images_nor_prior_determine_ends_as_an_estimation_that_says
     for of in (
         lambda: posterior_sd(minimum, 2),
         lambda: gain(evaluation, 2),
-        lambda: deciding_directions(ParameterMap(np.ones(2), np.eye(2), ("a", "b"), "c", True, (0,)), evaluation),
+        lambda: deciding_directions(evaluation, 2),
     ):
         with pytest.raises(EstimationError, match="do not determine"):
             of()

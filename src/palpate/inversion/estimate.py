@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.errors import EstimationError
+from palpate.errors import ConfigurationError, EstimationError
 from palpate.inversion.driver import learned_precision
 from palpate.inversion.expansion import Expansion, expansion_near
 from palpate.inversion.later_state import InverseProblem, LaterState
@@ -103,9 +103,15 @@ def invert(
 
     States that bring an approximation are estimated on it; for the others a reduced basis is made at the middle start
     and extended where the estimate goes. rule: when the linear estimate ends; None: at its full accuracy, or when it is
-    near where another law follows. Raises `EstimationError`s of solving; an estimate that did not converge says so in
+    near where another law follows. Raises `ConfigurationError` for an open Poisson's ratio with another law,
+    `EstimationError`s of solving; an estimate that did not converge says so in
     its minimum's outcome.
     """
+    if problem.finite_strain and problem.parameters.poisson:
+        raise ConfigurationError(
+            "a Poisson's ratio can be sought under the linear law only: the finite-strain models hold those of the"
+            " tissues; seek none, or leave out the states' `finite_strain` models (`InverseProblem.linear`)"
+        )
     middle = np.asarray(np.median(np.stack(settings.starts), axis=0))
     states = problem.states
     if any(state.approximation is None for state in states):
@@ -148,8 +154,9 @@ def _with_reduced_bases(
     objective = with_first_noise(Objective(problem.states, parameters).under(bases))
     still = np.concatenate([middle, np.zeros(sum(parameters.n_modes))])
     fitted = fit_coefficients(objective.rematched(still), middle, bounds=settings.bounds)
+    by_theta = parameters.derivatives(middle)
     triples = zip(problem.states, bases, parameters.coefficients(fitted.unknowns), strict=True)
-    return tuple(s.with_approximation(b.with_modulus_series(q, parameters.selection)) for s, b, q in triples)
+    return tuple(s.with_approximation(b.with_modulus_series(q, by_theta)) for s, b, q in triples)
 
 
 def _linear(

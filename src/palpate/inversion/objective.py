@@ -124,10 +124,12 @@ class Objective:
         moduli, coefficients = mapping.moduli(unknowns), mapping.coefficients(unknowns)
         if evaluation is None:
             return [Place(moduli, q) for q in coefficients]
-        directions = deciding_directions(mapping, evaluation)
-        metrics = [mapping.metric_of(s, evaluation.matrix) for s in range(len(coefficients))]
-        triples = zip(coefficients, directions, metrics, strict=True)
-        return [Place(moduli, q, along, metric, near) for q, along, metric in triples]
+        directions, places = deciding_directions(evaluation, mapping.n_parameters), []
+        for s, q in enumerate(coefficients):
+            own, chain = mapping.unknowns_of(s), mapping.chain(s, unknowns)
+            metric = chain @ evaluation.matrix[np.ix_(own, own)] @ chain.T
+            places.append(Place(moduli, q, chain @ directions[own], metric, near))
+        return places
 
     def under(self, approximations: Sequence[Approximation]) -> Objective:
         """The same observations and weights with other approximations, one a state."""
@@ -173,7 +175,7 @@ class Objective:
             seen = mapped(lambda of: (of[0], of[0].residuals(of[1])), self._seen(s, solution.values))
             value += sum(_misfit(*of) for of in seen)
             by_region = solution.adjoint(np.concatenate([_pull(*of) for of in seen]))[None]
-            gradient[self.parameters.unknowns_of(s)] += self.parameters.by_unknowns(by_region)[0]
+            gradient[self.parameters.unknowns_of(s)] += self.parameters.by_unknowns(by_region, unknowns)[0]
         return value, gradient
 
     def rematched(self, unknowns: NDArray[np.float64]) -> Objective:
@@ -205,7 +207,7 @@ class Objective:
 
     def _linearised(self, s: int, unknowns: NDArray[np.float64]) -> list[Linearisation]:
         state, solution = self.states[s], self._equilibrium(s, unknowns)
-        values, tangent = solution.values, self.parameters.by_unknowns(solution.tangent())
+        values, tangent = solution.values, self.parameters.by_unknowns(solution.tangent(), unknowns)
         columns = self.parameters.unknowns_of(s)
 
         def line(of: tuple[slice, Observation]) -> Linearisation:
@@ -220,17 +222,16 @@ class Objective:
         return mapped(line, zip(state.slices, state.observations, strict=True))
 
 
-def deciding_directions(parameters: ParameterMap, evaluation: Evaluation) -> list[NDArray[np.float64]]:
-    """Directions (n_regions + n_modes, 2 n_parameters) of each state's (ln E, q) that decide the moduli, dimensionless.
+def deciding_directions(evaluation: Evaluation, n_parameters: int) -> NDArray[np.float64]:
+    """Directions (n_unknowns, 2 n_parameters) of the unknowns that decide the parameters theta, dimensionless.
 
-    First the unit vectors e_i of the log-moduli, then h_i = H^-1 e_i with the Gauss-Newton matrix H. Where the
+    First the unit vectors e_i of the parameters, then h_i = H^-1 e_i with the Gauss-Newton matrix H. Where the
     derivatives J h_i of the residuals are exact, so are to first order in an error of the other columns of J the
-    moduli's part of the step, e_i^T H^-1 J^T W r = (J h_i)^T W r + ..., their gain (J h_i)^T W and their variance
+    parameters' part of the step, e_i^T H^-1 J^T W r = (J h_i)^T W r + ..., their gain (J h_i)^T W and their variance
     e_i^T H^-1 e_i, whose variation is -2 (dJ h_i)^T W J h_i.
     """
-    unit = np.eye(len(evaluation.matrix))[:, : parameters.n_parameters]
-    directions = np.concatenate([unit, evaluation.covariance_columns(parameters.n_parameters)], axis=1)
-    return [parameters.directions_of(s, directions) for s in range(len(parameters.n_modes))]
+    unit = np.eye(len(evaluation.matrix))[:, :n_parameters]
+    return np.concatenate([unit, evaluation.covariance_columns(n_parameters)], axis=1)
 
 
 def _misfit(observation: Observation, residuals: Residuals) -> float:

@@ -27,7 +27,6 @@ __all__ = [
     "OuterIterate",
     "StopRule",
     "minimised",
-    "ratios_in_words",
     "run_outer_loop",
     "updated",
 ]
@@ -150,7 +149,7 @@ def run_outer_loop(
     now, refinements = updated(OuterIterate(objective, begun), rule), 0
     for number in range(1, rule.iterations + 1):
         line = f"{title}, outer iteration {number}"
-        progress(f"{line}: {ratios_in_words(now)}")
+        progress(f"{line}: {now.objective.parameters.in_words(now.minimum.unknowns)}")
         now = _iteration(now, settings, rule, progress, line)
         if now.stayed:
             return now
@@ -191,15 +190,6 @@ def minimised(
         polish = min(tolerance, POLISH) if np.all(np.isfinite(within)) else tolerance
         return lbfgs(objective, start, bounds=settings.bounds, tolerance=polish)
     return gauss_newton(objective, start, bounds=settings.bounds, tolerance=tolerance, within=within)
-
-
-def ratios_in_words(now: OuterIterate) -> str:
-    """The moduli of an iterate in words, for the progress."""
-    mapping = now.objective.parameters
-    ratios = np.exp(now.minimum.unknowns[: mapping.n_parameters])
-    return ", ".join(
-        f"{name} {ratio:.2f} x {mapping.relative_to}" for name, ratio in zip(mapping.tissues, ratios, strict=True)
-    )
 
 
 def _iteration(
@@ -252,7 +242,7 @@ def _reweighted_minimum(
         change = float(np.max([moved, np.where(rule.tolerance(minimum, n) > rule.floor, widened, 0.0)], initial=0.0))
         if change < forcing:
             break
-        progress(f"{line}, reweighting {number}: {ratios_in_words(OuterIterate(objective, minimum))}")
+        progress(f"{line}, reweighting {number}: {objective.parameters.in_words(minimum.unknowns)}")
     return objective, minimum, change
 
 

@@ -105,20 +105,20 @@ class ReducedBasis:
         moved = replace(self, projection=self.projection.under(model), system=system, place=None)
         return _extended(moved, fresh, SolveCounts(forward=1))
 
-    def with_modulus_series(self, coefficients: NDArray[np.float64], selection: NDArray[np.float64]) -> ReducedBasis:
+    def with_modulus_series(self, coefficients: NDArray[np.float64], by_theta: NDArray[np.float64]) -> ReducedBasis:
         """Add how the displacement at `coefficients` (n_modes,) changes with the parameters, to high order.
 
-        selection (n_regions, n_parameters): the regions that each log-modulus scales. The repeated derivatives
+        by_theta (n_regions, n_parameters): derivatives of the log-moduli by the parameters. The repeated derivatives
         w -> K^-1 (-E_r K_r w) of all orders up to a number span the dependence on the moduli over a wide range, for K
         is affine in them (moment matching; Grimme 1997). One right-hand side each, no factorisation.
         """
-        model, system, regions = self.full_model, self.system, np.flatnonzero(selection.any(axis=1))
-        groups = [np.flatnonzero(column[regions]) for column in selection.T]
+        model, system, regions = self.full_model, self.system, np.flatnonzero(by_theta.any(axis=1))
+        n_parameters = by_theta.shape[1]
         level = self.model.solve(system.moduli, coefficients).values[:, None]
         vectors: list[NDArray[np.float64]] = []
-        while level.shape[1] * len(groups) + sum(v.shape[1] for v in vectors) <= SERIES:
+        while level.shape[1] * n_parameters + sum(v.shape[1] for v in vectors) <= SERIES:
             by_region = system.modulus_responses(level, regions=regions)
-            level = np.concatenate([by_region[group].sum(axis=0) for group in groups], axis=1)
+            level = np.concatenate([np.tensordot(column, by_region, axes=1) for column in by_theta[regions].T], axis=1)
             vectors.append(level)
         if not vectors:
             return self

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.errors import ConfigurationError
 from palpate.inversion import (
     FittedState,
     Interval,
@@ -156,9 +157,12 @@ def conclude(
 ) -> Estimation:
     """State the result of an inversion; `truth`: true moduli (kPa) by tissue where they are known.
 
-    The covariance is the sandwich under the residuals' law plus the scatter over grid positions.
+    The covariance is the sandwich under the residuals' law plus the scatter over grid positions. Raises
+    `ConfigurationError` where a Poisson's ratio was sought.
     """
     objective, minimum = inversion.objective, inversion.minimum
+    if objective.parameters.poisson:
+        raise ConfigurationError("a result states Young's moduli only: a Poisson's ratio was sought beside them")
     rng = np.random.default_rng(seed)
     shifts = grid_position_shifts(objective, minimum.evaluation, observed.states, draws=GRID_DRAWS, rng=rng)
     grid_part = shifts.T @ shifts / len(shifts)
