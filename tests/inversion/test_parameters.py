@@ -177,7 +177,7 @@ def test_the_mean_of_a_prior_must_be_a_number_where_it_counts(mean):
 @pytest.mark.parametrize("shape", [(2, 2), (4, 4), (3,)])
 def test_a_drivers_prior_of_another_size_is_refused_and_not_replaced(shape):
     with pytest.raises(ConfigurationError, match="driver_precision"):
-        mapping_of(3).with_driver_precision(np.ones(shape))
+        replace(mapping_of(3), driver_precision=np.ones(shape))
 
 
 def test_a_prior_of_another_number_of_moduli_is_refused():

@@ -25,11 +25,9 @@ from palpate.inversion.uncertainty import (
     Interval,
     gain,
     grid_position_shifts,
-    hull,
     imaging_errors,
     log_interval,
     sandwich_covariance,
-    verdict,
 )
 
 __all__ = [
@@ -62,7 +60,6 @@ __all__ = [
     "gain",
     "gauss_newton",
     "grid_position_shifts",
-    "hull",
     "imaging_errors",
     "invert",
     "log_interval",
@@ -73,6 +70,5 @@ __all__ = [
     "run_outer_loop",
     "sample_posterior",
     "sandwich_covariance",
-    "verdict",
     "with_first_noise",
 ]

@@ -16,7 +16,7 @@ from palpate.mechanics.linear_model import LinearEquilibrium, LinearModel, with_
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.constraint import Constraint
 
-__all__ = ["Approximation", "ExactApproximation", "LocalModel", "Place", "corrected_error", "exact_approximation"]
+__all__ = ["Approximation", "ExactApproximation", "LocalModel", "Place", "exact_approximation"]
 
 
 class LocalModel(ForwardModel, Protocol):
@@ -151,12 +151,12 @@ class ExactApproximation:
         return SolveCounts(forward=1)
 
     def error(self, at: Place) -> float:
-        """A bound under the linear law (see `LinearSystem.error_bound`), else an estimate (see `corrected_error`)."""
+        """A bound under the linear law (see `LinearSystem.error_bound`), else an estimate (see `error_estimate`)."""
         if at.same_as(self.place):
             return 0.0
         displacement = self.model.solve(at.moduli, at.coefficients).values
         if isinstance(self.equilibrium, FiniteStrainEquilibrium):
-            return corrected_error(self.equilibrium, at.moduli, displacement)
+            return self.equilibrium.error_estimate(at.moduli, displacement)
         return float(self.equilibrium.system.error_bound(at.moduli, displacement[:, None])[0])
 
     def with_constraint(self, constraint: Constraint) -> ExactApproximation:
@@ -182,21 +182,3 @@ def exact_approximation(
     model = expanded(there, names=linear.names, moduli=at.moduli, coefficients=at.coefficients)
     spent = SolveCounts() if nearby is None else nearby.counts
     return ExactApproximation(linear, finite_strain, model, at, there, spent + there.counts + there.tangent_counts)
-
-
-def corrected_error(
-    near: FiniteStrainEquilibrium, moduli: NDArray[np.float64], displacement: NDArray[np.float64]
-) -> float:
-    """Estimated relative error in energy of a displacement (n_dof,) mm at moduli (n_regions,) kPa.
-
-    It is that of one correction r^T K^-1 r by the residual r, K the stiffness of the equilibrium `near`, not the one
-    there: one right-hand side. Infinite where no factorisation of K is kept.
-    """
-    if near.factorisation is None:
-        return np.inf
-    balance = near.model.balance(moduli)
-    residual = np.asarray(balance.free.T @ balance.residual(displacement)[0])
-    correction = near.factorisation.solve(residual[:, None])[:, 0]
-    internal = balance.region_forces(displacement, balance.moduli).sum(axis=1)
-    squared = abs(residual @ correction) / max(abs(float(internal @ displacement)), np.finfo(float).tiny)
-    return float(np.sqrt(squared)) if np.isfinite(squared) else np.inf

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, EstimationError
-from palpate.inversion.driver import learned_precision
+from palpate.inversion.driver import with_learned_prior
 from palpate.inversion.expansion import Expansion, expansion_near
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import Evaluation, Objective
@@ -104,8 +104,7 @@ def invert(
     States that bring an approximation are estimated on it; for the others a reduced basis is made at the middle start
     and extended where the estimate goes. rule: when the linear estimate ends; None: at its full accuracy, or when it is
     near where another law follows. Raises `ConfigurationError` for an open Poisson's ratio with another law,
-    `EstimationError`s of solving; an estimate that did not converge says so in
-    its minimum's outcome.
+    `EstimationError`s of solving; an estimate that did not converge says so in its minimum's outcome.
     """
     if problem.finite_strain and problem.parameters.poisson:
         raise ConfigurationError(
@@ -167,9 +166,7 @@ def _linear(
     objective = with_first_noise(objective).rematched(still)
     rest = objective(still)
     fitted = fit_coefficients(objective, middle, bounds=settings.bounds)
-    precision = learned_precision(objective, fitted.evaluation, fitted.unknowns)
-    if precision is not None:
-        objective = replace(objective, parameters=objective.parameters.with_driver_precision(precision))
+    objective = with_learned_prior(objective, fitted.evaluation, fitted.unknowns)
     minima = _from_starts(objective, settings, fitted.unknowns[objective.n_parameters :], progress)
     groups = _groups(minima, objective.n_parameters)
     best = groups[_best(minima)]
@@ -225,11 +222,11 @@ def _at_finite_strain(linear: OuterIterate, settings: InversionSettings, progres
     progress("finite strain: the equilibrium at the linear estimate")
     tolerance = float(np.clip(0.1 * REPORTED.error_limit(linear.objective), ACCURACY, EQUILIBRIUM))
     unknowns, first = linear.minimum.unknowns, list[Expansion]()
-    linear_models = zip(linear.objective.states, linear.objective.approximations, strict=True)
-    for (state, approximation), place in zip(linear_models, linear.objective.places(unknowns), strict=True):
+    before = linear.objective
+    for state, basis, place in zip(before.states, before.approximations, before.places(unknowns), strict=True):
         assert state.finite_strain is not None
-        first.append(expansion_near(state.finite_strain, approximation, place, tolerance=tolerance))
-    objective = linear.objective.under(first).rematched(unknowns)
+        first.append(expansion_near(state.finite_strain, basis, place, tolerance=tolerance))
+    objective = before.under(first).rematched(unknowns)
     start = replace(linear.minimum, evaluation=objective(unknowns))
     end = run_outer_loop(objective, start, settings, REPORTED, progress=progress, title="finite strain")
     exact = []

@@ -185,10 +185,6 @@ class ParameterMap:
             )
         return replace(self, prior_mean=np.where(np.isfinite(sd), mean, 0.0), prior_precision=np.diag(sd**-2.0))
 
-    def with_driver_precision(self, precision: NDArray[np.float64]) -> ParameterMap:
-        """The same with another prior of the coefficients: precision (n_coefficients, n_coefficients)."""
-        return replace(self, driver_precision=precision)
-
 
 def parameter_map(
     tissues: tuple[Tissue, ...],
@@ -218,27 +214,24 @@ def parameter_map(
             "nothing can be estimated: displacements fix ratios of moduli only, so a case needs an `estimate` tissue"
             " and a `known` tissue, a known load, or a second `estimate` tissue"
         )
-    own = [np.flatnonzero([tissue.name == name for tissue in meshed]) for name in open_poisson]
-    parts = np.count_nonzero(lame_parts(0.25, dilatation))
-    for name, places in zip(open_poisson, own, strict=True):
+    parts, poisson = np.count_nonzero(lame_parts(0.25, dilatation)), list[OpenPoisson]()
+    for name in open_poisson:
+        places = tuple(i for i, tissue in enumerate(meshed) if tissue.name == name)
         if len(places) != parts:
             raise ConfigurationError(
                 f"the Poisson's ratio of '{name}' is sought, but the model has {len(places)} moduli for it and not"
                 f" {parts}: make it with `linear_model(..., open_poisson=...)` and with the same dilatation"
             )
-    poisson = tuple(
-        OpenPoisson(name, len(sought) + i, tuple(places.tolist()), dilatation)
-        for i, (name, places) in enumerate(zip(open_poisson, own, strict=True))
-    )
+        poisson.append(OpenPoisson(name, len(sought) + len(poisson), places, dilatation))
     columns = [[float(tissue.name in group) for group in sought] for tissue in meshed]
     selection = np.pad(np.array(columns), ((0, 0), (0, len(poisson))))
     names, modes = tuple(" and ".join(group) for group in sought), tuple(n_modes)
     if loaded and not known:
-        return ParameterMap(np.ones(len(meshed)), selection, names, LOADS, True, modes, poisson=poisson)
+        return ParameterMap(np.ones(len(meshed)), selection, names, LOADS, True, modes, poisson=tuple(poisson))
     unit = (known[0].youngs_modulus_kpa or 1.0) if absolute else 1.0
     base = np.array([(t.youngs_modulus_kpa or unit) if t.role is Role.KNOWN else unit for t in meshed])
     scale = known[0].name if absolute else " and ".join(groups[0])
-    return ParameterMap(base, selection, names, scale, absolute, modes, poisson=poisson)
+    return ParameterMap(base, selection, names, scale, absolute, modes, poisson=tuple(poisson))
 
 
 def _groups(names: Sequence[str], tied: Sequence[Sequence[str]]) -> list[tuple[str, ...]]:

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from palpate.inversion.approximation import Place
 from palpate.mechanics.forward import SolveCounts
@@ -73,18 +72,26 @@ class ReducedBasis:
         Both are corrections by conjugate gradients with the factorisation that is there, from the reduced answers on;
         where it is none, or the moduli are far from its own, with a new one. Raises `SolverError`.
         """
-        model, near = self.full_model, _near(self, at.moduli)
-        sharper, displacement = replace(self, system=near.system), self.model.solve(at.moduli, at.coefficients).values
+        model, (near, made) = self.full_model, _system_near(self, at.moduli)
+        matrix = weighted_sum(at.moduli, model.free_stiffness)
+        sharper = replace(self, system=near, counts=self.counts + made)
+        displacement = self.model.solve(at.moduli, at.coefficients).values
+
+        def solved(rhs: NDArray[np.float64], tolerance: float) -> NDArray[np.float64]:
+            """Solution (n_free, k) mm at the place to a relative residual."""
+            nearly = near.factorisation.nearly
+            return conjugate_gradients(matrix, rhs, nearly, tolerance=tolerance, max_iterations=MAX_ITERATIONS)[0]
+
         if not at.same_as(self.place):
-            missing = -near.solve(model.residual(at.moduli, displacement[:, None]), DISPLACEMENT)
+            missing = -solved(model.residual(at.moduli, displacement[:, None]), DISPLACEMENT)
             displacement = displacement + np.asarray(model.constraint.free @ missing)[:, 0]
-            sharper = _extended(sharper, missing, near.counts + SolveCounts(forward=1))
+            sharper = _extended(sharper, missing, SolveCounts(forward=1))
         if at.directions is None:
             return replace(sharper, place=at)
         loads = _loads_along(at.directions, model, at.moduli, displacement)
         vectors = sharper.projection.vectors
         known = vectors @ sharper.model.system(at.moduli).backward(vectors.T @ loads)
-        rest = near.solve(loads - near.matrix @ known, TANGENT)
+        rest = solved(loads - matrix @ known, TANGENT)
         return replace(_extended(sharper, rest, SolveCounts(tangent=rest.shape[1])), place=at)
 
     @property
@@ -162,31 +169,13 @@ def _loads_along(
     return loads
 
 
-@dataclass(frozen=True, slots=True)
-class _Near:
-    """The stiffness `matrix` (n_free, n_free), mN/mm, at some moduli; `system`: that of the factors at hand."""
+def _system_near(basis: ReducedBasis, moduli: NDArray[np.float64]) -> tuple[LinearSystem, SolveCounts]:
+    """The system whose factors serve at moduli (n_regions,) kPa: that at hand, or their own where it is no help.
 
-    matrix: sparse.csr_matrix[np.float64]
-    system: LinearSystem
-    counts: SolveCounts
-
-    def solve(self, rhs: NDArray[np.float64], tolerance: float) -> NDArray[np.float64]:
-        """Solution (n_free, k) mm to a relative residual; raises `SolverError`."""
-        solution, _ = conjugate_gradients(
-            self.matrix, rhs, self.system.factorisation.nearly, tolerance=tolerance, max_iterations=MAX_ITERATIONS
-        )
-        return solution
-
-
-def _near(basis: ReducedBasis, moduli: NDArray[np.float64]) -> _Near:
-    """The stiffness at moduli (n_regions,) kPa with the factors at hand, or with its own where those are no help."""
-    system, matrix = basis.system, weighted_sum(moduli, basis.full_model.free_stiffness)
-    ratios = moduli / system.moduli
-    if ratios.max() < FAR * ratios.min() and _direct(system.factorisation):
-        return _Near(matrix, system, SolveCounts())
-    return _Near(matrix, basis.full_model.system(moduli), SolveCounts(factorisations=1))
-
-
-def _direct(factorisation: Factorisation) -> bool:
-    """Whether a solution costs little beside the factorisation: not where it iterates itself."""
-    return isinstance(factorisation, CheckedFactorisation) and SOLVERS[factorisation.solver].direct
+    It is none where the moduli are far, or where its solutions iterate themselves and cost much beside a factorisation.
+    """
+    factorisation, ratios = basis.system.factorisation, moduli / basis.system.moduli
+    direct = isinstance(factorisation, CheckedFactorisation) and SOLVERS[factorisation.solver].direct
+    if direct and ratios.max() < FAR * ratios.min():
+        return basis.system, SolveCounts()
+    return basis.full_model.system(moduli), SolveCounts(factorisations=1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,10 +18,8 @@ from palpate.inversion import (
     Outcome,
     StartRun,
     grid_position_shifts,
-    hull,
     log_interval,
     sandwich_covariance,
-    verdict,
 )
 from palpate.mechanics.deformation import deformation_determinants
 from palpate.mesh.voxelise import voxelise
@@ -36,12 +34,15 @@ __all__ = [
     "Start",
     "TissueFit",
     "conclude",
+    "hull",
     "no_estimate",
+    "verdict",
 ]
 
 GRID_DRAWS = 8
 AT_BOUND = 1e-6
 STRONG_CORRELATION = 0.99
+IDENTIFIED, WEAK = 2.0, 10.0  # largest ratio of an interval's ends
 AS_GOOD = 0.05  # of the objective: another minimum that is worse by less cannot be excluded
 
 
@@ -206,6 +207,35 @@ def no_estimate(
         why=why,
         truth=truth,
     )
+
+
+def hull(intervals: Sequence[Interval]) -> Interval:
+    """Smallest interval that holds all of one or more; an end that is open in one of them is open."""
+    lows, highs = [low for low, _ in intervals], [high for _, high in intervals]
+    low = None if None in lows else min(end for end in lows if end is not None)
+    high = None if None in highs else max(end for end in highs if end is not None)
+    return low, high
+
+
+def verdict(interval: Interval, *, at_bound: bool, absolute: bool) -> tuple[str, str]:
+    """Verdict and its reason from the interval of a modulus or ratio.
+
+    `identified`: closed and high/low <= 2; `weak`: closed and wider; `not identified`: an open end, a bound, or
+    high/low > 10; `ratio only`: identified or weak, but no known modulus holds the scale.
+    """
+    low, high = interval
+    if at_bound:
+        return "not identified", "the estimate lies at its bound; the images do not hold it back"
+    if low is None or high is None:
+        return "not identified", "the 95 % interval is open: it reaches beyond the bounds of the search"
+    width = high / low
+    if width > WEAK:
+        return "not identified", f"the 95 % interval spans a factor {width:.1f}"
+    if not absolute:
+        return "ratio only", f"no modulus is known, so only the ratio is determined (within a factor {width:.2f})"
+    if width <= IDENTIFIED:
+        return "identified", f"the 95 % interval spans a factor {width:.2f}"
+    return "weak", f"the 95 % interval spans a factor {width:.2f}; more image pairs or a larger motion narrow it"
 
 
 def _reason(inversion: Inversion) -> str:

@@ -17,11 +17,10 @@ from palpate.inversion import (
     ParameterMap,
     log_interval,
     sandwich_covariance,
-    verdict,
 )
 from palpate.mesh import LagrangeSpace
 from palpate.phantoms import imaged
-from palpate.study import Body, ImagedStates, Observed, aligned, conclude, fitted_states
+from palpate.study import Body, ImagedStates, Observed, aligned, conclude, fitted_states, verdict
 
 __all__ = [
     "entries_from_surfaces",
