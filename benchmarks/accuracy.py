@@ -30,9 +30,7 @@ from palpate.inversion import (
     Inversion,
     InversionSettings,
     Objective,
-    Observed,
     Place,
-    conclude,
     continue_at_finite_strain,
     exact_approximation,
     imaging_errors,
@@ -41,7 +39,7 @@ from palpate.inversion import (
 from palpate.mesh import LagrangeSpace, triangle_normals
 from palpate.observation import NoiseModel, fit_noise_model, observed_surface
 from palpate.phantoms import Noise, Scene
-from palpate.study import Body, fitted_states
+from palpate.study import Body, Observed, conclude, fitted_states
 
 Array = NDArray[np.float64]
 Result = dict[str, Any]  # a line of JSON

@@ -62,7 +62,7 @@ def disagreement(gradient: Array, frozen: FrozenMisfit, problem: InverseProblem,
     model, mapping = problem.states[0].model, problem.parameters
     equilibrium = model.solve(mapping.moduli(unknowns), mapping.coefficients(unknowns)[0])
     pull = _widened(frozen, len(equilibrium.values)).pull(equilibrium.values)
-    exact = mapping.by_unknowns(equilibrium.adjoint(pull)[None])[0] + mapping.prior_matrix @ unknowns
+    exact = mapping.by_unknowns(equilibrium.adjoint(pull)[None], unknowns)[0] + mapping.prior_matrix @ unknowns
     return float(np.linalg.norm(gradient - exact) / np.linalg.norm(exact))
 
 

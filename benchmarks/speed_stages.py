@@ -27,7 +27,7 @@ STAGES = {  # functions whose time, with all that they call, is a stage of its o
     "responses and series": ("estimate.py", "_with_reduced_bases"),
     "linear estimate": ("estimate.py", "_linear"),
     "finite-strain estimate": ("estimate.py", "continue_at_finite_strain"),
-    "intervals and fits": ("result.py", "conclude"),
+    "intervals and fits": ("estimation.py", "conclude"),
 }
 WITHIN = {  # parts of the stages above
     "closest points": ("surface_residuals.py", "_closest"),

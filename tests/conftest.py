@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import signal
+import sys
 from itertools import permutations
 from pathlib import Path
 
@@ -13,12 +15,12 @@ import pytest
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.segmentation import segment
 from palpate.images.tissue import Role
-from palpate.inversion.result import Estimation, Iteration, ModulusEstimate, Remark, Start, TissueFit
 from palpate.mesh.space import lagrange_space
 from palpate.mesh.tet_mesh import OUTER, TetMesh
 from palpate.mesh.tetrahedralise import boundary_of
 from palpate.observation.contract import Fit
 from palpate.study.case import Case, CaseTissue, Images
+from palpate.study.estimation import Estimation, Iteration, ModulusEstimate, Remark, Start, TissueFit
 from palpate.study.result import CaseResult, MeshSummary, Provenance
 
 EDGE = 4.0
@@ -119,6 +121,7 @@ def make_estimation(displacement: np.ndarray) -> Estimation:
         displacements=(displacement,),
         counts={"forward": 3, "adjoint": 0, "tangent": 2, "factorisations": 4, "evaluations": 9},
         remarks=(Remark("example", "a warning to be shown"),),
+        observations={"surface distance": "the distance between surfaces"},
     )
 
 
@@ -139,3 +142,50 @@ def case_result() -> CaseResult:
         after=(make_segmentation(mesh, moved=True),),
         provenance=Provenance({"total": 1.5}, {"before": "ab" * 32}, {"palpate": "0.1.0"}),
     )
+
+
+TESTS = Path(__file__).parent
+
+
+@pytest.fixture(scope="session")
+def twins():
+    """The module `twins`, loaded by its path: tests are no package."""
+    return loaded("inversion_twins", TESTS / "inversion" / "twins.py")
+
+
+@pytest.fixture(scope="session")
+def toys():
+    """The module `toys`: objectives whose minimum is known by hand."""
+    return loaded("inversion_toys", TESTS / "inversion" / "toys.py")
+
+
+@pytest.fixture(scope="session")
+def point_motion():
+    """The module `point_motion` of the observations' tests: a second kind of observation."""
+    return loaded("point_motion", TESTS / "observation" / "point_motion.py")
+
+
+def loaded(name, path):
+    spec = importlib.util.spec_from_file_location(name, path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="session")
+def twin(twins):
+    """A linear-element twin at known moduli."""
+    return twins.make_twin()
+
+
+@pytest.fixture(scope="session")
+def exact(twins, twin):
+    """Its inverse problem with exact targets."""
+    return twins.exact_problem(twin)
+
+
+@pytest.fixture(scope="session")
+def voxels(twins, twin):
+    """Its inverse problem through voxels."""
+    return twins.voxel_problem(twin)

@@ -11,9 +11,7 @@ from palpate.inversion import (
     Bounds,
     FittedState,
     InversionSettings,
-    Observed,
     OuterIterate,
-    conclude,
     estimate,
     fit_driver,
     gauss_newton,
@@ -22,6 +20,7 @@ from palpate.inversion import (
     sandwich_covariance,
 )
 from palpate.observation.noise_model import NoiseModel
+from palpate.study.estimation import Observed, conclude
 
 SHARP = NoiseModel(np.array([1e-6]), np.array([3.0]))
 
@@ -205,6 +204,52 @@ def test_the_worse_fit_does_not_win_because_its_noise_is_believed_to_be_larger(t
     found = concluded(twins, *(good, bad)[::order])
     assert found.minimum.unknowns == pytest.approx(minimum.unknowns)
     assert found.candidates[found.best].value < found.candidates[1 - found.best].value
+
+
+def test_no_kind_of_observation_decides_alone_under_which_noise_minima_are_compared(twins, with_points, monkeypatch):
+    """One per cent in the largest standard deviation of all is less than a factor of three in another kind's."""
+    _, problem = with_points
+    objective = twins.objective_of(problem)
+    sds = [{"surface distance": 0.1, "point motion": 1.0}, {"surface distance": 0.3, "point motion": 0.99}]
+    noises = [{kind: NoiseModel(np.array([sd**2]), np.array([3.0])) for kind, sd in of.items()} for of in sds]
+    iterates = []
+    for noise in noises:
+        believed = objective.with_observations([o.with_noise(noise[o.kind]) for o in objective.observations])
+        iterates.append(OuterIterate(believed, gauss_newton(believed, np.zeros(14), bounds=twins.settings(1.0).bounds)))
+    compared = []
+
+    def under(objective, start, settings, **_):
+        compared.append({kind: noise.sd for kind, noise in objective.noise.items()})
+        return gauss_newton(objective, start, bounds=settings.bounds, max_steps=1)
+
+    monkeypatch.setattr(estimate, "minimised", under)
+    estimate._values(iterates, twins.settings(1.0))
+    assert compared == [pytest.approx(sds[0])] * 2
+
+
+def test_what_was_spent_on_other_minima_is_counted(twins, voxels, monkeypatch):
+    """The second start's minimum is followed on its own, on approximations that the first one's loop has made."""
+    ends, follow, groups = [], estimate.run_outer_loop, iter([[0, 1]])
+    whole = estimate._groups
+
+    def followed(*of, **named):
+        ends.append(follow(*of, **named))
+        return ends[-1]
+
+    monkeypatch.setattr(estimate, "run_outer_loop", followed)
+    monkeypatch.setattr(estimate, "_groups", lambda *of: next(groups, None) or whole(*of))
+    monkeypatch.setattr(estimate, "LOWER", -1e9)
+    found = invert(voxels, twins.settings(0.5, 8.0), progress=twins.silent)
+    first, second = ends
+    assert sum(vars_of(second.counts)) > sum(vars_of(first.counts)) - sum(vars_of(first.checks))
+    assert found.counts == second.counts + first.checks
+    assert first.checks.forward > 0
+    history = found.minimum.history
+    assert history in (first.minimum.history, second.minimum.history)
+
+
+def vars_of(counts):
+    return [getattr(counts, name) for name in ("forward", "adjoint", "tangent", "factorisations")]
 
 
 def hold(monkeypatch):

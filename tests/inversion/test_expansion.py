@@ -9,7 +9,6 @@ import pytest
 
 from palpate.errors import NotConverged
 from palpate.inversion import Outcome, continue_at_finite_strain, estimate, expansion, invert
-from palpate.inversion.objective import deciding_directions
 from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.laws.registry import law_named
 
@@ -66,7 +65,7 @@ def test_the_derivatives_that_decide_the_moduli_are_those_of_the_equilibrium(bod
     """The other columns may be those of an earlier one."""
     moduli, q, approximation = split(continued)
     there = body[2].solve(moduli, q)
-    directions = deciding_directions(continued.objective.parameters, continued.minimum.evaluation)[0]
+    directions = continued.objective.places(continued.minimum.unknowns, continued.minimum.evaluation)[0].directions
     exact, stated = there.tangent() @ directions, approximation.model.derivatives @ directions
     assert np.linalg.norm(stated - exact, axis=0) == pytest.approx(0.0, abs=0.02 * np.linalg.norm(exact))
 

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.optimize import OptimizeResult
@@ -14,15 +10,6 @@ from palpate.inversion.optimise import FIRST_RADIUS, MAX_RADIUS, Bounds, Outcome
 
 WIDE = Bounds(np.full(2, -5.0), np.full(2, 5.0))
 METHODS = {"gauss-newton": gauss_newton, "lbfgs": lbfgs}
-
-
-@pytest.fixture(scope="module")
-def toys():
-    spec = importlib.util.spec_from_file_location("inversion_toys", Path(__file__).with_name("toys.py"))
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture(params=sorted(METHODS))
@@ -112,6 +99,17 @@ def test_a_step_that_a_bound_cuts_short_is_judged_by_what_is_left_of_it(toys):
     assert found.outcome is Outcome.CONVERGED
     assert found.unknowns[0] == 1e-9
     assert found.evaluations == 2
+
+
+def test_a_step_that_a_bound_bends_uphill_is_not_taken(toys):
+    """The step leads out of the bound, though the slope there leads in: what is left of it promises a larger value."""
+    objective = toys.Quadratic(np.array([[1.0, 0.95], [0.95, 1.0]]), np.array([0.5, -0.5]), height=1e-6)
+    bounds = Bounds(np.full(2, -5.0), np.array([0.0, 5.0]))
+    found = gauss_newton(objective, np.array([0.0, 0.2]), bounds=bounds, tolerance=1e-8)
+    values = [iterate.value for iterate in found.history]
+    assert np.all(np.diff(values) <= 0.0)
+    assert found.outcome.converged
+    assert found.unknowns == pytest.approx([0.0, -0.025], abs=1e-3)
 
 
 def test_what_lbfgs_is_told_of_a_place_does_not_depend_on_what_it_asked_before(toys, rng, monkeypatch):

@@ -48,19 +48,18 @@ def test_derivatives_by_the_unknowns_are_those_by_region_through_the_map(rng, ti
     mapping = mapping_of(2, 3, tied=tied)
     own = mapping.unknowns_of(1)
     tangent, chain = rng.normal(size=(6, 4 + 3)), chain_of(mapping, 1, rng.normal(size=mapping.n_unknowns))
-    assert mapping.by_unknowns(tangent) == pytest.approx(tangent @ chain[:, own], rel=1e-8, abs=1e-9)
+    assert mapping.by_unknowns(tangent, np.zeros(mapping.n_unknowns)) == pytest.approx(
+        tangent @ chain[:, own], rel=1e-8, abs=1e-9
+    )
     assert not np.delete(chain, own, axis=1).any()
 
 
 @pytest.mark.parametrize("tied", TIED)
 @pytest.mark.parametrize("state", [0, 1])
-def test_directions_and_metric_of_a_state_are_carried_by_the_same_matrix(rng, tied, state):
+def test_the_chain_of_a_state_is_that_of_its_own_unknowns(rng, tied, state):
     mapping = mapping_of(2, 3, tied=tied)
-    chain, directions = chain_of(mapping, state, np.zeros(mapping.n_unknowns)), rng.normal(size=(mapping.n_unknowns, 4))
-    metric = rng.normal(size=(mapping.n_unknowns,) * 2)
-    metric = metric @ metric.T
-    assert mapping.directions_of(state, directions) == pytest.approx(chain @ directions, rel=1e-8, abs=1e-9)
-    assert mapping.metric_of(state, metric) == pytest.approx(chain @ metric @ chain.T, rel=1e-8, abs=1e-8)
+    unknowns, own = rng.normal(size=mapping.n_unknowns), mapping.unknowns_of(state)
+    assert mapping.chain(state, unknowns) == pytest.approx(chain_of(mapping, state, unknowns)[:, own], abs=1e-8)
 
 
 def chain_of(mapping, state, unknowns):
@@ -159,6 +158,31 @@ def test_a_prior_may_be_of_one_tissue_alone(objective):
     parameters = objective.parameters.with_prior(np.array([0.5, 7.0]), np.array([0.2, np.inf]))
     assert parameters.prior_precision == pytest.approx(np.diag([25.0, 0.0]))
     assert parameters.prior_centre[:2].tolist() == [0.5, 0.0]
+
+
+@pytest.mark.parametrize("sd", [0.0, -0.1, np.nan, -np.inf])
+def test_a_prior_without_a_spread_is_refused(sd):
+    with pytest.raises(ConfigurationError, match=r"'sac'.*positive"):
+        mapping_of(3).with_prior(np.zeros(2), np.array([0.2, sd]))
+
+
+@pytest.mark.parametrize("mean", [np.nan, np.inf])
+def test_the_mean_of_a_prior_must_be_a_number_where_it_counts(mean):
+    with pytest.raises(ConfigurationError, match="'gland'"):
+        mapping_of(3).with_prior(np.array([mean, 0.0]), np.array([0.2, 0.2]))
+    flat = mapping_of(3).with_prior(np.array([mean, 0.0]), np.array([np.inf, 0.2]))
+    assert flat.prior_mean.tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (4, 4), (3,)])
+def test_a_drivers_prior_of_another_size_is_refused_and_not_replaced(shape):
+    with pytest.raises(ConfigurationError, match="driver_precision"):
+        replace(mapping_of(3), driver_precision=np.ones(shape))
+
+
+def test_a_prior_of_another_number_of_moduli_is_refused():
+    with pytest.raises(ConfigurationError, match="prior_mean"):
+        mapping_of(3).with_prior(np.zeros(3), np.ones(3))
 
 
 def test_where_images_tell_nothing_the_posterior_is_the_prior(twin, objective):

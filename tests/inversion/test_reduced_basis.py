@@ -86,7 +86,8 @@ def evaluated(twins, problem, basis, unknowns):
 @pytest.fixture(scope="module")
 def directions(twins, twin, exact, first):
     """The deciding directions at the truth."""
-    return deciding_directions(exact.parameters, evaluated(twins, exact, first, twin.unknowns))[0]
+    found = evaluated(twins, exact, first, twin.unknowns)
+    return exact.parameters.chain(0, twin.unknowns) @ deciding_directions(found, 2)
 
 
 def test_an_update_makes_displacement_and_deciding_derivatives_exact_there(first, twin, directions):
@@ -118,7 +119,8 @@ def test_an_update_where_it_is_exact_already_solves_no_displacement_again(first,
 
 def test_exact_deciding_derivatives_give_the_posterior_of_the_full_model(twins, twin, exact, plain):
     """The other columns may be off: the moduli's variance is stationary in them."""
-    along = deciding_directions(exact.parameters, evaluated(twins, exact, plain, twin.unknowns))[0]
+    found = evaluated(twins, exact, plain, twin.unknowns)
+    along = exact.parameters.chain(0, twin.unknowns) @ deciding_directions(found, 2)
     sharper = plain.update(Place(twin.moduli, twin.coefficients, along))
     full = plain.with_responses(twin.moduli, twin.coefficients)
     matrices = [evaluated(twins, exact, basis, twin.unknowns).matrix for basis in (plain, sharper, full)]

@@ -7,9 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from palpate.errors import EstimationError
 from palpate.inversion import FittedState, LaterState, Objective, ParameterMap, gain, sandwich_covariance
-from palpate.inversion.objective import Evaluation, Linearisation
-from palpate.inversion.uncertainty import grid_position_shifts, hull, imaging_errors, log_interval, verdict
+from palpate.inversion.objective import Evaluation, Linearisation, deciding_directions
+from palpate.inversion.optimise import Minimum, Outcome, posterior_sd
+from palpate.inversion.uncertainty import grid_position_shifts, imaging_errors, log_interval
 from palpate.observation.contract import Residuals, Weighting
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.robust_loss import Tukey
@@ -44,6 +46,19 @@ def surface(places, normals, jacobian, *, precision, noise, state=0, kind="surfa
     return Linearisation(
         Seen(noise, Weighting(precision, Tukey()), state, kind), state, residuals, columns, jacobian, weights, None
     )
+
+
+def test_what_neither_images_nor_prior_determine_ends_as_an_estimation_that_says_so(toys):
+    """Two log-moduli that only their sum moves."""
+    evaluation = toys.Quadratic(np.ones((2, 2)), np.zeros(2))(np.ones(2))
+    minimum = Minimum(np.ones(2), evaluation, Outcome.CONVERGED, ())
+    for of in (
+        lambda: posterior_sd(minimum, 2),
+        lambda: gain(evaluation, 2),
+        lambda: deciding_directions(evaluation, 2),
+    ):
+        with pytest.raises(EstimationError, match="do not determine"):
+            of()
 
 
 def observed(*lines, n_parameters=2, rests=(0, 1)):
@@ -207,39 +222,3 @@ def test_the_interval_is_symmetric_in_the_logarithm():
 def test_an_end_beyond_the_bounds_is_open(centre, open_low, open_high):
     low, high = log_interval(centre, 0.5, lower=0.02, upper=200.0)
     assert (low is None, high is None) == (open_low, open_high)
-
-
-@pytest.mark.parametrize(
-    ("interval", "absolute", "word"),
-    [
-        ((1.0, 2.0), True, "identified"),
-        ((1.0, 2.01), True, "weak"),
-        ((1.0, 10.0), True, "weak"),
-        ((1.0, 10.1), True, "not identified"),
-        ((None, 2.0), True, "not identified"),
-        ((1.0, None), True, "not identified"),
-        ((1.0, 1.5), False, "ratio only"),
-        ((1.0, 5.0), False, "ratio only"),
-        ((1.0, 11.0), False, "not identified"),
-        ((None, 1.5), False, "not identified"),
-    ],
-)
-def test_the_verdict_follows_from_the_width_of_the_interval(interval, absolute, word):
-    assert verdict(interval, at_bound=False, absolute=absolute)[0] == word
-
-
-def test_an_estimate_at_its_bound_is_not_identified_however_narrow():
-    word, why = verdict((1.0, 1.1), at_bound=True, absolute=True)
-    assert word == "not identified"
-    assert "bound" in why
-
-
-def test_every_verdict_states_its_figure():
-    for interval in ((1.0, 1.5), (1.0, 4.0), (1.0, 20.0)):
-        assert f"{interval[1]:.1f}" in verdict(interval, at_bound=False, absolute=True)[1]
-
-
-def test_the_hull_holds_every_interval_and_an_open_end_stays_open():
-    assert hull([(2.0, 4.0), (1.0, 3.0)]) == (1.0, 4.0)
-    assert hull([(2.0, 4.0), (None, 3.0)]) == (None, 4.0)
-    assert hull([(2.0, None)]) == (2.0, None)

@@ -11,16 +11,20 @@ from palpate.inversion.objective import Evaluation
 
 @dataclass(frozen=True)
 class Quadratic:
-    """1/2 (x - centre)^T curvature (x - centre) with `n_parameters` log-moduli; `pull` spoils the score's sign."""
+    """1/2 (x - centre)^T curvature (x - centre) with `n_parameters` log-moduli.
+
+    `pull` spoils the score's sign; `height` makes the value alone flatter than its score and matrix say.
+    """
 
     curvature: np.ndarray
     centre: np.ndarray
     n_parameters: int = 2
     pull: float = 1.0
+    height: float = 1.0
 
     def value(self, unknowns):
         away = unknowns - self.centre
-        return float(0.5 * away @ self.curvature @ away)
+        return self.height * float(0.5 * away @ self.curvature @ away)
 
     def __call__(self, unknowns):
         slope = self.curvature @ (unknowns - self.centre)

@@ -26,6 +26,7 @@ class PointMotion:
     weighting: Weighting
     name: str = "landmark"
     kind: str = "point motion"
+    description: str = "the displacement of points that were seen in both images"
     of_driver: bool = False
     observed_share: float = 1.0
 

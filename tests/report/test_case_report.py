@@ -15,12 +15,12 @@ import pytest
 
 from palpate.errors import InputDataError, NotConverged
 from palpate.images.readers import write_scalar_image
-from palpate.inversion.result import Remark
 from palpate.report import collect as collect_module
 from palpate.report import page as page_module
 from palpate.report.case_report import redrawn_page, write_case_report, write_failure_report
 from palpate.report.pairs import drawn_images
 from palpate.study.case import Mechanics
+from palpate.study.estimation import Remark
 
 EVIL = '</script><img src=x onerror=alert(1)>$\\frac{"&'
 

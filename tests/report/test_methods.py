@@ -28,6 +28,13 @@ def test_the_text_says_what_was_set(case_result):
         assert words in text
 
 
+def test_the_misfit_is_what_the_observations_say_of_themselves(case_result):
+    seen = {"surface distance": "the distance between surfaces", "point motion": "the motion of points"}
+    estimation = dataclasses.replace(case_result.estimation, observations=seen)
+    text = " ".join(methods_text(collect(dataclasses.replace(case_result, estimation=estimation))).paragraphs)
+    assert "The misfit was the distance between surfaces and the motion of points." in text
+
+
 def test_the_finite_strain_law_is_told_with_its_start(case_result):
     for law, told in (("linear", False), ("neo-hookean", True)):
         case = dataclasses.replace(case_result.case, mechanics=Mechanics(law=law))

@@ -37,7 +37,9 @@ def test_the_document_has_the_fixed_keys(case_result):
     assert set(document["fit"][0]) == {"after", "prostate", "bladder"}
     assert document["fit"][0]["after"] == "after.nii.gz"
     assert document["fit"][0]["prostate"]["end"]["hd95_mm"] == 0.22
-    assert set(document["starts"][0]) >= {"start", "end", "objective_mm2", "status", "iterations"}
+    assert set(document["starts"][0]) >= {"start", "end", "objective_mm2", "status", "reason", "iterations"}
+    assert document["starts"][0]["reason"] == "ok"
+    assert document["observations"] == {"surface distance": "the distance between surfaces"}
     assert document["inputs"]["before"] == {"sha256": "ab" * 32}
     assert document["warnings"] == [{"code": "example", "message": "a warning to be shown"}]
     assert document["correlation"][0][1] == pytest.approx(-0.003 / np.sqrt(0.01 * 0.06))

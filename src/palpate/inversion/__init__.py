@@ -2,14 +2,21 @@
 
 from palpate.inversion.approximation import Approximation, ExactApproximation, Place, exact_approximation
 from palpate.inversion.driver_fit import fit_driver
-from palpate.inversion.estimate import Inversion, continue_at_finite_strain, invert
+from palpate.inversion.estimate import Inversion, StartRun, continue_at_finite_strain, invert
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import Evaluation, Linearisation, Objective
-from palpate.inversion.optimise import Bounds, Minimum, Outcome, fit_coefficients, gauss_newton, posterior_sd
+from palpate.inversion.optimise import (
+    Bounds,
+    Iterate,
+    Minimum,
+    Outcome,
+    fit_coefficients,
+    gauss_newton,
+    posterior_sd,
+)
 from palpate.inversion.outer_loop import InversionSettings, OuterIterate, StopRule, run_outer_loop
 from palpate.inversion.parameters import ParameterMap, parameter_map
 from palpate.inversion.reduced_basis import ReducedBasis, reduced_basis
-from palpate.inversion.result import Estimation, Observed, Remark, conclude
 from palpate.inversion.reweighting import reweighted, with_first_noise
 from palpate.inversion.sampling import sample_posterior
 from palpate.inversion.uncertainty import (
@@ -17,17 +24,16 @@ from palpate.inversion.uncertainty import (
     FittedState,
     Interval,
     gain,
+    grid_position_shifts,
     imaging_errors,
     log_interval,
     sandwich_covariance,
-    verdict,
 )
 
 __all__ = [
     "NORMAL_95",
     "Approximation",
     "Bounds",
-    "Estimation",
     "Evaluation",
     "ExactApproximation",
     "FittedState",
@@ -35,25 +41,25 @@ __all__ = [
     "InverseProblem",
     "Inversion",
     "InversionSettings",
+    "Iterate",
     "LaterState",
     "Linearisation",
     "Minimum",
     "Objective",
-    "Observed",
     "Outcome",
     "OuterIterate",
     "ParameterMap",
     "Place",
     "ReducedBasis",
-    "Remark",
+    "StartRun",
     "StopRule",
-    "conclude",
     "continue_at_finite_strain",
     "exact_approximation",
     "fit_coefficients",
     "fit_driver",
     "gain",
     "gauss_newton",
+    "grid_position_shifts",
     "imaging_errors",
     "invert",
     "log_interval",
@@ -64,6 +70,5 @@ __all__ = [
     "run_outer_loop",
     "sample_posterior",
     "sandwich_covariance",
-    "verdict",
     "with_first_noise",
 ]

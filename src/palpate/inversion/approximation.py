@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from palpate.mechanics.equilibrium import from_start
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
 from palpate.mechanics.first_order import FirstOrderModel, expanded
-from palpate.mechanics.forward import Equilibrium, ForwardModel, SolveCounts
-from palpate.mechanics.linear_model import LinearModel, with_constraint
+from palpate.mechanics.forward import ForwardModel, SolveCounts
+from palpate.mechanics.linear_model import LinearEquilibrium, LinearModel, with_constraint
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.constraint import Constraint
 
-__all__ = ["Approximation", "ExactApproximation", "LocalModel", "Place"]
+__all__ = ["Approximation", "ExactApproximation", "LocalModel", "Place", "exact_approximation"]
 
 
 class LocalModel(ForwardModel, Protocol):
@@ -71,7 +71,7 @@ class Approximation(Protocol):
 
     @property
     def counts(self) -> SolveCounts:
-        """What the full model has cost so far."""
+        """What the full model has cost to make the approximation."""
         ...
 
     @property
@@ -89,6 +89,11 @@ class Approximation(Protocol):
 
         Raises `NotConverged` when the full model has no equilibrium there, `SolverError` when it cannot be solved.
         """
+        ...
+
+    @property
+    def error_counts(self) -> SolveCounts:
+        """What one call of `error` costs; an approximation cannot add it to its own `counts`."""
         ...
 
     def error(self, at: Place) -> float:
@@ -111,7 +116,7 @@ class ExactApproximation:
     finite_strain: FiniteStrainModel | None
     model: FirstOrderModel
     place: Place
-    equilibrium: Equilibrium = field(repr=False)
+    equilibrium: LinearEquilibrium | FiniteStrainEquilibrium = field(repr=False)
     counts: SolveCounts
 
     @property
@@ -140,12 +145,19 @@ class ExactApproximation:
             return self
         return exact_approximation(self.linear, self.finite_strain, at, nearby=self)
 
+    @property
+    def error_counts(self) -> SolveCounts:
+        """One right-hand side with the factorisation that is there."""
+        return SolveCounts(forward=1)
+
     def error(self, at: Place) -> float:
-        """Nothing where it was solved; elsewhere what another solution changes, over the length of the displacement."""
+        """A bound under the linear law (see `LinearSystem.error_bound`), else an estimate (see `error_estimate`)."""
         if at.same_as(self.place):
             return 0.0
-        stated, there = self.model.solve(at.moduli, at.coefficients).values, self.update(at).equilibrium.values
-        return float(np.linalg.norm(stated - there) / max(np.linalg.norm(there), np.finfo(float).tiny))
+        displacement = self.model.solve(at.moduli, at.coefficients).values
+        if isinstance(self.equilibrium, FiniteStrainEquilibrium):
+            return self.equilibrium.error_estimate(at.moduli, displacement)
+        return float(self.equilibrium.system.error_bound(at.moduli, displacement[:, None])[0])
 
     def with_constraint(self, constraint: Constraint) -> ExactApproximation:
         """The model solved again under another offset."""
@@ -159,7 +171,7 @@ def exact_approximation(
 ) -> ExactApproximation:
     """Solve the model at a place, from an equilibrium `nearby` where there is one; raises as `update` does."""
     before = None if nearby is None else nearby.equilibrium
-    there: Equilibrium
+    there: LinearEquilibrium | FiniteStrainEquilibrium
     if finite_strain is None:
         there = linear.solve(at.moduli, at.coefficients)
     else:

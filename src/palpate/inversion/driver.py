@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, optimize
 
-from palpate.inversion.objective import Evaluation, Objective
+from palpate.inversion.objective import Evaluation, Objective, determined
 from palpate.mesh.constraint import Constraint
 
-__all__ = ["learned_precision", "refined_walls"]
+__all__ = ["learned_precision", "refined_walls", "with_learned_prior"]
 
 AMPLITUDES = (0.005, 2.0)  # times the modes' own standard deviation
 FIRST_AMPLITUDES = ((0.3, 0.05), (0.05, 0.3))  # of drift and swelling; one may hide the other
@@ -53,14 +53,6 @@ class _Seen:
         return evidence, 0.5 * (scaled**2 + np.sum(inverse**2, axis=0) - 1.0)
 
 
-@dataclass(frozen=True, slots=True)
-class _Belief:
-    """A prior covariance (n_modes, n_modes) of one wall's coefficients, and its log-evidence."""
-
-    covariance: NDArray[np.float64]
-    evidence: float
-
-
 def learned_precision(
     objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
@@ -70,7 +62,7 @@ def learned_precision(
     and standard deviations of their own. With the residuals linear around `unknowns` x (n_unknowns,), A = J^T W J and
     b = A x - J^T W r, the log-evidence of P is 1/2 (b^T (A + P)^-1 b - ln det(A + P) + ln det P) up to a constant
     (MacKay 1992, Neural Computation 4, 415-447, section 4). Of kernels whose evidence is as good as equal, those that
-    leave the log-moduli the widest posterior.
+    leave the log-moduli the widest posterior. Raises `EstimationError` where a wall's motion is left open.
     """
     if not any(state.walls for state in objective.states):
         return None
@@ -81,12 +73,21 @@ def learned_precision(
         own = objective.parameters.unknowns_of(s)[n_parameters:]
         for wall in state.walls:
             places = own[wall.columns]
-            seen = _seen(data + prior, data, pull, places)
-            beliefs = [_most_evident(pair, seen) for pair in product(wall.drifts, wall.swellings)]
-            best = max(belief.evidence for belief in beliefs)
-            alike = [(b.evidence, _with(prior, places, b.covariance)) for b in beliefs if b.evidence > best - ALIKE]
-            prior = max(alike, key=lambda pair: (_width(data + pair[1], n_parameters), pair[0]))[1]
+            with determined():
+                seen = _seen(data + prior, data, pull, places)
+                beliefs = [_most_evident(pair, seen) for pair in product(wall.drifts, wall.swellings)]
+                best = max(evidence for evidence, _ in beliefs)
+                alike = [(e, _with(prior, places, covariance)) for e, covariance in beliefs if e > best - ALIKE]
+                prior = max(alike, key=lambda pair: (_width(data + pair[1], n_parameters), pair[0]))[1]
     return prior[n_parameters:, n_parameters:]
+
+
+def with_learned_prior(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> Objective:
+    """The objective with the drivers' prior that has the largest evidence (see `learned_precision`)."""
+    precision = learned_precision(objective, evaluation, unknowns)
+    if precision is None:
+        return objective
+    return replace(objective, parameters=replace(objective.parameters, driver_precision=precision))
 
 
 def refined_walls(objective: Objective, evaluation: Evaluation) -> list[Constraint | None]:
@@ -126,10 +127,11 @@ def _seen(
     return _Seen(0.5 * (information + information.T), pull[places] - followed[:, -1])
 
 
-def _most_evident(parts: Sequence[NDArray[np.float64]], seen: _Seen) -> _Belief:
-    """The best weights of drift and swelling, covariances (n_modes, n_modes) at the modes' own standard deviation.
+def _most_evident(parts: Sequence[NDArray[np.float64]], seen: _Seen) -> tuple[float, NDArray[np.float64]]:
+    """The largest log-evidence of a prior of one wall's coefficients, and that prior's covariance (n_modes, n_modes).
 
-    In the common eigenvectors of both, D = W W^T and S = W diag(lambda) W^T, every sum of them is diagonal.
+    Sought are the weights of drift and swelling, covariances (n_modes, n_modes) at the modes' own standard deviation:
+    in the common eigenvectors of both, D = W W^T and S = W diag(lambda) W^T, every sum of them is diagonal.
     """
     drift, swelling = (part + LEAST_VARIANCE * np.eye(len(part)) for part in parts)
     ratios, vectors = linalg.eigh(swelling, drift, check_finite=False)
@@ -154,7 +156,7 @@ def _most_evident(parts: Sequence[NDArray[np.float64]], seen: _Seen) -> _Belief:
         for start in FIRST_AMPLITUDES
     ]
     best = min(found, key=lambda trial: float(trial.fun))
-    return _Belief((basis * sum(shares(best.x))) @ basis.T, -float(best.fun))
+    return -float(best.fun), (basis * sum(shares(best.x))) @ basis.T
 
 
 def _with(

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
 from palpate.inversion.approximation import Approximation, Place
-from palpate.inversion.driver import learned_precision
+from palpate.inversion.driver import with_learned_prior
 from palpate.inversion.expansion import expansion_near
 from palpate.inversion.later_state import InverseProblem
 from palpate.inversion.objective import Objective
 from palpate.inversion.optimise import Bounds, fit_coefficients
 from palpate.inversion.reduced_basis import reduced_basis
 from palpate.mechanics.equilibrium import ACCURACY
-from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
+from palpate.mechanics.finite_strain import FiniteStrainEquilibrium
 from palpate.observation.noise_model import SEGMENTATION_NOISE
 
 __all__ = ["fit_driver"]
@@ -56,10 +56,7 @@ def _fitted(
     objective = held.under(models).with_observations([o.with_noise(SEGMENTATION_NOISE) for o in held.observations])
     objective = objective.rematched(np.concatenate([theta, coefficients]))
     first = fit_coefficients(objective, theta, bounds=bounds, coefficients=coefficients)
-    precision = learned_precision(objective, first.evaluation, first.unknowns)
-    if precision is not None:
-        objective = replace(objective, parameters=parameters.with_driver_precision(precision))
-    objective = objective.rematched(first.unknowns)
+    objective = with_learned_prior(objective, first.evaluation, first.unknowns).rematched(first.unknowns)
     found = fit_coefficients(objective, theta, bounds=bounds, coefficients=first.unknowns[len(theta) :])
     if not found.converged:
         raise NotConverged(f"the driver's wall could not be fitted to the later image: {found.outcome.value}")
@@ -70,11 +67,8 @@ def _followed(near: FiniteStrainEquilibrium, coefficients: NDArray[np.float64], 
     """Equilibria at shares of the coefficients and of the offset, each from the one before it."""
     states: list[NDArray[np.float64]] = []
     for share in shares:
-        model = _at_share(near.model, share)
+        constraint = near.model.constraint
+        model = near.model.under(replace(constraint, offset=share * constraint.offset))
         start = states[-1] if states else share * near.displacement
         states.append(model.solve(near.moduli, share * coefficients, start=start).displacement)
     return tuple(states)
-
-
-def _at_share(model: FiniteStrainModel, share: float) -> FiniteStrainModel:
-    return model.under(replace(model.constraint, offset=share * model.constraint.offset))

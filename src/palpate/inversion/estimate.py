@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.errors import EstimationError
-from palpate.inversion.approximation import Place
-from palpate.inversion.driver import learned_precision
+from palpate.errors import ConfigurationError, EstimationError
+from palpate.inversion.driver import with_learned_prior
 from palpate.inversion.expansion import Expansion, expansion_near
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import Evaluation, Objective
@@ -69,7 +68,10 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Inversion:
-    """The distinct minima, the number of the best one, every start, and the evaluation at no motion (`rest`)."""
+    """The distinct minima, the number of the best one, every start, and the evaluation at no motion (`rest`).
+
+    evaluations, counts: of everything that was followed to find and compare them, not of the best one alone.
+    """
 
     candidates: tuple[Candidate, ...]
     best: int
@@ -101,9 +103,14 @@ def invert(
 
     States that bring an approximation are estimated on it; for the others a reduced basis is made at the middle start
     and extended where the estimate goes. rule: when the linear estimate ends; None: at its full accuracy, or when it is
-    near where another law follows. Raises `EstimationError`s of solving; an estimate that did not converge says so in
-    its minimum's outcome.
+    near where another law follows. Raises `ConfigurationError` for an open Poisson's ratio with another law,
+    `EstimationError`s of solving; an estimate that did not converge says so in its minimum's outcome.
     """
+    if problem.finite_strain and problem.parameters.poisson:
+        raise ConfigurationError(
+            "a Poisson's ratio can be sought under the linear law only: the finite-strain models hold those of the"
+            " tissues; seek none, or leave out the states' `finite_strain` models (`InverseProblem.linear`)"
+        )
     middle = np.asarray(np.median(np.stack(settings.starts), axis=0))
     states = problem.states
     if any(state.approximation is None for state in states):
@@ -127,7 +134,7 @@ def continue_at_finite_strain(linear: Inversion, settings: InversionSettings, *,
         if number == linear.best or candidate.minimum.converged:
             try:
                 end = _at_finite_strain(candidate.iterate, settings, progress)
-                spent, evaluations = spent + _counts(end), evaluations + end.minimum.evaluations
+                spent, evaluations = spent + end.counts, evaluations + end.minimum.evaluations
             except EstimationError:
                 if number == linear.best:
                     raise
@@ -146,8 +153,9 @@ def _with_reduced_bases(
     objective = with_first_noise(Objective(problem.states, parameters).under(bases))
     still = np.concatenate([middle, np.zeros(sum(parameters.n_modes))])
     fitted = fit_coefficients(objective.rematched(still), middle, bounds=settings.bounds)
+    by_theta = parameters.derivatives(middle)
     triples = zip(problem.states, bases, parameters.coefficients(fitted.unknowns), strict=True)
-    return tuple(s.with_approximation(b.with_modulus_series(q, parameters.selection)) for s, b, q in triples)
+    return tuple(s.with_approximation(b.with_modulus_series(q, by_theta)) for s, b, q in triples)
 
 
 def _linear(
@@ -158,9 +166,7 @@ def _linear(
     objective = with_first_noise(objective).rematched(still)
     rest = objective(still)
     fitted = fit_coefficients(objective, middle, bounds=settings.bounds)
-    precision = learned_precision(objective, fitted.evaluation, fitted.unknowns)
-    if precision is not None:
-        objective = replace(objective, parameters=objective.parameters.with_driver_precision(precision))
+    objective = with_learned_prior(objective, fitted.evaluation, fitted.unknowns)
     minima = _from_starts(objective, settings, fitted.unknowns[objective.n_parameters :], progress)
     groups = _groups(minima, objective.n_parameters)
     best = groups[_best(minima)]
@@ -173,7 +179,9 @@ def _linear(
     starts = tuple(StartRun(theta, minimum, order.index(group)) for theta, minimum, group in triples)
     evaluations = 1 + fitted.evaluations + sum(m.evaluations for m in (*minima, *(f.minimum for f in followed)))
     found = _concluded(followed, starts, rest, settings, 0)
-    return replace(found, evaluations=found.evaluations + evaluations, counts=_counts(followed[0]))
+    first = followed[0].counts  # the others' approximations are this one's, extended
+    spent = sum((other.counts - first for other in followed[1:]), first)
+    return replace(found, evaluations=found.evaluations + evaluations, counts=spent)
 
 
 def _from_starts(
@@ -203,10 +211,10 @@ def _another(
     start = np.concatenate([minimum.unknowns[:n], best.minimum.unknowns[n:]])
     found = minimised(best.objective, start, settings, tolerance=OTHER)
     if found.converged and found.evaluation.value < best.minimum.evaluation.value - LOWER:
-        return run_outer_loop(
-            best.objective, found, settings, rule, progress=progress, title="linear law, another minimum"
-        )
-    return OuterIterate(best.objective, found, best.convergence)
+        title = "linear law, another minimum"
+        end = run_outer_loop(best.objective, found, settings, rule, progress=progress, title=title)
+        return replace(end, checks=best.checks + end.checks)
+    return replace(best, minimum=found)
 
 
 def _at_finite_strain(linear: OuterIterate, settings: InversionSettings, progress: Progress) -> OuterIterate:
@@ -214,28 +222,23 @@ def _at_finite_strain(linear: OuterIterate, settings: InversionSettings, progres
     progress("finite strain: the equilibrium at the linear estimate")
     tolerance = float(np.clip(0.1 * REPORTED.error_limit(linear.objective), ACCURACY, EQUILIBRIUM))
     unknowns, first = linear.minimum.unknowns, list[Expansion]()
-    for state, place in _placed(linear.objective, unknowns):
+    before = linear.objective
+    for state, basis, place in zip(before.states, before.approximations, before.places(unknowns), strict=True):
         assert state.finite_strain is not None
-        assert state.approximation is not None
-        first.append(expansion_near(state.finite_strain, state.approximation, place, tolerance=tolerance))
-    objective = linear.objective.under(first).rematched(unknowns)
+        first.append(expansion_near(state.finite_strain, basis, place, tolerance=tolerance))
+    objective = before.under(first).rematched(unknowns)
     start = replace(linear.minimum, evaluation=objective(unknowns))
     end = run_outer_loop(objective, start, settings, REPORTED, progress=progress, title="finite strain")
     exact = []
-    for state, place in _placed(end.objective, end.minimum.unknowns):
-        assert isinstance(state.approximation, Expansion)
-        exact.append(state.approximation.at_equilibrium(place, tolerance=ACCURACY))
+    places = end.objective.places(end.minimum.unknowns)
+    for approximation, place in zip(end.objective.approximations, places, strict=True):
+        assert isinstance(approximation, Expansion)
+        exact.append(approximation.at_equilibrium(place, tolerance=ACCURACY))
     final = end.objective.under(exact)
     evaluation, spent = final(end.minimum.unknowns), end.minimum.evaluations + 2
     history = linear.minimum.history + end.minimum.history
     minimum = replace(end.minimum, evaluation=evaluation, evaluations=spent, history=history)
     return replace(end, objective=final, minimum=minimum)
-
-
-def _placed(objective: Objective, unknowns: NDArray[np.float64]) -> list[tuple[LaterState, Place]]:
-    """Each state with the place that unknowns (n_unknowns,) mean for it."""
-    moduli, coefficients = objective.parameters.moduli(unknowns), objective.parameters.coefficients(unknowns)
-    return [(state, Place(moduli, q)) for state, q in zip(objective.states, coefficients, strict=True)]
 
 
 def _concluded(
@@ -248,8 +251,10 @@ def _concluded(
     """The distinct ones of the iterates, compared with each other; `first`: the number of the one sought first."""
     n = followed[0].objective.n_parameters
     groups = _groups([iterate.minimum for iterate in followed], n)
-    leaders = [_leader(followed, groups, group, first) for group in range(max(groups) + 1)]
-    distinct = [followed[i] for i in leaders]
+    distinct = []
+    for group in range(max(groups) + 1):  # stood for by the one sought first, else one that converged
+        members = [i for i, of in enumerate(groups) if of == group]
+        distinct.append(followed[min(members, key=lambda i: (i != first, not followed[i].minimum.converged, i))])
     values, evaluations = _values(distinct, settings)
     candidates = tuple(Candidate(iterate, value) for iterate, value in zip(distinct, values, strict=True))
     usable = [c.value if c.minimum.converged else np.inf for c in candidates]
@@ -258,28 +263,24 @@ def _concluded(
     return Inversion(candidates, best, joined, rest, evaluations, SolveCounts())
 
 
-def _leader(followed: Sequence[OuterIterate], groups: Sequence[int], group: int, first: int) -> int:
-    """Number of the iterate that stands for its group: the one sought first, else one that converged."""
-    members = [i for i, g in enumerate(groups) if g == group]
-    return min(members, key=lambda i: (i != first, not followed[i].minimum.converged, i))
-
-
 def _values(distinct: Sequence[OuterIterate], settings: InversionSettings) -> tuple[list[float], int]:
     """The iterates' values under one objective, each at its minimum under that, and what it cost in evaluations.
 
     Each iterate has noise models, weights and a prior of its own, and a worse fit is a smaller value where the noise is
     believed to be larger: all are compared under the objective of the one with the least noise, on their own
-    approximations.
+    approximations. Least is the geometric mean of the observations' standard deviations: each of them counts as a
+    ratio, so that no kind decides by its unit or size. The evidence of each iterate under its own objective is no way
+    out: a robust loss with a cutoff of its own is the logarithm of no density that could be normalised.
     """
     if len(distinct) == 1:
         return [distinct[0].minimum.evaluation.value], 0
     usable = [iterate for iterate in distinct if iterate.minimum.converged] or list(distinct)
-    reference = min(usable, key=lambda iterate: max(noise.sd for noise in iterate.objective.noise.values()))
+    reference = min(usable, key=lambda iterate: sum(np.log(o.noise_model.sd) for o in iterate.objective.observations))
     values, evaluations = [], 0
     for iterate in distinct:
         unknowns = iterate.minimum.unknowns
-        own = [state.approximation for state in iterate.objective.states if state.approximation is not None]
-        there = minimised(reference.objective.under(own).rematched(unknowns), unknowns, settings)
+        same = reference.objective.under(iterate.objective.approximations).rematched(unknowns)
+        there = minimised(same, unknowns, settings)
         values.append(there.evaluation.value)
         evaluations += there.evaluations
     return values, evaluations
@@ -305,8 +306,3 @@ def _groups(minima: Sequence[Minimum], n_parameters: int) -> list[int]:
             distinct.append(minimum)
         groups.append(same[0] if same else len(distinct) - 1)
     return groups
-
-
-def _counts(iterate: OuterIterate) -> SolveCounts:
-    approximations = [state.approximation for state in iterate.objective.states]
-    return sum((a.counts for a in approximations if a is not None), SolveCounts())

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
 from palpate.inversion.approximation import Approximation, Place
+from palpate.inversion.objective import determined
 from palpate.mechanics.equilibrium import from_start
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
 from palpate.mechanics.first_order import FirstOrderModel
@@ -65,31 +66,34 @@ class Expansion:
     def update(self, at: Place) -> Expansion:
         """The expansion around the equilibrium at another place, its derivatives exact there where they are worth it.
 
-        They are worth their price near the estimate, or where there are few. Raises `NotConverged` when there is no
-        equilibrium.
+        They are worth their price near the estimate, or where there are few. With directions D, the exact C along them
+        and H the metric T becomes T + (C - T D) (D^T H D)^+ D^T H: of all T' with T' D = C the one that changes least.
+        The other columns stay as they were where T was made. Raises `NotConverged` when there is no equilibrium.
         """
         there = self if at.same_as(self.place) else self._around(self._equilibrium(at))
         few = there.model.n_regions + there.model.n_modes <= FEW
         if at.directions is None or at.metric is None or not (at.near or few):
             return there
-        return _with_derivatives(there, np.eye(len(at.directions)) if few else at.directions, at.metric)
+        directions = np.eye(len(at.directions)) if few else at.directions
+        before = there.model.derivatives @ directions
+        change = there.equilibrium.tangent_along(directions, before) - before
+        with determined():
+            share = np.linalg.pinv(directions.T @ at.metric @ directions, hermitian=True) @ (directions.T @ at.metric)
+        sharper = replace(there.model, derivatives=there.model.derivatives + change @ share)
+        spent = there.counts + SolveCounts(tangent=directions.shape[1])
+        return replace(there, model=sharper, counts=spent, derivatives_at=there.equilibrium.moduli)
+
+    @property
+    def error_counts(self) -> SolveCounts:
+        """One right-hand side with the factorisation that is there."""
+        return SolveCounts(forward=1)
 
     def error(self, at: Place) -> float:
-        """Estimated relative error in energy of the displacement: of one correction r^T K^-1 r by its residual r.
-
-        K is the stiffness at hand, not the one there. Without a factorisation, infinite but at its own equilibrium.
-        """
+        """An estimate (see `FiniteStrainEquilibrium.error_estimate`); nothing at its own equilibrium."""
         if at.same_as(self.place):
             return 0.0
-        if self.factorisation is None:
-            return np.inf
-        balance = self.equilibrium.model.balance(at.moduli)
         displacement = self.model.solve(at.moduli, at.coefficients).values
-        residual = np.asarray(balance.free.T @ balance.residual(displacement)[0])
-        correction = self.factorisation.solve(residual[:, None])[:, 0]
-        internal = balance.region_forces(displacement, balance.moduli).sum(axis=1)
-        squared = abs(residual @ correction) / max(abs(float(internal @ displacement)), np.finfo(float).tiny)
-        return float(np.sqrt(squared)) if np.isfinite(squared) else np.inf
+        return self.equilibrium.error_estimate(at.moduli, displacement)
 
     def with_constraint(self, constraint: Constraint) -> Expansion:
         """The expansion around the equilibrium that another offset of what is prescribed leads to; `NotConverged`."""
@@ -134,17 +138,3 @@ def expansion_near(model: FiniteStrainModel, linear: Approximation, at: Place, *
     found = from_start(full, at.moduli, at.coefficients, start=near.displacement, nearby=near.factorisation)
     derivatives = FirstOrderModel(model.names, at.moduli, at.coefficients, found.values, near.tangent())
     return Expansion(derivatives, found, near.counts + near.tangent_counts + found.counts)
-
-
-def _with_derivatives(near: Expansion, directions: NDArray[np.float64], metric: NDArray[np.float64]) -> Expansion:
-    """The expansion with the derivatives along `directions` D (n_regions + n_modes, k) exact at its equilibrium.
-
-    T + (C - T D) (D^T H D)^+ D^T H with the exact C and H the `metric` (n_regions + n_modes, n_regions + n_modes): of
-    all T' with T' D = C the one that changes least. The other columns stay as they were where T was made.
-    """
-    before = near.model.derivatives @ directions
-    change = near.equilibrium.tangent_along(directions, before) - before
-    share = np.linalg.pinv(directions.T @ metric @ directions, hermitian=True) @ (directions.T @ metric)
-    sharper = replace(near.model, derivatives=near.model.derivatives + change @ share)
-    spent = near.counts + SolveCounts(tangent=directions.shape[1])
-    return replace(near, model=sharper, counts=spent, derivatives_at=near.equilibrium.moduli)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inversion.approximation import Approximation
+from palpate.errors import EstimationError
+from palpate.inversion.approximation import Approximation, Place
 from palpate.inversion.later_state import LaterState
 from palpate.inversion.parameters import ParameterMap
 from palpate.mechanics.forward import Equilibrium
@@ -16,7 +18,20 @@ from palpate.observation.contract import Observation, Residuals
 from palpate.observation.noise_model import NoiseModel
 from palpate.parallel import mapped
 
-__all__ = ["Evaluation", "Linearisation", "Objective", "deciding_directions"]
+__all__ = ["Evaluation", "Linearisation", "Objective", "deciding_directions", "determined"]
+
+
+@contextmanager
+def determined() -> Iterator[None]:
+    """Where images and prior leave an unknown open, its matrix has no inverse: raises `EstimationError` for it."""
+    try:
+        yield
+    except np.linalg.LinAlgError as error:
+        raise EstimationError(
+            f"the images do not determine what is sought ({error}): beside the noise ([noise] surface_sd_mm, or that of"
+            " the residuals) the driver's motion cannot be told from none; state the noise smaller, or use images in"
+            " which the organs move more"
+        ) from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +75,14 @@ class Evaluation:
     prior: NDArray[np.float64]
     prior_score: NDArray[np.float64]
 
+    def covariance_columns(self, n_parameters: int) -> NDArray[np.float64]:
+        """H^-1 [e_1, ..., e_k] (n, k) of the first k unknowns, the log-moduli, with the Gauss-Newton matrix H.
+
+        Raises `EstimationError` where neither images nor prior determine some unknown.
+        """
+        with determined():
+            return np.asarray(np.linalg.solve(self.matrix, np.eye(len(self.matrix))[:, :n_parameters]))
+
 
 @dataclass(frozen=True, slots=True)
 class Objective:
@@ -86,6 +109,28 @@ class Objective:
         """The noise model of each kind of observation."""
         return {observation.kind: observation.noise_model for observation in self.observations}
 
+    @property
+    def approximations(self) -> list[Approximation]:
+        """What stands in for each state's model."""
+        found = [state.approximation for state in self.states if state.approximation is not None]
+        assert len(found) == len(self.states), "an objective is made of states with approximations"
+        return found
+
+    def places(
+        self, unknowns: NDArray[np.float64], evaluation: Evaluation | None = None, *, near: bool = False
+    ) -> list[Place]:
+        """What unknowns (n_unknowns,) mean for each state; by an `evaluation` with the directions that decide there."""
+        mapping = self.parameters
+        moduli, coefficients = mapping.moduli(unknowns), mapping.coefficients(unknowns)
+        if evaluation is None:
+            return [Place(moduli, q) for q in coefficients]
+        directions, places = deciding_directions(evaluation, mapping.n_parameters), []
+        for s, q in enumerate(coefficients):
+            own, chain = mapping.unknowns_of(s), mapping.chain(s, unknowns)
+            metric = chain @ evaluation.matrix[np.ix_(own, own)] @ chain.T
+            places.append(Place(moduli, q, chain @ directions[own], metric, near))
+        return places
+
     def under(self, approximations: Sequence[Approximation]) -> Objective:
         """The same observations and weights with other approximations, one a state."""
         pairs = zip(self.states, approximations, strict=True)
@@ -99,20 +144,17 @@ class Objective:
 
     def value(self, unknowns: NDArray[np.float64]) -> float:
         """J alone at unknowns (n_unknowns,), for trial steps."""
-        away = unknowns - self.parameters.prior_centre
-        total = 0.5 * float(away @ self.parameters.prior_matrix @ away)
-        for s, state in enumerate(self.states):
-            seen = self._seen(s, self._equilibrium(s, unknowns).values)
-            total += sum(
-                mapped(lambda of: _misfit(of[0], of[0].residuals(of[1])), zip(state.observations, seen, strict=True))
-            )
+        total, _ = self._prior(unknowns)
+        for s in range(len(self.states)):
+            pairs = self._seen(s, self._equilibrium(s, unknowns).values)
+            total += sum(mapped(lambda of: _misfit(of[0], of[0].residuals(of[1])), pairs))
         return total
 
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
         """J with gradient, Gauss-Newton matrix and residuals at `unknowns` (n_unknowns,)."""
-        prior, away = self.parameters.prior_matrix, unknowns - self.parameters.prior_centre
-        pull = prior @ away
-        value, gradient, score, matrix = 0.5 * float(away @ pull), pull.copy(), pull.copy(), prior.copy()
+        value, pull = self._prior(unknowns)
+        prior = self.parameters.prior_matrix
+        gradient, score, matrix = pull.copy(), pull.copy(), prior.copy()
         lines = [line for s in range(len(self.states)) for line in self._linearised(s, unknowns)]
         misfit = 0.0
         for line in lines:
@@ -127,16 +169,13 @@ class Objective:
 
     def value_and_gradient(self, unknowns: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         """J and its exact gradient (n_unknowns,) by one adjoint solve a state, without the Gauss-Newton system."""
-        away = unknowns - self.parameters.prior_centre
-        pull = self.parameters.prior_matrix @ away
-        value, gradient = 0.5 * float(away @ pull), pull.copy()
-        for s, state in enumerate(self.states):
+        value, gradient = self._prior(unknowns)
+        for s in range(len(self.states)):
             solution = self._equilibrium(s, unknowns)
-            pairs = zip(state.observations, self._seen(s, solution.values), strict=True)
-            found = mapped(lambda of: _misfit_and_pull(*of), pairs)
-            value += sum(misfit for misfit, _ in found)
-            by_region = solution.adjoint(np.concatenate([force for _, force in found]))[None]
-            gradient[self.parameters.unknowns_of(s)] += self.parameters.by_unknowns(by_region)[0]
+            seen = mapped(lambda of: (of[0], of[0].residuals(of[1])), self._seen(s, solution.values))
+            value += sum(_misfit(*of) for of in seen)
+            by_region = solution.adjoint(np.concatenate([_pull(*of) for of in seen]))[None]
+            gradient[self.parameters.unknowns_of(s)] += self.parameters.by_unknowns(by_region, unknowns)[0]
         return value, gradient
 
     def rematched(self, unknowns: NDArray[np.float64]) -> Objective:
@@ -145,9 +184,9 @@ class Objective:
         Raises `EstimationError` when an observation has nothing left to compare.
         """
         fresh = []
-        for s, state in enumerate(self.states):
-            seen = self._seen(s, self._equilibrium(s, unknowns).values)
-            fresh += [o.rematched(motion) for o, motion in zip(state.observations, seen, strict=True)]
+        for s in range(len(self.states)):
+            pairs = self._seen(s, self._equilibrium(s, unknowns).values)
+            fresh += [observation.rematched(motion) for observation, motion in pairs]
         return self.with_observations(fresh)
 
     def _equilibrium(self, s: int, unknowns: NDArray[np.float64]) -> Equilibrium:
@@ -155,13 +194,20 @@ class Objective:
         assert observed is not None, "an objective is made of states with approximations"
         return observed.solve(self.parameters.moduli(unknowns), self.parameters.coefficients(unknowns)[s])
 
-    def _seen(self, s: int, values: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Displacements (n_dofs,) mm of each observation of a state."""
-        return [values[rows] for rows in self.states[s].slices]
+    def _prior(self, unknowns: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """1/2 (x - m)^T P (x - m) and its gradient (n_unknowns,)."""
+        away = unknowns - self.parameters.prior_centre
+        pull = self.parameters.prior_matrix @ away
+        return 0.5 * float(away @ pull), pull
+
+    def _seen(self, s: int, values: NDArray[np.float64]) -> list[tuple[Observation, NDArray[np.float64]]]:
+        """Each observation of a state with its displacements (n_dofs,) mm."""
+        state = self.states[s]
+        return [(o, values[rows]) for o, rows in zip(state.observations, state.slices, strict=True)]
 
     def _linearised(self, s: int, unknowns: NDArray[np.float64]) -> list[Linearisation]:
         state, solution = self.states[s], self._equilibrium(s, unknowns)
-        values, tangent = solution.values, self.parameters.by_unknowns(solution.tangent())
+        values, tangent = solution.values, self.parameters.by_unknowns(solution.tangent(), unknowns)
         columns = self.parameters.unknowns_of(s)
 
         def line(of: tuple[slice, Observation]) -> Linearisation:
@@ -176,17 +222,16 @@ class Objective:
         return mapped(line, zip(state.slices, state.observations, strict=True))
 
 
-def deciding_directions(parameters: ParameterMap, evaluation: Evaluation) -> list[NDArray[np.float64]]:
-    """Directions (n_regions + n_modes, 2 n_parameters) of each state's (ln E, q) that decide the moduli, dimensionless.
+def deciding_directions(evaluation: Evaluation, n_parameters: int) -> NDArray[np.float64]:
+    """Directions (n_unknowns, 2 n_parameters) of the unknowns that decide the parameters theta, dimensionless.
 
-    First the unit vectors e_i of the log-moduli, then h_i = H^-1 e_i with the Gauss-Newton matrix H. Where the
+    First the unit vectors e_i of the parameters, then h_i = H^-1 e_i with the Gauss-Newton matrix H. Where the
     derivatives J h_i of the residuals are exact, so are to first order in an error of the other columns of J the
-    moduli's part of the step, e_i^T H^-1 J^T W r = (J h_i)^T W r + ..., their gain (J h_i)^T W and their variance
+    parameters' part of the step, e_i^T H^-1 J^T W r = (J h_i)^T W r + ..., their gain (J h_i)^T W and their variance
     e_i^T H^-1 e_i, whose variation is -2 (dJ h_i)^T W J h_i.
     """
-    unit = np.eye(len(evaluation.matrix))[:, : parameters.n_parameters]
-    directions = np.concatenate([unit, np.linalg.solve(evaluation.matrix, unit)], axis=1)
-    return [parameters.directions_of(s, directions) for s in range(len(parameters.n_modes))]
+    unit = np.eye(len(evaluation.matrix))[:, :n_parameters]
+    return np.concatenate([unit, evaluation.covariance_columns(n_parameters)], axis=1)
 
 
 def _misfit(observation: Observation, residuals: Residuals) -> float:
@@ -194,13 +239,8 @@ def _misfit(observation: Observation, residuals: Residuals) -> float:
     return 0.5 * observation.weighting.precision * _mean_loss(observation, residuals)
 
 
-def _misfit_and_pull(observation: Observation, motion: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-    """What an observation adds to the objective, and its derivative (n_dofs,) by its displacement, 1/mm."""
-    residuals = observation.residuals(motion)
-    return _misfit(observation, residuals), _pull(observation, residuals)
-
-
 def _pull(observation: Observation, residuals: Residuals) -> NDArray[np.float64]:
+    """Derivative (n_dofs,) of that by the observation's displacement, 1/mm."""
     weighting = observation.weighting
     weights = residuals.weights * weighting.loss.weight(residuals.values)
     return np.asarray(residuals.jacobian.T @ (weighting.precision * weights * residuals.values))

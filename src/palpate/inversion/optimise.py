@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from palpate.inversion.objective import Evaluation, Objective
+from palpate.inversion.objective import Evaluation, Objective, determined
 
 __all__ = ["Bounds", "Iterate", "Minimum", "Outcome", "fit_coefficients", "gauss_newton", "lbfgs", "posterior_sd"]
 
@@ -91,10 +91,15 @@ class _Region:
         return _Region(min(2.0 * self.radius, MAX_RADIUS), self.damping / 10.0 if self.damping > 1e-6 else 0.0)
 
 
+WHOLE = _Region(np.inf, 0.0)  # the step to the minimum of the quadratic model
+
+
 def posterior_sd(minimum: Minimum, n_parameters: int) -> NDArray[np.float64]:
-    """Standard deviations (n_parameters,) of the log-moduli by the Gauss-Newton matrix."""
-    inverse = np.linalg.inv(minimum.evaluation.matrix)[:n_parameters, :n_parameters]
-    return np.asarray(np.sqrt(np.diag(inverse)))
+    """Standard deviations (n_parameters,) of the log-moduli by the Gauss-Newton matrix.
+
+    Raises `EstimationError` where neither images nor prior determine some unknown.
+    """
+    return np.asarray(np.sqrt(np.diag(minimum.evaluation.covariance_columns(n_parameters))))
 
 
 def fit_coefficients(
@@ -142,13 +147,14 @@ def gauss_newton(
         free = _free(objective, unknowns, now, bounds, hold_theta)
         decrement = _decrement(now, free)
         history.append(Iterate(unknowns[: objective.n_parameters], now.value, now.misfit_mm2, decrement))
-        if decrement < tolerance and np.all(_moves(now, free, objective.n_parameters) < within):
+        whole = _step(now, free, objective.n_parameters, WHOLE)[: objective.n_parameters]
+        if decrement < tolerance and np.all(np.abs(whole) < within):
             outcome = Outcome.CONVERGED
             break
         found, trials = _search(objective, unknowns, now, free=free, bounds=bounds, region=region)
         evaluations += trials
         if found is None:
-            near = decrement < STALLED or _near(now, free, objective.n_parameters)
+            near = decrement < STALLED or _within_noise(now, free, whole, decrement)
             outcome = Outcome.STALLED if near else Outcome.STUCK
             break
         unknowns, now, region = found
@@ -173,7 +179,8 @@ def _search(
         step, there = trial - unknowns, objective(trial)
         promised = -now.score @ step - 0.5 * step @ now.matrix @ step
         gain = now.value - there.value
-        if gain > 1e-4 * promised or _decrement(there, free) < 0.9 * before:
+        progress = gain > 1e-4 * promised or _decrement(there, free) < 0.9 * before
+        if promised > 0.0 and progress:  # what a bound leaves of a step may lead uphill
             return (trial, there, region.larger() if gain > 0.25 * promised else region), trials
         region = region.smaller()
     return None, SEARCHES
@@ -194,25 +201,18 @@ def _decrement(now: Evaluation, free: NDArray[np.bool_]) -> float:
     return float(0.5 * score @ _solve(matrix, score))
 
 
-def _moves(now: Evaluation, free: NDArray[np.bool_], n_parameters: int) -> NDArray[np.float64]:
-    """Change (n_parameters,), without sign, of the log-moduli by the step to the minimum of the quadratic model."""
-    return np.abs(_step(now, free, n_parameters, _Region(np.inf, 0.0))[:n_parameters])
-
-
-def _near(now: Evaluation, free: NDArray[np.bool_], n_parameters: int) -> bool:
-    """Whether the step that finds no smaller value is the noise of re-chosen closest points.
+def _within_noise(now: Evaluation, free: NDArray[np.bool_], step: NDArray[np.float64], decrement: float) -> bool:
+    """Whether the step (n_parameters,) that finds no smaller value is the noise of re-chosen closest points.
 
     It moves every free log-modulus by less than a tenth of its posterior width, and promises less than a thousandth of
     the objective (a hundredth where the moduli are held and only the driver moves).
     """
-    step = _step(now, free, n_parameters, _Region(np.inf, 0.0))[:n_parameters]
-    inverse = np.linalg.inv(now.matrix[np.ix_(free, free)])
-    width = np.full(n_parameters, np.inf)
-    moving = free[:n_parameters]
-    width[moving] = np.sqrt(np.diag(inverse)[: int(moving.sum())])
-    small = bool(np.all(np.abs(step) < 0.1 * width))
+    moving = free[: len(step)]
+    with determined():
+        inverse = np.linalg.inv(now.matrix[np.ix_(free, free)])
+    width = np.sqrt(np.diag(inverse)[: int(moving.sum())])
     share = 1e-3 if moving.any() else 1e-2
-    return small and _decrement(now, free) < share * now.value + STALLED
+    return bool(np.all(np.abs(step[moving]) < 0.1 * width)) and decrement < share * now.value + STALLED
 
 
 def _step(now: Evaluation, free: NDArray[np.bool_], n_parameters: int, region: _Region) -> NDArray[np.float64]:
@@ -272,15 +272,11 @@ def lbfgs(
         options={"maxiter": max_steps, "ftol": 1e-14, "gtol": float(np.sqrt(tolerance))},
     )
     best = at(found.x)
-    history = tuple(_iterate(minimum, n, scale) for minimum in [*profile.values(), best])
+    history = []
+    for minimum in [*profile.values(), best]:  # half of the squared scaled slope stands for the decrement
+        now, slope = minimum.evaluation, minimum.evaluation.gradient[:n] * scale
+        history.append(Iterate(minimum.unknowns[:n], now.value, now.misfit_mm2, float(0.5 * slope @ slope)))
     small = history[-1].decrement < 100.0 * tolerance
     outcome = Outcome.CONVERGED if found.success else Outcome.STALLED if small else Outcome.STEPS
     evaluations = first.evaluations + sum(minimum.evaluations for minimum in profile.values())
-    return Minimum(best.unknowns, best.evaluation, outcome, history, evaluations)
-
-
-def _iterate(minimum: Minimum, n_parameters: int, scale: NDArray[np.float64]) -> Iterate:
-    """The point with half of the squared scaled slope in the place of the decrement."""
-    now = minimum.evaluation
-    slope = now.gradient[:n_parameters] * scale
-    return Iterate(minimum.unknowns[:n_parameters], now.value, now.misfit_mm2, float(0.5 * slope @ slope))
+    return Minimum(best.unknowns, best.evaluation, outcome, tuple(history), evaluations)

@@ -6,19 +6,19 @@ It is the same for the linear and for a finite-strain law, and for every approxi
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
-from palpate.inversion.approximation import Approximation, Place
+from palpate.inversion.approximation import Approximation
 from palpate.inversion.driver import refined_walls
-from palpate.inversion.objective import Evaluation, Objective, deciding_directions
+from palpate.inversion.objective import Evaluation, Objective
 from palpate.inversion.optimise import Bounds, Minimum, Outcome, gauss_newton, lbfgs, posterior_sd
 from palpate.inversion.reweighting import reweighted
+from palpate.mechanics.forward import SolveCounts
 
 __all__ = [
     "Convergence",
@@ -27,7 +27,6 @@ __all__ = [
     "OuterIterate",
     "StopRule",
     "minimised",
-    "ratios_in_words",
     "run_outer_loop",
     "updated",
 ]
@@ -115,7 +114,7 @@ class OuterIterate:
     """Where an outer iteration ended: a minimum under the objective that it was found with.
 
     step: how far it moved a log-modulus, over the stop rule's tolerance; stayed: whether no part of the step lowered
-    the objective, so that it ended where it began.
+    the objective, so that it ended where it began; checks: what it cost to state the approximations' errors.
     """
 
     objective: Objective
@@ -123,6 +122,12 @@ class OuterIterate:
     convergence: Convergence = Convergence()
     step: float = np.inf
     stayed: bool = False
+    checks: SolveCounts = field(default_factory=SolveCounts)
+
+    @property
+    def counts(self) -> SolveCounts:
+        """What the full model has cost: to make the approximations, and to state their errors."""
+        return sum((approximation.counts for approximation in self.objective.approximations), self.checks)
 
 
 def run_outer_loop(
@@ -144,8 +149,8 @@ def run_outer_loop(
     now, refinements = updated(OuterIterate(objective, begun), rule), 0
     for number in range(1, rule.iterations + 1):
         line = f"{title}, outer iteration {number}"
-        progress(f"{line}: {ratios_in_words(now)}")
-        now = _iteration(now, settings, rule, partial(_say, progress, line))
+        progress(f"{line}: {now.objective.parameters.in_words(now.minimum.unknowns)}")
+        now = _iteration(now, settings, rule, progress, line)
         if now.stayed:
             return now
         if now.convergence.converged:
@@ -161,9 +166,12 @@ def run_outer_loop(
 
 def updated(now: OuterIterate, rule: StopRule) -> OuterIterate:
     """The iterate on approximations that are exact at its unknowns, with derivatives, where their error asks for it."""
-    if _model_error(now.objective, now.minimum.unknowns) < rule.solve_above:
-        return now
-    return _with_approximations(now, _solved(now.objective, now.minimum.unknowns, now.minimum.evaluation, near=False))
+    if rule.solve_above > 0.0:
+        error, cost = _model_error(now.objective, now.minimum.unknowns)
+        now = replace(now, checks=now.checks + cost)
+        if error < rule.solve_above:
+            return now
+    return _with_approximations(now, _solved(now.objective, now.minimum.unknowns, now.minimum.evaluation))
 
 
 def minimised(
@@ -184,32 +192,19 @@ def minimised(
     return gauss_newton(objective, start, bounds=settings.bounds, tolerance=tolerance, within=within)
 
 
-def ratios_in_words(now: OuterIterate) -> str:
-    """The moduli of an iterate in words, for the progress."""
-    mapping = now.objective.parameters
-    ratios = np.exp(now.minimum.unknowns[: mapping.n_parameters])
-    return ", ".join(
-        f"{name} {ratio:.2f} x {mapping.relative_to}" for name, ratio in zip(mapping.tissues, ratios, strict=True)
-    )
-
-
-def _say(progress: Callable[[str], None], line: str, words: str) -> None:
-    progress(f"{line}, {words}")
-
-
 def _iteration(
-    now: OuterIterate, settings: InversionSettings, rule: StopRule, progress: Callable[[str], None]
+    now: OuterIterate, settings: InversionSettings, rule: StopRule, progress: Callable[[str], None], line: str
 ) -> OuterIterate:
     """Reweight and minimise on the present approximations, and update these there, or on a part of the way."""
-    objective, found, reweighting = _reweighted_minimum(now, settings, rule, progress)
+    objective, found, reweighting = _reweighted_minimum(now, settings, rule, progress, line)
     n = objective.n_parameters
     tolerance = rule.tolerance(found, n)
     moved = np.abs(found.unknowns - now.minimum.unknowns)[:n]
     step = float(np.max(moved / tolerance, initial=0.0))
     open_ = np.max(_linearisation(objective, found) / tolerance, initial=0.0) if rule.derivatives else step
-    error, limit = _model_error(objective, found.unknowns), rule.error_limit(objective)
+    (error, cost), limit = _model_error(objective, found.unknowns), rule.error_limit(objective)
     convergence = Convergence(reweighting, float(open_), error / limit if np.isfinite(limit) else 0.0)
-    there = OuterIterate(objective, found, convergence, step)
+    there = OuterIterate(objective, found, convergence, step, checks=now.checks + cost)
     if convergence.converged or error < rule.solve_above:
         return there
     near = bool(np.all(moved < NEAR * posterior_sd(found, n)))
@@ -219,7 +214,7 @@ def _iteration(
 
 
 def _reweighted_minimum(
-    now: OuterIterate, settings: InversionSettings, rule: StopRule, progress: Callable[[str], None]
+    now: OuterIterate, settings: InversionSettings, rule: StopRule, progress: Callable[[str], None], line: str
 ) -> tuple[Objective, Minimum, float]:
     """Iteratively reweighted minimisation on the present approximations, and what its last pass changed.
 
@@ -228,7 +223,7 @@ def _reweighted_minimum(
     step where that is more. The log-moduli go no further than the approximations reach.
     """
     n, objective = now.objective.n_parameters, now.objective
-    reach = min(_approximation(objective, s).reach for s in range(len(objective.states)))
+    reach = min(approximation.reach for approximation in objective.approximations)
     theta, bounds = now.minimum.unknowns[:n], settings.bounds
     near = Bounds(np.maximum(bounds.lower, theta - reach), np.minimum(bounds.upper, theta + reach))
     forcing, change = max(1.0, FORCING * now.step), np.inf
@@ -247,7 +242,7 @@ def _reweighted_minimum(
         change = float(np.max([moved, np.where(rule.tolerance(minimum, n) > rule.floor, widened, 0.0)], initial=0.0))
         if change < forcing:
             break
-        progress(f"reweighting {number}: {ratios_in_words(OuterIterate(objective, minimum))}")
+        progress(f"{line}, reweighting {number}: {objective.parameters.in_words(minimum.unknowns)}")
     return objective, minimum, change
 
 
@@ -298,8 +293,8 @@ def _linearisation(objective: Objective, there: Minimum) -> NDArray[np.float64]:
     standard deviation counts as 0.03 at least: its own error is a share d, too, and may be a per cent.
     """
     moduli, distance = objective.parameters.moduli(there.unknowns), 0.0
-    for s in range(len(objective.states)):
-        exact = _approximation(objective, s).derivatives_at
+    for approximation in objective.approximations:
+        exact = approximation.derivatives_at
         distance = np.inf if exact is None else max(distance, float(np.abs(np.log(moduli / exact)).max()))
     return distance * np.maximum(posterior_sd(there, objective.n_parameters), LEAST_SD)
 
@@ -309,8 +304,8 @@ def _with_finer_walls(now: OuterIterate) -> OuterIterate | None:
     finer = refined_walls(now.objective, now.minimum.evaluation)
     if all(constraint is None for constraint in finer):
         return None
-    held = [_approximation(now.objective, s) for s in range(len(finer))]
-    moved = [a if c is None else a.with_constraint(c) for a, c in zip(held, finer, strict=True)]
+    pairs = zip(now.objective.approximations, finer, strict=True)
+    moved = [a if constraint is None else a.with_constraint(constraint) for a, constraint in pairs]
     return replace(_with_approximations(now, moved), convergence=Convergence(), step=np.inf)
 
 
@@ -325,30 +320,12 @@ def _solved(
     objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation | None = None, *, near: bool = False
 ) -> list[Approximation]:
     """The states' approximations updated at unknowns, with the derivatives that decide by an evaluation."""
-    places = _places(objective, unknowns, evaluation, near=near)
-    return [_approximation(objective, s).update(place) for s, place in enumerate(places)]
+    places = objective.places(unknowns, evaluation, near=near)
+    return [approximation.update(at) for approximation, at in zip(objective.approximations, places, strict=True)]
 
 
-def _places(
-    objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation | None = None, *, near: bool = False
-) -> list[Place]:
-    parameters = objective.parameters
-    moduli, coefficients = parameters.moduli(unknowns), parameters.coefficients(unknowns)
-    if evaluation is None:
-        return [Place(moduli, q) for q in coefficients]
-    directions = deciding_directions(parameters, evaluation)
-    return [
-        Place(moduli, q, d, parameters.metric_of(s, evaluation.matrix), near)
-        for s, (q, d) in enumerate(zip(coefficients, directions, strict=True))
-    ]
-
-
-def _model_error(objective: Objective, unknowns: NDArray[np.float64]) -> float:
-    """The largest error in energy of the approximations at unknowns (n_unknowns,)."""
-    return max(_approximation(objective, s).error(place) for s, place in enumerate(_places(objective, unknowns)))
-
-
-def _approximation(objective: Objective, s: int) -> Approximation:
-    approximation = objective.states[s].approximation
-    assert approximation is not None, "an objective is made of states with approximations"
-    return approximation
+def _model_error(objective: Objective, unknowns: NDArray[np.float64]) -> tuple[float, SolveCounts]:
+    """The largest error in energy of the approximations at unknowns (n_unknowns,), and what it cost to know."""
+    pairs = list(zip(objective.approximations, objective.places(unknowns), strict=True))
+    cost = sum((approximation.error_counts for approximation, _ in pairs), SolveCounts())
+    return max(approximation.error(at) for approximation, at in pairs), cost

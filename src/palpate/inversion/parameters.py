@@ -7,27 +7,58 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role, Tissue
+from palpate.mechanics.dilatation import Dilatation
+from palpate.mechanics.stiffness import lame_parts, lame_parts_by_poisson
 
-__all__ = ["ParameterMap", "parameter_map"]
+__all__ = ["OpenPoisson", "ParameterMap", "parameter_map"]
 
 LOADS = "the known loads"
 
 
 @dataclass(frozen=True, slots=True)
-class ParameterMap:
-    """Unknowns x = [theta, q_1, ..., q_S] (n_unknowns,): theta = ln(E / E_reference), then each state's coefficients.
+class OpenPoisson:
+    """A tissue whose Poisson's ratio nu is sought, by eta = ln(lambda / mu), which no bound cuts short near nu = 0.5.
 
-    base (n_regions,) kPa: moduli of the meshed tissues, in the order of the mesh's regions, at theta = 0; selection
-    (n_regions, n_parameters): 1 where a parameter scales a region, several regions where tissues are tied; `tissues`:
-    the parameters' names; n_modes: driver coefficients of each later state. `relative_to`: the tissue that holds the
-    scale; `absolute` is False when nothing sets one: then the first `estimate` tissue is held at 1 and every value is a
-    ratio to it. Where known loads alone set it, `relative_to` says so, and the base is 1 kPa.
+    nu = 1/2 e^eta / (1 + e^eta), between 0 and 0.5; column: number of eta among the unknowns; regions: numbers of the
+    model's regions, one for each part of the tissue's stiffness that its dilatation has (see `stiffness_parts`).
+    """
+
+    tissue: str
+    column: int
+    regions: tuple[int, ...]
+    dilatation: Dilatation
+
+    def ratio(self, unknowns: NDArray[np.float64]) -> float:
+        """Poisson's ratio, dimensionless, of unknowns (n_unknowns,)."""
+        return float(0.5 / (1.0 + np.exp(-unknowns[self.column])))
+
+    def weights(self, unknowns: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(n_parts,) dimensionless: the moduli of the parts over Young's, and the derivatives of their ln by eta."""
+        ratio = self.ratio(unknowns)
+        parts, slopes = lame_parts(ratio, self.dilatation), lame_parts_by_poisson(ratio, self.dilatation)
+        present = [i for i, part in enumerate(lame_parts(0.25, self.dilatation)) if part > 0.0]
+        values = np.array(parts)[present]
+        return values, ratio * (1.0 - 2.0 * ratio) * np.array(slopes)[present] / values
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterMap:
+    """Unknowns x = [theta, q_1, ..., q_S] (n_unknowns,): the parameters theta, then each state's coefficients.
+
+    theta: ln(E / E_reference) of the `tissues`, then eta = ln(lambda / mu) of those of `poisson` (see `OpenPoisson`).
+    base (n_regions,) kPa: Young's moduli of the model's regions at theta = 0; selection (n_regions, n_parameters): 1
+    where a log-modulus scales a region, several regions where tissues are tied; n_modes: driver coefficients of each
+    later state. `relative_to`: the tissue that holds the scale; `absolute` is False when nothing sets one: then the
+    first `estimate` tissue is held at 1 and every value is a ratio to it. Where known loads alone set it, `relative_to`
+    says so, and the base is 1 kPa.
 
     The prior is normal: theta with `prior_mean` (n_parameters,) and `prior_precision` (n_parameters, n_parameters),
     flat by default, the coefficients with mean 0 and `driver_precision` (n_coefficients, n_coefficients), by default 1.
+    Raises `ConfigurationError` for a prior of another shape.
     """
 
     base: NDArray[np.float64]
@@ -39,14 +70,24 @@ class ParameterMap:
     prior_mean: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     prior_precision: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
     driver_precision: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    poisson: tuple[OpenPoisson, ...] = ()
 
     def __post_init__(self) -> None:
-        n, n_coefficients = len(self.tissues), sum(self.n_modes)
-        if not len(self.prior_mean):
-            object.__setattr__(self, "prior_mean", np.zeros(n))
-            object.__setattr__(self, "prior_precision", np.zeros((n, n)))
-        if len(self.driver_precision) != n_coefficients:
-            object.__setattr__(self, "driver_precision", np.eye(n_coefficients))
+        n = self.n_parameters
+        defaults = {
+            "prior_mean": np.zeros(n),
+            "prior_precision": np.zeros((n, n)),
+            "driver_precision": np.eye(sum(self.n_modes)),
+        }
+        for name, default in defaults.items():
+            given = getattr(self, name)
+            if not given.size:
+                object.__setattr__(self, name, default)
+            elif given.shape != default.shape:
+                raise ConfigurationError(
+                    f"{name} has the shape {given.shape}; {n} parameters and {sum(self.n_modes)} driver coefficients"
+                    f" need {default.shape}"
+                )
 
     @property
     def by_load(self) -> bool:
@@ -59,9 +100,20 @@ class ParameterMap:
         return float(self.base[self.selection[:, 0] > 0.0][0])
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """What each parameter is, for a reader."""
+        return (*self.tissues, *(f"Poisson's ratio of {open_.tissue}" for open_ in self.poisson))
+
+    def in_words(self, unknowns: NDArray[np.float64]) -> str:
+        """The parameters' values at unknowns (n_unknowns,), for the progress."""
+        ratios = zip(self.tissues, np.exp(unknowns), strict=False)
+        words = [f"{name} {ratio:.2f} x {self.relative_to}" for name, ratio in ratios]
+        return ", ".join([*words, *(f"{open_.tissue} nu {open_.ratio(unknowns):.3f}" for open_ in self.poisson)])
+
+    @property
     def n_parameters(self) -> int:
-        """Number of log-moduli among the unknowns."""
-        return len(self.tissues)
+        """Number of parameters theta among the unknowns."""
+        return len(self.tissues) + len(self.poisson)
 
     @property
     def n_unknowns(self) -> int:
@@ -82,8 +134,21 @@ class ParameterMap:
         return np.concatenate([self.prior_mean, np.zeros(sum(self.n_modes))])
 
     def moduli(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Young's moduli (n_regions,) kPa of unknowns (n_unknowns,), or of theta (n_parameters,) alone."""
-        return np.asarray(self.base * np.exp(self.selection @ unknowns[: self.n_parameters]))
+        """The regions' moduli (n_regions,) kPa at unknowns (n_unknowns,), or at theta (n_parameters,) alone.
+
+        Young's, or those of the parts of the stiffness where Poisson's ratio is open.
+        """
+        moduli = np.asarray(self.base * np.exp(self.selection @ unknowns[: self.n_parameters]))
+        for open_ in self.poisson:
+            moduli[list(open_.regions)] *= open_.weights(unknowns)[0]
+        return moduli
+
+    def derivatives(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivatives (n_regions, n_parameters) of the moduli's logarithms by theta at unknowns (n_unknowns,)."""
+        by_theta = self.selection.copy()
+        for open_ in self.poisson:
+            by_theta[list(open_.regions), open_.column] = open_.weights(unknowns)[1]
+        return by_theta
 
     def coefficients(self, unknowns: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         """Driver coefficients (n_modes,) of each state."""
@@ -94,31 +159,31 @@ class ParameterMap:
         start = self.n_parameters + sum(self.n_modes[:state])
         return np.concatenate([np.arange(self.n_parameters), np.arange(start, start + self.n_modes[state])])
 
-    def by_unknowns(self, tangent: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives (n, n_parameters + n_modes) by a state's unknowns, from those by (ln E, q)."""
+    def by_unknowns(self, tangent: NDArray[np.float64], unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivatives (n, n_parameters + n_modes) by a state's unknowns, from those by (ln E, q), at `unknowns`."""
         n_regions = len(self.base)
-        return np.concatenate([tangent[:, :n_regions] @ self.selection, tangent[:, n_regions:]], axis=1)
+        return np.concatenate([tangent[:, :n_regions] @ self.derivatives(unknowns), tangent[:, n_regions:]], axis=1)
 
-    def directions_of(self, state: int, directions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Directions (n_unknowns, k) of the unknowns as those of a state's (ln E, q), (n_regions + n_modes, k)."""
-        return self._by_region(directions[self.unknowns_of(state)])
+    def chain(self, state: int, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivatives (n_regions + n_modes, n_parameters + n_modes) of a state's (ln E, q) by its own unknowns.
 
-    def metric_of(self, state: int, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-        """A quadratic form (n_unknowns, n_unknowns) as one of a state's (ln E, q), (n_regions + n_modes, the same)."""
-        own = self.unknowns_of(state)
-        return self._by_region(self._by_region(matrix[np.ix_(own, own)]).T)
-
-    def _by_region(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Rows (n_parameters + n_modes, k) with each parameter's at the regions that it scales."""
-        return np.concatenate([self.selection @ rows[: self.n_parameters], rows[self.n_parameters :]])
+        Its columns are those of `unknowns_of`, at unknowns (n_unknowns,).
+        """
+        return np.asarray(linalg.block_diag(self.derivatives(unknowns), np.eye(self.n_modes[state])))
 
     def with_prior(self, mean: NDArray[np.float64], sd: NDArray[np.float64]) -> ParameterMap:
-        """The same with a normal prior of theta: mean and standard deviation (n_parameters,), inf where it is flat."""
-        return replace(self, prior_mean=np.where(np.isfinite(sd), mean, 0.0), prior_precision=np.diag(sd**-2.0))
+        """The same with a normal prior of theta: mean and standard deviation (n_parameters,), inf where it is flat.
 
-    def with_driver_precision(self, precision: NDArray[np.float64]) -> ParameterMap:
-        """The same with another prior of the coefficients: precision (n_coefficients, n_coefficients)."""
-        return replace(self, driver_precision=precision)
+        Raises `ConfigurationError` unless every sd is positive and every mean that counts is a number.
+        """
+        wrong = ~(sd > 0.0) | (np.isfinite(sd) & ~np.isfinite(mean))
+        if wrong.any():
+            first = int(np.flatnonzero(wrong)[0])
+            raise ConfigurationError(
+                f"the prior of ln E of '{self.names[first]}' has the mean {mean[first]} and the standard deviation"
+                f" {sd[first]}; give a number and a positive one (inf: no prior), or hold the modulus as a `known` one"
+            )
+        return replace(self, prior_mean=np.where(np.isfinite(sd), mean, 0.0), prior_precision=np.diag(sd**-2.0))
 
 
 def parameter_map(
@@ -128,12 +193,16 @@ def parameter_map(
     *,
     loaded: bool = False,
     tied: Sequence[Sequence[str]] = (),
+    open_poisson: Sequence[str] = (),
+    dilatation: Dilatation = Dilatation.POINTWISE,
 ) -> ParameterMap:
     """Make the map for a mesh whose regions are `tissues[i] for i in regions` and later states with n_modes each.
 
     The scale is the modulus of the first `known` tissue in the file, or without one what the loads say (`loaded`: known
-    loads act). tied: groups of `estimate` tissues, by name, that share one modulus. Raises `ConfigurationError` when
-    there is nothing to estimate, or a single tissue and nothing to compare it with.
+    loads act). tied: groups of `estimate` tissues, by name, that share one modulus. open_poisson: names of the tissues
+    whose Poisson's ratio is sought, too, those and the `dilatation` with which the `linear_model` was made. Raises
+    `ConfigurationError` when there is nothing to estimate, or a single tissue and nothing to compare it with, or when
+    the model's regions are not the parts of such a tissue.
     """
     meshed = [tissues[i] for i in regions]
     known = [tissue for tissue in meshed if tissue.role is Role.KNOWN]
@@ -145,14 +214,24 @@ def parameter_map(
             "nothing can be estimated: displacements fix ratios of moduli only, so a case needs an `estimate` tissue"
             " and a `known` tissue, a known load, or a second `estimate` tissue"
         )
-    selection = np.array([[float(tissue.name in group) for group in sought] for tissue in meshed])
+    parts, poisson = np.count_nonzero(lame_parts(0.25, dilatation)), list[OpenPoisson]()
+    for name in open_poisson:
+        places = tuple(i for i, tissue in enumerate(meshed) if tissue.name == name)
+        if len(places) != parts:
+            raise ConfigurationError(
+                f"the Poisson's ratio of '{name}' is sought, but the model has {len(places)} moduli for it and not"
+                f" {parts}: make it with `linear_model(..., open_poisson=...)` and with the same dilatation"
+            )
+        poisson.append(OpenPoisson(name, len(sought) + len(poisson), places, dilatation))
+    columns = [[float(tissue.name in group) for group in sought] for tissue in meshed]
+    selection = np.pad(np.array(columns), ((0, 0), (0, len(poisson))))
     names, modes = tuple(" and ".join(group) for group in sought), tuple(n_modes)
     if loaded and not known:
-        return ParameterMap(np.ones(len(meshed)), selection, names, LOADS, True, modes)
+        return ParameterMap(np.ones(len(meshed)), selection, names, LOADS, True, modes, poisson=tuple(poisson))
     unit = (known[0].youngs_modulus_kpa or 1.0) if absolute else 1.0
     base = np.array([(t.youngs_modulus_kpa or unit) if t.role is Role.KNOWN else unit for t in meshed])
     scale = known[0].name if absolute else " and ".join(groups[0])
-    return ParameterMap(base, selection, names, scale, absolute, modes)
+    return ParameterMap(base, selection, names, scale, absolute, modes, poisson=tuple(poisson))
 
 
 def _groups(names: Sequence[str], tied: Sequence[Sequence[str]]) -> list[tuple[str, ...]]:

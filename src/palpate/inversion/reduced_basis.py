@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from palpate.inversion.approximation import Place
 from palpate.mechanics.forward import SolveCounts
@@ -73,19 +72,32 @@ class ReducedBasis:
         Both are corrections by conjugate gradients with the factorisation that is there, from the reduced answers on;
         where it is none, or the moduli are far from its own, with a new one. Raises `SolverError`.
         """
-        model, near = self.full_model, _near(self, at.moduli)
-        sharper, displacement = replace(self, system=near.system), self.model.solve(at.moduli, at.coefficients).values
+        model, (near, made) = self.full_model, _system_near(self, at.moduli)
+        matrix = weighted_sum(at.moduli, model.free_stiffness)
+        sharper = replace(self, system=near, counts=self.counts + made)
+        displacement = self.model.solve(at.moduli, at.coefficients).values
+
+        def solved(rhs: NDArray[np.float64], tolerance: float) -> NDArray[np.float64]:
+            """Solution (n_free, k) mm at the place to a relative residual."""
+            nearly = near.factorisation.nearly
+            return conjugate_gradients(matrix, rhs, nearly, tolerance=tolerance, max_iterations=MAX_ITERATIONS)[0]
+
         if not at.same_as(self.place):
-            missing = -near.solve(model.residual(at.moduli, displacement[:, None]), DISPLACEMENT)
+            missing = -solved(model.residual(at.moduli, displacement[:, None]), DISPLACEMENT)
             displacement = displacement + np.asarray(model.constraint.free @ missing)[:, 0]
-            sharper = _extended(sharper, missing, near.counts + SolveCounts(forward=1))
+            sharper = _extended(sharper, missing, SolveCounts(forward=1))
         if at.directions is None:
             return replace(sharper, place=at)
         loads = _loads_along(at.directions, model, at.moduli, displacement)
         vectors = sharper.projection.vectors
         known = vectors @ sharper.model.system(at.moduli).backward(vectors.T @ loads)
-        rest = near.solve(loads - near.matrix @ known, TANGENT)
+        rest = solved(loads - matrix @ known, TANGENT)
         return replace(_extended(sharper, rest, SolveCounts(tangent=rest.shape[1])), place=at)
+
+    @property
+    def error_counts(self) -> SolveCounts:
+        """One right-hand side with the last factorisation."""
+        return SolveCounts(forward=1)
 
     def error(self, at: Place) -> float:
         """Upper bound of the displacement's relative error in energy (see `LinearSystem.error_bound`)."""
@@ -100,20 +112,20 @@ class ReducedBasis:
         moved = replace(self, projection=self.projection.under(model), system=system, place=None)
         return _extended(moved, fresh, SolveCounts(forward=1))
 
-    def with_modulus_series(self, coefficients: NDArray[np.float64], selection: NDArray[np.float64]) -> ReducedBasis:
+    def with_modulus_series(self, coefficients: NDArray[np.float64], by_theta: NDArray[np.float64]) -> ReducedBasis:
         """Add how the displacement at `coefficients` (n_modes,) changes with the parameters, to high order.
 
-        selection (n_regions, n_parameters): the regions that each log-modulus scales. The repeated derivatives
+        by_theta (n_regions, n_parameters): derivatives of the log-moduli by the parameters. The repeated derivatives
         w -> K^-1 (-E_r K_r w) of all orders up to a number span the dependence on the moduli over a wide range, for K
         is affine in them (moment matching; Grimme 1997). One right-hand side each, no factorisation.
         """
-        model, system, regions = self.full_model, self.system, np.flatnonzero(selection.any(axis=1))
-        groups = [np.flatnonzero(column[regions]) for column in selection.T]
+        model, system, regions = self.full_model, self.system, np.flatnonzero(by_theta.any(axis=1))
+        n_parameters = by_theta.shape[1]
         level = self.model.solve(system.moduli, coefficients).values[:, None]
         vectors: list[NDArray[np.float64]] = []
-        while level.shape[1] * len(groups) + sum(v.shape[1] for v in vectors) <= SERIES:
+        while level.shape[1] * n_parameters + sum(v.shape[1] for v in vectors) <= SERIES:
             by_region = system.modulus_responses(level, regions=regions)
-            level = np.concatenate([by_region[group].sum(axis=0) for group in groups], axis=1)
+            level = np.concatenate([np.tensordot(column, by_region, axes=1) for column in by_theta[regions].T], axis=1)
             vectors.append(level)
         if not vectors:
             return self
@@ -157,31 +169,13 @@ def _loads_along(
     return loads
 
 
-@dataclass(frozen=True, slots=True)
-class _Near:
-    """The stiffness `matrix` (n_free, n_free), mN/mm, at some moduli; `system`: that of the factors at hand."""
+def _system_near(basis: ReducedBasis, moduli: NDArray[np.float64]) -> tuple[LinearSystem, SolveCounts]:
+    """The system whose factors serve at moduli (n_regions,) kPa: that at hand, or their own where it is no help.
 
-    matrix: sparse.csr_matrix[np.float64]
-    system: LinearSystem
-    counts: SolveCounts
-
-    def solve(self, rhs: NDArray[np.float64], tolerance: float) -> NDArray[np.float64]:
-        """Solution (n_free, k) mm to a relative residual; raises `SolverError`."""
-        solution, _ = conjugate_gradients(
-            self.matrix, rhs, self.system.factorisation.nearly, tolerance=tolerance, max_iterations=MAX_ITERATIONS
-        )
-        return solution
-
-
-def _near(basis: ReducedBasis, moduli: NDArray[np.float64]) -> _Near:
-    """The stiffness at moduli (n_regions,) kPa with the factors at hand, or with its own where those are no help."""
-    system, matrix = basis.system, weighted_sum(moduli, basis.full_model.free_stiffness)
-    ratios = moduli / system.moduli
-    if ratios.max() < FAR * ratios.min() and _direct(system.factorisation):
-        return _Near(matrix, system, SolveCounts())
-    return _Near(matrix, basis.full_model.system(moduli), SolveCounts(factorisations=1))
-
-
-def _direct(factorisation: Factorisation) -> bool:
-    """Whether a solution costs little beside the factorisation: not where it iterates itself."""
-    return isinstance(factorisation, CheckedFactorisation) and SOLVERS[factorisation.solver].direct
+    It is none where the moduli are far, or where its solutions iterate themselves and cost much beside a factorisation.
+    """
+    factorisation, ratios = basis.system.factorisation, moduli / basis.system.moduli
+    direct = isinstance(factorisation, CheckedFactorisation) and SOLVERS[factorisation.solver].direct
+    if direct and ratios.max() < FAR * ratios.min():
+        return basis.system, SolveCounts()
+    return basis.full_model.system(moduli), SolveCounts(factorisations=1)

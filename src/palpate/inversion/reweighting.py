@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
-from palpate.inversion.driver import learned_precision
+from palpate.inversion.driver import with_learned_prior
 from palpate.inversion.objective import Evaluation, Objective
 from palpate.inversion.optimise import Minimum
 from palpate.observation.contract import Observation
@@ -27,9 +26,8 @@ def reweighted(objective: Objective, minimum: Minimum) -> Objective:
     Raises `EstimationError` as `Objective.rematched` does.
     """
     evaluation = minimum.evaluation
-    precision = learned_precision(objective, evaluation, minimum.unknowns)
-    parameters = objective.parameters if precision is None else objective.parameters.with_driver_precision(precision)
-    by_noise = _by_noise(replace(objective, parameters=parameters), fitted_noise(evaluation))
+    believed = with_learned_prior(objective, evaluation, minimum.unknowns)
+    by_noise = _by_noise(believed, fitted_noise(evaluation))
     pairs = zip(by_noise.observations, evaluation.lines, strict=True)
     robust = by_noise.with_observations([o.reweighted(line.residuals) for o, line in pairs])
     return robust.rematched(minimum.unknowns)

@@ -69,16 +69,15 @@ class PosteriorSamples:
         return np.asarray(np.quantile(self.theta, [tail, 1.0 - tail], axis=0).T)
 
 
-def frozen_posterior(objective: Objective, unknowns: NDArray[np.float64]) -> FrozenPosterior:
-    """The posterior with the closest points and weights at `unknowns` (n,); the moduli's own prior is flat.
+def frozen_posterior(
+    objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation | None = None
+) -> FrozenPosterior:
+    """The posterior with the closest points and weights at `unknowns` (n,), under the objective's own prior of them.
 
-    Residuals are point-to-plane, r + n.(u - u_0), as in the Gauss-Newton matrix. Raises `ConfigurationError` for
-    models that are not reduced ones.
+    Residuals are point-to-plane, r + n.(u - u_0), as in the Gauss-Newton matrix. evaluation: that of the objective
+    there, where it is known. Raises `ConfigurationError` for models that are not reduced ones.
     """
-    return _frozen(objective, objective(unknowns), unknowns)
-
-
-def _frozen(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> FrozenPosterior:
+    evaluation = evaluation or objective(unknowns)
     parameters = objective.parameters
     moduli, models, forms = parameters.moduli(unknowns), [], []
     for number, coefficients in enumerate(parameters.coefficients(unknowns)):
@@ -118,14 +117,21 @@ def sample_posterior(
     `EstimationError` where a modulus moves nothing, `ConfigurationError` for models that are not reduced ones.
     """
     evaluation = objective(start)
-    frozen = _frozen(objective, evaluation, start)
-    laplace = _laplace(start, evaluation)
+    frozen = frozen_posterior(objective, start, evaluation)
+    try:
+        laplace = _Laplace(start, linalg.cholesky(evaluation.matrix, lower=True))
+    except linalg.LinAlgError as error:
+        raise EstimationError(
+            f"the Gauss-Newton matrix is not positive definite ({error}): some modulus moves nothing at this place, so"
+            " its posterior cannot be sampled; start at a minimum"
+        ) from error
     anchor = evaluation.value - frozen(start)
     now, chain, counts, gap, refreshed = start, [], 0, 0.0, 0
     for done in range(0, evaluations, BETWEEN_CHECKS):
-        part = _chain(frozen, laplace, now, bounds=bounds, steps=min(BETWEEN_CHECKS, evaluations - done), rng=rng)
-        now, counts = part.end, counts + part.accepted
-        chain.append(part.theta)
+        steps = min(BETWEEN_CHECKS, evaluations - done)
+        theta, now, accepted = _chain(frozen, laplace, now, bounds=bounds, steps=steps, rng=rng)
+        chain.append(theta)
+        counts += accepted
         off = abs(objective.value(now) - frozen(now) - anchor)
         gap = max(gap, off)
         if off > GAP:
@@ -152,25 +158,6 @@ class _Laplace:
         return np.asarray(linalg.solve_triangular(self.factor.T, normal, lower=False).T)
 
 
-def _laplace(centre: NDArray[np.float64], evaluation: Evaluation) -> _Laplace:
-    try:
-        return _Laplace(centre, linalg.cholesky(evaluation.matrix, lower=True))
-    except linalg.LinAlgError as error:
-        raise EstimationError(
-            f"the Gauss-Newton matrix is not positive definite ({error}): some modulus moves nothing at this place, so"
-            " its posterior cannot be sampled; start at a minimum"
-        ) from error
-
-
-@dataclass(frozen=True, slots=True)
-class _Part:
-    """A stretch of the chain: its log-moduli, where it ended, how many proposals it accepted."""
-
-    theta: NDArray[np.float64]
-    end: NDArray[np.float64]
-    accepted: int
-
-
 def _chain(
     frozen: FrozenPosterior,
     laplace: _Laplace,
@@ -179,20 +166,17 @@ def _chain(
     bounds: Bounds,
     steps: int,
     rng: np.random.Generator,
-) -> _Part:
+) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
+    """A stretch of the chain: its log-moduli (steps, n_parameters), its end (n,), how many proposals it accepted."""
     n = frozen.objective.n_parameters
     theta, accepted = np.empty((steps, n)), 0
     now, level = start, frozen(start) - laplace.energy(start)
     draws, thresholds = laplace.draws(steps, rng), np.log(rng.random(steps))
     for k in range(steps):
         trial = laplace.centre + np.sqrt(1.0 - STEP**2) * (now - laplace.centre) + STEP * draws[k]
-        if _inside(trial[:n], bounds):
+        if np.all((trial[:n] >= bounds.lower) & (trial[:n] <= bounds.upper)):
             there = frozen(trial) - laplace.energy(trial)
             if thresholds[k] < level - there:
                 now, level, accepted = trial, there, accepted + 1
         theta[k] = now[:n]
-    return _Part(theta, now, accepted)
-
-
-def _inside(theta: NDArray[np.float64], bounds: Bounds) -> bool:
-    return bool(np.all(theta >= bounds.lower) and np.all(theta <= bounds.upper))
+    return theta, now, accepted

@@ -15,7 +15,7 @@ from scipy import sparse
 
 from palpate.errors import ConfigurationError, NotConverged
 from palpate.mechanics.balance import TissueBalance
-from palpate.mechanics.dilatation import Dilatation, pointwise_lame, pointwise_lame_slope
+from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.forward import SolveCounts, checked_coefficients, checked_moduli
 from palpate.mechanics.hyperelastic import Elements, Moduli, elements_of
 from palpate.mechanics.laws.contract import Law
@@ -24,7 +24,7 @@ from palpate.mechanics.loads import Load
 from palpate.mechanics.newton import NewtonPath, NewtonSettings, follow
 from palpate.mechanics.pattern import BlockPattern, Restriction, block_pattern, restriction
 from palpate.mechanics.solvers.contract import Factorisation
-from palpate.mechanics.stiffness import lame_by_poisson, lame_parameters
+from palpate.mechanics.stiffness import lame_parts, lame_parts_by_poisson
 from palpate.mesh.constraint import Constraint
 from palpate.mesh.space import LagrangeSpace
 
@@ -130,11 +130,12 @@ class FiniteStrainModel:
 
     def moduli_of(self, moduli: NDArray[np.float64]) -> Moduli:
         """Lame's constants of every element at Young's moduli (n_regions,) kPa."""
-        return self._spread(moduli, [self._lame(nu) for nu in self.poisson_ratios])
+        return self._spread(moduli, [lame_parts(nu, self.elements.dilatation) for nu in self.poisson_ratios])
 
     def moduli_by_poisson(self, moduli: NDArray[np.float64]) -> Moduli:
         """Derivatives of every element's Lame constants with respect to its nu, at moduli (n_regions,) kPa."""
-        return self._spread(moduli, [self._lame_slope(nu) for nu in self.poisson_ratios])
+        slopes = [lame_parts_by_poisson(nu, self.elements.dilatation) for nu in self.poisson_ratios]
+        return self._spread(moduli, slopes)
 
     def under(self, constraint: Constraint) -> FiniteStrainModel:
         """The same body with other modes and another offset of the same prescribed points.
@@ -152,18 +153,6 @@ class FiniteStrainModel:
     def to_tolerance(self, tolerance: float) -> FiniteStrainModel:
         """The same body, its equilibria found to another `tolerance` of the forces (see `NewtonSettings`)."""
         return replace(self, settings=replace(self.settings, tolerance=tolerance))
-
-    def _lame(self, poisson_ratio: float) -> tuple[float, float, float]:
-        """(mu, lambda at the points, lambda in the mean) at E = 1."""
-        lame, mu = lame_parameters(1.0, poisson_ratio)
-        pointwise = pointwise_lame(self.elements.dilatation, lame, mu)
-        return mu, pointwise, lame - pointwise
-
-    def _lame_slope(self, poisson_ratio: float) -> tuple[float, float, float]:
-        lame, mu = lame_parameters(1.0, poisson_ratio)
-        by_lame, by_mu = lame_by_poisson(1.0, poisson_ratio)
-        pointwise = pointwise_lame_slope(self.elements.dilatation, lame, mu, by=(by_lame, by_mu))
-        return by_mu, pointwise, by_lame - pointwise
 
     def _spread(self, moduli: NDArray[np.float64], units: list[tuple[float, float, float]]) -> Moduli:
         mu, pointwise, mean = (moduli[:, None] * np.array(units)).T[:, self.element_region]
@@ -232,6 +221,21 @@ class FiniteStrainEquilibrium:
     def factorisation(self) -> Factorisation | None:
         """The last factorisation, of a tangent stiffness near this state's: for `nearby` of another solve."""
         return self.path.factorisation
+
+    def error_estimate(self, moduli: NDArray[np.float64], displacement: NDArray[np.float64]) -> float:
+        """Estimated relative error in energy of a displacement (n_dof,) mm at other moduli (n_regions,) kPa.
+
+        It is that of one correction r^T K^-1 r by the residual r, K the stiffness of this equilibrium: one right-hand
+        side. Infinite where no factorisation of K is kept.
+        """
+        if self.factorisation is None:
+            return np.inf
+        balance = self.model.balance(moduli)
+        residual = np.asarray(balance.free.T @ balance.residual(displacement)[0])
+        correction = self.factorisation.solve(residual[:, None])[:, 0]
+        internal = balance.region_forces(displacement, balance.moduli).sum(axis=1)
+        squared = abs(residual @ correction) / max(abs(float(internal @ displacement)), np.finfo(float).tiny)
+        return float(np.sqrt(squared)) if np.isfinite(squared) else np.inf
 
     def refactorised(self) -> FiniteStrainEquilibrium:
         """The same state with the factorisation of its own tangent stiffness; raises `NotConverged`.

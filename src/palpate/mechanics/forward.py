@@ -16,7 +16,7 @@ __all__ = ["Equilibrium", "ForwardModel", "SolveCounts", "checked_coefficients",
 
 @dataclass(frozen=True, slots=True)
 class SolveCounts:
-    """How much was solved: right-hand sides forward, adjoint and for tangents, and factorisations. They add up."""
+    """How much was solved: right-hand sides forward, adjoint and for tangents, and factorisations."""
 
     forward: int = 0
     adjoint: int = 0
@@ -29,6 +29,14 @@ class SolveCounts:
             self.adjoint + other.adjoint,
             self.tangent + other.tangent,
             self.factorisations + other.factorisations,
+        )
+
+    def __sub__(self, other: SolveCounts) -> SolveCounts:
+        return SolveCounts(
+            self.forward - other.forward,
+            self.adjoint - other.adjoint,
+            self.tangent - other.tangent,
+            self.factorisations - other.factorisations,
         )
 
 

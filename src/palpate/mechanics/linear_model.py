@@ -1,6 +1,7 @@
 """Small-strain equilibrium of several tissues: affine in the moduli, linear in the boundary modes.
 
-K(E) = sum_r E_r K_r; an admissible u = F z + M q + o is in equilibrium when F^T (K u - f) = 0, that is
+K(E) = sum_r E_r K_r, one r for each tissue, or for each part of the stiffness of a tissue whose Poisson's ratio is
+open; an admissible u = F z + M q + o is in equilibrium when F^T (K u - f) = 0, that is
 K_ff z = F^T f - F^T K (M q + o) with K_ff = F^T K F and dead loads f.
 """
 
@@ -20,7 +21,7 @@ from palpate.mechanics.loads import Load
 from palpate.mechanics.rigid import rigid_modes
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mechanics.solvers.registry import factorise
-from palpate.mechanics.stiffness import tissue_stiffness
+from palpate.mechanics.stiffness import stiffness_parts, tissue_stiffness
 from palpate.mesh.constraint import Constraint
 from palpate.mesh.space import LagrangeSpace
 from palpate.parallel import mapped
@@ -34,7 +35,8 @@ FURTHER = 10  # right-hand sides a modulus, beside one for each mode: sensitivit
 class LinearModel:
     """Assembled stiffness of every meshed tissue under one constraint.
 
-    regions: indices in `space.mesh.tissues` of the meshed ones; per region at 1 kPa: stiffness K_r (n_dof, n_dof),
+    regions: indices in `space.mesh.tissues` of the meshed ones, one for each of `stiffness_parts` where the Poisson's
+    ratio is open (the moduli are then E times its `lame_parts`); per region at 1 kPa: stiffness K_r (n_dof, n_dof),
     free_stiffness F^T K_r F (n_free, n_free), coupling F^T K_r [M, o] (n_free, n_modes + 1), all mN/mm.
     load (n_dof,) mN: the nodal forces f of all dead loads.
     """
@@ -229,14 +231,16 @@ def linear_model(
     solver: str = "auto",
     dilatation: Dilatation = Dilatation.POINTWISE,
     loads: tuple[Load, ...] = (),
+    open_poisson: tuple[str, ...] = (),
 ) -> LinearModel:
     """Assemble the linear model of all meshed tissues of `space.mesh`, with their Poisson's ratios.
 
     A pressure that follows its surface acts as on the surface at rest: to first order the body does not move.
 
     solver: a name of `palpate.mechanics.solvers.registry.SOLVERS` or "auto"; dilatation: that of the element, as
-    `choose_element` gives it. Raises `ConfigurationError` when the constraint is of another space, `GeometryError` for
-    tetrahedra without positive volume.
+    `choose_element` gives it; open_poisson: names of tissues whose Poisson's ratio the moduli say, which have one
+    modulus (kPa) for each part of their stiffness, see `LinearModel`. Raises `ConfigurationError` when the constraint
+    is of another space, `GeometryError` for tetrahedra without positive volume.
     """
     n_dof = 3 * len(space.points)
     if constraint.free.shape[0] != n_dof or len(constraint.modes) != n_dof or len(constraint.offset) != n_dof:
@@ -244,14 +248,18 @@ def linear_model(
             f"the constraint has {constraint.free.shape[0]} unknowns and the space {n_dof}: make both of the same space"
         )
     tissues = space.mesh.tissues
-    regions = tuple(number for number, tissue in enumerate(tissues) if tissue.meshed)
 
-    def assembled(region: int) -> tuple[sparse.csr_matrix[np.float64], sparse.csr_matrix[np.float64]]:
-        """K_r and F^T K_r F of one tissue."""
-        matrix = tissue_stiffness(space, region, tissues[region].poisson_ratio, dilatation=dilatation)
-        return matrix, sparse.csr_matrix(sparse.csr_matrix(constraint.free.T @ matrix) @ constraint.free)
+    def assembled(region: int) -> list[tuple[int, sparse.csr_matrix[np.float64], sparse.csr_matrix[np.float64]]]:
+        """The region with K_r and F^T K_r F of one tissue, or of each part of it."""
+        matrices = [tissue_stiffness(space, region, tissues[region].poisson_ratio, dilatation=dilatation)]
+        if tissues[region].name in open_poisson:
+            matrices = [part for part in stiffness_parts(space, region, dilatation) if part is not None]
+        free = constraint.free
+        return [(region, part, sparse.csr_matrix(sparse.csr_matrix(free.T @ part) @ free)) for part in matrices]
 
-    stiffness, free_stiffness = zip(*mapped(assembled, regions), strict=True)
+    meshed = [number for number, tissue in enumerate(tissues) if tissue.meshed]
+    parts = [part for of_tissue in mapped(assembled, meshed) for part in of_tissue]
+    regions, stiffness, free_stiffness = zip(*parts, strict=True)
     still = np.zeros_like(space.points)
     load = sum((part.forces(still) for part in loads), np.zeros(n_dof))
     model = LinearModel(space, constraint, regions, stiffness, free_stiffness, (), solver, load)

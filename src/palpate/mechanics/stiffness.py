@@ -7,12 +7,20 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from palpate.errors import ConfigurationError, GeometryError
-from palpate.mechanics.dilatation import Dilatation, pointwise_lame
+from palpate.mechanics.dilatation import Dilatation, pointwise_lame, pointwise_lame_slope
 from palpate.mechanics.element import barycentric_gradients, mean_reference_tensor, reference_tensor
 from palpate.mechanics.pattern import block_pattern
 from palpate.mesh.space import LagrangeSpace
 
-__all__ = ["checked_gradients", "lame_by_poisson", "lame_parameters", "tissue_stiffness"]
+__all__ = [
+    "checked_gradients",
+    "lame_by_poisson",
+    "lame_parameters",
+    "lame_parts",
+    "lame_parts_by_poisson",
+    "stiffness_parts",
+    "tissue_stiffness",
+]
 
 CHUNK = 4096  # elements at once: some 30 MB of P2 blocks
 
@@ -38,6 +46,24 @@ def lame_by_poisson(youngs_modulus: float, poisson_ratio: float) -> tuple[float,
     return by_lame, -youngs_modulus / (2.0 * (1.0 + nu) ** 2)
 
 
+def lame_parts(poisson_ratio: float, dilatation: Dilatation) -> tuple[float, float, float]:
+    """(mu, lambda at the points, lambda in the mean) over Young's modulus, dimensionless; raises `ConfigurationError`.
+
+    They are the weights of `stiffness_parts`.
+    """
+    lame, mu = lame_parameters(1.0, poisson_ratio)
+    pointwise = pointwise_lame(dilatation, lame, mu)
+    return mu, pointwise, lame - pointwise
+
+
+def lame_parts_by_poisson(poisson_ratio: float, dilatation: Dilatation) -> tuple[float, float, float]:
+    """Derivatives of `lame_parts` with respect to nu, dimensionless."""
+    lame, mu = lame_parameters(1.0, poisson_ratio)
+    by_lame, by_mu = lame_by_poisson(1.0, poisson_ratio)
+    pointwise = pointwise_lame_slope(dilatation, lame, mu, by=(by_lame, by_mu))
+    return by_mu, pointwise, by_lame - pointwise
+
+
 def tissue_stiffness(
     space: LagrangeSpace, tissue: int, poisson_ratio: float, *, dilatation: Dilatation = Dilatation.POINTWISE
 ) -> sparse.csr_matrix[np.float64]:
@@ -49,20 +75,34 @@ def tissue_stiffness(
     the means of grad N_a and grad N_b instead. Raises `GeometryError` where a tetrahedron has no
     positive volume, `ConfigurationError` for an impossible Poisson's ratio.
     """
+    return _stiffness(space, tissue, lame_parts(poisson_ratio, dilatation))
+
+
+def stiffness_parts(
+    space: LagrangeSpace, tissue: int, dilatation: Dilatation
+) -> tuple[sparse.csr_matrix[np.float64] | None, ...]:
+    """What `tissue_stiffness` is the sum of, by the weights of `lame_parts`: (n_dof, n_dof), mN/mm, each at 1 kPa.
+
+    None for a part that this dilatation has not. All are positive semi-definite. Raises `GeometryError` as there.
+    """
+    present = [weight > 0.0 for weight in lame_parts(0.25, dilatation)]
+    units = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    return tuple(_stiffness(space, tissue, unit) if has else None for unit, has in zip(units, present, strict=True))
+
+
+def _stiffness(space: LagrangeSpace, tissue: int, weights: tuple[float, float, float]) -> sparse.csr_matrix[np.float64]:
+    mu, pointwise, in_mean = weights
     inside = space.mesh.region == tissue
     cells = space.cells[inside]
     gradients, volumes = checked_gradients(space, inside)
-    lame, mu = lame_parameters(1.0, poisson_ratio)
-    pointwise = pointwise_lame(dilatation, lame, mu)
     tensor = reference_tensor(space.order).reshape(-1, 16)
     mean = mean_reference_tensor(space.order).reshape(-1, 16)
     blocks = np.empty((len(cells), len(tensor), 9))
     for start in range(0, len(cells), CHUNK):
         part = slice(start, start + CHUNK)
         np.matmul(tensor, _constant_gradient_blocks(gradients[part], volumes[part], (pointwise, mu)), out=blocks[part])
-        if pointwise < lame:
-            rest = (lame - pointwise, 0.0)
-            blocks[part] += mean @ _constant_gradient_blocks(gradients[part], volumes[part], rest)
+        if in_mean:
+            blocks[part] += mean @ _constant_gradient_blocks(gradients[part], volumes[part], (in_mean, 0.0))
     return block_pattern(cells, len(space.points)).assemble(blocks.reshape(-1, 9))
 
 

@@ -17,7 +17,7 @@ from palpate.mesh.smoothing import smoothed
 from palpate.mesh.snapping import contacts_of, debiased, snapped
 from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh
 
-__all__ = ["boundary_of", "tetrahedralise"]
+__all__ = ["COARSER", "COARSEST", "GRADING", "boundary_of", "tetrahedralise"]
 
 COARSEST = 4.0  # longest edge far from all surfaces, in edge lengths
 GRADING = 0.45  # growth of the edge length with the distance from a surface, mm per mm

@@ -67,6 +67,11 @@ class Observation(Protocol):
         ...
 
     @property
+    def description(self) -> str:
+        """What the misfit of the kind is, as an object of a methods section's sentence: "the distance between ..."."""
+        ...
+
+    @property
     def name(self) -> str:
         """Name of what is seen, the tissue's for a surface."""
         ...

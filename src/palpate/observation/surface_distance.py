@@ -52,6 +52,15 @@ class SurfaceDistance:
         return "surface distance"
 
     @property
+    def description(self) -> str:
+        """What the misfit is, for a methods section."""
+        return (
+            "the symmetric surface distance between model and later image, taken as a difference to the rest state, so"
+            " that what smoothing, voxels and facets do to both images drops out, without the faces on drivers, bones"
+            " and the image's border, and with its full weight up to the edge of a voxel"
+        )
+
+    @property
     def name(self) -> str:
         """The tissue's name."""
         return self.target.surface.name

@@ -125,12 +125,11 @@ def _fit(data: ReportData, cite: _Citations) -> str:
     law = _law(data)
     finite = law is not None and law.finite
     onwards = " The linear law gave the start; the fit then went on over expansions around finite-strain equilibria."
+    observed = _list(list(data.document.get("observations", {}).values())) or "what the case's observations compare"
     return (
-        "The misfit was the symmetric surface distance between model and later image, taken as a difference to the rest"
-        " state, so that what smoothing, voxels and facets do to both images drops out, under Tukey's biweight"
-        f" {cite('huber')} beyond the edge of a voxel. It was minimised over the logarithms of the moduli from {starts}"
-        f" starts by {optimiser} {cite(source)}, on a reduced basis whose error was bounded at the estimate"
-        f" {cite('reduced')}; faces on drivers, bones and the image's border were left out.{onwards if finite else ''}"
+        f"The misfit was {observed}. Outliers counted less by Tukey's biweight {cite('huber')}. It was minimised over"
+        f" the logarithms of the moduli from {starts} starts by {optimiser} {cite(source)}, on a reduced basis whose"
+        f" error was bounded at the estimate {cite('reduced')}.{onwards if finite else ''}"
     )
 
 

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from palpate.study.case_file import read_case
     from palpate.study.cost import expected_cost
     from palpate.study.earlier import strange_files
+    from palpate.study.estimation import Observed, Remark, conclude, verdict
     from palpate.study.journal import recover
     from palpate.study.lock import own_file
     from palpate.study.outputs import make_folder, staged, write_json, write_text
@@ -29,8 +30,11 @@ __all__ = [
     "ImagedStates",
     "Mechanics",
     "MeshSettings",
+    "Observed",
     "Phantom",
+    "Remark",
     "aligned",
+    "conclude",
     "estimate",
     "estimate_states",
     "expected_cost",
@@ -50,6 +54,7 @@ __all__ = [
     "staged",
     "strange_files",
     "surface_observations",
+    "verdict",
     "write_json",
     "write_text",
 ]
@@ -63,8 +68,11 @@ _HOMES = {
     "ImagedStates": "palpate.study.body",
     "Mechanics": "palpate.study.case",
     "MeshSettings": "palpate.study.case",
+    "Observed": "palpate.study.estimation",
     "Phantom": "palpate.study.case",
+    "Remark": "palpate.study.estimation",
     "aligned": "palpate.study.body",
+    "conclude": "palpate.study.estimation",
     "estimate": "palpate.study.run",
     "estimate_states": "palpate.study.run",
     "expected_cost": "palpate.study.cost",
@@ -84,6 +92,7 @@ _HOMES = {
     "staged": "palpate.study.outputs",
     "strange_files": "palpate.study.earlier",
     "surface_observations": "palpate.study.body",
+    "verdict": "palpate.study.estimation",
     "write_json": "palpate.study.outputs",
     "write_text": "palpate.study.outputs",
 }

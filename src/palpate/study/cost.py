@@ -12,16 +12,13 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.mechanics.solvers.registry import expected_of_size
 from palpate.memory import available_memory
-from palpate.mesh.anatomy import Box
+from palpate.mesh import COARSER, COARSEST, GRADING, Box
 from palpate.parallel import processors
 from palpate.study.body import case_domain
 from palpate.study.case import Case
 
 __all__ = ["ExpectedCost", "expected_cost", "expected_tets", "free_memory_gb"]
 
-GRADING = 0.45  # the mesher's: growth of the edge length with the distance from a surface, mm per mm
-COARSEST = 4.0  # its longest edge, in edge lengths
-COARSER = 1.5  # its edge length on bones, air and known tissues, in edge lengths
 LATTICE = 96  # points of the lattice along the longest side, on which edge lengths are summed
 # Fitted to the runs of benchmarks/cost.py (docs/command-line.md), on two cores of a 2.1 GHz server.
 TETS_A_CUBE = 22.8  # tetrahedra in a cube of the wanted edge length: 17 in smooth phantoms, 31 in a real pelvis

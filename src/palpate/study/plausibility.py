@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from palpate.images.tissue import Role
-from palpate.inversion import Estimation, Remark
 from palpate.study.case import Case
+from palpate.study.estimation import Estimation, Remark
 
 __all__ = [
     "PUBLISHED",

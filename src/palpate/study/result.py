@@ -15,10 +15,9 @@ from palpate.errors import NotConverged, PalpateError
 from palpate.images.label_image import LabelImage
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
-from palpate.inversion import Estimation, Remark
-from palpate.inversion.result import ModulusEstimate, Start, TissueFit, no_estimate
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.case import Case, CaseTissue
+from palpate.study.estimation import Estimation, ModulusEstimate, Remark, Start, TissueFit, no_estimate
 
 __all__ = [
     "CaseResult",
@@ -127,6 +126,7 @@ class CaseResult:
             "fit": [_fit(name, fits) for name, fits in zip(image_names(self.case), estimation.fits, strict=False)],
             "starts": [_start(start) for start in estimation.starts],
             "outer_loop": {"history_mm2": [step.objective_mm2 for step in estimation.outer_loop]},
+            "observations": dict(estimation.observations),
             "counts": dict(estimation.counts),
             "mesh": _plain(self.mesh_summary),
         }
@@ -202,6 +202,7 @@ def failure_document(case: Case, error: PalpateError) -> dict[str, Any]:
         "fit": [],
         "starts": [],
         "outer_loop": {"history_mm2": []},
+        "observations": {},
         "counts": {},
         "mesh": None,
         "note": "",
@@ -288,6 +289,7 @@ def _start(start: Start) -> dict[str, Any]:
         "end": dict(start.end),
         "objective_mm2": start.objective_mm2,
         "status": start.status,
+        "reason": start.reason,
         "iterations": start.iterations,
         "minimum": start.minimum,
         "history_mm2": [step.objective_mm2 for step in start.history],

@@ -8,22 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from palpate.errors import ConfigurationError, EstimationError
+from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role
-from palpate.inversion import (
-    Bounds,
-    Estimation,
-    FittedState,
-    Inversion,
-    InversionSettings,
-    Observed,
-    ParameterMap,
-    Remark,
-    conclude,
-    invert,
-)
+from palpate.inversion import Bounds, FittedState, Inversion, InversionSettings, ParameterMap, invert
 from palpate.study.body import Body, ImagedStates, joint_problem, make_body
 from palpate.study.case import Case
+from palpate.study.estimation import Estimation, Observed, Remark, conclude
 from palpate.study.plausibility import estimate_warnings, unit_warnings
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.read import read_pairs, read_states
@@ -90,18 +80,11 @@ def estimate_states(
     problem = joint_problem(bodies, case, progress=progress)
     clock.append(time.perf_counter())
     settings = inversion_settings(case, problem.parameters)
-    try:
-        inversion = invert(problem, settings, progress=progress)
-        progress("intervals: residuals' correlation, grid position, driver")
-        images = tuple(image.index for pair in bodies for image in pair.states.after)
-        observed = Observed(fitted_states(inversion, *bodies), images)
-        estimation = conclude(inversion, settings, observed, truth=truth or {}, seed=case.seed)
-    except np.linalg.LinAlgError as error:
-        raise EstimationError(
-            f"the images do not determine what is sought ({error}): beside the noise ([noise] surface_sd_mm, or that of"
-            " the residuals) the driver's motion cannot be told from none; state the noise smaller, or use images in"
-            " which the organs move more"
-        ) from error
+    inversion = invert(problem, settings, progress=progress)
+    progress("intervals: residuals' correlation, grid position, driver")
+    images = tuple(image.index for pair in bodies for image in pair.states.after)
+    observed = Observed(fitted_states(inversion, *bodies), images)
+    estimation = conclude(inversion, settings, observed, truth=truth or {}, seed=case.seed)
     clock.append(time.perf_counter())
     stages = np.diff(clock)
     seconds = {"read": read_seconds, "mesh": stages[0], "assemble": stages[1], "estimate": stages[2]}

@@ -12,7 +12,7 @@ from palpate.errors import ConfigurationError
 from palpate.images.label_image import LabelImage
 from palpate.images.segmentation import Segmentation, first_labels
 from palpate.images.tissue import Role, Tissue
-from palpate.inversion import Remark, fit_driver
+from palpate.inversion import fit_driver
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.equilibrium import equilibrium
@@ -25,6 +25,7 @@ from palpate.phantoms.wall_filling import wall_filling
 from palpate.study.body import Body, inverse_problem, make_body
 from palpate.study.case import Case, Mechanics
 from palpate.study.case_loads import case_loads
+from palpate.study.estimation import Remark
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.read import phantom_scene, read_states
 from palpate.study.result import MeshSummary, Provenance, Simulation

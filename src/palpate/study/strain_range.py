@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inversion import Remark
 from palpate.mechanics.deformation import largest_strains
 from palpate.mechanics.laws.contract import Law
 from palpate.mesh.space import LagrangeSpace
+from palpate.study.estimation import Remark
 
 __all__ = ["LINEAR_RANGE", "linear_strain_warnings"]
 

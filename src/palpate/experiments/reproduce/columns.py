@@ -14,16 +14,13 @@ from palpate.inversion import (
     Bounds,
     Inversion,
     InversionSettings,
-    Observed,
     ParameterMap,
-    conclude,
     log_interval,
     sandwich_covariance,
-    verdict,
 )
 from palpate.mesh import LagrangeSpace
 from palpate.phantoms import imaged
-from palpate.study import Body, ImagedStates, aligned, fitted_states
+from palpate.study import Body, ImagedStates, Observed, aligned, conclude, fitted_states, verdict
 
 __all__ = [
     "entries_from_surfaces",

@@ -19,13 +19,13 @@ from palpate.inversion import (
     invert,
     log_interval,
     sandwich_covariance,
-    verdict,
     with_first_noise,
 )
 from palpate.mechanics import ForwardModel, LinearModel
 from palpate.mesh import lagrange_space
 from palpate.observation import NoiseModel
 from palpate.phantoms import smooth_field
+from palpate.study import verdict
 
 __all__ = ["ESTIMATOR_PROBLEMS", "coverage", "gradient_error", "recovered"]
 

@@ -16,13 +16,13 @@ the slow ones (marked *), which are also left out by continuous integration; `--
 interrupted goes on where it was. A problem may have several checks: the table has the worst of each, and the list below
 it has them all.
 
-The tolerances were set before the computation, by what each discretisation can reach; exact problems are held to
-round-off. Those of the measured beads (M1) are exceptions. For their error a tolerance of 200 % (three times the beads'
-median scatter) was tried first, and missed: the neo-Hookean law has 200.3 %. It is 231 % now, set after the result: a
-typical error no larger than the 95th percentile of the beads' own scatter. The Poisson's ratio's, 0.45 to 0.5, was set
-after the result, too. So M1 records how far model and measurement are apart rather than tests it. It compares motions
-only: neither the gel's modulus nor the force is known. The reference of B7c is ours, for no number is published. B7a's
-23.96 belongs to the middle of the free side; the corner, to which some pages ascribe it, moves by 25.1.
+A tolerance is what the discretisation can reach and does not depend on the result; exact problems are held to
+round-off. The two of the measured beads (M1) are exceptions: both are chosen to hold. 231 % is a typical error no
+larger than the 95th percentile of the beads' own scatter (at 200 %, three times its median, the neo-Hookean law would
+miss), and 0.45 to 0.5 for the Poisson's ratio is wide enough for the one that fits. So M1 records how far model and
+measurement are apart and tests nothing. It compares motions only: neither the gel's modulus nor the force is known. The
+reference of B7c is ours, for no number is published. B7a's 23.96 belongs to the middle of the free side; the corner, to
+which some pages ascribe it, moves by 25.1.
 """
 
 

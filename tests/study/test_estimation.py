@@ -10,10 +10,8 @@ import pytest
 from palpate.inversion import (
     FittedState,
     Inversion,
-    Observed,
     Outcome,
     OuterIterate,
-    conclude,
     gauss_newton,
     invert,
     sandwich_covariance,
@@ -22,6 +20,7 @@ from palpate.inversion.estimate import Candidate
 from palpate.inversion.outer_loop import Convergence
 from palpate.mechanics.forward import SolveCounts
 from palpate.observation.noise_model import NoiseModel
+from palpate.study.estimation import Observed, conclude, hull, verdict
 
 NOISE = NoiseModel(np.array([0.03**2]), np.array([3.0]))
 
@@ -244,3 +243,39 @@ def test_another_minimum_that_fits_as_well_is_within_the_interval(inversion, set
     low, high = stated(both, settings, observed).estimates[0].interval95
     assert low < 30.0
     assert (high > 30.0 * np.e) == counts
+
+
+@pytest.mark.parametrize(
+    ("interval", "absolute", "word"),
+    [
+        ((1.0, 2.0), True, "identified"),
+        ((1.0, 2.01), True, "weak"),
+        ((1.0, 10.0), True, "weak"),
+        ((1.0, 10.1), True, "not identified"),
+        ((None, 2.0), True, "not identified"),
+        ((1.0, None), True, "not identified"),
+        ((1.0, 1.5), False, "ratio only"),
+        ((1.0, 5.0), False, "ratio only"),
+        ((1.0, 11.0), False, "not identified"),
+        ((None, 1.5), False, "not identified"),
+    ],
+)
+def test_the_verdict_follows_from_the_width_of_the_interval(interval, absolute, word):
+    assert verdict(interval, at_bound=False, absolute=absolute)[0] == word
+
+
+def test_an_estimate_at_its_bound_is_not_identified_however_narrow():
+    word, why = verdict((1.0, 1.1), at_bound=True, absolute=True)
+    assert word == "not identified"
+    assert "bound" in why
+
+
+def test_every_verdict_states_its_figure():
+    for interval in ((1.0, 1.5), (1.0, 4.0), (1.0, 20.0)):
+        assert f"{interval[1]:.1f}" in verdict(interval, at_bound=False, absolute=True)[1]
+
+
+def test_the_hull_holds_every_interval_and_an_open_end_stays_open():
+    assert hull([(2.0, 4.0), (1.0, 3.0)]) == (1.0, 4.0)
+    assert hull([(2.0, 4.0), (None, 3.0)]) == (None, 4.0)
+    assert hull([(2.0, None)]) == (2.0, None)

@@ -1,24 +1,25 @@
-"""What an inversion states: moduli with interval and verdict, every start, the fit of everything observed."""
+"""What is stated of an inversion: moduli with interval and verdict, every start, the fit of everything observed."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inversion.estimate import Inversion, StartRun
-from palpate.inversion.optimise import Iterate, Outcome
-from palpate.inversion.outer_loop import InversionSettings
-from palpate.inversion.uncertainty import (
+from palpate.errors import ConfigurationError
+from palpate.inversion import (
     FittedState,
     Interval,
+    Inversion,
+    InversionSettings,
+    Iterate,
+    Outcome,
+    StartRun,
     grid_position_shifts,
-    hull,
     log_interval,
     sandwich_covariance,
-    verdict,
 )
 from palpate.mechanics.deformation import deformation_determinants
 from palpate.mesh.voxelise import voxelise
@@ -33,12 +34,15 @@ __all__ = [
     "Start",
     "TissueFit",
     "conclude",
+    "hull",
     "no_estimate",
+    "verdict",
 ]
 
 GRID_DRAWS = 8
 AT_BOUND = 1e-6
 STRONG_CORRELATION = 0.99
+IDENTIFIED, WEAK = 2.0, 10.0  # largest ratio of an interval's ends
 AS_GOOD = 0.05  # of the objective: another minimum that is worse by less cannot be excluded
 
 
@@ -117,7 +121,8 @@ class Estimation:
 
     correlation (n, n) of the log-moduli; fits: the tissues of each later image; displacements: (n_points, 3) mm of
     each later image; covariance (n, n) of the log-moduli, grid_covariance (n, n) the part of the voxel grid's place;
-    outer_loop: the steps from the best start's minimum to the estimate, which all starts of that minimum share.
+    outer_loop: the steps from the best start's minimum to the estimate, which all starts of that minimum share;
+    counts: of all starts and minima together; observations: what was compared, in words, by its kind.
     """
 
     status: str
@@ -131,6 +136,7 @@ class Estimation:
     outer_loop: tuple[Iteration, ...] = ()
     remarks: tuple[Remark, ...] = ()
     grid_covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    observations: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def correlation(self) -> NDArray[np.float64]:
@@ -152,9 +158,12 @@ def conclude(
 ) -> Estimation:
     """State the result of an inversion; `truth`: true moduli (kPa) by tissue where they are known.
 
-    The covariance is the sandwich under the residuals' law plus the scatter over grid positions.
+    The covariance is the sandwich under the residuals' law plus the scatter over grid positions. Raises
+    `ConfigurationError` where a Poisson's ratio was sought.
     """
     objective, minimum = inversion.objective, inversion.minimum
+    if objective.parameters.poisson:
+        raise ConfigurationError("a result states Young's moduli only: a Poisson's ratio was sought beside them")
     rng = np.random.default_rng(seed)
     shifts = grid_position_shifts(objective, minimum.evaluation, observed.states, draws=GRID_DRAWS, rng=rng)
     grid_part = shifts.T @ shifts / len(shifts)
@@ -177,6 +186,7 @@ def conclude(
         outer_loop=tuple(_iteration(inversion, iterate) for iterate in minimum.history),
         remarks=(*_remarks(inversion, covariance), *_folds(observed)),
         grid_covariance=grid_part,
+        observations={observation.kind: observation.description for observation in objective.observations},
     )
 
 
@@ -199,6 +209,35 @@ def no_estimate(
     )
 
 
+def hull(intervals: Sequence[Interval]) -> Interval:
+    """Smallest interval that holds all of one or more; an end that is open in one of them is open."""
+    lows, highs = [low for low, _ in intervals], [high for _, high in intervals]
+    low = None if None in lows else min(end for end in lows if end is not None)
+    high = None if None in highs else max(end for end in highs if end is not None)
+    return low, high
+
+
+def verdict(interval: Interval, *, at_bound: bool, absolute: bool) -> tuple[str, str]:
+    """Verdict and its reason from the interval of a modulus or ratio.
+
+    `identified`: closed and high/low <= 2; `weak`: closed and wider; `not identified`: an open end, a bound, or
+    high/low > 10; `ratio only`: identified or weak, but no known modulus holds the scale.
+    """
+    low, high = interval
+    if at_bound:
+        return "not identified", "the estimate lies at its bound; the images do not hold it back"
+    if low is None or high is None:
+        return "not identified", "the 95 % interval is open: it reaches beyond the bounds of the search"
+    width = high / low
+    if width > WEAK:
+        return "not identified", f"the 95 % interval spans a factor {width:.1f}"
+    if not absolute:
+        return "ratio only", f"no modulus is known, so only the ratio is determined (within a factor {width:.2f})"
+    if width <= IDENTIFIED:
+        return "identified", f"the 95 % interval spans a factor {width:.2f}"
+    return "weak", f"the 95 % interval spans a factor {width:.2f}; more image pairs or a larger motion narrow it"
+
+
 def _reason(inversion: Inversion) -> str:
     """How the estimate ended, and what became of the starts."""
     converged = sum(start.minimum.converged for start in inversion.starts)
@@ -214,20 +253,20 @@ def _reason(inversion: Inversion) -> str:
 def _estimates(
     inversion: Inversion, settings: InversionSettings, covariance: NDArray[np.float64], truth: Mapping[str, float]
 ) -> tuple[ModulusEstimate, ...]:
-    mapping = inversion.objective.parameters
-    theta = inversion.minimum.unknowns[: mapping.n_parameters]
-    bounds = settings.bounds
-    scale = mapping.scale_kpa
-    if not inversion.minimum.converged:
-        why = f"the estimation did not converge: {inversion.minimum.outcome.value}"
-        return tuple(
-            no_estimate(
-                name, absolute=mapping.absolute, relative_to=mapping.relative_to, why=why, truth=truth.get(name)
-            )
-            for name in mapping.tissues
-        )
+    mapping, bounds = inversion.objective.parameters, settings.bounds
+    theta, scale = inversion.minimum.unknowns[: mapping.n_parameters], mapping.scale_kpa
     found = []
     for i, name in enumerate(mapping.tissues):
+        none = no_estimate(
+            name,
+            absolute=mapping.absolute,
+            relative_to=mapping.relative_to,
+            why=f"the estimation did not converge: {inversion.minimum.outcome.value}",
+            truth=truth.get(name),
+        )
+        if not inversion.minimum.converged:
+            found.append(none)
+            continue
         ratio = float(np.exp(theta[i]))
         limits = {"lower": float(np.exp(bounds.lower[i])), "upper": float(np.exp(bounds.upper[i]))}
         sd = float(np.sqrt(covariance[i, i]))
@@ -236,18 +275,14 @@ def _estimates(
         word, why = verdict(interval, at_bound=at_bound, absolute=mapping.absolute)
         low, high = interval
         found.append(
-            ModulusEstimate(
-                tissue=name,
-                unit="kPa" if mapping.absolute else "ratio",
+            replace(
+                none,
                 value=ratio * scale if mapping.absolute else None,
                 interval95=(low and low * scale, high and high * scale) if mapping.absolute else None,
-                interval_kind="linearised",
-                relative_to=mapping.relative_to,
                 ratio=None if mapping.by_load else ratio,
                 ratio_interval95=None if mapping.by_load else interval,
                 verdict=word,
                 why=why,
-                truth=truth.get(name),
             )
         )
     return tuple(found)
