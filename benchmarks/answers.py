@@ -103,7 +103,7 @@ def plain_estimate(
     theta = np.asarray(np.median(np.stack(settings.starts), axis=0))
     still = np.concatenate([theta, np.zeros(sum(problem.parameters.n_modes))])
     objective = with_first_noise(_exact(Objective(problem.states, problem.parameters), still)).rematched(still)
-    filled = fit_coefficients(objective, theta, bounds=settings.bounds)
+    filled = fit_coefficients(objective, still, bounds=settings.bounds)
     objective = _exact(objective, filled.unknowns).rematched(filled.unknowns)  # a body at rest shows no modulus
     filled = replace(filled, evaluation=objective(filled.unknowns))
     rule = replace(RULE, refinements=0) if problem.finite_strain else RULE

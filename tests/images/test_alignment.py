@@ -175,6 +175,20 @@ def test_aligned_images_keep_only_each_bones_own_motion() -> None:
         assert again.overall.motion.angle_deg < 0.01
 
 
+def test_pieces_of_a_tissue_that_move_by_themselves_are_told() -> None:
+    rng = np.random.default_rng(12)
+    still, own = RigidMotion.identity(), RigidMotion(np.eye(3), np.array([-3.0, 0.0, 0.0]))
+    grid = grid_of((110, 60, 56), rng)
+    one = (two_bones(grid, (still, still)).tissues[0], Tissue("bones", Role.RIGID, (1, 2)))
+
+    def bones(*motions: RigidMotion) -> Segmentation:
+        both = two_bones(grid, (motions[0], motions[1]))
+        return Segmentation(np.minimum(both.index, 1), grid, one)
+
+    assert not align(bones(still, still), bones(own, own)).loose
+    assert align(bones(still, still), bones(still, own)).loose["bones"] > 0.5
+
+
 def test_moving_an_image_changes_its_affine_and_no_voxel() -> None:
     rng = np.random.default_rng(13)
     motion = motion_of(rng, degrees=40.0, mm=30.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
@@ -35,6 +35,7 @@ MAX_STEPS = 50
 STEP_TOLERANCE_MM = 1e-5
 TUKEY = 4.685  # 95 % efficiency for Gaussian residuals
 EXTRA_SMOOTHING = 0.8  # voxels; a rigid surface keeps its shape, so a wide Gaussian takes its stairs and biases nothing
+LOOSE_VOXELS = 0.5  # a piece that lies further off the motion of the whole moves by itself
 UNDETERMINED = 4e-3  # (lever / radius)^2 of a turn; the stairs left on a ball give 2e-3 at any radius
 
 
@@ -101,10 +102,14 @@ class RigidFit:
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Motion before -> after: `overall` of all rigid tissues as one body, `tissues` of each by its name."""
+    """Motion before -> after: `overall` of all rigid tissues as one body, `tissues` of each by its name.
+
+    loose: of a tissue with pieces that move by themselves, how far (mm, median) the worst lies off the tissue's motion.
+    """
 
     overall: RigidFit
     tissues: Mapping[str, RigidFit]
+    loose: Mapping[str, float] = field(default_factory=dict)
 
     def remaining(self, tissue: str) -> RigidMotion:
         """The tissue's own motion once the after image has been moved by `overall.motion.inverse()`."""
@@ -178,7 +183,12 @@ def align(before: Segmentation, after: Segmentation) -> Alignment:
     overall = fit_rigid_motion(pairs)
     names = [before.tissues[i].name for i in rigid]
     each = {name: _fit_or(pair, overall) for name, pair in zip(names, pairs, strict=True)}
-    return Alignment(overall, each)
+    loose = {}
+    for i, name, pair in zip(rigid, names, pairs, strict=True):
+        off = _off_the_motion(before.mask(i), pair, each[name].motion)
+        if off > LOOSE_VOXELS * float(after.grid.spacing.max()):
+            loose[name] = off
+    return Alignment(overall, each, loose)
 
 
 def moved(segmentation: Segmentation, motion: RigidMotion) -> Segmentation:
@@ -192,6 +202,25 @@ def _fit_or(pair: tuple[DistanceMap, DistanceMap], overall: RigidFit) -> RigidFi
         return fit_rigid_motion([pair])
     except InputDataError:
         return replace(overall, n_points=0)
+
+
+def _off_the_motion(mask: NDArray[np.bool_], pair: tuple[DistanceMap, DistanceMap], motion: RigidMotion) -> float:
+    """The largest median distance (mm) of a separate piece of a tissue from where its motion takes it; 0 of one piece.
+
+    Pieces that show less surface than a motion is measured on are left out.
+    """
+    pieces, count = ndimage.label(mask, structure=np.ones((3, 3, 3)))
+    if count < 2:
+        return 0.0
+    before, after = pair
+    places = _surface(before).places
+    seen = _inside(after.grid, motion.apply(places))
+    places = places[seen]
+    nearest = np.clip(np.rint(before.grid.index(places)).astype(int), 0, np.array(mask.shape) - 1)
+    number = ndimage.grey_dilation(pieces, size=(3, 3, 3))[tuple(nearest.T)]  # the surface lies beside the voxels
+    distance = np.abs(after.at(motion.apply(places)) - before.at(places))
+    shown = [distance[number == piece] for piece in range(1, count + 1)]
+    return max((float(np.median(one)) for one in shown if len(one) >= MIN_POINTS), default=0.0)
 
 
 def _smoothed(surface: DistanceMap, voxel: float) -> DistanceMap:

@@ -23,7 +23,6 @@ VOLUME_IMPLAUSIBLE = 0.30
 SMALL_VOXELS = 50
 THIN_VOXELS = 4
 THIN_SHARE = 0.2
-ISLAND_SHARE = 1e-3
 COMMON_SHARE = 0.5
 SPACING_MM = (0.02, 20.0)  # outside of this a voxel edge is more likely in metres or micrometres
 MIRROR_CERTAIN = 0.25  # gain in agreement, of 1, at which a mirrored image is refused
@@ -65,7 +64,7 @@ def check_segmentation(segmentation: Segmentation, name: str) -> tuple[Finding, 
         if tissue.role is not Role.RIGID:
             findings += _cut_by_border(segmentation.mask(i), tissue, name)
             findings += _too_thin(_surrounded(segmentation, i, box[0]), tissue, name)
-        findings += _islands(segmentation.index[box[0]] == i, tissue, name)
+            findings += _islands(segmentation.index[box[0]] == i, tissue, name)
     return tuple(findings)
 
 
@@ -181,9 +180,6 @@ def _islands(mask: NDArray[np.bool_], tissue: Tissue, name: str) -> list[Finding
         return []
     sizes = np.sort(np.bincount(parts.ravel())[1:])
     rest = float(sizes[:-1].sum() / sizes.sum())
-    if tissue.role is Role.RIGID:
-        text = f"the {count} pieces of '{tissue.name}' in '{name}' move as one body; give each bone its own tissue"
-        return [Finding("several-bodies", text)] if rest > ISLAND_SHARE else []
     text = (
         f"'{tissue.name}' has {count} separate pieces in '{name}', {rest:.2%} of it outside the largest; remove stray"
         " voxels from the labels"

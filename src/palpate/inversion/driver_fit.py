@@ -22,6 +22,8 @@ from palpate.observation.noise_model import SEGMENTATION_NOISE
 
 __all__ = ["fit_driver"]
 
+DECREMENT = 1e-2  # of a fit that is the result itself
+
 Motions = tuple[NDArray[np.float64], ...]
 
 
@@ -51,16 +53,16 @@ def _fitted(
     held: Objective, models: Sequence[Approximation], coefficients: NDArray[np.float64]
 ) -> list[NDArray[np.float64]]:
     """Driver coefficients of each state that bring the walls to the images, from given ones, all in one row."""
-    parameters = held.parameters
-    theta, bounds = np.zeros(held.n_parameters), Bounds(*np.outer([-1.0, 1.0], np.ones(held.n_parameters)))
+    begin = np.concatenate([np.zeros(held.n_parameters), coefficients])
+    bounds = Bounds(*np.outer([-1.0, 1.0], np.ones(held.n_parameters)))
     objective = held.under(models).with_observations([o.with_noise(SEGMENTATION_NOISE) for o in held.observations])
-    objective = objective.rematched(np.concatenate([theta, coefficients]))
-    first = fit_coefficients(objective, theta, bounds=bounds, coefficients=coefficients)
+    objective = objective.rematched(begin)
+    first = fit_coefficients(objective, begin, bounds=bounds, tolerance=DECREMENT)
     objective = with_learned_prior(objective, first.evaluation, first.unknowns).rematched(first.unknowns)
-    found = fit_coefficients(objective, theta, bounds=bounds, coefficients=first.unknowns[len(theta) :])
+    found = fit_coefficients(objective, first.unknowns, bounds=bounds, tolerance=DECREMENT)
     if not found.converged:
         raise NotConverged(f"the driver's wall could not be fitted to the later image: {found.outcome.value}")
-    return parameters.coefficients(found.unknowns)
+    return held.parameters.coefficients(found.unknowns)
 
 
 def _followed(near: FiniteStrainEquilibrium, coefficients: NDArray[np.float64], shares: Sequence[float]) -> Motions:

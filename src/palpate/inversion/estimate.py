@@ -112,12 +112,12 @@ def invert(
             " tissues; seek none, or leave out the states' `finite_strain` models (`InverseProblem.linear`)"
         )
     middle = np.asarray(np.median(np.stack(settings.starts), axis=0))
-    states = problem.states
+    states, begin = problem.states, np.concatenate([middle, np.zeros(sum(problem.parameters.n_modes))])
     if any(state.approximation is None for state in states):
         progress("responses of the full model at the middle start")
-        states = _with_reduced_bases(problem, settings, middle)
+        states, begin = _with_reduced_bases(problem, settings, begin)
     rule = rule or (FIRST_GUESS if problem.finite_strain else REPORTED)
-    linear = _linear(Objective(states, problem.parameters), settings, middle, rule, progress)
+    linear = _linear(Objective(states, problem.parameters), settings, begin, rule, progress)
     return continue_at_finite_strain(linear, settings, progress=progress) if problem.finite_strain else linear
 
 
@@ -146,26 +146,29 @@ def continue_at_finite_strain(linear: Inversion, settings: InversionSettings, *,
 
 def _with_reduced_bases(
     problem: InverseProblem, settings: InversionSettings, middle: NDArray[np.float64]
-) -> tuple[LaterState, ...]:
-    """The states with reduced bases made at the middle start, where their drivers' motion is fitted first."""
-    parameters, moduli = problem.parameters, problem.parameters.moduli(middle)
-    bases = [reduced_basis(state.model, moduli) for state in problem.states]
+) -> tuple[tuple[LaterState, ...], NDArray[np.float64]]:
+    """The states with reduced bases made at unknowns (n_unknowns,), where their drivers' motion is fitted first."""
+    parameters, theta = problem.parameters, middle[: problem.parameters.n_parameters]
+    bases = [reduced_basis(state.model, parameters.moduli(middle)) for state in problem.states]
     objective = with_first_noise(Objective(problem.states, parameters).under(bases))
-    still = np.concatenate([middle, np.zeros(sum(parameters.n_modes))])
-    fitted = fit_coefficients(objective.rematched(still), middle, bounds=settings.bounds)
-    by_theta = parameters.derivatives(middle)
+    fitted = fit_coefficients(objective.rematched(middle), middle, bounds=settings.bounds)
+    by_theta = parameters.derivatives(theta)
     triples = zip(problem.states, bases, parameters.coefficients(fitted.unknowns), strict=True)
-    return tuple(s.with_approximation(b.with_modulus_series(q, by_theta)) for s, b, q in triples)
+    states = tuple(s.with_approximation(b.with_modulus_series(q, by_theta)) for s, b, q in triples)
+    return states, fitted.unknowns
 
 
 def _linear(
-    objective: Objective, settings: InversionSettings, middle: NDArray[np.float64], rule: StopRule, progress: Progress
+    objective: Objective, settings: InversionSettings, begin: NDArray[np.float64], rule: StopRule, progress: Progress
 ) -> Inversion:
-    """The estimate of the linear law: every start under the first noise model, the best one followed to its end."""
+    """The estimate of the linear law: every start under the first noise model, the best one followed to its end.
+
+    begin (n_unknowns,): the middle start, with drivers' coefficients near the best ones there.
+    """
     still = np.zeros(objective.parameters.n_unknowns)
     objective = with_first_noise(objective).rematched(still)
     rest = objective(still)
-    fitted = fit_coefficients(objective, middle, bounds=settings.bounds)
+    fitted = fit_coefficients(objective, begin, bounds=settings.bounds)
     objective = with_learned_prior(objective, fitted.evaluation, fitted.unknowns)
     minima = _from_starts(objective, settings, fitted.unknowns[objective.n_parameters :], progress)
     groups = _groups(minima, objective.n_parameters)
@@ -192,7 +195,8 @@ def _from_starts(
     for number, theta in enumerate(settings.starts, start=1):
         motion = minima[0].unknowns[len(theta) :] if minima else coefficients
         bounds = settings.bounds
-        first = fit_coefficients(objective, theta, bounds=bounds, coefficients=motion, max_steps=FIRST_STEPS)
+        begin = np.concatenate([theta, motion])
+        first = fit_coefficients(objective, begin, bounds=bounds, max_steps=FIRST_STEPS)
         fresh = objective.rematched(first.unknowns)
         found = minimised(fresh, first.unknowns, settings, tolerance=START)
         minima.append(replace(found, evaluations=found.evaluations + first.evaluations))

@@ -15,8 +15,10 @@ __all__ = ["Bounds", "Iterate", "Minimum", "Outcome", "fit_coefficients", "gauss
 
 FIRST_RADIUS = 1.0  # of the log-moduli, per step: a factor e
 MAX_RADIUS = 2.0
+LEAST_DAMPING = 1e-2  # of the diagonal: less is nearly the step that was refused
 SEARCHES = 8  # trials of a step
-COEFFICIENTS = 1e-2  # decrement of the drivers' coefficients at held moduli, which other unknowns are going to change
+WORTH = 1e-2  # units of log-likelihood that a damped step must promise to be tried
+COEFFICIENTS = 0.1  # decrement of the drivers' coefficients at held moduli, which other unknowns are going to change
 STALLED = 1e-2  # decrement under which a refused step is the noise of re-chosen closest points, whatever it moves
 
 
@@ -84,11 +86,11 @@ class _Region:
 
     def smaller(self) -> _Region:
         """After a step that was refused."""
-        return _Region(self.radius / 3.0, max(10.0 * self.damping, 1e-4))
+        return _Region(self.radius / 3.0, max(10.0 * self.damping, LEAST_DAMPING))
 
     def larger(self) -> _Region:
         """After a step that brought what it promised."""
-        return _Region(min(2.0 * self.radius, MAX_RADIUS), self.damping / 10.0 if self.damping > 1e-6 else 0.0)
+        return _Region(min(2.0 * self.radius, MAX_RADIUS), self.damping / 10.0 if self.damping > LEAST_DAMPING else 0.0)
 
 
 WHOLE = _Region(np.inf, 0.0)  # the step to the minimum of the quadratic model
@@ -104,20 +106,18 @@ def posterior_sd(minimum: Minimum, n_parameters: int) -> NDArray[np.float64]:
 
 def fit_coefficients(
     objective: Objective,
-    theta: NDArray[np.float64],
+    begin: NDArray[np.float64],
     *,
     bounds: Bounds,
-    coefficients: NDArray[np.float64] | None = None,
+    tolerance: float = COEFFICIENTS,
     max_steps: int = 40,
 ) -> Minimum:
-    """The best driver coefficients at held log-moduli theta (n_parameters,), to a decrement of 1e-2.
+    """The best driver coefficients at the log-moduli of `begin` (n_unknowns,), sought from there.
 
-    coefficients (n_coefficients,), where the search begins; None: at rest. They are left where they are after
-    `max_steps`.
+    To a decrement of `tolerance`, by default what serves where the moduli are going to change; they are left where they
+    are after `max_steps`.
     """
-    first = np.zeros(objective.parameters.n_unknowns - len(theta)) if coefficients is None else coefficients
-    start = np.concatenate([theta, first])
-    return gauss_newton(objective, start, bounds=bounds, hold_theta=True, tolerance=COEFFICIENTS, max_steps=max_steps)
+    return gauss_newton(objective, begin, bounds=bounds, hold_theta=True, tolerance=tolerance, max_steps=max_steps)
 
 
 def gauss_newton(
@@ -170,18 +170,25 @@ def _search(
     bounds: Bounds,
     region: _Region,
 ) -> tuple[tuple[NDArray[np.float64], Evaluation, _Region] | None, int]:
-    """First step that makes progress, with the region for the next, None when eight did not; and the trials."""
+    """First step that makes progress, with the region for the next; None when there is none; and the trials.
+
+    After a refusal only steps are tried that promise a reduction of more than `WORTH`: less is the noise of re-chosen
+    closest points.
+    """
     n = objective.n_parameters
     before = _decrement(now, free)
-    for trials in range(1, SEARCHES + 1):
+    for trials in range(SEARCHES):
         trial = unknowns + _step(now, free, n, region)
         trial[:n] = np.clip(trial[:n], bounds.lower, bounds.upper)
-        step, there = trial - unknowns, objective(trial)
+        step = trial - unknowns
         promised = -now.score @ step - 0.5 * step @ now.matrix @ step
+        if trials and promised < WORTH:
+            return None, trials
+        there = objective(trial)
         gain = now.value - there.value
         progress = gain > 1e-4 * promised or _decrement(there, free) < 0.9 * before
         if promised > 0.0 and progress:  # what a bound leaves of a step may lead uphill
-            return (trial, there, region.larger() if gain > 0.25 * promised else region), trials
+            return (trial, there, region.larger() if gain > 0.25 * promised else region), trials + 1
         region = region.smaller()
     return None, SEARCHES
 

@@ -108,6 +108,14 @@ def aligned(
         ]
         findings += [
             Finding(
+                "several-bodies",
+                f"after image {number}: a piece of '{name}' lies {off:.1f} mm off the motion of the whole, which"
+                " moves as one body; give each bone its own tissue",
+            )
+            for name, off in alignment.loose.items()
+        ]
+        findings += [
+            Finding(
                 "rotation-undetermined",
                 f"after image {number}: the surface of '{name}' does not show its rotation about"
                 f" {len(fit.undetermined)} of three axes; it is taken as not turning about them",

@@ -154,13 +154,9 @@ def usual_modulus(name: str) -> UsualModulus | None:
 def plausibility_warnings(moduli_kpa: Mapping[str, float]) -> tuple[Remark, ...]:
     """Warnings on moduli (tissue name -> kPa) far outside what was published, each naming its source.
 
-    A bladder's modulus is called effective: a filled bladder meshed as one solid has no wall.
+    A bladder is not compared with its wall: meshed as one solid it has an effective modulus, which none published.
     """
-    return tuple(
-        warning
-        for name, value in moduli_kpa.items()
-        for warning in (*_out_of_range(name, value), *_effective_modulus(name))
-    )
+    return tuple(warning for name, value in moduli_kpa.items() for warning in _out_of_range(name, value))
 
 
 def estimate_warnings(estimation: Estimation) -> tuple[Remark, ...]:
@@ -189,7 +185,8 @@ def unit_warnings(case: Case) -> tuple[Remark, ...]:
 
 
 def _out_of_range(name: str, value: float) -> Iterable[Remark]:
-    entries = published_for(name)
+    walls = "wall" in name.lower()
+    entries = [entry for entry in published_for(name) if walls or not entry.tissue.endswith("wall")]
     if not entries:
         return
     low, high = min(entry.low for entry in entries), max(entry.high for entry in entries)
@@ -202,12 +199,3 @@ def _out_of_range(name: str, value: float) -> Iterable[Remark]:
         f" ({low:g} to {high:g} kPa; nearest: {closest.method}; {closest.source}). Check the `known` tissue's modulus,"
         " the labels and the boundary before you believe it",
     )
-
-
-def _effective_modulus(name: str) -> Iterable[Remark]:
-    if "wall" not in name.lower() and any(entry.tissue == "bladder wall" for entry in published_for(name)):
-        yield Remark(
-            "effective-modulus",
-            f"{name}: meshed as one solid, a filled bladder has an effective modulus, not that of its wall; compare it"
-            " with other estimates made this way only",
-        )
