@@ -101,11 +101,11 @@ def _model(data: ReportData, cite: _Citations) -> str:
         f" A conforming mesh{size} (edge length {settings['edge length at the organs']} at the organs) was cut along"
         f" their zero levels and improved with Mmg {cite('mmg')}.{more} The tissues followed"
         f" {law.description if law else 'the law ' + document['law']} in"
-        f" {ELEMENTS.get(document['element'], str(document['element']))}, with Poisson's ratios of {_list(ratios)}; each"
-        " was one solid, so that the modulus of an organ with a wall around a fluid, as a bladder, is an effective one,"
-        f" not its wall's. The outer boundary: {settings['outer boundary']}. The motion of the drivers' walls was a"
-        f" Gaussian process in its leading modes ({settings['driver motion']}) {cite('kernel')}, estimated together with"
-        f" the moduli.{acted}"
+        f" {ELEMENTS.get(document['element'], str(document['element']))}, with Poisson's ratios of {_list(ratios)};"
+        " each was one solid, so that the modulus of an organ with a wall around a fluid, as a bladder, is an effective"
+        f" one, not its wall's. The outer boundary: {settings['outer boundary']}. The motion of the drivers' walls was a"
+        f" Gaussian process in its leading modes ({settings['driver motion']}) {cite('kernel')}, estimated together"
+        f" with the moduli.{acted}"
     )
 
 
