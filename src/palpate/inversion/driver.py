@@ -83,7 +83,7 @@ def learned_precision(
 
 
 def with_learned_prior(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> Objective:
-    """The objective with the drivers' prior that has the largest evidence (see `learned_precision`)."""
+    """The objective with the drivers' prior of the largest evidence around unknowns (n_unknowns,)."""
     precision = learned_precision(objective, evaluation, unknowns)
     if precision is None:
         return objective
