@@ -103,8 +103,8 @@ def _model(data: ReportData, cite: _Citations) -> str:
         f" {law.description if law else 'the law ' + document['law']} in"
         f" {ELEMENTS.get(document['element'], str(document['element']))}, with Poisson's ratios of {_list(ratios)};"
         " each was one solid, so that the modulus of an organ with a wall around a fluid, as a bladder, is an effective"
-        f" one, not its wall's. The outer boundary: {settings['outer boundary']}. The motion of the drivers' walls was a"
-        f" Gaussian process in its leading modes ({settings['driver motion']}) {cite('kernel')}, estimated together"
+        f" one, not its wall's. The outer boundary: {settings['outer boundary']}. The motion of the drivers' walls was"
+        f" a Gaussian process in its leading modes ({settings['driver motion']}) {cite('kernel')}, estimated together"
         f" with the moduli.{acted}"
     )
 
