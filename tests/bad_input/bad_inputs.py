@@ -133,6 +133,21 @@ def cut(path: Path, size: int) -> None:
     path.write_bytes(path.read_bytes()[:size])
 
 
+def masks(folder: Path, *, affine: np.ndarray = AFFINE, value: int = 1, wide: float = 0.0) -> None:
+    """The later image as a folder of masks; `affine` and `value` are those of the rectum's, `wide` widens it (mm)."""
+    labels = anatomy(shift=0.8, radius=6.0)
+    (folder / "after").mkdir()
+    save(folder / "after" / "prostate.nii.gz", labels == 1)
+    rectum = (anatomy(radius=6.0 + wide) == 2).astype(np.uint8)
+    rectum[:12] *= value
+    save(folder / "after" / "rectum.nii.gz", rectum, affine)
+    replace_after(folder, "after")
+    changed(folder, "[images]", '[images]\nnames = "names.json"')
+    (folder / "names.json").write_text('{"prostate": 1, "rectum": 2}')
+    changed(folder, "label = 1", 'label = "prostate"')
+    changed(folder, "label = 2", 'label = "rectum"')
+
+
 def flipped(folder: Path) -> None:
     labels = anatomy(shift=0.8, radius=6.0)
     labels[ball([30.0, 30.0, 30.0], 5.0)] = 3

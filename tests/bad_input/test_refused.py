@@ -8,6 +8,7 @@ import shutil
 import numpy as np
 import pytest
 from bad_inputs import (
+    AFFINE,
     LAYERS,
     NRRD,
     anatomy,
@@ -20,6 +21,7 @@ from bad_inputs import (
     flipped,
     header,
     layers,
+    masks,
     nrrd,
     overlapping,
     replace_after,
@@ -60,6 +62,13 @@ REFUSED = {
         lambda f: nrrd(f, "a.seg.nrrd", LAYERS.replace("Layer:=1", "Layer:=0"), layers(anatomy() == 1, anatomy() == 2)),
         3,
         "a.seg.nrrd",
+    ),
+    "13 masks on two grids": (lambda f: masks(f, affine=AFFINE * 2.0), 3, "are not on one grid"),
+    "13 masks with several values": (lambda f: masks(f, value=3), 3, "is no mask of one organ"),
+    "13 a folder without masks": (
+        lambda f: [(f / "after").mkdir(), (f / "after" / "notes.txt").write_text("x"), replace_after(f, "after")],
+        3,
+        "has 0 masks",
     ),
     "18 mirrored": (flipped, 3, "looks mirrored"),
     "19 a label in one image only": (
@@ -126,3 +135,10 @@ def test_check_finds_what_an_estimate_refuses(name, folder, palpate):
     problems = json.loads(done["out"])["problems"]
     assert done["code"] == code
     assert any(words in problem["message"] for problem in problems if problem["severity"] == "refused")
+
+
+def test_no_image_is_written_among_the_masks_of_a_run(folder, palpate):
+    masks(folder)
+    done = palpate("estimate", "case.toml", "--output", "after", "--quiet", cwd=folder)
+    assert "a folder of masks" in sentence(done, 2)
+    assert sorted(path.name for path in (folder / "after").iterdir()) == ["prostate.nii.gz", "rectum.nii.gz"]

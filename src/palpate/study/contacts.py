@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.images.checks import Finding
+from palpate.images.finding import Finding
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 

@@ -113,7 +113,9 @@ def new_case(images: CaseImages, folder: Path) -> NewCase:
             )
     tissues = guess_tissues(before, after)
     questions = _questions(tissues)
-    blocks = [_heading(images, folder, questions), _domain(before, tissues), _mesh(before, tissues)]
+    named = zip((images.before, *images.after), (before, *after), strict=True)
+    notes = [f"'{path.name}': {finding.message}" for path, image in named for finding in image.findings]
+    blocks = [_heading(images, folder, questions, notes), _domain(before, tissues), _mesh(before, tissues)]
     blocks += [_tissue(tissue, before) for tissue in tissues]
     return NewCase("\n\n".join(block for block in blocks if block) + "\n", tissues, questions)
 
@@ -141,9 +143,10 @@ def _questions(tissues: Sequence[GuessedTissue]) -> tuple[str, ...]:
     return tuple(asked)
 
 
-def _heading(images: CaseImages, folder: Path, questions: Sequence[str]) -> str:
+def _heading(images: CaseImages, folder: Path, questions: Sequence[str], notes: Sequence[str]) -> str:
     lines = ["# Made by `palpate init`. Every role is a guess: read the reasons, correct what is wrong."]
     lines += [_comment(f"QUESTION: {question}") for question in questions]
+    lines += [_comment(f"NOTE: {note}") for note in notes]
     lines += ["", "[images]", f"before = {_path(images.before, folder)}"]
     lines.append(f"after = [{', '.join(_path(path, folder) for path in images.after)}]")
     if images.table:

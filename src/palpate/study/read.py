@@ -106,6 +106,6 @@ def _read_pair(case: Case, before: Path, after: tuple[Path, ...], *, key: str) -
     inputs = {"names": names.sha256} if names else {}
     keys = (f"{key}before", *(f"{key}after[{i}]" for i in range(len(later))))
     for name, image, path in zip(keys, (reference, *later), (before, *after), strict=True):
-        own, *voxels = image.digests or (file_digest(path),)  # a reader from elsewhere may not say what it read
-        inputs |= {name: own} | {f"{name}.voxels": digest for digest in voxels}
+        digests = image.digests or {"": file_digest(path)}  # a reader from elsewhere may not say what it read
+        inputs |= {f"{name}.{part}" if part else name: digest for part, digest in digests.items()}
     return replace(states, inputs=inputs)

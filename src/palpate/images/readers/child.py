@@ -80,7 +80,8 @@ def _send_image(pipe: BinaryIO, values: NDArray[Any], stored: StoredImage) -> No
     """`values` (n_1, n_2, n_3), in the order of Fortran, with place and names as stored."""
     names = [[row.label, row.name, row.colour] for row in stored.names]
     answer = {"shape": values.shape, "dtype": values.dtype.str, "affine": stored.affine.tolist(), "names": names}
-    answer["digests"] = stored.digests
+    answer["digests"] = dict(stored.digests)
+    answer["findings"] = [[finding.code, finding.message] for finding in stored.findings]
     _send(pipe, answer)
     pipe.write(values.T.data.cast("B"))
 

@@ -15,7 +15,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, InputDataError, PalpateError, ResourceError
+from palpate.images.finding import Finding
 from palpate.images.named_labels import NamedLabel, printable
 from palpate.images.readers.registry import ImageFormat, StoredImage
 from palpate.images.readers.voxel_stream import MAX_VOXELS, read_exactly
@@ -59,6 +60,7 @@ def read_stored(path: Path, kind: str, image_format: ImageFormat, limits: ReadLi
     """
     if not image_format.read.__module__.startswith("palpate."):
         return image_format.read(path)  # the program's own code, which another process would not find
+    limits = replace(limits, cpu_seconds=image_format.patience * limits.cpu_seconds)
     with _reader(_command(path, kind, limits), path, limits) as (pipe, verdict):
         if pipe.readline(len(GREETING)) != GREETING:
             raise _not_started(path)
@@ -155,17 +157,18 @@ def _stored(answer: Mapping[str, Any], pipe: BinaryIO, path: Path) -> StoredImag
         shape = tuple(int(n) for n in answer["shape"])
         affine = np.array(answer["affine"], dtype=np.float64)
         names = tuple(NamedLabel(int(k), str(name), None if c is None else str(c)) for k, name, c in answer["names"])
-        digests = tuple(str(digest) for digest in answer.get("digests", ()))
+        digests = {printable(str(part)): str(digest) for part, digest in answer.get("digests", {}).items()}
+        findings = tuple(Finding(str(code), printable(str(text))) for code, text in answer.get("findings", ()))
         placed = len(shape) == 3 and min(shape) > 0 and affine.shape == (4, 4)
-        valid = placed and DTYPE.fullmatch(answer["dtype"]) and all(map(DIGEST.fullmatch, digests))
-    except (KeyError, TypeError, ValueError):
+        valid = placed and DTYPE.fullmatch(answer["dtype"]) and all(map(DIGEST.fullmatch, digests.values()))
+    except (AttributeError, KeyError, TypeError, ValueError):
         valid = None
     if not valid or math.prod(shape) > MAX_VOXELS:
         raise InputDataError(
             f"the process that read '{path}' gave an answer that cannot be used; export the image again"
         )
     values = _received(pipe, shape, np.dtype(answer["dtype"]), path)
-    return None if values is None else StoredImage(values, affine, names, digests)
+    return None if values is None else StoredImage(values, affine, names, digests, findings)
 
 
 def _received(pipe: BinaryIO, shape: tuple[int, ...], dtype: np.dtype[Any], path: Path) -> NDArray[Any] | None:

@@ -63,7 +63,7 @@ def read_nifti(path: Path) -> StoredImage:
             read_exactly(stream, layout.offset - used, path)
             values = read_exactly(stream, layout.n_bytes, path).view(layout.dtype)
             check_end(stream, layout.n_bytes, path)
-            digests = (file.sha256(),)
+            digests = {"": file.sha256()}
     except (OSError, EOFError, zlib.error) as error:
         raise damaged(path, error) from error
     values = _scaled(values.reshape(layout.shape, order="F"), layout)
