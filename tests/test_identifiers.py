@@ -102,6 +102,10 @@ def write_nifti(path: Path, image: LabelImage) -> None:
     nifti.header["db_name"] = PLANTED.encode()
     nifti.header["intent_name"] = PLANTED.encode()
     nifti.header.extensions.append(nibabel.nifti1.Nifti1Extension("comment", f"{PLANTED} {DATE}".encode()))
+    rows = "".join(f'<Label Key="{k}"><![CDATA[{name}]]></Label>' for k, (name, _) in NAMES.items())
+    free = f"<MetaData><MD><Name>PatientName</Name><Value>{PLANTED}</Value></MD></MetaData><Date>{DATE}</Date>"
+    table = f"<CaretExtension>{free}<VolumeInformation>{free}<LabelTable>{free}{rows}</LabelTable></VolumeInformation>"
+    nifti.header.extensions.append(nibabel.nifti1.Nifti1Extension(0, f"{table}</CaretExtension>".encode()))
     nibabel.save(nifti, path)
 
 

@@ -148,6 +148,13 @@ def masks(folder: Path, *, affine: np.ndarray = AFFINE, value: int = 1, wide: fl
     changed(folder, "label = 2", 'label = "rectum"')
 
 
+def named(folder: Path, text: str) -> None:
+    """Label names in the later image's header."""
+    image = nibabel.Nifti1Image(anatomy(shift=0.8, radius=6.0), AFFINE)
+    image.header.extensions.append(nibabel.nifti1.Nifti1Extension(0, text.encode()))
+    nibabel.save(image, folder / "after.nii.gz")
+
+
 def flipped(folder: Path) -> None:
     labels = anatomy(shift=0.8, radius=6.0)
     labels[ball([30.0, 30.0, 30.0], 5.0)] = 3

@@ -22,6 +22,7 @@ from bad_inputs import (
     header,
     layers,
     masks,
+    named,
     nrrd,
     overlapping,
     replace_after,
@@ -63,6 +64,12 @@ REFUSED = {
         3,
         "a.seg.nrrd",
     ),
+    "13 names with a document type": (
+        lambda f: named(f, '<!DOCTYPE a [<!ENTITY b "c">]><CaretExtension>&b;</CaretExtension>'),
+        3,
+        "declare a document type",
+    ),
+    "13 names that are no XML": (lambda f: named(f, "<CaretExtension><a>"), 3, "are no XML"),
     "13 masks on two grids": (lambda f: masks(f, affine=AFFINE * 2.0), 3, "are not on one grid"),
     "13 masks with several values": (lambda f: masks(f, value=3), 3, "is no mask of one organ"),
     "13 a folder without masks": (
