@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import signal
+import sys
 from itertools import permutations
 from pathlib import Path
 
@@ -20,6 +21,8 @@ from palpate.mesh.tetrahedralise import boundary_of
 from palpate.observation.contract import Fit
 from palpate.study.case import Case, CaseTissue, Images
 from palpate.study.result import CaseResult, MeshSummary, Provenance
+
+sys.path.insert(0, str(Path(__file__).parent))  # tests are no package; dicom_files.py lies here
 
 EDGE = 4.0
 CELLS = 10

@@ -155,6 +155,15 @@ def named(folder: Path, text: str) -> None:
     nibabel.save(image, folder / "after.nii.gz")
 
 
+def dicom(folder: Path, name: str) -> None:
+    """The later image as one file of a class that holds no segmentation, alone or in a folder."""
+    path = folder / name
+    path.parent.mkdir(exist_ok=True)
+    uid = b"1.2.840.10008.5.1.4.1.1.2"
+    path.write_bytes(bytes(128) + b"DICM" + b"\x02\x00\x02\x00UI\x1a\x00" + uid + bytes(400))
+    replace_after(folder, name.split("/", maxsplit=1)[0])
+
+
 def flipped(folder: Path) -> None:
     labels = anatomy(shift=0.8, radius=6.0)
     labels[ball([30.0, 30.0, 30.0], 5.0)] = 3

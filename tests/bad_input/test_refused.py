@@ -18,6 +18,7 @@ from bad_inputs import (
     both,
     changed,
     cut,
+    dicom,
     flipped,
     header,
     layers,
@@ -76,6 +77,13 @@ REFUSED = {
         lambda f: [(f / "after").mkdir(), (f / "after" / "notes.txt").write_text("x"), replace_after(f, "after")],
         3,
         "has 0 masks",
+    ),
+    "16 a DICOM slice": (lambda f: dicom(f, "IM0001"), 3, "dcm2niix or 3D Slicer"),
+    "16 a DICOM series": (lambda f: dicom(f, "ct/IM0001.dcm"), 3, "dcm2niix or 3D Slicer"),
+    "14 what only is called DICOM": (
+        lambda f: [(f / "a.dcm").write_bytes(b"words" * 99), replace_after(f, "a.dcm")],
+        3,
+        "does not begin as a DICOM file does",
     ),
     "18 mirrored": (flipped, 3, "looks mirrored"),
     "19 a label in one image only": (

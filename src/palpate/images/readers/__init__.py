@@ -1,6 +1,7 @@
 """Readers of image files and label tables, one file a format; importing this package registers them all."""
 
 from palpate.images.readers import (
+    dicom,
     mask_folder,
     metaimage,
     nrrd,
@@ -16,6 +17,7 @@ from palpate.images.readers.read import read_intensities, read_label_image
 
 __all__ = [
     "ReadLimits",
+    "dicom",
     "mask_folder",
     "metaimage",
     "nrrd",

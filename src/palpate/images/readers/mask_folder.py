@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
 from palpate.images.named_labels import NamedLabel, printable
+from palpate.images.readers.dicom import refused_series
 from palpate.images.readers.merged_masks import Mask, merged
-from palpate.images.readers.registry import FOLDER, ImageFormat, StoredImage, format_of, register
+from palpate.images.readers.registry import FOLDER, ImageFormat, StoredImage, format_of, marked_format, register
 from palpate.images.readers.values import label_values
 from palpate.images.totalsegmentator import CLASSES
 
@@ -24,6 +25,7 @@ __all__ = ["read_mask_folder"]
 ENDINGS = (".nii.gz", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd")
 MOST_FILES = 10_000  # of any kind in the folder
 MOST_MASKS = 500
+MOST_LOOKED_AT = 20  # files in a folder without masks: do they say what they are?
 SAME_PLACE = 0.01  # of a voxel, at the corners: what rounding leaves
 
 
@@ -75,6 +77,8 @@ def _mask_files(folder: Path) -> list[_MaskFile]:
             )
         if stem:
             found[stem] = name
+    if not found and any(marked_format(folder / name) for name in sorted(names)[:MOST_LOOKED_AT]):
+        raise refused_series(folder)
     if not 1 <= len(found) <= MOST_MASKS or len(names) > MOST_FILES:
         raise InputDataError(
             f"the folder '{folder}' has {len(found)} masks ({', '.join(ENDINGS)}) among"

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.finding import Finding
+from palpate.images.input_file import open_input
 from palpate.images.named_labels import NamedLabel
 
-__all__ = ["FOLDER", "ImageFormat", "StoredImage", "format_of", "register"]
+__all__ = ["FOLDER", "ImageFormat", "StoredImage", "format_of", "marked_format", "register"]
 
 FOLDER = "/"  # no file's name ends so
 
@@ -41,13 +42,15 @@ class ImageFormat:
     """A file format: its name, the endings of its files (lower case, with the dot) and the function that reads one.
 
     `read` takes the path of an existing, non-empty file; it raises `InputDataError` and lets nothing else out. A folder
-    has the ending `FOLDER`. `patience`: how many times the processor time of one file reading may take.
+    has the ending `FOLDER`. `patience`: how many times the processor time of one file reading may take;
+    `mark`: what stands at byte 128 of its files, which then need no ending.
     """
 
     name: str
     endings: tuple[str, ...]
     read: Callable[[Path], StoredImage]
     patience: int = 1
+    mark: bytes = b""
 
 
 _FORMATS: dict[str, ImageFormat] = {}
@@ -70,8 +73,21 @@ def format_of(path: Path) -> ImageFormat:
     for ending in sorted(_FORMATS, key=len, reverse=True):
         if path.name.lower().endswith(ending):
             return _FORMATS[ending]
+    marked = marked_format(path)
+    if marked is not None:
+        return marked
     known = ", ".join(sorted(set(_FORMATS) - {FOLDER}))
     raise InputDataError(
         f"no reader for '{path}': the endings known are {known}; convert the image to one of these, or name a folder of"
         " masks"
     )
+
+
+def marked_format(path: Path) -> ImageFormat | None:
+    """The format whose mark the file bears, whatever its name; None when there is none, or it cannot be read."""
+    try:
+        with open_input(path) as file:
+            begins = file.read(256)[128:]
+    except (OSError, ValueError):
+        return None
+    return next((each for each in _FORMATS.values() if each.mark and begins.startswith(each.mark)), None)
