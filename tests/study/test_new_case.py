@@ -9,8 +9,10 @@ import pytest
 
 from palpate.cli import main
 from palpate.errors import ConfigurationError, InputDataError
+from palpate.experiments.simulated_pelvis import DATA
 from palpate.images.label_image import LabelImage, VoxelGrid
-from palpate.images.readers import write_label_image
+from palpate.images.label_table import read_label_table
+from palpate.images.readers import read_label_image, write_label_image
 from palpate.images.tissue import Role
 from palpate.images.totalsegmentator import CLASSES
 from palpate.study import check
@@ -18,6 +20,7 @@ from palpate.study.case_file import read_case
 from palpate.study.class_names import class_names
 from palpate.study.guess import guess_tissues
 from palpate.study.new_case import CaseImages, new_case
+from palpate.study.read import read_segmentation
 
 GRID = VoxelGrid((30, 30, 30), np.diag([2.0, 2.0, 2.0, 1.0]))
 NAMES = {1: "Prostate", 2: "urinary_bladder", 3: "rectum", 4: "femur_left", 5: "colon", 6: "prostateTumour", 9: "body"}
@@ -238,3 +241,33 @@ def test_names_in_a_folder_of_masks_make_a_case_without_numbers(tmp_path):
     assert 'before = "before"' in text
     assert "# NOTE: 'before': 64 voxels are claimed by several organs" in text
     assert 'label = "urinary_bladder"' in text
+
+
+def test_the_demo_as_masks_of_totalsegmentator_is_the_same_segmentation(tmp_path):
+    demo = read_case(DATA / "demo.toml")
+    names = read_label_table(demo.images.names)
+    classes = {"rectum": "colon", "sacrum_S1": "sacrum"}
+    images = dict(zip(("before", "after"), (demo.images.before, *demo.images.after), strict=True))
+    for state, path in images.items():
+        (tmp_path / state).mkdir()
+        shown = read_label_image(path)
+        for number in (1, 2, 3, 6, 7, 8, 9, 10, 20):
+            name = classes.get(names[number], names[number])
+            mask = LabelImage(shown.labels == number, shown.grid)
+            write_label_image(tmp_path / state / f"{name}.nii.gz", mask)
+    case = new_case(CaseImages(tmp_path / "before", (tmp_path / "after",)), tmp_path)
+    (tmp_path / "case.toml").write_text(case.text)
+    (question,) = case.questions
+    assert "is the rectum part of that label?" in question
+    ours = read_case(tmp_path / "case.toml")
+    for state, path in images.items():
+        there = read_segmentation(demo, path, names, None)
+        here = read_segmentation(ours, tmp_path / state, None, None)
+        mine = {tissue.name: i for i, tissue in enumerate(here.tissues)}
+        same = {"bladder": "urinary_bladder", "rectum": "colon"}
+        for i, tissue in enumerate(there.tissues):
+            side = " ".join(tissue.name.split()[::-1]).replace(" ", "_")  # "left hip" is hip_left
+            j = mine[same.get(tissue.name, side)]
+            assert here.tissues[j].role is tissue.role
+            assert np.array_equal(here.mask(j), there.mask(i))
+        assert np.array_equal(here.grid.affine, there.grid.affine)

@@ -53,7 +53,11 @@ __all__ = [
 ]
 
 THIN_VOXELS = 4
-STATED = ("motion-below-noise", "sides-exchanged")  # findings on contacts stand in the result as observed shares
+STATED = (
+    "motion-below-noise",
+    "sides-exchanged",
+    "front-exchanged",
+)  # findings on contacts stand in the result as observed shares
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ __all__ = ["GuessedTissue", "guess_tissues"]
 SURROUNDINGS = "surroundings"
 BORDER_SHARE = 0.1  # of the image's border that the body, or the air around it, covers
 STILL_SHARE = 0.005  # of a label's voxels
-NEAR_MM = 10.0  # between the colon and an organ that it may move
+NEAR_MM = 15.0  # between the colon and an organ that it may move
 HOLLOW_CHANGE = 0.10  # of a volume: no solid organ changes so much between two scans
 
 
