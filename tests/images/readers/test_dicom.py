@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 import sys
 from functools import partial
 from pathlib import Path
@@ -15,7 +16,9 @@ from numpy.typing import NDArray
 from dicom_files import TILTED, axes_of, ct_slices, save_contours, save_segmentation, save_series, traced
 from palpate.errors import InputDataError, ResourceError
 from palpate.images import readers
-from palpate.images.label_image import LabelImage
+from palpate.images.label_image import LabelImage, VoxelGrid
+from palpate.study.case_file import read_case
+from palpate.study.read import read_segmentation
 
 read_label_image = partial(readers.read_label_image, limits=None)
 
@@ -223,3 +226,39 @@ def test_sizes_beyond_all_are_refused_before_memory_is_taken(tmp_path: Path) -> 
     ds.save_as(tmp_path / "a.dcm")
     with pytest.raises(InputDataError):
         read_label_image(tmp_path / "a.dcm")
+
+
+@pytest.mark.parametrize("orientation", ["axial", "sagittal"])
+def test_a_grid_that_is_given_stands_for_a_series_that_is_not_there(tmp_path: Path, orientation: str) -> None:
+    slices = series(orientation)
+    segments = save_segmentation(tmp_path / "a.dcm", slices, "BINARY", NAMES, masks())
+    contours = save_contours(tmp_path / "b.dcm", slices, NAMES, {n: traced(mask, 0.5) for n, mask in masks().items()})
+    save_series(tmp_path / "ct", slices)
+    whole = read_label_image(segments)
+    shutil.rmtree(tmp_path / "ct")
+    for path in (segments, contours):
+        for read in (read_label_image, readers.read_label_image):
+            image = read(path, grid=whole.grid)
+            assert image.findings == ()
+            assert sorted(image.digests) == [""]
+            assert np.array_equal(image.labels, whole.labels)
+    apart = VoxelGrid(whole.grid.shape, whole.grid.affine + np.eye(4)[:, ::-1] * 0.3)
+    assert [finding.code for finding in read_label_image(segments, grid=apart).findings] == ["cropped"]
+
+
+def test_a_case_gives_contours_the_grid_of_its_grey_image(tmp_path: Path) -> None:
+    slices = series()
+    save_series(tmp_path / "ct", slices)
+    path = save_contours(tmp_path / "a.dcm", slices, NAMES, {n: traced(mask, 0.5) for n, mask in masks().items()})
+    whole = read_label_image(path)
+    shutil.rmtree(tmp_path / "ct")
+    readers.write_scalar_image(tmp_path / "ct.nii.gz", np.zeros(whole.grid.shape), whole.grid)
+    (tmp_path / "case.toml").write_text(
+        '[images]\nbefore = "a.dcm"\nafter = ["a.dcm"]\nintensities_before = "ct.nii.gz"\n'
+        '[tissues.gland]\nlabel = "prostate"\nrole = "estimate"\n'
+        '[tissues.rest]\nlabel = "remaining"\nrole = "known"\nyoungs_modulus_kpa = 10.0\n'
+    )
+    case = read_case(tmp_path / "case.toml")
+    assert case.images is not None
+    found = read_segmentation(case, case.images.before, None, None)
+    assert np.count_nonzero(found.mask(0)) == np.count_nonzero(masks()[1])

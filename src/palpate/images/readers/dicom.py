@@ -12,6 +12,7 @@ from pathlib import Path
 
 from palpate.errors import InputDataError, ResourceError
 from palpate.images.input_file import open_input
+from palpate.images.label_image import VoxelGrid
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
 from palpate.images.readers.voxel_stream import damaged
 
@@ -26,10 +27,11 @@ READERS = {
 }
 
 
-def read_dicom(path: Path) -> StoredImage:
+def read_dicom(path: Path, grid: VoxelGrid | None = None) -> StoredImage:
     """Read the segments of a DICOM-SEG, or the contours of an RTSTRUCT, as one label image.
 
-    Raises `InputDataError` for other classes and damaged files, `ResourceError` without the extra `dicom`.
+    `grid` is taken where the series that it refers to is not beside it. Raises `InputDataError` for other classes and
+    damaged files, `ResourceError` without the extra `dicom`.
     """
     try:
         with open_input(path) as file:
@@ -49,7 +51,7 @@ def read_dicom(path: Path) -> StoredImage:
             f"'{path}' is a DICOM segmentation, and the libraries that read it are not installed: run"
             ' pip install "palpate[dicom]"'
         ) from error
-    image: StoredImage = module.read(path)
+    image: StoredImage = module.read(path, grid)
     return image
 
 
@@ -61,4 +63,4 @@ def refused_series(path: Path) -> InputDataError:
     )
 
 
-register(ImageFormat("DICOM", (".dcm", ".dicom"), read_dicom, patience=4, mark=MARK))
+register(ImageFormat("DICOM", (".dcm", ".dicom"), read_dicom, patience=4, mark=MARK, read_on=read_dicom))

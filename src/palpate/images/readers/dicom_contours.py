@@ -17,16 +17,17 @@ from pydicom.dataset import Dataset
 
 from palpate.errors import InputDataError
 from palpate.images.finding import Finding
+from palpate.images.label_image import VoxelGrid
 from palpate.images.named_labels import MAX_LABEL, MAX_NAME, NamedLabel, hex_colour, printable
-from palpate.images.readers.dicom_dataset import read_dataset, sentences, series_beside
+from palpate.images.readers.dicom_dataset import Series, read_dataset, sentences, series_beside
 from palpate.images.readers.merged_masks import Mask, merged
 from palpate.images.readers.registry import StoredImage
-from palpate.images.readers.voxel_stream import check_size
 
 __all__ = ["read"]
 
 CLOSED = ("CLOSED_PLANAR", "CLOSEDPLANAR_XOR")
 ON_EDGE = 0.01  # of a voxel: contours are written with some six digits
+MOST_TRIED = 20  # contours of a structure, to see how slices lie
 SPARSE = 1.5  # slices between planes
 ONE_PLANE = 0.1  # of the distance of slices, between points of one contour, and contours of one plane
 
@@ -50,26 +51,50 @@ class _Structure:
         return float(np.median(np.diff(self.heights))) if len(self.heights) > 1 else 1.0
 
 
-def read(path: Path) -> StoredImage:
-    """Read the structures of `path`; their series must lie beside the file, or in a folder there.
+def read(path: Path, grid: VoxelGrid | None) -> StoredImage:
+    """Read the structures of `path` on the grid of their series where that lies beside the file, else on `grid`.
 
     Structures that overlap are made one label image as masks are. Raises `InputDataError` for whatever is wrong.
     """
     with sentences(path):
         dataset, sha256 = read_dataset(path)
-        series = series_beside(path, _series_uid(dataset))
+        series = series_beside(path, _series_uid(dataset)) or (Series(grid) if grid else None)
         if series is None:
             raise InputDataError(
                 f"the DICOM series that '{path}' was drawn on is not beside it, and without its slices contours have no"
-                " voxels; copy it into the folder of that file, or into a folder there"
+                " voxels; copy it into the folder of that file, or into one there, or name a grey image on its grid as"
+                " intensities_before or intensities_after of the case"
             )
-        check_size(series.shape, 0, path, available=0, packed=False)
-        structures = _structures(dataset, np.asarray(np.linalg.inv(series.affine), dtype=np.float64), path)
+        axis = _slice_axis(dataset, series.grid)
+        rows, columns = (n for k, n in enumerate(series.grid.shape) if k != axis)
+        shape = (series.grid.shape[axis], rows, columns)
+        structures = _structures(dataset, _to_index(series.grid, axis), path)
         findings = _flaws(structures)
-        masks = (Mask(each.row, _filled(each, series.shape)) for each in structures)
-        labels, overlaps = merged(masks, series.shape)
-    rows = tuple(each.row for each in structures)
-    return StoredImage(labels, series.affine, rows, {"": sha256, "series": series.sha256}, (*findings, *overlaps))
+        masks = (Mask(each.row, _filled(each, shape)) for each in structures)
+        labels, overlaps = merged(masks, shape)
+    named = tuple(each.row for each in structures)
+    digests = {"": sha256, **({"series": series.sha256} if series.sha256 else {})}
+    return StoredImage(np.moveaxis(labels, 0, axis), series.grid.affine, named, digests, (*findings, *overlaps))
+
+
+def _slice_axis(dataset: Dataset, grid: VoxelGrid) -> int:
+    """The axis of the grid across which the first contours run least."""
+    extent = np.zeros(3)
+    for item in dataset.ROIContourSequence:
+        for contour in (item.get("ContourSequence") or ())[:MOST_TRIED]:
+            extent += np.ptp(grid.index(_points(contour)), axis=0)
+    return int(np.argmin(extent))
+
+
+def _to_index(grid: VoxelGrid, axis: int) -> NDArray[np.float64]:
+    """RAS mm -> index, the axis of the slices first."""
+    inverse = np.asarray(np.linalg.inv(grid.affine), dtype=np.float64)
+    return inverse[[axis, *(k for k in range(3) if k != axis), 3]]
+
+
+def _points(contour: Dataset) -> NDArray[np.float64]:
+    """The points of a contour (n, 3), RAS mm."""
+    return np.array(contour.ContourData, dtype=np.float64).reshape(-1, 3) * [-1.0, -1.0, 1.0]
 
 
 def _series_uid(dataset: Dataset) -> str:
@@ -103,7 +128,7 @@ def _structure(item: Dataset, row: NamedLabel, to_index: NDArray[np.float64], pa
     contours: list[NDArray[np.float64]] = []
     n_open = n_short = 0
     for contour in item.ContourSequence:
-        points = np.array(contour.ContourData, dtype=np.float64).reshape(-1, 3) * [-1.0, -1.0, 1.0]
+        points = _points(contour)
         if len(points) < 3:
             n_short += 1
         elif contour.get("ContourGeometricType") not in CLOSED:

@@ -14,11 +14,13 @@ from pathlib import Path
 
 import numpy as np
 import pydicom
-from numpy.typing import NDArray
 from pydicom.dataset import Dataset
 
 from palpate.errors import InputDataError, PalpateError
 from palpate.images.input_file import read_input
+from palpate.images.label_image import VoxelGrid
+from palpate.images.readers.canonical import to_canonical
+from palpate.images.readers.voxel_stream import check_size
 
 __all__ = ["LPS_TO_RAS", "Series", "read_dataset", "sentences", "series_beside"]
 
@@ -32,11 +34,10 @@ PLACE = ("SeriesInstanceUID", "ImagePositionPatient", "ImageOrientationPatient",
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """The grid of a series: `shape` (slices, rows, columns), `affine` (4, 4) index -> RAS mm; SHA-256 of its files."""
+    """The grid of a series, in the order closest to RAS; SHA-256 of its files, empty where there are none."""
 
-    shape: tuple[int, int, int]
-    affine: NDArray[np.float64]
-    sha256: str
+    grid: VoxelGrid
+    sha256: str = ""
 
 
 @contextmanager
@@ -117,4 +118,7 @@ def _stack(found: list[tuple[Dataset, str]], path: Path) -> Series:
     lps[:3, :3] = np.stack([step, down * spacing[0], across * spacing[1]], axis=1)
     lps[:3, 3] = places[0]
     total = hashlib.sha256("".join(digest for _, digest in alike).encode()).hexdigest()
-    return Series((len(alike), int(first.Rows), int(first.Columns)), LPS_TO_RAS @ lps, total)
+    shape = (len(alike), int(first.Rows), int(first.Columns))
+    check_size(shape, 0, path, available=0, packed=False)
+    empty, affine = to_canonical(np.zeros(shape, dtype=np.uint8), LPS_TO_RAS @ lps)
+    return Series(VoxelGrid((empty.shape[0], empty.shape[1], empty.shape[2]), affine), total)

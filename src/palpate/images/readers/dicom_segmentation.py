@@ -14,7 +14,9 @@ from pydicom.dataset import Dataset
 
 from palpate.errors import InputDataError
 from palpate.images.finding import Finding
+from palpate.images.label_image import VoxelGrid
 from palpate.images.named_labels import MAX_NAME, NamedLabel, hex_colour, printable
+from palpate.images.readers.canonical import to_canonical
 from palpate.images.readers.dicom_dataset import LPS_TO_RAS, Series, read_dataset, sentences, series_beside
 from palpate.images.readers.merged_masks import Mask, merged
 from palpate.images.readers.registry import StoredImage
@@ -26,8 +28,8 @@ MOST_SEGMENTS = 1000
 SAME_PLACE = 0.01  # of a voxel
 
 
-def read(path: Path) -> StoredImage:
-    """Read the segments of `path`, numbered as there, on the grid of their series where that lies beside the file.
+def read(path: Path, grid: VoxelGrid | None) -> StoredImage:
+    """Read the segments of `path`, on the grid of their series where that lies beside the file, else on `grid`.
 
     Segments that overlap are made one label image as masks are. Raises `InputDataError` for whatever is wrong.
     """
@@ -53,6 +55,7 @@ def read(path: Path) -> StoredImage:
         affine = LPS_TO_RAS @ geometry.affine
         referenced = dataset.get("ReferencedSeriesSequence") or ()
         series = series_beside(path, str(referenced[0].SeriesInstanceUID)) if referenced else None
+        series = series or (Series(grid) if grid else None)
         return _completed(StoredImage(labels, affine, rows, {"": sha256}, findings), series)
 
 
@@ -82,25 +85,23 @@ def _labels(
 
 def _completed(image: StoredImage, series: Series | None) -> StoredImage:
     """The image with the slices that the file leaves out as empty, which only its series can tell."""
-    labels, affine = image.values, image.affine
     if series is not None:
-        if float((np.linalg.inv(series.affine) @ affine)[0, 0]) < 0.0:  # which end is the first differs
-            last = np.array([[-1.0, 0, 0, len(labels) - 1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-            labels, affine = labels[::-1], affine @ last
-        place = np.linalg.inv(series.affine) @ affine
+        labels, affine = to_canonical(image.values, image.affine)
+        place = np.linalg.inv(series.grid.affine) @ affine
         first = np.rint(place[:3, 3]).astype(int)
         same = np.eye(4)
         same[:3, 3] = first
-        inside = (first >= 0).all() and (first + labels.shape <= series.shape).all()
+        inside = (first >= 0).all() and (first + labels.shape <= series.grid.shape).all()
         if inside and np.abs(place - same).max() < SAME_PLACE:
-            whole = np.zeros(series.shape, dtype=labels.dtype)
+            whole = np.zeros(series.grid.shape, dtype=labels.dtype)
             whole[tuple(slice(f, f + n) for f, n in zip(first, labels.shape, strict=True))] = labels
-            digests = {**image.digests, "series": series.sha256}
-            return StoredImage(whole, series.affine, image.names, digests, image.findings)
+            digests = {**image.digests, **({"series": series.sha256} if series.sha256 else {})}
+            return StoredImage(whole, series.grid.affine, image.names, digests, image.findings)
+    labels = image.values
     if not (labels[0].any() and labels[-1].any()):
         return image
     text = (
         "the image ends with the first and the last slice that a segment reaches, as files of this kind leave out empty"
-        " slices; copy the DICOM series that it was made on beside it, or into a folder there"
+        " slices; copy the DICOM series that it was made on beside it, or name a grey image on its grid as intensities"
     )
     return replace(image, findings=(*image.findings, Finding("cropped", text)))

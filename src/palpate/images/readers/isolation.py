@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, InputDataError, PalpateError, ResourceError
 from palpate.images.finding import Finding
+from palpate.images.label_image import VoxelGrid
 from palpate.images.named_labels import NamedLabel, printable
 from palpate.images.readers.registry import ImageFormat, StoredImage
 from palpate.images.readers.voxel_stream import MAX_VOXELS, read_exactly
@@ -52,16 +53,18 @@ class ReadLimits:
     wall_seconds: float = 900.0
 
 
-def read_stored(path: Path, kind: str, image_format: ImageFormat, limits: ReadLimits) -> StoredImage:
+def read_stored(
+    path: Path, kind: str, image_format: ImageFormat, limits: ReadLimits, grid: VoxelGrid | None = None
+) -> StoredImage:
     """Read `path` in a process of its own, which reduces its values to `kind`, "labels" or "intensities".
 
-    A format that the program itself registered is read here, as it is.
+    `grid` is as of `ImageFormat.stored`. A format that the program itself registered is read here, as it is.
     Raises what the reader raises, `InputDataError` when it crashed, `ResourceError` when it ran over a limit.
     """
     if not image_format.read.__module__.startswith("palpate."):
-        return image_format.read(path)  # the program's own code, which another process would not find
+        return image_format.stored(path, grid)  # the program's own code, which another process would not find
     limits = replace(limits, cpu_seconds=image_format.patience * limits.cpu_seconds)
-    with _reader(_command(path, kind, limits), path, limits) as (pipe, verdict):
+    with _reader(_command(path, kind, limits, grid), path, limits) as (pipe, verdict):
         if pipe.readline(len(GREETING)) != GREETING:
             raise _not_started(path)
         answer = _answer(pipe.readline(MAX_ANSWER))
@@ -125,10 +128,12 @@ def _not_started(path: Path) -> ResourceError:
     )
 
 
-def _command(path: Path, kind: str, limits: ReadLimits) -> list[str]:
+def _command(path: Path, kind: str, limits: ReadLimits, grid: VoxelGrid | None) -> list[str]:
     # -P: an image's folder, if it is the working folder, must not be searched for modules.
     numbers = [str(limits.memory_bytes), str(limits.cpu_seconds)]
-    return [sys.executable, "-P", "-W", "ignore", "-m", "palpate.images.readers.child", *numbers, kind, str(path)]
+    place = [] if grid is None else [json.dumps([grid.shape, grid.affine.tolist()])]
+    module = ["-P", "-W", "ignore", "-m", "palpate.images.readers.child"]
+    return [sys.executable, *module, *numbers, kind, str(path), *place]
 
 
 def _environment() -> dict[str, str]:

@@ -25,20 +25,25 @@ LIMITS = ReadLimits()
 
 
 def read_label_image(
-    path: Path | str, *, names: Mapping[int, str] | None = None, limits: ReadLimits | None = LIMITS
+    path: Path | str,
+    *,
+    names: Mapping[int, str] | None = None,
+    limits: ReadLimits | None = LIMITS,
+    grid: VoxelGrid | None = None,
 ) -> LabelImage:
     """Read a label image, or a folder of masks; axes come in the order closest to RAS, the affine (mm) stays exact.
 
     Labels are integers from 0 to 65535; floats are rounded when they are within 1e-3 of one. `names` is a label table,
-    used where the file brings no names of its own. `limits` are those of the process that reads; None reads here.
+    used where the file brings no names of its own; `grid` is used where a DICOM segmentation lacks its series. `limits`
+    are those of the process that reads; None reads here.
     Raises `InputDataError` for whatever cannot be read or is no label image, `ResourceError` when memory or time is
     short.
     """
     path = Path(path)
-    stored, grid = _read(path, "labels", limits)
+    stored, own_grid = _read(path, "labels", limits, grid)
     own = checked_table(stored.names, path)
     table = own or (names if isinstance(names, LabelTable) else LabelTable(names or {}))
-    return LabelImage(stored.values, grid, table.names, table.colours, stored.digests, stored.findings)
+    return LabelImage(stored.values, own_grid, table.names, table.colours, stored.digests, stored.findings)
 
 
 def read_intensities(
@@ -55,12 +60,17 @@ def read_intensities(
     return stored.values, grid
 
 
-def _read(path: Path, kind: str, limits: ReadLimits | None) -> tuple[StoredImage, VoxelGrid]:
+def _read(
+    path: Path, kind: str, limits: ReadLimits | None, given: VoxelGrid | None = None
+) -> tuple[StoredImage, VoxelGrid]:
     """The image in the order closest to RAS, and its grid; `kind`: what its values are, a key of `REDUCED`."""
     image_format = format_of(path)
     _check_file(path, kind)
     try:
-        stored = image_format.read(path) if limits is None else read_stored(path, kind, image_format, limits)
+        if limits is None:
+            stored = image_format.stored(path, given)
+        else:
+            stored = read_stored(path, kind, image_format, limits, given)
         _check_affine(stored.affine, path)
         values, affine = to_canonical(REDUCED[kind](stored.values, path), stored.affine)
     except MemoryError as error:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.finding import Finding
 from palpate.images.input_file import open_input
+from palpate.images.label_image import VoxelGrid
 from palpate.images.named_labels import NamedLabel
 
 __all__ = ["FOLDER", "ImageFormat", "StoredImage", "format_of", "marked_format", "register"]
@@ -43,7 +44,8 @@ class ImageFormat:
 
     `read` takes the path of an existing, non-empty file; it raises `InputDataError` and lets nothing else out. A folder
     has the ending `FOLDER`. `patience`: how many times the processor time of one file reading may take;
-    `mark`: what stands at byte 128 of its files, which then need no ending.
+    `mark`: what stands at byte 128 of its files, which then need no ending; `read_on`: reads a
+    file that may lack its grid (contours).
     """
 
     name: str
@@ -51,6 +53,11 @@ class ImageFormat:
     read: Callable[[Path], StoredImage]
     patience: int = 1
     mark: bytes = b""
+    read_on: Callable[[Path, VoxelGrid], StoredImage] | None = None
+
+    def stored(self, path: Path, grid: VoxelGrid | None) -> StoredImage:
+        """What `path` holds, on `grid` where the format may need one; raises as `read` does."""
+        return self.read(path) if grid is None or self.read_on is None else self.read_on(path, grid)
 
 
 _FORMATS: dict[str, ImageFormat] = {}
