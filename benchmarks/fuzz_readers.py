@@ -42,8 +42,14 @@ WORDS = (
     *(b"nan", b"inf", b"-inf", b"1e-320", b"none", b"(", b")", b",", b'"', b"#", b":", b":=", b"=", b"\n", b"\n\n"),
     *(b"%d", b"%s%n", b"LIST", b"LOCAL", b"../../x", b"/etc/passwd", b"x.raw", b"gzip", b"raw", b"ascii", b"block"),
     *(b"True", b"False", b"\0", b"\xff\xfe", b"\xc3\x28", b"\x1b[2J", "\u202e".encode(), b"A" * 70000, b"\t", b"\r"),
+    *(b"<Label ", b"<!DOCTYPE x [", b"]]>", b"&a;", b"</"),
     *(b"Segment0_LabelValue:=", b"Segment99999_Name:=", b"list", b"{", b"[" * 2000, b"null", b"1_0", "²".encode()),
 )
+
+TABLE = (
+    b'<?xml version="1.0"?><CaretExtension><VolumeInformation Index="0"><LabelTable><Label Key="1" Red="1" Green="0.5"'
+)
+TABLE += b' Blue="0" Alpha="1"><![CDATA[prostate]]></Label></LabelTable></VolumeInformation></CaretExtension>'
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +79,9 @@ def image_targets() -> list[Target]:
     raw = labels.tobytes(order="F")
     nifti1 = nibabel.Nifti1Image(labels, np.diag([1.0, 2.0, 3.0, 1.0])).to_bytes()
     nifti2 = nibabel.Nifti2Image(labels, np.diag([1.0, 2.0, 3.0, 1.0])).to_bytes()
+    named = nibabel.Nifti1Image(labels, np.diag([1.0, 2.0, 3.0, 1.0]))
+    named.header.extensions.append(nibabel.nifti1.Nifti1Extension(0, TABLE))
+    table = named.to_bytes()
     layers = np.stack([labels == 1, labels == 2]).astype(np.uint8).tobytes(order="F")
     lists = nrrd("2 4 5 6", "raw", kinds="list domain domain domain", directions="none ")
     heads = [
@@ -80,6 +89,7 @@ def image_targets() -> list[Target]:
         (".nii.gz", nifti1, 352, zipped),
         (".nii.gz", zipped(nifti1), 200, plain),
         (".nii", nifti2, 544, plain),
+        (".nii", table, 352 + 8 + len(TABLE), plain),
         *(
             (ending, head + body, len(head), plain)
             for ending, head, body in (

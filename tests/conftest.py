@@ -23,6 +23,8 @@ from palpate.study.case import Case, CaseTissue, Images
 from palpate.study.estimation import Estimation, Iteration, ModulusEstimate, Remark, Start, TissueFit
 from palpate.study.result import CaseResult, MeshSummary, Provenance
 
+sys.path.insert(0, str(Path(__file__).parent))  # tests are no package; dicom_files.py lies here
+
 EDGE = 4.0
 CELLS = 10
 

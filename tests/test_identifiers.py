@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import gzip
+import json
 import re
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 import SimpleITK
 
+from dicom_files import ct_slices, save_contours, save_segmentation, save_series, traced
 from palpate.cli import main
 from palpate.images.label_image import LabelImage
 from palpate.phantoms.spheres import SpheresOptions, spheres
@@ -102,6 +104,10 @@ def write_nifti(path: Path, image: LabelImage) -> None:
     nifti.header["db_name"] = PLANTED.encode()
     nifti.header["intent_name"] = PLANTED.encode()
     nifti.header.extensions.append(nibabel.nifti1.Nifti1Extension("comment", f"{PLANTED} {DATE}".encode()))
+    rows = "".join(f'<Label Key="{k}"><![CDATA[{name}]]></Label>' for k, (name, _) in NAMES.items())
+    free = f"<MetaData><MD><Name>PatientName</Name><Value>{PLANTED}</Value></MD></MetaData><Date>{DATE}</Date>"
+    table = f"<CaretExtension>{free}<VolumeInformation>{free}<LabelTable>{free}{rows}</LabelTable></VolumeInformation>"
+    nifti.header.extensions.append(nibabel.nifti1.Nifti1Extension(0, f"{table}</CaretExtension>".encode()))
     nibabel.save(nifti, path)
 
 
@@ -117,6 +123,40 @@ def contents(path: Path) -> list[bytes]:
 def planted_in(path: Path) -> bool:
     traces = [trace.encode() for trace in (PLANTED, DATE, "Meyer", "Erika")]
     return any(trace.lower() in content.lower() for content in contents(path) for trace in traces)
+
+
+@pytest.fixture(scope="module")
+def dicom_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("dicom")
+    scene = spheres(SpheresOptions(seed=2, spacing_mm=(1.5, 1.5, 1.5), truth_edge_mm=5.0))
+    before, after = (image.labels.transpose(2, 1, 0) for image in (scene.before, scene.after))
+    slices = ct_slices(before.shape, (1.5, 1.5, 1.5), (0.0, 0.0, 0.0))
+    save_series(folder / "ct", slices)
+    save_segmentation(folder / "before.dcm", slices, "BINARY", NAMES, {k: before == k for k in NAMES})
+    save_contours(folder / "after.dcm", slices, NAMES, {k: traced(after == k, 0.5) for k in NAMES})
+    lines = [line for line in CASE.splitlines() if not line.startswith(("names", "intensities"))]
+    text = "\n".join(lines).replace("before.seg.nrrd", "before.dcm").replace("after.nii.gz", "after.dcm")
+    (folder / "case.toml").write_text(text)
+    return folder
+
+
+def test_no_identifier_of_dicom_is_in_any_output(
+    dicom_folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert all(planted_in(path) for path in dicom_folder.rglob("*.dcm"))
+    output = tmp_path / "out"
+    assert main(["estimate", str(dicom_folder / "case.toml"), "--output", str(output)]) == 0
+    files = [path for path in output.rglob("*") if path.is_file()]
+    assert [path.name for path in files if planted_in(path)] == []
+    spoken = capfd.readouterr()
+    assert "Meyer" not in spoken.out + spoken.err
+    assert sorted(json.loads((output / "result.json").read_text())["inputs"]) == [
+        "after[0]",
+        "after[0].series",
+        "before",
+        "before.series",
+    ]
+    assert "1,core,128,64,32,255" in (output / "labels.csv").read_text()
 
 
 def test_the_search_finds_what_was_planted(folder: Path) -> None:

@@ -133,6 +133,37 @@ def cut(path: Path, size: int) -> None:
     path.write_bytes(path.read_bytes()[:size])
 
 
+def masks(folder: Path, *, affine: np.ndarray = AFFINE, value: int = 1, wide: float = 0.0) -> None:
+    """The later image as a folder of masks; `affine` and `value` are those of the rectum's, `wide` widens it (mm)."""
+    labels = anatomy(shift=0.8, radius=6.0)
+    (folder / "after").mkdir()
+    save(folder / "after" / "prostate.nii.gz", labels == 1)
+    rectum = (anatomy(radius=6.0 + wide) == 2).astype(np.uint8)
+    rectum[:12] *= value
+    save(folder / "after" / "rectum.nii.gz", rectum, affine)
+    replace_after(folder, "after")
+    changed(folder, "[images]", '[images]\nnames = "names.json"')
+    (folder / "names.json").write_text('{"prostate": 1, "rectum": 2}')
+    changed(folder, "label = 1", 'label = "prostate"')
+    changed(folder, "label = 2", 'label = "rectum"')
+
+
+def named(folder: Path, text: str) -> None:
+    """Label names in the later image's header."""
+    image = nibabel.Nifti1Image(anatomy(shift=0.8, radius=6.0), AFFINE)
+    image.header.extensions.append(nibabel.nifti1.Nifti1Extension(0, text.encode()))
+    nibabel.save(image, folder / "after.nii.gz")
+
+
+def dicom(folder: Path, name: str) -> None:
+    """The later image as one file of a class that holds no segmentation, alone or in a folder."""
+    path = folder / name
+    path.parent.mkdir(exist_ok=True)
+    uid = b"1.2.840.10008.5.1.4.1.1.2"
+    path.write_bytes(bytes(128) + b"DICM" + b"\x02\x00\x02\x00UI\x1a\x00" + uid + bytes(400))
+    replace_after(folder, name.split("/", maxsplit=1)[0])
+
+
 def flipped(folder: Path) -> None:
     labels = anatomy(shift=0.8, radius=6.0)
     labels[ball([30.0, 30.0, 30.0], 5.0)] = 3

@@ -8,6 +8,7 @@ import shutil
 import numpy as np
 import pytest
 from bad_inputs import (
+    AFFINE,
     LAYERS,
     NRRD,
     anatomy,
@@ -17,9 +18,12 @@ from bad_inputs import (
     both,
     changed,
     cut,
+    dicom,
     flipped,
     header,
     layers,
+    masks,
+    named,
     nrrd,
     overlapping,
     replace_after,
@@ -60,6 +64,26 @@ REFUSED = {
         lambda f: nrrd(f, "a.seg.nrrd", LAYERS.replace("Layer:=1", "Layer:=0"), layers(anatomy() == 1, anatomy() == 2)),
         3,
         "a.seg.nrrd",
+    ),
+    "13 names with a document type": (
+        lambda f: named(f, '<!DOCTYPE a [<!ENTITY b "c">]><CaretExtension>&b;</CaretExtension>'),
+        3,
+        "declare a document type",
+    ),
+    "13 names that are no XML": (lambda f: named(f, "<CaretExtension><a>"), 3, "are no XML"),
+    "13 masks on two grids": (lambda f: masks(f, affine=AFFINE * 2.0), 3, "are not on one grid"),
+    "13 masks with several values": (lambda f: masks(f, value=3), 3, "is no mask of one organ"),
+    "13 a folder without masks": (
+        lambda f: [(f / "after").mkdir(), (f / "after" / "notes.txt").write_text("x"), replace_after(f, "after")],
+        3,
+        "has 0 masks",
+    ),
+    "16 a DICOM slice": (lambda f: dicom(f, "IM0001"), 3, "dcm2niix or 3D Slicer"),
+    "16 a DICOM series": (lambda f: dicom(f, "ct/IM0001.dcm"), 3, "dcm2niix or 3D Slicer"),
+    "14 what only is called DICOM": (
+        lambda f: [(f / "a.dcm").write_bytes(b"words" * 99), replace_after(f, "a.dcm")],
+        3,
+        "does not begin as a DICOM file does",
     ),
     "18 mirrored": (flipped, 3, "looks mirrored"),
     "19 a label in one image only": (
@@ -126,3 +150,10 @@ def test_check_finds_what_an_estimate_refuses(name, folder, palpate):
     problems = json.loads(done["out"])["problems"]
     assert done["code"] == code
     assert any(words in problem["message"] for problem in problems if problem["severity"] == "refused")
+
+
+def test_no_image_is_written_among_the_masks_of_a_run(folder, palpate):
+    masks(folder)
+    done = palpate("estimate", "case.toml", "--output", "after", "--quiet", cwd=folder)
+    assert "a folder of masks" in sentence(done, 2)
+    assert sorted(path.name for path in (folder / "after").iterdir()) == ["prostate.nii.gz", "rectum.nii.gz"]

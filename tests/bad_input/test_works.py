@@ -18,6 +18,7 @@ from bad_inputs import (
     changed,
     islands,
     layers,
+    masks,
     nrrd,
     other_grid,
     save,
@@ -31,6 +32,7 @@ from palpate.study.lock import folder_lock
 
 WARNED = {
     "20 an organ at the border": (lambda f: both(f, to_the_border), "cut-by-border"),
+    "13 masks that overlap": (lambda f: masks(f, wide=2.0), "overlap"),
     "22 islands": (lambda f: both(f, islands), "islands"),
     "23 organs that touch": (lambda f: both(f, touching), "touching"),
     "26 motion below the noise": (
@@ -57,12 +59,15 @@ def test_what_is_warned_of_is_not_refused(name, folder, palpate):
     assert name.startswith("8") or (done["code"], refused) == (0, [])
 
 
-@pytest.mark.parametrize("name", ["good", "9 labels of 0.9999", "17 another grid", "13 layers without overlap"])
+@pytest.mark.parametrize(
+    "name", ["good", "9 labels of 0.9999", "17 another grid", "13 layers without overlap", "13 masks"]
+)
 def test_what_must_work_works(name, folder, palpate):
     spoil = {
         "good": lambda _: None,
         "9 labels of 0.9999": lambda f: as_floats(f, 0.9999),
         "17 another grid": other_grid,
+        "13 masks": masks,
         "13 layers without overlap": lambda f: (
             nrrd(f, "after.seg.nrrd", LAYERS, layers(*(anatomy(shift=0.8, radius=6.0) == i for i in (1, 2)))),
             changed(f, "label = 1", 'label = "prostate"'),

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from palpate.experiments.simulated_pelvis import DATA
+from palpate.experiments.simulated_pelvis import DATA, LAW
 from palpate.images.tissue import Role
 from palpate.study.case_file import read_case
 
 
 def test_the_demo_case_can_be_read_and_has_its_images():
     case = read_case(DATA / "demo.toml")
-    assert case.mechanics.law == "linear"
+    assert case.mechanics.law == LAW
     assert [t.name for t in case.tissues if t.role is Role.ESTIMATE] == ["prostate", "bladder"]
     assert case.images is not None
     for path in (case.images.before, *case.images.after, case.images.names, case.images.intensities_before):

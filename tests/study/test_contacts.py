@@ -9,7 +9,7 @@ from palpate.errors import GeometryError, InputDataError
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
-from palpate.study.contacts import contact_findings, motion_findings, sides_findings, wall_motion
+from palpate.study.contacts import contact_findings, front_findings, motion_findings, sides_findings, wall_motion
 from palpate.study.refusals import refuse_lost, refuse_unmeshable
 
 TISSUES = (
@@ -78,6 +78,16 @@ def test_sides_that_are_exchanged_are_named():
     images = [scene((0, one, (4, 8), (4, 8)), (1, other, (4, 8), (4, 8)), tissues=bones) for one, other in apart]
     assert sides_findings(images[0], "before") == ()
     assert [finding.code for finding in sides_findings(images[1], "before")] == ["sides-exchanged"]
+
+
+def test_a_sacrum_in_front_of_the_bladder_is_named():
+    tissues = (Tissue("Sacrum", Role.RIGID, (1,)), Tissue("urinary_bladder", Role.ESTIMATE, (2,)), TISSUES[2])
+    apart = [((2, 6), (18, 22)), ((18, 22), (2, 6))]  # +y is the patient's front
+    images = [scene((0, (4, 8), one, (4, 8)), (1, (4, 8), other, (4, 8)), tissues=tissues) for one, other in apart]
+    assert front_findings(images[0], "before") == ()
+    (finding,) = front_findings(images[1], "before")
+    assert finding.code == "front-exchanged"
+    assert "'Sacrum' lies in front of 'urinary_bladder'" in finding.message
 
 
 @pytest.mark.parametrize(

@@ -9,13 +9,18 @@ import pytest
 
 from palpate.cli import main
 from palpate.errors import ConfigurationError, InputDataError
+from palpate.experiments.simulated_pelvis import DATA
 from palpate.images.label_image import LabelImage, VoxelGrid
-from palpate.images.readers import write_label_image
+from palpate.images.label_table import read_label_table
+from palpate.images.readers import read_label_image, write_label_image
 from palpate.images.tissue import Role
+from palpate.images.totalsegmentator import CLASSES
 from palpate.study import check
 from palpate.study.case_file import read_case
+from palpate.study.class_names import class_names
 from palpate.study.guess import guess_tissues
 from palpate.study.new_case import CaseImages, new_case
+from palpate.study.read import read_segmentation
 
 GRID = VoxelGrid((30, 30, 30), np.diag([2.0, 2.0, 2.0, 1.0]))
 NAMES = {1: "Prostate", 2: "urinary_bladder", 3: "rectum", 4: "femur_left", 5: "colon", 6: "prostateTumour", 9: "body"}
@@ -154,3 +159,115 @@ def test_names_that_toml_could_stumble_over_survive(folder):
     (folder / "case.toml").write_text(new_case(images, folder).text)
     tissues = read_case(folder / "case.toml").tissues
     assert {tissue.name for tissue in tissues} >= {names["1"], names["2"], names["3"]}
+
+
+COLON = {1: "prostate", 2: "urinary_bladder", 3: "colon", 4: "femur_left", 9: "body"}
+
+
+def test_without_a_rectum_the_colon_near_an_organ_of_the_pelvis_is_offered_as_driver(folder):
+    (folder / "names.json").write_text(json.dumps({str(k): v for k, v in COLON.items()}))
+    case = new_case(CaseImages(folder / "b.nii.gz", (folder / "a.nii.gz",), folder / "names.json"), folder)
+    (folder / "case.toml").write_text(case.text)
+    roles = {tissue.name: tissue.role for tissue in read_case(folder / "case.toml").tissues}
+    assert roles["colon"] is Role.DRIVER
+    (question,) = case.questions
+    assert "[tissues.colon] role: no rectum is labelled, and 'colon' comes within 6.0 mm of 'prostate'" in question
+
+
+def test_a_colon_that_is_far_from_the_pelvic_organs_is_not_offered():
+    near, far = ({1: organ, 2: "liver", 3: "colon", 9: "body"} for organ in ("prostate", "pancreas"))
+    roles = [{g.name: g.role for g in guess_tissues(image(names)) if g.labels == (3,)} for names in (near, far)]
+    assert roles == [{"colon": Role.DRIVER}, {}]
+    array = labels()
+    array[array == 3] = 9
+    array[27, 27, :] = 3
+    assert Role.DRIVER not in [g.role for g in guess_tissues(LabelImage(array, GRID, near))]
+
+
+def test_every_class_of_totalsegmentator_has_a_rule():
+    for names in CLASSES.values():
+        array = np.zeros((5, 5, len(names)), dtype=np.int32)
+        array[2, 2] = list(names.values())
+        grid = VoxelGrid(array.shape, np.diag([20.0, 20.0, 20.0, 1.0]))
+        guesses = guess_tissues(LabelImage(array, grid, {number: name for name, number in names.items()}))
+        assert [g.name for g in guesses if g.role is None] == []
+        roles = {g.name: g.role for g in guesses}
+        assert {roles[name] for name in ("urinary_bladder", "prostate")} == {Role.ESTIMATE}
+        assert {roles[name] for name in ("hip_left", "hip_right", "femur_left", "sacrum")} == {Role.RIGID}
+
+
+@pytest.mark.parametrize(("task", "organ", "colon"), [("total", 22, 20), ("total_mr", 17, 15)])
+def test_numbers_of_totalsegmentator_are_known_where_left_and_right_confirm_them(tmp_path, task, organ, colon):
+    classes = CLASSES[task]
+    array = np.zeros((30, 30, 30), dtype=np.int32)
+    array[10:18, 10:18, 10:18] = organ
+    array[12:16, 4:8, 5:25] = colon
+    for name, place in (("hip_left", 3), ("hip_right", 26), ("femur_left", 1), ("femur_right", 28)):
+        array[place, 10:18, 10:18] = classes[name]
+    paths = [tmp_path / "b.nii.gz", tmp_path / "a.nii.gz"]
+    write_label_image(paths[0], LabelImage(array, GRID))
+    array[11, 4:8, 5:25] = colon
+    write_label_image(paths[1], LabelImage(array, GRID))
+    case = new_case(CaseImages(paths[0], (paths[1],)), tmp_path)
+    assert {t.name: t.role for t in case.tissues if t.labels and t.labels != (0,)} == {
+        "prostate": Role.ESTIMATE,
+        "colon": Role.DRIVER,
+        "hip_left": Role.RIGID,
+        "hip_right": Role.RIGID,
+        "femur_left": Role.RIGID,
+        "femur_right": Role.RIGID,
+    }
+    assert (
+        f"NOTE: the labels have no names; their numbers were taken for those of TotalSegmentator's task '{task}', for 2"
+        in (case.text)
+    )
+    (tmp_path / "case.toml").write_text(case.text)
+    assert {t.name: t.label for t in read_case(tmp_path / "case.toml").tissues}["prostate"] == (organ,)
+    mirrored = VoxelGrid(GRID.shape, np.diag([-2.0, 2.0, 2.0, 1.0]))
+    assert class_names(LabelImage(array, mirrored)).names == {}
+    assert class_names(LabelImage(labels(), GRID)).names == {}
+
+
+def test_names_in_a_folder_of_masks_make_a_case_without_numbers(tmp_path):
+    for state, filled in (("before", False), ("after", True)):
+        (tmp_path / state).mkdir()
+        array = labels(filled=filled)
+        for number, name in COLON.items():
+            if name != "body":
+                mask = (array == number) | ((array == 1) & (number == 2) & (np.arange(30) == 17))
+                write_label_image(tmp_path / state / f"{name}.nii.gz", LabelImage(mask, GRID))
+    assert main(["init", *(str(tmp_path / s) for s in ("before", "after")), "--output", str(tmp_path), "--quiet"]) == 0
+    text = (tmp_path / "case.toml").read_text()
+    assert 'before = "before"' in text
+    assert "# NOTE: 'before': 64 voxels are claimed by several organs" in text
+    assert 'label = "urinary_bladder"' in text
+
+
+def test_the_demo_as_masks_of_totalsegmentator_is_the_same_segmentation(tmp_path):
+    demo = read_case(DATA / "demo.toml")
+    names = read_label_table(demo.images.names)
+    classes = {"rectum": "colon", "sacrum_S1": "sacrum"}
+    images = dict(zip(("before", "after"), (demo.images.before, *demo.images.after), strict=True))
+    for state, path in images.items():
+        (tmp_path / state).mkdir()
+        shown = read_label_image(path)
+        for number in (1, 2, 3, 6, 7, 8, 9, 10, 20):
+            name = classes.get(names[number], names[number])
+            mask = LabelImage(shown.labels == number, shown.grid)
+            write_label_image(tmp_path / state / f"{name}.nii.gz", mask)
+    case = new_case(CaseImages(tmp_path / "before", (tmp_path / "after",)), tmp_path)
+    (tmp_path / "case.toml").write_text(case.text)
+    (question,) = case.questions
+    assert "is the rectum part of that label?" in question
+    ours = read_case(tmp_path / "case.toml")
+    for state, path in images.items():
+        there = read_segmentation(demo, path, names, None)
+        here = read_segmentation(ours, tmp_path / state, None, None)
+        mine = {tissue.name: i for i, tissue in enumerate(here.tissues)}
+        same = {"bladder": "urinary_bladder", "rectum": "colon"}
+        for i, tissue in enumerate(there.tissues):
+            side = " ".join(tissue.name.split()[::-1]).replace(" ", "_")  # "left hip" is hip_left
+            j = mine[same.get(tissue.name, side)]
+            assert here.tissues[j].role is tissue.role
+            assert np.array_equal(here.mask(j), there.mask(i))
+        assert np.array_equal(here.grid.affine, there.grid.affine)

@@ -119,6 +119,12 @@ def _spare_inputs(arguments: argparse.Namespace, case: Case | None, outputs: Out
             f"{outputs.path / names[0]} is an input of this run, and would be replaced by its output of that name:"
             " choose another --output folder"
         )
+    masks = [path for path in inputs if path is not None and outputs.same_files([""], [path])]
+    if masks and any(name.endswith((".nii", ".nii.gz")) for name in arguments.targets):
+        raise ConfigurationError(
+            f"{outputs.path} is an input of this run, a folder of masks, in which an image would be taken for one more"
+            " mask: choose another --output folder"
+        )
 
 
 def _failure(kind: str, message: str, exit_code: int) -> Outcome:

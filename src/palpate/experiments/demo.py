@@ -13,10 +13,10 @@ from palpate.study import CaseResult, estimate, read_case
 __all__ = ["run_demo"]
 
 NOTE = (
-    "The anatomy is a real male pelvis CT (Wasserthal et al. 2023) with automatic labels of 3 mm voxels; the later"
-    f" state is simulated: the rectum was filled by {FILLING_MM:g} mm on a finer mesh ({TRUTH_EDGE_MM:g} mm) with known"
-    " moduli, and both states were turned into 1 mm label images, which is all that the estimate sees. The prostate is"
-    " cut by the scan's lower border; its cut face is left free and out of the observation."
+    "The anatomy is a real male pelvis CT (Wasserthal et al. 2023) with automatic labels of 3 mm voxels, smoothed; what"
+    " the scan cuts off of the prostate is the mirror image of its upper part. The later state is simulated: the rectum"
+    f" was filled by {FILLING_MM:g} mm in a neo-Hookean body on a finer mesh ({TRUTH_EDGE_MM:g} mm) with known moduli,"
+    " and both states were turned into 1 mm label images, which is all that the estimate sees."
 )
 
 

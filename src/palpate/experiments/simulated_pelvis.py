@@ -41,7 +41,7 @@ from palpate.mesh import (
 from palpate.phantoms import imaged
 from palpate.study import Mechanics, filled
 
-__all__ = ["DATA", "TISSUES", "SimulatedPelvis", "simulate_pelvis"]
+__all__ = ["DATA", "LAW", "TISSUES", "SimulatedPelvis", "simulate_pelvis"]
 
 DATA = Path(__file__).parent / "data"
 FILLING_MM = 8.0

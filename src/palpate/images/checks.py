@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from palpate.errors import InputDataError
+from palpate.images.finding import Finding
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 
-__all__ = ["Finding", "check_images", "check_pair", "check_segmentation"]
+__all__ = ["check_images", "check_pair", "check_segmentation"]
 
 OBSERVED = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
 VOLUME_CHANGE = 0.05  # no modulus explains a filling between the scans
@@ -29,14 +30,6 @@ MIRROR_CERTAIN = 0.25  # gain in agreement, of 1, at which a mirrored image is r
 MIRROR_LIKELY = 0.10
 MIRROR_SAMPLES = 4000
 DIRECTIONS = ("left-right", "front-back", "head-foot")
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """Something the user should know: `code` for programs (lower case, hyphens), `message` a sentence with advice."""
-
-    code: str
-    message: str
 
 
 def check_images(before: Segmentation, after: Sequence[Segmentation]) -> tuple[Finding, ...]:
@@ -53,8 +46,9 @@ def check_images(before: Segmentation, after: Sequence[Segmentation]) -> tuple[F
 
 
 def check_segmentation(segmentation: Segmentation, name: str) -> tuple[Finding, ...]:
-    """Findings on one image, called `name` in the text: voxel size, cut organs, small or thin organs, islands."""
-    findings = _voxel_size(segmentation.grid, name)
+    """Findings on one image, called `name` in the text: its reading, voxel size, cut, small or thin organs, islands."""
+    findings = [replace(finding, message=f"'{name}': {finding.message}") for finding in segmentation.findings]
+    findings += _voxel_size(segmentation.grid, name)
     for i, tissue in enumerate(segmentation.tissues):
         if tissue.role not in OBSERVED:
             continue

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
+from palpate.images.finding import Finding
 
 __all__ = ["LabelImage", "VoxelGrid"]
 
@@ -54,15 +55,16 @@ class VoxelGrid:
 class LabelImage:
     """Labels (n_x, n_y, n_z) int on `grid`; `names`: label -> name and `colours`: label -> #rrggbb, where given.
 
-    `digests`: SHA-256 (hexadecimal) of the file it was read from, and of the file beside it that holds its voxels, if
-    there is one.
+    `digests`: SHA-256 (hexadecimal) of each file it was read from, by its part in the image (`StoredImage`);
+    `findings`: what the user should know of the reading.
     """
 
     labels: NDArray[np.int32]
     grid: VoxelGrid
     names: Mapping[int, str] = field(default_factory=dict)
     colours: Mapping[int, str] = field(default_factory=dict)
-    digests: tuple[str, ...] = ()
+    digests: Mapping[str, str] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
         labels = np.array(self.labels, dtype=np.int32)

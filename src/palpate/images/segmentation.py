@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, InputDataError
+from palpate.images.finding import Finding
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.tissue import Tissue
 
@@ -16,12 +18,16 @@ __all__ = ["Segmentation", "first_labels", "segment"]
 
 @dataclass(frozen=True, slots=True)
 class Segmentation:
-    """`index` (n_x, n_y, n_z) int16: which of `tissues` a voxel of `grid` belongs to; `digests`: as of `LabelImage`."""
+    """`index` (n_x, n_y, n_z) int16: which of `tissues` a voxel of `grid` belongs to.
+
+    `digests`, `findings`: as of `LabelImage`.
+    """
 
     index: NDArray[np.int16]
     grid: VoxelGrid
     tissues: tuple[Tissue, ...]
-    digests: tuple[str, ...] = ()
+    digests: Mapping[str, str] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
         index = np.array(self.index, dtype=np.int16)
@@ -65,7 +71,8 @@ def segment(image: LabelImage, tissues: tuple[Tissue, ...]) -> Segmentation:
         )
     table = np.array([owner.get(int(label), rest[0] if rest else -1) for label in labels], dtype=np.int16)
     described = tuple(_described(tissue, image) for tissue in tissues)
-    return Segmentation(table[inverse].reshape(image.labels.shape), image.grid, described, image.digests)
+    index = table[inverse].reshape(image.labels.shape)
+    return Segmentation(index, image.grid, described, image.digests, image.findings)
 
 
 def _described(tissue: Tissue, image: LabelImage) -> Tissue:

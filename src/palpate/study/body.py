@@ -9,8 +9,9 @@ import numpy as np
 
 from palpate.errors import ConfigurationError, ResourceError
 from palpate.images.alignment import RigidMotion, align, moved
-from palpate.images.checks import Finding, check_images
+from palpate.images.checks import check_images
 from palpate.images.distance import DistanceMap, observation_width, smoothing_width
+from palpate.images.finding import Finding
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.images.tissue_distance import tissue_distance_map
@@ -52,7 +53,11 @@ __all__ = [
 ]
 
 THIN_VOXELS = 4
-STATED = ("motion-below-noise", "sides-exchanged")  # findings on contacts stand in the result as observed shares
+STATED = (
+    "motion-below-noise",
+    "sides-exchanged",
+    "front-exchanged",
+)  # findings on contacts stand in the result as observed shares
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from palpate.errors import GeometryError, InputDataError, PalpateError, ResourceError
-from palpate.images.checks import Finding, check_pair, check_segmentation
+from palpate.images.checks import check_pair, check_segmentation
+from palpate.images.finding import Finding
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_intensities
 from palpate.images.segmentation import Segmentation
@@ -246,7 +247,7 @@ def _absent(images: Sequence[tuple[str, Segmentation]]) -> dict[str, list[str]]:
 def _without(image: Segmentation, absent: dict[str, list[str]]) -> Segmentation:
     """The image with the absent tissues made void, which nobody looks at."""
     tissues = tuple(replace(t, role=Role.VOID) if t.name in absent else t for t in image.tissues)
-    return Segmentation(image.index, image.grid, tissues)
+    return replace(image, tissues=tissues)
 
 
 def _check_edge(case: Case, before: Segmentation, after: tuple[Segmentation, ...]) -> None:

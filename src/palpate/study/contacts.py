@@ -7,12 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.images.checks import Finding
+from palpate.images.finding import Finding
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 
-__all__ = ["contact_findings", "every_finding", "motion_findings", "sides_findings", "wall_motion"]
+__all__ = ["contact_findings", "every_finding", "front_findings", "motion_findings", "sides_findings", "wall_motion"]
 
+BEHIND, IN_FRONT = ("sacrum", "coccyx"), ("prostate", "bladder")  # in every pelvis
 LEAST_OBSERVED = 0.1  # below, an estimate is refused (see observation.observed_surface)
 LITTLE_OBSERVED = 0.5
 STILL_VOXELS = 0.15  # mean motion of a surface, in voxels, that the voxels' own rounding makes
@@ -86,7 +87,7 @@ def wall_motion(before: Segmentation, after: Segmentation, tissue: int) -> float
 def sides_findings(segmentation: Segmentation, name: str) -> tuple[Finding, ...]:
     """A finding when tissues called left lie to the right (+x, RAS) of their namesakes called right."""
     middles = {
-        tissue.name.lower(): _middle(segmentation, i)
+        tissue.name.lower(): _middle(segmentation, i, axis=0)
         for i, tissue in enumerate(segmentation.tissues)
         if ("left" in tissue.name.lower() or "right" in tissue.name.lower()) and segmentation.mask(i).any()
     }
@@ -99,6 +100,25 @@ def sides_findings(segmentation: Segmentation, name: str) -> tuple[Finding, ...]
         " exchanged in the names or in the header; stiffness does not mind, but check the image's orientation"
     )
     return (Finding("sides-exchanged", text),)
+
+
+def front_findings(segmentation: Segmentation, name: str) -> tuple[Finding, ...]:
+    """A finding when a sacrum lies in front (+y, RAS) of a prostate or bladder, as where a file is mirrored."""
+    middles = {
+        tissue.name: _middle(segmentation, i, axis=1)
+        for i, tissue in enumerate(segmentation.tissues)
+        if any(word in tissue.name.lower() for word in (*BEHIND, *IN_FRONT)) and segmentation.mask(i).any()
+    }
+    behind = [tissue for tissue in middles if any(word in tissue.lower() for word in BEHIND)]
+    in_front = [tissue for tissue in middles if tissue not in behind]
+    wrong = [(a, b) for a in behind for b in in_front if middles[a] > middles[b]]
+    if not wrong:
+        return ()
+    text = (
+        f"in '{name}', '{wrong[0][0]}' lies in front of '{wrong[0][1]}': the file is mirrored front to back, or its"
+        " header is wrong; stiffness does not mind where all images are so, but check the images' orientation"
+    )
+    return (Finding("front-exchanged", text),)
 
 
 def _shared_faces(segmentation: Segmentation) -> NDArray[np.float64]:
@@ -125,9 +145,9 @@ def _outside(one: Segmentation, other: Segmentation, tissue: int) -> int:
     return int(np.count_nonzero(other.index[tuple(index[inside].T)] != tissue))
 
 
-def _middle(segmentation: Segmentation, tissue: int) -> float:
-    """World x of a tissue's centroid, mm."""
-    return float(segmentation.grid.world(np.argwhere(segmentation.mask(tissue)).mean(axis=0)[None])[0, 0])
+def _middle(segmentation: Segmentation, tissue: int, *, axis: int) -> float:
+    """World coordinate of a tissue's centroid along an axis, mm."""
+    return float(segmentation.grid.world(np.argwhere(segmentation.mask(tissue)).mean(axis=0)[None])[0, axis])
 
 
 def every_finding(before: Segmentation, after: Sequence[Segmentation], *, loaded: bool = False) -> tuple[Finding, ...]:
@@ -141,4 +161,5 @@ def every_finding(before: Segmentation, after: Sequence[Segmentation], *, loaded
         for name, image in zip(names, after, strict=True)
         for finding in motion_findings(before, image, name, loaded=loaded)
     ]
-    return (*contact_findings(before), *sides_findings(before, "before"), *motions)
+    sides = (*sides_findings(before, "before"), *front_findings(before, "before"))
+    return (*contact_findings(before), *sides, *motions)

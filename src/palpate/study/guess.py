@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import ndimage
 
 from palpate.errors import InputDataError
 from palpate.images.label_image import LabelImage
@@ -20,18 +21,23 @@ __all__ = ["GuessedTissue", "guess_tissues"]
 SURROUNDINGS = "surroundings"
 BORDER_SHARE = 0.1  # of the image's border that the body, or the air around it, covers
 STILL_SHARE = 0.005  # of a label's voxels
+NEAR_MM = 15.0  # between the colon and an organ that it may move
 HOLLOW_CHANGE = 0.10  # of a volume: no solid organ changes so much between two scans
 
 
 @dataclass(frozen=True, slots=True)
 class GuessedTissue:
-    """A tissue of a case to be: its labels (none: the rest), its role and why; `role` None must be asked for."""
+    """A tissue of a case to be: its labels (none: the rest), its role and why; `role` None must be asked for.
+
+    `question`: what the user is to confirm.
+    """
 
     name: str
     labels: tuple[int, ...]
     role: Role | None
     reason: str
     youngs_modulus_kpa: float | None = None
+    question: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +90,8 @@ RULES = (
     _Rule(
         _words(
             "artery arteries vein veins vessel vessels aorta vena cava nerve cord canal bowel colon intestine duodenum"
-            " stomach oesophagus esophagus trachea skin cartilage costal lymph node ureter urethra atrial appendage"
+            " stomach oesophagus esophagus trachea trunk disc discs skin cartilage cartilages costal lymph node ureter"
+            " urethra atrial appendage"
         ),
         None,
         "is neither observed nor held",
@@ -99,6 +106,9 @@ RULES = (
         "is an organ",
     ),
 )
+
+PELVIC = _words("prostate prostatic bladder uterus cervix ovary vesicle vesicles")
+LARGE_BOWEL = _words("colon sigmoid")
 
 
 def guess_tissues(before: LabelImage, after: Sequence[LabelImage] = ()) -> tuple[GuessedTissue, ...]:
@@ -116,7 +126,7 @@ def guess_tissues(before: LabelImage, after: Sequence[LabelImage] = ()) -> tuple
     sizes = {int(label): int(count) for label, count in zip(present, counts, strict=True)}
     border = _border_shares(before)
     guesses = [_guess(label, before, after, border) for label in sizes]
-    guesses = [_checked(guess, after) for guess in guesses]
+    guesses = _with_driver([_checked(guess, after) for guess in guesses], before, after)
     outside = [g for g in guesses if g.role is Role.VOID]
     rest = [g for g in guesses if g.name == SURROUNDINGS]
     organs = [g for g in guesses if g.role is not Role.VOID and g.name != SURROUNDINGS]
@@ -127,7 +137,7 @@ def _guess(label: int, before: LabelImage, after: Sequence[LabelImage], border: 
     name = before.names.get(label, "")
     if not name:
         return _by_place(label, before, after, border)
-    words = _words(re.sub(r"[^a-z]+", " ", re.sub(r"([a-z])([A-Z])", r"\1 \2", name).lower()))
+    words = _words_of(name)
     for rule in RULES:
         found = sorted(words & rule.words)
         if found:
@@ -143,6 +153,46 @@ def _guess(label: int, before: LabelImage, after: Sequence[LabelImage], border: 
                 None if usual is None else usual.kpa,
             )
     return GuessedTissue(name, (label,), None, f"no rule knows the name '{name}'")
+
+
+def _words_of(name: str) -> frozenset[str]:
+    return _words(re.sub(r"[^a-z]+", " ", re.sub(r"([a-z])([A-Z])", r"\1 \2", name).lower()))
+
+
+def _with_driver(guesses: list[GuessedTissue], before: LabelImage, after: Sequence[LabelImage]) -> list[GuessedTissue]:
+    """Without a driver the colon is offered as one, where it comes near an organ of the pelvis."""
+    organs = [g for g in guesses if g.role is Role.ESTIMATE and _words_of(g.name) & PELVIC]
+    if not organs or any(g.role is Role.DRIVER for g in guesses):
+        return guesses
+    offered = list(guesses)
+    for i, guess in enumerate(guesses):
+        names = [before.names.get(label, "") for label in guess.labels]
+        if len(names) != 1 or not _words_of(names[0]) & LARGE_BOWEL:
+            continue
+        if any(not np.isin(image.labels, guess.labels).any() for image in after):
+            continue
+        gaps = {organ.name: _gap(before, guess.labels, organ.labels) for organ in organs}
+        nearest = min(gaps, key=gaps.__getitem__)
+        if gaps[nearest] <= NEAR_MM:
+            reason = f"no rectum is labelled, and '{names[0]}' comes within {gaps[nearest]:.1f} mm of '{nearest}'"
+            question = (
+                f"{reason}, so it is taken for the hollow organ that moves the others; is the rectum part of that"
+                " label? If not, segment the rectum in all images, as a label of its own"
+            )
+            offered[i] = GuessedTissue(names[0], guess.labels, Role.DRIVER, reason, question=question)
+    return offered
+
+
+def _gap(image: LabelImage, labels: tuple[int, ...], organ: tuple[int, ...]) -> float:
+    """Least distance of the organ's voxels to those of `labels`, mm; infinite where it is more than NEAR_MM."""
+    inside = np.isin(image.labels, organ)
+    margin = np.ceil(NEAR_MM / image.grid.spacing).astype(int)
+    box = ndimage.find_objects(inside.astype(np.int8))[0]
+    window = tuple(slice(max(s.start - m, 0), s.stop + m) for s, m in zip(box, margin, strict=True))
+    others = np.isin(image.labels[window], labels)
+    if not others.any():
+        return float("inf")
+    return float(ndimage.distance_transform_edt(~others, sampling=image.grid.spacing)[inside[window]].min())
 
 
 def _by_place(label: int, before: LabelImage, after: Sequence[LabelImage], border: dict[int, float]) -> GuessedTissue:
@@ -165,7 +215,7 @@ def _by_place(label: int, before: LabelImage, after: Sequence[LabelImage], borde
 
 
 def _is_body(name: str) -> bool:
-    return bool(_words(re.sub(r"[^a-z]+", " ", name.lower())) & _words("body surroundings surrounding other rest soft"))
+    return bool(_words_of(name) & _words("body surroundings surrounding other rest soft"))
 
 
 def _checked(guess: GuessedTissue, after: Sequence[LabelImage]) -> GuessedTissue:

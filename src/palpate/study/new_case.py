@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from palpate.images.named_labels import printable
 from palpate.images.readers import read_label_image
 from palpate.images.tissue import Role
 from palpate.study.case import REMAINING
+from palpate.study.class_names import class_names
 from palpate.study.guess import GuessedTissue, guess_tissues
 from palpate.study.outputs import OutputFolder, read_regular, write_text
 
@@ -111,9 +112,17 @@ def new_case(images: CaseImages, folder: Path) -> NewCase:
                 f"'{images.before}' and '{path}' are the same label image, voxel by voxel; without a deformation"
                 " nothing can be estimated: check the two paths"
             )
-    tissues = guess_tissues(before, after)
+    known = class_names(before)
+    tissues = guess_tissues(replace(before, names=known.names) if known.names else before, after)
     questions = _questions(tissues)
-    blocks = [_heading(images, folder, questions), _domain(before, tissues), _mesh(before, tissues)]
+    named = zip((images.before, *images.after), (before, *after), strict=True)
+    notes = [f"'{path.name}': {finding.message}" for path, image in named for finding in image.findings]
+    if known.names:
+        notes.append(
+            "the labels have no names; their numbers were taken for those of TotalSegmentator's task"
+            f" '{known.task}', for {known.pairs} pairs of left and right lie as its names say"
+        )
+    blocks = [_heading(images, folder, questions, notes), _domain(before, tissues), _mesh(before, tissues)]
     blocks += [_tissue(tissue, before) for tissue in tissues]
     return NewCase("\n\n".join(block for block in blocks if block) + "\n", tissues, questions)
 
@@ -126,12 +135,14 @@ def _questions(tissues: Sequence[GuessedTissue]) -> tuple[str, ...]:
         for t in tissues
         if t.role is None
     ]
+    asked += [f"[tissues.{_key(t.name)}] role: {t.question}" for t in tissues if t.question]
     if Role.ESTIMATE not in roles:
         asked.append('no organ was found to estimate; give role = "estimate" to the tissues whose stiffness you want')
     if Role.DRIVER not in roles:
         asked.append(
             'nothing was found that moves the organs; give role = "driver" to the hollow organ whose wall deforms the'
-            " others"
+            " others (TotalSegmentator has no class for the rectum: segment it in all images, as a label of its own,"
+            " or as rectum.nii.gz in a folder of masks)"
         )
     if Role.KNOWN not in roles:
         asked.append(
@@ -141,9 +152,10 @@ def _questions(tissues: Sequence[GuessedTissue]) -> tuple[str, ...]:
     return tuple(asked)
 
 
-def _heading(images: CaseImages, folder: Path, questions: Sequence[str]) -> str:
+def _heading(images: CaseImages, folder: Path, questions: Sequence[str], notes: Sequence[str]) -> str:
     lines = ["# Made by `palpate init`. Every role is a guess: read the reasons, correct what is wrong."]
     lines += [_comment(f"QUESTION: {question}") for question in questions]
+    lines += [_comment(f"NOTE: {note}") for note in notes]
     lines += ["", "[images]", f"before = {_path(images.before, folder)}"]
     lines.append(f"after = [{', '.join(_path(path, folder) for path in images.after)}]")
     if images.table:

@@ -13,7 +13,19 @@ from palpate.study.case import Case
 
 __all__ = ["file_digest", "input_digests", "software_versions"]
 
-PACKAGES = ("palpate", "numpy", "scipy", "mmgpy", "libigl", "nibabel", "pyamg", "pymetis", "matplotlib")
+PACKAGES = (
+    "palpate",
+    "numpy",
+    "scipy",
+    "mmgpy",
+    "libigl",
+    "nibabel",
+    "pyamg",
+    "pymetis",
+    "matplotlib",
+    "pydicom",
+    "highdicom",
+)
 
 
 def input_digests(case: Case, *pairs: Mapping[str, str]) -> dict[str, str]:

@@ -7,8 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from palpate.errors import ConfigurationError
+from palpate.images.label_image import VoxelGrid
 from palpate.images.label_table import read_label_table
-from palpate.images.readers import read_label_image
+from palpate.images.readers import read_intensities, read_label_image
+from palpate.images.readers.registry import format_of
 from palpate.images.segmentation import Segmentation, segment
 from palpate.images.tissue import Tissue
 from palpate.phantoms.pelvis import PelvisOptions, pelvis, pelvis_anatomy
@@ -54,8 +56,18 @@ def read_segmentation(
     `names`: the label table (label -> name), if the case has one; an image that brings its own names is read by those.
     `tissues`: those of the reference image, for an image without names. Raises as `read_states` does.
     """
-    image = read_label_image(path, names=names)
+    image = read_label_image(path, names=names, grid=_given_grid(case, path))
     return segment(image, case.resolve_tissues(image.names) if tissues is None or image.names else tissues)
+
+
+def _given_grid(case: Case, path: Path) -> VoxelGrid | None:
+    """The grid of the grey image of the same state, for files that may lack theirs; None where there is none."""
+    images = case.images
+    if images is None or format_of(path).read_on is None:
+        return None
+    later = dict(zip(images.after, images.intensities_after, strict=False))
+    grey = images.intensities_before if path == images.before else later.get(path)
+    return read_intensities(grey)[1] if grey is not None else None
 
 
 def phantom_scene(case: Case) -> Scene:
@@ -106,6 +118,6 @@ def _read_pair(case: Case, before: Path, after: tuple[Path, ...], *, key: str) -
     inputs = {"names": names.sha256} if names else {}
     keys = (f"{key}before", *(f"{key}after[{i}]" for i in range(len(later))))
     for name, image, path in zip(keys, (reference, *later), (before, *after), strict=True):
-        own, *voxels = image.digests or (file_digest(path),)  # a reader from elsewhere may not say what it read
-        inputs |= {name: own} | {f"{name}.voxels": digest for digest in voxels}
+        digests = image.digests or {"": file_digest(path)}  # a reader from elsewhere may not say what it read
+        inputs |= {f"{name}.{part}" if part else name: digest for part, digest in digests.items()}
     return replace(states, inputs=inputs)

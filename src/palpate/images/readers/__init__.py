@@ -1,12 +1,24 @@
 """Readers of image files and label tables, one file a format; importing this package registers them all."""
 
-from palpate.images.readers import metaimage, nrrd, table_bids, table_ctbl, table_itksnap, table_json, table_slicer
+from palpate.images.readers import (
+    dicom,
+    mask_folder,
+    metaimage,
+    nrrd,
+    table_bids,
+    table_ctbl,
+    table_itksnap,
+    table_json,
+    table_slicer,
+)
 from palpate.images.readers.isolation import ReadLimits
 from palpate.images.readers.nifti import write_label_image, write_scalar_image
 from palpate.images.readers.read import read_intensities, read_label_image
 
 __all__ = [
     "ReadLimits",
+    "dicom",
+    "mask_folder",
     "metaimage",
     "nrrd",
     "read_intensities",

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import PalpateError
+from palpate.images.label_image import VoxelGrid
 from palpate.images.readers.isolation import GREETING
 from palpate.images.readers.registry import StoredImage, format_of
 from palpate.images.readers.values import REDUCED
@@ -27,14 +28,18 @@ else:
 
 
 def main(arguments: list[str]) -> None:
-    """Read an image; arguments: bytes of address space, seconds of processor time, "labels" or "intensities", path."""
+    """Read an image.
+
+    Arguments: bytes of address space, seconds of processor time, "labels" or "intensities", path, and a grid (JSON).
+    """
     memory_bytes, cpu_seconds, kind, path = int(arguments[0]), int(arguments[1]), arguments[2], Path(arguments[3])
     with _private_stdout() as pipe:
         pipe.write(GREETING)
         pipe.flush()
         _limit(memory_bytes, cpu_seconds)
         try:
-            stored = format_of(path).read(path)
+            grid = VoxelGrid(*_place(arguments[4])) if len(arguments) > 4 else None
+            stored = format_of(path).stored(path, grid)
             values = np.asfortranarray(REDUCED[kind](stored.values, path))
         except PalpateError as error:
             _send(pipe, {"error": type(error).__name__, "message": str(error)})
@@ -46,6 +51,11 @@ def main(arguments: list[str]) -> None:
             _send(pipe, {"error": "InputDataError", "message": f"{flaw}; export the image again, and report this"})
         else:
             _send_image(pipe, values, stored)
+
+
+def _place(text: str) -> tuple[tuple[int, int, int], NDArray[np.float64]]:
+    shape, affine = json.loads(text)
+    return (int(shape[0]), int(shape[1]), int(shape[2])), np.array(affine, dtype=np.float64)
 
 
 def _private_stdout() -> BinaryIO:
@@ -80,7 +90,8 @@ def _send_image(pipe: BinaryIO, values: NDArray[Any], stored: StoredImage) -> No
     """`values` (n_1, n_2, n_3), in the order of Fortran, with place and names as stored."""
     names = [[row.label, row.name, row.colour] for row in stored.names]
     answer = {"shape": values.shape, "dtype": values.dtype.str, "affine": stored.affine.tolist(), "names": names}
-    answer["digests"] = stored.digests
+    answer["digests"] = dict(stored.digests)
+    answer["findings"] = [[finding.code, finding.message] for finding in stored.findings]
     _send(pipe, answer)
     pipe.write(values.T.data.cast("B"))
 

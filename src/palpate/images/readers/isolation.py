@@ -15,7 +15,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
@@ -23,6 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, InputDataError, PalpateError, ResourceError
+from palpate.images.finding import Finding
+from palpate.images.label_image import VoxelGrid
 from palpate.images.named_labels import NamedLabel, printable
 from palpate.images.readers.registry import ImageFormat, StoredImage
 from palpate.images.readers.voxel_stream import MAX_VOXELS, read_exactly
@@ -51,15 +53,18 @@ class ReadLimits:
     wall_seconds: float = 900.0
 
 
-def read_stored(path: Path, kind: str, image_format: ImageFormat, limits: ReadLimits) -> StoredImage:
+def read_stored(
+    path: Path, kind: str, image_format: ImageFormat, limits: ReadLimits, grid: VoxelGrid | None = None
+) -> StoredImage:
     """Read `path` in a process of its own, which reduces its values to `kind`, "labels" or "intensities".
 
-    A format that the program itself registered is read here, as it is.
+    `grid` is as of `ImageFormat.stored`. A format that the program itself registered is read here, as it is.
     Raises what the reader raises, `InputDataError` when it crashed, `ResourceError` when it ran over a limit.
     """
     if not image_format.read.__module__.startswith("palpate."):
-        return image_format.read(path)  # the program's own code, which another process would not find
-    with _reader(_command(path, kind, limits), path, limits) as (pipe, verdict):
+        return image_format.stored(path, grid)  # the program's own code, which another process would not find
+    limits = replace(limits, cpu_seconds=image_format.patience * limits.cpu_seconds)
+    with _reader(_command(path, kind, limits, grid), path, limits) as (pipe, verdict):
         if pipe.readline(len(GREETING)) != GREETING:
             raise _not_started(path)
         answer = _answer(pipe.readline(MAX_ANSWER))
@@ -123,10 +128,12 @@ def _not_started(path: Path) -> ResourceError:
     )
 
 
-def _command(path: Path, kind: str, limits: ReadLimits) -> list[str]:
+def _command(path: Path, kind: str, limits: ReadLimits, grid: VoxelGrid | None) -> list[str]:
     # -P: an image's folder, if it is the working folder, must not be searched for modules.
     numbers = [str(limits.memory_bytes), str(limits.cpu_seconds)]
-    return [sys.executable, "-P", "-W", "ignore", "-m", "palpate.images.readers.child", *numbers, kind, str(path)]
+    place = [] if grid is None else [json.dumps([grid.shape, grid.affine.tolist()])]
+    module = ["-P", "-W", "ignore", "-m", "palpate.images.readers.child"]
+    return [sys.executable, *module, *numbers, kind, str(path), *place]
 
 
 def _environment() -> dict[str, str]:
@@ -155,17 +162,18 @@ def _stored(answer: Mapping[str, Any], pipe: BinaryIO, path: Path) -> StoredImag
         shape = tuple(int(n) for n in answer["shape"])
         affine = np.array(answer["affine"], dtype=np.float64)
         names = tuple(NamedLabel(int(k), str(name), None if c is None else str(c)) for k, name, c in answer["names"])
-        digests = tuple(str(digest) for digest in answer.get("digests", ()))
+        digests = {printable(str(part)): str(digest) for part, digest in answer.get("digests", {}).items()}
+        findings = tuple(Finding(str(code), printable(str(text))) for code, text in answer.get("findings", ()))
         placed = len(shape) == 3 and min(shape) > 0 and affine.shape == (4, 4)
-        valid = placed and DTYPE.fullmatch(answer["dtype"]) and all(map(DIGEST.fullmatch, digests))
-    except (KeyError, TypeError, ValueError):
+        valid = placed and DTYPE.fullmatch(answer["dtype"]) and all(map(DIGEST.fullmatch, digests.values()))
+    except (AttributeError, KeyError, TypeError, ValueError):
         valid = None
     if not valid or math.prod(shape) > MAX_VOXELS:
         raise InputDataError(
             f"the process that read '{path}' gave an answer that cannot be used; export the image again"
         )
     values = _received(pipe, shape, np.dtype(answer["dtype"]), path)
-    return None if values is None else StoredImage(values, affine, names, digests)
+    return None if values is None else StoredImage(values, affine, names, digests, findings)
 
 
 def _received(pipe: BinaryIO, shape: tuple[int, ...], dtype: np.dtype[Any], path: Path) -> NDArray[Any] | None:

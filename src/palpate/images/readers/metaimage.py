@@ -62,7 +62,7 @@ def read_metaimage(path: Path) -> StoredImage:
                 file = stack.enter_context(open_input(beside(path, header[LAST])))
                 files.append(file)
             values = read_block(file, block, path)
-            digests = tuple(each.sha256() for each in files)
+            digests = {part: each.sha256() for part, each in zip(("", "voxels"), files, strict=False)}
     except (OSError, EOFError, zlib.error) as error:
         raise damaged(path, error) from error
     return StoredImage(values.reshape(block.shape[:3], order="F"), affine, digests=digests)

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from palpate.errors import ConfigurationError, InputDataError, ResourceError
 from palpate.images.input_file import open_input
 from palpate.images.label_image import LabelImage, VoxelGrid
+from palpate.images.readers.nifti_extension import extension_names
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
 from palpate.images.readers.voxel_stream import MAX_OFFSET, check_end, check_size, damaged, read_exactly
 
@@ -60,14 +61,15 @@ def read_nifti(path: Path) -> StoredImage:
             layout = _layout(header, path)
             packed = stream is not file
             check_size(layout.shape, layout.offset + layout.n_bytes, path, available=file.n_bytes, packed=packed)
-            read_exactly(stream, layout.offset - used, path)
+            between = read_exactly(stream, layout.offset - used, path).tobytes()
             values = read_exactly(stream, layout.n_bytes, path).view(layout.dtype)
             check_end(stream, layout.n_bytes, path)
-            digests = (file.sha256(),)
+            digests = {"": file.sha256()}
     except (OSError, EOFError, zlib.error) as error:
         raise damaged(path, error) from error
     values = _scaled(values.reshape(layout.shape, order="F"), layout)
-    return StoredImage(values, layout.affine, digests=digests)
+    names = extension_names(between, header.endianness, path)
+    return StoredImage(values, layout.affine, names, digests)
 
 
 def _uncompressed(file: BinaryIO, path: Path) -> BinaryIO:

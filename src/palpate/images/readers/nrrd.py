@@ -102,7 +102,7 @@ def read_nrrd(path: Path) -> StoredImage:
                 files.append(file)
             _skip_lines(file, header)
             values = read_block(file, block, path)
-            digests = tuple(each.sha256() for each in files)
+            digests = {part: each.sha256() for part, each in zip(("", "voxels"), files, strict=False)}
     except (OSError, EOFError, zlib.error) as error:
         raise damaged(path, error) from error
     return replace(_image(values, header, place), digests=digests)

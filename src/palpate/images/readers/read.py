@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import stat
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,20 +25,25 @@ LIMITS = ReadLimits()
 
 
 def read_label_image(
-    path: Path | str, *, names: Mapping[int, str] | None = None, limits: ReadLimits | None = LIMITS
+    path: Path | str,
+    *,
+    names: Mapping[int, str] | None = None,
+    limits: ReadLimits | None = LIMITS,
+    grid: VoxelGrid | None = None,
 ) -> LabelImage:
-    """Read a label image; its axes are brought to the order closest to RAS, its affine (mm) stays exact.
+    """Read a label image, or a folder of masks; axes come in the order closest to RAS, the affine (mm) stays exact.
 
     Labels are integers from 0 to 65535; floats are rounded when they are within 1e-3 of one. `names` is a label table,
-    used where the file brings no names of its own. `limits` are those of the process that reads; None reads here.
+    used where the file brings no names of its own; `grid` is used where a DICOM segmentation lacks its series. `limits`
+    are those of the process that reads; None reads here.
     Raises `InputDataError` for whatever cannot be read or is no label image, `ResourceError` when memory or time is
     short.
     """
     path = Path(path)
-    stored, grid = _read(path, "labels", limits)
+    stored, own_grid = _read(path, "labels", limits, grid)
     own = checked_table(stored.names, path)
     table = own or (names if isinstance(names, LabelTable) else LabelTable(names or {}))
-    return LabelImage(stored.values, grid, table.names, table.colours, stored.digests)
+    return LabelImage(stored.values, own_grid, table.names, table.colours, stored.digests, stored.findings)
 
 
 def read_intensities(
@@ -49,17 +55,22 @@ def read_intensities(
     file has another digest.
     """
     stored, grid = _read(Path(path), "intensities", limits)
-    if sha256 is not None and stored.digests and stored.digests[0] != sha256:
+    if sha256 is not None and stored.digests.get("", sha256) != sha256:
         raise InputDataError(f"'{path}' was changed after this run began; run it again with the file as it is now")
     return stored.values, grid
 
 
-def _read(path: Path, kind: str, limits: ReadLimits | None) -> tuple[StoredImage, VoxelGrid]:
+def _read(
+    path: Path, kind: str, limits: ReadLimits | None, given: VoxelGrid | None = None
+) -> tuple[StoredImage, VoxelGrid]:
     """The image in the order closest to RAS, and its grid; `kind`: what its values are, a key of `REDUCED`."""
     image_format = format_of(path)
-    _check_file(path)
+    _check_file(path, kind)
     try:
-        stored = image_format.read(path) if limits is None else read_stored(path, kind, image_format, limits)
+        if limits is None:
+            stored = image_format.stored(path, given)
+        else:
+            stored = read_stored(path, kind, image_format, limits, given)
         _check_affine(stored.affine, path)
         values, affine = to_canonical(REDUCED[kind](stored.values, path), stored.affine)
     except MemoryError as error:
@@ -67,10 +78,10 @@ def _read(path: Path, kind: str, limits: ReadLimits | None) -> tuple[StoredImage
             f"'{path}' does not fit into the memory of this machine; crop the image to the organs of the case"
         ) from error
     grid = VoxelGrid((values.shape[0], values.shape[1], values.shape[2]), affine)
-    return StoredImage(values, affine, stored.names, stored.digests), grid
+    return replace(stored, values=values, affine=affine), grid
 
 
-def _check_file(path: Path) -> None:
+def _check_file(path: Path, kind: str) -> None:
     try:
         found = path.stat()
     except FileNotFoundError as error:
@@ -82,7 +93,9 @@ def _check_file(path: Path) -> None:
             f"'{path}' cannot be opened ({error}); check the path and your right to read it"
         ) from error
     if stat.S_ISDIR(found.st_mode):
-        raise InputDataError(f"'{path}' is a folder, not an image; name the file in it")
+        if kind == "labels":
+            return
+        raise InputDataError(f"'{path}' is a folder, not a grey image; name the file in it")
     if not stat.S_ISREG(found.st_mode):
         raise InputDataError(f"'{path}' is a pipe, a socket or a device; save the image as a file")
     if found.st_size == 0:

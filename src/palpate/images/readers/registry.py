@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,35 +12,52 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, InputDataError
+from palpate.images.finding import Finding
+from palpate.images.input_file import open_input
+from palpate.images.label_image import VoxelGrid
 from palpate.images.named_labels import NamedLabel
 
-__all__ = ["ImageFormat", "StoredImage", "format_of", "register"]
+__all__ = ["FOLDER", "ImageFormat", "StoredImage", "format_of", "marked_format", "register"]
+
+FOLDER = "/"  # no file's name ends so
 
 
 @dataclass(frozen=True, slots=True)
 class StoredImage:
     """A file's voxels as they are stored: `values` (n_1, n_2, n_3) integers or floats, `affine` (4, 4) index -> RAS mm.
 
-    `names`: what the file itself says of its labels; `digests`: SHA-256 (hexadecimal) of the file as it was read, and
-    of the file beside it that holds the voxels, where there is one; empty when the reader does not say.
+    `names`: what the file itself says of its labels. `digests`: SHA-256 (hexadecimal) of each file as it was read, by
+    its part in the image: "" the file itself, "voxels" the one beside it that holds the voxels, or a file's name in a
+    folder; empty when the reader does not say. `findings`: what the user should know of the reading.
     """
 
     values: NDArray[Any]
     affine: NDArray[np.float64]
     names: tuple[NamedLabel, ...] = ()
-    digests: tuple[str, ...] = ()
+    digests: Mapping[str, str] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class ImageFormat:
     """A file format: its name, the endings of its files (lower case, with the dot) and the function that reads one.
 
-    `read` takes the path of an existing, non-empty file; it raises `InputDataError` and lets nothing else out.
+    `read` takes the path of an existing, non-empty file; it raises `InputDataError` and lets nothing else out. A folder
+    has the ending `FOLDER`. `patience`: how many times the processor time of one file reading may take;
+    `mark`: what stands at byte 128 of its files, which then need no ending; `read_on`: reads a
+    file that may lack its grid (contours).
     """
 
     name: str
     endings: tuple[str, ...]
     read: Callable[[Path], StoredImage]
+    patience: int = 1
+    mark: bytes = b""
+    read_on: Callable[[Path, VoxelGrid], StoredImage] | None = None
+
+    def stored(self, path: Path, grid: VoxelGrid | None) -> StoredImage:
+        """What `path` holds, on `grid` where the format may need one; raises as `read` does."""
+        return self.read(path) if grid is None or self.read_on is None else self.read_on(path, grid)
 
 
 _FORMATS: dict[str, ImageFormat] = {}
@@ -57,8 +75,26 @@ def register(image_format: ImageFormat) -> None:
 
 def format_of(path: Path) -> ImageFormat:
     """The format of a file by the longest ending that fits; raises `InputDataError` when none does."""
+    if os.path.isdir(path):  # noqa: PTH112 - a path that cannot be searched, or is too long, is no folder
+        return _FORMATS[FOLDER]
     for ending in sorted(_FORMATS, key=len, reverse=True):
         if path.name.lower().endswith(ending):
             return _FORMATS[ending]
-    known = ", ".join(sorted(_FORMATS))
-    raise InputDataError(f"no reader for '{path}': the endings known are {known}; convert the image to one of these")
+    marked = marked_format(path)
+    if marked is not None:
+        return marked
+    known = ", ".join(sorted(set(_FORMATS) - {FOLDER}))
+    raise InputDataError(
+        f"no reader for '{path}': the endings known are {known}; convert the image to one of these, or name a folder of"
+        " masks"
+    )
+
+
+def marked_format(path: Path) -> ImageFormat | None:
+    """The format whose mark the file bears, whatever its name; None when there is none, or it cannot be read."""
+    try:
+        with open_input(path) as file:
+            begins = file.read(256)[128:]
+    except (OSError, ValueError):
+        return None
+    return next((each for each in _FORMATS.values() if each.mark and begins.startswith(each.mark)), None)

@@ -1,0 +1,66 @@
+"""DICOM files: which of them are segmentations, and who reads those; a plain series is refused with what converts it.
+
+Reading takes the extra `dicom` (highdicom, pydicom), whose modules are imported when such a file comes. Class UIDs:
+DICOM PS3.6, annex A.
+"""
+
+from __future__ import annotations
+
+import re
+from importlib import import_module
+from pathlib import Path
+
+from palpate.errors import InputDataError, ResourceError
+from palpate.images.input_file import open_input
+from palpate.images.label_image import VoxelGrid
+from palpate.images.readers.registry import ImageFormat, StoredImage, register
+from palpate.images.readers.voxel_stream import damaged
+
+__all__ = ["read_dicom", "refused_series"]
+
+MARK = b"DICM"  # at byte 128
+SOP_CLASS = re.compile(rb"\x02\x00\x02\x00UI(..)([0-9.]{1,64})\0?", re.DOTALL)  # in the file meta information
+READERS = {
+    "1.2.840.10008.5.1.4.1.1.66.4": "dicom_segmentation",  # Segmentation Storage
+    "1.2.840.10008.5.1.4.1.1.66.7": "dicom_segmentation",  # Label Map Segmentation Storage
+    "1.2.840.10008.5.1.4.1.1.481.3": "dicom_contours",  # RT Structure Set Storage
+}
+
+
+def read_dicom(path: Path, grid: VoxelGrid | None = None) -> StoredImage:
+    """Read the segments of a DICOM-SEG, or the contours of an RTSTRUCT, as one label image.
+
+    `grid` is taken where the series that it refers to is not beside it. Raises `InputDataError` for other classes and
+    damaged files, `ResourceError` without the extra `dicom`.
+    """
+    try:
+        with open_input(path) as file:
+            head = file.read(2000)
+    except OSError as error:
+        raise damaged(path, error) from error
+    if head[128:132] != MARK:
+        raise InputDataError(f"'{path}' does not begin as a DICOM file does; export the segmentation again")
+    found = SOP_CLASS.search(head)
+    reader = READERS.get(found[2].decode("ascii") if found else "")
+    if reader is None:
+        raise refused_series(path)
+    try:
+        module = import_module(f"palpate.images.readers.{reader}")
+    except ImportError as error:
+        raise ResourceError(
+            f"'{path}' is a DICOM segmentation, and the libraries that read it are not installed: run"
+            ' pip install "palpate[dicom]"'
+        ) from error
+    image: StoredImage = module.read(path, grid)
+    return image
+
+
+def refused_series(path: Path) -> InputDataError:
+    """The sentence for DICOM that holds no segmentation."""
+    return InputDataError(
+        f"'{path}' is a DICOM image or series, which is not read: convert it to NIfTI with dcm2niix or 3D Slicer,"
+        " segment it, and name the segmentation (a DICOM-SEG or an RTSTRUCT by its file)"
+    )
+
+
+register(ImageFormat("DICOM", (".dcm", ".dicom"), read_dicom, patience=4, mark=MARK, read_on=read_dicom))

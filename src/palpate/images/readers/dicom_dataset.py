@@ -1,0 +1,124 @@
+"""What the readers of DICOM share: data sets, foreign errors as sentences, the grid of the series beside a file."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pydicom
+from pydicom.dataset import Dataset
+
+from palpate.errors import InputDataError, PalpateError
+from palpate.images.input_file import read_input
+from palpate.images.label_image import VoxelGrid
+from palpate.images.readers.canonical import to_canonical
+from palpate.images.readers.voxel_stream import check_size
+
+__all__ = ["LPS_TO_RAS", "Series", "read_dataset", "sentences", "series_beside"]
+
+LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
+MOST_FILES = 5000  # in the folder of a segmentation and those in it
+MOST_BYTES = 2**31  # of a segmentation
+MOST_SLICE_BYTES = 2**26  # of another file beside it, to be one of its series
+UNEVEN = 0.02  # of the distance between slices
+PLACE = ("SeriesInstanceUID", "ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing", "Rows", "Columns")
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """The grid of a series, in the order closest to RAS; SHA-256 of its files, empty where there are none."""
+
+    grid: VoxelGrid
+    sha256: str = ""
+
+
+@contextmanager
+def sentences(path: Path) -> Iterator[None]:
+    """Whatever the libraries raise becomes an `InputDataError`; their own words may quote a patient's data."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except (PalpateError, MemoryError):
+        raise
+    except Exception as error:
+        raise InputDataError(
+            f"'{path}' is no DICOM segmentation that can be read ({type(error).__name__}); export it again"
+        ) from error
+
+
+def read_dataset(path: Path) -> tuple[Dataset, str]:
+    """The data set in the file `path` and the SHA-256 (hexadecimal) of the file."""
+    content, sha256 = read_input(path, MOST_BYTES)
+    if len(content) > MOST_BYTES:
+        raise InputDataError(
+            f"'{path}' is larger than {MOST_BYTES} bytes; save a segmentation of fewer slices or organs"
+        )
+    return pydicom.dcmread(io.BytesIO(content)), sha256
+
+
+def series_beside(path: Path, uid: str) -> Series | None:
+    """The grid of the series `uid`, if its slices lie in the folder of `path` or in one there; no link is followed.
+
+    Raises `InputDataError` when they are no stack of evenly spaced slices.
+    """
+    found: list[tuple[Dataset, str]] = []
+    for file in islice(_files(path.parent), MOST_FILES):
+        content, sha256 = read_input(file, MOST_SLICE_BYTES)
+        if content[128:132] != b"DICM" or len(content) > MOST_SLICE_BYTES:
+            continue
+        head = pydicom.dcmread(io.BytesIO(content), stop_before_pixels=True, specific_tags=list(PLACE))
+        if head.get("SeriesInstanceUID") == uid and all(name in head for name in PLACE):
+            found.append((head, sha256))
+    return _stack(found, path) if found else None
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    with os.scandir(folder) as entries:
+        inside = sorted(entries, key=lambda entry: entry.name)
+    for entry in inside:
+        if entry.is_file(follow_symlinks=False):
+            yield Path(entry.path)
+    for entry in inside:
+        if entry.is_dir(follow_symlinks=False):
+            with os.scandir(entry.path) as deeper:
+                files = sorted(each.path for each in deeper if each.is_file(follow_symlinks=False))
+            yield from map(Path, files)
+
+
+def _stack(found: list[tuple[Dataset, str]], path: Path) -> Series:
+    first = found[0][0]
+    across, down = np.array(first.ImageOrientationPatient, dtype=np.float64).reshape(2, 3)
+    normal = np.cross(across, down)
+    alike = [
+        (np.array(head.ImagePositionPatient, dtype=np.float64), digest)
+        for head, digest in found
+        if all(head.get(name) == first.get(name) for name in PLACE[2:])
+    ]
+    alike.sort(key=lambda slice_: float(slice_[0] @ normal))
+    places = np.array([place for place, _ in alike])
+    steps = np.diff(places, axis=0)
+    step = steps.mean(axis=0) if len(steps) else normal
+    even = bool(len(steps)) and float(np.abs(steps - step).max()) <= UNEVEN * float(np.linalg.norm(step))
+    if len(alike) < len(found) or not even:
+        raise InputDataError(
+            f"the {len(found)} slices beside '{path}' of the series that it refers to are no stack of one size and even"
+            " distance; put one complete series there"
+        )
+    spacing = [float(number) for number in first.PixelSpacing]  # between rows, then between columns
+    lps = np.eye(4)
+    lps[:3, :3] = np.stack([step, down * spacing[0], across * spacing[1]], axis=1)
+    lps[:3, 3] = places[0]
+    total = hashlib.sha256("".join(digest for _, digest in alike).encode()).hexdigest()
+    shape = (len(alike), int(first.Rows), int(first.Columns))
+    check_size(shape, 0, path, available=0, packed=False)
+    empty, affine = to_canonical(np.zeros(shape, dtype=np.uint8), LPS_TO_RAS @ lps)
+    return Series(VoxelGrid((empty.shape[0], empty.shape[1], empty.shape[2]), affine), total)

@@ -1,0 +1,107 @@
+"""DICOM-SEG: binary and labelmap segmentations through highdicom, with the names and colours of their segments."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from highdicom.color import CIELabColor
+from highdicom.seg import Segmentation
+from numpy.typing import NDArray
+from pydicom.dataset import Dataset
+
+from palpate.errors import InputDataError
+from palpate.images.finding import Finding
+from palpate.images.label_image import VoxelGrid
+from palpate.images.named_labels import MAX_NAME, NamedLabel, hex_colour, printable
+from palpate.images.readers.canonical import to_canonical
+from palpate.images.readers.dicom_dataset import LPS_TO_RAS, Series, read_dataset, sentences, series_beside
+from palpate.images.readers.merged_masks import Mask, merged
+from palpate.images.readers.registry import StoredImage
+from palpate.images.readers.voxel_stream import check_size
+
+__all__ = ["read"]
+
+MOST_SEGMENTS = 1000
+SAME_PLACE = 0.01  # of a voxel
+
+
+def read(path: Path, grid: VoxelGrid | None) -> StoredImage:
+    """Read the segments of `path`, on the grid of their series where that lies beside the file, else on `grid`.
+
+    Segments that overlap are made one label image as masks are. Raises `InputDataError` for whatever is wrong.
+    """
+    with sentences(path):
+        dataset, sha256 = read_dataset(path)
+        if dataset.SegmentationType == "FRACTIONAL":
+            raise InputDataError(
+                f"'{path}' is a fractional segmentation, which gives a probability or an occupancy in each voxel and no"
+                " border; threshold it, and save it as a binary or labelmap segmentation"
+            )
+        segmentation = Segmentation.from_dataset(dataset, copy=False)
+        numbers = [int(number) for number in segmentation.segment_numbers]
+        if not 1 <= len(numbers) <= MOST_SEGMENTS:
+            raise InputDataError(f"'{path}' has {len(numbers)} segments; 1 to {MOST_SEGMENTS} are read")
+        geometry = segmentation.get_volume_geometry()
+        if geometry is None:
+            raise InputDataError(
+                f"the slices of '{path}' are not evenly spaced, so that no image can be made of them; resample it"
+            )
+        check_size(tuple(geometry.spatial_shape), 0, path, available=0, packed=False)
+        rows = tuple(_row(item) for item in segmentation.SegmentSequence if int(item.SegmentNumber) in numbers)
+        labels, findings = _labels(segmentation, rows, tuple(geometry.spatial_shape))
+        affine = LPS_TO_RAS @ geometry.affine
+        referenced = dataset.get("ReferencedSeriesSequence") or ()
+        series = series_beside(path, str(referenced[0].SeriesInstanceUID)) if referenced else None
+        series = series or (Series(grid) if grid else None)
+        return _completed(StoredImage(labels, affine, rows, {"": sha256}, findings), series)
+
+
+def _row(item: Dataset) -> NamedLabel:
+    colour = None
+    if "RecommendedDisplayCIELabValue" in item:
+        red, green, blue = CIELabColor.from_dicom_value(item.RecommendedDisplayCIELabValue).to_rgb(clip=True)
+        colour = hex_colour(red, green, blue, top=255)
+    number = int(item.SegmentNumber)
+    name = printable(str(item.get("SegmentLabel", "")).strip())[:MAX_NAME] or f"segment {number}"
+    return NamedLabel(number, name, colour)
+
+
+def _labels(
+    segmentation: Segmentation, rows: tuple[NamedLabel, ...], shape: tuple[int, ...]
+) -> tuple[NDArray[np.uint16], tuple[Finding, ...]]:
+    if segmentation.SegmentationType == "LABELMAP":
+        return np.asarray(segmentation.get_volume(combine_segments=True, dtype=np.uint16).array), ()
+
+    def masks() -> Iterator[Mask]:
+        for row in rows:
+            volume = segmentation.get_volume(segment_numbers=[row.label], dtype=np.uint8)
+            yield Mask(row, np.asarray(volume.array)[..., 0] > 0)
+
+    return merged(masks(), shape)
+
+
+def _completed(image: StoredImage, series: Series | None) -> StoredImage:
+    """The image with the slices that the file leaves out as empty, which only its series can tell."""
+    if series is not None:
+        labels, affine = to_canonical(image.values, image.affine)
+        place = np.linalg.inv(series.grid.affine) @ affine
+        first = np.rint(place[:3, 3]).astype(int)
+        same = np.eye(4)
+        same[:3, 3] = first
+        inside = (first >= 0).all() and (first + labels.shape <= series.grid.shape).all()
+        if inside and np.abs(place - same).max() < SAME_PLACE:
+            whole = np.zeros(series.grid.shape, dtype=labels.dtype)
+            whole[tuple(slice(f, f + n) for f, n in zip(first, labels.shape, strict=True))] = labels
+            digests = {**image.digests, **({"series": series.sha256} if series.sha256 else {})}
+            return StoredImage(whole, series.grid.affine, image.names, digests, image.findings)
+    labels = image.values
+    if not (labels[0].any() and labels[-1].any()):
+        return image
+    text = (
+        "the image ends with the first and the last slice that a segment reaches, as files of this kind leave out empty"
+        " slices; copy the DICOM series that it was made on beside it, or name a grey image on its grid as intensities"
+    )
+    return replace(image, findings=(*image.findings, Finding("cropped", text)))

@@ -1,0 +1,160 @@
+"""A folder of masks, one file an organ, as TotalSegmentator writes it; the files are named after the organs."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import InputDataError
+from palpate.images.named_labels import NamedLabel, printable
+from palpate.images.readers.dicom import refused_series
+from palpate.images.readers.merged_masks import Mask, merged
+from palpate.images.readers.registry import FOLDER, ImageFormat, StoredImage, format_of, marked_format, register
+from palpate.images.readers.values import label_values
+from palpate.images.totalsegmentator import CLASSES
+
+__all__ = ["read_mask_folder"]
+
+ENDINGS = (".nii.gz", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd")
+MOST_FILES = 10_000  # of any kind in the folder
+MOST_MASKS = 500
+MOST_LOOKED_AT = 20  # files in a folder without masks: do they say what they are?
+SAME_PLACE = 0.01  # of a voxel, at the corners: what rounding leaves
+
+
+@dataclass(frozen=True, slots=True)
+class _MaskFile:
+    """A mask's row in the table of labels, its file's name and where that leads, links followed."""
+
+    row: NamedLabel
+    file: str
+    target: Path
+
+
+def read_mask_folder(folder: Path) -> StoredImage:
+    """Read the masks in `folder`, which must lie on one grid, into one label image.
+
+    A label's name is that of the file, its number TotalSegmentator's where it is the name of a class, else the next in
+    sorted order. Raises `InputDataError` with a sentence for whatever is wrong.
+    """
+    files = _mask_files(folder)
+    first = _read(files[0])
+    digests: dict[str, str] = {}
+
+    def masks() -> Iterator[Mask]:
+        for file in files:
+            image = first if file is files[0] else _read(file)
+            _refuse_another_grid(first, image, (files[0].file, file.file), folder)
+            for part, digest in image.digests.items():
+                digests[f"{file.file}.{part}" if part else file.file] = digest
+            yield Mask(file.row, _inside(image.values, file.target))
+
+    labels, findings = merged(masks(), first.values.shape)
+    return StoredImage(labels, first.affine, tuple(file.row for file in files), digests, findings)
+
+
+def _mask_files(folder: Path) -> list[_MaskFile]:
+    """The masks by their names; other files, and those that begin with a dot, are passed over."""
+    try:
+        with os.scandir(folder) as entries:
+            names = [entry.name for entry in islice(entries, MOST_FILES + 1)]
+    except OSError as error:
+        raise InputDataError(f"the folder '{folder}' cannot be read ({error}); check your right to read it") from error
+    found: dict[str, str] = {}
+    for name in sorted(name for name in names if not name.startswith(".")):
+        stem = next((name[: -len(ending)] for ending in ENDINGS if name.lower().endswith(ending)), "")
+        if stem and stem in found:
+            raise InputDataError(
+                f"'{folder}' has two masks of '{printable(stem)}', '{printable(found[stem])}' and '{printable(name)}';"
+                " take one away"
+            )
+        if stem:
+            found[stem] = name
+    if not found and any(marked_format(folder / name) for name in sorted(names)[:MOST_LOOKED_AT]):
+        raise refused_series(folder)
+    if not 1 <= len(found) <= MOST_MASKS or len(names) > MOST_FILES:
+        raise InputDataError(
+            f"the folder '{folder}' has {len(found)} masks ({', '.join(ENDINGS)}) among"
+            f" {len(names) if len(names) <= MOST_FILES else f'over {MOST_FILES}'} files; 1 to {MOST_MASKS} masks in a"
+            " folder of their own are read, one file an organ (prostate.nii.gz), or name a single label image"
+        )
+    numbers = _numbers(list(found))
+    return [
+        _MaskFile(NamedLabel(numbers[stem], printable(stem)), printable(name), _target(folder, name))
+        for stem, name in found.items()
+    ]
+
+
+def _target(folder: Path, name: str) -> Path:
+    """The file that the folder's entry leads to; raises `InputDataError` when a link leads out of the folder."""
+    try:
+        target = (folder / name).resolve()
+        inside = target.is_relative_to(folder.resolve())
+    except (OSError, RuntimeError):  # a loop of links
+        inside = False
+    if not inside:
+        raise InputDataError(
+            f"'{folder / name}' is a link that leads out of its folder, which is not followed; copy the mask into the"
+            " folder"
+        )
+    return target
+
+
+def _numbers(names: Sequence[str]) -> Mapping[str, int]:
+    """Labels of sorted names: those of the task that knows most of them; others follow after its last class."""
+    classes = max(CLASSES.values(), key=lambda known: len(set(names) & set(known)))
+    known = set(names) & set(classes)
+    last = len(classes) if known else 0
+    others = enumerate((name for name in names if name not in known), start=last + 1)
+    return {name: classes[name] for name in known} | {name: number for number, name in others}
+
+
+def _read(file: _MaskFile) -> StoredImage:
+    image = format_of(file.target).read(file.target)
+    if image.names:
+        raise InputDataError(
+            f"'{file.target}' brings names of {len(image.names)} segments of its own, so it is no mask of one organ;"
+            " name that file as the image, or take it out of the folder"
+        )
+    return image
+
+
+def _inside(values: NDArray[Any], path: Path) -> NDArray[np.bool_]:
+    """The voxels of a mask: those that are not zero, which have one value, whichever it is."""
+    labels = label_values(values, path)
+    inside = labels > 0
+    high = int(labels.max())
+    others = int(np.count_nonzero(inside & (labels != high)))
+    if others:
+        raise InputDataError(
+            f"'{path}' is no mask of one organ: of its {np.count_nonzero(inside)} voxels that are not 0, {others} have"
+            f" another value than {high}; a mask has 0 and one other value. Name a label image by itself, not in a"
+            " folder of masks"
+        )
+    return inside
+
+
+def _refuse_another_grid(image: StoredImage, other: StoredImage, names: tuple[str, str], folder: Path) -> None:
+    here, there = image.values.shape, other.values.shape
+    alike = here == there
+    corners = np.array([[*(np.array(c) * (np.array(here) - 1.0)), 1.0] for c in np.ndindex(2, 2, 2)])
+    with np.errstate(all="ignore"):  # what is not finite is refused
+        apart = float(np.linalg.norm((corners @ (image.affine - other.affine).T)[:, :3], axis=1).max())
+        voxel = float(np.linalg.norm(image.affine[:3, :3], axis=0).min())
+    if alike and apart <= SAME_PLACE * voxel:
+        return
+    how = f"their corners lie up to {apart:.3g} mm apart" if alike else f"{list(here)} and {list(there)} voxels"
+    raise InputDataError(
+        f"the masks '{names[0]}' and '{names[1]}' in '{folder}' are not on one grid: {how}; resample them on the"
+        " grid of one image, with nearest neighbour"
+    )
+
+
+register(ImageFormat("a folder of masks", (FOLDER,), read_mask_folder, patience=4))

@@ -1,0 +1,264 @@
+"""DICOM segmentations: volumes, places, names and colours are those of what was written; nothing of a patient is."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import sys
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pydicom
+import pytest
+from numpy.typing import NDArray
+
+from dicom_files import TILTED, axes_of, ct_slices, save_contours, save_segmentation, save_series, traced
+from palpate.errors import InputDataError, ResourceError
+from palpate.images import readers
+from palpate.images.label_image import LabelImage, VoxelGrid
+from palpate.study.case_file import read_case
+from palpate.study.read import read_segmentation
+
+read_label_image = partial(readers.read_label_image, limits=None)
+
+SHAPE = (14, 40, 36)  # slices, rows, columns
+SPACING = (3.0, 1.5, 1.2)
+ORIGIN = (-30.0, -70.0, 12.0)  # LPS mm
+series = partial(ct_slices, SHAPE, SPACING, ORIGIN)
+NAMES = {1: ("prostate", "#804020"), 2: ("Blase ü", "#20c040"), 3: ("tumour", "#4060ff")}
+
+
+def masks() -> dict[int, NDArray[np.bool_]]:
+    """Asymmetric organs (slices, rows, columns) that do not overlap; the first has a hole."""
+    k, j, i = (axis * step for axis, step in zip(np.indices(SHAPE), SPACING, strict=True))
+    prostate = ((k - 20) / 12) ** 2 + ((j - 20) / 13) ** 2 + ((i - 18) / 11) ** 2 < 1
+    hole = ((k - 20) / 7) ** 2 + ((j - 20) / 5) ** 2 + ((i - 18) / 4) ** 2 < 1
+    bladder = ((k - 22) / 9) ** 2 + ((j - 46) / 10) ** 2 + ((i - 24) / 14) ** 2 < 1
+    tumour = ((k - 12) / 5) ** 2 + ((j - 20) / 4) ** 2 + ((i - 32) / 5) ** 2 < 1
+    return {1: prostate & ~hole, 2: bladder & ~prostate, 3: tumour & ~prostate & ~bladder}
+
+
+def assert_same(
+    image: LabelImage, volume_within: float, orientation: str = "axial", organs: dict | None = None
+) -> None:
+    """Names, volumes, and centroids within 0.1 mm, against what was written."""
+    axes, origin = axes_of(series(orientation))
+    assert image.names == {number: name for number, (name, _) in NAMES.items()}
+    for number, mask in (organs or masks()).items():
+        found = image.labels == number
+        volume = np.count_nonzero(found) * image.grid.voxel_volume
+        assert volume == pytest.approx(np.count_nonzero(mask) * np.prod(SPACING), rel=volume_within)
+        centroid = image.grid.world(np.argwhere(found).mean(axis=0, keepdims=True))[0]
+        truth = (np.argwhere(mask).mean(axis=0) @ axes + origin) * [-1, -1, 1]
+        np.testing.assert_allclose(centroid, truth, atol=0.1)
+
+
+@pytest.mark.parametrize("kind", ["BINARY", "LABELMAP"])
+@pytest.mark.parametrize("orientation", TILTED)
+def test_a_segmentation_has_the_volumes_and_places_that_were_written(
+    tmp_path: Path, kind: str, orientation: str
+) -> None:
+    path = save_segmentation(tmp_path / "a.dcm", series(orientation), kind, NAMES, masks())
+    assert_same(read_label_image(path), 0.001, orientation)
+
+
+def test_a_segmentation_is_read_by_a_process_of_its_own_with_colours_and_whatever_name(tmp_path: Path) -> None:
+    path = save_segmentation(tmp_path / "a.dcm", series(), "BINARY", NAMES, masks())
+    path = path.rename(tmp_path / "IM0001")
+    image = readers.read_label_image(path)
+    assert_same(image, 0.001)
+    assert image.digests == {"": hashlib.sha256(path.read_bytes()).hexdigest()}
+    for number, (_, colour) in NAMES.items():
+        there, written = (np.frombuffer(bytes.fromhex(c[1:]), np.uint8) for c in (image.colours[number], colour))
+        np.testing.assert_allclose(there.astype(int), written, atol=2)  # CIELab in 16 bits is not RGB
+
+
+def test_slices_left_out_are_filled_from_the_series_beside_or_warned_of(tmp_path: Path) -> None:
+    slices = series()
+    path = save_segmentation(tmp_path / "a.dcm", slices, "BINARY", NAMES, masks())
+    alone = read_label_image(path)
+    (finding,) = alone.findings
+    assert finding.code == "cropped"
+    save_series(tmp_path / "ct", slices[::-1])
+    whole = read_label_image(path)
+    assert (alone.labels.shape, whole.labels.shape) == ((36, 40, 8), (36, 40, 14))
+    assert whole.findings == ()
+    assert sorted(whole.digests) == ["", "series"]
+    assert_same(whole, 0.001)
+
+
+def test_segments_that_overlap_go_to_the_smaller_one(tmp_path: Path) -> None:
+    organs = masks()
+    organs[2] = organs[2] | organs[3]
+    image = read_label_image(save_segmentation(tmp_path / "a.dcm", series(), "BINARY", NAMES, organs))
+    assert "overlap" in [finding.code for finding in image.findings]
+    assert_same(image, 0.001)
+
+
+def test_a_fractional_segmentation_is_refused(tmp_path: Path) -> None:
+    path = save_segmentation(tmp_path / "a.dcm", series(), "FRACTIONAL", NAMES, masks())
+    with pytest.raises(InputDataError, match="is a fractional segmentation"):
+        read_label_image(path)
+
+
+@pytest.mark.parametrize("level", [0.5, 0.9995])
+@pytest.mark.parametrize("orientation", TILTED)
+def test_contours_have_the_volumes_and_places_that_were_drawn(tmp_path: Path, level: float, orientation: str) -> None:
+    slices = series(orientation)
+    save_series(tmp_path / "ct", slices)
+    path = save_contours(tmp_path / "a.dcm", slices, NAMES, {n: traced(mask, level) for n, mask in masks().items()})
+    image = read_label_image(path)
+    assert_same(image, 0.01, orientation)
+    assert image.colours == {number: colour for number, (_, colour) in NAMES.items()}
+    assert image.findings == ()
+    assert sorted(image.digests) == ["", "series"]
+
+
+def test_contours_of_sparser_or_finer_planes_fill_the_slices_nearest_to_them(tmp_path: Path) -> None:
+    slices = series()
+    save_series(tmp_path / "ct", slices)
+    square = np.array([[0, 9.5, 9.5], [0, 9.5, 19.5], [0, 29.5, 19.5], [0, 29.5, 9.5]])
+    for planes, expected in (((2, 4, 6), 6), (np.arange(2, 6.1, 0.5), 5), ((2.5, 3.5), 2), ((4,), 1)):
+        lines = [(np.add(square, [k, 0, 0]), "CLOSED_PLANAR") for k in planes]
+        image = read_label_image(save_contours(tmp_path / "a.dcm", slices, NAMES, {1: lines}))
+        assert np.count_nonzero(image.labels) == expected * 200
+        assert [finding.code for finding in image.findings] == ["sparse-contours"] * (expected == 6)
+
+
+def test_contours_that_enclose_nothing_are_left_out_and_warned_of(tmp_path: Path) -> None:
+    slices = series()
+    save_series(tmp_path, slices)
+    square = np.array([[3, 9.5, 9.5], [3, 9.5, 19.5], [3, 29.5, 19.5], [3, 29.5, 9.5]])
+    lines = [(square, "CLOSED_PLANAR"), (np.add(square, [1, 0, 0]), "OPEN_PLANAR"), (square[:2], "CLOSED_PLANAR")]
+    image = read_label_image(save_contours(tmp_path / "a.dcm", slices, NAMES, {1: [*lines, (square[:1], "POINT")]}))
+    assert np.count_nonzero(image.labels) == 200
+    (finding,) = image.findings
+    assert finding.code == "open-contours"
+    assert "'prostate' (1 open and 2 of under 3 points)" in finding.message
+
+
+def test_contours_without_their_slices_or_across_them_are_refused(tmp_path: Path) -> None:
+    slices = series()
+    path = save_contours(tmp_path / "a.dcm", slices, NAMES, {1: traced(masks()[1], 0.5)})
+    with pytest.raises(InputDataError, match=r"the DICOM series that '.*a\.dcm' was drawn on is not beside it"):
+        read_label_image(path)
+    save_series(tmp_path / "ct", [*slices[:5], *slices[6:]])
+    with pytest.raises(InputDataError, match=r"the 13 slices beside .* are no stack"):
+        read_label_image(path)
+    save_series(tmp_path / "ct", slices[5:6])
+    across = np.array([[2, 9, 9], [2, 9, 19], [5, 29, 19]])
+    path = save_contours(tmp_path / "a.dcm", slices, NAMES, {1: [(across, "CLOSED_PLANAR")]})
+    with pytest.raises(InputDataError, match=r"'prostate' in .* runs over 3 slices"):
+        read_label_image(path)
+    with pytest.raises(InputDataError, match="no structure with a contour"):
+        read_label_image(save_contours(tmp_path / "a.dcm", slices, NAMES, {1: []}))
+
+
+def test_a_link_to_a_series_is_not_followed(tmp_path: Path) -> None:
+    slices = series()
+    save_series(tmp_path / "ct", slices)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "ct").symlink_to(tmp_path / "ct")
+    path = save_contours(tmp_path / "mine" / "a.dcm", slices, NAMES, {1: traced(masks()[1], 0.5)})
+    with pytest.raises(InputDataError, match="is not beside it"):
+        read_label_image(path)
+
+
+def test_a_plain_series_is_refused_with_what_converts_it(tmp_path: Path) -> None:
+    save_series(tmp_path / "ct", series())
+    first = sorted((tmp_path / "ct").iterdir())[0]
+    bare = first.rename(tmp_path / "ct" / "IM0001")
+    for path in (tmp_path / "ct", bare):
+        for read in (read_label_image, readers.read_label_image):
+            with pytest.raises(InputDataError, match="dcm2niix or 3D Slicer"):
+                read(path)
+    with pytest.raises(InputDataError, match="dcm2niix or 3D Slicer"):
+        readers.read_intensities(bare)
+
+
+def test_without_the_extra_a_segmentation_names_it_and_a_series_its_converters(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = save_segmentation(tmp_path / "a.dcm", series(), "BINARY", NAMES, masks())
+    save_series(tmp_path, series())
+    for name in ("dicom_segmentation", "dicom_dataset"):
+        monkeypatch.delitem(sys.modules, f"palpate.images.readers.{name}", raising=False)
+    monkeypatch.setitem(sys.modules, "pydicom", None)
+    monkeypatch.setitem(sys.modules, "highdicom", None)
+    with pytest.raises(ResourceError, match=r'pip install "palpate\[dicom\]"'):
+        read_label_image(path)
+    with pytest.raises(InputDataError, match="dcm2niix"):
+        read_label_image(next(each for each in tmp_path.iterdir() if each != path))
+
+
+def test_damaged_files_are_sentences_without_a_word_of_the_patient(tmp_path: Path) -> None:
+    slices = series()
+    save_series(tmp_path / "ct", slices)
+    files = [
+        save_segmentation(tmp_path / "a.dcm", slices, "BINARY", NAMES, masks()),
+        save_contours(tmp_path / "b.dcm", slices, NAMES, {n: traced(mask, 0.5) for n, mask in masks().items()}),
+    ]
+    random = np.random.default_rng(3)
+    outcomes = []
+    for path in files:
+        content = path.read_bytes()
+        for number in range(40):
+            damaged = bytearray(content)
+            if number % 4 == 0:
+                del damaged[int(random.integers(132, len(content))) :]
+            for place in random.integers(132, len(damaged), 6) if number % 4 else ():
+                damaged[place] = int(random.integers(0, 256))
+            bad = tmp_path / "bad.dcm"
+            bad.write_bytes(damaged)
+            try:
+                read_label_image(bad)
+                outcomes.append("read")
+            except InputDataError as error:
+                outcomes.append(str(error))
+    assert 1 < len(set(outcomes)) < len(outcomes)
+    assert not any("Meyer" in outcome for outcome in outcomes)
+
+
+def test_sizes_beyond_all_are_refused_before_memory_is_taken(tmp_path: Path) -> None:
+    ds = pydicom.dcmread(save_segmentation(tmp_path / "a.dcm", series(), "BINARY", NAMES, masks()))
+    ds.PerFrameFunctionalGroupsSequence[-1].PlanePositionSequence[0].ImagePositionPatient = [-30, -70, 12 + 3 * 10**7]
+    ds.save_as(tmp_path / "a.dcm")
+    with pytest.raises(InputDataError):
+        read_label_image(tmp_path / "a.dcm")
+
+
+@pytest.mark.parametrize("orientation", ["axial", "sagittal"])
+def test_a_grid_that_is_given_stands_for_a_series_that_is_not_there(tmp_path: Path, orientation: str) -> None:
+    slices = series(orientation)
+    segments = save_segmentation(tmp_path / "a.dcm", slices, "BINARY", NAMES, masks())
+    contours = save_contours(tmp_path / "b.dcm", slices, NAMES, {n: traced(mask, 0.5) for n, mask in masks().items()})
+    save_series(tmp_path / "ct", slices)
+    whole = read_label_image(segments)
+    shutil.rmtree(tmp_path / "ct")
+    for path in (segments, contours):
+        for read in (read_label_image, readers.read_label_image):
+            image = read(path, grid=whole.grid)
+            assert image.findings == ()
+            assert sorted(image.digests) == [""]
+            assert np.array_equal(image.labels, whole.labels)
+    apart = VoxelGrid(whole.grid.shape, whole.grid.affine + np.eye(4)[:, ::-1] * 0.3)
+    assert [finding.code for finding in read_label_image(segments, grid=apart).findings] == ["cropped"]
+
+
+def test_a_case_gives_contours_the_grid_of_its_grey_image(tmp_path: Path) -> None:
+    slices = series()
+    save_series(tmp_path / "ct", slices)
+    path = save_contours(tmp_path / "a.dcm", slices, NAMES, {n: traced(mask, 0.5) for n, mask in masks().items()})
+    whole = read_label_image(path)
+    shutil.rmtree(tmp_path / "ct")
+    readers.write_scalar_image(tmp_path / "ct.nii.gz", np.zeros(whole.grid.shape), whole.grid)
+    (tmp_path / "case.toml").write_text(
+        '[images]\nbefore = "a.dcm"\nafter = ["a.dcm"]\nintensities_before = "ct.nii.gz"\n'
+        '[tissues.gland]\nlabel = "prostate"\nrole = "estimate"\n'
+        '[tissues.rest]\nlabel = "remaining"\nrole = "known"\nyoungs_modulus_kpa = 10.0\n'
+    )
+    case = read_case(tmp_path / "case.toml")
+    assert case.images is not None
+    found = read_segmentation(case, case.images.before, None, None)
+    assert np.count_nonzero(found.mask(0)) == np.count_nonzero(masks()[1])
