@@ -45,7 +45,9 @@ def main() -> None:
                 write(folder, content)
                 seconds[way].append(time.perf_counter() - began)
     medians = {way: statistics.median(times) for way, times in seconds.items()}
-    print(json.dumps({"bytes": sum(SIZES.values()), **medians, "more": medians["together"] - medians["alone"]}, indent=1))
+    print(
+        json.dumps({"bytes": sum(SIZES.values()), **medians, "more": medians["together"] - medians["alone"]}, indent=1)
+    )
 
 
 def write_together(folder: Path, content: dict[str, bytes]) -> None:
