@@ -35,7 +35,9 @@ OTHER = 1e-4  # decrement of the minima that are not the best one
 SAME_MINIMUM, SAME_SD = 0.02, 0.3  # of ln E, and of a posterior standard deviation: minima no further apart are one
 LOWER = 0.5  # in units of log-likelihood: a minimum that is lower by less is as good
 REPORTED = StopRule()
-FIRST_GUESS = StopRule(step_sd=0.5, model_error=np.inf, derivatives=False, solve_above=0.1, passes=1, refinements=0)
+FIRST_GUESS = StopRule(
+    step_sd=0.5, model_error=np.inf, derivatives=False, solve_above=0.1, passes=1, iterations=1, refinements=0
+)
 EQUILIBRIUM = 1e-4  # of the forces, at the most, while the estimate moves
 
 Progress = Callable[[str], None]
