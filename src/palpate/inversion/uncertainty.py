@@ -14,6 +14,7 @@ from palpate.inversion.objective import Evaluation, Linearisation, Objective
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.noise_model import NoiseModel
+from palpate.parallel import mapped
 
 __all__ = [
     "NORMAL_95",
@@ -93,14 +94,17 @@ def grid_position_shifts(
 ) -> NDArray[np.float64]:
     """Shifts (draws, n_parameters) of the estimated log-moduli when an exact model is imaged on random grids.
 
-    The errors e of the residuals (see `imaging_errors`) go through the gain of one Gauss-Newton step, -G e.
+    The errors e of the residuals (see `imaging_errors`) go through the gain of one Gauss-Newton step, -G e. Every draw
+    has a generator of its own, so that they can be made side by side.
     """
     rows = gain(evaluation, objective.n_parameters)
-    shifts = np.zeros((draws, objective.n_parameters))
-    for draw in range(draws):
-        for row, error in zip(rows, imaging_errors(objective, evaluation, states, rng=rng), strict=True):
-            shifts[draw] -= row @ error
-    return shifts
+
+    def shift(own: np.random.Generator) -> NDArray[np.float64]:
+        """That of one draw (n_parameters,)."""
+        errors = imaging_errors(objective, evaluation, states, rng=own)
+        return -sum((row @ error for row, error in zip(rows, errors, strict=True)), np.zeros(objective.n_parameters))
+
+    return np.asarray(mapped(shift, rng.spawn(draws))).reshape(draws, objective.n_parameters)
 
 
 def imaging_errors(
