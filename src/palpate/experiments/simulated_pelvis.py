@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy import ndimage
 
 from palpate.images import (
     LabelImage,
@@ -76,7 +77,8 @@ class SimulatedPelvis:
 def simulate_pelvis(progress: Callable[[str], None]) -> SimulatedPelvis:
     """Make the truth and its two images; some minutes."""
     names = read_label_table(DATA / "labels.json")
-    scan = segment(_completed(read_label_image(DATA / "labels.nii.gz", names=names)), TISSUES)
+    labels = _completed(read_label_image(DATA / "labels.nii.gz", names=names))
+    scan = segment(labels, TISSUES)
     box = _field(scan)
     anatomy = anatomy_of(scan, box=box, smoothing_mm=SMOOTHING_MM)
     progress(f"meshing {np.round(box.lengths).astype(int).tolist()} mm at {TRUTH_EDGE_MM:g} mm")
@@ -89,7 +91,7 @@ def simulate_pelvis(progress: Callable[[str], None]) -> SimulatedPelvis:
     progress("turning both states into voxels")
     grid = _grid(box)
     still = np.zeros_like(displacement)
-    before, after = (_labelled(imaged(space, motion, grid)) for motion in (still, displacement))
+    before, after = (_labelled(imaged(space, motion, grid), scan, labels) for motion in (still, displacement))
     return SimulatedPelvis(space, displacement, before, after)
 
 
@@ -123,11 +125,20 @@ def _grid(box: Box) -> VoxelGrid:
     return VoxelGrid((int(shape[0]), int(shape[1]), int(shape[2])), affine)
 
 
-def _labelled(image: LabelImage) -> LabelImage:
-    """The image with the labels of the scan instead of the tissues' numbers; all bones have the first one's."""
+def _labelled(image: LabelImage, scan: Segmentation, labels: LabelImage) -> LabelImage:
+    """The image with the labels of the scan instead of the tissues' numbers, a bone's the nearest one's; the rest's 20.
+
+    labels: of the grid that was segmented as `scan`.
+    """
     table = np.array([0] + [tissue.labels[0] if tissue.labels else REST for tissue in TISSUES], dtype=np.int32)
-    names = {int(table[i + 1]): tissue.name for i, tissue in enumerate(TISSUES)}
-    return LabelImage(table[image.labels], image.grid, names)
+    found = table[image.labels]
+    bones = [tissue.name for tissue in TISSUES].index("bones")
+    nearest = ndimage.distance_transform_edt(scan.index != bones, return_distances=False, return_indices=True)
+    voxels = np.argwhere(image.labels == bones + 1)
+    there = np.rint(scan.grid.index(image.grid.world(voxels.astype(float)))).astype(int)
+    there = np.clip(there, 0, np.array(scan.index.shape) - 1)
+    found[tuple(voxels.T)] = labels.labels[tuple(nearest[(slice(None), *there.T)])]
+    return LabelImage(found, image.grid, labels.names)
 
 
 def main() -> None:

@@ -36,7 +36,14 @@ SAME_MINIMUM, SAME_SD = 0.02, 0.3  # of ln E, and of a posterior standard deviat
 LOWER = 0.5  # in units of log-likelihood: a minimum that is lower by less is as good
 REPORTED = StopRule()
 FIRST_GUESS = StopRule(
-    step_sd=0.5, model_error=np.inf, derivatives=False, solve_above=0.1, passes=1, iterations=1, refinements=0
+    step_sd=0.5,
+    model_error=np.inf,
+    derivatives=False,
+    solve_above=0.1,
+    passes=1,
+    iterations=1,
+    refinements=0,
+    far=np.inf,
 )
 EQUILIBRIUM = 1e-4  # of the forces, at the most, while the estimate moves
 

@@ -41,7 +41,6 @@ LEAST_SD = 0.03  # of ln E, see `_linearisation`
 HALVINGS = 3
 TRUSTED = 0.03  # error in energy of an approximation, below which the step on it needs no line search
 ROUGHNESS = 0.5  # of the objective, in units of log-likelihood: the noise of re-chosen closest points
-FAR = 5.0  # tolerances: an estimate that still moves by more has not converged
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +87,8 @@ class StopRule:
     that is more; model_error: relative error in energy of the displacement that the approximation may have where
     residuals are rough; derivatives: whether those that decide the moduli must be exact so near that they leave no more
     than a step; solve_above: error from which the full model is solved; passes: of weights and estimate in turn on one
-    approximation; iterations; refinements of the drivers' walls: the largest numbers of each.
+    approximation; iterations; refinements of the drivers' walls: the largest numbers of each; far: tolerances by which
+    an estimate may still move at its largest number of iterations, where more has not converged.
     """
 
     step_sd: float = 0.02
@@ -99,6 +99,7 @@ class StopRule:
     passes: int = 15
     iterations: int = 16
     refinements: int = 2
+    far: float = 5.0
 
     def tolerance(self, minimum: Minimum, n_parameters: int) -> NDArray[np.float64]:
         """By how much each log-modulus (n_parameters,) may still move."""
@@ -159,7 +160,7 @@ def run_outer_loop(
             if finer is None:
                 return now
             now, refinements = finer, refinements + 1
-    if max(now.convergence.reweighting, now.convergence.linearisation) > FAR and now.minimum.converged:
+    if max(now.convergence.reweighting, now.convergence.linearisation) > rule.far and now.minimum.converged:
         now = replace(now, minimum=replace(now.minimum, outcome=Outcome.STEPS))
     return now
 
