@@ -79,6 +79,13 @@ def test_too_few_steps_are_not_called_convergence(toys):
     assert not found.outcome.converged
 
 
+def test_steps_that_circle_in_the_noise_end_where_the_decrement_was_least(toys):
+    found = gauss_newton(toys.Circling(), np.zeros(3), bounds=WIDE, tolerance=1e-9)
+    assert found.outcome is Outcome.STALLED
+    assert found.evaluations < 10
+    assert found.evaluation.score[2] == 0.09
+
+
 def test_an_objective_that_no_step_reduces_is_stuck(toys, rng):
     wrong = toys.Quadratic(np.eye(5), np.zeros(5), pull=-1.0)
     found = gauss_newton(wrong, rng.standard_normal(5), bounds=WIDE)

@@ -19,6 +19,7 @@ LEAST_DAMPING = 1e-2  # of the diagonal: less is nearly the step that was refuse
 SEARCHES = 8  # trials of a step
 WORTH = 1e-2  # units of log-likelihood that a damped step must promise to be tried
 COEFFICIENTS = 0.1  # decrement of the drivers' coefficients at held moduli, which other unknowns are going to change
+CIRCLING = 4  # steps without a smaller decrement, after which those within the noise go round in circles
 STALLED = 1e-2  # decrement under which a refused step is the noise of re-chosen closest points, whatever it moves
 
 
@@ -136,10 +137,12 @@ def gauss_newton(
     is taken when it reduces the objective (Nocedal & Wright 2006, Algorithm 4.1) or lowers by a tenth the decrement
     -s.d / 2, the reduction that the quadratic model still promises in units of log-likelihood. It ends when that is
     under `tolerance` and the step to the model's minimum moves each log-modulus by less than `within` (one number, or
-    (n_parameters,)). `hold_theta` moves the drivers' coefficients only.
+    (n_parameters,)), or where steps within the noise of closest points lower the decrement no more: then where that was
+    least. `hold_theta` moves the drivers' coefficients only.
     """
     unknowns, region, history = start.copy(), _Region(), list[Iterate]()
     now, evaluations, outcome = objective(unknowns), 1, Outcome.STEPS
+    nearest, least, since = (unknowns, now), np.inf, 0
     for _ in range(max_steps):
         if not np.isfinite(now.value):
             outcome = Outcome.NOT_FINITE
@@ -150,6 +153,12 @@ def gauss_newton(
         whole = _step(now, free, objective.n_parameters, WHOLE)[: objective.n_parameters]
         if decrement < tolerance and np.all(np.abs(whole) < within):
             outcome = Outcome.CONVERGED
+            break
+        since += 1
+        if decrement < 0.9 * least:
+            nearest, least, since = (unknowns, now), decrement, 0
+        if since >= CIRCLING and _within_noise(now, free, whole, decrement):
+            (unknowns, now), outcome = nearest, Outcome.STALLED
             break
         found, trials = _search(objective, unknowns, now, free=free, bounds=bounds, region=region)
         evaluations += trials
