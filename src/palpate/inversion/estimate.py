@@ -157,11 +157,11 @@ def _with_reduced_bases(
     problem: InverseProblem, settings: InversionSettings, middle: NDArray[np.float64]
 ) -> tuple[tuple[LaterState, ...], NDArray[np.float64]]:
     """The states with reduced bases made at unknowns (n_unknowns,), where their drivers' motion is fitted first."""
-    parameters, theta = problem.parameters, middle[: problem.parameters.n_parameters]
+    parameters = problem.parameters
     bases = [reduced_basis(state.model, parameters.moduli(middle)) for state in problem.states]
     objective = with_first_noise(Objective(problem.states, parameters).under(bases))
     fitted = fit_coefficients(objective.rematched(middle), middle, bounds=settings.bounds)
-    by_theta = parameters.derivatives(theta)
+    by_theta = parameters.derivatives(middle)
     triples = zip(problem.states, bases, parameters.coefficients(fitted.unknowns), strict=True)
     states = tuple(s.with_approximation(b.with_modulus_series(q, by_theta)) for s, b, q in triples)
     return states, fitted.unknowns

@@ -158,7 +158,7 @@ def conclude(
 ) -> Estimation:
     """State the result of an inversion; `truth`: true moduli (kPa) by tissue where they are known.
 
-    The covariance is the sandwich under the residuals' law plus the scatter over grid positions. Raises
+    The covariance is the sandwich under the residuals' noise model plus the scatter over grid positions. Raises
     `ConfigurationError` where a Poisson's ratio was sought.
     """
     objective, minimum = inversion.objective, inversion.minimum
@@ -357,7 +357,7 @@ def _folds(observed: Observed) -> tuple[Remark, ...]:
                     "fold-over",
                     f"after image {number}: {folded} of {len(smallest)} elements are turned inside out, the worst near"
                     f" {np.round(worst).astype(int).tolist()} mm (RAS): the motion is too large there for the law or"
-                    " the mesh",
+                    " the mesh. Look at the labels there, or set a smaller [mesh] edge_length_mm",
                 )
             )
     return tuple(remarks)
@@ -388,7 +388,8 @@ def _remarks(inversion: Inversion, covariance: NDArray[np.float64]) -> tuple[Rem
             Remark(
                 "no-equilibrium",
                 f"{len(lost)} of {len(inversion.candidates)} minima of the linear law have no equilibrium under the"
-                " case's law and are not compared with the others",
+                " case's law and are not compared with the others; other [estimate] start_ratios show"
+                " whether they are minima at all",
             )
         )
     if len(inversion.candidates) - len(lost) > 1:
@@ -404,5 +405,8 @@ def _remarks(inversion: Inversion, covariance: NDArray[np.float64]) -> tuple[Rem
         for j in range(i):
             if abs(covariance[i, j]) > STRONG_CORRELATION * sd[i] * sd[j]:
                 names = f"'{mapping.tissues[j]}' and '{mapping.tissues[i]}'"
-                remarks.append(Remark("correlated", f"the moduli of {names} cannot be told apart by these images"))
+                text = (
+                    f"the moduli of {names} cannot be told apart by these images; add one that moves them otherwise"
+                )
+                remarks.append(Remark("correlated", text))
     return tuple(remarks)
