@@ -405,8 +405,6 @@ def _remarks(inversion: Inversion, covariance: NDArray[np.float64]) -> tuple[Rem
         for j in range(i):
             if abs(covariance[i, j]) > STRONG_CORRELATION * sd[i] * sd[j]:
                 names = f"'{mapping.tissues[j]}' and '{mapping.tissues[i]}'"
-                text = (
-                    f"the moduli of {names} cannot be told apart by these images; add one that moves them otherwise"
-                )
+                text = f"the moduli of {names} cannot be told apart by these images; add one that moves them otherwise"
                 remarks.append(Remark("correlated", text))
     return tuple(remarks)
