@@ -26,6 +26,7 @@ from palpate.inversion.reduced_basis import reduced_basis
 from palpate.inversion.reweighting import with_first_noise
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.forward import SolveCounts
+from palpate.parallel import blas_on_one_thread
 
 __all__ = ["Candidate", "Inversion", "StartRun", "continue_at_finite_strain", "invert"]
 
@@ -105,6 +106,7 @@ class Inversion:
         return self.candidates[self.best].iterate.convergence
 
 
+@blas_on_one_thread()
 def invert(
     problem: InverseProblem, settings: InversionSettings, *, progress: Progress, rule: StopRule | None = None
 ) -> Inversion:

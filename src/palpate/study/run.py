@@ -11,6 +11,7 @@ import numpy as np
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role
 from palpate.inversion import Bounds, FittedState, Inversion, InversionSettings, ParameterMap, invert
+from palpate.parallel import blas_on_one_thread
 from palpate.study.body import Body, ImagedStates, joint_problem, make_body
 from palpate.study.case import Case
 from palpate.study.estimation import Estimation, Observed, Remark, conclude
@@ -59,6 +60,7 @@ def estimate(case: Case, *, progress: Progress = silent, truth: Mapping[str, flo
     return replace(result, provenance=replace(result.provenance, inputs=inputs))
 
 
+@blas_on_one_thread()
 def estimate_states(
     states: ImagedStates,
     case: Case,

@@ -17,7 +17,7 @@ from palpate.mechanics.solvers.multifrontal.numeric import factorised
 from palpate.mechanics.solvers.multifrontal.plan import make_plan
 from palpate.mechanics.solvers.multifrontal.refinement import refined_order
 from palpate.mechanics.solvers.multifrontal.substitution import substituted
-from palpate.mechanics.solvers.multifrontal.threads import blas_on_one_thread
+from palpate.parallel import blas_on_one_thread
 
 NOTHING = Hints()
 
@@ -229,27 +229,24 @@ def test_no_changed_number_of_blas_threads_is_left_behind(body):
         assert blas_threads() == before
 
 
-def test_overlapping_calls_wait_for_each_other_and_restore_the_number_of_blas_threads():
-    with threadpoolctl.threadpool_limits(2, user_api="blas"):
-        before = blas_threads()
-    seen, inside, most = [], [], []
+def test_calls_side_by_side_and_nested_share_the_limit_and_restore_the_number_of_blas_threads():
+    before, together, seen = blas_threads(), threading.Barrier(4), list[int]()
 
     def work():
         with blas_on_one_thread():
-            inside.append(1)
-            most.append(len(inside))
-            seen.extend(blas_threads())
-            inside.pop()
+            together.wait(timeout=60.0)  # all of them inside at once
+            with blas_on_one_thread():
+                seen.extend(blas_threads())
+            together.wait(timeout=60.0)
 
-    workers = [threading.Thread(target=work) for _ in range(8)]
+    workers = [threading.Thread(target=work) for _ in range(4)]
     for worker in workers:
         worker.start()
     for worker in workers:
         worker.join()
+    assert len(seen) >= 4
     assert set(seen) == {1}
-    assert max(most) == 1
-    with threadpoolctl.threadpool_limits(2, user_api="blas"):
-        assert blas_threads() == before
+    assert blas_threads() == before
 
 
 def eliminated(matrix):

@@ -14,7 +14,7 @@ from palpate.errors import SolverError
 from palpate.mechanics.solvers.multifrontal import dense
 from palpate.mechanics.solvers.multifrontal.dense import Matrix
 from palpate.mechanics.solvers.multifrontal.plan import Front, Plan, blocks_of, panel_of
-from palpate.mechanics.solvers.multifrontal.threads import pool_of
+from palpate.parallel import pool_of
 
 __all__ = ["factorised"]
 

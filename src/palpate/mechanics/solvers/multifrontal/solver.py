@@ -25,9 +25,8 @@ from palpate.mechanics.solvers.multifrontal.expectation import PRODUCT, expected
 from palpate.mechanics.solvers.multifrontal.numeric import factorised
 from palpate.mechanics.solvers.multifrontal.plan import Plan, make_plan
 from palpate.mechanics.solvers.multifrontal.substitution import substituted
-from palpate.mechanics.solvers.multifrontal.threads import blas_on_one_thread
 from palpate.memory import available_memory
-from palpate.parallel import processors
+from palpate.parallel import blas_on_one_thread, processors
 
 __all__ = ["MIXED", "SOLVER", "plan_of"]
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from palpate.mechanics.solvers.multifrontal import dense
 from palpate.mechanics.solvers.multifrontal.dense import Matrix
 from palpate.mechanics.solvers.multifrontal.plan import Plan, panel_of
-from palpate.mechanics.solvers.multifrontal.threads import pool_of
+from palpate.parallel import pool_of
 
 __all__ = ["substituted"]
 
