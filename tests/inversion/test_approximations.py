@@ -137,13 +137,13 @@ def test_where_it_is_updated_it_is_the_full_model_and_states_no_error(body, made
     updated = made.update(there)
     assert off(body, made, there) > 1e-4  # or there would be nothing to show
     assert off(body, updated, there) < 1e-5
-    assert updated.error(there) < 1e-5
+    assert updated.error(there).relative < 1e-5
 
 
 def test_elsewhere_its_error_is_stated(kind, body, made, there):
     over, under = FACTORS[kind[0]]
     true = off(body, made, there)
-    assert true / under * (1.0 - 1e-6) < made.error(there) < over * true
+    assert true / under * (1.0 - 1e-6) < made.error(there).relative < over * true
 
 
 def test_along_the_directions_wanted_its_derivatives_are_those_of_the_full_model(body, made, deciding, monkeypatch):

@@ -50,7 +50,7 @@ def test_a_drivers_residuals_do_not_tell_the_noise(minimum):
 def test_reweighting_gives_a_new_objective_and_leaves_the_old_one(minimum, twin):
     objective, found = minimum
     before = objective.value(twin.unknowns)
-    again = reweighted(objective, found)
+    again = reweighted(objective, found).rematched(found.unknowns)
     assert objective.value(twin.unknowns) == before
     assert again.value(twin.unknowns) != before
     assert again.noise["surface distance"].sd == fitted_noise(found.evaluation)["surface distance"].sd

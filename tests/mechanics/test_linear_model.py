@@ -114,9 +114,9 @@ def test_the_error_bound_is_the_error_at_its_own_moduli_and_never_below_it_elsew
     error = wrong - exact
     energy = [v @ model.forces(MODULI, v[:, None])[:, 0] for v in (error, wrong)]
     truth = np.sqrt(energy[0] / energy[1])
-    assert model.system(MODULI).error_bound(MODULI, wrong[:, None])[0] == pytest.approx(truth, rel=1e-9)
+    assert model.system(MODULI).error_bound(MODULI, wrong)[0] == pytest.approx(truth, rel=1e-9)
     for frozen in ([1.0, 1.0, 1.0], [4.0, 6.0, 1.0]):
-        bound = model.system(np.array(frozen)).error_bound(MODULI, wrong[:, None])[0]
+        bound = model.system(np.array(frozen)).error_bound(MODULI, wrong)[0]
         assert truth <= bound <= 30.0 * truth
 
 

@@ -82,7 +82,7 @@ def test_the_frozen_factor_certifies_the_reduced_answer(model, small):
         answer, truth = small.solve(moduli, q).values, model.solve(moduli, q).values
         error = answer - truth
         energies = [v @ model.forces(moduli, v[:, None])[:, 0] for v in (error, answer)]
-        assert np.sqrt(energies[0] / energies[1]) <= frozen.error_bound(moduli, answer[:, None])[0] < 0.1
+        assert np.sqrt(energies[0] / energies[1]) <= frozen.error_bound(moduli, answer)[0] < 0.1
 
 
 def test_selected_outputs_are_the_rows_of_all(small, rng):

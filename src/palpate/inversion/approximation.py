@@ -16,7 +16,7 @@ from palpate.mechanics.linear_model import LinearEquilibrium, LinearModel, with_
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.constraint import Constraint
 
-__all__ = ["Approximation", "ExactApproximation", "LocalModel", "Place", "exact_approximation"]
+__all__ = ["Approximation", "ExactApproximation", "LocalModel", "ModelError", "Place", "exact_approximation"]
 
 
 class LocalModel(ForwardModel, Protocol):
@@ -49,6 +49,18 @@ class Place:
             and np.array_equal(self.moduli, other.moduli)
             and np.array_equal(self.coefficients, other.coefficients)
         )
+
+
+@dataclass(frozen=True, slots=True)
+class ModelError:
+    """What an approximation misses at a place, by one right-hand side of the full model.
+
+    relative: of the displacement, in energy, a bound or an estimate; missing (n_dof,) mm: a first estimate of the exact
+    displacement less the approximate one, for what it does to what is sought.
+    """
+
+    relative: float
+    missing: NDArray[np.float64]
 
 
 class Approximation(Protocol):
@@ -96,8 +108,8 @@ class Approximation(Protocol):
         """What one call of `error` costs; an approximation cannot add it to its own `counts`."""
         ...
 
-    def error(self, at: Place) -> float:
-        """Relative error, in energy, of the displacement at a place: a bound or an estimate."""
+    def error(self, at: Place) -> ModelError:
+        """What it misses at a place."""
         ...
 
     def with_constraint(self, constraint: Constraint) -> Self:
@@ -150,14 +162,14 @@ class ExactApproximation:
         """One right-hand side with the factorisation that is there."""
         return SolveCounts(forward=1)
 
-    def error(self, at: Place) -> float:
+    def error(self, at: Place) -> ModelError:
         """A bound under the linear law (see `LinearSystem.error_bound`), else an estimate (see `error_estimate`)."""
-        if at.same_as(self.place):
-            return 0.0
         displacement = self.model.solve(at.moduli, at.coefficients).values
-        if isinstance(self.equilibrium, FiniteStrainEquilibrium):
-            return self.equilibrium.error_estimate(at.moduli, displacement)
-        return float(self.equilibrium.system.error_bound(at.moduli, displacement[:, None])[0])
+        if at.same_as(self.place):
+            return ModelError(0.0, np.zeros_like(displacement))
+        there = self.equilibrium
+        of = there.error_estimate if isinstance(there, FiniteStrainEquilibrium) else there.system.error_bound
+        return ModelError(*of(at.moduli, displacement))
 
     def with_constraint(self, constraint: Constraint) -> ExactApproximation:
         """The model solved again under another offset."""

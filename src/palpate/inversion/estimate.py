@@ -46,7 +46,7 @@ FIRST_GUESS = StopRule(
     refinements=0,
     far=np.inf,
 )
-EQUILIBRIUM = 1e-4  # of the forces, at the most, while the estimate moves
+EQUILIBRIUM = 1e-5  # of the forces, while the estimate moves
 
 Progress = Callable[[str], None]
 
@@ -235,12 +235,11 @@ def _another(
 def _at_finite_strain(linear: OuterIterate, settings: InversionSettings, progress: Progress) -> OuterIterate:
     """The outer loop on expansions around the equilibria at a linear minimum, ended at exact equilibria."""
     progress("finite strain: the equilibrium at the linear estimate")
-    tolerance = float(np.clip(0.1 * REPORTED.error_limit(linear.objective), ACCURACY, EQUILIBRIUM))
     unknowns, first = linear.minimum.unknowns, list[Expansion]()
     before = linear.objective
     for state, basis, place in zip(before.states, before.approximations, before.places(unknowns), strict=True):
         assert state.finite_strain is not None
-        first.append(expansion_near(state.finite_strain, basis, place, tolerance=tolerance))
+        first.append(expansion_near(state.finite_strain, basis, place, tolerance=EQUILIBRIUM))
     objective = before.under(first).rematched(unknowns)
     start = replace(linear.minimum, evaluation=objective(unknowns))
     end = run_outer_loop(objective, start, settings, REPORTED, progress=progress, title="finite strain")

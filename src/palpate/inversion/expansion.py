@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
-from palpate.inversion.approximation import Approximation, Place
+from palpate.inversion.approximation import Approximation, ModelError, Place
 from palpate.inversion.objective import determined
 from palpate.mechanics.equilibrium import from_start
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
@@ -88,12 +88,12 @@ class Expansion:
         """One right-hand side with the factorisation that is there."""
         return SolveCounts(forward=1)
 
-    def error(self, at: Place) -> float:
+    def error(self, at: Place) -> ModelError:
         """An estimate (see `FiniteStrainEquilibrium.error_estimate`); nothing at its own equilibrium."""
-        if at.same_as(self.place):
-            return 0.0
         displacement = self.model.solve(at.moduli, at.coefficients).values
-        return self.equilibrium.error_estimate(at.moduli, displacement)
+        if at.same_as(self.place):
+            return ModelError(0.0, np.zeros_like(displacement))
+        return ModelError(*self.equilibrium.error_estimate(at.moduli, displacement))
 
     def with_constraint(self, constraint: Constraint) -> Expansion:
         """The expansion around the equilibrium that another offset of what is prescribed leads to; `NotConverged`."""

@@ -18,7 +18,7 @@ from palpate.observation.contract import Observation, Residuals
 from palpate.observation.noise_model import NoiseModel
 from palpate.parallel import mapped
 
-__all__ = ["Evaluation", "Linearisation", "Objective", "deciding_directions", "determined"]
+__all__ = ["Evaluation", "Linearisation", "LinearisedObjective", "Objective", "deciding_directions", "determined"]
 
 
 @contextmanager
@@ -152,10 +152,15 @@ class Objective:
 
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
         """J with gradient, Gauss-Newton matrix and residuals at `unknowns` (n_unknowns,)."""
+        return self.assembled(
+            unknowns, [line for s in range(len(self.states)) for line in self._linearised(s, unknowns)]
+        )
+
+    def assembled(self, unknowns: NDArray[np.float64], lines: Sequence[Linearisation]) -> Evaluation:
+        """The evaluation at `unknowns` (n_unknowns,) from all observations' residuals there, with their derivatives."""
         value, pull = self._prior(unknowns)
         prior = self.parameters.prior_matrix
         gradient, score, matrix = pull.copy(), pull.copy(), prior.copy()
-        lines = [line for s in range(len(self.states)) for line in self._linearised(s, unknowns)]
         misfit = 0.0
         for line in lines:
             root = np.sqrt(line.precision * line.weights)
@@ -220,6 +225,40 @@ class Objective:
             return Linearisation(observation, s, residuals, columns, jacobian, weights, gradient)
 
         return mapped(line, zip(state.slices, state.observations, strict=True))
+
+
+@dataclass(frozen=True, slots=True)
+class LinearisedObjective:
+    """An objective with the residuals linear around unknowns (n_unknowns,) where it was evaluated.
+
+    No displacement and no closest point is sought: a value costs a hundredth. `objective` says how much each residual
+    counts; its observations may be reweighted ones of those that were evaluated.
+    """
+
+    objective: Objective
+    unknowns: NDArray[np.float64]
+    evaluation: Evaluation
+
+    @property
+    def n_parameters(self) -> int:
+        """Number of log-moduli among the unknowns."""
+        return self.objective.n_parameters
+
+    def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
+        """J at `unknowns` (n_unknowns,) with the residuals r + J (x - x_0) by the smooth Jacobians."""
+        step = unknowns - self.unknowns
+
+        def line(of: tuple[Observation, Linearisation]) -> Linearisation:
+            """One observation's residuals with their derivative."""
+            observation, known = of
+            values = known.residuals.values + known.jacobian @ step[known.columns]
+            residuals = replace(known.residuals, values=values)
+            weights = residuals.weights * observation.weighting.loss.weight(values)
+            gradient = np.asarray(known.jacobian.T @ (observation.weighting.precision * weights * values))
+            return replace(known, observation=observation, residuals=residuals, weights=weights, gradient=gradient)
+
+        lines = mapped(line, zip(self.objective.observations, self.evaluation.lines, strict=True))
+        return self.objective.assembled(unknowns, lines)
 
 
 def deciding_directions(evaluation: Evaluation, n_parameters: int) -> NDArray[np.float64]:

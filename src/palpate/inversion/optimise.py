@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,17 @@ from scipy import optimize
 
 from palpate.inversion.objective import Evaluation, Objective, determined
 
-__all__ = ["Bounds", "Iterate", "Minimum", "Outcome", "fit_coefficients", "gauss_newton", "lbfgs", "posterior_sd"]
+__all__ = [
+    "Bounds",
+    "Iterate",
+    "Minimum",
+    "Outcome",
+    "fit_coefficients",
+    "gauss_newton",
+    "lbfgs",
+    "newton_decrement",
+    "posterior_sd",
+]
 
 FIRST_RADIUS = 1.0  # of the log-moduli, per step: a factor e
 MAX_RADIUS = 2.0
@@ -21,6 +32,19 @@ WORTH = 1e-2  # units of log-likelihood that a damped step must promise to be tr
 COEFFICIENTS = 0.1  # decrement of the drivers' coefficients at held moduli, which other unknowns are going to change
 CIRCLING = 4  # steps without a smaller decrement, after which those within the noise go round in circles
 STALLED = 1e-2  # decrement under which a refused step is the noise of re-chosen closest points, whatever it moves
+
+
+class LeastSquares(Protocol):
+    """What Gauss-Newton minimises: the objective, or one with linear residuals."""
+
+    @property
+    def n_parameters(self) -> int:
+        """Number of log-moduli among the unknowns."""
+        ...
+
+    def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
+        """Value, score and Gauss-Newton matrix at `unknowns` (n_unknowns,)."""
+        ...
 
 
 class Outcome(StrEnum):
@@ -122,7 +146,7 @@ def fit_coefficients(
 
 
 def gauss_newton(
-    objective: Objective,
+    objective: LeastSquares,
     start: NDArray[np.float64],
     *,
     bounds: Bounds,
@@ -148,7 +172,7 @@ def gauss_newton(
             outcome = Outcome.NOT_FINITE
             break
         free = _free(objective, unknowns, now, bounds, hold_theta)
-        decrement = _decrement(now, free)
+        decrement = newton_decrement(now, free)
         history.append(Iterate(unknowns[: objective.n_parameters], now.value, now.misfit_mm2, decrement))
         whole = _step(now, free, objective.n_parameters, WHOLE)[: objective.n_parameters]
         if decrement < tolerance and np.all(np.abs(whole) < within):
@@ -171,7 +195,7 @@ def gauss_newton(
 
 
 def _search(
-    objective: Objective,
+    objective: LeastSquares,
     unknowns: NDArray[np.float64],
     now: Evaluation,
     *,
@@ -185,7 +209,7 @@ def _search(
     closest points.
     """
     n = objective.n_parameters
-    before = _decrement(now, free)
+    before = newton_decrement(now, free)
     for trials in range(SEARCHES):
         trial = unknowns + _step(now, free, n, region)
         trial[:n] = np.clip(trial[:n], bounds.lower, bounds.upper)
@@ -195,7 +219,7 @@ def _search(
             return None, trials
         there = objective(trial)
         gain = now.value - there.value
-        progress = gain > 1e-4 * promised or _decrement(there, free) < 0.9 * before
+        progress = gain > 1e-4 * promised or newton_decrement(there, free) < 0.9 * before
         if promised > 0.0 and progress:  # what a bound leaves of a step may lead uphill
             return (trial, there, region.larger() if gain > 0.25 * promised else region), trials + 1
         region = region.smaller()
@@ -203,7 +227,7 @@ def _search(
 
 
 def _free(
-    objective: Objective, unknowns: NDArray[np.float64], now: Evaluation, bounds: Bounds, hold_theta: bool
+    objective: LeastSquares, unknowns: NDArray[np.float64], now: Evaluation, bounds: Bounds, hold_theta: bool
 ) -> NDArray[np.bool_]:
     """Unknowns that may move: not a log-modulus at a bound that pulls outwards, nor any when theta is held."""
     n = objective.n_parameters
@@ -212,8 +236,9 @@ def _free(
     return np.concatenate([~held, np.ones(len(unknowns) - n, dtype=bool)])
 
 
-def _decrement(now: Evaluation, free: NDArray[np.bool_]) -> float:
-    matrix, score = now.matrix[np.ix_(free, free)], now.score[free]
+def newton_decrement(now: Evaluation, free: NDArray[np.bool_] | slice = slice(None)) -> float:
+    """s^T H^-1 s / 2 of score s and Gauss-Newton matrix H, by the `free` (n,) unknowns: what a step still promises."""
+    matrix, score = now.matrix[free][:, free], now.score[free]
     return float(0.5 * score @ _solve(matrix, score))
 
 

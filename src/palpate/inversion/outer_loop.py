@@ -15,8 +15,17 @@ from numpy.typing import NDArray
 from palpate.errors import NotConverged
 from palpate.inversion.approximation import Approximation
 from palpate.inversion.driver import refined_walls
-from palpate.inversion.objective import Evaluation, Objective
-from palpate.inversion.optimise import Bounds, Minimum, Outcome, gauss_newton, lbfgs, posterior_sd
+from palpate.inversion.objective import Evaluation, LinearisedObjective, Objective
+from palpate.inversion.optimise import (
+    Bounds,
+    Iterate,
+    Minimum,
+    Outcome,
+    gauss_newton,
+    lbfgs,
+    newton_decrement,
+    posterior_sd,
+)
 from palpate.inversion.reweighting import reweighted
 from palpate.mechanics.forward import SolveCounts
 
@@ -35,8 +44,10 @@ FORCING = 0.1  # of the last outer iteration's step: to which the next one's wei
 INNER = 20.0  # a minimum is found to so small a part of what a reweighting may still change
 POLISH = 1e-5  # decrement of a minimum by a method that does not tell how far the log-moduli are from it
 WIDTH = 0.05  # of a posterior standard deviation, by which a reweighting may still change it
+AGREED = 0.3  # of that tolerance, to which weights and estimate agree on linearised residuals
+LINEARISED = 1e-4  # decrement of a minimum on them
+WITHIN_NOISE = 0.1  # of the posterior's width: a step that finds no smaller value
 NEAR = 0.5  # posterior standard deviations: a step that is shorter ends where derivatives are worth making exact
-ROUGH_SURFACE = 1.0 / 3.0  # mm, of a residual: below that a model must be as much more exact
 LEAST_SD = 0.03  # of ln E, see `_linearisation`
 HALVINGS = 3
 TRUSTED = 0.03  # error in energy of an approximation, below which the step on it needs no line search
@@ -93,10 +104,10 @@ class StopRule:
 
     step_sd: float = 0.02
     floor: float = 3e-4
-    model_error: float = 2e-4
+    model_error: float = 0.5
     derivatives: bool = True
     solve_above: float = 0.0
-    passes: int = 15
+    passes: int = 6
     iterations: int = 16
     refinements: int = 2
     far: float = 5.0
@@ -104,10 +115,6 @@ class StopRule:
     def tolerance(self, minimum: Minimum, n_parameters: int) -> NDArray[np.float64]:
         """By how much each log-modulus (n_parameters,) may still move."""
         return np.maximum(self.step_sd * posterior_sd(minimum, n_parameters), self.floor)
-
-    def error_limit(self, objective: Objective) -> float:
-        """Relative error in energy that the approximation may have: the less, the finer the residuals."""
-        return self.model_error * min(1.0, *(noise.sd / ROUGH_SURFACE for noise in objective.noise.values()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +153,9 @@ def run_outer_loop(
     `progress`. The minimum's history is that of the loop alone. Raises `NotConverged` when the full model has no
     equilibrium where every part of a step leads.
     """
-    begun = replace(start, history=(), evaluations=0)
+    theta, at = start.unknowns[: objective.n_parameters], start.evaluation
+    first = Iterate(theta, at.value, at.misfit_mm2, newton_decrement(at))
+    begun = replace(start, history=(first,), evaluations=0)
     now, refinements = updated(OuterIterate(objective, begun), rule), 0
     for number in range(1, rule.iterations + 1):
         line = f"{title}, outer iteration {number}"
@@ -168,7 +177,7 @@ def run_outer_loop(
 def updated(now: OuterIterate, rule: StopRule) -> OuterIterate:
     """The iterate on approximations that are exact at its unknowns, with derivatives, where their error asks for it."""
     if rule.solve_above > 0.0:
-        error, cost = _model_error(now.objective, now.minimum.unknowns)
+        error, _, cost = _model_error(now.objective, now.minimum)
         now = replace(now, checks=now.checks + cost)
         if error < rule.solve_above:
             return now
@@ -203,8 +212,9 @@ def _iteration(
     moved = np.abs(found.unknowns - now.minimum.unknowns)[:n]
     step = float(np.max(moved / tolerance, initial=0.0))
     open_ = np.max(_linearisation(objective, found) / tolerance, initial=0.0) if rule.derivatives else step
-    (error, cost), limit = _model_error(objective, found.unknowns), rule.error_limit(objective)
-    convergence = Convergence(reweighting, float(open_), error / limit if np.isfinite(limit) else 0.0)
+    error, off, cost = _model_error(objective, found)
+    missing = float(np.max(off / (rule.model_error * tolerance), initial=0.0))
+    convergence = Convergence(reweighting, float(open_), missing)
     there = OuterIterate(objective, found, convergence, step, checks=now.checks + cost)
     if convergence.converged or error < rule.solve_above:
         return there
@@ -219,32 +229,79 @@ def _reweighted_minimum(
 ) -> tuple[Objective, Minimum, float]:
     """Iteratively reweighted minimisation on the present approximations, and what its last pass changed.
 
-    First the minimum under the present weights: what an updated model misses elsewhere would pass for noise. Weights
-    and estimate agree to the tolerance, standard deviations to `WIDTH`, or to a tenth of the last outer iteration's
-    step where that is more. The log-moduli go no further than the approximations reach.
+    Each pass finds weights and estimate that agree on the linearised residuals, and goes there on the objective itself.
+    It ends where that moves the log-moduli by less than the tolerance and their standard deviations by less than
+    `WIDTH`, or by a tenth of the last outer iteration's step where that is more. The log-moduli go no further than the
+    approximations reach.
     """
-    n, objective = now.objective.n_parameters, now.objective
+    n, objective, minimum = now.objective.n_parameters, now.objective, now.minimum
     reach = min(approximation.reach for approximation in objective.approximations)
-    theta, bounds = now.minimum.unknowns[:n], settings.bounds
+    theta, bounds = minimum.unknowns[:n], settings.bounds
     near = Bounds(np.maximum(bounds.lower, theta - reach), np.minimum(bounds.upper, theta + reach))
     forcing, change = max(1.0, FORCING * now.step), np.inf
-
-    def found_from(objective: Objective, start: Minimum) -> Minimum:
-        """The minimum under an objective from another one."""
-        within = forcing * rule.tolerance(start, n) / INNER
-        return minimised(objective, start.unknowns, replace(settings, bounds=near), within=within).after(start)
-
-    minimum = found_from(objective, now.minimum)
     for number in range(1, rule.passes + 1):
-        objective = reweighted(objective, minimum)
-        before, minimum = minimum, found_from(objective, minimum)
-        moved = np.abs(minimum.unknowns - before.unknowns)[:n] / rule.tolerance(minimum, n)
-        widened = np.abs(np.log(posterior_sd(minimum, n) / posterior_sd(before, n))) / WIDTH
-        change = float(np.max([moved, np.where(rule.tolerance(minimum, n) > rule.floor, widened, 0.0)], initial=0.0))
-        if change < forcing:
+        before, (weighted, aim, left) = minimum, _agreed(objective, minimum, near, rule, forcing)
+        objective, minimum = _advanced(weighted, minimum, aim.unknowns, replace(settings, bounds=near))
+        change = max(left, _change(before, minimum, rule, n))
+        if change < forcing or not minimum.converged:
             break
         progress(f"{line}, reweighting {number}: {objective.parameters.in_words(minimum.unknowns)}")
     return objective, minimum, change
+
+
+def _change(before: Minimum, minimum: Minimum, rule: StopRule, n_parameters: int) -> float:
+    """How far a reweighting moved the log-moduli, or widened what is known of them, over its tolerance."""
+    tolerance = rule.tolerance(minimum, n_parameters)
+    moved = np.abs(minimum.unknowns - before.unknowns)[:n_parameters] / tolerance
+    widened = np.abs(np.log(posterior_sd(minimum, n_parameters) / posterior_sd(before, n_parameters))) / WIDTH
+    return float(np.max([moved, np.where(tolerance > rule.floor, widened, 0.0)], initial=0.0))
+
+
+def _agreed(
+    objective: Objective, minimum: Minimum, bounds: Bounds, rule: StopRule, forcing: float
+) -> tuple[Objective, Minimum, float]:
+    """Weights and an estimate that agree with each other on the residuals linear around `minimum`; their last change.
+
+    First the estimate under the present weights: what an updated model misses elsewhere would pass for noise.
+    """
+    n = objective.n_parameters
+    linearised = LinearisedObjective(objective, minimum.unknowns, minimum.evaluation)
+    within = forcing * rule.tolerance(minimum, n) / INNER
+    found = gauss_newton(linearised, minimum.unknowns, bounds=bounds, tolerance=LINEARISED, within=within)
+    for _ in range(rule.passes):
+        linearised = replace(linearised, objective=reweighted(linearised.objective, found))
+        before = found
+        found = gauss_newton(linearised, before.unknowns, bounds=bounds, tolerance=LINEARISED, within=within)
+        change = _change(before, found, rule, n)
+        if change < AGREED * forcing:
+            break
+    return linearised.objective, found, change
+
+
+def _advanced(
+    objective: Objective, minimum: Minimum, aim: NDArray[np.float64], settings: InversionSettings
+) -> tuple[Objective, Minimum]:
+    """The objective matched, and evaluated, at the first of step, step / 2, ... towards `aim` that lowers it.
+
+    Where none does the estimate ends there if the step is within the noise of closest points, else it is `STUCK`.
+    """
+    n, before, step = objective.n_parameters, minimum.unknowns, aim - minimum.unknowns
+    here = LinearisedObjective(objective, before, minimum.evaluation)(before)
+    for halving in range(HALVINGS + 1):
+        unknowns = before + 0.5**halving * step
+        matched = objective.rematched(unknowns)
+        there = matched(unknowns)
+        if _lowers(here, there, unknowns - before):
+            outcome = Outcome.CONVERGED
+            break
+    else:
+        width = np.sqrt(np.diag(there.covariance_columns(n)))
+        outcome = Outcome.STALLED if np.all(np.abs(step[:n]) < WITHIN_NOISE * width) else Outcome.STUCK
+    arrived = Iterate(unknowns[:n], there.value, there.misfit_mm2, newton_decrement(there))
+    found = Minimum(unknowns, there, outcome, (arrived,), halving + 1).after(minimum)
+    if settings.method == "lbfgs":
+        return matched, minimised(matched, unknowns, settings, within=0.0).after(found)
+    return matched, found
 
 
 def _line_search(now: OuterIterate, there: OuterIterate, *, near: bool) -> OuterIterate:
@@ -325,8 +382,19 @@ def _solved(
     return [approximation.update(at) for approximation, at in zip(objective.approximations, places, strict=True)]
 
 
-def _model_error(objective: Objective, unknowns: NDArray[np.float64]) -> tuple[float, SolveCounts]:
-    """The largest error in energy of the approximations at unknowns (n_unknowns,), and what it cost to know."""
-    pairs = list(zip(objective.approximations, objective.places(unknowns), strict=True))
+def _model_error(objective: Objective, minimum: Minimum) -> tuple[float, NDArray[np.float64], SolveCounts]:
+    """What the approximations miss at a minimum: the largest error in energy, and what it cost to know.
+
+    Between them by how much it sets the log-moduli off (n_parameters,): |H^-1 J^T W S du|, with the displacement du
+    that is missing, the residuals' smooth derivatives S by it and the Gauss-Newton matrix H = J^T W J + P.
+    """
+    pairs = list(zip(objective.approximations, objective.places(minimum.unknowns), strict=True))
     cost = sum((approximation.error_counts for approximation, _ in pairs), SolveCounts())
-    return max(approximation.error(at) for approximation, at in pairs), cost
+    errors = [approximation.error(at) for approximation, at in pairs]
+    pull = np.zeros(len(minimum.unknowns))
+    for line in minimum.evaluation.lines:
+        du = errors[line.state].missing[line.observation.dofs]
+        missing = np.asarray(line.residuals.smooth_jacobian @ du)
+        pull[line.columns] += line.jacobian.T @ (line.precision * line.weights * missing)
+    off = np.abs(minimum.evaluation.covariance_columns(objective.n_parameters).T @ pull)
+    return max(error.relative for error in errors), np.asarray(off), cost

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inversion.approximation import Place
+from palpate.inversion.approximation import ModelError, Place
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import LinearModel, LinearSystem, weighted_sum, with_constraint
 from palpate.mechanics.reduced import Projection, ReducedModel, projection
@@ -99,10 +99,10 @@ class ReducedBasis:
         """One right-hand side with the last factorisation."""
         return SolveCounts(forward=1)
 
-    def error(self, at: Place) -> float:
+    def error(self, at: Place) -> ModelError:
         """Upper bound of the displacement's relative error in energy (see `LinearSystem.error_bound`)."""
         displacement = self.model.solve(at.moduli, at.coefficients).values
-        return float(self.system.error_bound(at.moduli, displacement[:, None])[0])
+        return ModelError(*self.system.error_bound(at.moduli, displacement))
 
     def with_constraint(self, constraint: Constraint) -> ReducedBasis:
         """The same vectors under another offset, and the response to it added."""

@@ -22,15 +22,14 @@ def with_first_noise(objective: Objective) -> Objective:
 def reweighted(objective: Objective, minimum: Minimum) -> Objective:
     """What the residuals at a minimum of `objective` say: their noise, the drivers' prior, robust losses.
 
-    The next minimum is sought under the objective that is returned; an estimate has converged when that is the same.
-    Raises `EstimationError` as `Objective.rematched` does.
+    The next minimum is sought under the objective that is returned, once that is `rematched`; an estimate has converged
+    when that is the same. Raises `EstimationError` where the images leave a driver's motion open.
     """
     evaluation = minimum.evaluation
     believed = with_learned_prior(objective, evaluation, minimum.unknowns)
     by_noise = _by_noise(believed, fitted_noise(evaluation))
     pairs = zip(by_noise.observations, evaluation.lines, strict=True)
-    robust = by_noise.with_observations([o.reweighted(line.residuals) for o, line in pairs])
-    return robust.rematched(minimum.unknowns)
+    return by_noise.with_observations([o.reweighted(line.residuals) for o, line in pairs])
 
 
 def fitted_noise(evaluation: Evaluation) -> dict[str, NoiseModel]:

@@ -222,20 +222,23 @@ class FiniteStrainEquilibrium:
         """The last factorisation, of a tangent stiffness near this state's: for `nearby` of another solve."""
         return self.path.factorisation
 
-    def error_estimate(self, moduli: NDArray[np.float64], displacement: NDArray[np.float64]) -> float:
+    def error_estimate(
+        self, moduli: NDArray[np.float64], displacement: NDArray[np.float64]
+    ) -> tuple[float, NDArray[np.float64]]:
         """Estimated relative error in energy of a displacement (n_dof,) mm at other moduli (n_regions,) kPa.
 
-        It is that of one correction r^T K^-1 r by the residual r, K the stiffness of this equilibrium: one right-hand
-        side. Infinite where no factorisation of K is kept.
+        It is that of one correction -K^-1 r (n_dof,) mm by the residual r, K the stiffness of this equilibrium, which
+        comes with it: one right-hand side. Infinite where no factorisation of K is kept.
         """
         if self.factorisation is None:
-            return np.inf
+            return np.inf, np.zeros_like(displacement)
         balance = self.model.balance(moduli)
         residual = np.asarray(balance.free.T @ balance.residual(displacement)[0])
-        correction = self.factorisation.solve(residual[:, None])[:, 0]
+        correction = -self.factorisation.solve(residual[:, None])[:, 0]
         internal = balance.region_forces(displacement, balance.moduli).sum(axis=1)
         squared = abs(residual @ correction) / max(abs(float(internal @ displacement)), np.finfo(float).tiny)
-        return float(np.sqrt(squared)) if np.isfinite(squared) else np.inf
+        missing = np.asarray(balance.free @ correction)
+        return (float(np.sqrt(squared)) if np.isfinite(squared) else np.inf), missing
 
     def refactorised(self) -> FiniteStrainEquilibrium:
         """The same state with the factorisation of its own tangent stiffness; raises `NotConverged`.

@@ -152,18 +152,22 @@ class LinearSystem:
         values.setflags(write=False)
         return LinearEquilibrium(self, checked, values)
 
-    def error_bound(self, moduli: NDArray[np.float64], displacements: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Upper bound (k,) of the relative energy-norm error of admissible displacements (n_dof, k) mm at `moduli`.
+    def error_bound(
+        self, moduli: NDArray[np.float64], displacement: NDArray[np.float64]
+    ) -> tuple[float, NDArray[np.float64]]:
+        """Upper bound of the relative energy-norm error of an admissible displacement (n_dof,) mm at `moduli`.
 
-        With the residual r = F^T (K(E) u - f) the error is exactly |r|_{K(E)^-1}; the system's own K(E0) stands in for
-        K(E), as K(E) >= min_r(E_r / E0_r) K(E0): |e|_K / |u|_K <= sqrt(r^T K(E0)^-1 r / min_r(E_r / E0_r)) / |u|_K.
+        With it comes what it misses (n_dof,) mm, if K(E) is like the system's own K(E0). With the residual
+        r = F^T (K(E) u - f) the error is exactly |r|_{K(E)^-1}; K(E0) stands in for K(E), as
+        K(E) >= min_r(E_r / E0_r) K(E0): |e|_K / |u|_K <= sqrt(r^T K(E0)^-1 r / min_r(E_r / E0_r)) / |u|_K.
         Source: Patera & Rozza, Reduced Basis Approximation (2007), section 4.2 (min-theta approach).
         """
-        residual = self.model.residual(moduli, displacements)
-        squared = np.einsum("ij,ij->j", residual, self.factorisation.solve(residual))
-        energy = np.einsum("ij,ij->j", displacements, self.model.forces(moduli, displacements))
+        residual = self.model.residual(moduli, displacement[:, None])
+        missing = -self.factorisation.solve(residual)
+        energy = float(displacement @ self.model.forces(moduli, displacement[:, None])[:, 0])
         least = float(np.min(np.asarray(moduli) / self.moduli))
-        return np.asarray(np.sqrt(squared / least / np.maximum(energy, np.finfo(float).tiny)))
+        squared = float(-residual[:, 0] @ missing[:, 0]) / least / max(energy, np.finfo(float).tiny)
+        return float(np.sqrt(max(squared, 0.0))), np.asarray(self.model.constraint.free @ missing)[:, 0]
 
     def _modulus_forces(self, displacements: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         """E_r F^T K_r u, one (n_free, k) mN for each region."""

@@ -147,7 +147,7 @@ class _Pair:
         settings = InversionSettings((np.log(np.full(len(ORGANS), 2.0)),), bounds)
         found = invert(problem, settings, progress=lambda _: None, rule=REDUCED_ALONE).minimum
         coefficients = problem.parameters.coefficients(found.unknowns)[0]
-        bound = self.basis.error(Place(problem.parameters.moduli(found.unknowns), coefficients))
+        bound = self.basis.error(Place(problem.parameters.moduli(found.unknowns), coefficients)).relative
         return _Estimate(SURROUNDINGS_KPA * np.exp(found.unknowns[: len(ORGANS)]), found.converged, bound)
 
     def problem(self) -> InverseProblem:
