@@ -107,13 +107,13 @@ def plain_estimate(
     objective = _exact(objective, filled.unknowns).rematched(filled.unknowns)  # a body at rest shows no modulus
     filled = replace(filled, evaluation=objective(filled.unknowns))
     rule = replace(RULE, refinements=0) if problem.finite_strain else RULE
-    found = run_outer_loop(objective, filled, settings, rule, progress=progress, title="linear law")
+    found = run_outer_loop(OuterIterate(objective, filled), settings, rule, progress=progress, title="linear law")
     if not problem.finite_strain:
         return found
     unknowns = found.minimum.unknowns
     objective = _exact(found.objective, unknowns, finite_strain=True).rematched(unknowns)
-    start = replace(found.minimum, evaluation=objective(unknowns))
-    return run_outer_loop(objective, start, settings, RULE, progress=progress, title="finite strain")
+    start = OuterIterate(objective, replace(found.minimum, evaluation=objective(unknowns)))
+    return run_outer_loop(start, settings, RULE, progress=progress, title="finite strain")
 
 
 def _exact(objective: Objective, unknowns: Array, *, finite_strain: bool = False) -> Objective:

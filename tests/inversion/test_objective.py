@@ -12,6 +12,7 @@ import pytest
 
 import palpate.inversion
 from palpate.inversion import Objective, reduced_basis
+from palpate.inversion.objective import LinearisedObjective
 from palpate.observation.contract import Weighting
 from palpate.observation.robust_loss import Tukey
 
@@ -112,6 +113,31 @@ def test_matrix_and_score_are_those_of_weighted_residuals_and_the_prior(objectiv
     assert now.matrix == pytest.approx(rows.T @ rows + prior, rel=1e-10, abs=1e-8)
     assert now.score == pytest.approx(rows.T @ values + pull, rel=1e-10, abs=1e-8)
     assert np.linalg.eigvalsh(now.matrix).min() > 0.0
+
+
+def test_a_linearised_objective_is_the_objective_at_its_place_and_a_least_squares_problem_elsewhere(objective, rng):
+    """Value, score and matrix there; away from it the score is the slope of the value, by central differences."""
+    unknowns = place(objective, 4)
+    now = objective(unknowns)
+    linearised = LinearisedObjective(objective, unknowns, now)
+    there = linearised(unknowns)
+    assert there.value == pytest.approx(now.value, rel=1e-12)
+    assert there.score == pytest.approx(now.score, rel=1e-12)
+    assert there.matrix == pytest.approx(now.matrix, rel=1e-12)
+    away, direction, h = unknowns + 0.05 * rng.standard_normal(len(unknowns)), rng.standard_normal(len(unknowns)), 1e-5
+    slope = (linearised(away + h * direction).value - linearised(away - h * direction).value) / (2.0 * h)
+    assert linearised(away).score @ direction == pytest.approx(slope, rel=1e-5)
+    assert linearised(away).gradient @ direction == pytest.approx(slope, rel=1e-5)
+
+
+def test_a_linearised_objective_counts_by_the_weights_of_its_own_objective(objective):
+    unknowns = place(objective, 4)
+    now = objective(unknowns)
+    weighting = Weighting(60.0, Tukey(0.4, 0.1))
+    other = objective.with_observations([replace(o, weighting=weighting) for o in objective.observations])
+    linearised = LinearisedObjective(other, unknowns, now)
+    assert linearised(unknowns).value == pytest.approx(other(unknowns).value, rel=1e-12)
+    assert linearised(unknowns).score == pytest.approx(other(unknowns).score, rel=1e-12)
 
 
 def test_the_modes_of_one_image_do_not_move_the_other(twins, twin):

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import OptimizeResult
 
-from palpate.inversion.optimise import FIRST_RADIUS, MAX_RADIUS, Bounds, Outcome, gauss_newton, lbfgs
+from palpate.inversion.optimise import FIRST_RADIUS, MAX_RADIUS, Bounds, Outcome, gauss_newton, lbfgs, same_minimum
 
 WIDE = Bounds(np.full(2, -5.0), np.full(2, 5.0))
 METHODS = {"gauss-newton": gauss_newton, "lbfgs": lbfgs}
@@ -84,6 +86,21 @@ def test_steps_that_circle_in_the_noise_end_where_the_decrement_was_least(toys):
     assert found.outcome is Outcome.STALLED
     assert found.evaluations < 10
     assert found.evaluation.score[2] == 0.09
+
+
+def test_a_start_ends_where_it_meets_the_minimum_of_another_but_not_on_its_way_past_one(toys):
+    objective = toys.Saturating(np.array([0.3, -0.5]))
+    first = gauss_newton(objective, np.full(2, -3.0), bounds=WIDE, tolerance=1e-12)
+    alone = gauss_newton(objective, np.full(2, 3.0), bounds=WIDE, tolerance=1e-12)
+    met = gauss_newton(objective, np.full(2, 3.0), bounds=WIDE, tolerance=1e-12, known=[first])
+    assert met.outcome is Outcome.JOINED
+    assert met.converged
+    assert met.evaluations < alone.evaluations
+    assert same_minimum(met.unknowns, first, 2)
+    on_the_way = replace(first, unknowns=alone.history[2].theta)
+    past = gauss_newton(objective, np.full(2, 3.0), bounds=WIDE, tolerance=1e-12, known=[on_the_way])
+    assert past.outcome is alone.outcome
+    assert past.evaluations == alone.evaluations
 
 
 def test_an_objective_that_no_step_reduces_is_stuck(toys, rng):

@@ -111,9 +111,7 @@ def test_what_an_approximation_misses_is_told_by_how_far_it_sets_the_moduli_off(
 def test_the_model_is_not_solved_where_its_error_is_small_enough(twins, twin, voxels):
     objective = twins.objective_of(voxels, twin.coefficients).rematched(twin.unknowns)
     start = minimised(objective, twin.unknowns, twins.settings(1.0))
-    spared, solved = (
-        loop.updated(OuterIterate(objective, start), StopRule(solve_above=above)) for above in (np.inf, 0.0)
-    )
+    spared, solved = (loop.updated(objective, start, StopRule(solve_above=above)) for above in (np.inf, 0.0))
     before = objective.states[0].approximation.counts
     assert spared.objective.states[0].approximation.counts == before
     assert solved.objective.states[0].approximation.counts.forward == before.forward + 1

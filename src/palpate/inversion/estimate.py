@@ -13,7 +13,7 @@ from palpate.inversion.driver import with_learned_prior
 from palpate.inversion.expansion import Expansion, expansion_near
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import Evaluation, Objective
-from palpate.inversion.optimise import Minimum, Outcome, fit_coefficients, posterior_sd
+from palpate.inversion.optimise import Minimum, Outcome, fit_coefficients, same_minimum
 from palpate.inversion.outer_loop import (
     Convergence,
     InversionSettings,
@@ -21,6 +21,7 @@ from palpate.inversion.outer_loop import (
     StopRule,
     minimised,
     run_outer_loop,
+    updated,
 )
 from palpate.inversion.reduced_basis import reduced_basis
 from palpate.inversion.reweighting import with_first_noise
@@ -33,7 +34,6 @@ __all__ = ["Candidate", "Inversion", "StartRun", "continue_at_finite_strain", "i
 FIRST_STEPS = 2  # of the drivers' coefficients at a start's moduli, before these move
 START = 1e-2  # decrement to which a start is followed under the first noise model
 OTHER = 1e-4  # decrement of the minima that are not the best one
-SAME_MINIMUM, SAME_SD = 0.02, 0.3  # of ln E, and of a posterior standard deviation: minima no further apart are one
 LOWER = 0.5  # in units of log-likelihood: a minimum that is lower by less is as good
 REPORTED = StopRule()
 FIRST_GUESS = StopRule(
@@ -184,7 +184,8 @@ def _linear(
     minima = _from_starts(objective, settings, fitted.unknowns[objective.n_parameters :], progress)
     groups = _groups(minima, objective.n_parameters)
     best = groups[_best(minima)]
-    followed = [run_outer_loop(objective, minima[_best(minima)], settings, rule, progress=progress, title="linear law")]
+    start = updated(objective, minima[_best(minima)], rule)
+    followed = [run_outer_loop(start, settings, rule, progress=progress, title="linear law")]
     for group in dict.fromkeys(g for g in groups if g != best):
         member = min((m for m, g in zip(minima, groups, strict=True) if g == group), key=lambda m: m.evaluation.value)
         followed.append(_another(followed[0], member, settings, rule, progress))
@@ -209,7 +210,7 @@ def _from_starts(
         begin = np.concatenate([theta, motion])
         first = fit_coefficients(objective, begin, bounds=bounds, max_steps=FIRST_STEPS)
         fresh = objective.rematched(first.unknowns)
-        found = minimised(fresh, first.unknowns, settings, tolerance=START)
+        found = minimised(fresh, first.unknowns, settings, tolerance=START, known=minima)
         minima.append(replace(found, evaluations=found.evaluations + first.evaluations))
         progress(f"start {number} of {len(settings.starts)}: {len(found.history)} steps, {found.outcome.value}")
     return minima
@@ -227,7 +228,7 @@ def _another(
     found = minimised(best.objective, start, settings, tolerance=OTHER)
     if found.converged and found.evaluation.value < best.minimum.evaluation.value - LOWER:
         title = "linear law, another minimum"
-        end = run_outer_loop(best.objective, found, settings, rule, progress=progress, title=title)
+        end = run_outer_loop(updated(best.objective, found, rule), settings, rule, progress=progress, title=title)
         return replace(end, checks=best.checks + end.checks)
     return replace(best, minimum=found)
 
@@ -241,8 +242,8 @@ def _at_finite_strain(linear: OuterIterate, settings: InversionSettings, progres
         assert state.finite_strain is not None
         first.append(expansion_near(state.finite_strain, basis, place, tolerance=EQUILIBRIUM))
     objective = before.under(first).rematched(unknowns)
-    start = replace(linear.minimum, evaluation=objective(unknowns))
-    end = run_outer_loop(objective, start, settings, REPORTED, progress=progress, title="finite strain")
+    start = OuterIterate(objective, replace(linear.minimum, evaluation=objective(unknowns)))
+    end = run_outer_loop(start, settings, REPORTED, progress=progress, title="finite strain")
     exact = []
     places = end.objective.places(end.minimum.unknowns)
     for approximation, place in zip(end.objective.approximations, places, strict=True):
@@ -313,9 +314,7 @@ def _groups(minima: Sequence[Minimum], n_parameters: int) -> list[int]:
     distinct: list[Minimum] = []
     groups = []
     for minimum in minima:
-        width = np.maximum(SAME_MINIMUM, SAME_SD * posterior_sd(minimum, n_parameters))
-        apart = [np.abs(minimum.unknowns - other.unknowns)[:n_parameters] for other in distinct]
-        same = [i for i, distance in enumerate(apart) if np.all(distance < width)]
+        same = [i for i, other in enumerate(distinct) if same_minimum(minimum.unknowns, other, n_parameters)]
         if not same:
             distinct.append(minimum)
         groups.append(same[0] if same else len(distinct) - 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Protocol
@@ -22,12 +23,15 @@ __all__ = [
     "lbfgs",
     "newton_decrement",
     "posterior_sd",
+    "same_minimum",
 ]
 
 FIRST_RADIUS = 1.0  # of the log-moduli, per step: a factor e
 MAX_RADIUS = 2.0
 LEAST_DAMPING = 1e-2  # of the diagonal: less is nearly the step that was refused
 SEARCHES = 8  # trials of a step
+SAME_MINIMUM, SAME_SD = 0.02, 0.3  # of ln E, and of a posterior standard deviation: minima no further apart are one
+MET = 0.5  # decrement (log-likelihood) from which an iterate is where it is going to end
 WORTH = 1e-2  # units of log-likelihood that a damped step must promise to be tried
 COEFFICIENTS = 0.1  # decrement of the drivers' coefficients at held moduli, which other unknowns are going to change
 CIRCLING = 4  # steps without a smaller decrement, after which those within the noise go round in circles
@@ -51,6 +55,7 @@ class Outcome(StrEnum):
     """How an iteration ended; the value is the sentence that the user reads."""
 
     CONVERGED = "the decrement fell under its tolerance"
+    JOINED = "it reached a minimum that another start had found"
     STALLED = "no smaller value was found within a tenth of the posterior's width"
     STEPS = "the iteration reached its largest number of steps; raise it, or start nearer"
     STUCK = "no step reduced the objective; look at the fit of the driver's surface and at the images"
@@ -60,7 +65,7 @@ class Outcome(StrEnum):
     @property
     def converged(self) -> bool:
         """Whether the point reached is a minimum."""
-        return self in (Outcome.CONVERGED, Outcome.STALLED)
+        return self in (Outcome.CONVERGED, Outcome.JOINED, Outcome.STALLED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +134,12 @@ def posterior_sd(minimum: Minimum, n_parameters: int) -> NDArray[np.float64]:
     return np.asarray(np.sqrt(np.diag(minimum.evaluation.covariance_columns(n_parameters))))
 
 
+def same_minimum(unknowns: NDArray[np.float64], minimum: Minimum, n_parameters: int) -> bool:
+    """Whether unknowns (n_unknowns,) lie so near a minimum that both are one."""
+    width = np.maximum(SAME_MINIMUM, SAME_SD * posterior_sd(minimum, n_parameters))
+    return bool(np.all(np.abs(unknowns - minimum.unknowns)[:n_parameters] < width))
+
+
 def fit_coefficients(
     objective: Objective,
     begin: NDArray[np.float64],
@@ -153,6 +164,7 @@ def gauss_newton(
     hold_theta: bool = False,
     tolerance: float = 1e-3,
     within: NDArray[np.float64] | float = np.inf,
+    known: Sequence[Minimum] = (),
     max_steps: int = 40,
 ) -> Minimum:
     """Minimise `objective` from `start` (n_unknowns,).
@@ -162,7 +174,7 @@ def gauss_newton(
     -s.d / 2, the reduction that the quadratic model still promises in units of log-likelihood. It ends when that is
     under `tolerance` and the step to the model's minimum moves each log-modulus by less than `within` (one number, or
     (n_parameters,)), or where steps within the noise of closest points lower the decrement no more: then where that was
-    least. `hold_theta` moves the drivers' coefficients only.
+    least; or where it has met one of the `known` minima. `hold_theta` moves the drivers' coefficients only.
     """
     unknowns, region, history = start.copy(), _Region(), list[Iterate]()
     now, evaluations, outcome = objective(unknowns), 1, Outcome.STEPS
@@ -177,6 +189,9 @@ def gauss_newton(
         whole = _step(now, free, objective.n_parameters, WHOLE)[: objective.n_parameters]
         if decrement < tolerance and np.all(np.abs(whole) < within):
             outcome = Outcome.CONVERGED
+            break
+        if decrement < MET and any(same_minimum(unknowns, other, objective.n_parameters) for other in known):
+            outcome = Outcome.JOINED
             break
         since += 1
         if decrement < 0.9 * least:

@@ -5,7 +5,7 @@ It is the same for the linear and for a finite-strain law, and for every approxi
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
@@ -139,8 +139,7 @@ class OuterIterate:
 
 
 def run_outer_loop(
-    objective: Objective,
-    start: Minimum,
+    start: OuterIterate,
     settings: InversionSettings,
     rule: StopRule,
     *,
@@ -149,14 +148,13 @@ def run_outer_loop(
 ) -> OuterIterate:
     """Follow a minimum until reweighting it and updating its approximations change it no more.
 
-    Drivers' walls are refined where their surfaces ask for it (see `refined_walls`). `title` begins each line of
-    `progress`. The minimum's history is that of the loop alone. Raises `NotConverged` when the full model has no
-    equilibrium where every part of a step leads.
+    The approximations of `start` are exact there (see `updated`). Drivers' walls are refined where their surfaces ask
+    for it (see `refined_walls`). `title` begins each line of `progress`. The minimum's history is that of the loop
+    alone. Raises `NotConverged` when the full model has no equilibrium where every part of a step leads.
     """
-    theta, at = start.unknowns[: objective.n_parameters], start.evaluation
+    at, theta = start.minimum.evaluation, start.minimum.unknowns[: start.objective.n_parameters]
     first = Iterate(theta, at.value, at.misfit_mm2, newton_decrement(at))
-    begun = replace(start, history=(first,), evaluations=0)
-    now, refinements = updated(OuterIterate(objective, begun), rule), 0
+    now, refinements = replace(start, minimum=replace(start.minimum, history=(first,), evaluations=0)), 0
     for number in range(1, rule.iterations + 1):
         line = f"{title}, outer iteration {number}"
         progress(f"{line}: {now.objective.parameters.in_words(now.minimum.unknowns)}")
@@ -174,14 +172,15 @@ def run_outer_loop(
     return now
 
 
-def updated(now: OuterIterate, rule: StopRule) -> OuterIterate:
-    """The iterate on approximations that are exact at its unknowns, with derivatives, where their error asks for it."""
+def updated(objective: Objective, minimum: Minimum, rule: StopRule) -> OuterIterate:
+    """A minimum on approximations that are made exact there, where their error asks for it."""
+    now = OuterIterate(objective, minimum)
     if rule.solve_above > 0.0:
-        error, _, cost = _model_error(now.objective, now.minimum)
-        now = replace(now, checks=now.checks + cost)
+        error, _, cost = _model_error(objective, minimum)
+        now = replace(now, checks=cost)
         if error < rule.solve_above:
             return now
-    return _with_approximations(now, _solved(now.objective, now.minimum.unknowns, now.minimum.evaluation))
+    return _with_approximations(now, _solved(objective, minimum.unknowns, minimum.evaluation))
 
 
 def minimised(
@@ -191,15 +190,17 @@ def minimised(
     *,
     tolerance: float = 1e-3,
     within: NDArray[np.float64] | float = np.inf,
+    known: Sequence[Minimum] = (),
 ) -> Minimum:
     """The minimum from `start` (n_unknowns,) by the method of the settings.
 
-    `tolerance` of the decrement; `within` (one, or (n_parameters,)): how far the log-moduli may yet be from it.
+    `tolerance` of the decrement; `within` (one, or (n_parameters,)): how far the log-moduli may yet be from it;
+    `known`: minima that may end Gauss-Newton where it meets one.
     """
     if settings.method == "lbfgs":
         polish = min(tolerance, POLISH) if np.all(np.isfinite(within)) else tolerance
         return lbfgs(objective, start, bounds=settings.bounds, tolerance=polish)
-    return gauss_newton(objective, start, bounds=settings.bounds, tolerance=tolerance, within=within)
+    return gauss_newton(objective, start, bounds=settings.bounds, tolerance=tolerance, within=within, known=known)
 
 
 def _iteration(
