@@ -95,11 +95,11 @@ class StopRule:
     """When an estimate ends, in its own posterior standard deviations.
 
     step_sd, floor: a log-modulus may still move by so many of its standard deviations, or by `floor` (of ln E) where
-    that is more; model_error: relative error in energy of the displacement that the approximation may have where
-    residuals are rough; derivatives: whether those that decide the moduli must be exact so near that they leave no more
-    than a step; solve_above: error from which the full model is solved; passes: of weights and estimate in turn on one
-    approximation; iterations; refinements of the drivers' walls: the largest numbers of each; far: tolerances by which
-    an estimate may still move at its largest number of iterations, where more has not converged.
+    that is more; model_error: share of that by which what the approximation misses may set it off; derivatives: whether
+    those that decide the moduli must be exact so near that they leave no more than a step; solve_above: error from
+    which the full model is solved; passes: of weights and estimate in turn on one approximation; iterations;
+    refinements of the drivers' walls: the largest numbers of each; far: tolerances by which an estimate may still move
+    at its largest number of iterations, where more has not converged.
     """
 
     step_sd: float = 0.02
