@@ -77,8 +77,13 @@ def learned_precision(
                 seen = _seen(data + prior, data, pull, places)
                 beliefs = [_most_evident(pair, seen) for pair in product(wall.drifts, wall.swellings)]
                 best = max(evidence for evidence, _ in beliefs)
-                alike = [(e, _with(prior, places, covariance)) for e, covariance in beliefs if e > best - ALIKE]
-                prior = max(alike, key=lambda pair: (_width(data + pair[1], n_parameters), pair[0]))[1]
+                found = list[tuple[float, float, NDArray[np.float64]]]()
+                for evidence, covariance in beliefs:
+                    if evidence > best - ALIKE:
+                        with_it = prior.copy()
+                        with_it[np.ix_(places, places)] = np.linalg.inv(covariance)
+                        found.append((_width(data + with_it, n_parameters), evidence, with_it))
+                prior = max(found, key=lambda each: each[:2])[2]
     return prior[n_parameters:, n_parameters:]
 
 
@@ -157,15 +162,6 @@ def _most_evident(parts: Sequence[NDArray[np.float64]], seen: _Seen) -> tuple[fl
     ]
     best = min(found, key=lambda trial: float(trial.fun))
     return -float(best.fun), (basis * sum(shares(best.x))) @ basis.T
-
-
-def _with(
-    prior: NDArray[np.float64], places: NDArray[np.int64], covariance: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """The precision of all unknowns (n, n) with that of one wall's coefficients from their covariance."""
-    changed = prior.copy()
-    changed[np.ix_(places, places)] = np.linalg.inv(covariance)
-    return changed
 
 
 def _width(matrix: NDArray[np.float64], n_parameters: int) -> float:

@@ -17,7 +17,6 @@ from palpate.inversion.objective import Objective
 from palpate.inversion.optimise import Bounds, fit_coefficients
 from palpate.inversion.reduced_basis import reduced_basis
 from palpate.mechanics.equilibrium import ACCURACY
-from palpate.mechanics.finite_strain import FiniteStrainEquilibrium
 from palpate.observation.noise_model import SEGMENTATION_NOISE
 
 __all__ = ["fit_driver"]
@@ -46,7 +45,15 @@ def fit_driver(
         assert state.finite_strain is not None
         first.append(expansion_near(state.finite_strain, basis, Place(moduli, q), tolerance=ACCURACY))
     amounts = _fitted(held, first, np.concatenate(amounts))
-    return tuple(_followed(near.equilibrium, q, shares) for near, q in zip(first, amounts, strict=True))
+    found = []
+    for near, q in zip([expansion.equilibrium for expansion in first], amounts, strict=True):
+        states, offset = list[NDArray[np.float64]](), near.model.constraint.offset
+        for share in shares:  # each from the one before it
+            model = near.model.under(replace(near.model.constraint, offset=share * offset))
+            start = states[-1] if states else share * near.displacement
+            states.append(model.solve(near.moduli, share * q, start=start).displacement)
+        found.append(tuple(states))
+    return tuple(found)
 
 
 def _fitted(
@@ -63,14 +70,3 @@ def _fitted(
     if not found.converged:
         raise NotConverged(f"the driver's wall could not be fitted to the later image: {found.outcome.value}")
     return held.parameters.coefficients(found.unknowns)
-
-
-def _followed(near: FiniteStrainEquilibrium, coefficients: NDArray[np.float64], shares: Sequence[float]) -> Motions:
-    """Equilibria at shares of the coefficients and of the offset, each from the one before it."""
-    states: list[NDArray[np.float64]] = []
-    for share in shares:
-        constraint = near.model.constraint
-        model = near.model.under(replace(constraint, offset=share * constraint.offset))
-        start = states[-1] if states else share * near.displacement
-        states.append(model.solve(near.moduli, share * coefficients, start=start).displacement)
-    return tuple(states)

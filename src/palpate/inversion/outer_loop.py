@@ -162,11 +162,13 @@ def run_outer_loop(
         if now.stayed:
             return now
         if now.convergence.converged:
-            done = refinements == rule.refinements or number == rule.iterations
-            finer = None if done else _with_finer_walls(now)
-            if finer is None:
+            finer = refined_walls(now.objective, now.minimum.evaluation)
+            if all(of is None for of in finer) or refinements == rule.refinements or number == rule.iterations:
                 return now
-            now, refinements = finer, refinements + 1
+            pairs = zip(now.objective.approximations, finer, strict=True)
+            moved = [a if constraint is None else a.with_constraint(constraint) for a, constraint in pairs]
+            now, refinements = _with_approximations(now, moved), refinements + 1
+            now = replace(now, convergence=Convergence(), step=np.inf)
     if max(now.convergence.reweighting, now.convergence.linearisation) > rule.far and now.minimum.converged:
         now = replace(now, minimum=replace(now.minimum, outcome=Outcome.STEPS))
     return now
@@ -356,16 +358,6 @@ def _linearisation(objective: Objective, there: Minimum) -> NDArray[np.float64]:
         exact = approximation.derivatives_at
         distance = np.inf if exact is None else max(distance, float(np.abs(np.log(moduli / exact)).max()))
     return distance * np.maximum(posterior_sd(there, objective.n_parameters), LEAST_SD)
-
-
-def _with_finer_walls(now: OuterIterate) -> OuterIterate | None:
-    """The iterate with finer motions of the drivers' walls, where their surfaces ask for it; None where none does."""
-    finer = refined_walls(now.objective, now.minimum.evaluation)
-    if all(constraint is None for constraint in finer):
-        return None
-    pairs = zip(now.objective.approximations, finer, strict=True)
-    moved = [a if constraint is None else a.with_constraint(constraint) for a, constraint in pairs]
-    return replace(_with_approximations(now, moved), convergence=Convergence(), step=np.inf)
 
 
 def _with_approximations(now: OuterIterate, approximations: list[Approximation]) -> OuterIterate:

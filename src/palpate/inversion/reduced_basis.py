@@ -72,9 +72,13 @@ class ReducedBasis:
         Both are corrections by conjugate gradients with the factorisation that is there, from the reduced answers on;
         where it is none, or the moduli are far from its own, with a new one. Raises `SolverError`.
         """
-        model, (near, made) = self.full_model, _system_near(self, at.moduli)
+        model, near, sharper = self.full_model, self.system, self
+        direct = isinstance(near.factorisation, CheckedFactorisation) and SOLVERS[near.factorisation.solver].direct
+        ratios = at.moduli / near.moduli
+        if not direct or ratios.max() >= FAR * ratios.min():  # solutions that iterate themselves help none
+            near = model.system(at.moduli)
+            sharper = replace(self, system=near, counts=self.counts + SolveCounts(factorisations=1))
         matrix = weighted_sum(at.moduli, model.free_stiffness)
-        sharper = replace(self, system=near, counts=self.counts + made)
         displacement = self.model.solve(at.moduli, at.coefficients).values
 
         def solved(rhs: NDArray[np.float64], tolerance: float) -> NDArray[np.float64]:
@@ -167,15 +171,3 @@ def _loads_along(
     for modulus, matrix, share in zip(moduli, model.stiffness, by_modulus, strict=True):
         loads -= np.outer(model.constraint.free.T @ (modulus * (matrix @ values)), share)
     return loads
-
-
-def _system_near(basis: ReducedBasis, moduli: NDArray[np.float64]) -> tuple[LinearSystem, SolveCounts]:
-    """The system whose factors serve at moduli (n_regions,) kPa: that at hand, or their own where it is no help.
-
-    It is none where the moduli are far, or where its solutions iterate themselves and cost much beside a factorisation.
-    """
-    factorisation, ratios = basis.system.factorisation, moduli / basis.system.moduli
-    direct = isinstance(factorisation, CheckedFactorisation) and SOLVERS[factorisation.solver].direct
-    if direct and ratios.max() < FAR * ratios.min():
-        return basis.system, SolveCounts()
-    return basis.full_model.system(moduli), SolveCounts(factorisations=1)

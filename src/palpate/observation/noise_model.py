@@ -137,18 +137,13 @@ def _gather(
     rows: NDArray[np.float64], places: NDArray[np.float64], normals: NDArray[np.float64], size: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Sum of rows times normals in cells, (n_rows, n_cells, 3), and the cells' centres (n_cells, 3)."""
-    inverse = _cell_numbers(places, size)
+    _, inverse = _cell_keys(places, size)
     count = np.bincount(inverse)
     centre = np.stack([np.bincount(inverse, places[:, a]) / count for a in range(3)], axis=1)
     carried = np.stack(
         [np.stack([np.bincount(inverse, row * normals[:, a]) for a in range(3)], axis=1) for row in rows]
     ).astype(np.float64)
     return carried, centre
-
-
-def _cell_numbers(places: NDArray[np.float64], size: float) -> NDArray[np.int64]:
-    """The cell, from 0, that each place (n, 3) mm lies in."""
-    return _cell_keys(places, size)[1]
 
 
 def _cell_keys(places: NDArray[np.float64], size: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

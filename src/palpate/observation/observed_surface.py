@@ -55,7 +55,9 @@ def observed_surface(space: LagrangeSpace, tissue: int) -> ObservedSurface:
     """
     mesh = space.mesh
     surface = tissue_surface(mesh, tissue)
-    seen = _observable(mesh.tissues[tissue].role, surface.other, [t.role for t in mesh.tissues])
+    driver = mesh.tissues[tissue].role is Role.DRIVER  # all of its wall is seen: it is itself an unknown
+    prescribed = [i for i, other in enumerate(mesh.tissues) if other.role in (Role.DRIVER, Role.RIGID)]
+    seen = ~np.isin(surface.other, [OUTER, *prescribed]) | driver
     facets = space.facets(surface.triangles)
     split = facets[:, SUBTRIANGLES].reshape(-1, 3) if space.order == 2 else facets
     observed = np.repeat(seen, len(split) // max(len(facets), 1))
@@ -71,17 +73,8 @@ def observed_surface(space: LagrangeSpace, tissue: int) -> ObservedSurface:
             " its modulus cannot be observed; enlarge the image, or make the tissue `known`"
         )
     faces = np.searchsorted(points, facets if space.order == 2 else np.zeros((0, 6), dtype=np.int64))
-    driver = mesh.tissues[tissue].role is Role.DRIVER
     rim = _rim(triangles, observed)
     return ObservedSurface(tissue, name, points, rest, triangles, observed, rim, share, faces, driver)
-
-
-def _observable(role: Role, other: NDArray[np.int64], roles: list[Role]) -> NDArray[np.bool_]:
-    """Which faces are observed; all of a driver's, whose wall is itself an unknown."""
-    if role is Role.DRIVER:
-        return np.ones(len(other), dtype=bool)
-    prescribed = [i for i, r in enumerate(roles) if r in (Role.DRIVER, Role.RIGID)]
-    return ~np.isin(other, [OUTER, *prescribed])
 
 
 def _rim(triangles: NDArray[np.int64], observed: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -43,7 +43,7 @@ def prescribed_motion(
     blocks, walls = list[NDArray[np.float64]](), list[Wall]()
     roles = [tissue.role for tissue in space.mesh.tissues]
     for tissue in (i for i, role in enumerate(roles) if role is Role.RIGID):
-        points = _points(space, tissue)
+        points = np.unique(space.facets(tissue_surface(space.mesh, tissue).triangles))
         prescribed[points] = True
         if tissue in bones:
             offset[points] = bones[tissue].apply(space.points[points]) - space.points[points]
@@ -74,7 +74,3 @@ def _wall(space: LagrangeSpace, tissue: int, held: NDArray[np.bool_]) -> tuple[N
     points = points[~held[points]]
     lengths = np.linalg.norm(sums[points], axis=1, keepdims=True)
     return points, sums[points] / np.maximum(lengths, np.finfo(float).tiny)
-
-
-def _points(space: LagrangeSpace, tissue: int) -> NDArray[np.int64]:
-    return np.unique(space.facets(tissue_surface(space.mesh, tissue).triangles))
