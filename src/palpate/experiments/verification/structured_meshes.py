@@ -121,7 +121,12 @@ def octant_mesh(
     )
     nodes = (levels[:, None, None] * directions).reshape(-1, 3)
     layer_of = np.repeat(np.arange(len(n_radial)), n_radial)
-    tets, region = _prisms(triangles, len(directions), layer_of)
+    prisms = []  # between two levels, three tetrahedra each
+    for level in range(len(layer_of)):
+        a, b, c = (triangles + level * len(directions)).T
+        d, e, f = (triangles + (level + 1) * len(directions)).T
+        prisms += [np.stack(corners, axis=1) for corners in ((a, b, c, f), (a, b, e, f), (a, d, e, f))]
+    tets, region = np.concatenate(prisms), np.repeat(layer_of, 3 * len(triangles))
     if solid:
         tets = np.vstack([tets, np.column_stack([np.full(len(triangles), len(nodes)), triangles])])
         region = np.concatenate([region, np.zeros(len(triangles), int)])
@@ -147,18 +152,6 @@ def _spherical_triangle(n: int) -> tuple[Array, Integers]:
     triangles = np.sort(np.array(up + down), axis=1)
     volume = np.abs(np.linalg.det(directions[triangles])).sum() / 6.0
     return directions * (np.pi / 6.0 / volume) ** (1 / 3), triangles
-
-
-def _prisms(triangles: Integers, n_places: int, layer_of: Integers) -> tuple[Integers, Integers]:
-    """Tetrahedra (n_tets, 4), three a prism between two levels, and the layer (n_tets,) of each."""
-    tets, region = [], []
-    for level, layer in enumerate(layer_of):
-        a, b, c = (triangles + level * n_places).T
-        d, e, f = (triangles + (level + 1) * n_places).T
-        for corners in ((a, b, c, f), (a, b, e, f), (a, d, e, f)):
-            tets.append(np.stack(corners, axis=1))
-            region.append(np.full(len(triangles), layer))
-    return np.concatenate(tets), np.concatenate(region)
 
 
 def quarter_ring_mesh(inner: float, outer: float, n_radial: int, n_turn: int, tissue: Tissue) -> TetMesh:
