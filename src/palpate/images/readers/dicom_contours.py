@@ -65,31 +65,23 @@ def read(path: Path, grid: VoxelGrid | None) -> StoredImage:
                 " voxels; copy it into the folder of that file, or into one there, or name a grey image on its grid as"
                 " intensities_before or intensities_after of the case"
             )
-        axis = _slice_axis(dataset, series.grid)
+        # the slices lie across the axis along which the first contours run least
+        extent = np.zeros(3)
+        for item in dataset.ROIContourSequence:
+            for contour in (item.get("ContourSequence") or ())[:MOST_TRIED]:
+                extent += np.ptp(series.grid.index(_points(contour)), axis=0)
+        axis = int(np.argmin(extent))
         rows, columns = (n for k, n in enumerate(series.grid.shape) if k != axis)
         shape = (series.grid.shape[axis], rows, columns)
-        structures = _structures(dataset, _to_index(series.grid, axis), path)
+        # RAS mm -> index, the axis of the slices first
+        inverse = np.asarray(np.linalg.inv(series.grid.affine), dtype=np.float64)
+        structures = _structures(dataset, inverse[[axis, *(k for k in range(3) if k != axis), 3]], path)
         findings = _flaws(structures)
         masks = (Mask(each.row, _filled(each, shape)) for each in structures)
         labels, overlaps = merged(masks, shape)
     named = tuple(each.row for each in structures)
     digests = {"": sha256, **({"series": series.sha256} if series.sha256 else {})}
     return StoredImage(np.moveaxis(labels, 0, axis), series.grid.affine, named, digests, (*findings, *overlaps))
-
-
-def _slice_axis(dataset: Dataset, grid: VoxelGrid) -> int:
-    """The axis of the grid across which the first contours run least."""
-    extent = np.zeros(3)
-    for item in dataset.ROIContourSequence:
-        for contour in (item.get("ContourSequence") or ())[:MOST_TRIED]:
-            extent += np.ptp(grid.index(_points(contour)), axis=0)
-    return int(np.argmin(extent))
-
-
-def _to_index(grid: VoxelGrid, axis: int) -> NDArray[np.float64]:
-    """RAS mm -> index, the axis of the slices first."""
-    inverse = np.asarray(np.linalg.inv(grid.affine), dtype=np.float64)
-    return inverse[[axis, *(k for k in range(3) if k != axis), 3]]
 
 
 def _points(contour: Dataset) -> NDArray[np.float64]:

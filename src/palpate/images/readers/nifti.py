@@ -56,7 +56,14 @@ def read_nifti(path: Path) -> StoredImage:
     """Read one image of three axes from `path`; raises `InputDataError` with a sentence for whatever is wrong."""
     try:
         with open_input(path) as file:
-            stream = _uncompressed(file, path)
+            zipped = file.read(2) == b"\x1f\x8b"
+            file.seek(0)
+            if zipped != path.name.lower().endswith(".gz"):
+                is_and_should = ("is compressed", ".nii.gz") if zipped else ("is not compressed by gzip", ".nii")
+                raise InputDataError(
+                    f"'{path}' {is_and_should[0]}, against its ending; rename it to {is_and_should[1]}"
+                )
+            stream = io.BufferedReader(gzip.GzipFile(fileobj=file, mode="rb")) if zipped else file
             header, used = _header(stream, path)
             layout = _layout(header, path)
             packed = stream is not file
@@ -67,18 +74,12 @@ def read_nifti(path: Path) -> StoredImage:
             digests = {"": file.sha256()}
     except (OSError, EOFError, zlib.error) as error:
         raise damaged(path, error) from error
-    values = _scaled(values.reshape(layout.shape, order="F"), layout)
+    values = values.reshape(layout.shape, order="F").astype(layout.dtype.newbyteorder("="), copy=False)
+    if (layout.slope, layout.intercept) != (1.0, 0.0):
+        with np.errstate(over="ignore", invalid="ignore"):
+            values = np.asarray(values * layout.slope + layout.intercept)
     names = extension_names(between, header.endianness, path)
     return StoredImage(values, layout.affine, names, digests)
-
-
-def _uncompressed(file: BinaryIO, path: Path) -> BinaryIO:
-    zipped = file.read(2) == b"\x1f\x8b"
-    file.seek(0)
-    if zipped != path.name.lower().endswith(".gz"):
-        is_and_should = ("is compressed", ".nii.gz") if zipped else ("is not compressed by gzip", ".nii")
-        raise InputDataError(f"'{path}' {is_and_should[0]}, against its ending; rename it to {is_and_should[1]}")
-    return io.BufferedReader(gzip.GzipFile(fileobj=file, mode="rb")) if zipped else file
 
 
 def _header(stream: BinaryIO, path: Path) -> tuple[Any, int]:
@@ -109,17 +110,6 @@ def _layout(header: Any, path: Path) -> _Layout:
             f"the voxels of '{path}' are of the type {dtype}; only integers and floats of up to 64 bits are read:"
             " export one grey or label channel"
         )
-    return _Layout(
-        shape=_shape(header, path),
-        dtype=dtype,
-        offset=_offset(header, path),
-        slope=1.0 if slope is None else float(slope),
-        intercept=0.0 if intercept is None else float(intercept),
-        affine=_affine(header, path),
-    )
-
-
-def _shape(header: Any, path: Path) -> tuple[int, int, int]:
     dim = [int(n) for n in header["dim"]]
     sizes = dim[1 : 1 + dim[0]] if 1 <= dim[0] <= 7 else []
     if not sizes or min(sizes) < 1:
@@ -129,7 +119,14 @@ def _shape(header: Any, path: Path) -> tuple[int, int, int]:
             f"'{path}' has the sizes {sizes}, but an image of three axes is needed; extract one volume (a time point,"
             " a channel) or stack the slices"
         )
-    return sizes[0], sizes[1], sizes[2]
+    return _Layout(
+        shape=(sizes[0], sizes[1], sizes[2]),
+        dtype=dtype,
+        offset=_offset(header, path),
+        slope=1.0 if slope is None else float(slope),
+        intercept=0.0 if intercept is None else float(intercept),
+        affine=_affine(header, path),
+    )
 
 
 def _offset(header: Any, path: Path) -> int:
@@ -184,14 +181,6 @@ def _refuse_disagreement(sform: NDArray[np.float64], qform: NDArray[np.float64],
         )
 
 
-def _scaled(values: NDArray[Any], layout: _Layout) -> NDArray[Any]:
-    native = values.astype(layout.dtype.newbyteorder("="), copy=False)
-    if layout.slope == 1.0 and layout.intercept == 0.0:
-        return native
-    with np.errstate(over="ignore", invalid="ignore"):
-        return np.asarray(native * layout.slope + layout.intercept)
-
-
 def write_label_image(path: Path | str, image: LabelImage) -> None:
     """Write labels as NIfTI (.nii or .nii.gz) in the smallest of uint8, uint16, int32; sform and qform in mm.
 
@@ -224,11 +213,7 @@ def _write(path: Path, values: NDArray[Any], grid: VoxelGrid) -> None:
     content: bytes = image.to_bytes()
     if path.name.lower().endswith(".gz"):
         content = gzip.compress(content, compresslevel=6, mtime=0)  # no time stamp: equal images give equal files
-    _replace(path, content)
-
-
-def _replace(path: Path, content: bytes) -> None:
-    """Put `content` at `path` in one step, so that a crash never leaves half a file there."""
+    # in one step, so that a crash never leaves half a file there
     temporary = path.with_name(f".{path.name[:50]}.{os.getpid()}.tmp")
     try:
         with temporary.open("wb") as file:

@@ -12,8 +12,8 @@ from typing import Literal
 from xml.parsers import expat
 
 from palpate.errors import InputDataError
-from palpate.images.named_labels import MAX_NAME, NamedLabel, hex_colour, printable
-from palpate.images.readers.text_header import NUMBER
+from palpate.images.named_labels import MAX_NAME, NamedLabel, printable
+from palpate.images.readers.text_header import unit_colour
 
 __all__ = ["extension_names"]
 
@@ -103,6 +103,4 @@ class _Table:
         if not (key.isascii() and key.isdigit() and len(key) <= 9) or len(name) > MAX_NAME:
             raise self._refused(f"have the entry '{printable(key[:20])}': '{name[:50]}'")
         parts = [self._attributes.get(colour, "") for colour in ("Red", "Green", "Blue")]
-        plain = all(NUMBER.fullmatch(part) for part in parts)
-        red, green, blue = (float(part) for part in parts) if plain else (-1.0, -1.0, -1.0)
-        return NamedLabel(int(key), name, hex_colour(red, green, blue, top=1.0))
+        return NamedLabel(int(key), name, unit_colour(parts))

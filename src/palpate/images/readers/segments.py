@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
-from palpate.images.named_labels import MAX_LABEL, MAX_NAME, NamedLabel, hex_colour, printable
-from palpate.images.readers.text_header import NUMBER
+from palpate.images.named_labels import MAX_LABEL, MAX_NAME, NamedLabel, printable
+from palpate.images.readers.text_header import unit_colour
 
 __all__ = ["Segment", "flattened", "segments_of"]
 
@@ -60,7 +60,8 @@ def segments_of(keys: Mapping[str, str], path: Path) -> tuple[Segment, ...]:
 def _segment(entry: Mapping[str, str], number: int, path: Path, *, old: bool) -> Segment:
     name = printable(entry.get("Name", "").strip())[:MAX_NAME] or f"segment {number + 1}"
     layer = number if old else _whole(entry.get("Layer", "0"), path, low=0)
-    return Segment(name, _colour(entry.get("Color", "")), layer, _whole(entry.get("LabelValue", "1"), path, low=1))
+    colour = unit_colour(entry.get("Color", "").split())
+    return Segment(name, colour, layer, _whole(entry.get("LabelValue", "1"), path, low=1))
 
 
 def _whole(text: str, path: Path, *, low: int) -> int:
@@ -71,14 +72,6 @@ def _whole(text: str, path: Path, *, low: int) -> int:
             f" from {low} to {MAX_LABEL}: export the segmentation again"
         )
     return int(text)
-
-
-def _colour(text: str) -> str | None:
-    words = text.split()
-    if len(words) != 3 or not all(NUMBER.fullmatch(word) for word in words):
-        return None
-    red, green, blue = (float(word) for word in words)
-    return hex_colour(red, green, blue, top=1.0)
 
 
 def flattened(

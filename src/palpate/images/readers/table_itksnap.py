@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 
 from palpate.images.named_labels import NamedLabel
@@ -22,8 +23,8 @@ def read_itksnap_table(text: str, path: Path) -> list[NamedLabel]:
     return pattern_rows(text, path, ROW, form='ITK-SNAP\'s form `1 255 0 0 1 1 1 "prostate"`')
 
 
-def _recognised(text: str) -> bool:
-    return begins_with(text, QUOTED)
-
-
-register_table(TableFormat("ITK-SNAP's label description", (".txt", ".label"), _recognised, read_itksnap_table))
+register_table(
+    TableFormat(
+        "ITK-SNAP's label description", (".txt", ".label"), partial(begins_with, pattern=QUOTED), read_itksnap_table
+    )
+)

@@ -22,15 +22,17 @@ def read_slicer_table(text: str, path: Path) -> list[NamedLabel]:
     missing = {"labelvalue", "name"} - set(column_names(text, ","))
     if missing:
         raise InputDataError(f"the label table '{path}' lacks the columns {sorted(missing)}; it needs LabelValue, Name")
-    rows = delimited_rows(text, path, delimiter=",")
-    return [
-        NamedLabel(
-            whole_number(row.get("labelvalue", ""), path),
-            _unquoted(row.get("name", "")),
-            _colour([row.get(f"color_{letter}", "") for letter in "rgb"]),
+    found = []
+    for row in delimited_rows(text, path, delimiter=","):
+        name, parts = row.get("name", ""), [row.get(f"color_{letter}", "") for letter in "rgb"]
+        if name.startswith("'") and computed_by_spreadsheets(name[1:]):
+            name = name[1:]
+        plain = all(part.isascii() and part.isdigit() and len(part) <= 3 for part in parts)
+        red, green, blue = map(int, parts) if plain else (-1, -1, -1)
+        found.append(
+            NamedLabel(whole_number(row.get("labelvalue", ""), path), name, hex_colour(red, green, blue, top=255))
         )
-        for row in rows
-    ]
+    return found
 
 
 def slicer_table(rows: Iterable[NamedLabel]) -> str:
@@ -46,17 +48,6 @@ def slicer_table(rows: Iterable[NamedLabel]) -> str:
         parts = [] if row.colour is None else [*bytes.fromhex(row.colour[1:]), 255]
         writer.writerow([row.label, name, *(parts or [""] * 4)])
     return text.getvalue()
-
-
-def _unquoted(name: str) -> str:
-    return name[1:] if name.startswith("'") and computed_by_spreadsheets(name[1:]) else name
-
-
-def _colour(parts: list[str]) -> str | None:
-    if not all(part.isascii() and part.isdigit() and len(part) <= 3 for part in parts):
-        return None
-    red, green, blue = (int(part) for part in parts)
-    return hex_colour(red, green, blue, top=255)
 
 
 def _recognised(text: str) -> bool:
