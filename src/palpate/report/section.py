@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from palpate.images.label_image import VoxelGrid
+from palpate.images.tissue_distance import window_of
 
 __all__ = ["VIEWS", "Plane", "View", "cut_image", "joined"]
 
@@ -73,7 +74,8 @@ def cut_image(values: NDArray[Any], grid: VoxelGrid, plane: Plane, *, order: Lit
     """
     points = plane.points
     index = grid.index(points.reshape(-1, 3))
-    window, origin = _window(index, grid.shape)
+    window = window_of(index, grid, margin=2)
+    origin = np.array([axis.start for axis in window])
     sampled = ndimage.map_coordinates(
         values[window].astype(np.float64), (index - origin).T, order=order, mode="nearest"
     )
@@ -139,13 +141,3 @@ def _cut(
     places = flat[a] + share[..., None] * (flat[b] - flat[a])
     keys = a * len(points) + b
     return np.asarray(places[crossed[hit]].reshape(-1, 2, 2)), np.asarray(keys[crossed[hit]].reshape(-1, 2))
-
-
-def _window(
-    index: NDArray[np.float64], shape: tuple[int, int, int]
-) -> tuple[tuple[slice, slice, slice], NDArray[np.int64]]:
-    """The part of an array that voxel indices (n, 3) need, and its first voxel (3,)."""
-    last = np.array(shape) - 1
-    low = np.clip(np.floor(index.min(axis=0)).astype(np.int64) - 2, 0, last)
-    high = np.clip(np.ceil(index.max(axis=0)).astype(np.int64) + 2, 0, last)
-    return (slice(low[0], high[0] + 1), slice(low[1], high[1] + 1), slice(low[2], high[2] + 1)), low

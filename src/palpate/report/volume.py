@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
-from palpate.images.tissue_distance import cropped
+from palpate.images.tissue_distance import cropped, window_of
 from palpate.report.report_data import SliceBox, Volume
 
 __all__ = ["MOST_VOXELS", "grey_volume", "label_volume"]
@@ -44,18 +44,15 @@ def _step(grid: VoxelGrid, box: SliceBox, most_voxels: float) -> NDArray[np.floa
     """Voxel edges (3,) mm: the image's finest, or coarser where the box would hold too many; they fill the box."""
     size = box.high - box.low
     edge = max(float(grid.spacing.min()), float(np.prod(size) / most_voxels) ** (1.0 / 3.0))
-    return np.asarray(size / (_counts(size, edge) - 1))
-
-
-def _counts(size: NDArray[np.float64], edge: float) -> NDArray[np.int64]:
-    return np.maximum(np.rint(size / edge).astype(np.int64) + 1, 2)
+    return np.asarray(size / (np.maximum(np.rint(size / edge).astype(np.int64) + 1, 2) - 1))
 
 
 def _cut(
     values: NDArray[Any], grid: VoxelGrid, box: SliceBox, *, step: NDArray[np.float64], order: Literal[0, 1]
 ) -> NDArray[np.float32]:
     """Values on the grid from `box.low` in steps of `step`; NaN outside of the image."""
-    window = _window_of(grid, box)
+    corners = np.array(np.meshgrid(*np.stack([box.low, box.high], axis=1))).reshape(3, -1).T
+    window = window_of(grid.index(corners), grid, margin=1)
     part = cropped(grid, window)
     inverse = np.linalg.inv(part.affine)
     counts = np.rint((box.high - box.low) / step).astype(np.int64) + 1
@@ -69,16 +66,6 @@ def _cut(
         cval=np.nan,
     )
     return np.asarray(cut)
-
-
-def _window_of(grid: VoxelGrid, box: SliceBox) -> tuple[slice, slice, slice]:
-    """Voxels of the image that the box may need; one of them where it needs none."""
-    corners = np.array(np.meshgrid(*np.stack([box.low, box.high], axis=1))).reshape(3, -1).T
-    index, last = grid.index(corners), np.array(grid.shape) - 1
-    low = np.clip(np.floor(index.min(axis=0)).astype(np.int64) - 1, 0, last)
-    high = np.clip(np.ceil(index.max(axis=0)).astype(np.int64) + 1, 0, last)
-    i, j, k = (slice(int(a), int(b) + 1) for a, b in zip(low, high, strict=True))
-    return (i, j, k)
 
 
 def _window(values: NDArray[np.float32]) -> tuple[float, float]:
