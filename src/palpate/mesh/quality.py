@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from palpate.errors import MeshQualityError
 from palpate.mesh.anatomy import Anatomy
+from palpate.mesh.cutting import face_pieces
 from palpate.mesh.dihedral import tet_dihedrals
-from palpate.mesh.tet_mesh import FACES, TetMesh
+from palpate.mesh.tet_mesh import TetMesh
 
 __all__ = ["MeshQuality", "check_mesh", "dihedral_angles", "level_set_volumes", "mesh_quality"]
 
@@ -61,10 +61,11 @@ def mesh_quality(mesh: TetMesh, anatomy: Anatomy, *, voxel_volumes: Mapping[str,
     smallest = angles.min(axis=1)
     worst = int(smallest.argmin())
     place = mesh.nodes[mesh.tets[worst]].mean(axis=0)
-    volume = _tissue_volumes(mesh)
+    sums = np.bincount(mesh.region, mesh.volumes, minlength=len(mesh.tissues))
+    volume = {tissue.name: float(sums[i]) for i, tissue in enumerate(mesh.tissues) if tissue.meshed}
     target = level_set_volumes(anatomy)
     counted = voxel_volumes or {}
-    components, overfull = _connection(mesh)
+    piece, with_face = face_pieces(mesh.tets)
     return MeshQuality(
         nodes=len(mesh.nodes),
         tets=len(mesh.tets),
@@ -77,8 +78,8 @@ def mesh_quality(mesh: TetMesh, anatomy: Anatomy, *, voxel_volumes: Mapping[str,
         volume=volume,
         volume_error=_errors(volume, target),
         voxel_volume_error=_errors(volume, counted),
-        components=components,
-        overfull_faces=overfull,
+        components=int(piece.max()) + 1,
+        overfull_faces=int(np.count_nonzero(with_face > 2)),
     )
 
 
@@ -158,23 +159,8 @@ def _shares(values: NDArray[np.float64], edge: float) -> NDArray[np.float64]:
     return np.array([*shares, left])
 
 
-def _tissue_volumes(mesh: TetMesh) -> dict[str, float]:
-    sums = np.bincount(mesh.region, mesh.volumes, minlength=len(mesh.tissues))
-    return {tissue.name: float(sums[i]) for i, tissue in enumerate(mesh.tissues) if tissue.meshed}
-
-
 def _errors(volume: Mapping[str, float], target: Mapping[str, float]) -> dict[str, float]:
     return {name: volume[name] / target[name] - 1.0 for name in volume if target.get(name, 0.0) > 0.0}
-
-
-def _connection(mesh: TetMesh) -> tuple[int, int]:
-    """Number of pieces joined through faces, and number of faces in more than two tetrahedra."""
-    faces = np.sort(mesh.tets[:, FACES].reshape(-1, 3), axis=1)
-    _, inverse, count = np.unique(faces, axis=0, return_inverse=True, return_counts=True)
-    owner = np.repeat(np.arange(len(mesh.tets)), 4)
-    by_face = sparse.csr_matrix((np.ones(len(owner)), (owner, inverse.ravel())))
-    pieces = sparse.csgraph.connected_components(by_face @ by_face.T, directed=False)[0]
-    return int(pieces), int(np.count_nonzero(count > 2))
 
 
 def _shape_failures(quality: MeshQuality) -> list[str]:

@@ -209,18 +209,14 @@ def _facet_means(grid: Grid, contacts: Contacts) -> NDArray[np.float64]:
     total, weight = np.zeros(contacts.on.shape), np.zeros(contacts.on.shape)
     barycentric = np.concatenate([np.roll(row, shift)[None] for row in QUADRATURE for shift in range(3)])
     for place, share in zip(barycentric, QUADRATURE_WEIGHTS, strict=True):
-        value = _on_faces(contacts, np.einsum("k,nki->ni", place, corners))
+        points = np.einsum("k,nki->ni", place, corners)
+        value = np.zeros(len(points))
+        for k, phi in enumerate(contacts.level_sets):
+            mine = contacts.surface == k
+            if mine.any():
+                value[mine] = phi.at(points[mine])
         for corner in range(3):
             key = (contacts.faces[:, corner], contacts.surface)
             np.add.at(total, key, share * area * place[corner] * value)
             np.add.at(weight, key, share * area * place[corner])
     return np.asarray(total / np.where(weight > 0.0, weight, 1.0))
-
-
-def _on_faces(contacts: Contacts, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    values = np.zeros(len(points))
-    for k, phi in enumerate(contacts.level_sets):
-        mine = contacts.surface == k
-        if mine.any():
-            values[mine] = phi.at(points[mine])
-    return values

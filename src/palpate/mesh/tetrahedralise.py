@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from palpate.errors import GeometryError
 from palpate.images.tissue import Role
 from palpate.mesh.anatomy import Anatomy
 from palpate.mesh.closing import closed
-from palpate.mesh.cutting import Grid, cut, graded_grid, signed_volumes
+from palpate.mesh.cutting import Grid, cut, face_pieces, graded_grid, signed_volumes
 from palpate.mesh.dihedral import tet_dihedrals
 from palpate.mesh.remeshing import compact, remeshed
 from palpate.mesh.smoothing import smoothed
@@ -133,19 +132,11 @@ def _meshed_part(grid: Grid, anatomy: Anatomy) -> Grid:
     keep = np.array([tissue.meshed for tissue in anatomy.tissues])[grid.region]
     if not keep.any():
         raise GeometryError("no tetrahedron is left: the `estimate` and `known` tissues lie outside the domain")
-    return _without_crumbs(compact(grid.nodes, grid.tets[keep], grid.region[keep]))
-
-
-def _without_crumbs(grid: Grid) -> Grid:
-    """The grid without small pieces that share no face with the rest, as between bones that touch."""
-    faces = np.sort(grid.tets[:, FACES].reshape(-1, 3), axis=1)
-    _, number = np.unique(faces, axis=0, return_inverse=True)
-    owner = np.repeat(np.arange(len(grid.tets)), 4)
-    by_face = sparse.csr_matrix((np.ones(len(owner)), (owner, number.ravel())))
-    piece = sparse.csgraph.connected_components(by_face @ by_face.T, directed=False)[1]
-    volume = np.bincount(piece, signed_volumes(grid.nodes, grid.tets))
+    tets, region = grid.tets[keep], grid.region[keep]
+    piece, _ = face_pieces(tets)  # small ones share no face with the rest, as between bones that touch
+    volume = np.bincount(piece, signed_volumes(grid.nodes, tets))
     keep = volume[piece] > CRUMB * volume.sum()
-    return compact(grid.nodes, grid.tets[keep], grid.region[keep])
+    return compact(grid.nodes, tets[keep], region[keep])
 
 
 def _beyond(anatomy: Anatomy, nodes: NDArray[np.float64], boundary: NDArray[np.int64]) -> NDArray[np.int64]:

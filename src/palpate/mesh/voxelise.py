@@ -53,11 +53,18 @@ def voxelise(
     triangles, inner, other = _interfaces(space.mesh)
     pieces = _pieces(space, displacement, triangles, subdivisions=subdivisions, warp=warp)
     count = 4**subdivisions
-    code_inner, code_other = (np.repeat(_codes(side, space.mesh), count) for side in (inner, other))
+    code_inner, code_other = (
+        np.repeat(np.where(np.isin(side, space.mesh.region), BASE ** np.maximum(side, 0), 0), count)
+        for side in (inner, other)
+    )
     tissue = _regions(_accumulate(pieces, code_other - code_inner, grid), space.mesh, crossing)
     hollow = code_other == 0
     behind = np.repeat(np.where(other == OUTER, inner, other), count)
-    return _fill_hollows(tissue, grid, centroids=pieces[hollow].mean(axis=1), values=behind[hollow])
+    empty = np.argwhere(tissue < 0)
+    if len(empty):
+        nearest = KDTree(pieces[hollow].mean(axis=1)).query(grid.world(empty.astype(float)), workers=-1)[1]
+        tissue[tuple(empty.T)] = behind[hollow][nearest]
+    return tissue
 
 
 def _interfaces(mesh: TetMesh) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
@@ -70,11 +77,6 @@ def _interfaces(mesh: TetMesh) -> tuple[NDArray[np.int64], NDArray[np.int64], ND
         other.append(surface.other[first])
         inner.append(np.full(int(first.sum()), region))
     return np.concatenate(triangles), np.concatenate(inner), np.concatenate(other)
-
-
-def _codes(side: NDArray[np.int64], mesh: TetMesh) -> NDArray[np.int64]:
-    """Digit of each region, 0 for what is not meshed."""
-    return np.where(np.isin(side, mesh.region), BASE ** np.maximum(side, 0), 0)
 
 
 def _regions(codes: NDArray[np.int64], mesh: TetMesh, crossing: bool) -> NDArray[np.int16]:
@@ -184,16 +186,3 @@ def _height(corners: NDArray[np.float64], x: NDArray[np.int64], y: NDArray[np.in
 def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Third component (n,) of the cross product of the first two components of a and b."""
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-
-
-def _fill_hollows(
-    tissue: NDArray[np.int16], grid: VoxelGrid, *, centroids: NDArray[np.float64], values: NDArray[np.int64]
-) -> NDArray[np.int16]:
-    """`tissue` with each -1 replaced by the value of the nearest of the boundary's centroids (n, 3) mm."""
-    empty = np.argwhere(tissue < 0)
-    if len(empty) == 0:
-        return tissue
-    nearest = KDTree(centroids).query(grid.world(empty.astype(float)), workers=-1)[1]
-    filled = tissue.copy()
-    filled[tuple(empty.T)] = values[nearest]
-    return filled
