@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.images import Role, Tissue
-from palpate.mesh import FACES, OUTER, TetMesh
+from palpate.mesh import OUTER, TetMesh, boundary_of
 
 __all__ = [
     "VOID",
-    "boundary_faces",
     "box_mesh",
     "known",
     "kuhn_tets",
@@ -51,13 +50,6 @@ def oriented(nodes: Array, tets: Integers) -> Integers:
     return result
 
 
-def boundary_faces(tets: Integers) -> Integers:
-    """Faces (n_faces, 3) that only one of the tetrahedra (n_tets, 4) has, seen from outside."""
-    faces = tets[:, FACES].reshape(-1, 3)
-    _, place, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    return np.asarray(faces[place[count == 1]])
-
-
 def make_mesh(
     nodes: Array,
     tets: Integers,
@@ -70,7 +62,7 @@ def make_mesh(
     beyond(centroids (n, 3)) gives the neighbour of each outer face, OUTER by default.
     """
     tets = oriented(nodes, tets)
-    boundary = boundary_faces(tets)
+    boundary = boundary_of(tets)
     behind = np.full(len(boundary), OUTER) if beyond is None else beyond(nodes[boundary].mean(axis=1))
     return TetMesh(nodes, tets, region, boundary, behind, tuple(tissues))
 
