@@ -19,14 +19,7 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.images.tissue_distance import tissue_distance_map
 
-__all__ = [
-    "Alignment",
-    "RigidFit",
-    "RigidMotion",
-    "align",
-    "fit_rigid_motion",
-    "moved",
-]
+__all__ = ["Alignment", "RigidFit", "RigidMotion", "align", "fit_rigid_motion", "moved"]
 
 BORDER_VOXELS = 3.0  # nearer to the image's border the map continues what it cannot see
 MAX_POINTS = 20_000

@@ -62,7 +62,14 @@ def check_segmentation(segmentation: Segmentation, name: str) -> tuple[Finding, 
         if tissue.role is not Role.RIGID:
             findings += _cut_by_border(segmentation.mask(i), tissue, name)
             findings += _too_thin(segmentation.index == i, box[0], tissue, name)
-            findings += _islands(segmentation.index[box[0]] == i, tissue, name)
+            parts, count = ndimage.label(segmentation.index[box[0]] == i, structure=np.ones((3, 3, 3)))
+            if count > 1:
+                sizes = np.sort(np.bincount(parts.ravel())[1:])
+                text = (
+                    f"'{tissue.name}' has {count} separate pieces in '{name}', {sizes[:-1].sum() / sizes.sum():.2%} of"
+                    " it outside the largest; remove stray voxels from the labels"
+                )
+                findings.append(Finding("islands", text))
     return tuple(findings)
 
 
@@ -74,7 +81,15 @@ def check_pair(before: Segmentation, after: Segmentation, *, name: str = "after"
     """
     if [t.name for t in before.tissues] != [t.name for t in after.tissues]:
         raise InputDataError(f"'before' and '{name}' have been segmented into different tissues; use one list for both")
-    _refuse_renamed(before, after, name)
+    # 3D Slicer numbers segments anew in each file: one number may be two organs
+    for here, there in zip(before.tissues, after.tissues, strict=True):
+        names = [sorted(word.casefold() for word in tissue.called) for tissue in (here, there)]
+        if all(names) and names[0] != names[1]:
+            raise InputDataError(
+                f"tissue '{here.name}' (label {', '.join(map(str, here.labels))}) is called {list(here.called)} in"
+                f" 'before' and {list(there.called)} in '{name}'; give the tissue a name as its label in the case"
+                f' (label = "{here.called[0]}"), or the same names in both files'
+            )
     if np.array_equal(before.index, after.index):
         raise InputDataError(
             f"'before' and '{name}' are the same label image, voxel by voxel; without a deformation nothing can be"
@@ -89,18 +104,6 @@ def check_pair(before: Segmentation, after: Segmentation, *, name: str = "after"
     for i in observed:
         findings += _volume_change(before, after, i, name)
     return tuple(findings)
-
-
-def _refuse_renamed(before: Segmentation, after: Segmentation, name: str) -> None:
-    """3D Slicer numbers segments anew in each file: one number may be two organs."""
-    for here, there in zip(before.tissues, after.tissues, strict=True):
-        names = [sorted(word.casefold() for word in tissue.called) for tissue in (here, there)]
-        if all(names) and names[0] != names[1]:
-            raise InputDataError(
-                f"tissue '{here.name}' (label {', '.join(map(str, here.labels))}) is called {list(here.called)} in"
-                f" 'before' and {list(there.called)} in '{name}'; give the tissue a name as its label in the case"
-                f' (label = "{here.called[0]}"), or the same names in both files'
-            )
 
 
 def _refuse_absent(segmentation: Segmentation, where: str) -> None:
@@ -154,19 +157,6 @@ def _too_thin(mask: NDArray[np.bool_], box: tuple[slice, ...], tissue: Tissue, n
     return [Finding("thin", text)]
 
 
-def _islands(mask: NDArray[np.bool_], tissue: Tissue, name: str) -> list[Finding]:
-    parts, count = ndimage.label(mask, structure=np.ones((3, 3, 3)))
-    if count < 2:
-        return []
-    sizes = np.sort(np.bincount(parts.ravel())[1:])
-    rest = float(sizes[:-1].sum() / sizes.sum())
-    text = (
-        f"'{tissue.name}' has {count} separate pieces in '{name}', {rest:.2%} of it outside the largest; remove stray"
-        " voxels from the labels"
-    )
-    return [Finding("islands", text)]
-
-
 def _common_part(before: Segmentation, after: Segmentation, name: str) -> list[Finding]:
     share = max(_share_inside(before.grid, after.grid), _share_inside(after.grid, before.grid))
     if share == 0.0:
@@ -199,12 +189,14 @@ def _mirrored(before: Segmentation, after: Segmentation, observed: Sequence[int]
     points = [_sample(before, i) for i in observed]
     middle = np.mean([p.mean(axis=0) for p in points], axis=0)
     target = np.mean([_centroid(after, i) for i in observed], axis=0)
-    agreement = {
-        signs: float(
-            np.mean([_hits(after, i, target + (p - middle) * signs) for i, p in zip(observed, points, strict=True)])
-        )
-        for signs in product((1.0, -1.0), repeat=3)
-    }
+    agreement = {}
+    for signs in product((1.0, -1.0), repeat=3):
+        hits = []
+        for i, p in zip(observed, points, strict=True):
+            index = np.rint(after.grid.index(target + (p - middle) * signs)).astype(np.int64)
+            inside = index[((index >= 0) & (index < after.grid.shape)).all(axis=1)]
+            hits.append(np.count_nonzero(after.index[tuple(inside.T)] == i) / len(p))
+        agreement[signs] = float(np.mean(hits))
     plain = agreement.pop((1.0, 1.0, 1.0))
     signs, best = max(agreement.items(), key=lambda item: (round(item[1], 3), sum(item[0])))
     if best - plain < MIRROR_LIKELY:
@@ -228,12 +220,6 @@ def _sample(segmentation: Segmentation, tissue: int) -> NDArray[np.float64]:
 def _centroid(segmentation: Segmentation, tissue: int) -> NDArray[np.float64]:
     index = np.argwhere(segmentation.mask(tissue)).mean(axis=0, keepdims=True)
     return np.asarray(segmentation.grid.world(index)[0])
-
-
-def _hits(segmentation: Segmentation, tissue: int, points: NDArray[np.float64]) -> float:
-    index = np.rint(segmentation.grid.index(points)).astype(np.int64)
-    inside = ((index >= 0) & (index < segmentation.grid.shape)).all(axis=1)
-    return float(np.count_nonzero(segmentation.index[tuple(index[inside].T)] == tissue) / len(points))
 
 
 def _shifts(before: Segmentation, after: Segmentation, observed: Sequence[int], name: str) -> list[Finding]:

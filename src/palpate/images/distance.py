@@ -48,8 +48,9 @@ class DistanceMap:
         last = np.array(self.coefficients.shape)[:, None] - 1
         nodes = np.abs(base[:, :, None] + np.arange(-1, 3)) % np.maximum(2 * last, 1)
         x, y, z = (last - np.abs(nodes - last)).transpose(1, 0, 2)
-        flat = ((x[:, :, None, None] * ny + y[:, None, :, None]) * nz) + z[:, None, None, :]
-        stencil = self.coefficients.ravel().take(flat)
+        stencil = self.coefficients.ravel().take(
+            ((x[:, :, None, None] * ny + y[:, None, :, None]) * nz) + z[:, None, None, :]
+        )
         plane, along_z = _contract(stencil, value[:, 2]), _contract(stencil, slope[:, 2])
         line = _contract(plane, value[:, 1])
         by_index = [

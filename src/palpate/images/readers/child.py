@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.errors import PalpateError
 from palpate.images.label_image import VoxelGrid
@@ -41,7 +40,10 @@ def main(arguments: list[str]) -> None:
         pipe.flush()
         _limit(memory_bytes, cpu_seconds)
         try:
-            grid = VoxelGrid(*_place(arguments[4])) if len(arguments) > 4 else None
+            grid = None
+            if len(arguments) > 4:
+                (nx, ny, nz), affine = json.loads(arguments[4])
+                grid = VoxelGrid((int(nx), int(ny), int(nz)), np.array(affine, dtype=np.float64))
             stored = format_of(path).stored(path, grid)
             values = np.asfortranarray(REDUCED[kind](stored.values, path))
         except PalpateError as error:
@@ -58,11 +60,6 @@ def main(arguments: list[str]) -> None:
             findings = [[finding.code, finding.message] for finding in stored.findings]
             _send(pipe, {**place, "names": names, "digests": dict(stored.digests), "findings": findings})
             pipe.write(values.T.data.cast("B"))
-
-
-def _place(text: str) -> tuple[tuple[int, int, int], NDArray[np.float64]]:
-    shape, affine = json.loads(text)
-    return (int(shape[0]), int(shape[1]), int(shape[2])), np.array(affine, dtype=np.float64)
 
 
 def _limit(memory_bytes: int, cpu_seconds: int) -> None:

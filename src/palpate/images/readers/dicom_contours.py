@@ -58,7 +58,13 @@ def read(path: Path, grid: VoxelGrid | None) -> StoredImage:
     """
     with sentences(path):
         dataset, sha256 = read_dataset(path)
-        series = series_beside(path, _series_uid(dataset)) or (Series(grid) if grid else None)
+        uids = (
+            str(series.SeriesInstanceUID)
+            for frame in dataset.get("ReferencedFrameOfReferenceSequence", ())
+            for study in frame.get("RTReferencedStudySequence", ())
+            for series in study.get("RTReferencedSeriesSequence", ())
+        )
+        series = series_beside(path, next(uids, "")) or (Series(grid) if grid else None)
         if series is None:
             raise InputDataError(
                 f"the DICOM series that '{path}' was drawn on is not beside it, and without its slices contours have no"
@@ -87,14 +93,6 @@ def read(path: Path, grid: VoxelGrid | None) -> StoredImage:
 def _points(contour: Dataset) -> NDArray[np.float64]:
     """The points of a contour (n, 3), RAS mm."""
     return np.array(contour.ContourData, dtype=np.float64).reshape(-1, 3) * [-1.0, -1.0, 1.0]
-
-
-def _series_uid(dataset: Dataset) -> str:
-    for frame in dataset.get("ReferencedFrameOfReferenceSequence", ()):
-        for study in frame.get("RTReferencedStudySequence", ()):
-            for series in study.get("RTReferencedSeriesSequence", ()):
-                return str(series.SeriesInstanceUID)
-    return ""
 
 
 def _structures(dataset: Dataset, to_index: NDArray[np.float64], path: Path) -> list[_Structure]:

@@ -92,7 +92,21 @@ def _reader(
 
         def verdict() -> PalpateError:
             """Why the process ended; waits for its end."""
-            return _verdict(process.wait(), path, limits, overdue=overdue.is_set())
+            code = process.wait()
+            name = {-int(number): number.name for number in signal.Signals}.get(code, f"exit code {code}")
+            if overdue.is_set() or name == "SIGXCPU":
+                return ResourceError(
+                    f"reading '{path}' took more than {limits.cpu_seconds} s of processor time, or"
+                    f" {limits.wall_seconds:g} s in all, that one file gets; copy it to a local disk, or it is damaged:"
+                    " export it again"
+                )
+            if name == "SIGKILL":
+                return ResourceError(
+                    f"the system stopped the reading of '{path}', most often because memory is short; crop the image"
+                )
+            return InputDataError(
+                f"the reader of '{path}' crashed ({name}); the file is most likely damaged: export it again"
+            )
 
         timer = threading.Timer(limits.wall_seconds, stop)
         timer.start()
@@ -161,18 +175,3 @@ def _stored(answer: Mapping[str, Any], pipe: BinaryIO, path: Path) -> StoredImag
     except InputDataError:
         return None
     return StoredImage(content.view(dtype).reshape(shape, order="F"), affine, names, digests, findings)
-
-
-def _verdict(code: int, path: Path, limits: ReadLimits, *, overdue: bool) -> PalpateError:
-    """Why the process ended before its answer was whole; `code` below zero is a signal's number."""
-    name = {-int(number): number.name for number in signal.Signals}.get(code, f"exit code {code}")
-    if overdue or name == "SIGXCPU":
-        return ResourceError(
-            f"reading '{path}' took more than {limits.cpu_seconds} s of processor time, or {limits.wall_seconds:g} s"
-            " in all, that one file gets; copy it to a local disk, or it is damaged: export it again"
-        )
-    if name == "SIGKILL":
-        return ResourceError(
-            f"the system stopped the reading of '{path}', most often because memory is short; crop the image"
-        )
-    return InputDataError(f"the reader of '{path}' crashed ({name}); the file is most likely damaged: export it again")

@@ -28,24 +28,16 @@ def extension_names(content: bytes, byte_order: Literal["<", ">"], path: Path) -
 
     Raises `InputDataError` for a table that is damaged, too large, or declares a document type.
     """
-    for code, data in _extensions(content, byte_order):
-        text = data.rstrip(b"\0 \r\n\t")
-        if code == 0 and f"<{ROOT}".encode() in text[:1000]:
-            return tuple(_Table(path).read(text))
-    return ()
-
-
-def _extensions(content: bytes, byte_order: str) -> list[tuple[int, bytes]]:
-    """Code and data of each extension, up to the first whose size cannot be."""
-    found: list[tuple[int, bytes]] = []
     place = 4
     while content[:1] not in (b"", b"\0") and place + 8 <= len(content):
         size, code = struct.unpack_from(f"{byte_order}2i", content, place)
-        if not 8 <= size <= len(content) - place:
+        if not 8 <= size <= len(content) - place:  # a size that cannot be: nothing behind it can be found
             break
-        found.append((code, content[place + 8 : place + size]))
+        text = content[place + 8 : place + size].rstrip(b"\0 \r\n\t")
+        if code == 0 and f"<{ROOT}".encode() in text[:1000]:
+            return tuple(_Table(path).read(text))
         place += size
-    return found
+    return ()
 
 
 class _Table:

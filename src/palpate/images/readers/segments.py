@@ -48,20 +48,18 @@ def segments_of(keys: Mapping[str, str], path: Path) -> tuple[Segment, ...]:
         (number, entry) for number, entry in sorted(found.items()) if {"ID", "Name", "LabelValue"} & set(entry)
     ]
     old = not any("Layer" in entry or "LabelValue" in entry for _, entry in described)
-    segments = tuple(_segment(entry, number, path, old=old) for number, entry in described)
+    segments = []
+    for number, entry in described:
+        name = printable(entry.get("Name", "").strip())[:MAX_NAME] or f"segment {number + 1}"
+        layer = number if old else _whole(entry.get("Layer", "0"), path, low=0)
+        label = _whole(entry.get("LabelValue", "1"), path, low=1)
+        segments.append(Segment(name, unit_colour(entry.get("Color", "").split()), layer, label))
     if len({(s.layer, s.label) for s in segments}) < len(segments):
         raise InputDataError(
             f"'{path}' has two segments with the same label value in one layer, so one of them is lost; export the"
             " segmentation again"
         )
-    return segments
-
-
-def _segment(entry: Mapping[str, str], number: int, path: Path, *, old: bool) -> Segment:
-    name = printable(entry.get("Name", "").strip())[:MAX_NAME] or f"segment {number + 1}"
-    layer = number if old else _whole(entry.get("Layer", "0"), path, low=0)
-    colour = unit_colour(entry.get("Color", "").split())
-    return Segment(name, colour, layer, _whole(entry.get("LabelValue", "1"), path, low=1))
+    return tuple(segments)
 
 
 def _whole(text: str, path: Path, *, low: int) -> int:
@@ -92,10 +90,6 @@ def flattened(
     names = tuple(NamedLabel(label, s.name, s.colour) for label, s in zip(labels, segments, strict=True))
     if len(layers) == 1:
         return layers[0], names
-    return _merged(layers, segments, labels, path), names
-
-
-def _merged(layers: NDArray[Any], segments: tuple[Segment, ...], labels: list[int], path: Path) -> NDArray[np.uint16]:
     merged = np.zeros(layers.shape[1:], dtype=np.uint16)
     for k, layer in enumerate(layers):
         ours = [(s, label) for s, label in zip(segments, labels, strict=True) if s.layer == k]
@@ -110,7 +104,7 @@ def _merged(layers: NDArray[Any], segments: tuple[Segment, ...], labels: list[in
                 " there (3D Slicer: Segment Editor, allow no overlap)"
             )
         merged += mapped
-    return merged
+    return merged, names
 
 
 def _relabelled(layer: NDArray[Any], segments: list[tuple[Segment, int]], path: Path) -> NDArray[np.uint16]:

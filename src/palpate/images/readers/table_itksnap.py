@@ -13,7 +13,7 @@ from palpate.images.readers.table_registry import TableFormat, register_table
 __all__ = ["read_itksnap_table"]
 
 ROW = re.compile(
-    r"\s*(?P<label>[0-9]{1,9})\s+" + COLOURS + r'\s+[0-9.eE+-]{1,20}\s+[0-9]\s+[0-9]\s+"(?P<name>[^"]*)"\s*',
+    r"\s*(?P<label>[0-9]{1,9})\s+" + COLOURS + r'\s+[0-9.eE+-]{1,20}\s+[0-9]\s+[0-9]\s+"(?P<name>[^"]*)"\s*'
 )
 QUOTED = re.compile(r'.*".*')
 

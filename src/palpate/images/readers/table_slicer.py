@@ -5,11 +5,12 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 
 from palpate.errors import InputDataError
 from palpate.images.named_labels import NamedLabel, computed_by_spreadsheets, hex_colour
-from palpate.images.readers.delimited import column_names, delimited_rows, whole_number
+from palpate.images.readers.delimited import column_names, delimited_rows, separated_by, whole_number
 from palpate.images.readers.table_registry import TableFormat, register_table
 
 __all__ = ["read_slicer_table", "slicer_table"]
@@ -50,8 +51,6 @@ def slicer_table(rows: Iterable[NamedLabel]) -> str:
     return text.getvalue()
 
 
-def _recognised(text: str) -> bool:
-    return "," in text.partition("\n")[0]
-
-
-register_table(TableFormat("3D Slicer's CSV colour table", (".csv",), _recognised, read_slicer_table))
+register_table(
+    TableFormat("3D Slicer's CSV colour table", (".csv",), partial(separated_by, delimiter=","), read_slicer_table)
+)
