@@ -137,7 +137,19 @@ def anatomy_of(segmentation: Segmentation, *, box: Box, smoothing_mm: float) -> 
         """That of the tissue at this place of the order."""
         held = tissues[order[rank]].role in (Role.RIGID, Role.VOID)
         width = HELD_SMOOTHING * smoothing_mm if held else smoothing_mm
-        return _extended_map(segmentation, order[rank], order[:rank], width)
+        tissue = order[rank]
+        mask = segmentation.mask(tissue)
+        if not mask.any():
+            raise InputDataError(f"tissue '{segmentation.tissues[tissue].name}' has no voxel in the image")
+        window = window_around(mask, segmentation.grid, reach_mm=CROP_MM)
+        index, part = segmentation.index[window], mask[window]
+        won = np.isin(index, order[:rank])
+        if won.any() and not won.all():
+            nearest = ndimage.distance_transform_edt(
+                won, sampling=segmentation.grid.spacing, return_distances=False, return_indices=True
+            )
+            part = part[tuple(nearest)]
+        return volume_preserving(distance_map(part, cropped(segmentation.grid, window), smoothing_mm=width), part)
 
     made = dict(zip(order, mapped(level_set, range(len(order))), strict=True))
     return Anatomy(tissues, tuple(made.get(i) for i in range(len(tissues))), box)
@@ -167,23 +179,6 @@ def margin_box(box: Box, points: NDArray[np.float64], *, margin_mm: float) -> Bo
 def _priority(tissues: tuple[Tissue, ...], filler: int) -> tuple[int, ...]:
     rest = [i for i in range(len(tissues)) if i != filler]
     return tuple(sorted(rest, key=lambda i: tissues[i].meshed))
-
-
-def _extended_map(
-    segmentation: Segmentation, tissue: int, winners: tuple[int, ...], smoothing_mm: float
-) -> DistanceMap:
-    mask = segmentation.mask(tissue)
-    if not mask.any():
-        raise InputDataError(f"tissue '{segmentation.tissues[tissue].name}' has no voxel in the image")
-    window = window_around(mask, segmentation.grid, reach_mm=CROP_MM)
-    index, part = segmentation.index[window], mask[window]
-    won = np.isin(index, winners)
-    if won.any() and not won.all():
-        nearest = ndimage.distance_transform_edt(
-            won, sampling=segmentation.grid.spacing, return_distances=False, return_indices=True
-        )
-        part = part[tuple(nearest)]
-    return volume_preserving(distance_map(part, cropped(segmentation.grid, window), smoothing_mm=smoothing_mm), part)
 
 
 def volume_preserving(distance: DistanceMap, mask: NDArray[np.bool_]) -> DistanceMap:

@@ -168,7 +168,15 @@ def _divide(
         edge, whole = _first_edge(tets, keys, rank, n)
         done.append((tets[whole], parent[whole]))
         tets, parent, edge = tets[~whole], parent[~whole], edge[~whole]
-        tets, parent = _halved(tets, parent, edge, keys, n)
+        rows = np.arange(len(tets))
+        key = _edge_keys(tets, n)[rows, edge]
+        middle = n + np.searchsorted(keys, key)
+        halves = []
+        for end in range(2):
+            half = tets.copy()
+            half[rows, TET_EDGES[edge, end]] = middle
+            halves.append(half)
+        tets, parent = np.concatenate(halves), np.concatenate([parent, parent])
     return Grid(nodes, np.concatenate([t for t, _ in done]), grid.region[np.concatenate([p for _, p in done])]), (
         np.concatenate([p for _, p in done])
     )
@@ -193,20 +201,6 @@ def _edge_keys(tets: NDArray[np.int64], n: int) -> NDArray[np.int64]:
     return np.asarray(np.where(pairs[..., 1] < n, pairs[..., 0] * n + pairs[..., 1], -1))
 
 
-def _halved(
-    tets: NDArray[np.int64], parent: NDArray[np.int64], edge: NDArray[np.int64], keys: NDArray[np.int64], n: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    rows = np.arange(len(tets))
-    key = _edge_keys(tets, n)[rows, edge]
-    middle = n + np.searchsorted(keys, key)
-    halves = []
-    for end in range(2):
-        half = tets.copy()
-        half[rows, TET_EDGES[edge, end]] = middle
-        halves.append(half)
-    return np.concatenate(halves), np.concatenate([parent, parent])
-
-
 def _roots(ends: NDArray[np.float64], values: NDArray[np.float64], phi: LevelSet) -> NDArray[np.float64]:
     """Points (n, 3) of the segments `ends` (n, 2, 3) where phi is zero, by regula falsi (Illinois)."""
     low, high = np.zeros(len(ends)), np.ones(len(ends))
@@ -216,11 +210,7 @@ def _roots(ends: NDArray[np.float64], values: NDArray[np.float64], phi: LevelSet
         f = phi.at(ends[:, 0] + at[:, None] * (ends[:, 1] - ends[:, 0]))
         left = np.sign(f) == np.sign(f_low)
         low, f_low, f_high = np.where(left, at, low), np.where(left, f, f_low), np.where(left, 0.5 * f_high, f_high)
-        high, f_high, f_low = (
-            np.where(left, high, at),
-            np.where(left, f_high, f),
-            np.where(left, f_low, 0.5 * f_low),
-        )
+        high, f_high, f_low = (np.where(left, high, at), np.where(left, f_high, f), np.where(left, f_low, 0.5 * f_low))
         at = (low * f_high - high * f_low) / np.where(f_high == f_low, 1.0, f_high - f_low)
     at = np.clip(at, 0.05, 0.95)
     return np.asarray(ends[:, 0] + at[:, None] * (ends[:, 1] - ends[:, 0]))

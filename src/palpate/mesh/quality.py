@@ -84,11 +84,7 @@ def mesh_quality(mesh: TetMesh, anatomy: Anatomy, *, voxel_volumes: Mapping[str,
 
 
 def check_mesh(
-    mesh: TetMesh,
-    anatomy: Anatomy,
-    *,
-    voxel_volumes: Mapping[str, float] | None = None,
-    thin: tuple[str, ...] = (),
+    mesh: TetMesh, anatomy: Anatomy, *, voxel_volumes: Mapping[str, float] | None = None, thin: tuple[str, ...] = ()
 ) -> MeshQuality:
     """The gate: the mesh's quality, or `MeshQualityError` that names every region and place that fails.
 
@@ -97,7 +93,18 @@ def check_mesh(
     piece; no face in more than two tetrahedra. `voxel_volumes`: tissue name -> mm^3 inside the box.
     """
     quality = mesh_quality(mesh, anatomy, voxel_volumes=voxel_volumes)
-    failures = [*_shape_failures(quality), *_volume_failures(quality, thin)]
+    failures = _shape_failures(quality)
+    checks = (
+        ("level set", quality.volume_error, LEVEL_SET_TOLERANCE),
+        ("voxels", quality.voxel_volume_error, VOXEL_TOLERANCE),
+    )
+    for of, errors, limit in checks:
+        for name, error in errors.items():
+            if abs(error) > limit and name not in thin:
+                failures.append(
+                    f"region '{name}' of {quality.volume[name]:.0f} mm^3 differs by {100 * error:+.1f} % from the"
+                    f" volume of its {of} (limit {100 * limit:g} %)"
+                )
     if failures:
         raise MeshQualityError(
             f"the mesh of {quality.tets} tetrahedra is not fit to compute with: {'; '.join(failures)};"
@@ -124,23 +131,14 @@ def level_set_volumes(anatomy: Anatomy) -> dict[str, float]:
     for block in np.array_split(np.flatnonzero(crossed), max(1, int(crossed.sum()) // 200)):
         points = anatomy.box.world((centres[block][:, None] + fine).reshape(-1, 3))
         edge = cell ** (1 / 3) / FINE_CELLS
-        inside = _refined(anatomy, points, values[:, block], reach)
+        inside = np.repeat(values[:, block], FINE_CELLS**3, axis=1)
+        for rank, tissue in enumerate(anatomy.priority):
+            near, phi = np.abs(inside[rank]) < reach, anatomy.level_sets[tissue]
+            if phi is not None and near.any():
+                inside[rank, near] = phi.at(points[near])
         total += cell / FINE_CELLS**3 * _shares(inside, edge).sum(axis=1)
     order = (*anatomy.priority, anatomy.filler)
     return {anatomy.tissues[i].name: float(total[rank]) for rank, i in enumerate(order)}
-
-
-def _refined(
-    anatomy: Anatomy, points: NDArray[np.float64], coarse: NDArray[np.float64], reach: float
-) -> NDArray[np.float64]:
-    """Level sets (n_tissues - 1, n) at points (n, 3); `coarse` values where a cell is not crossed by one."""
-    values = np.repeat(coarse, FINE_CELLS**3, axis=1)
-    for rank, tissue in enumerate(anatomy.priority):
-        near = np.abs(values[rank]) < reach
-        phi = anatomy.level_sets[tissue]
-        if phi is not None and near.any():
-            values[rank, near] = phi.at(points[near])
-    return values
 
 
 def _cell_centres(counts: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -178,20 +176,4 @@ def _shape_failures(quality: MeshQuality) -> list[str]:
         failures.append(f"it falls into {quality.components} pieces that share no face")
     if quality.overfull_faces:
         failures.append(f"{quality.overfull_faces} faces belong to more than two tetrahedra")
-    return failures
-
-
-def _volume_failures(quality: MeshQuality, thin: tuple[str, ...]) -> list[str]:
-    failures = []
-    checks = (
-        ("level set", quality.volume_error, LEVEL_SET_TOLERANCE),
-        ("voxels", quality.voxel_volume_error, VOXEL_TOLERANCE),
-    )
-    for of, errors, limit in checks:
-        for name, error in errors.items():
-            if abs(error) > limit and name not in thin:
-                failures.append(
-                    f"region '{name}' of {quality.volume[name]:.0f} mm^3 differs by {100 * error:+.1f} % from the"
-                    f" volume of its {of} (limit {100 * limit:g} %)"
-                )
     return failures
