@@ -12,14 +12,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from palpate.report.report_data import (
-    LaterImage,
-    MeshPicture,
-    Reference,
-    ReportData,
-    TriangleSurface,
-    Volume,
-)
+from palpate.report.report_data import LaterImage, MeshPicture, Reference, ReportData, TriangleSurface, Volume
 from palpate.report.scales import Scale, angle_scale, distance_scale, modulus_scale, strain_scale
 from palpate.report.section import VIEWS
 

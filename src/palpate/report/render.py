@@ -75,16 +75,19 @@ def render_png(triangles: Triangles, camera: Camera, *, width: int, height: int,
     for density in np.unique(wanted):
         group = wanted == density
         _splat(flat[group], (triangles.colours * light)[group], int(density), edges=triangles.edges, into=buffer)
-    return _png(buffer)
+    # the mean over FINE x FINE samples, with straight alpha
+    there = (buffer >= 0)[..., None]
+    parts = np.stack([(buffer >> shift) & 255 for shift in (16, 8, 0)], axis=-1) * there
+    fine = np.concatenate([parts / 255.0, there], axis=-1)
+    mean = fine.reshape(buffer.shape[0] // FINE, FINE, buffer.shape[1] // FINE, FINE, 4).mean(axis=(1, 3))
+    mean[..., :3] /= np.maximum(mean[..., 3:], 1e-9)
+    memory = io.BytesIO()
+    mpimg.imsave(memory, np.rint(255.0 * mean).astype(np.uint8), format="png")
+    return memory.getvalue()
 
 
 def _splat(
-    flat: NDArray[np.float64],
-    colours: NDArray[np.float64],
-    density: int,
-    *,
-    edges: bool,
-    into: NDArray[np.int64],
+    flat: NDArray[np.float64], colours: NDArray[np.float64], density: int, *, edges: bool, into: NDArray[np.int64]
 ) -> None:
     """Put `density` samples along each edge of the triangles into the picture, where they are nearer than others."""
     i, j = np.meshgrid(np.arange(density + 1), np.arange(density + 1))
@@ -119,15 +122,3 @@ def _keep_nearest(places: NDArray[np.float64], shade: NDArray[np.float64], buffe
     colour = (red << 16) | (green << 8) | blue
     near = (places[seen, 2] * DEPTH_STEPS).astype(np.int64)
     np.maximum.at(buffer.reshape(-1), (y * columns + x)[seen], (near << 24) | colour)
-
-
-def _png(buffer: NDArray[np.int64]) -> bytes:
-    """The mean over FINE x FINE samples of the buffer, as a PNG with straight alpha."""
-    there = (buffer >= 0)[..., None]
-    parts = np.stack([(buffer >> shift) & 255 for shift in (16, 8, 0)], axis=-1) * there
-    fine = np.concatenate([parts / 255.0, there], axis=-1)
-    mean = fine.reshape(buffer.shape[0] // FINE, FINE, buffer.shape[1] // FINE, FINE, 4).mean(axis=(1, 3))
-    mean[..., :3] /= np.maximum(mean[..., 3:], 1e-9)
-    memory = io.BytesIO()
-    mpimg.imsave(memory, np.rint(255.0 * mean).astype(np.uint8), format="png")
-    return memory.getvalue()

@@ -95,33 +95,22 @@ def joined(points: NDArray[np.float64], triangles: NDArray[np.int64], plane: Pla
             neighbours.setdefault(end, []).append(number)
     unused = set(range(len(keys)))
     open_ends = [ends[0] for ends in neighbours.values() if len(ends) == 1]
-    return [
-        _follow(first, keys, segments, neighbours=neighbours, unused=unused)
-        for first in (*open_ends, *range(len(keys)))
-        if first in unused
-    ]
-
-
-def _follow(
-    first: int,
-    keys: NDArray[np.int64],
-    segments: NDArray[np.float64],
-    *,
-    neighbours: dict[int, list[int]],
-    unused: set[int],
-) -> NDArray[np.float64]:
-    """The line that begins with segment `first`, whose segments are taken from `unused`."""
-    unused.discard(first)
-    start = 0 if len(neighbours[int(keys[first, 0])]) == 1 else 1
-    line = [segments[first, start], segments[first, 1 - start]]
-    end = int(keys[first, 1 - start])
-    while following := [number for number in neighbours[end] if number in unused]:
-        number = following[0]
-        unused.discard(number)
-        side = 1 if keys[number, 0] == end else 0
-        line.append(segments[number, side])
-        end = int(keys[number, side])
-    return np.asarray(line)
+    lines = []
+    for first in (*open_ends, *range(len(keys))):
+        if first not in unused:
+            continue
+        unused.discard(first)
+        start = 0 if len(neighbours[int(keys[first, 0])]) == 1 else 1
+        line = [segments[first, start], segments[first, 1 - start]]
+        end = int(keys[first, 1 - start])
+        while following := [number for number in neighbours[end] if number in unused]:
+            number = following[0]
+            unused.discard(number)
+            side = 1 if keys[number, 0] == end else 0
+            line.append(segments[number, side])
+            end = int(keys[number, side])
+        lines.append(np.asarray(line))
+    return lines
 
 
 def _cut(

@@ -48,7 +48,23 @@ def slice_svg(data: ReportData, plane: Plane, later: LaterImage, *, name: str) -
         for model in later.model:
             lines = joined(model.fitted.astype(np.float64), model.triangles.astype(np.int64), plane)
             _add(axes, lines, gid="layer-model", colors=["white"], linewidth=1.0)
-        _furniture(axes, plane)
+        view = plane.view
+        axes.set_xlim(plane.high[view.across], plane.low[view.across])
+        axes.set_ylim(plane.low[view.up], plane.high[view.up])
+        axes.set_axis_off()
+        places = ((0.025, 0.5), (0.975, 0.5), (0.5, 0.97), (0.5, 0.03))
+        for letter, (x, y) in zip(view.letters, places, strict=True):
+            _write(axes, x, y, letter, ha="center", va="center", fontweight="bold")
+        where = f"{'xyz'[view.normal]} = {plane.position:.0f} mm"
+        _write(axes, 0.975, 0.03, where, ha="right", va="center", fontsize=7)
+        width = float(plane.high[view.across] - plane.low[view.across])
+        bar = next(size for size in (50.0, 20.0, 10.0, 5.0, 1.0, 0.0) if size < 0.4 * width)
+        left, bottom = plane.high[view.across] - 0.06 * width, plane.low[view.up] + 0.06 * width
+        stroke = [withStroke(linewidth=3.4, foreground="#000000")]
+        ends = [left, left - bar]
+        axes.plot(ends, [bottom] * 2, color="white", linewidth=2.0, solid_capstyle="butt", path_effects=stroke)
+        place = (left, bottom + 0.015 * width)
+        axes.text(*place, f"{bar:g} mm", color="white", ha="left", va="bottom", fontsize=8, path_effects=OUTLINE)
 
     return draw_svg(draw, size=(WIDTH_INCHES, WIDTH_INCHES * up / across), name=name)
 
@@ -78,27 +94,6 @@ def _add(axes: Axes, lines: list[NDArray[np.float64]], *, gid: str, **style: Any
     collection = LineCollection(lines, capstyle="round", **style)
     collection.set_gid(gid)
     axes.add_collection(collection, autolim=False)
-
-
-def _furniture(axes: Axes, plane: Plane) -> None:
-    """Limits (the patient's right on the left), orientation letters, scale bar."""
-    view = plane.view
-    axes.set_xlim(plane.high[view.across], plane.low[view.across])
-    axes.set_ylim(plane.low[view.up], plane.high[view.up])
-    axes.set_axis_off()
-    places = ((0.025, 0.5), (0.975, 0.5), (0.5, 0.97), (0.5, 0.03))
-    for letter, (x, y) in zip(view.letters, places, strict=True):
-        _write(axes, x, y, letter, ha="center", va="center", fontweight="bold")
-    where = f"{'xyz'[view.normal]} = {plane.position:.0f} mm"
-    _write(axes, 0.975, 0.03, where, ha="right", va="center", fontsize=7)
-    width = float(plane.high[view.across] - plane.low[view.across])
-    bar = next(size for size in (50.0, 20.0, 10.0, 5.0, 1.0, 0.0) if size < 0.4 * width)
-    left, bottom = plane.high[view.across] - 0.06 * width, plane.low[view.up] + 0.06 * width
-    stroke = [withStroke(linewidth=3.4, foreground="#000000")]
-    ends = [left, left - bar]
-    axes.plot(ends, [bottom] * 2, color="white", linewidth=2.0, solid_capstyle="butt", path_effects=stroke)
-    place = (left, bottom + 0.015 * width)
-    axes.text(*place, f"{bar:g} mm", color="white", ha="left", va="bottom", fontsize=8, path_effects=OUTLINE)
 
 
 def _write(axes: Axes, x: float, y: float, text: str, **style: Any) -> None:

@@ -27,7 +27,11 @@ def grey_volume(values: NDArray[Any], grid: VoxelGrid, box: SliceBox, *, most_vo
     """
     step = _step(grid, box, most_voxels)
     cut = _cut(values, grid, box, step=step, order=1)
-    low, high = _window(cut)
+    finite = cut[np.isfinite(cut)]
+    low, high = 0.0, 1.0
+    if len(finite):  # shown black and white: a soft-tissue window for a CT, else the middle 98 percent
+        low, high = CT_WINDOW if finite.min() < -500.0 else np.percentile(finite, [1.0, 99.0]).tolist()
+        high = max(high, low + 1e-6)
     shade = np.clip((cut - low) / (high - low), 0.0, 1.0)
     return Volume("grey", np.rint(255.0 * np.nan_to_num(shade)).astype(np.uint8), box.low, step)
 
@@ -66,14 +70,3 @@ def _cut(
         cval=np.nan,
     )
     return np.asarray(cut)
-
-
-def _window(values: NDArray[np.float32]) -> tuple[float, float]:
-    """Grey values shown black and white: a soft-tissue window for a CT, else the middle 98 percent."""
-    finite = values[np.isfinite(values)]
-    if not len(finite):
-        return 0.0, 1.0
-    if finite.min() < -500.0:
-        return CT_WINDOW
-    low, high = np.percentile(finite, [1.0, 99.0])
-    return float(low), float(max(high, low + 1e-6))
