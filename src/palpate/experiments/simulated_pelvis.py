@@ -29,15 +29,7 @@ from palpate.images import (
     segment,
     write_label_image,
 )
-from palpate.mesh import (
-    LagrangeSpace,
-    anatomy_of,
-    check_mesh,
-    domain_box,
-    lagrange_space,
-    margin_box,
-    tetrahedralise,
-)
+from palpate.mesh import LagrangeSpace, anatomy_of, check_mesh, domain_box, lagrange_space, margin_box, tetrahedralise
 from palpate.phantoms import imaged
 from palpate.study import Mechanics, filled
 

@@ -20,12 +20,7 @@ from palpate.experiments.reproduce.balls import (
     pulled,
     random_grid,
 )
-from palpate.experiments.reproduce.columns import (
-    entries_from_surfaces,
-    entries_from_voxels,
-    from_half,
-    imaged_states,
-)
+from palpate.experiments.reproduce.columns import entries_from_surfaces, entries_from_voxels, from_half, imaged_states
 from palpate.experiments.reproduce.jobs import Job, Progress, compute
 from palpate.experiments.reproduce.ledger import Ledger
 from palpate.experiments.reproduce.paper import PAPER_TABLE1

@@ -89,10 +89,7 @@ def _sensitivity_checks() -> tuple[Check, ...]:
 
 CONCENTRIC_PROBLEMS = (
     Problem(
-        "B4a",
-        "Hollow concentric organs, the cavity grows",
-        SOURCE,
-        lambda: _radial_checks(hollow_spheres(12), HOLLOW),
+        "B4a", "Hollow concentric organs, the cavity grows", SOURCE, lambda: _radial_checks(hollow_spheres(12), HOLLOW)
     ),
     Problem(
         "B4b",

@@ -13,13 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.experiments.verification.conditions import (
-    loaded,
-    nodal_gradients,
-    prescribe,
-    sliding_sides,
-    sphere_faces,
-)
+from palpate.experiments.verification.conditions import loaded, nodal_gradients, prescribe, sliding_sides, sphere_faces
 from palpate.experiments.verification.problem import Check, Problem
 from palpate.experiments.verification.structured_meshes import VOID, known, octant_mesh
 from palpate.mechanics import LinearModel, lame_parameters, linear_model, outer_constraint

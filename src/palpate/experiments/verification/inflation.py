@@ -63,13 +63,7 @@ def inflated_model(space: LagrangeSpace, bore: NDArray[np.int64], law: Law, *, a
 
 
 def wall_pressures(
-    mesh: TetMesh,
-    law: Law,
-    *,
-    moduli: Sequence[float],
-    stretches: Sequence[float],
-    radius: float = 10.0,
-    axes: int = 3,
+    mesh: TetMesh, law: Law, *, moduli: Sequence[float], stretches: Sequence[float], radius: float = 10.0, axes: int = 3
 ) -> Array:
     """Pressures (n,) kPa on the bore when its wall has been moved outwards by each of the stretches (n,).
 

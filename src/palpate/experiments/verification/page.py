@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from palpate.experiments.verification.problem import RowDict
@@ -38,24 +39,19 @@ def page(rows: Sequence[RowDict], slow: Sequence[str] = ()) -> str:
     ]
     for name in ids:
         own = [row for row in rows if row["id"] == name]
-        worst = max(own, key=_share)
-        errors = f"{_number(worst['error_percent'])} / {_number(worst['tolerance_percent'])}"
+        errors = [math.inf if row["error_percent"] is None else row["error_percent"] for row in own]
+        shares = [error / max(row["tolerance_percent"], 1e-12) for error, row in zip(errors, own, strict=True)]
+        worst = own[shares.index(max(shares))]
+        of_both = f"{_number(worst['error_percent'])} / {_number(worst['tolerance_percent'])}"
         orders = ", ".join(f"{row['order']:.2f}" for row in own if row["order"] is not None)
         mark = "*" if name in slow else ""
-        lines.append(f"| {name}{mark} | {worst['title']} | {len(own)} | {errors} | {orders} | {worst['source']} |")
+        lines.append(f"| {name}{mark} | {worst['title']} | {len(own)} | {of_both} | {orders} | {worst['source']} |")
     lines += ["", "## All checks", "", "| id | quantity | reference | ours | error (%) | tolerance (%) |"]
     lines.append("|---|---|---|---|---|---|")
     for row in rows:
         cells = [_number(row[key]) for key in ("reference", "value", "error_percent", "tolerance_percent")]
         lines.append(f"| {row['id']} | {row['quantity']} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
-
-
-def _share(row: RowDict) -> float:
-    """How near a check is to its tolerance."""
-    if row["error_percent"] is None:
-        return float("inf")
-    return float(row["error_percent"]) / max(float(row["tolerance_percent"]), 1e-12)
 
 
 def _number(value: float | None) -> str:
