@@ -12,7 +12,6 @@ from palpate.experiments.verification.conditions import (
 )
 from palpate.experiments.verification.structured_meshes import (
     VOID,
-    boundary_faces,
     box_mesh,
     known,
     kuhn_tets,
@@ -25,7 +24,6 @@ from palpate.experiments.verification.structured_meshes import (
 
 __all__ = [
     "VOID",
-    "boundary_faces",
     "box_mesh",
     "every_node_prescribed",
     "held_components",

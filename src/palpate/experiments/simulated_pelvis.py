@@ -29,16 +29,7 @@ from palpate.images import (
     segment,
     write_label_image,
 )
-from palpate.mesh import (
-    Box,
-    LagrangeSpace,
-    anatomy_of,
-    check_mesh,
-    domain_box,
-    lagrange_space,
-    margin_box,
-    tetrahedralise,
-)
+from palpate.mesh import LagrangeSpace, anatomy_of, check_mesh, domain_box, lagrange_space, margin_box, tetrahedralise
 from palpate.phantoms import imaged
 from palpate.study import Mechanics, filled
 
@@ -79,7 +70,11 @@ def simulate_pelvis(progress: Callable[[str], None]) -> SimulatedPelvis:
     names = read_label_table(DATA / "labels.json")
     labels = _completed(read_label_image(DATA / "labels.nii.gz", names=names))
     scan = segment(labels, TISSUES)
-    box = _field(scan)
+    # what lies within 12 mm of prostate, bladder and rectum
+    observed = [i for i, t in enumerate(scan.tissues) if t.role in (Role.ESTIMATE, Role.DRIVER)]
+    voxels = np.argwhere(np.isin(scan.index, observed)).astype(float)
+    box = margin_box(domain_box([scan.grid]), scan.grid.world(voxels), margin_mm=MARGIN_MM)
+    box = replace(box, lengths=np.floor(box.lengths / VOXEL_MM) * VOXEL_MM)
     anatomy = anatomy_of(scan, box=box, smoothing_mm=SMOOTHING_MM)
     progress(f"meshing {np.round(box.lengths).astype(int).tolist()} mm at {TRUTH_EDGE_MM:g} mm")
     mesh = tetrahedralise(anatomy, edge_length_mm=TRUTH_EDGE_MM)
@@ -89,7 +84,12 @@ def simulate_pelvis(progress: Callable[[str], None]) -> SimulatedPelvis:
     mechanics = Mechanics(law=LAW, element="P2")
     displacement = filled(space, scan, filling_mm=FILLING_MM, outer="fixed", mechanics=mechanics)
     progress("turning both states into voxels")
-    grid = _grid(box)
+    # 1 mm, filling the box exactly
+    shape = np.round(box.lengths / VOXEL_MM).astype(int)
+    affine = np.eye(4)
+    affine[:3, :3] = box.axes.T * VOXEL_MM
+    affine[:3, 3] = box.origin + 0.5 * VOXEL_MM * box.axes.sum(axis=0)
+    grid = VoxelGrid((int(shape[0]), int(shape[1]), int(shape[2])), affine)
     still = np.zeros_like(displacement)
     before, after = (_labelled(imaged(space, motion, grid), scan, labels) for motion in (still, displacement))
     return SimulatedPelvis(space, displacement, before, after)
@@ -106,23 +106,6 @@ def _completed(scan: LabelImage) -> LabelImage:
     affine[:3, 3] -= BELOW * affine[:3, 2]
     labels = np.concatenate([below, scan.labels], axis=2)
     return LabelImage(labels, VoxelGrid((labels.shape[0], labels.shape[1], labels.shape[2]), affine), scan.names)
-
-
-def _field(scan: Segmentation) -> Box:
-    """The part of the scan within 12 mm of prostate, bladder and rectum."""
-    observed = [i for i, t in enumerate(scan.tissues) if t.role in (Role.ESTIMATE, Role.DRIVER)]
-    voxels = np.argwhere(np.isin(scan.index, observed)).astype(float)
-    box = margin_box(domain_box([scan.grid]), scan.grid.world(voxels), margin_mm=MARGIN_MM)
-    return replace(box, lengths=np.floor(box.lengths / VOXEL_MM) * VOXEL_MM)
-
-
-def _grid(box: Box) -> VoxelGrid:
-    """Voxels of 1 mm that fill the box exactly."""
-    shape = np.round(box.lengths / VOXEL_MM).astype(int)
-    affine = np.eye(4)
-    affine[:3, :3] = box.axes.T * VOXEL_MM
-    affine[:3, 3] = box.origin + 0.5 * VOXEL_MM * box.axes.sum(axis=0)
-    return VoxelGrid((int(shape[0]), int(shape[1]), int(shape[2])), affine)
 
 
 def _labelled(image: LabelImage, scan: Segmentation, labels: LabelImage) -> LabelImage:

@@ -35,7 +35,9 @@ def write_estimate_files(result: CaseResult, folder: Path) -> tuple[Path, ...]:
     make_folder(folder)
     paths = [folder / "mesh.vtu", folder / "stiffness.nii.gz"]
     _write_fitted(paths[0], result, result.space, result.estimation.displacements[: len(result.after)])
-    write_scalar_image(paths[1], _stiffness_image(result), result.before.grid)
+    stiffness = np.append(result.stiffness, np.nan)  # region -1 takes the last entry, NaN
+    region = region_image(result.space.mesh, result.before.grid)
+    write_scalar_image(paths[1], stiffness[region], result.before.grid)
     paths.append(write_label_table(folder / "labels.csv", result.tissues))
     for number, pair in enumerate(result.further, start=2):
         paths.append(folder / f"mesh_{number}.vtu")
@@ -85,35 +87,27 @@ def write_simulation_files(result: Simulation, folder: Path) -> tuple[Path, ...]
     moduli = np.array([result.moduli_kpa.get(tissue.name, np.nan) for tissue in space.mesh.tissues])
     cells = _cell_data(space.mesh, moduli)
     _write_moved(folder / "mesh.vtu", space, last, cells)
-    surfaces = folder / "surfaces"
-    return (
-        *images,
-        folder / "mesh.vtu",
-        write_label_table(folder / "labels.csv", space.mesh.tissues),
-        *_write_surfaces(space, np.zeros_like(last), surfaces, ending="before"),
-        *_write_surfaces(space, last, surfaces, ending="after"),
-        *_write_series(result, cells, folder),
-    )
+    table = write_label_table(folder / "labels.csv", space.mesh.tissues)
+    surfaces, still = folder / "surfaces", np.zeros_like(last)
+    paths = [*images, folder / "mesh.vtu", table]
+    paths += _write_surfaces(space, still, surfaces, ending="before")
+    paths += _write_surfaces(space, last, surfaces, ending="after")
+    if len(result.displacements) > 1:
+        states = (still, *result.displacements)
+        steps_folder = make_folder(folder / "steps")
+        steps = [steps_folder / f"step_{number:03d}.vtu" for number in range(len(states))]
+        for path, displacement in zip(steps, states, strict=True):
+            _write_moved(path, space, displacement, cells)
+        times = np.linspace(0.0, 1.0, len(steps))
+        write_pvd(folder / "mesh.pvd", [(float(t), f"steps/{path.name}") for t, path in zip(times, steps, strict=True)])
+        paths += [folder / "mesh.pvd", *steps]
+    return tuple(paths)
 
 
 def file_name(name: str) -> str:
     """A tissue's name as a part of a file name: letters, digits, hyphen and underscore only, of 60 bytes at most."""
     plain = "".join(letter if letter.isalnum() or letter in "-_" else "_" for letter in name)
     return plain.encode("utf-8")[:MOST_BYTES].decode("utf-8", errors="ignore") or "tissue"
-
-
-def _write_series(result: Simulation, cells: Mapping[str, NDArray[Any]], folder: Path) -> tuple[Path, ...]:
-    if len(result.displacements) < 2:
-        return ()
-    steps = make_folder(folder / "steps")
-    still = np.zeros_like(result.displacements[0])
-    paths = []
-    for number, displacement in enumerate((still, *result.displacements)):
-        paths.append(steps / f"step_{number:03d}.vtu")
-        _write_moved(paths[-1], result.space, displacement, cells)
-    times = np.linspace(0.0, 1.0, len(paths))
-    write_pvd(folder / "mesh.pvd", [(float(t), f"steps/{path.name}") for t, path in zip(times, paths, strict=True)])
-    return (folder / "mesh.pvd", *paths)
 
 
 def _write_surfaces(
@@ -138,8 +132,3 @@ def _cell_data(mesh: TetMesh, moduli: NDArray[np.float64]) -> dict[str, NDArray[
         "youngs_modulus_kpa": moduli[mesh.region],
         "poisson_ratio": poisson[mesh.region],
     }
-
-
-def _stiffness_image(result: CaseResult) -> NDArray[np.float64]:
-    region = region_image(result.space.mesh, result.before.grid)
-    return np.asarray(np.append(result.stiffness, np.nan)[region])  # region -1 takes the last entry, NaN

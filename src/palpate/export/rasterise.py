@@ -29,7 +29,9 @@ def region_image(mesh: TetMesh, grid: VoxelGrid) -> NDArray[np.int16]:
         """Voxels (n, 3) whose centres lie in some of the tetrahedra, and in which (n,)."""
         owner = np.repeat(tets, count[tets])
         step = np.arange(len(owner)) - np.repeat(np.cumsum(count[tets]) - count[tets], count[tets])
-        voxel = low[owner] + _unravel(step, size[owner])
+        rest, z = np.divmod(step, size[owner, 2])  # from the step's number in the box of the tetrahedron
+        x, y = np.divmod(rest, size[owner, 1])
+        voxel = low[owner] + np.stack([x, y, z], axis=1)
         b = np.einsum("na,nab->nb", voxel - corners[owner, 0], to_barycentric[owner])
         inside = (b >= -TOLERANCE).all(axis=1) & (b.sum(axis=1) <= 1.0 + TOLERANCE)
         return voxel[inside], owner[inside]
@@ -39,10 +41,3 @@ def region_image(mesh: TetMesh, grid: VoxelGrid) -> NDArray[np.int16]:
     for voxel, owner in mapped(centres_of, parts):
         image[tuple(voxel.T)] = mesh.region[owner]
     return image
-
-
-def _unravel(step: NDArray[np.int64], size: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Place (n, 3) of the number `step` (n,) in a box of `size` (n, 3)."""
-    rest, z = np.divmod(step, size[:, 2])
-    x, y = np.divmod(rest, size[:, 1])
-    return np.stack([x, y, z], axis=1)

@@ -28,6 +28,9 @@ Arrays = Mapping[str, NDArray[Any]]
 VTK_TETRA = {1: 10, 2: 24}  # linear and quadratic tetrahedron; VTK numbers the edges as TET_EDGES does
 NAMES = {"f": "Float", "i": "Int", "u": "UInt"}
 BLOCK = 2**20  # bytes compressed at once
+SPACE_FIELD = (  # the text RAS as VTK writes it: codes that end in zero
+    '<FieldData><Array type="String" Name="SPACE" NumberOfTuples="1" format="ascii">82 65 83 0</Array></FieldData>'
+)
 
 
 def write_vtu(path: Path, space: LagrangeSpace, *, point_data: Arrays, cell_data: Arrays) -> None:
@@ -74,7 +77,7 @@ def write_vtp(
         + _points(points[used])
         + f"<Polys>{_arrays(polygons)}</Polys></Piece>"
     )
-    write_bytes(path, _file("PolyData", piece, field=_space_field()))
+    write_bytes(path, _file("PolyData", piece, field=SPACE_FIELD))
 
 
 def write_pvd(path: Path, files: Sequence[tuple[float, str]]) -> None:
@@ -103,12 +106,6 @@ def _file(kind: str, piece: str, *, field: str = "") -> bytes:
     ).encode()
 
 
-def _space_field() -> str:
-    """The text RAS in the field SPACE, as VTK writes it: codes that end in zero."""
-    codes = " ".join(str(code) for code in (*b"RAS", 0))
-    return f'<FieldData><Array type="String" Name="SPACE" NumberOfTuples="1" format="ascii">{codes}</Array></FieldData>'
-
-
 def _points(points: NDArray[np.float64]) -> str:
     return f"<Points>{_arrays({'Points': points.astype(np.float64)})}</Points>"
 
@@ -118,20 +115,15 @@ def _data(tag: str, arrays: Arrays) -> str:
 
 
 def _arrays(arrays: Arrays) -> str:
-    return "".join(_array(name, array) for name, array in arrays.items())
-
-
-def _array(name: str, array: NDArray[Any]) -> str:
-    kind = f"{NAMES[array.dtype.kind]}{8 * array.dtype.itemsize}"
-    width = f' NumberOfComponents="{array.shape[1]}"' if array.ndim == 2 else ""
-    little = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
-    head = f'type="{kind}" Name={quoteattr(name)}{width} format="binary"'
-    return f"<DataArray {head}>{_encode(little)}</DataArray>"
-
-
-def _encode(array: NDArray[Any]) -> str:
-    """Header (number of blocks, block size, size of the last, compressed sizes) and blocks, base64 each."""
-    raw = array.tobytes()
-    blocks = [zlib.compress(raw[start : start + BLOCK], 6) for start in range(0, len(raw), BLOCK)]
-    header = np.array([len(blocks), BLOCK, len(raw) % BLOCK, *map(len, blocks)], dtype="<u8")
-    return (base64.b64encode(header.tobytes()) + base64.b64encode(b"".join(blocks))).decode()
+    """Each array with its header (number of blocks, block size, size of the last, compressed sizes), base64 both."""
+    elements = []
+    for name, array in arrays.items():
+        kind = f"{NAMES[array.dtype.kind]}{8 * array.dtype.itemsize}"
+        width = f' NumberOfComponents="{array.shape[1]}"' if array.ndim == 2 else ""
+        raw = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")).tobytes()
+        blocks = [zlib.compress(raw[start : start + BLOCK], 6) for start in range(0, len(raw), BLOCK)]
+        header = np.array([len(blocks), BLOCK, len(raw) % BLOCK, *map(len, blocks)], dtype="<u8")
+        content = (base64.b64encode(header.tobytes()) + base64.b64encode(b"".join(blocks))).decode()
+        head = f'type="{kind}" Name={quoteattr(name)}{width} format="binary"'
+        elements.append(f"<DataArray {head}>{content}</DataArray>")
+    return "".join(elements)

@@ -19,14 +19,7 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.images.tissue_distance import tissue_distance_map
 
-__all__ = [
-    "Alignment",
-    "RigidFit",
-    "RigidMotion",
-    "align",
-    "fit_rigid_motion",
-    "moved",
-]
+__all__ = ["Alignment", "RigidFit", "RigidMotion", "align", "fit_rigid_motion", "moved"]
 
 BORDER_VOXELS = 3.0  # nearer to the image's border the map continues what it cannot see
 MAX_POINTS = 20_000
@@ -154,16 +147,34 @@ def fit_rigid_motion(pairs: Sequence[tuple[DistanceMap, DistanceMap]]) -> RigidF
     """
     voxel = max(float(surface.grid.spacing.max()) for pair in pairs for surface in pair)
     smooth = [(_smoothed(before, voxel), _smoothed(after, voxel)) for before, after in pairs]
-    matches = [_match(before, after) for before, after in smooth]
+    matches = []
+    for before, after in smooth:
+        surface = _surface(before)
+        step = -(-len(surface.area) // MAX_POINTS) or 1
+        thinned = IsosurfacePoints(surface.places[::step], surface.normals[::step], surface.area[::step] * step)
+        matches.append(_Match(thinned, before.at(thinned.places), after))
     target = [_surface(after) for _, after in smooth]
-    _check_enough(matches, target)
+    for where, surfaces in (("before", [match.surface for match in matches]), ("after", target)):
+        n = sum(len(surface.area) for surface in surfaces)
+        if n < MIN_POINTS:
+            raise InputDataError(
+                f"the {where} image shows {n} surface points of the rigid tissue away from its border, {MIN_POINTS} are"
+                " needed; enlarge the image, or give the tissue another role"
+            )
     source, aim = _moments([match.surface for match in matches]), _moments(target)
     best = _descend(_about_centroids(np.eye(3), source, aim), matches)
     if _scale(best) > 0.25 * voxel:
-        starts = [_about_centroids(turn, source, aim) for turn in _principal_turns(source, aim)]
-        others = [_descend(start, matches) for start in starts if _n_inside(start, matches) >= MIN_POINTS]
-        best = min([best, *others], key=_misfit)
-    return _fit(best)
+        # the four proper rotations that lay the principal axes of one surface on those of the other
+        first, second = (np.linalg.eigh(moments.covariance)[1] for moments in (source, aim))
+        turns = [second @ np.diag(signs) @ first.T for signs in product((1.0, -1.0), repeat=3)]
+        starts = [_about_centroids(turn, source, aim) for turn in turns if np.linalg.det(turn) > 0.0]
+        for start in starts:
+            inside = [_inside(match.after.grid, start.apply(match.surface.places)) for match in matches]
+            if sum(map(np.count_nonzero, inside)) >= MIN_POINTS:
+                best = min(best, _descend(start, matches), key=_misfit)
+    weight = best.area * _tukey(best, _scale(best))
+    rms = float(np.sqrt(weight @ best.residual**2 / weight.sum()))
+    return RigidFit(best.motion, rms, int(np.count_nonzero(weight)), _shown(best, weight)[1].T)
 
 
 def align(before: Segmentation, after: Segmentation) -> Alignment:
@@ -182,9 +193,12 @@ def align(before: Segmentation, after: Segmentation) -> Alignment:
     ]
     overall = fit_rigid_motion(pairs)
     names = [before.tissues[i].name for i in rigid]
-    each = {name: _fit_or(pair, overall) for name, pair in zip(names, pairs, strict=True)}
-    loose = {}
+    each, loose = {}, {}
     for i, name, pair in zip(rigid, names, pairs, strict=True):
+        try:
+            each[name] = fit_rigid_motion([pair])
+        except InputDataError:
+            each[name] = replace(overall, n_points=0)
         off = _off_the_motion(before.mask(i), pair, each[name].motion)
         if off > LOOSE_VOXELS * float(after.grid.spacing.max()):
             loose[name] = off
@@ -195,13 +209,6 @@ def moved(segmentation: Segmentation, motion: RigidMotion) -> Segmentation:
     """The segmentation after a rigid motion (mm): the voxels are the same, only their affine changes."""
     grid = VoxelGrid(segmentation.grid.shape, motion.matrix @ segmentation.grid.affine)
     return replace(segmentation, grid=grid)
-
-
-def _fit_or(pair: tuple[DistanceMap, DistanceMap], overall: RigidFit) -> RigidFit:
-    try:
-        return fit_rigid_motion([pair])
-    except InputDataError:
-        return replace(overall, n_points=0)
 
 
 def _off_the_motion(mask: NDArray[np.bool_], pair: tuple[DistanceMap, DistanceMap], motion: RigidMotion) -> float:
@@ -235,23 +242,6 @@ def _surface(distance: DistanceMap) -> IsosurfacePoints:
     return IsosurfacePoints(found.places[keep], found.normals[keep], found.area[keep])
 
 
-def _match(before: DistanceMap, after: DistanceMap) -> _Match:
-    surface = _surface(before)
-    step = -(-len(surface.area) // MAX_POINTS) or 1
-    thinned = IsosurfacePoints(surface.places[::step], surface.normals[::step], surface.area[::step] * step)
-    return _Match(thinned, before.at(thinned.places), after)
-
-
-def _check_enough(matches: Sequence[_Match], target: Sequence[IsosurfacePoints]) -> None:
-    for where, surfaces in (("before", [match.surface for match in matches]), ("after", target)):
-        n = sum(len(surface.area) for surface in surfaces)
-        if n < MIN_POINTS:
-            raise InputDataError(
-                f"the {where} image shows {n} surface points of the rigid tissue away from its border, {MIN_POINTS} are"
-                " needed; enlarge the image, or give the tissue another role"
-            )
-
-
 def _moments(surfaces: Sequence[IsosurfacePoints]) -> _Moments:
     places, area = np.concatenate([s.places for s in surfaces]), np.concatenate([s.area for s in surfaces])
     share = area / area.sum()
@@ -264,13 +254,6 @@ def _about_centroids(turn: NDArray[np.float64], source: _Moments, target: _Momen
     return RigidMotion(turn, target.centre - turn @ source.centre)
 
 
-def _principal_turns(source: _Moments, target: _Moments) -> list[NDArray[np.float64]]:
-    """The four proper rotations that lay the principal axes of one surface on those of the other."""
-    first, second = (np.linalg.eigh(moments.covariance)[1] for moments in (source, target))
-    turns = [second @ np.diag(signs) @ first.T for signs in product((1.0, -1.0), repeat=3)]
-    return [turn for turn in turns if np.linalg.det(turn) > 0.0]
-
-
 def _descend(motion: RigidMotion, matches: Sequence[_Match]) -> _State:
     """Gauss-Newton with Tukey weights; a step that does not lower the cost at the weights' scale is halved."""
     state = _state(motion, matches)
@@ -278,7 +261,9 @@ def _descend(motion: RigidMotion, matches: Sequence[_Match]) -> _State:
         scale = _scale(state)
         step, cost = _step(state, scale), _cost(state, scale)
         for _ in range(6):
-            trial = _state(_stepped(state, step), matches)
+            turn = Rotation.from_rotvec(step[:3]).as_matrix()
+            by_step = RigidMotion(turn, state.centre - turn @ state.centre + step[3:])
+            trial = _state(by_step.compose(state.motion), matches)
             if _cost(trial, scale) <= cost:
                 break
             step = 0.5 * step
@@ -313,10 +298,6 @@ def _inside(grid: VoxelGrid, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray(((index >= BORDER_VOXELS) & (index <= np.array(grid.shape) - 1.0 - BORDER_VOXELS)).all(axis=1))
 
 
-def _n_inside(motion: RigidMotion, matches: Sequence[_Match]) -> int:
-    return sum(int(np.count_nonzero(_inside(m.after.grid, motion.apply(m.surface.places)))) for m in matches)
-
-
 def _scale(state: _State) -> float:
     """Robust standard deviation of the residuals, mm: 1.4826 times the median of their sizes."""
     return max(1.4826 * float(np.median(np.abs(state.residual[state.area > 0.0]))), 1e-4)
@@ -338,18 +319,14 @@ def _misfit(state: _State) -> float:
     return float(state.area @ np.abs(state.residual) / state.area.sum() / inside)
 
 
-def _normal_matrix(state: _State, weight: NDArray[np.float64]) -> NDArray[np.float64]:
-    """J^T W J per weight, with turns measured in mm at the surface's radius of gyration, so that it has no unit."""
-    scaled = state.jacobian / np.array([state.radius] * 3 + [1.0] * 3)
-    return np.asarray((scaled * (weight / weight.sum())[:, None]).T @ scaled)
-
-
 def _shown(state: _State, weight: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Turns that the surface shows (3, m) and does not show (3, k), as orthonormal columns.
 
     A turn counts by what is left of its normal matrix when the shifts have been eliminated (Schur complement).
     """
-    normal = _normal_matrix(state, weight)
+    # J^T W J per weight; turns in mm at the surface's radius of gyration, so that it has no unit
+    scaled = state.jacobian / np.array([state.radius] * 3 + [1.0] * 3)
+    normal = np.asarray((scaled * (weight / weight.sum())[:, None]).T @ scaled)
     coupling = normal[:3, 3:] @ np.linalg.pinv(normal[3:, 3:], rcond=1e-6, hermitian=True) @ normal[3:, :3]
     values, axes = np.linalg.eigh(normal[:3, :3] - coupling)
     return axes[:, values > UNDETERMINED], axes[:, values <= UNDETERMINED]
@@ -365,14 +342,3 @@ def _step(state: _State, scale: float) -> NDArray[np.float64]:
     normal = (reduced * weight[:, None]).T @ reduced
     slope = reduced.T @ (weight * state.residual)
     return np.asarray(-basis @ np.linalg.pinv(normal, rcond=1e-6, hermitian=True) @ slope)
-
-
-def _stepped(state: _State, step: NDArray[np.float64]) -> RigidMotion:
-    turn = Rotation.from_rotvec(step[:3]).as_matrix()
-    return RigidMotion(turn, state.centre - turn @ state.centre + step[3:]).compose(state.motion)
-
-
-def _fit(state: _State) -> RigidFit:
-    weight = state.area * _tukey(state, _scale(state))
-    rms = float(np.sqrt(weight @ state.residual**2 / weight.sum()))
-    return RigidFit(state.motion, rms, int(np.count_nonzero(weight)), _shown(state, weight)[1].T)

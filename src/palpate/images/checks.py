@@ -48,7 +48,11 @@ def check_images(before: Segmentation, after: Sequence[Segmentation]) -> tuple[F
 def check_segmentation(segmentation: Segmentation, name: str) -> tuple[Finding, ...]:
     """Findings on one image, called `name` in the text: its reading, voxel size, cut, small or thin organs, islands."""
     findings = [replace(finding, message=f"'{name}': {finding.message}") for finding in segmentation.findings]
-    findings += _voxel_size(segmentation.grid, name)
+    spacing = segmentation.grid.spacing
+    if not SPACING_MM[0] <= float(spacing.min()) <= float(spacing.max()) <= SPACING_MM[1]:
+        size = " x ".join(f"{edge:.4g}" for edge in spacing)
+        text = f"'{name}' has voxels of {size} mm; is its header in metres or micrometres? Set its unit of length"
+        findings.append(Finding("voxel-size", text))
     for i, tissue in enumerate(segmentation.tissues):
         if tissue.role not in OBSERVED:
             continue
@@ -57,8 +61,15 @@ def check_segmentation(segmentation: Segmentation, name: str) -> tuple[Finding, 
             continue  # a tissue that is absent is refused by check_pair
         if tissue.role is not Role.RIGID:
             findings += _cut_by_border(segmentation.mask(i), tissue, name)
-            findings += _too_thin(_surrounded(segmentation, i, box[0]), tissue, name)
-            findings += _islands(segmentation.index[box[0]] == i, tissue, name)
+            findings += _too_thin(segmentation.index == i, box[0], tissue, name)
+            parts, count = ndimage.label(segmentation.index[box[0]] == i, structure=np.ones((3, 3, 3)))
+            if count > 1:
+                sizes = np.sort(np.bincount(parts.ravel())[1:])
+                text = (
+                    f"'{tissue.name}' has {count} separate pieces in '{name}', {sizes[:-1].sum() / sizes.sum():.2%} of"
+                    " it outside the largest; remove stray voxels from the labels"
+                )
+                findings.append(Finding("islands", text))
     return tuple(findings)
 
 
@@ -70,8 +81,20 @@ def check_pair(before: Segmentation, after: Segmentation, *, name: str = "after"
     """
     if [t.name for t in before.tissues] != [t.name for t in after.tissues]:
         raise InputDataError(f"'before' and '{name}' have been segmented into different tissues; use one list for both")
-    _refuse_renamed(before, after, name)
-    _refuse_identical(before, after, name)
+    # 3D Slicer numbers segments anew in each file: one number may be two organs
+    for here, there in zip(before.tissues, after.tissues, strict=True):
+        names = [sorted(word.casefold() for word in tissue.called) for tissue in (here, there)]
+        if all(names) and names[0] != names[1]:
+            raise InputDataError(
+                f"tissue '{here.name}' (label {', '.join(map(str, here.labels))}) is called {list(here.called)} in"
+                f" 'before' and {list(there.called)} in '{name}'; give the tissue a name as its label in the case"
+                f' (label = "{here.called[0]}"), or the same names in both files'
+            )
+    if np.array_equal(before.index, after.index):
+        raise InputDataError(
+            f"'before' and '{name}' are the same label image, voxel by voxel; without a deformation nothing can be"
+            " estimated: check the two paths"
+        )
     for segmentation, where in ((before, "before"), (after, name)):
         _refuse_absent(segmentation, where)
     findings = _common_part(before, after, name)
@@ -83,26 +106,6 @@ def check_pair(before: Segmentation, after: Segmentation, *, name: str = "after"
     return tuple(findings)
 
 
-def _refuse_renamed(before: Segmentation, after: Segmentation, name: str) -> None:
-    """3D Slicer numbers segments anew in each file: one number may be two organs."""
-    for here, there in zip(before.tissues, after.tissues, strict=True):
-        names = [sorted(word.casefold() for word in tissue.called) for tissue in (here, there)]
-        if all(names) and names[0] != names[1]:
-            raise InputDataError(
-                f"tissue '{here.name}' (label {', '.join(map(str, here.labels))}) is called {list(here.called)} in"
-                f" 'before' and {list(there.called)} in '{name}'; give the tissue a name as its label in the case"
-                f' (label = "{here.called[0]}"), or the same names in both files'
-            )
-
-
-def _refuse_identical(before: Segmentation, after: Segmentation, name: str) -> None:
-    if np.array_equal(before.index, after.index):
-        raise InputDataError(
-            f"'before' and '{name}' are the same label image, voxel by voxel; without a deformation nothing can be"
-            " estimated: check the two paths"
-        )
-
-
 def _refuse_absent(segmentation: Segmentation, where: str) -> None:
     present = set(np.unique(segmentation.index).tolist())
     for i, tissue in enumerate(segmentation.tissues):
@@ -112,15 +115,6 @@ def _refuse_absent(segmentation: Segmentation, where: str) -> None:
                 f"tissue '{tissue.name}' (label {labels}, role {tissue.role}) has no voxel in '{where}'; an organ must"
                 " be seen in both states: check its label in the image, or take the tissue out of the case"
             )
-
-
-def _voxel_size(grid: VoxelGrid, name: str) -> list[Finding]:
-    low, high = float(grid.spacing.min()), float(grid.spacing.max())
-    if SPACING_MM[0] <= low and high <= SPACING_MM[1]:
-        return []
-    size = " x ".join(f"{edge:.4g}" for edge in grid.spacing)
-    text = f"'{name}' has voxels of {size} mm; is its header in metres or micrometres? Set its unit of length"
-    return [Finding("voxel-size", text)]
 
 
 def _cut_by_border(mask: NDArray[np.bool_], tissue: Tissue, name: str) -> list[Finding]:
@@ -140,25 +134,20 @@ def _touching(mask: NDArray[np.bool_]) -> int:
     return sum(int(np.count_nonzero(np.take(mask, end, axis))) for axis in range(3) for end in (0, -1))
 
 
-def _surrounded(segmentation: Segmentation, tissue: int, box: tuple[slice, ...]) -> NDArray[np.bool_]:
-    """The tissue's bounding box and THIN_VOXELS around it; where the image ends, the tissue goes on."""
-    window = tuple(slice(max(s.start - THIN_VOXELS, 0), s.stop + THIN_VOXELS) for s in box)
-    missing = [
-        (max(THIN_VOXELS - s.start, 0), max(s.stop + THIN_VOXELS - n, 0))
-        for s, n in zip(box, segmentation.index.shape, strict=True)
-    ]
-    return np.pad(segmentation.index[window] == tissue, missing, mode="edge")
-
-
-def _too_thin(mask: NDArray[np.bool_], tissue: Tissue, name: str) -> list[Finding]:
-    """Few voxels at all, or many that no cube of THIN_VOXELS inside the organ covers; `mask` as `_surrounded` gives."""
-    inner = (slice(THIN_VOXELS, -THIN_VOXELS),) * 3
-    count = int(np.count_nonzero(mask[inner]))
+def _too_thin(mask: NDArray[np.bool_], box: tuple[slice, ...], tissue: Tissue, name: str) -> list[Finding]:
+    """Few voxels at all, or many that no cube of THIN_VOXELS inside the organ covers; box: the bounding one."""
+    count = int(np.count_nonzero(mask[box]))
     if count < SMALL_VOXELS:
         text = f"'{tissue.name}' has only {count} voxels in '{name}'; its surface cannot be trusted: use finer images"
         return [Finding("too-small", text)]
-    thick = ndimage.binary_opening(mask, np.ones((THIN_VOXELS,) * 3, dtype=bool))
-    share = 1.0 - np.count_nonzero(thick[inner] & mask[inner]) / count
+    window = tuple(slice(max(s.start - THIN_VOXELS, 0), s.stop + THIN_VOXELS) for s in box)
+    missing = [
+        (max(THIN_VOXELS - s.start, 0), max(s.stop + THIN_VOXELS - n, 0)) for s, n in zip(box, mask.shape, strict=True)
+    ]
+    around = np.pad(mask[window], missing, mode="edge")  # where the image ends, the tissue goes on
+    thick = ndimage.binary_opening(around, np.ones((THIN_VOXELS,) * 3, dtype=bool))
+    inner = (slice(THIN_VOXELS, -THIN_VOXELS),) * 3
+    share = 1.0 - np.count_nonzero(thick[inner] & around[inner]) / count
     if share <= THIN_SHARE:
         return []
     text = (
@@ -166,19 +155,6 @@ def _too_thin(mask: NDArray[np.bool_], tissue: Tissue, name: str) -> list[Findin
         " to about half a voxel only: use finer images, or join it to its neighbour"
     )
     return [Finding("thin", text)]
-
-
-def _islands(mask: NDArray[np.bool_], tissue: Tissue, name: str) -> list[Finding]:
-    parts, count = ndimage.label(mask, structure=np.ones((3, 3, 3)))
-    if count < 2:
-        return []
-    sizes = np.sort(np.bincount(parts.ravel())[1:])
-    rest = float(sizes[:-1].sum() / sizes.sum())
-    text = (
-        f"'{tissue.name}' has {count} separate pieces in '{name}', {rest:.2%} of it outside the largest; remove stray"
-        " voxels from the labels"
-    )
-    return [Finding("islands", text)]
 
 
 def _common_part(before: Segmentation, after: Segmentation, name: str) -> list[Finding]:
@@ -213,12 +189,14 @@ def _mirrored(before: Segmentation, after: Segmentation, observed: Sequence[int]
     points = [_sample(before, i) for i in observed]
     middle = np.mean([p.mean(axis=0) for p in points], axis=0)
     target = np.mean([_centroid(after, i) for i in observed], axis=0)
-    agreement = {
-        signs: float(
-            np.mean([_hits(after, i, target + (p - middle) * signs) for i, p in zip(observed, points, strict=True)])
-        )
-        for signs in product((1.0, -1.0), repeat=3)
-    }
+    agreement = {}
+    for signs in product((1.0, -1.0), repeat=3):
+        hits = []
+        for i, p in zip(observed, points, strict=True):
+            index = np.rint(after.grid.index(target + (p - middle) * signs)).astype(np.int64)
+            inside = index[((index >= 0) & (index < after.grid.shape)).all(axis=1)]
+            hits.append(np.count_nonzero(after.index[tuple(inside.T)] == i) / len(p))
+        agreement[signs] = float(np.mean(hits))
     plain = agreement.pop((1.0, 1.0, 1.0))
     signs, best = max(agreement.items(), key=lambda item: (round(item[1], 3), sum(item[0])))
     if best - plain < MIRROR_LIKELY:
@@ -242,12 +220,6 @@ def _sample(segmentation: Segmentation, tissue: int) -> NDArray[np.float64]:
 def _centroid(segmentation: Segmentation, tissue: int) -> NDArray[np.float64]:
     index = np.argwhere(segmentation.mask(tissue)).mean(axis=0, keepdims=True)
     return np.asarray(segmentation.grid.world(index)[0])
-
-
-def _hits(segmentation: Segmentation, tissue: int, points: NDArray[np.float64]) -> float:
-    index = np.rint(segmentation.grid.index(points)).astype(np.int64)
-    inside = ((index >= 0) & (index < segmentation.grid.shape)).all(axis=1)
-    return float(np.count_nonzero(segmentation.index[tuple(index[inside].T)] == tissue) / len(points))
 
 
 def _shifts(before: Segmentation, after: Segmentation, observed: Sequence[int], name: str) -> list[Finding]:

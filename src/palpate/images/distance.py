@@ -38,8 +38,19 @@ class DistanceMap:
         """Gradient (n, 3), mm per mm, of the interpolated map at points (n, 3) in RAS mm."""
         index = self._inside(points)
         base = np.floor(index).astype(np.int64)
-        value, slope = _value_weights(index - base), _slope_weights(index - base)
-        stencil = _stencil(self.coefficients, base)
+        t = index - base
+        s = 1.0 - t
+        # cubic B-spline weights (n, 3, 4) of the four nodes around, and their derivatives
+        value = np.stack([s**3, 4.0 - 6.0 * t**2 + 3.0 * t**3, 4.0 - 6.0 * s**2 + 3.0 * s**3, t**3], axis=-1) / 6.0
+        slope = np.stack([-(s**2), 3.0 * t**2 - 4.0 * t, 4.0 * s - 3.0 * s**2, t**2], axis=-1) / 2.0
+        # the coefficients of the 4 x 4 x 4 nodes (n, 4, 4, 4) around, mirrored beyond the border
+        _, ny, nz = self.coefficients.shape
+        last = np.array(self.coefficients.shape)[:, None] - 1
+        nodes = np.abs(base[:, :, None] + np.arange(-1, 3)) % np.maximum(2 * last, 1)
+        x, y, z = (last - np.abs(nodes - last)).transpose(1, 0, 2)
+        stencil = self.coefficients.ravel().take(
+            ((x[:, :, None, None] * ny + y[:, None, :, None]) * nz) + z[:, None, None, :]
+        )
         plane, along_z = _contract(stencil, value[:, 2]), _contract(stencil, slope[:, 2])
         line = _contract(plane, value[:, 1])
         by_index = [
@@ -109,34 +120,8 @@ def _distance_transform(mask: NDArray[np.bool_], grid: VoxelGrid) -> NDArray[np.
     return np.asarray(np.where(mask, half - inside, outside - half))
 
 
-def _stencil(coefficients: NDArray[np.float64], base: NDArray[np.int64]) -> NDArray[np.float64]:
-    """The 4 x 4 x 4 spline coefficients (n, 4, 4, 4) around voxels (n, 3); mirrored beyond the border."""
-    x, y, z = (_mirror(base[:, a, None] + np.arange(-1, 3), coefficients.shape[a]) for a in range(3))
-    _, ny, nz = coefficients.shape
-    flat = ((x[:, :, None, None] * ny + y[:, None, :, None]) * nz) + z[:, None, None, :]
-    return np.asarray(coefficients.ravel().take(flat))
-
-
 def _contract(block: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
     """Sum of block (n, ..., 4) over its last axis with weights (n, 4)."""
     inner = int(np.prod(block.shape[1:-1]))  # not -1, which no points at all would leave undefined
     flat = block.reshape(len(block), inner, 4)
     return np.asarray(np.matmul(flat, weights[:, :, None])[..., 0].reshape(block.shape[:-1]))
-
-
-def _value_weights(t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Cubic B-spline weights (n, 3, 4) of the four nodes around fractions t (n, 3) in [0, 1)."""
-    s = 1.0 - t
-    return np.stack([s**3, 4.0 - 6.0 * t**2 + 3.0 * t**3, 4.0 - 6.0 * s**2 + 3.0 * s**3, t**3], axis=-1) / 6.0
-
-
-def _slope_weights(t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Derivatives (n, 3, 4) of the cubic B-spline weights, per voxel."""
-    s = 1.0 - t
-    return np.stack([-(s**2), 3.0 * t**2 - 4.0 * t, 4.0 * s - 3.0 * s**2, t**2], axis=-1) / 2.0
-
-
-def _mirror(place: NDArray[np.int64], size: int) -> NDArray[np.int64]:
-    period = max(2 * (size - 1), 1)
-    folded = np.abs(place) % period
-    return np.asarray(np.where(folded >= size, period - folded, folded))

@@ -34,10 +34,16 @@ def isosurface_points(distance: DistanceMap, level: float = 0.0) -> IsosurfacePo
     axis = np.concatenate([np.full(len(index), a) for a, index in enumerate(found)])
     index = np.concatenate(found)
     kept = np.all((index >= BORDER) & (index <= np.array(values.shape) - 1.0 - BORDER), axis=1)
-    places = _refine(distance, distance.grid.world(index[kept]), axis[kept], level)
+    places = distance.grid.world(index[kept])
+    directions = (distance.grid.affine[:3, :3] / distance.grid.spacing).T[axis[kept]]
+    limit = 0.5 * distance.grid.spacing[axis[kept]]
+    for _ in range(2):  # two Newton steps along the grid's edges, each at most half a voxel
+        slope = np.einsum("na,na->n", distance.gradient_at(places), directions)
+        slope = np.where(np.abs(slope) < 0.05, np.inf, slope)
+        step = np.clip((level - distance.at(places)) / slope, -limit, limit)
+        places = places + step[:, None] * directions
     gradient = distance.gradient_at(places)
     normals = gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
-    directions = (distance.grid.affine[:3, :3] / distance.grid.spacing).T[axis[kept]]
     face = distance.grid.voxel_volume / distance.grid.spacing[axis[kept]]
     return IsosurfacePoints(places, normals, face * np.abs(np.einsum("na,na->n", normals, directions)))
 
@@ -52,17 +58,3 @@ def _crossings(values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
     index[:, 0] += start / (start - end)
     order = np.argsort([axis, *[a for a in range(3) if a != axis]])
     return np.asarray(index[:, order])
-
-
-def _refine(
-    distance: DistanceMap, places: NDArray[np.float64], axis: NDArray[np.int64], level: float
-) -> NDArray[np.float64]:
-    """Two Newton steps along the grid edges, each at most half a voxel."""
-    directions = (distance.grid.affine[:3, :3] / distance.grid.spacing).T[axis]
-    limit = 0.5 * distance.grid.spacing[axis]
-    for _ in range(2):
-        slope = np.einsum("na,na->n", distance.gradient_at(places), directions)
-        slope = np.where(np.abs(slope) < 0.05, np.inf, slope)
-        step = np.clip((level - distance.at(places)) / slope, -limit, limit)
-        places = places + step[:, None] * directions
-    return places

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from palpate.errors import InputDataError
 from palpate.images.finding import Finding
 
-__all__ = ["LabelImage", "VoxelGrid"]
+__all__ = ["LabelImage", "VoxelGrid", "corners_apart"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,3 +74,17 @@ class LabelImage:
         object.__setattr__(self, "labels", labels)
         object.__setattr__(self, "names", dict(self.names))
         object.__setattr__(self, "colours", dict(self.colours))
+
+
+def corners_apart(
+    shape: Sequence[float], affine: NDArray[np.float64], other: NDArray[np.float64]
+) -> tuple[float, float]:
+    """How far (mm) two affines (4, 4), index -> mm, place the corners of voxels of `shape` (3,) apart; a voxel's edge.
+
+    What an affine that is not finite gives is not finite either, without a warning.
+    """
+    last = np.maximum(np.array(shape) - 1.0, 0.0)
+    corners = np.array([[*(last * corner), 1.0] for corner in np.ndindex(2, 2, 2)])
+    with np.errstate(all="ignore"):
+        apart = np.linalg.norm((corners @ (affine - other).T)[:, :3], axis=1).max()
+        return float(apart), float(np.linalg.norm(affine[:3, :3], axis=0).min())

@@ -23,26 +23,17 @@ def read_label_table(path: Path | str) -> LabelTable:
     """
     path = Path(path)
     candidates = table_formats(path)
-    content, sha256 = _content(path)
-    table = checked_table(read_rows(_text(content, path), path, candidates), path)
-    if not table:
-        raise InputDataError(f"the label table '{path}' names no label; is it another file?")
-    return replace(table, sha256=sha256)
-
-
-def _content(path: Path) -> tuple[bytes, str]:
-    """The file's bytes and their digest."""
     try:
         content, sha256 = read_input(path, MAX_BYTES)
     except (OSError, ValueError) as error:
         raise InputDataError(f"the label table '{path}' cannot be read ({error}); check the path") from error
     if len(content) > MAX_BYTES:
         raise InputDataError(f"the label table '{path}' is larger than {MAX_BYTES} bytes; is it another file?")
-    return content, sha256
-
-
-def _text(content: bytes, path: Path) -> str:
     try:
-        return content.decode("utf-8-sig")
+        text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputDataError(f"the label table '{path}' is not UTF-8 text ({error}); save it as UTF-8") from error
+    table = checked_table(read_rows(text, path, candidates), path)
+    if not table:
+        raise InputDataError(f"the label table '{path}' names no label; is it another file?")
+    return replace(table, sha256=sha256)

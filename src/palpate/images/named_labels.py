@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import unicodedata
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from palpate.errors import InputDataError
@@ -60,7 +60,16 @@ def checked_table(rows: Iterable[NamedLabel], path: Path) -> LabelTable:
 
     Raises `InputDataError` for a label or name that is impossible or given twice.
     """
-    rows = sorted((_checked(row, path) for row in rows), key=lambda row: row.label)
+    rows = [replace(row, name=row.name.strip()) for row in rows]
+    for row in rows:
+        if not 0 <= row.label <= MAX_LABEL or not 1 <= len(row.name) <= MAX_NAME:
+            raise InputDataError(
+                f"'{path}' has the entry {str(row.label)[:20]}: {printable(row.name[:50])!r}; it must be a label from"
+                f" 0 to {MAX_LABEL} and a name of 1 to {MAX_NAME} characters"
+            )
+        if not row.name.isprintable():
+            raise InputDataError(f"'{path}' has control characters in the name {row.name!r}; remove them")
+    rows.sort(key=lambda row: row.label)
     seen: set[int | str] = set()
     for row in rows:
         if row.label in seen or row.name in seen:
@@ -68,18 +77,6 @@ def checked_table(rows: Iterable[NamedLabel], path: Path) -> LabelTable:
         seen |= {row.label, row.name}
     colours = {row.label: row.colour for row in rows if row.colour is not None}
     return LabelTable({row.label: row.name for row in rows}, colours)
-
-
-def _checked(row: NamedLabel, path: Path) -> NamedLabel:
-    name = row.name.strip()
-    if not 0 <= row.label <= MAX_LABEL or not 1 <= len(name) <= MAX_NAME:
-        raise InputDataError(
-            f"'{path}' has the entry {str(row.label)[:20]}: {printable(row.name[:50])!r}; it must be a label from 0 to"
-            f" {MAX_LABEL} and a name of 1 to {MAX_NAME} characters"
-        )
-    if not name.isprintable():
-        raise InputDataError(f"'{path}' has control characters in the name {name!r}; remove them")
-    return NamedLabel(row.label, name, row.colour)
 
 
 def printable(text: str) -> str:

@@ -59,7 +59,15 @@ def segment(image: LabelImage, tissues: tuple[Tissue, ...]) -> Segmentation:
     Raises `ConfigurationError` when two tissues claim one label or two are "remaining", `InputDataError` when a
     voxel's label belongs to no tissue or a tissue has no voxel.
     """
-    owner = _owners(tissues)
+    owner: dict[int, int] = {}
+    for i, tissue in enumerate(tissues):
+        for label in tissue.labels:
+            if label in owner:
+                raise ConfigurationError(
+                    f"label {label} is claimed by '{tissues[owner[label]].name}' and by '{tissue.name}';"
+                    " a voxel can belong to one tissue only"
+                )
+            owner[label] = i
     rest = [i for i, tissue in enumerate(tissues) if not tissue.labels]
     if len(rest) > 1:
         raise ConfigurationError(f"tissues {[tissues[i].name for i in rest]} are both 'remaining'; only one can be")
@@ -70,25 +78,10 @@ def segment(image: LabelImage, tissues: tuple[Tissue, ...]) -> Segmentation:
             f"labels {orphans[:10]} belong to no tissue; name them in a tissue, or give one tissue label = 'remaining'"
         )
     table = np.array([owner.get(int(label), rest[0] if rest else -1) for label in labels], dtype=np.int16)
-    described = tuple(_described(tissue, image) for tissue in tissues)
+    described = []
+    for tissue in tissues:
+        called = tuple(image.names[label] for label in tissue.labels if label in image.names)
+        colour = next((image.colours[label] for label in tissue.labels if label in image.colours), None)
+        described.append(replace(tissue, called=called or tissue.called, colour=tissue.colour or colour))
     index = table[inverse].reshape(image.labels.shape)
-    return Segmentation(index, image.grid, described, image.digests, image.findings)
-
-
-def _described(tissue: Tissue, image: LabelImage) -> Tissue:
-    called = tuple(image.names[label] for label in tissue.labels if label in image.names)
-    colour = next((image.colours[label] for label in tissue.labels if label in image.colours), None)
-    return replace(tissue, called=called or tissue.called, colour=tissue.colour or colour)
-
-
-def _owners(tissues: tuple[Tissue, ...]) -> dict[int, int]:
-    owner: dict[int, int] = {}
-    for i, tissue in enumerate(tissues):
-        for label in tissue.labels:
-            if label in owner:
-                raise ConfigurationError(
-                    f"label {label} is claimed by '{tissues[owner[label]].name}' and by '{tissue.name}';"
-                    " a voxel can belong to one tissue only"
-                )
-            owner[label] = i
-    return owner
+    return Segmentation(index, image.grid, tuple(described), image.digests, image.findings)

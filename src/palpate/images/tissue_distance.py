@@ -11,7 +11,7 @@ from palpate.images.distance import DistanceMap, distance_map
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 
-__all__ = ["REACH_MM", "cropped", "tissue_distance_map", "window_around"]
+__all__ = ["REACH_MM", "cropped", "tissue_distance_map", "window_around", "window_of"]
 
 REACH_MM = 25.0  # organs that move further are not found again
 
@@ -37,6 +37,15 @@ def window_around(mask: NDArray[np.bool_], grid: VoxelGrid, *, reach_mm: float) 
     i, j, k = (
         slice(max(s.start - m, 0), min(s.stop + m, n)) for s, m, n in zip(found, margin, mask.shape, strict=True)
     )
+    return (i, j, k)
+
+
+def window_of(index: NDArray[np.float64], grid: VoxelGrid, *, margin: int) -> tuple[slice, slice, slice]:
+    """Index ranges of the voxels within `margin` of voxel indices (n, 3); one voxel where these lie beyond the grid."""
+    last = np.array(grid.shape) - 1
+    low = np.clip(np.floor(index.min(axis=0)).astype(np.int64) - margin, 0, last)
+    high = np.clip(np.ceil(index.max(axis=0)).astype(np.int64) + margin, 0, last)
+    i, j, k = (slice(int(a), int(b) + 1) for a, b in zip(low, high, strict=True))
     return (i, j, k)
 
 

@@ -39,12 +39,23 @@ def outer_constraint(
     if outer not in OUTER_KINDS:
         raise ConfigurationError(f"outer_boundary is '{outer}'; it must be one of {list(OUTER_KINDS)}")
     _check_prescription(space, modes, offset, prescribed)
-    faces = _held_faces(space)
+    # of `known` tissues on the cut of the image
+    tissues = space.mesh.tissues
+    known = [number for number, tissue in enumerate(tissues) if tissue.role is Role.KNOWN]
+    surfaces = [tissue_surface(space.mesh, number) for number in known]
+    cuts = [surface.triangles[surface.other == OUTER] for surface in surfaces]
+    faces = np.concatenate([np.zeros((0, 3), dtype=np.int64), *cuts])
     held = np.zeros((len(space.points), 3, 3))
     if outer == "fixed":
         held[np.unique(space.facets(faces))] = np.eye(3)
     elif outer == "sliding":
-        held = _normal_moments(space, faces)
+        # the sum of n (x) n over the unit normals n of the faces at each point
+        normals = triangle_normals(space.mesh.nodes, faces)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        dyads = np.einsum("fi,fj->fij", normals, normals)
+        held = np.zeros((len(space.points), 3, 3))
+        for column in space.facets(faces).T:
+            np.add.at(held, column, dyads)
     held[prescribed] = np.eye(3)
     free = _free_directions(held)
     refuse_floating(space, free)
@@ -67,26 +78,6 @@ def _check_prescription(
             f"modes or offset move {int(stray.sum())} points that are not prescribed (the first is number"
             f" {int(np.flatnonzero(stray)[0])}): mark them in `prescribed` or set their rows to zero"
         )
-
-
-def _held_faces(space: LagrangeSpace) -> NDArray[np.int64]:
-    """Faces (n, 3) of `known` tissues on the cut of the image."""
-    tissues = space.mesh.tissues
-    known = [number for number, tissue in enumerate(tissues) if tissue.role is Role.KNOWN]
-    surfaces = [tissue_surface(space.mesh, number) for number in known]
-    cuts = [surface.triangles[surface.other == OUTER] for surface in surfaces]
-    return np.concatenate([np.zeros((0, 3), dtype=np.int64), *cuts])
-
-
-def _normal_moments(space: LagrangeSpace, faces: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Sum of n (x) n over the unit normals n of the faces at each point, (n_points, 3, 3)."""
-    normals = triangle_normals(space.mesh.nodes, faces)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    dyads = np.einsum("fi,fj->fij", normals, normals)
-    moments = np.zeros((len(space.points), 3, 3))
-    for column in space.facets(faces).T:
-        np.add.at(moments, column, dyads)
-    return moments
 
 
 def _free_directions(held: NDArray[np.float64]) -> sparse.csr_matrix[np.float64]:

@@ -35,11 +35,8 @@ def quadrature(degree: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     if degree == 2:
         low = (5.0 - np.sqrt(5.0)) / 20.0
         return np.full((4, 4), low) + (1.0 - 4.0 * low) * np.eye(4), np.full(4, 0.25)
-    return _conical_rule(degree // 2 + 1)
-
-
-def _conical_rule(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """n^3 points from the cube by lambda_1 = x, lambda_2 = (1 - x) y, lambda_3 = (1 - x)(1 - y) z."""
+    # from the cube by lambda_1 = x, lambda_2 = (1 - x) y, lambda_3 = (1 - x)(1 - y) z
+    n = degree // 2 + 1
     rules = [roots_jacobi(n, power, 0.0) for power in (2.0, 1.0, 0.0)]
     x, y, z = np.meshgrid(*[0.5 * (1.0 + points) for points, _ in rules], indexing="ij")
     weights = np.einsum("i,j,k->ijk", *[w / w.sum() for _, w in rules])

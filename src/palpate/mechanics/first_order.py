@@ -67,11 +67,7 @@ class FirstOrderEquilibrium(DenseEquilibrium):
 
 
 def expanded(
-    equilibrium: Equilibrium,
-    *,
-    names: tuple[str, ...],
-    moduli: NDArray[np.float64],
-    coefficients: NDArray[np.float64],
+    equilibrium: Equilibrium, *, names: tuple[str, ...], moduli: NDArray[np.float64], coefficients: NDArray[np.float64]
 ) -> FirstOrderModel:
     """The expansion around an equilibrium at moduli (n_regions,) kPa and coefficients (n_modes,); one tangent."""
     return FirstOrderModel(names, moduli, coefficients, equilibrium.values, equilibrium.tangent())

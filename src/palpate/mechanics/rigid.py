@@ -32,10 +32,22 @@ def rigid_modes(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def refuse_floating(space: LagrangeSpace, free: sparse.csr_matrix[np.float64]) -> None:
     """Raise `GeometryError` when a connected part of the mesh can move rigidly within `free` (n_dof, n_free)."""
-    n_parts, part = _parts(space)
+    first = np.repeat(space.cells[:, 0], space.cells.shape[1] - 1)
+    second = space.cells[:, 1:].ravel()
+    n = len(space.points)
+    graph = sparse.csr_matrix((np.ones(len(first)), (first, second)), shape=(n, n))
+    n_parts, part = connected_components(graph, directed=False)
     for number in range(n_parts):
         points = np.flatnonzero(part == number)
-        loose = _loose_motions(space.points[points], free[_dofs(points)])
+        allowed = free[(3 * points[:, None] + np.arange(3)).ravel()]
+        motions = rigid_modes(space.points[points]) / np.sqrt(len(points))
+        opposed = motions - allowed @ (allowed.T @ motions)
+        values, directions = np.linalg.eigh(opposed.T @ opposed)
+        loose = []  # the combinations whose part outside `free` vanishes
+        for sizes in np.abs(directions.T[values < SUPPORTED**2]):
+            name = NAMES[int(np.argmax(sizes))]
+            pure = sizes.max() > 0.99 * float(np.linalg.norm(sizes))
+            loose.append(name if pure else f"a motion that is mostly {name}")
         if loose:
             centre = np.round(space.points[points].mean(axis=0), 1).tolist()
             raise GeometryError(
@@ -43,31 +55,3 @@ def refuse_floating(space: LagrangeSpace, free: sparse.csr_matrix[np.float64]) -
                 f" {', '.join(loose)}; hold it with outer_boundary = 'fixed', or with a `rigid` or `driver` tissue,"
                 " or remove it from the labels"
             )
-
-
-def _parts(space: LagrangeSpace) -> tuple[int, NDArray[np.int64]]:
-    first = np.repeat(space.cells[:, 0], space.cells.shape[1] - 1)
-    second = space.cells[:, 1:].ravel()
-    n = len(space.points)
-    graph = sparse.csr_matrix((np.ones(len(first)), (first, second)), shape=(n, n))
-    n_parts, part = connected_components(graph, directed=False)
-    return int(n_parts), np.asarray(part, dtype=np.int64)
-
-
-def _dofs(points: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.asarray((3 * points[:, None] + np.arange(3)).ravel())
-
-
-def _loose_motions(points: NDArray[np.float64], free: sparse.csr_matrix[np.float64]) -> list[str]:
-    """Names of the rigid motions that nothing opposes: combinations whose part outside `free` vanishes."""
-    motions = rigid_modes(points) / np.sqrt(len(points))
-    opposed = motions - free @ (free.T @ motions)
-    values, directions = np.linalg.eigh(opposed.T @ opposed)
-    return [_describe(directions[:, number]) for number in np.flatnonzero(values < SUPPORTED**2)]
-
-
-def _describe(combination: NDArray[np.float64]) -> str:
-    """The name of the largest component, with a word where others share in it."""
-    largest = int(np.argmax(np.abs(combination)))
-    pure = abs(combination[largest]) > 0.99 * float(np.linalg.norm(combination))
-    return NAMES[largest] if pure else f"a motion that is mostly {NAMES[largest]}"

@@ -15,6 +15,7 @@ from palpate.images.distance import DistanceMap, distance_map
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
+from palpate.images.tissue_distance import cropped, window_around
 from palpate.parallel import mapped
 
 __all__ = ["Anatomy", "Box", "LevelSet", "anatomy_of", "domain_box", "margin_box", "volume_preserving"]
@@ -125,14 +126,30 @@ def anatomy_of(segmentation: Segmentation, *, box: Box, smoothing_mm: float) -> 
     Raises `InputDataError` when a tissue has no voxel.
     """
     tissues = segmentation.tissues
-    filler = _filler(segmentation)
+    meshed = [i for i, tissue in enumerate(segmentation.tissues) if tissue.meshed]
+    if not meshed:
+        raise GeometryError("no tissue of the case is `estimate` or `known`: there is nothing to mesh")
+    remaining = [i for i in meshed if not segmentation.tissues[i].labels]
+    filler = remaining[0] if remaining else max(meshed, key=segmentation.volume)
     order = _priority(tissues, filler)
 
     def level_set(rank: int) -> LevelSet:
         """That of the tissue at this place of the order."""
         held = tissues[order[rank]].role in (Role.RIGID, Role.VOID)
         width = HELD_SMOOTHING * smoothing_mm if held else smoothing_mm
-        return _extended_map(segmentation, order[rank], order[:rank], width)
+        tissue = order[rank]
+        mask = segmentation.mask(tissue)
+        if not mask.any():
+            raise InputDataError(f"tissue '{segmentation.tissues[tissue].name}' has no voxel in the image")
+        window = window_around(mask, segmentation.grid, reach_mm=CROP_MM)
+        index, part = segmentation.index[window], mask[window]
+        won = np.isin(index, order[:rank])
+        if won.any() and not won.all():
+            nearest = ndimage.distance_transform_edt(
+                won, sampling=segmentation.grid.spacing, return_distances=False, return_indices=True
+            )
+            part = part[tuple(nearest)]
+        return volume_preserving(distance_map(part, cropped(segmentation.grid, window), smoothing_mm=width), part)
 
     made = dict(zip(order, mapped(level_set, range(len(order))), strict=True))
     return Anatomy(tissues, tuple(made.get(i) for i in range(len(tissues))), box)
@@ -143,7 +160,8 @@ def domain_box(grids: Sequence[VoxelGrid]) -> Box:
 
     Raises `GeometryError` when the images share no volume.
     """
-    axes = _axes(grids[0])
+    u, _, vt = np.linalg.svd((grids[0].affine[:3, :3] / grids[0].spacing).T)
+    axes = u @ vt  # of the nearest rotation, for an oblique header may be slightly sheared
     extents = [_extent(grid, axes) for grid in grids]
     low = np.max([extent[0] for extent in extents], axis=0)
     high = np.min([extent[1] for extent in extents], axis=0)
@@ -163,32 +181,6 @@ def _priority(tissues: tuple[Tissue, ...], filler: int) -> tuple[int, ...]:
     return tuple(sorted(rest, key=lambda i: tissues[i].meshed))
 
 
-def _filler(segmentation: Segmentation) -> int:
-    meshed = [i for i, tissue in enumerate(segmentation.tissues) if tissue.meshed]
-    if not meshed:
-        raise GeometryError("no tissue of the case is `estimate` or `known`: there is nothing to mesh")
-    remaining = [i for i in meshed if not segmentation.tissues[i].labels]
-    return remaining[0] if remaining else max(meshed, key=segmentation.volume)
-
-
-def _extended_map(
-    segmentation: Segmentation, tissue: int, winners: tuple[int, ...], smoothing_mm: float
-) -> DistanceMap:
-    mask = segmentation.mask(tissue)
-    if not mask.any():
-        raise InputDataError(f"tissue '{segmentation.tissues[tissue].name}' has no voxel in the image")
-    window = _window(mask, np.ceil(CROP_MM / segmentation.grid.spacing).astype(int))
-    index, part = segmentation.index[window], mask[window]
-    won = np.isin(index, winners)
-    if won.any() and not won.all():
-        nearest = ndimage.distance_transform_edt(
-            won, sampling=segmentation.grid.spacing, return_distances=False, return_indices=True
-        )
-        part = part[tuple(nearest)]
-    grid = _cropped(segmentation.grid, window, part.shape)
-    return volume_preserving(distance_map(part, grid, smoothing_mm=smoothing_mm), part)
-
-
 def volume_preserving(distance: DistanceMap, mask: NDArray[np.bool_]) -> DistanceMap:
     """The map shifted so that as much lies inside as the voxels of `mask` (n_x, n_y, n_z) fill.
 
@@ -205,25 +197,6 @@ def volume_preserving(distance: DistanceMap, mask: NDArray[np.bool_]) -> Distanc
         inside = float(np.clip(0.5 - (values + shift) / edge, 0.0, 1.0).sum())
         low, high = (low, shift) if inside < wanted else (shift, high)
     return distance.shifted(0.5 * (low + high))
-
-
-def _window(mask: NDArray[np.bool_], margin: NDArray[np.int64]) -> tuple[slice, ...]:
-    found = ndimage.find_objects(mask.astype(np.int8))[0]
-    return tuple(
-        slice(max(s.start - m, 0), min(s.stop + m, n)) for s, m, n in zip(found, margin, mask.shape, strict=True)
-    )
-
-
-def _cropped(grid: VoxelGrid, window: tuple[slice, ...], shape: tuple[int, ...]) -> VoxelGrid:
-    affine = np.array(grid.affine)
-    affine[:3, 3] = grid.world(np.array([[s.start for s in window]], dtype=float))[0]
-    return VoxelGrid((shape[0], shape[1], shape[2]), affine)
-
-
-def _axes(grid: VoxelGrid) -> NDArray[np.float64]:
-    """The grid's axes as rows of the nearest rotation (an oblique header may be slightly sheared)."""
-    u, _, vt = np.linalg.svd((grid.affine[:3, :3] / grid.spacing).T)
-    return np.asarray(u @ vt)
 
 
 def _extent(grid: VoxelGrid, axes: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -7,11 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from palpate.mesh.anatomy import Box, LevelSet
 from palpate.mesh.space import TET_EDGES
+from palpate.mesh.tet_mesh import FACES
 
-__all__ = ["Grid", "cut", "edge_lengths", "graded_grid", "signed_volumes", "within_faces"]
+__all__ = ["Grid", "cut", "edge_lengths", "face_pieces", "graded_grid", "signed_volumes", "within_faces"]
 
 MAX_ROUNDS = 60
 CUBE_PATHS = np.array([[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]])
@@ -34,7 +36,16 @@ def graded_grid(
     Kuhn's six tetrahedra of each cell of a lattice of about `coarsest_mm`, bisected at their longest edges
     (Rivara 1984), which keeps all angles above 30 degrees. All tetrahedra get `region`.
     """
-    grid = _lattice(box, coarsest_mm, region)
+    counts = np.maximum(np.round(box.lengths / coarsest_mm).astype(int), 1)
+    steps = [np.linspace(0.0, length, n + 1) for length, n in zip(box.lengths, counts, strict=True)]
+    nodes = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    strides = np.array([(counts[1] + 1) * (counts[2] + 1), counts[2] + 1, 1])
+    cells = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), axis=-1).reshape(-1, 3) @ strides
+    walks = np.concatenate([np.zeros((6, 1), dtype=int), np.cumsum(strides[CUBE_PATHS], axis=1)], axis=1)
+    tets = (cells[:, None, None] + walks).reshape(-1, 4)
+    flip = signed_volumes(box.world(nodes), tets) < 0.0
+    tets[flip, :2] = tets[flip, 1::-1]
+    grid = Grid(box.world(nodes), tets, np.full(len(tets), region))
     for _ in range(MAX_ROUNDS):
         too_large = edge_lengths(grid).max(axis=1) > size(grid.nodes[grid.tets].mean(axis=1))
         if not too_large.any():
@@ -74,20 +85,13 @@ def cut(
     return Grid(divided.nodes, divided.tets, region)
 
 
-def _lattice(box: Box, coarsest_mm: float, region: int) -> Grid:
-    counts = np.maximum(np.round(box.lengths / coarsest_mm).astype(int), 1)
-    steps = [np.linspace(0.0, length, n + 1) for length, n in zip(box.lengths, counts, strict=True)]
-    nodes = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
-    strides = np.array([(counts[1] + 1) * (counts[2] + 1), counts[2] + 1, 1])
-    cells = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), axis=-1).reshape(-1, 3) @ strides
-    walks = np.concatenate([np.zeros((6, 1), dtype=int), np.cumsum(strides[CUBE_PATHS], axis=1)], axis=1)
-    tets = (cells[:, None, None] + walks).reshape(-1, 4)
-    return Grid(box.world(nodes), _oriented(box.world(nodes), tets), np.full(len(tets), region))
-
-
 def _moved_onto(grid: Grid, phi: LevelSet, chosen: NDArray[np.int64], box: Box) -> Grid:
     """Move the chosen nodes onto the surface along its gradient, but for those of earlier surfaces."""
-    free = np.setdiff1d(chosen, _interface_nodes(grid))
+    low = np.full(len(grid.nodes), np.iinfo(np.int64).max)
+    high = np.full(len(grid.nodes), -1)
+    np.minimum.at(low, grid.tets, grid.region[:, None])
+    np.maximum.at(high, grid.tets, grid.region[:, None])
+    free = np.setdiff1d(chosen, np.flatnonzero(high > low))
     nodes = grid.nodes.copy()
     for _ in range(2):
         slope = within_faces(phi.gradient_at(nodes[free]), nodes[free], box)
@@ -116,20 +120,14 @@ def signed_volumes(nodes: NDArray[np.float64], tets: NDArray[np.int64]) -> NDArr
     return np.asarray(np.einsum("ni,ni->n", np.cross(a, b), c) / 6.0)
 
 
-def _interface_nodes(grid: Grid) -> NDArray[np.int64]:
-    """Nodes that belong to tetrahedra of more than one region."""
-    low = np.full(len(grid.nodes), np.iinfo(np.int64).max)
-    high = np.full(len(grid.nodes), -1)
-    np.minimum.at(low, grid.tets, grid.region[:, None])
-    np.maximum.at(high, grid.tets, grid.region[:, None])
-    return np.asarray(np.flatnonzero(high > low))
-
-
-def _oriented(nodes: NDArray[np.float64], tets: NDArray[np.int64]) -> NDArray[np.int64]:
-    flip = signed_volumes(nodes, tets) < 0.0
-    turned = tets.copy()
-    turned[flip, 0], turned[flip, 1] = tets[flip, 1], tets[flip, 0]
-    return turned
+def face_pieces(tets: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Number (n_tets,) of the piece, joined through faces, of tets (n_tets, 4); of each face (n,) how many have it."""
+    faces = np.sort(tets[:, FACES].reshape(-1, 3), axis=1)
+    _, number, count = np.unique(faces, axis=0, return_inverse=True, return_counts=True)
+    owner = np.repeat(np.arange(len(tets)), 4)
+    by_face = sparse.csr_matrix((np.ones(len(owner)), (owner, number.ravel())))
+    piece = sparse.csgraph.connected_components(by_face @ by_face.T, directed=False)[1]
+    return np.asarray(piece, dtype=np.int64), np.asarray(count, dtype=np.int64)
 
 
 def _bisected(grid: Grid, chosen: NDArray[np.bool_]) -> Grid:
@@ -170,7 +168,15 @@ def _divide(
         edge, whole = _first_edge(tets, keys, rank, n)
         done.append((tets[whole], parent[whole]))
         tets, parent, edge = tets[~whole], parent[~whole], edge[~whole]
-        tets, parent = _halved(tets, parent, edge, keys, n)
+        rows = np.arange(len(tets))
+        key = _edge_keys(tets, n)[rows, edge]
+        middle = n + np.searchsorted(keys, key)
+        halves = []
+        for end in range(2):
+            half = tets.copy()
+            half[rows, TET_EDGES[edge, end]] = middle
+            halves.append(half)
+        tets, parent = np.concatenate(halves), np.concatenate([parent, parent])
     return Grid(nodes, np.concatenate([t for t, _ in done]), grid.region[np.concatenate([p for _, p in done])]), (
         np.concatenate([p for _, p in done])
     )
@@ -195,20 +201,6 @@ def _edge_keys(tets: NDArray[np.int64], n: int) -> NDArray[np.int64]:
     return np.asarray(np.where(pairs[..., 1] < n, pairs[..., 0] * n + pairs[..., 1], -1))
 
 
-def _halved(
-    tets: NDArray[np.int64], parent: NDArray[np.int64], edge: NDArray[np.int64], keys: NDArray[np.int64], n: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    rows = np.arange(len(tets))
-    key = _edge_keys(tets, n)[rows, edge]
-    middle = n + np.searchsorted(keys, key)
-    halves = []
-    for end in range(2):
-        half = tets.copy()
-        half[rows, TET_EDGES[edge, end]] = middle
-        halves.append(half)
-    return np.concatenate(halves), np.concatenate([parent, parent])
-
-
 def _roots(ends: NDArray[np.float64], values: NDArray[np.float64], phi: LevelSet) -> NDArray[np.float64]:
     """Points (n, 3) of the segments `ends` (n, 2, 3) where phi is zero, by regula falsi (Illinois)."""
     low, high = np.zeros(len(ends)), np.ones(len(ends))
@@ -218,11 +210,7 @@ def _roots(ends: NDArray[np.float64], values: NDArray[np.float64], phi: LevelSet
         f = phi.at(ends[:, 0] + at[:, None] * (ends[:, 1] - ends[:, 0]))
         left = np.sign(f) == np.sign(f_low)
         low, f_low, f_high = np.where(left, at, low), np.where(left, f, f_low), np.where(left, 0.5 * f_high, f_high)
-        high, f_high, f_low = (
-            np.where(left, high, at),
-            np.where(left, f_high, f),
-            np.where(left, f_low, 0.5 * f_low),
-        )
+        high, f_high, f_low = (np.where(left, high, at), np.where(left, f_high, f), np.where(left, f_low, 0.5 * f_low))
         at = (low * f_high - high * f_low) / np.where(f_high == f_low, 1.0, f_high - f_low)
     at = np.clip(at, 0.05, 0.95)
     return np.asarray(ends[:, 0] + at[:, None] * (ends[:, 1] - ends[:, 0]))

@@ -39,12 +39,8 @@ def _others_take_none(numbers: tuple[signal.Signals, ...]) -> bool:
     mask = sum(1 << (number - 1) for number in numbers)
     try:
         others = [task for task in Path("/proc/self/task").iterdir() if task.name != str(threading.get_native_id())]
-        return all(_blocked(task) & mask == mask for task in others)
-    except (OSError, ValueError):
+        statuses = [(task / "status").read_text(encoding="ascii", errors="replace") for task in others]
+        blocked = [int(status.partition("\nSigBlk:")[2].split()[0], 16) for status in statuses]  # a bit a signal
+    except (OSError, ValueError, IndexError):
         return False
-
-
-def _blocked(task: Path) -> int:
-    """The signals that a thread blocks, a bit each."""
-    status = (task / "status").read_text(encoding="ascii", errors="replace")
-    return int(next(line for line in status.splitlines() if line.startswith("SigBlk:")).split()[1], 16)
+    return all(bits & mask == mask for bits in blocked)

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from palpate.errors import MeshQualityError
 from palpate.mesh.anatomy import Anatomy
+from palpate.mesh.cutting import face_pieces
 from palpate.mesh.dihedral import tet_dihedrals
-from palpate.mesh.tet_mesh import FACES, TetMesh
+from palpate.mesh.tet_mesh import TetMesh
 
 __all__ = ["MeshQuality", "check_mesh", "dihedral_angles", "level_set_volumes", "mesh_quality"]
 
@@ -61,10 +61,11 @@ def mesh_quality(mesh: TetMesh, anatomy: Anatomy, *, voxel_volumes: Mapping[str,
     smallest = angles.min(axis=1)
     worst = int(smallest.argmin())
     place = mesh.nodes[mesh.tets[worst]].mean(axis=0)
-    volume = _tissue_volumes(mesh)
+    sums = np.bincount(mesh.region, mesh.volumes, minlength=len(mesh.tissues))
+    volume = {tissue.name: float(sums[i]) for i, tissue in enumerate(mesh.tissues) if tissue.meshed}
     target = level_set_volumes(anatomy)
     counted = voxel_volumes or {}
-    components, overfull = _connection(mesh)
+    piece, with_face = face_pieces(mesh.tets)
     return MeshQuality(
         nodes=len(mesh.nodes),
         tets=len(mesh.tets),
@@ -77,17 +78,13 @@ def mesh_quality(mesh: TetMesh, anatomy: Anatomy, *, voxel_volumes: Mapping[str,
         volume=volume,
         volume_error=_errors(volume, target),
         voxel_volume_error=_errors(volume, counted),
-        components=components,
-        overfull_faces=overfull,
+        components=int(piece.max()) + 1,
+        overfull_faces=int(np.count_nonzero(with_face > 2)),
     )
 
 
 def check_mesh(
-    mesh: TetMesh,
-    anatomy: Anatomy,
-    *,
-    voxel_volumes: Mapping[str, float] | None = None,
-    thin: tuple[str, ...] = (),
+    mesh: TetMesh, anatomy: Anatomy, *, voxel_volumes: Mapping[str, float] | None = None, thin: tuple[str, ...] = ()
 ) -> MeshQuality:
     """The gate: the mesh's quality, or `MeshQualityError` that names every region and place that fails.
 
@@ -96,7 +93,18 @@ def check_mesh(
     piece; no face in more than two tetrahedra. `voxel_volumes`: tissue name -> mm^3 inside the box.
     """
     quality = mesh_quality(mesh, anatomy, voxel_volumes=voxel_volumes)
-    failures = [*_shape_failures(quality), *_volume_failures(quality, thin)]
+    failures = _shape_failures(quality)
+    checks = (
+        ("level set", quality.volume_error, LEVEL_SET_TOLERANCE),
+        ("voxels", quality.voxel_volume_error, VOXEL_TOLERANCE),
+    )
+    for of, errors, limit in checks:
+        for name, error in errors.items():
+            if abs(error) > limit and name not in thin:
+                failures.append(
+                    f"region '{name}' of {quality.volume[name]:.0f} mm^3 differs by {100 * error:+.1f} % from the"
+                    f" volume of its {of} (limit {100 * limit:g} %)"
+                )
     if failures:
         raise MeshQualityError(
             f"the mesh of {quality.tets} tetrahedra is not fit to compute with: {'; '.join(failures)};"
@@ -123,23 +131,14 @@ def level_set_volumes(anatomy: Anatomy) -> dict[str, float]:
     for block in np.array_split(np.flatnonzero(crossed), max(1, int(crossed.sum()) // 200)):
         points = anatomy.box.world((centres[block][:, None] + fine).reshape(-1, 3))
         edge = cell ** (1 / 3) / FINE_CELLS
-        inside = _refined(anatomy, points, values[:, block], reach)
+        inside = np.repeat(values[:, block], FINE_CELLS**3, axis=1)
+        for rank, tissue in enumerate(anatomy.priority):
+            near, phi = np.abs(inside[rank]) < reach, anatomy.level_sets[tissue]
+            if phi is not None and near.any():
+                inside[rank, near] = phi.at(points[near])
         total += cell / FINE_CELLS**3 * _shares(inside, edge).sum(axis=1)
     order = (*anatomy.priority, anatomy.filler)
     return {anatomy.tissues[i].name: float(total[rank]) for rank, i in enumerate(order)}
-
-
-def _refined(
-    anatomy: Anatomy, points: NDArray[np.float64], coarse: NDArray[np.float64], reach: float
-) -> NDArray[np.float64]:
-    """Level sets (n_tissues - 1, n) at points (n, 3); `coarse` values where a cell is not crossed by one."""
-    values = np.repeat(coarse, FINE_CELLS**3, axis=1)
-    for rank, tissue in enumerate(anatomy.priority):
-        near = np.abs(values[rank]) < reach
-        phi = anatomy.level_sets[tissue]
-        if phi is not None and near.any():
-            values[rank, near] = phi.at(points[near])
-    return values
 
 
 def _cell_centres(counts: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -158,23 +157,8 @@ def _shares(values: NDArray[np.float64], edge: float) -> NDArray[np.float64]:
     return np.array([*shares, left])
 
 
-def _tissue_volumes(mesh: TetMesh) -> dict[str, float]:
-    sums = np.bincount(mesh.region, mesh.volumes, minlength=len(mesh.tissues))
-    return {tissue.name: float(sums[i]) for i, tissue in enumerate(mesh.tissues) if tissue.meshed}
-
-
 def _errors(volume: Mapping[str, float], target: Mapping[str, float]) -> dict[str, float]:
     return {name: volume[name] / target[name] - 1.0 for name in volume if target.get(name, 0.0) > 0.0}
-
-
-def _connection(mesh: TetMesh) -> tuple[int, int]:
-    """Number of pieces joined through faces, and number of faces in more than two tetrahedra."""
-    faces = np.sort(mesh.tets[:, FACES].reshape(-1, 3), axis=1)
-    _, inverse, count = np.unique(faces, axis=0, return_inverse=True, return_counts=True)
-    owner = np.repeat(np.arange(len(mesh.tets)), 4)
-    by_face = sparse.csr_matrix((np.ones(len(owner)), (owner, inverse.ravel())))
-    pieces = sparse.csgraph.connected_components(by_face @ by_face.T, directed=False)[0]
-    return int(pieces), int(np.count_nonzero(count > 2))
 
 
 def _shape_failures(quality: MeshQuality) -> list[str]:
@@ -192,20 +176,4 @@ def _shape_failures(quality: MeshQuality) -> list[str]:
         failures.append(f"it falls into {quality.components} pieces that share no face")
     if quality.overfull_faces:
         failures.append(f"{quality.overfull_faces} faces belong to more than two tetrahedra")
-    return failures
-
-
-def _volume_failures(quality: MeshQuality, thin: tuple[str, ...]) -> list[str]:
-    failures = []
-    checks = (
-        ("level set", quality.volume_error, LEVEL_SET_TOLERANCE),
-        ("voxels", quality.voxel_volume_error, VOXEL_TOLERANCE),
-    )
-    for of, errors, limit in checks:
-        for name, error in errors.items():
-            if abs(error) > limit and name not in thin:
-                failures.append(
-                    f"region '{name}' of {quality.volume[name]:.0f} mm^3 differs by {100 * error:+.1f} % from the"
-                    f" volume of its {of} (limit {100 * limit:g} %)"
-                )
     return failures

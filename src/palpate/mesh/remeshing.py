@@ -30,7 +30,12 @@ def remeshed(grid: Grid, sizes: NDArray[np.float64], *, box: Box, sag_mm: float)
     """
     mesh = MmgMesh3D()
     triangles, references = _surfaces(grid, box)
-    ridges = _ridges(triangles, references)
+    # where two faces of the box meet, or one meets a hollow tissue, Mmg must keep the edge sharp
+    border = references <= HOLLOW_REFERENCE
+    edges = np.sort(triangles[border][:, [[0, 1], [1, 2], [0, 2]]].reshape(-1, 2), axis=1)
+    kinds = np.unique(np.column_stack([edges, np.repeat(references[border], 3)]), axis=0)
+    unique, count = np.unique(kinds[:, :2], axis=0, return_counts=True)
+    ridges = unique[count > 1]
     mesh.set_mesh_size(vertices=len(grid.nodes), tetrahedra=len(grid.tets), triangles=len(triangles), edges=len(ridges))
     mesh.set_vertices(grid.nodes)
     mesh.set_tetrahedra(grid.tets.astype(np.int32), (grid.region + 1).astype(np.int32))
@@ -78,22 +83,8 @@ def _surfaces(grid: Grid, box: Box) -> tuple[NDArray[np.int64], NDArray[np.int64
     code = 10 + np.minimum(a, b) * (regions.max() + 1) + np.maximum(a, b)
     border = order[~same & ~second]
     triangles = np.concatenate([faces[order[pair]], faces[border]])
-    return triangles, np.concatenate([code, _box_face(grid.nodes[faces[border]], box)])
-
-
-def _ridges(triangles: NDArray[np.int64], references: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Edges (n, 2) where two faces of the box meet, or one meets a hollow tissue: Mmg must keep them sharp."""
-    border = references <= HOLLOW_REFERENCE
-    edges = np.sort(triangles[border][:, [[0, 1], [1, 2], [0, 2]]].reshape(-1, 2), axis=1)
-    kinds = np.unique(np.column_stack([edges, np.repeat(references[border], 3)]), axis=0)
-    unique, count = np.unique(kinds[:, :2], axis=0, return_counts=True)
-    return np.asarray(unique[count > 1])
-
-
-def _box_face(corners: NDArray[np.float64], box: Box) -> NDArray[np.int64]:
-    """Number 1 to 6 of the face of the box that triangles (n, 3, 3) lie on, else HOLLOW_REFERENCE."""
-    on = box.faces_of(corners)
-    return np.asarray(np.where(np.any(on, axis=1), 1 + on.argmax(axis=1), HOLLOW_REFERENCE))
+    on = box.faces_of(grid.nodes[faces[border]])
+    return triangles, np.concatenate([code, np.where(on.any(axis=1), 1 + on.argmax(axis=1), HOLLOW_REFERENCE)])
 
 
 @contextmanager

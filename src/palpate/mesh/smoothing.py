@@ -38,7 +38,9 @@ def smoothed(
         chosen = _independent(grid.tets, worst < below_deg, rng.random(len(nodes)))
         if not len(chosen):
             break
-        better, points = _search(nodes, grid.tets, contacts, star[chosen], chosen, _steps(reach[chosen], rng))
+        frames = np.linalg.qr(rng.normal(size=(TRIALS // 6, 3, 3)))[0].reshape(-1, 3)
+        steps = reach[chosen, None, None] * np.concatenate([frames, -frames])  # both ways along random axes
+        better, points = _search(nodes, grid.tets, contacts, star[chosen], chosen, steps)
         nodes[chosen[better]] = points[better]
         reach[chosen] *= np.where(better, 1.2, 0.6)
         touched = np.unique(star[chosen].indices)
@@ -56,12 +58,6 @@ def _independent(tets: NDArray[np.int64], bad: NDArray[np.bool_], priority: NDAr
     return np.asarray(candidates[lowest[candidates] == rank[candidates]])
 
 
-def _steps(reach: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
-    """Trial steps (n, TRIALS, 3) mm of length `reach` (n,): both ways along the axes of random frames."""
-    frames = np.linalg.qr(rng.normal(size=(TRIALS // 6, 3, 3)))[0].reshape(-1, 3)
-    return np.asarray(reach[:, None, None] * np.concatenate([frames, -frames]))
-
-
 def _search(
     nodes: NDArray[np.float64],
     tets: NDArray[np.int64],
@@ -77,9 +73,11 @@ def _search(
     around = tets[star.indices]
     corners = np.repeat(nodes[around][:, None], trials.shape[1], axis=1)
     mine = around == chosen[owner][:, None]
-    corners = np.where(mine[:, None, :, None], trials[owner][:, :, None, :], corners)
+    corners = np.where(mine[:, None, :, None], trials[owner][:, :, None, :], corners).reshape(-1, 4, 3)
+    angles = tet_dihedrals(corners)
+    angles[signed_volumes(corners.reshape(-1, 3), np.arange(4 * len(corners)).reshape(-1, 4)) <= 0.0] = INVERTED_DEG
     penalty = np.zeros(trials.shape[:2])
-    np.add.at(penalty, owner, _penalty(corners.reshape(-1, 4, 3)).reshape(len(owner), -1))
+    np.add.at(penalty, owner, np.exp(-angles / SHARPNESS_DEG).sum(axis=1).reshape(len(owner), -1))
     best = penalty.argmin(axis=1)
     rows = np.arange(len(chosen))
     return penalty[rows, best] < 0.999 * penalty[:, 0], trials[rows, best]
@@ -98,9 +96,3 @@ def _trial_points(
         points[surface] += contacts.onto(points[surface], index[surface], limit_mm=limit)
     local = np.clip(contacts.box.local(points), 0.0, contacts.box.lengths)
     return contacts.box.world(local).reshape(len(chosen), n_trials, 3)
-
-
-def _penalty(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    angles = tet_dihedrals(corners)
-    angles[signed_volumes(corners.reshape(-1, 3), np.arange(4 * len(corners)).reshape(-1, 4)) <= 0.0] = INVERTED_DEG
-    return np.asarray(np.exp(-angles / SHARPNESS_DEG).sum(axis=1))

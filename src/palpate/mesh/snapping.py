@@ -94,14 +94,27 @@ def contacts_of(grid: Grid, anatomy: Anatomy) -> Contacts:
     All hollow tissues are one surface, the first; then one a meshed tissue, in the order of priority. A face belongs
     to the tissue on its two sides that wins. The faces of the box belong to none.
     """
-    level_sets, number = _surfaces(anatomy)
+    hollow = tuple(
+        phi
+        for tissue, phi in zip(anatomy.tissues, anatomy.level_sets, strict=True)
+        if phi is not None and not tissue.meshed
+    )
+    level_sets: list[LevelSet] = [Union(hollow)] if hollow else []
+    number = np.full(len(anatomy.tissues) + 1, len(anatomy.tissues) + 1)
+    for i in anatomy.priority:
+        phi = anatomy.level_sets[i]
+        if phi is None or not anatomy.tissues[i].meshed:
+            number[i] = 0
+        else:
+            number[i] = len(level_sets)
+            level_sets.append(phi)
     faces, behind = _sides(grid, anatomy)
     rank = number[behind].min(axis=1)
     keep = rank < len(level_sets)
     faces, rank = faces[keep], rank[keep]
     on = np.zeros((len(grid.nodes), len(level_sets)), dtype=bool)
     on[faces, rank[:, None]] = True
-    return Contacts(level_sets, faces, rank, on, np.zeros(on.shape), anatomy.box)
+    return Contacts(tuple(level_sets), faces, rank, on, np.zeros(on.shape), anatomy.box)
 
 
 def snapped(grid: Grid, contacts: Contacts, *, limit_mm: float, sweeps: int = 3) -> Grid:
@@ -121,31 +134,25 @@ def debiased(grid: Grid, contacts: Contacts, *, sweeps: int = 3) -> tuple[Grid, 
     Returns the grid and the contacts with the targets that it was given.
     """
     for _ in range(sweeps):
-        target = contacts.target - _facet_means(grid, contacts)
+        corners = grid.nodes[contacts.faces]
+        area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        total, weight = np.zeros(contacts.on.shape), np.zeros(contacts.on.shape)
+        barycentric = np.concatenate([np.roll(row, shift)[None] for row in QUADRATURE for shift in range(3)])
+        for place, share in zip(barycentric, QUADRATURE_WEIGHTS, strict=True):
+            points = np.einsum("k,nki->ni", place, corners)
+            value = np.zeros(len(points))
+            for k, phi in enumerate(contacts.level_sets):
+                mine = contacts.surface == k
+                if mine.any():
+                    value[mine] = phi.at(points[mine])
+            for corner in range(3):
+                key = (contacts.faces[:, corner], contacts.surface)
+                np.add.at(total, key, share * area * place[corner] * value)
+                np.add.at(weight, key, share * area * place[corner])
+        target = contacts.target - total / np.where(weight > 0.0, weight, 1.0)
         contacts = replace(contacts, target=np.where(contacts.on, target, 0.0))
         grid = snapped(grid, contacts, limit_mm=1.0, sweeps=1)
     return grid, contacts
-
-
-def _surfaces(anatomy: Anatomy) -> tuple[tuple[LevelSet, ...], NDArray[np.int64]]:
-    """Level sets of the surfaces, the number (n_tissues + 1,) of each tissue's; last: the box."""
-    level_sets: list[LevelSet] = []
-    hollow = tuple(
-        phi
-        for tissue, phi in zip(anatomy.tissues, anatomy.level_sets, strict=True)
-        if phi is not None and not tissue.meshed
-    )
-    if hollow:
-        level_sets.append(Union(hollow))
-    number = np.full(len(anatomy.tissues) + 1, len(anatomy.tissues) + 1)
-    for i in anatomy.priority:
-        phi = anatomy.level_sets[i]
-        if phi is None or not anatomy.tissues[i].meshed:
-            number[i] = 0
-        else:
-            number[i] = len(level_sets)
-            level_sets.append(phi)
-    return tuple(level_sets), number
 
 
 def _sides(grid: Grid, anatomy: Anatomy) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -169,10 +176,7 @@ def _sides(grid: Grid, anatomy: Anatomy) -> tuple[NDArray[np.int64], NDArray[np.
     )
     inner = behind >= 0
     tissues = np.concatenate(
-        [
-            np.column_stack([region[a], region[b]])[differ],
-            np.column_stack([region[border], behind])[inner],
-        ]
+        [np.column_stack([region[a], region[b]])[differ], np.column_stack([region[border], behind])[inner]]
     )
     return np.concatenate([faces[a[differ]], faces[border[inner]]]), tissues
 
@@ -200,27 +204,3 @@ def _safely_moved(grid: Grid, step: NDArray[np.float64]) -> NDArray[np.float64]:
         step[np.unique(grid.tets[bad])] = 0.0
         bad = signed_volumes(grid.nodes + step, grid.tets) < SHRINK_LIMIT * before
     return np.asarray(grid.nodes + step)
-
-
-def _facet_means(grid: Grid, contacts: Contacts) -> NDArray[np.float64]:
-    """Mean of the level set (n_nodes, n_surfaces) mm over the facets around each node, weighted by its hat function."""
-    corners = grid.nodes[contacts.faces]
-    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    total, weight = np.zeros(contacts.on.shape), np.zeros(contacts.on.shape)
-    barycentric = np.concatenate([np.roll(row, shift)[None] for row in QUADRATURE for shift in range(3)])
-    for place, share in zip(barycentric, QUADRATURE_WEIGHTS, strict=True):
-        value = _on_faces(contacts, np.einsum("k,nki->ni", place, corners))
-        for corner in range(3):
-            key = (contacts.faces[:, corner], contacts.surface)
-            np.add.at(total, key, share * area * place[corner] * value)
-            np.add.at(weight, key, share * area * place[corner])
-    return np.asarray(total / np.where(weight > 0.0, weight, 1.0))
-
-
-def _on_faces(contacts: Contacts, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    values = np.zeros(len(points))
-    for k, phi in enumerate(contacts.level_sets):
-        mine = contacts.surface == k
-        if mine.any():
-            values[mine] = phi.at(points[mine])
-    return values

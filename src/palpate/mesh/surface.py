@@ -39,7 +39,8 @@ def tissue_surface(mesh: TetMesh, tissue: int) -> Surface:
     if not mesh.tissues[tissue].meshed:
         keep = mesh.beyond == tissue
         flipped = mesh.boundary[keep][:, ::-1]
-        return Surface(flipped, _region_behind(mesh, mesh.boundary[keep]))
+        every = _keys(mesh.tets[:, FACES].reshape(-1, 3), mesh)
+        return Surface(flipped, _look_up(_keys(flipped, mesh), every, np.repeat(mesh.region, 4)))
     inside = mesh.tets[mesh.region == tissue][:, FACES].reshape(-1, 3)
     rest = mesh.tets[mesh.region != tissue][:, FACES].reshape(-1, 3)
     regions = np.repeat(mesh.region[mesh.region != tissue], 4)
@@ -83,11 +84,6 @@ def _look_up(keys: NDArray[np.int64], table: NDArray[np.int64], values: NDArray[
     place = np.clip(np.searchsorted(table, keys, sorter=order), 0, len(table) - 1)
     found = table[order[place]] == keys
     return np.asarray(np.where(found, values[order[place]], MISSING))
-
-
-def _region_behind(mesh: TetMesh, triangles: NDArray[np.int64]) -> NDArray[np.int64]:
-    faces = mesh.tets[:, FACES].reshape(-1, 3)
-    return _look_up(_keys(triangles, mesh), _keys(faces, mesh), np.repeat(mesh.region, 4))
 
 
 def mean_curvature(points: NDArray[np.float64], triangles: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -33,13 +33,7 @@ class TetMesh:
     tissues: tuple[Tissue, ...]
 
     def __post_init__(self) -> None:
-        for name, dtype in (
-            ("nodes", float),
-            ("tets", int),
-            ("region", int),
-            ("boundary", int),
-            ("beyond", int),
-        ):
+        for name, dtype in (("nodes", float), ("tets", int), ("region", int), ("boundary", int), ("beyond", int)):
             array = np.array(getattr(self, name), dtype=dtype)
             array.setflags(write=False)
             object.__setattr__(self, name, array)

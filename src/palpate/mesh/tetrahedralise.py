@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from palpate.errors import GeometryError
 from palpate.images.tissue import Role
 from palpate.mesh.anatomy import Anatomy
 from palpate.mesh.closing import closed
-from palpate.mesh.cutting import Grid, cut, graded_grid, signed_volumes
+from palpate.mesh.cutting import Grid, cut, face_pieces, graded_grid, signed_volumes
 from palpate.mesh.dihedral import tet_dihedrals
 from palpate.mesh.remeshing import compact, remeshed
 from palpate.mesh.smoothing import smoothed
@@ -45,34 +44,37 @@ def tetrahedralise(anatomy: Anatomy, *, edge_length_mm: float) -> TetMesh:
             f"mesh.edge_length_mm is {edge_length_mm}; it must be positive and less than the smallest side of the"
             f" domain, {anatomy.box.lengths.min():.1f} mm"
         )
-    grid = _best_grid(anatomy, edge_length_mm)
+    # the first without a bad angle, or the best: a gap as wide as the closing's reach closes in patches
+    grid, best_angle = None, -np.inf
+    failure = GeometryError("no attempt at meshing was made")
+    for gap in GAPS:
+        try:
+            attempt = _grid(closed(anatomy, gap_mm=gap * edge_length_mm), edge_length_mm)
+        except GeometryError as error:
+            failure = error
+            continue
+        angle = float(tet_dihedrals(attempt.nodes[attempt.tets]).min())
+        if grid is None or angle > best_angle:
+            grid, best_angle = attempt, angle
+        if angle > GOOD_ENOUGH_DEG:
+            break
+    if grid is None:
+        raise failure
     boundary = boundary_of(grid.tets)
     beyond = _beyond(anatomy, grid.nodes, boundary)
     return TetMesh(grid.nodes, grid.tets, grid.region, boundary, beyond, anatomy.tissues)
 
 
-def _best_grid(anatomy: Anatomy, edge_length_mm: float) -> Grid:
-    """The first grid without a bad angle, or the best: a gap as wide as the closing's reach closes in patches."""
-    best, best_angle = None, -np.inf
-    failure: GeometryError | None = None
-    for gap in GAPS:
-        try:
-            grid = _grid(closed(anatomy, gap_mm=gap * edge_length_mm), edge_length_mm)
-        except GeometryError as error:
-            failure = error
-            continue
-        angle = float(tet_dihedrals(grid.nodes[grid.tets]).min())
-        if best is None or angle > best_angle:
-            best, best_angle = grid, angle
-        if angle > GOOD_ENOUGH_DEG:
-            break
-    if best is None:
-        raise failure or GeometryError("no attempt at meshing was made")
-    return best
-
-
 def _grid(anatomy: Anatomy, edge_length_mm: float) -> Grid:
-    grid = _meshed_part(_cut_grid(anatomy, edge_length_mm), anatomy)
+    cut_grid = _cut_grid(anatomy, edge_length_mm)
+    keep = np.array([tissue.meshed for tissue in anatomy.tissues])[cut_grid.region]
+    if not keep.any():
+        raise GeometryError("no tetrahedron is left: the `estimate` and `known` tissues lie outside the domain")
+    tets, region = cut_grid.tets[keep], cut_grid.region[keep]
+    piece, _ = face_pieces(tets)  # small ones share no face with the rest, as between bones that touch
+    volume = np.bincount(piece, signed_volumes(cut_grid.nodes, tets))
+    keep = volume[piece] > CRUMB * volume.sum()
+    grid = compact(cut_grid.nodes, tets[keep], region[keep])
     grid = _fitted(_remeshed(grid, anatomy, edge_length_mm), anatomy, edge_length_mm)
     try:
         return _fitted(_remeshed(grid, anatomy, edge_length_mm), anatomy, edge_length_mm)
@@ -127,25 +129,6 @@ def _sizes(anatomy: Anatomy, points: NDArray[np.float64], edge_length_mm: float)
     start = edge_length_mm * np.where(fine, 1.0, COARSER)[:, None]
     sizes = (start + GRADING * np.abs(values)).min(axis=0, initial=np.inf)
     return np.asarray(np.minimum(sizes, COARSEST * edge_length_mm))
-
-
-def _meshed_part(grid: Grid, anatomy: Anatomy) -> Grid:
-    keep = np.array([tissue.meshed for tissue in anatomy.tissues])[grid.region]
-    if not keep.any():
-        raise GeometryError("no tetrahedron is left: the `estimate` and `known` tissues lie outside the domain")
-    return _without_crumbs(compact(grid.nodes, grid.tets[keep], grid.region[keep]))
-
-
-def _without_crumbs(grid: Grid) -> Grid:
-    """The grid without small pieces that share no face with the rest, as between bones that touch."""
-    faces = np.sort(grid.tets[:, FACES].reshape(-1, 3), axis=1)
-    _, number = np.unique(faces, axis=0, return_inverse=True)
-    owner = np.repeat(np.arange(len(grid.tets)), 4)
-    by_face = sparse.csr_matrix((np.ones(len(owner)), (owner, number.ravel())))
-    piece = sparse.csgraph.connected_components(by_face @ by_face.T, directed=False)[1]
-    volume = np.bincount(piece, signed_volumes(grid.nodes, grid.tets))
-    keep = volume[piece] > CRUMB * volume.sum()
-    return compact(grid.nodes, grid.tets[keep], grid.region[keep])
 
 
 def _beyond(anatomy: Anatomy, nodes: NDArray[np.float64], boundary: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -53,11 +53,18 @@ def voxelise(
     triangles, inner, other = _interfaces(space.mesh)
     pieces = _pieces(space, displacement, triangles, subdivisions=subdivisions, warp=warp)
     count = 4**subdivisions
-    code_inner, code_other = (np.repeat(_codes(side, space.mesh), count) for side in (inner, other))
+    code_inner, code_other = (
+        np.repeat(np.where(np.isin(side, space.mesh.region), BASE ** np.maximum(side, 0), 0), count)
+        for side in (inner, other)
+    )
     tissue = _regions(_accumulate(pieces, code_other - code_inner, grid), space.mesh, crossing)
     hollow = code_other == 0
     behind = np.repeat(np.where(other == OUTER, inner, other), count)
-    return _fill_hollows(tissue, grid, centroids=pieces[hollow].mean(axis=1), values=behind[hollow])
+    empty = np.argwhere(tissue < 0)
+    if len(empty):
+        nearest = KDTree(pieces[hollow].mean(axis=1)).query(grid.world(empty.astype(float)), workers=-1)[1]
+        tissue[tuple(empty.T)] = behind[hollow][nearest]
+    return tissue
 
 
 def _interfaces(mesh: TetMesh) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
@@ -70,11 +77,6 @@ def _interfaces(mesh: TetMesh) -> tuple[NDArray[np.int64], NDArray[np.int64], ND
         other.append(surface.other[first])
         inner.append(np.full(int(first.sum()), region))
     return np.concatenate(triangles), np.concatenate(inner), np.concatenate(other)
-
-
-def _codes(side: NDArray[np.int64], mesh: TetMesh) -> NDArray[np.int64]:
-    """Digit of each region, 0 for what is not meshed."""
-    return np.where(np.isin(side, mesh.region), BASE ** np.maximum(side, 0), 0)
 
 
 def _regions(codes: NDArray[np.int64], mesh: TetMesh, crossing: bool) -> NDArray[np.int16]:
@@ -106,23 +108,19 @@ def _pieces(
     warp: Warp | None,
 ) -> NDArray[np.float64]:
     """Corners (n_triangles 4^subdivisions, 3, 3) mm of the deformed and warped pieces of each triangle."""
-    barycentric, cells = _subdivision(2**subdivisions)
+    n = 2**subdivisions
+    lattice = [(i, j) for i in range(n + 1) for j in range(n + 1 - i)]
+    number = {corner: k for k, corner in enumerate(lattice)}
+    cells = [(number[i, j], number[i + 1, j], number[i, j + 1]) for i, j in lattice if i + j < n]
+    cells += [(number[i + 1, j], number[i + 1, j + 1], number[i, j + 1]) for i, j in lattice if i + j < n - 1]
+    shares = np.array(lattice) / n
+    barycentric = np.column_stack([1.0 - shares.sum(axis=1), shares])
     moved = (space.points + displacement)[space.facets(triangles)]
     points = np.einsum("lk,fkd->fld", triangle_shape(space.order, barycentric), moved)
     if warp is not None:
         distinct, place = np.unique(np.round(points.reshape(-1, 3), 9), axis=0, return_inverse=True)
         points = warp(distinct)[place.reshape(-1)].reshape(points.shape)
-    return np.asarray(points[:, cells].reshape(-1, 3, 3))
-
-
-def _subdivision(n: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Barycentric lattice ((n+1)(n+2)/2, 3) of a triangle and its n^2 pieces (n^2, 3), turning the same way."""
-    lattice = [(i, j) for i in range(n + 1) for j in range(n + 1 - i)]
-    number = {place: k for k, place in enumerate(lattice)}
-    cells = [(number[i, j], number[i + 1, j], number[i, j + 1]) for i, j in lattice if i + j < n]
-    cells += [(number[i + 1, j], number[i + 1, j + 1], number[i, j + 1]) for i, j in lattice if i + j < n - 1]
-    place = np.array(lattice) / n
-    return np.column_stack([1.0 - place.sum(axis=1), place]), np.array(cells)
+    return np.asarray(points[:, np.array(cells)].reshape(-1, 3, 3))
 
 
 def _accumulate(pieces: NDArray[np.float64], step: NDArray[np.int64], grid: VoxelGrid) -> NDArray[np.int64]:
@@ -134,7 +132,10 @@ def _accumulate(pieces: NDArray[np.float64], step: NDArray[np.int64], grid: Voxe
     signed = (step * np.sign(area) * turn).astype(np.int64)
     corners[area < 0] = corners[area < 0][:, ::-1]
     hit, x, y = _columns(corners, np.flatnonzero(area), (nx, ny))
-    height = _height(corners[hit], x, y)
+    met = corners[hit]  # and where the column meets the triangle's plane
+    first, second, to = met[:, 1] - met[:, 0], met[:, 2] - met[:, 0], np.stack([x, y], axis=1) - met[:, 0, :2]
+    rise = (_cross(to, second) * first[:, 2] + _cross(first, to) * second[:, 2]) / _cross(first, second)
+    height = met[:, 0, 2] + rise
     start = np.clip(np.ceil(height - TIE), 0, nz).astype(np.int64)
     flat = ((x * ny + y) * (nz + 1) + start).astype(np.int64)
     jumps = np.bincount(flat, weights=signed[hit], minlength=nx * ny * (nz + 1))
@@ -157,43 +158,16 @@ def _columns(
     within = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
     x = low[owner, 0] + within // np.maximum(extent[owner, 1], 1)
     y = low[owner, 1] + within % np.maximum(extent[owner, 1], 1)
-    inside = _inside(corners[faces[owner], :, :2], np.stack([x, y], axis=1).astype(float))
-    return faces[owner[inside]], x[inside], y[inside]
-
-
-def _inside(corners: NDArray[np.float64], place: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether each place (n, 2) is in its anticlockwise triangle (n, 3, 2); on an edge, as if moved by (e, e^2)."""
+    around, place = corners[faces[owner], :, :2], np.stack([x, y], axis=1).astype(float)
     inside = np.ones(len(place), dtype=np.bool_)
     for k in range(3):
-        edge = corners[:, (k + 1) % 3] - corners[:, k]
-        side = _cross(edge, place - corners[:, k])
-        tie = (edge[:, 1] < 0) | ((edge[:, 1] == 0) & (edge[:, 0] > 0))
+        edge = around[:, (k + 1) % 3] - around[:, k]
+        side = _cross(edge, place - around[:, k])
+        tie = (edge[:, 1] < 0) | ((edge[:, 1] == 0) & (edge[:, 0] > 0))  # on an edge, as if moved by (e, e^2)
         inside &= (side > 0) | ((side == 0) & tie)
-    return inside
-
-
-def _height(corners: NDArray[np.float64], x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Third voxel coordinate (n,) at which the column (x, y) meets each plane triangle (n, 3, 3)."""
-    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    to = np.stack([x, y], axis=1) - corners[:, 0, :2]
-    weight_first, weight_second = _cross(to, second), _cross(first, to)
-    rise = (weight_first * first[:, 2] + weight_second * second[:, 2]) / _cross(first, second)
-    return np.asarray(corners[:, 0, 2] + rise)
+    return faces[owner[inside]], x[inside], y[inside]
 
 
 def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Third component (n,) of the cross product of the first two components of a and b."""
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-
-
-def _fill_hollows(
-    tissue: NDArray[np.int16], grid: VoxelGrid, *, centroids: NDArray[np.float64], values: NDArray[np.int64]
-) -> NDArray[np.int16]:
-    """`tissue` with each -1 replaced by the value of the nearest of the boundary's centroids (n, 3) mm."""
-    empty = np.argwhere(tissue < 0)
-    if len(empty) == 0:
-        return tissue
-    nearest = KDTree(centroids).query(grid.world(empty.astype(float)), workers=-1)[1]
-    filled = tissue.copy()
-    filled[tuple(empty.T)] = values[nearest]
-    return filled

@@ -16,7 +16,7 @@ from palpate.phantoms.boundary_noise import smooth_field
 from palpate.phantoms.motion import AffineMotion, WallMotion, filling_of
 from palpate.phantoms.pelvis_shapes import PelvisShapes, draw_pelvis
 from palpate.phantoms.scene import Noise, Scene, centred_grid, grid_box, make_scene
-from palpate.phantoms.shapes import Ellipsoid, rotation_about
+from palpate.phantoms.shapes import rotation_about
 
 __all__ = ["PelvisOptions", "pelvis", "pelvis_anatomy", "pelvis_grid"]
 
@@ -80,7 +80,12 @@ def pelvis_grid(options: PelvisOptions) -> VoxelGrid:
 
 def pelvis_anatomy(options: PelvisOptions) -> Anatomy:
     """The analytic shapes, tissues and true moduli of `options`, in the box of the images' voxels."""
-    parts = _parts(_body(options), options)
+    body = _body(options)
+    parts: dict[str, LevelSet | None] = {"tumour": body.tumour} if options.tumour else {}
+    parts |= {"prostate": body.prostate, "bladder": body.bladder, "rectum": body.rectum}
+    if options.bones:
+        parts |= {"left bone": body.bones[0], "right bone": body.bones[1]}
+    parts |= {"surroundings": None}
     material_rng = np.random.default_rng(options.seed).spawn(3)[1]
     tissues = _tissues(tuple(parts), options, material_rng)
     return Anatomy(tissues, tuple(parts.values()), grid_box(pelvis_grid(options)))
@@ -91,20 +96,19 @@ def _body(options: PelvisOptions) -> PelvisShapes:
     return draw_pelvis(shape_rng, grid_box(pelvis_grid(options)), bones=options.bones)
 
 
-def _parts(body: PelvisShapes, options: PelvisOptions) -> dict[str, LevelSet | None]:
-    """Level set of each tissue by name, in the order of the labels."""
-    parts: dict[str, LevelSet | None] = {"tumour": body.tumour} if options.tumour else {}
-    parts |= {"prostate": body.prostate, "bladder": body.bladder, "rectum": body.rectum}
-    if options.bones:
-        parts |= {"left bone": body.bones[0], "right bone": body.bones[1]}
-    return parts | {"surroundings": None}
-
-
 def _tissues(names: tuple[str, ...], options: PelvisOptions, rng: np.random.Generator) -> tuple[Tissue, ...]:
-    moduli = _moduli(options, rng)
+    prostate, bladder = SURROUNDINGS_KPA * np.exp(rng.uniform(np.log(1.5), np.log(6.0), 2))
+    factor = rng.uniform(2.0, 3.0)
+    moduli = {"surroundings": SURROUNDINGS_KPA, "prostate": prostate, "bladder": bladder}
+    given = dict(options.moduli_kpa or {})
+    unknown = sorted(set(given) - {*moduli, "tumour"})
+    if unknown:
+        raise ConfigurationError(f"moduli_kpa names {unknown}; a pelvis has {[*moduli, 'tumour']}")
+    moduli |= given
+    moduli["tumour"] = given.get("tumour", factor * moduli["prostate"])
     ratios = dict(zip(moduli, rng.uniform(0.40, 0.45, len(moduli)), strict=True))
-    given = options.poisson_ratio or {}
-    ratios |= given if isinstance(given, Mapping) else dict.fromkeys(ratios, given)
+    stated = options.poisson_ratio or {}
+    ratios |= stated if isinstance(stated, Mapping) else dict.fromkeys(ratios, stated)
     roles = {"rectum": Role.DRIVER, "left bone": Role.RIGID, "right bone": Role.RIGID, "surroundings": Role.KNOWN}
     tissues = []
     for label, name in enumerate(names, start=1):
@@ -114,19 +118,6 @@ def _tissues(names: tuple[str, ...], options: PelvisOptions, rng: np.random.Gene
             continue
         tissues.append(Tissue(name, role, (label,), float(ratios[name]), float(moduli[name])))
     return tuple(tissues)
-
-
-def _moduli(options: PelvisOptions, rng: np.random.Generator) -> dict[str, float]:
-    """Young's moduli, kPa; the tumour's follows its gland unless it is given."""
-    prostate, bladder = SURROUNDINGS_KPA * np.exp(rng.uniform(np.log(1.5), np.log(6.0), 2))
-    factor = rng.uniform(2.0, 3.0)
-    moduli = {"surroundings": SURROUNDINGS_KPA, "prostate": prostate, "bladder": bladder}
-    given = dict(options.moduli_kpa or {})
-    unknown = sorted(set(given) - {*moduli, "tumour"})
-    if unknown:
-        raise ConfigurationError(f"moduli_kpa names {unknown}; a pelvis has {[*moduli, 'tumour']}")
-    moduli |= given
-    return {**moduli, "tumour": given.get("tumour", factor * moduli["prostate"])}
 
 
 def _motions(body: PelvisShapes, options: PelvisOptions, rng: np.random.Generator) -> dict[str, WallMotion]:
@@ -143,14 +134,9 @@ def _motions(body: PelvisShapes, options: PelvisOptions, rng: np.random.Generato
         )
     }
     for name, bone in zip(("left bone", "right bone"), body.bones, strict=True):
-        motion = _rigid_motion(bone, options.bone_motion_mm, rng)
+        axis, direction = rng.normal(size=(2, 3))  # of a turn about the bone's centre, and of a shift
+        gradient = rotation_about(axis, options.bone_motion_mm) - np.eye(3)
+        motion = AffineMotion(gradient, bone.centre, options.bone_motion_mm * direction / np.linalg.norm(direction))
         if options.bones and options.bone_motion_mm > 0.0:
             motions[name] = motion
     return motions
-
-
-def _rigid_motion(bone: Ellipsoid, size_mm: float, rng: np.random.Generator) -> AffineMotion:
-    """A shift by `size_mm` and a turn by as many degrees about the bone's centre."""
-    axis, direction = rng.normal(size=(2, 3))
-    gradient = rotation_about(axis, size_mm) - np.eye(3)
-    return AffineMotion(gradient, bone.centre, size_mm * direction / np.linalg.norm(direction))

@@ -40,7 +40,14 @@ def draw_pelvis(rng: np.random.Generator, box: Box, *, bones: bool) -> PelvisSha
     """
     for _ in range(DRAWS):
         body = _placed(_upright(rng), rng, box)
-        if _fits(body, box, bones=bones):
+        margins: list[tuple[Ellipsoid | Tube, float]] = [(body.prostate, MARGIN_MM), (body.bladder, MARGIN_MM)]
+        margins += [(body.rectum, RECTUM_MARGIN_MM), *((bone, GAP_MM) for bone in body.bones if bones)]
+        places = [box.local(shape.surface(_directions(400))) for shape, _ in margins]
+        clearances = [np.minimum(local, box.lengths - local).min() for local in places]
+        inside = all(found > margin for found, (_, margin) in zip(clearances, margins, strict=True))
+        soft = Union([body.prostate, body.bladder, body.rectum])
+        apart = not bones or all(soft.at(bone.surface(_directions(400))).min() > GAP_MM for bone in body.bones)
+        if inside and apart:
             return body
     raise ConfigurationError(
         f"no pelvis fits into a field of {np.round(box.lengths, 1).tolist()} mm; give at least 110 x 120 x 120 mm"
@@ -122,21 +129,6 @@ def _placed(body: PelvisShapes, rng: np.random.Generator, box: Box) -> PelvisSha
     bones = (moved(body.bones[0]), moved(body.bones[1]))
     rectum = Tube(body.rectum.knots @ turn.T + shift, body.rectum.radii)
     return PelvisShapes(moved(body.prostate), moved(body.bladder), rectum, moved(body.tumour), bones, forwards)
-
-
-def _fits(body: PelvisShapes, box: Box, *, bones: bool) -> bool:
-    margins: list[tuple[Ellipsoid | Tube, float]] = [(body.prostate, MARGIN_MM), (body.bladder, MARGIN_MM)]
-    margins += [(body.rectum, RECTUM_MARGIN_MM), *((bone, GAP_MM) for bone in body.bones if bones)]
-    inside = all(_clearance(shape.surface(_directions(400)), box) > margin for shape, margin in margins)
-    soft = Union([body.prostate, body.bladder, body.rectum])
-    apart = not bones or all(soft.at(bone.surface(_directions(400))).min() > GAP_MM for bone in body.bones)
-    return inside and apart
-
-
-def _clearance(points: NDArray[np.float64], box: Box) -> float:
-    """Smallest distance (mm) from points (n, 3) mm inside the box to its faces."""
-    local = box.local(points)
-    return float(min(local.min(), (box.lengths - local).min()))
 
 
 def _reach(semi_axes: NDArray[np.float64], rotation: NDArray[np.float64], direction: NDArray[np.float64]) -> float:

@@ -94,7 +94,12 @@ def make_scene(
     `seed` only draws the noise. Raises `GeometryError` where the truth folds over or cannot be meshed.
     """
     space = lagrange_space(tetrahedralise(anatomy, edge_length_mm=edge_length_mm), "P2")
-    displacement = _equilibrium(space, motions, law)
+    walls, offset = _walls(space, motions)
+    no_modes = np.zeros((offset.size, 0))
+    constraint = outer_constraint(space, outer="fixed", modes=no_modes, offset=offset.ravel(), prescribed=walls)
+    moduli = [tissue.youngs_modulus_kpa or np.nan for tissue in space.mesh.tissues if tissue.meshed]
+    dilatation = Dilatation.BLENDED if law.finite else Dilatation.POINTWISE
+    displacement = equilibrium(space, constraint, np.array(moduli), law=law, dilatation=dilatation).displacement
     smallest = float(deformation_determinants(space, displacement).min())
     if smallest <= 0.0:
         raise GeometryError(
@@ -123,7 +128,11 @@ def rescaled(scene: Scene, factor: float) -> Scene:
 def _images(
     space: LagrangeSpace, displacement: NDArray[np.float64], grid: VoxelGrid, noise: Noise | None, seed: int
 ) -> tuple[LabelImage, LabelImage]:
-    warps = [_warp(noise, rng) for rng in np.random.default_rng([seed, 1]).spawn(2)]
+    warps: list[Warp | None] = [None, None]
+    if noise is not None:
+        size, length = noise.surface_sd_mm, noise.correlation_length_mm
+        rngs = np.random.default_rng([seed, 1]).spawn(2)
+        warps = [smooth_field(rng, sd_mm=size, correlation_mm=length).warp for rng in rngs]
     before = imaged(space, np.zeros_like(displacement), grid, warp=warps[0])
     return before, imaged(space, displacement, grid, warp=warps[1])
 
@@ -152,16 +161,6 @@ def grid_box(grid: VoxelGrid) -> Box:
     return Box(grid.world(np.full((1, 3), -0.5))[0], np.eye(3), lengths)
 
 
-def _equilibrium(space: LagrangeSpace, motions: Mapping[str, WallMotion], law: Law) -> NDArray[np.float64]:
-    """Displacement (n_points, 3) mm of the body whose hollow tissues move as `motions` say."""
-    walls, offset = _walls(space, motions)
-    no_modes = np.zeros((offset.size, 0))
-    constraint = outer_constraint(space, outer="fixed", modes=no_modes, offset=offset.ravel(), prescribed=walls)
-    moduli = [tissue.youngs_modulus_kpa or np.nan for tissue in space.mesh.tissues if tissue.meshed]
-    dilatation = Dilatation.BLENDED if law.finite else Dilatation.POINTWISE
-    return equilibrium(space, constraint, np.array(moduli), law=law, dilatation=dilatation).displacement
-
-
 def _walls(space: LagrangeSpace, motions: Mapping[str, WallMotion]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Which points (n_points,) are on walls of drivers and rigid tissues; the displacement (n_points, 3) mm there."""
     offset = np.zeros_like(space.points)
@@ -174,9 +173,3 @@ def _walls(space: LagrangeSpace, motions: Mapping[str, WallMotion]) -> tuple[NDA
         if tissue.name in motions:
             offset[points] = motions[tissue.name].at(space.points[points])
     return walls, offset
-
-
-def _warp(noise: Noise | None, rng: np.random.Generator) -> Warp | None:
-    if noise is None:
-        return None
-    return smooth_field(rng, sd_mm=noise.surface_sd_mm, correlation_mm=noise.correlation_length_mm).warp

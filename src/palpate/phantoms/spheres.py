@@ -86,7 +86,20 @@ def _body(options: SpheresOptions) -> tuple[Anatomy, dict[str, WallMotion]]:
     grid = _grid(options)
     centre = rng.uniform(-0.5, 0.5, 3) * grid.spacing
     parts, motions = (_pushed if options.kind == "pushed" else _squeezed)(options, centre, rng)
-    return Anatomy(_tissues(tuple(parts), options), tuple(parts.values()), grid_box(grid)), motions
+    names = tuple(parts)
+    given = dict(options.moduli_kpa or {})
+    unknown = sorted(set(given) - set(names))
+    if unknown:
+        raise ConfigurationError(f"moduli_kpa names {unknown}; these spheres have {list(names)}")
+    moduli = MODULI_KPA | given
+    roles = {"frame": Role.DRIVER, "cavity": Role.DRIVER, "surroundings": Role.KNOWN}
+    stated = options.poisson_ratio
+    ratios = dict(stated) if isinstance(stated, Mapping) else dict.fromkeys(names, stated)
+    tissues = tuple(
+        Tissue(name, roles.get(name, Role.ESTIMATE), (label,), ratios.get(name, 0.45), moduli.get(name))
+        for label, name in enumerate(names, start=1)
+    )
+    return Anatomy(tissues, tuple(parts.values()), grid_box(grid)), motions
 
 
 Parts = dict[str, LevelSet | None]
@@ -121,18 +134,3 @@ def _pushed(
     stray = smooth_field(rng, sd_mm=STRAY * options.push_mm, correlation_mm=CORE, features=300)
     filling = Swelling(centre, CORE, options.push_mm, towards, LEAN, stray)
     return parts, {"cavity": filling}
-
-
-def _tissues(names: tuple[str, ...], options: SpheresOptions) -> tuple[Tissue, ...]:
-    given = dict(options.moduli_kpa or {})
-    unknown = sorted(set(given) - set(names))
-    if unknown:
-        raise ConfigurationError(f"moduli_kpa names {unknown}; these spheres have {list(names)}")
-    moduli = MODULI_KPA | given
-    roles = {"frame": Role.DRIVER, "cavity": Role.DRIVER, "surroundings": Role.KNOWN}
-    stated = options.poisson_ratio
-    ratios = dict(stated) if isinstance(stated, Mapping) else dict.fromkeys(names, stated)
-    return tuple(
-        Tissue(name, roles.get(name, Role.ESTIMATE), (label,), ratios.get(name, 0.45), moduli.get(name))
-        for label, name in enumerate(names, start=1)
-    )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.errors import GeometryError
 from palpate.images.segmentation import Segmentation
@@ -38,25 +37,20 @@ def wall_filling(segmentation: Segmentation, tissue: int, *, filling_mm: float) 
     terms = np.stack([np.ones_like(along), along / length, (along / length) ** 2], axis=1)
     shift, tilt, bend = np.linalg.lstsq(terms, aside, rcond=None)[0]
     radius = float(np.sqrt(2.0 * np.mean(np.sum((aside - terms @ np.stack([shift, tilt, bend])) ** 2, axis=1))))
+    fullest, estimated = 0.0, [i for i, each in enumerate(segmentation.tissues) if each.role is Role.ESTIMATE]
+    if estimated:
+        organ = segmentation.grid.world(np.argwhere(segmentation.mask(estimated[0])).astype(float)).mean(axis=0)
+        distance = np.linalg.norm(voxels - organ, axis=1)
+        fullest = 0.5 * float(along[distance <= np.quantile(distance, 0.1)].mean())
     return Filling(
         origin=centre + shift,
         axis=axis,
         bend=bend,
         radius_mm=radius,
         filling_mm=filling_mm,
-        fullest_mm=_fullest(segmentation, voxels, along),
+        fullest_mm=fullest,
         length_mm=length,
         towards=axis,
         lean=0.0,
         stray=smooth_field(np.random.default_rng(0), sd_mm=0.0, correlation_mm=20.0, features=1),
     )
-
-
-def _fullest(segmentation: Segmentation, voxels: NDArray[np.float64], along: NDArray[np.float64]) -> float:
-    """Place (mm along the axis) of the voxels (n, 3) mm that are nearest to the first `estimate` tissue."""
-    estimated = [i for i, tissue in enumerate(segmentation.tissues) if tissue.role is Role.ESTIMATE]
-    if not estimated:
-        return 0.0
-    centre = segmentation.grid.world(np.argwhere(segmentation.mask(estimated[0])).astype(float)).mean(axis=0)
-    distance = np.linalg.norm(voxels - centre, axis=1)
-    return 0.5 * float(along[distance <= np.quantile(distance, 0.1)].mean())

@@ -8,13 +8,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from palpate.report.case_report import write_failure_report
 
-__all__ = [
-    "write_failure_report",
-]
+__all__ = ["write_failure_report"]
 
-_HOMES = {
-    "write_failure_report": "palpate.report.case_report",
-}
+_HOMES = {"write_failure_report": "palpate.report.case_report"}
 
 
 def __getattr__(name: str) -> Any:

@@ -79,20 +79,16 @@ def _arrays(content: bytes) -> dict[str, NDArray[Any]]:
             raise ValueError("it declares more data than a report has")
         for member in members:
             with archive.open(member) as file:
-                _check_header(file, member.file_size)
+                # its header must not ask for more memory than the file has bytes
+                version = np.lib.format.read_magic(file)
+                if version != (1, 0):
+                    raise ValueError("an array has an unknown version")
+                shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+                if dtype.hasobject or math.prod(shape) * dtype.itemsize > member.file_size or min(shape, default=0) < 0:
+                    raise ValueError("an array does not fit its file")
             with archive.open(member) as file:
                 found[member.filename.removesuffix(".npy")] = np.lib.format.read_array(file, allow_pickle=False)
     return found
-
-
-def _check_header(file: typing.IO[bytes], size: int) -> None:
-    """An array's header must not ask for more memory than its file has bytes."""
-    version = np.lib.format.read_magic(file)
-    if version != (1, 0):
-        raise ValueError("an array has an unknown version")
-    shape, _, dtype = np.lib.format.read_array_header_1_0(file)
-    if dtype.hasobject or math.prod(shape) * dtype.itemsize > size or min(shape, default=0) < 0:
-        raise ValueError("an array does not fit its file")
 
 
 def _encode(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
@@ -117,7 +113,12 @@ def _decode(hint: Any, value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
         inner = next(arm for arm in arms if arm is not types.NoneType)
         return None if value is None else _decode(inner, value, arrays)
     if origin is np.ndarray:
-        return _array(arrays[value], np.dtype(typing.get_args(arms[1])[0]))
+        array = arrays[value]
+        dtype = np.dtype(typing.get_args(arms[1])[0])
+        if array.dtype != dtype:
+            raise ValueError(f"an array holds {array.dtype} where {dtype} belongs")
+        array.setflags(write=False)
+        return array
     if origin is tuple:
         inners = (arms[0],) * len(value) if arms[1:] == (...,) else arms
         return tuple(_decode(inner, item, arrays) for inner, item in zip(inners, value, strict=True))
@@ -128,13 +129,6 @@ def _decode(hint: Any, value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
     if origin is not None:  # a mapping
         return {key: _decode(arms[1], item, arrays) for key, item in value.items()}
     return _scalar(hint, value)
-
-
-def _array(array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    if array.dtype != dtype:
-        raise ValueError(f"an array holds {array.dtype} where {dtype} belongs")
-    array.setflags(write=False)
-    return array
 
 
 def _scalar(hint: Any, value: Any) -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
@@ -94,7 +93,12 @@ def waterfall_svg(data: ReportData, *, name: str) -> str:
         axes.set_ylabel("final misfit (mm²)")
         axes.set_xlim(0.5, len(order) + 0.5)
         axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
-        _widen(axes, ends)
+        finite = ends[np.isfinite(ends)]
+        if len(finite):  # never less than a tenth of the values: starts that agree must look as if they did
+            low, high = float(finite.min()), float(finite.max())
+            room = max(0.12 * (high - low), 0.05 * abs(high), 1e-12)
+            axes.set_ylim(low - room, high + room)
+            axes.yaxis.set_major_locator(MaxNLocator(4))
         axes.grid(visible=True, axis="y")
 
     return draw_svg(draw, size=SIZE, name=name)
@@ -121,17 +125,6 @@ def angle_svg(angles: NDArray[np.float32], *, name: str) -> str:
 
 def _finite(value: float | None) -> float:
     return np.nan if value is None else float(value)
-
-
-def _widen(axes: Axes, values: NDArray[np.float64]) -> None:
-    """An axis that never spans less than a tenth of its values: starts that agree must look as if they did."""
-    finite = values[np.isfinite(values)]
-    if not len(finite):
-        return
-    low, high = float(finite.min()), float(finite.max())
-    room = max(0.12 * (high - low), 0.05 * abs(high), 1e-12)
-    axes.set_ylim(low - room, high + room)
-    axes.yaxis.set_major_locator(MaxNLocator(4))
 
 
 def _paths(figure: Figure, paths: list[list[float]], label: str) -> None:

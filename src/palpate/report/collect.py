@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TypeVar
@@ -88,13 +88,18 @@ def collect(result: CaseResult) -> ReportData:
     references = tuple(_reference(drawing) for drawing in drawings)
     later = tuple(_later(drawings[number], after, references[number].slices) for number, after in drawn)
     mesh = attempt.part("mesh", lambda: _mesh(result), None)
+    names = [estimate.tissue for estimate in result.estimation.estimates]
+    histories = [*(start.history for start in result.estimation.starts), result.estimation.outer_loop]
     return ReportData(
         document=result.to_dict(),
         created=_now(),
         settings=_settings(result.case),
         tissues=_tissues(result.tissues, result.stiffness),
         unit=result.unit,
-        moduli_paths=_moduli_paths(result),
+        moduli_paths=tuple(
+            {name: tuple(float(step.moduli.get(name, math.nan)) for step in history) for name in names}
+            for history in histories
+        ),
         references=references,
         later=later,
         mesh=mesh,
@@ -177,15 +182,6 @@ def _tissues(tissues: tuple[Tissue, ...], moduli: NDArray[np.float64]) -> tuple[
             modulus=float(modulus) if math.isfinite(modulus) else None,
         )
         for tissue, colour, modulus in zip(tissues, tissue_colours(tissues), moduli, strict=True)
-    )
-
-
-def _moduli_paths(result: CaseResult) -> tuple[Mapping[str, tuple[float, ...]], ...]:
-    names = [estimate.tissue for estimate in result.estimation.estimates]
-    histories = [*(start.history for start in result.estimation.starts), result.estimation.outer_loop]
-    return tuple(
-        {name: tuple(float(step.moduli.get(name, math.nan)) for step in history) for name in names}
-        for history in histories
     )
 
 

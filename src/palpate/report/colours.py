@@ -30,15 +30,8 @@ def tissue_colours(tissues: tuple[Tissue, ...]) -> tuple[str, ...]:
     for i in ranked:
         role = Role.ESTIMATE if tissues[i].role is Role.DRIVER else tissues[i].role
         palette = fixed.get(role, ORGANS)
-        colours[i] = _own(tissues[i]) or palette[used[role] % len(palette)]
+        own = tissues[i].colour or ""
+        seen = re.fullmatch("#[0-9a-fA-F]{6}", own) and max(bytes.fromhex(own[1:])) >= DARKEST
+        colours[i] = own.lower() if seen else palette[used[role] % len(palette)]
         used[role] += 1
     return tuple(colours)
-
-
-def _own(tissue: Tissue) -> str | None:
-    """The tissue's own colour if it has one that can be seen."""
-    colour = tissue.colour
-    if colour is None or not re.fullmatch("#[0-9a-fA-F]{6}", colour):
-        return None
-    brightest = max(int(colour[i : i + 2], 16) for i in (1, 3, 5))
-    return colour.lower() if brightest >= DARKEST else None

@@ -60,7 +60,17 @@ class _Citations:
 def methods_text(data: ReportData) -> Methods:
     """What was done to the images of this case, in sentences that can be taken over."""
     cite = _Citations({})
-    paragraphs = (_aim(data, cite), _model(data, cite), _fit(data, cite), _intervals(data, cite))
+    paragraphs = (
+        _aim(data, cite),
+        _model(data, cite),
+        _fit(data, cite),
+        (
+            "The 95 % intervals come from the sandwich covariance of the parameters under spatially correlated"
+            f" residuals {cite('white')}, with the scatter over the voxel grid's position added. They do not cover the"
+            " errors of the mesh, of the material law, of Poisson's ratios, of the boundary condition and of the given"
+            f" moduli. The seed of random numbers was {data.document['seed']}."
+        ),
+    )
     version = str(data.document["versions"].get("palpate", ""))
     return Methods(paragraphs, tuple(SOURCES[key].format(version) for key in cite.cited))
 
@@ -127,16 +137,6 @@ def _fit(data: ReportData, cite: _Citations) -> str:
         f"The misfit was {observed}. Outliers counted less by Tukey's biweight {cite('huber')}. It was minimised over"
         f" the logarithms of the moduli from {starts} starts by {optimiser} {cite(source)}, on a reduced basis whose"
         f" error was bounded at the estimate {cite('reduced')}.{onwards if finite else ''}"
-    )
-
-
-def _intervals(data: ReportData, cite: _Citations) -> str:
-    return (
-        "The 95 % intervals come from the sandwich covariance of the parameters under spatially correlated residuals"
-        f" {cite('white')}, with the scatter over the voxel grid's position added. They do not cover the errors of"
-        f" the mesh,"
-        " of the material law, of Poisson's ratios, of the boundary condition and of the given moduli."
-        f" The seed of random numbers was {data.document['seed']}."
     )
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from importlib import resources
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jinja2
 import numpy as np
@@ -17,10 +17,10 @@ from markupsafe import Markup, escape
 
 from palpate.report.charts import angle_svg, modulus_svg, objective_svg, residual_svg, waterfall_svg
 from palpate.report.colours import START_COLOURS
-from palpate.report.methods import Methods, methods_text
+from palpate.report.methods import methods_text
 from palpate.report.payload import payload
 from palpate.report.pictures import mesh_png, organs_png
-from palpate.report.report_data import LaterImage, Reference, ReportData, SliceBox
+from palpate.report.report_data import LaterImage, Reference, ReportData
 from palpate.report.rows import estimate_rows, number, scale_marks
 from palpate.report.scales import Scale, angle_scale, distance_scale, modulus_scale, strain_scale
 from palpate.report.section import VIEWS
@@ -76,15 +76,24 @@ def render(data: ReportData) -> str:
         live=live if scripts else None,
         rows=estimate_rows(data.document, colours),
         marks=scale_marks(data.document),
-        starts=_start_rows(data),
+        starts=tuple(
+            {"colour": START_COLOURS[i % len(START_COLOURS)], **start}
+            for i, start in enumerate(data.document["starts"])
+        ),
         warnings=_warnings(data),
         contours=contour_names(data),
         later=tuple(_later(data, k, later) for k, later in enumerate(data.later)),
         mesh_pictures=_mesh_pictures(data),
         moduli=_attempt("the scale of the moduli", lambda: modulus_scale(data)) if data.mesh else None,
         curves=_curves(data),
-        angles=_angles(data),
-        methods=_methods(data),
+        angles=(
+            _picture("Dihedral angles of the mesh", partial(angle_svg, data.mesh.angles, name="angles"))
+            if data.mesh
+            else None
+        ),
+        methods=(  # where nothing converged there is no result whose methods could be told
+            _attempt("the methods text", lambda: methods_text(data)) if data.document["status"] == "converged" else None
+        ),
         angle_scale=angle_scale(),
         strain_scale=strain_scale() if data.mesh and len(data.mesh.strains) else None,
         gradient=_gradient,
@@ -105,12 +114,6 @@ def _policy(scripts: tuple[Markup, ...]) -> Markup:
     return Markup(POLICY.format(hashes=hashes))  # noqa: S704 - our own words and base64
 
 
-def _start_rows(data: ReportData) -> tuple[dict[str, Any], ...]:
-    return tuple(
-        {"colour": START_COLOURS[i % len(START_COLOURS)], **start} for i, start in enumerate(data.document["starts"])
-    )
-
-
 def _warnings(data: ReportData) -> tuple[tuple[str, tuple[str, ...]], ...]:
     """Code and messages of the warnings, those of one code together."""
     groups: dict[str, list[str]] = {}
@@ -119,14 +122,10 @@ def _warnings(data: ReportData) -> tuple[tuple[str, tuple[str, ...]], ...]:
     return tuple((code, tuple(messages)) for code, messages in groups.items())
 
 
-def _widths(box: SliceBox | None) -> str:
-    """Columns of the three slices, so that all show a millimetre in the same size, as CSS."""
-    return "" if box is None else " ".join(f"{box.high[v.across] - box.low[v.across]:.1f}fr" for v in VIEWS)
-
-
 def _later(data: ReportData, k: int, later: LaterImage) -> _Later:
     reference = data.references[later.reference]
     planes = first_planes(reference.slices) if reference.slices else ()
+    box = reference.slices
     return _Later(
         name=later.name,
         slices=tuple(
@@ -146,7 +145,8 @@ def _later(data: ReportData, k: int, later: LaterImage) -> _Later:
         ),
         scale=distance_scale(reference.voxel_mm),
         reference=reference,
-        widths=_widths(reference.slices),
+        # of the columns, so that all show a millimetre in the same size
+        widths="" if box is None else " ".join(f"{box.high[v.across] - box.low[v.across]:.1f}fr" for v in VIEWS),
     )
 
 
@@ -173,19 +173,6 @@ def _curves(data: ReportData) -> tuple[Picture, ...]:
         _picture("Waterfall of the starts", partial(waterfall_svg, data, name="waterfall")),
         *moduli,
     )
-
-
-def _angles(data: ReportData) -> Picture | None:
-    if data.mesh is None:
-        return None
-    return _picture("Dihedral angles of the mesh", partial(angle_svg, data.mesh.angles, name="angles"))
-
-
-def _methods(data: ReportData) -> Methods | None:
-    """None where nothing converged: there is no result whose methods could be told."""
-    if data.document["status"] != "converged":
-        return None
-    return _attempt("the methods text", lambda: methods_text(data))
 
 
 def _gradient(scale: Scale) -> str:

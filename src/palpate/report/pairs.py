@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from palpate.study.case import Images, Pair
-from palpate.study.result import CaseResult, PairResult, distinct_names, image_names
+from palpate.study.case import Images
+from palpate.study.result import CaseResult, distinct_names, image_names
 
 __all__ = ["ImagePair", "drawn_images", "image_pairs"]
 
@@ -26,7 +26,19 @@ def image_pairs(result: CaseResult) -> tuple[ImagePair, ...]:
     befores = distinct_names([images.before, *(pair.before for pair in result.case.pairs)]) if images else ["before"]
     names = iter(image_names(result.case))
     sources = result.case.pairs if images else ()
-    results = [result, *(_alone(result, *both) for both in zip(result.further, sources, strict=False))]
+    results = [result]
+    for pair, source in zip(result.further, sources, strict=False):
+        alone = replace(
+            result,
+            case=replace(result.case, images=Images(source.before, source.after), pairs=()),  # only labels are known
+            estimation=replace(result.estimation, displacements=pair.displacements),
+            space=pair.space,
+            mesh_summary=pair.mesh_summary,
+            before=pair.before,
+            after=pair.after,
+            further=(),
+        )
+        results.append(alone)
     return tuple(
         ImagePair(one, before, tuple(next(names, f"after {k + 1}") for k in range(len(one.after))))
         for one, before in zip(results, befores, strict=False)
@@ -40,17 +52,3 @@ def drawn_images(counts: Sequence[int], most: int) -> tuple[tuple[int, int], ...
     """
     every = [(pair, after) for pair, count in enumerate(counts) for after in range(count)]
     return tuple(sorted(sorted(every, key=lambda item: item[1])[:most]))
-
-
-def _alone(result: CaseResult, pair: PairResult, source: Pair) -> CaseResult:
-    """The result with a further pair, read from `source`, in place of its first; only labels are known of it."""
-    return replace(
-        result,
-        case=replace(result.case, images=Images(source.before, source.after), pairs=()),
-        estimation=replace(result.estimation, displacements=pair.displacements),
-        space=pair.space,
-        mesh_summary=pair.mesh_summary,
-        before=pair.before,
-        after=pair.after,
-        further=(),
-    )

@@ -12,15 +12,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from palpate.report.report_data import (
-    LaterImage,
-    MeshPicture,
-    Reference,
-    ReportData,
-    SliceBox,
-    TriangleSurface,
-    Volume,
-)
+from palpate.report.report_data import LaterImage, MeshPicture, Reference, ReportData, TriangleSurface, Volume
 from palpate.report.scales import Scale, angle_scale, distance_scale, modulus_scale, strain_scale
 from palpate.report.section import VIEWS
 
@@ -111,17 +103,12 @@ def _quantum(data: ReportData) -> tuple[NDArray[np.float64], float]:
 
 
 def _reference(reference: Reference, packer: _Packer) -> dict[str, Any]:
+    box = reference.slices
     return {
-        "box": _box(reference.slices),
+        "box": {name: getattr(box, name).tolist() for name in ("low", "high", "position")} if box else None,
         "background": _volume(reference.background, packer),
         "surfaces": [_surface(surface, packer) for surface in reference.surfaces],
     }
-
-
-def _box(box: SliceBox | None) -> dict[str, Any] | None:
-    if box is None:
-        return None
-    return {"low": box.low.tolist(), "high": box.high.tolist(), "position": box.position.tolist()}
 
 
 def _volume(volume: Volume | None, packer: _Packer) -> dict[str, Any] | None:

@@ -31,7 +31,14 @@ def organs_png(data: ReportData, later: LaterImage, *, fitted: bool) -> bytes:
         distance = (model.distance_fitted if fitted else model.distance_rest).astype(np.float64)
         corners.append(points[model.triangles])
         colours.append(scale.colours(distance)[model.triangles])
-        normals.append(_smooth_normals(points, model.triangles)[model.triangles])
+        # unit normals of points, the mean of those of their triangles by area
+        corner = points[model.triangles]
+        face = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        total = np.zeros_like(points)
+        for side in range(3):
+            np.add.at(total, model.triangles[:, side], face)
+        total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
+        normals.append(total[model.triangles])
     triangles = Triangles(np.concatenate(corners), np.concatenate(colours), np.concatenate(normals))
     return render_png(triangles, BESIDE, width=WIDTH, height=HEIGHT)
 
@@ -75,13 +82,3 @@ def section_faces(mesh: MeshPicture, *, axis: int, position: float) -> tuple[NDA
     _, first, count = np.unique(keys, return_index=True, return_counts=True)
     outside = first[count == 1]
     return faces[outside], owner[outside]
-
-
-def _smooth_normals(points: NDArray[np.float64], triangles: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Unit normals (n, 3) of points, the mean of those of their triangles by area."""
-    corner = points[triangles]
-    face = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    total = np.zeros_like(points)
-    for side in range(3):
-        np.add.at(total, triangles[:, side], face)
-    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12))

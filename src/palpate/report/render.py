@@ -60,38 +60,34 @@ def render_png(triangles: Triangles, camera: Camera, *, width: int, height: int,
     scale = fill * FINE * min(width / max(high[0] - low[0], 1e-9), height / max(high[1] - low[1], 1e-9))
     shape = (FINE * height, FINE * width)
     flat = (flat - 0.5 * (low + high)) * scale + [0.5 * shape[1], 0.5 * shape[0], 0.0]
-    light = _light(triangles.normals, camera)
+    # a lamp beside the viewer, both sides of a surface lit
+    lamp = camera.back + 0.35 * camera.up - 0.3 * camera.right
+    cosine = np.abs(triangles.normals @ (lamp / np.linalg.norm(lamp)))
+    light = (0.5 + 0.55 * cosine)[..., None]
     depth = flat[..., 2]
     flat[..., 2] = (depth - depth.min()) / max(float(np.ptp(depth)), 1e-9)
     buffer = np.full(shape, -1, dtype=np.int64)
-    for group, density in _by_density(flat):
-        _splat(flat[group], (triangles.colours * light)[group], density, edges=triangles.edges, into=buffer)
-    return _png(buffer)
-
-
-def _light(normals: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
-    """Brightness (n, 3, 1) of corners: a lamp beside the viewer, both sides of a surface lit."""
-    lamp = camera.back + 0.35 * camera.up - 0.3 * camera.right
-    cosine = np.abs(normals @ (lamp / np.linalg.norm(lamp)))
-    return np.asarray(0.5 + 0.55 * cosine)[..., None]
-
-
-def _by_density(flat: NDArray[np.float64]) -> list[tuple[NDArray[np.int64], int]]:
-    """Triangles (n, 3, 3) in pixels by the number of samples along an edge, so that samples lie within a pixel."""
+    # by the number of samples along an edge, so that samples lie within a pixel
     edge = np.linalg.norm(flat[:, :, :2] - np.roll(flat[:, :, :2], 1, axis=1), axis=2).max(axis=1)
     wanted = DENSITIES[np.minimum(np.searchsorted(DENSITIES, 1.2 * edge), len(DENSITIES) - 1)]
     if float((wanted.astype(float) ** 2).sum()) > 2.0 * MOST_SAMPLES:
         raise ValueError("the picture has too many triangles to be drawn")
-    return [(np.flatnonzero(wanted == density), int(density)) for density in np.unique(wanted)]
+    for density in np.unique(wanted):
+        group = wanted == density
+        _splat(flat[group], (triangles.colours * light)[group], int(density), edges=triangles.edges, into=buffer)
+    # the mean over FINE x FINE samples, with straight alpha
+    there = (buffer >= 0)[..., None]
+    parts = np.stack([(buffer >> shift) & 255 for shift in (16, 8, 0)], axis=-1) * there
+    fine = np.concatenate([parts / 255.0, there], axis=-1)
+    mean = fine.reshape(buffer.shape[0] // FINE, FINE, buffer.shape[1] // FINE, FINE, 4).mean(axis=(1, 3))
+    mean[..., :3] /= np.maximum(mean[..., 3:], 1e-9)
+    memory = io.BytesIO()
+    mpimg.imsave(memory, np.rint(255.0 * mean).astype(np.uint8), format="png")
+    return memory.getvalue()
 
 
 def _splat(
-    flat: NDArray[np.float64],
-    colours: NDArray[np.float64],
-    density: int,
-    *,
-    edges: bool,
-    into: NDArray[np.int64],
+    flat: NDArray[np.float64], colours: NDArray[np.float64], density: int, *, edges: bool, into: NDArray[np.int64]
 ) -> None:
     """Put `density` samples along each edge of the triangles into the picture, where they are nearer than others."""
     i, j = np.meshgrid(np.arange(density + 1), np.arange(density + 1))
@@ -126,15 +122,3 @@ def _keep_nearest(places: NDArray[np.float64], shade: NDArray[np.float64], buffe
     colour = (red << 16) | (green << 8) | blue
     near = (places[seen, 2] * DEPTH_STEPS).astype(np.int64)
     np.maximum.at(buffer.reshape(-1), (y * columns + x)[seen], (near << 24) | colour)
-
-
-def _png(buffer: NDArray[np.int64]) -> bytes:
-    """The mean over FINE x FINE samples of the buffer, as a PNG with straight alpha."""
-    there = (buffer >= 0)[..., None]
-    parts = np.stack([(buffer >> shift) & 255 for shift in (16, 8, 0)], axis=-1) * there
-    fine = np.concatenate([parts / 255.0, there], axis=-1)
-    mean = fine.reshape(buffer.shape[0] // FINE, FINE, buffer.shape[1] // FINE, FINE, 4).mean(axis=(1, 3))
-    mean[..., :3] /= np.maximum(mean[..., 3:], 1e-9)
-    memory = io.BytesIO()
-    mpimg.imsave(memory, np.rint(255.0 * mean).astype(np.uint8), format="png")
-    return memory.getvalue()

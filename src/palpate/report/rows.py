@@ -66,7 +66,27 @@ def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tu
     items: Sequence[Mapping[str, Any]] = document["estimates"]
     shown = document["status"] == "converged"
     scale = _scale(items) if shown else None
-    return tuple(_row(item, colour=colours.get(item["tissue"], "#888888"), shown=shown, scale=scale) for item in items)
+    rows = []
+    for item in items:
+        value, interval = _main(item)
+        truth = item["truth"]
+        row = EstimateRow(
+            tissue=item["tissue"],
+            colour=colours.get(item["tissue"], "#888888"),
+            value=number(item["value"] if shown else None),
+            interval=interval_text(item["interval95"] if shown else None),
+            unit=item["unit"],
+            ratio=number(item["ratio"] if shown else None),
+            ratio_interval=interval_text(item["ratio_interval95"] if shown else None),
+            relative_to=item["relative_to"],
+            verdict=item["verdict"] if shown else "not identified",
+            why=item["why"],
+            truth=number(truth),
+            error=f"{100.0 * (value / truth - 1.0):+.1f} %" if shown and value and truth else NONE,
+            bar=_bar(value, interval, truth=truth, scale=scale) if scale and value else None,
+        )
+        rows.append(row)
+    return tuple(rows)
 
 
 def scale_marks(document: Mapping[str, Any]) -> tuple[tuple[float, str], ...]:
@@ -79,26 +99,6 @@ def scale_marks(document: Mapping[str, Any]) -> tuple[tuple[float, str], ...]:
     places = [(BAR * (math.log(n) - scale[0]) / (scale[1] - scale[0]), f"{n:g}") for n in numbers]
     inside = [mark for mark in places if 0.04 * BAR <= mark[0] <= 0.96 * BAR]
     return tuple(inside[:: math.ceil(len(inside) / 6) or 1])
-
-
-def _row(item: Mapping[str, Any], *, colour: str, shown: bool, scale: tuple[float, float] | None) -> EstimateRow:
-    value, interval = _main(item)
-    truth = item["truth"]
-    return EstimateRow(
-        tissue=item["tissue"],
-        colour=colour,
-        value=number(item["value"] if shown else None),
-        interval=interval_text(item["interval95"] if shown else None),
-        unit=item["unit"],
-        ratio=number(item["ratio"] if shown else None),
-        ratio_interval=interval_text(item["ratio_interval95"] if shown else None),
-        relative_to=item["relative_to"],
-        verdict=item["verdict"] if shown else "not identified",
-        why=item["why"],
-        truth=number(truth),
-        error=f"{100.0 * (value / truth - 1.0):+.1f} %" if shown and value and truth else NONE,
-        bar=_bar(value, interval, truth=truth, scale=scale) if scale and value else None,
-    )
 
 
 def _main(item: Mapping[str, Any]) -> tuple[float | None, Interval | None]:

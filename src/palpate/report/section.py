@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from palpate.images.label_image import VoxelGrid
+from palpate.images.tissue_distance import window_of
 
 __all__ = ["VIEWS", "Plane", "View", "cut_image", "joined"]
 
@@ -73,7 +74,8 @@ def cut_image(values: NDArray[Any], grid: VoxelGrid, plane: Plane, *, order: Lit
     """
     points = plane.points
     index = grid.index(points.reshape(-1, 3))
-    window, origin = _window(index, grid.shape)
+    window = window_of(index, grid, margin=2)
+    origin = np.array([axis.start for axis in window])
     sampled = ndimage.map_coordinates(
         values[window].astype(np.float64), (index - origin).T, order=order, mode="nearest"
     )
@@ -93,33 +95,22 @@ def joined(points: NDArray[np.float64], triangles: NDArray[np.int64], plane: Pla
             neighbours.setdefault(end, []).append(number)
     unused = set(range(len(keys)))
     open_ends = [ends[0] for ends in neighbours.values() if len(ends) == 1]
-    return [
-        _follow(first, keys, segments, neighbours=neighbours, unused=unused)
-        for first in (*open_ends, *range(len(keys)))
-        if first in unused
-    ]
-
-
-def _follow(
-    first: int,
-    keys: NDArray[np.int64],
-    segments: NDArray[np.float64],
-    *,
-    neighbours: dict[int, list[int]],
-    unused: set[int],
-) -> NDArray[np.float64]:
-    """The line that begins with segment `first`, whose segments are taken from `unused`."""
-    unused.discard(first)
-    start = 0 if len(neighbours[int(keys[first, 0])]) == 1 else 1
-    line = [segments[first, start], segments[first, 1 - start]]
-    end = int(keys[first, 1 - start])
-    while following := [number for number in neighbours[end] if number in unused]:
-        number = following[0]
-        unused.discard(number)
-        side = 1 if keys[number, 0] == end else 0
-        line.append(segments[number, side])
-        end = int(keys[number, side])
-    return np.asarray(line)
+    lines = []
+    for first in (*open_ends, *range(len(keys))):
+        if first not in unused:
+            continue
+        unused.discard(first)
+        start = 0 if len(neighbours[int(keys[first, 0])]) == 1 else 1
+        line = [segments[first, start], segments[first, 1 - start]]
+        end = int(keys[first, 1 - start])
+        while following := [number for number in neighbours[end] if number in unused]:
+            number = following[0]
+            unused.discard(number)
+            side = 1 if keys[number, 0] == end else 0
+            line.append(segments[number, side])
+            end = int(keys[number, side])
+        lines.append(np.asarray(line))
+    return lines
 
 
 def _cut(
@@ -139,13 +130,3 @@ def _cut(
     places = flat[a] + share[..., None] * (flat[b] - flat[a])
     keys = a * len(points) + b
     return np.asarray(places[crossed[hit]].reshape(-1, 2, 2)), np.asarray(keys[crossed[hit]].reshape(-1, 2))
-
-
-def _window(
-    index: NDArray[np.float64], shape: tuple[int, int, int]
-) -> tuple[tuple[slice, slice, slice], NDArray[np.int64]]:
-    """The part of an array that voxel indices (n, 3) need, and its first voxel (3,)."""
-    last = np.array(shape) - 1
-    low = np.clip(np.floor(index.min(axis=0)).astype(np.int64) - 2, 0, last)
-    high = np.clip(np.ceil(index.max(axis=0)).astype(np.int64) + 2, 0, last)
-    return (slice(low[0], high[0] + 1), slice(low[1], high[1] + 1), slice(low[2], high[2] + 1)), low

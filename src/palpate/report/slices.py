@@ -41,8 +41,30 @@ def slice_svg(data: ReportData, plane: Plane, later: LaterImage, *, name: str) -
         """Grey values, contours and furniture, one over the other."""
         axes = figure.add_axes((0, 0, 1, 1))
         _background(axes, data, plane, number=later.reference)
-        _contours(axes, data, plane, later)
-        _furniture(axes, plane)
+        for surface in later.surfaces:
+            _lines(axes, data, plane, surface, gid="layer-after", linewidth=4.0, alpha=0.5)
+        for surface in data.references[later.reference].surfaces:
+            _lines(axes, data, plane, surface, gid="layer-before", linewidth=1.0, linestyle=(0, (1, 1.6)))
+        for model in later.model:
+            lines = joined(model.fitted.astype(np.float64), model.triangles.astype(np.int64), plane)
+            _add(axes, lines, gid="layer-model", colors=["white"], linewidth=1.0)
+        view = plane.view
+        axes.set_xlim(plane.high[view.across], plane.low[view.across])
+        axes.set_ylim(plane.low[view.up], plane.high[view.up])
+        axes.set_axis_off()
+        places = ((0.025, 0.5), (0.975, 0.5), (0.5, 0.97), (0.5, 0.03))
+        for letter, (x, y) in zip(view.letters, places, strict=True):
+            _write(axes, x, y, letter, ha="center", va="center", fontweight="bold")
+        where = f"{'xyz'[view.normal]} = {plane.position:.0f} mm"
+        _write(axes, 0.975, 0.03, where, ha="right", va="center", fontsize=7)
+        width = float(plane.high[view.across] - plane.low[view.across])
+        bar = next(size for size in (50.0, 20.0, 10.0, 5.0, 1.0, 0.0) if size < 0.4 * width)
+        left, bottom = plane.high[view.across] - 0.06 * width, plane.low[view.up] + 0.06 * width
+        stroke = [withStroke(linewidth=3.4, foreground="#000000")]
+        ends = [left, left - bar]
+        axes.plot(ends, [bottom] * 2, color="white", linewidth=2.0, solid_capstyle="butt", path_effects=stroke)
+        place = (left, bottom + 0.015 * width)
+        axes.text(*place, f"{bar:g} mm", color="white", ha="left", va="bottom", fontsize=8, path_effects=OUTLINE)
 
     return draw_svg(draw, size=(WIDTH_INCHES, WIDTH_INCHES * up / across), name=name)
 
@@ -63,16 +85,6 @@ def _background(axes: Axes, data: ReportData, plane: Plane, *, number: int) -> N
     axes.imshow(colours[np.rint(cut).astype(int)], extent=extent, origin="lower", interpolation="none")
 
 
-def _contours(axes: Axes, data: ReportData, plane: Plane, later: LaterImage) -> None:
-    for surface in later.surfaces:
-        _lines(axes, data, plane, surface, gid="layer-after", linewidth=4.0, alpha=0.5)
-    for surface in data.references[later.reference].surfaces:
-        _lines(axes, data, plane, surface, gid="layer-before", linewidth=1.0, linestyle=(0, (1, 1.6)))
-    for model in later.model:
-        lines = joined(model.fitted.astype(np.float64), model.triangles.astype(np.int64), plane)
-        _add(axes, lines, gid="layer-model", colors=["white"], linewidth=1.0)
-
-
 def _lines(axes: Axes, data: ReportData, plane: Plane, surface: TriangleSurface, *, gid: str, **style: Any) -> None:
     lines = joined(surface.points.astype(np.float64), surface.triangles.astype(np.int64), plane)
     _add(axes, lines, gid=gid, colors=[data.tissues[surface.tissue].colour], **style)
@@ -84,37 +96,5 @@ def _add(axes: Axes, lines: list[NDArray[np.float64]], *, gid: str, **style: Any
     axes.add_collection(collection, autolim=False)
 
 
-def _furniture(axes: Axes, plane: Plane) -> None:
-    """Limits (the patient's right on the left), orientation letters, scale bar."""
-    view = plane.view
-    axes.set_xlim(plane.high[view.across], plane.low[view.across])
-    axes.set_ylim(plane.low[view.up], plane.high[view.up])
-    axes.set_axis_off()
-    places = ((0.025, 0.5), (0.975, 0.5), (0.5, 0.97), (0.5, 0.03))
-    for letter, (x, y) in zip(view.letters, places, strict=True):
-        _write(axes, x, y, letter, ha="center", va="center", fontweight="bold")
-    where = f"{'xyz'[view.normal]} = {plane.position:.0f} mm"
-    _write(axes, 0.975, 0.03, where, ha="right", va="center", fontsize=7)
-    _scale_bar(axes, plane)
-
-
 def _write(axes: Axes, x: float, y: float, text: str, **style: Any) -> None:
     axes.text(x, y, text, transform=axes.transAxes, color="white", path_effects=OUTLINE, **style)
-
-
-def _scale_bar(axes: Axes, plane: Plane) -> None:
-    view = plane.view
-    width = float(plane.high[view.across] - plane.low[view.across])
-    bar = next(size for size in (50.0, 20.0, 10.0, 5.0, 1.0, 0.0) if size < 0.4 * width)
-    left, bottom = plane.high[view.across] - 0.06 * width, plane.low[view.up] + 0.06 * width
-    stroke = (withStroke(linewidth=3.4, foreground="#000000"),)
-    axes.plot(
-        [left, left - bar],
-        [bottom, bottom],
-        color="white",
-        linewidth=2.0,
-        solid_capstyle="butt",
-        path_effects=stroke,
-    )
-    place = (left, bottom + 0.015 * width)
-    axes.text(*place, f"{bar:g} mm", color="white", ha="left", va="bottom", fontsize=8, path_effects=OUTLINE)

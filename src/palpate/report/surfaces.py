@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import igl
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
-from palpate.errors import InputDataError
-from palpate.images.distance import DistanceMap, distance_map, observation_width, smoothing_width
+from palpate.images.distance import observation_width, smoothing_width
 from palpate.images.segmentation import Segmentation
-from palpate.images.tissue_distance import cropped, window_around
+from palpate.images.tissue_distance import cropped, tissue_distance_map, window_around
 from palpate.mesh.surface import triangle_normals
-from palpate.observation.observed_surface import ObservedSurface, observed_surface
+from palpate.observation.observed_surface import observed_surface
 from palpate.report.report_data import ModelSurface, TriangleSurface
 from palpate.study.result import CaseResult
 
@@ -30,17 +28,22 @@ def image_surface(
 
     Open where the image cuts the tissue; empty where it has no voxel; coarser when it had over `most_triangles`.
     """
-    mask = image.mask(tissue)
+    mask, empty = image.mask(tissue), TriangleSurface(tissue, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
     if not mask.any():
-        return TriangleSurface(tissue, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+        return empty
     window = window_around(mask, image.grid, reach_mm=4.0 * smoothing_mm + float(image.grid.spacing.max()))
     inside, grid = mask[window], cropped(image.grid, window)
     skin = np.count_nonzero(inside & ~ndimage.binary_erosion(inside))
     step = int(np.ceil(np.sqrt(TRIANGLES_A_VOXEL * skin / most_triangles)))
     sigma = np.maximum(smoothing_mm / grid.spacing, 0.6 * step if step > 1 else 0.0)
     share = ndimage.gaussian_filter(inside.astype(np.float32), sigma, mode="nearest")[::step, ::step, ::step]
-    points, triangles = _half(share)
-    return TriangleSurface(tissue, grid.world(points * step).astype(np.float32), triangles)
+    flat = share.astype(np.float64).ravel(order="F")
+    if min(share.shape) < 2 or not flat.min() < 0.5 < flat.max():
+        return empty
+    places = np.ascontiguousarray(np.indices(share.shape, dtype=np.float64).reshape(3, -1, order="F").T)
+    points, triangles, _ = igl.marching_cubes(flat, places, *share.shape, 0.5)
+    corners = grid.world(np.asarray(points) * step).astype(np.float32)
+    return TriangleSurface(tissue, corners, np.asarray(triangles, dtype=np.int32))
 
 
 def model_surface(result: CaseResult, tissue: int, after: int) -> ModelSurface:
@@ -53,9 +56,12 @@ def model_surface(result: CaseResult, tissue: int, after: int) -> ModelSurface:
     motion = result.estimation.displacements[after][surface.points]
     fitted = surface.rest + motion
     reach = float(np.linalg.norm(motion, axis=1).max()) + ROOM_MM
-    before, later = (_distances(i, tissue, width, reach_mm=reach) for i in (result.before, result.after[after]))
+    images = (result.before, result.after[after])
+    before, later = (tissue_distance_map(image, tissue, smoothing_mm=width, reach_mm=reach) for image in images)
     level = before.at(surface.rest)
-    area = _vertex_area(surface)
+    # around each point: a third of each of its observed triangles
+    size = np.linalg.norm(triangle_normals(surface.rest, surface.triangles), axis=1) * surface.observed
+    area = np.asarray(np.bincount(surface.triangles.ravel(), np.repeat(size / 3.0, 3), minlength=len(surface.rest)))
     hidden = np.where(area > 0.0, 0.0, np.nan)
     return ModelSurface(
         tissue=tissue,
@@ -71,32 +77,3 @@ def model_surface(result: CaseResult, tissue: int, after: int) -> ModelSurface:
 def contour_width(result: CaseResult) -> float:
     """Smoothing (mm) of the images' surfaces in figures: that of the mesh, so that both are comparable."""
     return smoothing_width(result.before.grid, *(image.grid for image in result.after))
-
-
-def _distances(image: Segmentation, tissue: int, smoothing_mm: float, *, reach_mm: float) -> DistanceMap:
-    """The distance map of a tissue (index) as in the fit, but no further than `reach_mm` around it: it is slow to make.
-
-    Raises `InputDataError` when the image has no voxel of the tissue.
-    """
-    mask = image.mask(tissue)
-    if not mask.any():
-        raise InputDataError(f"tissue '{image.tissues[tissue].name}' has no voxel in the image")
-    window = window_around(mask, image.grid, reach_mm=reach_mm)
-    return distance_map(mask[window], cropped(image.grid, window), smoothing_mm=smoothing_mm)
-
-
-def _half(share: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Points (n, 3) in voxels and triangles (m, 3) of the level 1/2 in `share` (n_x, n_y, n_z)."""
-    nx, ny, nz = share.shape
-    places = np.indices(share.shape, dtype=np.float64).reshape(3, -1, order="F").T
-    flat = share.astype(np.float64).ravel(order="F")
-    if min(share.shape) < 2 or not flat.min() < 0.5 < flat.max():
-        return np.zeros((0, 3)), np.zeros((0, 3), np.int32)
-    points, triangles, _ = igl.marching_cubes(flat, np.ascontiguousarray(places), nx, ny, nz, 0.5)
-    return np.asarray(points), np.asarray(triangles, dtype=np.int32)
-
-
-def _vertex_area(surface: ObservedSurface) -> NDArray[np.float64]:
-    """Observed area (n_vertices,) mm^2 around each point: a third of each of its observed triangles."""
-    size = np.linalg.norm(triangle_normals(surface.rest, surface.triangles), axis=1) * surface.observed
-    return np.asarray(np.bincount(surface.triangles.ravel(), np.repeat(size / 3.0, 3), minlength=len(surface.rest)))

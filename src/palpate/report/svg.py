@@ -47,13 +47,9 @@ def draw_svg(draw: Callable[[Figure], None], *, size: tuple[float, float], name:
         draw(figure)
         text = io.StringIO()
         figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-    return _embedded(text.getvalue(), name)
-
-
-def _embedded(svg: str, name: str) -> str:
-    """The bare element: no prologue, no comments (they repeat names), scalable, identifiers with a prefix."""
+    svg = text.getvalue()
     element = svg[svg.index("<svg") :]
-    element = re.sub(r"<!--.*?-->", "", element, flags=re.DOTALL)
+    element = re.sub(r"<!--.*?-->", "", element, flags=re.DOTALL)  # comments repeat names
     element = re.sub(r"<metadata>.*?</metadata>", "", element, flags=re.DOTALL)
     element = re.sub(r'id="(layer-[a-z]+)[^"]*"', r'class="\1"', element)
     element = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", element, count=1)

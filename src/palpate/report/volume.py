@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
-from palpate.images.tissue_distance import cropped
+from palpate.images.tissue_distance import cropped, window_of
 from palpate.report.report_data import SliceBox, Volume
 
 __all__ = ["MOST_VOXELS", "grey_volume", "label_volume"]
@@ -27,7 +27,11 @@ def grey_volume(values: NDArray[Any], grid: VoxelGrid, box: SliceBox, *, most_vo
     """
     step = _step(grid, box, most_voxels)
     cut = _cut(values, grid, box, step=step, order=1)
-    low, high = _window(cut)
+    finite = cut[np.isfinite(cut)]
+    low, high = 0.0, 1.0
+    if len(finite):  # shown black and white: a soft-tissue window for a CT, else the middle 98 percent
+        low, high = CT_WINDOW if finite.min() < -500.0 else np.percentile(finite, [1.0, 99.0]).tolist()
+        high = max(high, low + 1e-6)
     shade = np.clip((cut - low) / (high - low), 0.0, 1.0)
     return Volume("grey", np.rint(255.0 * np.nan_to_num(shade)).astype(np.uint8), box.low, step)
 
@@ -44,18 +48,15 @@ def _step(grid: VoxelGrid, box: SliceBox, most_voxels: float) -> NDArray[np.floa
     """Voxel edges (3,) mm: the image's finest, or coarser where the box would hold too many; they fill the box."""
     size = box.high - box.low
     edge = max(float(grid.spacing.min()), float(np.prod(size) / most_voxels) ** (1.0 / 3.0))
-    return np.asarray(size / (_counts(size, edge) - 1))
-
-
-def _counts(size: NDArray[np.float64], edge: float) -> NDArray[np.int64]:
-    return np.maximum(np.rint(size / edge).astype(np.int64) + 1, 2)
+    return np.asarray(size / (np.maximum(np.rint(size / edge).astype(np.int64) + 1, 2) - 1))
 
 
 def _cut(
     values: NDArray[Any], grid: VoxelGrid, box: SliceBox, *, step: NDArray[np.float64], order: Literal[0, 1]
 ) -> NDArray[np.float32]:
     """Values on the grid from `box.low` in steps of `step`; NaN outside of the image."""
-    window = _window_of(grid, box)
+    corners = np.array(np.meshgrid(*np.stack([box.low, box.high], axis=1))).reshape(3, -1).T
+    window = window_of(grid.index(corners), grid, margin=1)
     part = cropped(grid, window)
     inverse = np.linalg.inv(part.affine)
     counts = np.rint((box.high - box.low) / step).astype(np.int64) + 1
@@ -69,24 +70,3 @@ def _cut(
         cval=np.nan,
     )
     return np.asarray(cut)
-
-
-def _window_of(grid: VoxelGrid, box: SliceBox) -> tuple[slice, slice, slice]:
-    """Voxels of the image that the box may need; one of them where it needs none."""
-    corners = np.array(np.meshgrid(*np.stack([box.low, box.high], axis=1))).reshape(3, -1).T
-    index, last = grid.index(corners), np.array(grid.shape) - 1
-    low = np.clip(np.floor(index.min(axis=0)).astype(np.int64) - 1, 0, last)
-    high = np.clip(np.ceil(index.max(axis=0)).astype(np.int64) + 1, 0, last)
-    i, j, k = (slice(int(a), int(b) + 1) for a, b in zip(low, high, strict=True))
-    return (i, j, k)
-
-
-def _window(values: NDArray[np.float32]) -> tuple[float, float]:
-    """Grey values shown black and white: a soft-tissue window for a CT, else the middle 98 percent."""
-    finite = values[np.isfinite(values)]
-    if not len(finite):
-        return 0.0, 1.0
-    if finite.min() < -500.0:
-        return CT_WINDOW
-    low, high = np.percentile(finite, [1.0, 99.0])
-    return float(low), float(max(high, low + 1e-6))

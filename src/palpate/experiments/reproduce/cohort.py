@@ -22,7 +22,7 @@ from palpate.inversion import (
     reduced_basis,
 )
 from palpate.mechanics import LinearModel, LinearSystem, linear_model, outer_constraint, with_constraint
-from palpate.mesh import Anatomy, Box, LagrangeSpace, lagrange_space, tetrahedralise
+from palpate.mesh import Anatomy, Box, lagrange_space, tetrahedralise
 from palpate.observation import NoiseModel, observed_surface, prescribed_motion, surface_distance
 from palpate.phantoms import (
     Noise,
@@ -101,7 +101,13 @@ def estimate_patient(settings: CohortSettings, patient: int, progress: Callable[
     seed = settings.seed + patient
     shapes = draw_pelvis(np.random.default_rng(seed), _box(), bones=False)
     space = lagrange_space(tetrahedralise(_anatomy(shapes), edge_length_mm=settings.edge_mm), "P2")
-    model = _model(space, settings.driver)
+    motion = prescribed_motion(
+        space, {}, n_modes=settings.driver.modes, kernel_mm=settings.driver.kernel_mm, prior_mm=settings.driver.prior_mm
+    )
+    constraint = outer_constraint(
+        space, outer="fixed", modes=motion.modes, offset=motion.offset, prescribed=motion.prescribed
+    )
+    model = linear_model(space, constraint)
     progress(f"patient {patient + 1}: {3 * len(space.points)} unknowns")
     basis = _basis(model)
     held = replace(model.constraint, modes=np.zeros((3 * len(space.points), 0)))
@@ -200,14 +206,6 @@ def _anatomy(shapes: PelvisShapes) -> Anatomy:
         Tissue("surroundings", Role.KNOWN, (4,), POISSON_RATIO, SURROUNDINGS_KPA),
     )
     return Anatomy(tissues, (shapes.prostate, shapes.bladder, shapes.rectum, None), _box())
-
-
-def _model(space: LagrangeSpace, driver: DriverMotion) -> LinearModel:
-    motion = prescribed_motion(space, {}, n_modes=driver.modes, kernel_mm=driver.kernel_mm, prior_mm=driver.prior_mm)
-    constraint = outer_constraint(
-        space, outer="fixed", modes=motion.modes, offset=motion.offset, prescribed=motion.prescribed
-    )
-    return linear_model(space, constraint)
 
 
 def _basis(model: LinearModel) -> ReducedBasis:

@@ -109,7 +109,12 @@ class Figure4:
         found = []
         for (body, case), points in self.lines("linear").items():
             stated = [(p.deformation_percent, abs(p.error_percent)) for p in points if p.error_percent is not None]
-            found.append({"body": body, "case": case, "deformation_percent": _passes([(0.0, 0.0), *stated])})
+            passes = (
+                before + (after - before) * (LEAVE_PERCENT - low) / (high - low)
+                for (before, low), (after, high) in pairwise([(0.0, 0.0), *stated])
+                if low < LEAVE_PERCENT <= high
+            )
+            found.append({"body": body, "case": case, "deformation_percent": next(passes, None)})
         return found
 
     def text(self) -> list[list[str]]:
@@ -151,11 +156,6 @@ def _part(balls: Balls, moduli: Moduli, deformation: float, key: str, progress: 
 
 def _name(moduli: Moduli) -> str:
     return "/".join(f"{modulus:g}" for modulus in moduli)
-
-
-@lru_cache(maxsize=1)
-def _bench(balls: Balls) -> _Bench:
-    return _Bench(balls)
 
 
 def nominal_stress(stretch: float) -> float:
@@ -229,18 +229,14 @@ class _Bench:
         return small * nominal_stress(1.0 + deformation)
 
 
+_bench = lru_cache(maxsize=1)(_Bench)
+
+
 def _errors(inversion: Inversion, moduli: Moduli) -> list[float | None]:
     if not inversion.minimum.outcome.converged:
         return [None] * len(moduli)
     found = inversion.objective.parameters.moduli(inversion.minimum.unknowns)
     return [float(100.0 * (value / truth - 1.0)) for value, truth in zip(found, moduli, strict=True)]
-
-
-def _passes(points: list[tuple[float, float]]) -> float | None:
-    for (before, low), (after, high) in pairwise(points):
-        if low < LEAVE_PERCENT <= high:
-            return before + (after - before) * (LEAVE_PERCENT - low) / (high - low)
-    return None
 
 
 def _cell(error: float | None) -> str:

@@ -7,13 +7,12 @@ from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from palpate.experiments.reproduce.balls import BODIES
 from palpate.experiments.reproduce.figure4 import LAW, LEAVE_PERCENT, Figure4
 from palpate.experiments.reproduce.staging import Staging
-from palpate.experiments.reproduce.table import COLUMNS, Table, TableRow
+from palpate.experiments.reproduce.table import COLUMNS, Table
 from palpate.study import staged
 
 __all__ = ["draw_figure4", "draw_staging", "draw_table"]
@@ -40,7 +39,23 @@ def draw_table(table: Table, path: Path) -> None:
         """All panels."""
         panels = figure.subplots(1, len(bodies), sharey=True, squeeze=False)[0]
         for axes, body in zip(panels, bodies, strict=True):
-            _errors(axes, [row for row in table.rows if row.body == body])
+            rows = [row for row in table.rows if row.body == body]
+            places = np.arange(len(rows))
+            papers = [
+                (i, abs(100.0 * (r.paper_kpa / r.true_kpa - 1.0)))
+                for i, r in enumerate(rows)
+                if r.paper_kpa is not None
+            ]
+            if papers:
+                axes.plot(*zip(*papers, strict=True), linestyle="none", marker="x", color="black", label="the paper")
+            for name, colour, marker in zip(COLUMNS, COLOURS, MARKERS, strict=False):
+                errors = [row.columns[name].error_percent for row in rows]
+                sizes = [np.nan if error is None else max(abs(error), SMALLEST) for error in errors]
+                axes.plot(places, sizes, linestyle="none", marker=marker, color=colour, markersize=4.5, label=name)
+            axes.set_yscale("log")
+            axes.minorticks_off()
+            axes.set_xticks(places, [row.case for row in rows], rotation=60, ha="right", fontsize=7.5)
+            axes.set_xlabel("true modulus, kPa")
             axes.set_title(body)
         panels[0].set_ylabel("absolute error of the modulus, %")
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
@@ -55,7 +70,15 @@ def draw_figure4(result: Figure4, path: Path) -> None:
         """All panels."""
         panels = figure.subplots(1, len(BODIES), sharey=True)
         for axes, body in zip(panels, BODIES, strict=True):
-            _lines(axes, result, body)
+            cases = list(dict.fromkeys(point.case for point in result.points))
+            for law, style in LINESTYLES.items():
+                lines = result.lines(law)
+                for colour, case in zip(COLOURS, cases, strict=False):
+                    points = lines.get((body, case), [])
+                    errors = [np.nan if p.error_percent is None else p.error_percent for p in points]
+                    deformations = [p.deformation_percent for p in points]
+                    axes.plot(deformations, errors, style, color=colour, marker=".", label=f"{case} kPa, {law}")
+            axes.axhspan(-LEAVE_PERCENT, LEAVE_PERCENT, color="0.9", zorder=0)
             axes.set_title(body)
             axes.set_xlabel("deformation, %")
         panels[0].set_ylabel("error of the modulus, %")
@@ -71,52 +94,25 @@ def draw_staging(result: Staging, path: Path) -> None:
         """All panels."""
         panels = figure.subplots(1, len(result.organs))
         for axes, organ in zip(panels, result.organs, strict=True):
-            _boxes(axes, result, organ)
+            stages = sorted({patient.stage for patient in result.patients})
+            values = [[kpa for p in result.patients if p.stage == stage for kpa in p.kpa[organ]] for stage in stages]
+            axes.boxplot(values, positions=stages, widths=0.5, showfliers=False)
+            for number, patient in enumerate(result.patients):
+                place = patient.stage + 0.04 * (number - 0.5 * (len(result.patients) - 1))
+                median = float(np.median(patient.kpa[organ]))
+                axes.plot(
+                    place, median, "o", color=COLOURS[0], markersize=4.0, label="" if number else "patient, median"
+                )
+                axes.plot(
+                    place, patient.true_kpa[organ], "_", color=COLOURS[1], label="" if number else "patient, truth"
+                )
+            axes.set_xticks(stages, [f"T{stage}" for stage in stages])
+            axes.legend(fontsize=7.5, frameon=False)
             axes.set_title(f"{organ} (simulated)")
             axes.set_xlabel("T stage")
             axes.set_ylabel("Young's modulus, kPa")
 
     _save(draw, path, width=8.5)
-
-
-def _errors(axes: Axes, rows: list[TableRow]) -> None:
-    places = np.arange(len(rows))
-    papers = [(i, abs(100.0 * (r.paper_kpa / r.true_kpa - 1.0))) for i, r in enumerate(rows) if r.paper_kpa is not None]
-    if papers:
-        axes.plot(*zip(*papers, strict=True), linestyle="none", marker="x", color="black", label="the paper")
-    for name, colour, marker in zip(COLUMNS, COLOURS, MARKERS, strict=False):
-        errors = [row.columns[name].error_percent for row in rows]
-        sizes = [np.nan if error is None else max(abs(error), SMALLEST) for error in errors]
-        axes.plot(places, sizes, linestyle="none", marker=marker, color=colour, markersize=4.5, label=name)
-    axes.set_yscale("log")
-    axes.minorticks_off()
-    axes.set_xticks(places, [row.case for row in rows], rotation=60, ha="right", fontsize=7.5)
-    axes.set_xlabel("true modulus, kPa")
-
-
-def _lines(axes: Axes, result: Figure4, body: str) -> None:
-    cases = list(dict.fromkeys(point.case for point in result.points))
-    for law, style in LINESTYLES.items():
-        lines = result.lines(law)
-        for colour, case in zip(COLOURS, cases, strict=False):
-            points = lines.get((body, case), [])
-            errors = [np.nan if p.error_percent is None else p.error_percent for p in points]
-            deformations = [p.deformation_percent for p in points]
-            axes.plot(deformations, errors, style, color=colour, marker=".", label=f"{case} kPa, {law}")
-    axes.axhspan(-LEAVE_PERCENT, LEAVE_PERCENT, color="0.9", zorder=0)
-
-
-def _boxes(axes: Axes, result: Staging, organ: str) -> None:
-    stages = sorted({patient.stage for patient in result.patients})
-    values = [[kpa for p in result.patients if p.stage == stage for kpa in p.kpa[organ]] for stage in stages]
-    axes.boxplot(values, positions=stages, widths=0.5, showfliers=False)
-    for number, patient in enumerate(result.patients):
-        place = patient.stage + 0.04 * (number - 0.5 * (len(result.patients) - 1))
-        median = float(np.median(patient.kpa[organ]))
-        axes.plot(place, median, "o", color=COLOURS[0], markersize=4.0, label="" if number else "patient, median")
-        axes.plot(place, patient.true_kpa[organ], "_", color=COLOURS[1], label="" if number else "patient, truth")
-    axes.set_xticks(stages, [f"T{stage}" for stage in stages])
-    axes.legend(fontsize=7.5, frameon=False)
 
 
 def _save(draw: Callable[[Figure], None], path: Path, *, width: float) -> None:

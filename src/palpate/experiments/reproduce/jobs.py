@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import connection, get_context
@@ -48,20 +48,16 @@ def compute(jobs: Sequence[Job], ledger: Ledger, *, workers: int, progress: Prog
     total, count = sum(len(job.keys) for job in jobs), sum(len(job.keys) for job in left)
     if count < total:
         progress(f"{total - count} of {total} parts are already computed")
-    made = _made_here(left, progress) if min(workers, len(left)) < 2 else _made_by(left, workers, progress)
+    made = ((key, dict(job.make(key, progress))) for job in left for key in job.keys)
+    if min(workers, len(left)) > 1:
+        made = _made_by(left, workers, progress)
     for done, (key, part) in enumerate(made, start=total - count + 1):
         parts[key] = ledger.keep(key, part)
         progress(f"part {done} of {total} done: {key}")
     return parts
 
 
-def _made_here(jobs: Sequence[Job], progress: Progress) -> Iterator[tuple[str, Part]]:
-    for job in jobs:
-        for key in job.keys:
-            yield key, dict(job.make(key, progress))
-
-
-def _made_by(jobs: Sequence[Job], workers: int, progress: Progress) -> Iterator[tuple[str, Part]]:
+def _made_by(jobs: Sequence[Job], workers: int, progress: Progress) -> Generator[tuple[str, Part]]:
     context = get_context("spawn")
     waiting = list(jobs)
     pipes = [context.Pipe() for _ in range(min(workers, len(jobs)))]

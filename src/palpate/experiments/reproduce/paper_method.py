@@ -94,24 +94,16 @@ def _distances(target: PaperTarget, motion: Array) -> tuple[float, Array]:
     deformed = np.ascontiguousarray(surface.rest + motion)
     slope = np.zeros_like(deformed)
     own = np.unique(surface.triangles[surface.observed])
-    _, _, nearest = igl.point_mesh_squared_distance(deformed[own], target.vertices, _plain(target.triangles))[:3]
+    faces = np.ascontiguousarray(target.triangles)
+    _, _, nearest = igl.point_mesh_squared_distance(deformed[own], target.vertices, faces)[:3]
     away = deformed[own] - np.asarray(nearest)
     slope[own] += away
     seen = np.unique(target.triangles[target.seen])
     image = np.ascontiguousarray(target.vertices[seen])
-    _, triangle, places = igl.point_mesh_squared_distance(image, deformed, _plain(surface.triangles))[:3]
+    faces = np.ascontiguousarray(surface.triangles)
+    _, triangle, places = igl.point_mesh_squared_distance(image, deformed, faces)[:3]
     corners = surface.triangles[np.asarray(triangle, dtype=np.int64)]
     back = np.asarray(places) - image
-    weights = _barycentric(np.asarray(places), deformed[corners])
+    weights = np.asarray(igl.barycentric_coordinates(places, *(deformed[corners[:, k]] for k in range(3))))
     np.add.at(slope, corners, weights[:, :, None] * back[:, None, :])
     return 0.5 * float(np.sum(away**2) + np.sum(back**2)), slope
-
-
-def _barycentric(places: Array, corners: Array) -> Array:
-    """Barycentric coordinates (n, 3) of places (n, 3) mm in triangles (n, 3 corners, 3 axes) mm."""
-    parts = [np.ascontiguousarray(part) for part in (places, corners[:, 0], corners[:, 1], corners[:, 2])]
-    return np.asarray(igl.barycentric_coordinates(*parts))
-
-
-def _plain(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.ascontiguousarray(triangles)

@@ -20,12 +20,7 @@ from palpate.experiments.reproduce.balls import (
     pulled,
     random_grid,
 )
-from palpate.experiments.reproduce.columns import (
-    entries_from_surfaces,
-    entries_from_voxels,
-    from_half,
-    imaged_states,
-)
+from palpate.experiments.reproduce.columns import entries_from_surfaces, entries_from_voxels, from_half, imaged_states
 from palpate.experiments.reproduce.jobs import Job, Progress, compute
 from palpate.experiments.reproduce.ledger import Ledger
 from palpate.experiments.reproduce.paper import PAPER_TABLE1
@@ -103,11 +98,6 @@ def _part(settings: Table1Settings, key: str, progress: Progress) -> dict[str, A
     return as_part(case.column(column, progress))
 
 
-@lru_cache(maxsize=1)
-def _bench(balls: Balls) -> _Bench:
-    return _Bench(balls)
-
-
 def _first_like(moduli: Moduli, cases: tuple[Moduli, ...]) -> Moduli:
     """The first case with the same ratios: the load goes with the moduli, so it is the same problem in other units."""
     return next(case for case in cases if np.allclose(np.array(case) * moduli[0], np.array(moduli) * case[0]))
@@ -137,6 +127,9 @@ class _Bench:
     def linear_tetrahedra(self) -> LinearModel:
         """The paper's model: the inverting mesh with linear tetrahedra."""
         return _model(balls_space(self.balls, self.balls.edge_mm, element="P1"))
+
+
+_bench = lru_cache(maxsize=1)(_Bench)
 
 
 @dataclass(frozen=True)
@@ -188,7 +181,7 @@ class _Case:
         """What two label images on a random grid say of every sphere."""
         balls, fine = self.bench.balls, self.bench.fine
         grid = random_grid(balls, np.random.default_rng(self.seed))
-        space = _renamed(fine.space, self.moduli)
+        space = replace(fine.space, mesh=replace(fine.space.mesh, tissues=balls_tissues(self.moduli)))
         states = imaged_states(space, (self.displacement(fine),), grid)
         mechanics = Mechanics(law="linear", element="P2")
         case = Case("table1", phantom=Phantom("spheres"), mesh=MeshSettings(balls.edge_mm), mechanics=mechanics)
@@ -210,7 +203,14 @@ class _Case:
     def by_the_paper(self, truth: LinearModel) -> dict[str, Entry]:
         """The paper's method; a few nodes hold the rigid motion, with the displacement that the truth has there."""
         own, u = self.bench.linear_tetrahedra, self.displacement(truth)
-        model = _held_as(_pulled_by(own, self.stress_kpa), truth.space, u)
+        offset = np.zeros(len(own.constraint.offset))
+        for dof in np.flatnonzero(own.constraint.modes.any(axis=1)):
+            away = truth.space.points - own.space.points[dof // 3]
+            near = np.argsort(np.linalg.norm(away, axis=1))[:NEAREST]
+            terms = np.column_stack([np.ones(NEAREST), away[near]])
+            offset[dof] = np.linalg.lstsq(terms, u[near, dof % 3], rcond=None)[0][0]
+        held = replace(own.constraint, modes=np.zeros((len(offset), 0)), offset=offset)
+        model = with_constraint(_pulled_by(own, self.stress_kpa), held)
         targets = [paper_target(truth.space, u, observed_surface(own.space, body)) for body in range(len(BODIES))]
         fit = paper_estimate(model, targets, moduli=0.5 * np.array(self.moduli), columns=np.arange(len(BODIES)))
         values = fit.moduli.tolist() if fit.converged else [None] * len(BODIES)
@@ -227,22 +227,3 @@ def _model(space: LagrangeSpace) -> LinearModel:
 def _pulled_by(model: LinearModel, stress_kpa: float) -> LinearModel:
     """The model with a pull of `stress_kpa` instead of 1 kPa."""
     return replace(model, load=stress_kpa * model.load)
-
-
-def _renamed(space: LagrangeSpace, moduli: Moduli) -> LagrangeSpace:
-    """The space with the true moduli in its tissues."""
-    return replace(space, mesh=replace(space.mesh, tissues=balls_tissues(moduli)))
-
-
-def _held_as(model: LinearModel, space: LagrangeSpace, u: Array) -> LinearModel:
-    """The model whose pinned nodes move as a truth u (n_points, 3) mm on `space` does there, without modes."""
-    constraint = model.constraint
-    pins = np.flatnonzero(constraint.modes.any(axis=1))
-    offset = np.zeros(len(constraint.offset))
-    for dof in pins:
-        place = model.space.points[dof // 3]
-        near = np.argsort(np.linalg.norm(space.points - place, axis=1))[:NEAREST]
-        terms = np.column_stack([np.ones(NEAREST), space.points[near] - place])
-        offset[dof] = np.linalg.lstsq(terms, u[near, dof % 3], rcond=None)[0][0]
-    held = replace(constraint, modes=np.zeros((len(offset), 0)), offset=offset)
-    return with_constraint(model, held)

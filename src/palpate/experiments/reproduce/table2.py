@@ -21,13 +21,7 @@ from palpate.experiments.reproduce.jobs import Job, Progress, compute
 from palpate.experiments.reproduce.ledger import Ledger
 from palpate.experiments.reproduce.paper import PAPER_TABLE2
 from palpate.experiments.reproduce.paper_method import paper_estimate, paper_target
-from palpate.experiments.reproduce.real_pelvis import (
-    ORGANS,
-    SMOOTHING_MM,
-    RealPelvis,
-    grid_within,
-    real_pelvis,
-)
+from palpate.experiments.reproduce.real_pelvis import ORGANS, SMOOTHING_MM, RealPelvis, grid_within, real_pelvis
 from palpate.experiments.reproduce.table import COLUMNS, Entry, Table, TableRow, as_part, entries_of
 from palpate.images import Role, VoxelGrid, observation_width, smoothing_width
 from palpate.inversion import InverseProblem, LaterState, ReducedBasis, invert, parameter_map, reduced_basis

@@ -14,7 +14,7 @@ from palpate.experiments.verification.conditions import held_components, loaded
 from palpate.experiments.verification.problem import Check, Problem
 from palpate.experiments.verification.structured_meshes import known, octant_mesh
 from palpate.mechanics import linear_model, triangle_quadrature
-from palpate.mesh import Constraint, LagrangeSpace, lagrange_space, triangle_normals, triangle_shape
+from palpate.mesh import LagrangeSpace, lagrange_space, triangle_normals, triangle_shape
 
 __all__ = ["INDENTATION_PROBLEMS", "half_space", "hertz_depth", "indenting_force", "point_force_depth"]
 
@@ -34,19 +34,15 @@ def half_space(contact: float, nu: float, *, n_surface: int = 12, fine: int = 6,
     The layers are thin near that ring and grow by half outwards, to `far` radii; the ring encloses the circle's area.
     """
     turn = 0.5 * np.pi / n_surface
-    grow = np.sqrt(turn / np.sin(turn)) / _lift(n_surface)
+    # how far outside of the unit sphere the corners of an eighth of a ball lie
+    mesh = octant_mesh(np.array([0.5, 1.0]), [1], n_surface, [known("ball")])
+    grow = np.sqrt(turn / np.sin(turn)) / float(np.linalg.norm(mesh.nodes, axis=1).max())
     near = 1.0 - 0.5 ** np.arange(1, fine)
     beyond = 1.0 + 0.5 ** np.arange(fine - 1, -1, -1)
     outwards = np.geomspace(2.0, far, round(np.log(far / 2.0) / np.log(1.5)) + 1)[1:]
     radii = contact * grow * np.concatenate([[0.25], near, [1.0], beyond, outwards])
     tissues = [known(f"layer {i}", nu=nu) for i in range(len(radii) - 1)]
     return lagrange_space(octant_mesh(radii, [1] * len(tissues), n_surface, tissues, solid=True), "P2")
-
-
-def _lift(n_surface: int) -> float:
-    """How far outside of the unit sphere the corners of an eighth of a ball lie."""
-    mesh = octant_mesh(np.array([0.5, 1.0]), [1], n_surface, [known("ball")])
-    return float(np.linalg.norm(mesh.nodes, axis=1).max())
 
 
 def _on_top(space: LagrangeSpace) -> tuple[NDArray[np.bool_], Array]:
@@ -79,8 +75,18 @@ def indenting_force(space: LagrangeSpace, contact: float, depth: Array, modulus:
 def hertz_depth(space: LagrangeSpace, contact: float, peak: float) -> Array:
     """Depths (2,) mm at the centre and on the ring under the pressure peak sqrt(1 - r^2 / a^2) kPa."""
     top, r = _on_top(space)
-    constraint = held_components(_held(space), np.zeros_like(space.points))
-    u = _under(space, constraint, _hertz_load(space, contact, peak))
+    # the load, by quadrature of degree 5 on the faces of z = 0
+    mesh = space.mesh
+    faces = mesh.boundary[np.all(np.abs(mesh.nodes[mesh.boundary][:, :, 2]) < 1e-9, axis=1)]
+    faces = faces[np.linalg.norm(mesh.nodes[faces][:, :, :2], axis=2).max(axis=1) < 1.02 * contact]
+    places, weights = triangle_quadrature(5)
+    away = np.linalg.norm(np.einsum("qk,fki->fqi", places, mesh.nodes[faces])[:, :, :2], axis=2)
+    pressure = peak * np.sqrt(np.maximum(1.0 - (away / contact) ** 2, 0.0))
+    area = 0.5 * np.linalg.norm(2.0 * triangle_normals(mesh.nodes, faces), axis=1)
+    nodal = np.einsum("f,q,fq,qa->fa", area, weights, pressure, triangle_shape(space.order, places))
+    load = np.zeros_like(space.points)
+    np.add.at(load[:, 2], space.facets(faces), nodal)
+    u = _under(space, load)
     ring = top & (np.abs(r / contact - 1.0) < 0.02)
     return np.array([u[r < 1e-9][np.argmin(space.points[r < 1e-9, 2]), 2], u[ring, 2].mean()])
 
@@ -90,29 +96,16 @@ def point_force_depth(space: LagrangeSpace, force: float) -> tuple[float, float]
     top, r = _on_top(space)
     load = np.zeros_like(space.points)
     load[np.argmin(np.linalg.norm(space.points, axis=1)), 2] = 0.25 * force
-    u = _under(space, held_components(_held(space), np.zeros_like(space.points)), load.ravel())
+    u = _under(space, load)
     ring = top & (np.abs(r - r[top][np.argmin(np.abs(r[top] - 10.0))]) < 1e-6)
     return float(r[ring].mean()), float(u[ring, 2].mean())
 
 
-def _under(space: LagrangeSpace, constraint: Constraint, load: Array) -> Array:
+def _under(space: LagrangeSpace, load: Array) -> Array:
+    """Displacement (n_points, 3) mm of the held space under nodal forces (n_points, 3) mN."""
+    constraint = held_components(_held(space), np.zeros_like(space.points))
     regions = len([t for t in space.mesh.tissues if t.meshed])
-    return loaded(space, constraint, load, moduli=np.full(regions, E)).reshape(-1, 3)
-
-
-def _hertz_load(space: LagrangeSpace, contact: float, peak: float) -> Array:
-    """Nodal forces (n_dof,) mN, by quadrature of degree 5 on the faces of z = 0."""
-    mesh = space.mesh
-    faces = mesh.boundary[np.all(np.abs(mesh.nodes[mesh.boundary][:, :, 2]) < 1e-9, axis=1)]
-    faces = faces[np.linalg.norm(mesh.nodes[faces][:, :, :2], axis=2).max(axis=1) < 1.02 * contact]
-    places, weights = triangle_quadrature(5)
-    r = np.linalg.norm(np.einsum("qk,fki->fqi", places, mesh.nodes[faces])[:, :, :2], axis=2)
-    pressure = peak * np.sqrt(np.maximum(1.0 - (r / contact) ** 2, 0.0))
-    area = 0.5 * np.linalg.norm(2.0 * triangle_normals(mesh.nodes, faces), axis=1)
-    nodal = np.einsum("f,q,fq,qa->fa", area, weights, pressure, triangle_shape(space.order, places))
-    load = np.zeros_like(space.points)
-    np.add.at(load[:, 2], space.facets(faces), nodal)
-    return np.asarray(load.ravel())
+    return loaded(space, constraint, load.ravel(), moduli=np.full(regions, E)).reshape(-1, 3)
 
 
 def _hertz_checks() -> tuple[Check, ...]:

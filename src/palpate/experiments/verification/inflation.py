@@ -63,13 +63,7 @@ def inflated_model(space: LagrangeSpace, bore: NDArray[np.int64], law: Law, *, a
 
 
 def wall_pressures(
-    mesh: TetMesh,
-    law: Law,
-    *,
-    moduli: Sequence[float],
-    stretches: Sequence[float],
-    radius: float = 10.0,
-    axes: int = 3,
+    mesh: TetMesh, law: Law, *, moduli: Sequence[float], stretches: Sequence[float], radius: float = 10.0, axes: int = 3
 ) -> Array:
     """Pressures (n,) kPa on the bore when its wall has been moved outwards by each of the stretches (n,).
 
@@ -88,7 +82,10 @@ def wall_pressures(
     return np.array(found)
 
 
-def _checks(table: dict[float, float], found: Array) -> tuple[Check, ...]:
+def _pressure_checks(
+    table: dict[float, float], mesh: TetMesh, moduli: Sequence[float], law: Law = NEO, *, axes: int = 3
+) -> tuple[Check, ...]:
+    found = wall_pressures(mesh, law, moduli=moduli, stretches=list(table), axes=axes)
     return tuple(
         Check(f"pressure at the stretch {stretch:g} (kPa)", reference, float(value), TOLERANCE)
         for (stretch, reference), value in zip(table.items(), found, strict=True)
@@ -97,8 +94,7 @@ def _checks(table: dict[float, float], found: Array) -> tuple[Check, ...]:
 
 def _balloon_checks(law: Law) -> tuple[Check, ...]:
     mesh = octant_mesh(np.array([10.0, 20.0]), [4], 6, [known("shell", nu=NU)])
-    table = BALLOON[law.name]
-    return _checks(table, wall_pressures(mesh, law, moduli=[10.0], stretches=list(table)))
+    return _pressure_checks(BALLOON[law.name], mesh, [10.0], law)
 
 
 def _limit_checks() -> tuple[Check, ...]:
@@ -118,13 +114,12 @@ def _limit_checks() -> tuple[Check, ...]:
 def _two_layer_checks() -> tuple[Check, ...]:
     tissues = [known("inner", nu=NU), known("outer", nu=NU)]
     mesh = octant_mesh(np.array([10.0, 15.0, 20.0]), [2, 2], 6, tissues)
-    found = wall_pressures(mesh, NEO, moduli=[10.0, 30.0], stretches=list(TWO_LAYERS))
-    return _checks(TWO_LAYERS, found)
+    return _pressure_checks(TWO_LAYERS, mesh, [10.0, 30.0])
 
 
 def _tube_checks() -> tuple[Check, ...]:
     mesh = quarter_ring_mesh(10.0, 20.0, 4, 6, known("tube", nu=NU))
-    return _checks(TUBE, wall_pressures(mesh, NEO, moduli=[10.0], stretches=list(TUBE), axes=2))
+    return _pressure_checks(TUBE, mesh, [10.0], axes=2)
 
 
 GREEN = "closed form (Green & Zerna 1968, section 3.10)"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from palpate.experiments.verification.problem import RowDict
@@ -37,33 +38,20 @@ def page(rows: Sequence[RowDict], slow: Sequence[str] = ()) -> str:
         "|---|---|---|---|---|---|",
     ]
     for name in ids:
-        lines.append(_summary([row for row in rows if row["id"] == name], name in slow))
+        own = [row for row in rows if row["id"] == name]
+        errors = [math.inf if row["error_percent"] is None else row["error_percent"] for row in own]
+        shares = [error / max(row["tolerance_percent"], 1e-12) for error, row in zip(errors, own, strict=True)]
+        worst = own[shares.index(max(shares))]
+        of_both = f"{_number(worst['error_percent'])} / {_number(worst['tolerance_percent'])}"
+        orders = ", ".join(f"{row['order']:.2f}" for row in own if row["order"] is not None)
+        mark = "*" if name in slow else ""
+        lines.append(f"| {name}{mark} | {worst['title']} | {len(own)} | {of_both} | {orders} | {worst['source']} |")
     lines += ["", "## All checks", "", "| id | quantity | reference | ours | error (%) | tolerance (%) |"]
     lines.append("|---|---|---|---|---|---|")
-    lines += [_detail(row) for row in rows]
+    for row in rows:
+        cells = [_number(row[key]) for key in ("reference", "value", "error_percent", "tolerance_percent")]
+        lines.append(f"| {row['id']} | {row['quantity']} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
-
-
-def _summary(rows: Sequence[RowDict], slow: bool) -> str:
-    """The line of one problem: its check that is nearest to its tolerance."""
-    worst = max(rows, key=_share)
-    orders = [f"{row['order']:.2f}" for row in rows if row["order"] is not None]
-    mark = "*" if slow else ""
-    errors = f"{_number(worst['error_percent'])} / {_number(worst['tolerance_percent'])}"
-    return (
-        f"| {worst['id']}{mark} | {worst['title']} | {len(rows)} | {errors} | {', '.join(orders)} | {worst['source']} |"
-    )
-
-
-def _share(row: RowDict) -> float:
-    if row["error_percent"] is None:
-        return float("inf")
-    return float(row["error_percent"]) / max(float(row["tolerance_percent"]), 1e-12)
-
-
-def _detail(row: RowDict) -> str:
-    cells = [row["reference"], row["value"], row["error_percent"], row["tolerance_percent"]]
-    return f"| {row['id']} | {row['quantity']} | " + " | ".join(map(_number, cells)) + " |"
 
 
 def _number(value: float | None) -> str:

@@ -26,7 +26,11 @@ def verify(problems: Sequence[Problem], folder: Path, *, progress: Callable[[str
     same versions of the software only.
     """
     versions = software_versions()
-    done = _earlier(folder, versions)
+    done: dict[str, list[RowDict]] = {}
+    with suppress(OSError, ValueError, KeyError, TypeError):  # no interrupted run, or its file is spoilt
+        kept = json.loads((folder / UNFINISHED).read_text(encoding="utf-8"))
+        if kept["versions"] == versions:
+            done = dict(kept["done"])
     for number, problem in enumerate(problems, start=1):
         if problem.id in done:
             progress(f"{problem.id} ({number} of {len(problems)}): already done")
@@ -57,12 +61,3 @@ def document_of(rows: list[RowDict]) -> dict[str, Any]:
     """The document of `palpate verify --json`."""
     passed = sum(bool(row["pass"]) for row in rows)
     return {"schema": SCHEMA, "problems": rows, "passed": passed, "failed": len(rows) - passed}
-
-
-def _earlier(folder: Path, versions: dict[str, str]) -> dict[str, list[RowDict]]:
-    """What an interrupted run of the same software has left; nothing when there is none, or its file is spoilt."""
-    with suppress(OSError, ValueError, KeyError, TypeError):
-        kept = json.loads((folder / UNFINISHED).read_text(encoding="utf-8"))
-        if kept["versions"] == versions:
-            return dict(kept["done"])
-    return {}

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.images import Role, Tissue
-from palpate.mesh import FACES, OUTER, TetMesh
+from palpate.mesh import OUTER, TetMesh, boundary_of
 
 __all__ = [
     "VOID",
-    "boundary_faces",
     "box_mesh",
     "known",
     "kuhn_tets",
@@ -51,13 +50,6 @@ def oriented(nodes: Array, tets: Integers) -> Integers:
     return result
 
 
-def boundary_faces(tets: Integers) -> Integers:
-    """Faces (n_faces, 3) that only one of the tetrahedra (n_tets, 4) has, seen from outside."""
-    faces = tets[:, FACES].reshape(-1, 3)
-    _, place, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    return np.asarray(faces[place[count == 1]])
-
-
 def make_mesh(
     nodes: Array,
     tets: Integers,
@@ -70,7 +62,7 @@ def make_mesh(
     beyond(centroids (n, 3)) gives the neighbour of each outer face, OUTER by default.
     """
     tets = oriented(nodes, tets)
-    boundary = boundary_faces(tets)
+    boundary = boundary_of(tets)
     behind = np.full(len(boundary), OUTER) if beyond is None else beyond(nodes[boundary].mean(axis=1))
     return TetMesh(nodes, tets, region, boundary, behind, tuple(tissues))
 
@@ -121,7 +113,12 @@ def octant_mesh(
     )
     nodes = (levels[:, None, None] * directions).reshape(-1, 3)
     layer_of = np.repeat(np.arange(len(n_radial)), n_radial)
-    tets, region = _prisms(triangles, len(directions), layer_of)
+    prisms = []  # between two levels, three tetrahedra each
+    for level in range(len(layer_of)):
+        a, b, c = (triangles + level * len(directions)).T
+        d, e, f = (triangles + (level + 1) * len(directions)).T
+        prisms += [np.stack(corners, axis=1) for corners in ((a, b, c, f), (a, b, e, f), (a, d, e, f))]
+    tets, region = np.concatenate(prisms), np.repeat(layer_of, 3 * len(triangles))
     if solid:
         tets = np.vstack([tets, np.column_stack([np.full(len(triangles), len(nodes)), triangles])])
         region = np.concatenate([region, np.zeros(len(triangles), int)])
@@ -147,18 +144,6 @@ def _spherical_triangle(n: int) -> tuple[Array, Integers]:
     triangles = np.sort(np.array(up + down), axis=1)
     volume = np.abs(np.linalg.det(directions[triangles])).sum() / 6.0
     return directions * (np.pi / 6.0 / volume) ** (1 / 3), triangles
-
-
-def _prisms(triangles: Integers, n_places: int, layer_of: Integers) -> tuple[Integers, Integers]:
-    """Tetrahedra (n_tets, 4), three a prism between two levels, and the layer (n_tets,) of each."""
-    tets, region = [], []
-    for level, layer in enumerate(layer_of):
-        a, b, c = (triangles + level * n_places).T
-        d, e, f = (triangles + (level + 1) * n_places).T
-        for corners in ((a, b, c, f), (a, b, e, f), (a, d, e, f)):
-            tets.append(np.stack(corners, axis=1))
-            region.append(np.full(len(triangles), layer))
-    return np.concatenate(tets), np.concatenate(region)
 
 
 def quarter_ring_mesh(inner: float, outer: float, n_radial: int, n_turn: int, tissue: Tissue) -> TetMesh:

@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.errors import PalpateError
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers.isolation import GREETING
-from palpate.images.readers.registry import StoredImage, format_of
+from palpate.images.readers.registry import format_of
 from palpate.images.readers.values import REDUCED
 
 __all__ = ["main"]
@@ -33,12 +32,18 @@ def main(arguments: list[str]) -> None:
     Arguments: bytes of address space, seconds of processor time, "labels" or "intensities", path, and a grid (JSON).
     """
     memory_bytes, cpu_seconds, kind, path = int(arguments[0]), int(arguments[1]), arguments[2], Path(arguments[3])
-    with _private_stdout() as pipe:
+    with os.fdopen(os.dup(1), "wb") as pipe:  # to the parent
+        nowhere = os.open(os.devnull, os.O_WRONLY)  # where goes what a C library prints on standard output
+        os.dup2(nowhere, 1)
+        os.close(nowhere)
         pipe.write(GREETING)
         pipe.flush()
         _limit(memory_bytes, cpu_seconds)
         try:
-            grid = VoxelGrid(*_place(arguments[4])) if len(arguments) > 4 else None
+            grid = None
+            if len(arguments) > 4:
+                (nx, ny, nz), affine = json.loads(arguments[4])
+                grid = VoxelGrid((int(nx), int(ny), int(nz)), np.array(affine, dtype=np.float64))
             stored = format_of(path).stored(path, grid)
             values = np.asfortranarray(REDUCED[kind](stored.values, path))
         except PalpateError as error:
@@ -50,21 +55,11 @@ def main(arguments: list[str]) -> None:
             flaw = f"the reader of '{path}' failed ({type(error).__name__}: {error})"
             _send(pipe, {"error": "InputDataError", "message": f"{flaw}; export the image again, and report this"})
         else:
-            _send_image(pipe, values, stored)
-
-
-def _place(text: str) -> tuple[tuple[int, int, int], NDArray[np.float64]]:
-    shape, affine = json.loads(text)
-    return (int(shape[0]), int(shape[1]), int(shape[2])), np.array(affine, dtype=np.float64)
-
-
-def _private_stdout() -> BinaryIO:
-    """The pipe to the parent; what a C library prints on standard output goes nowhere."""
-    pipe = os.fdopen(os.dup(1), "wb")
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    os.close(nowhere)
-    return pipe
+            names = [[row.label, row.name, row.colour] for row in stored.names]
+            place = {"shape": values.shape, "dtype": values.dtype.str, "affine": stored.affine.tolist()}
+            findings = [[finding.code, finding.message] for finding in stored.findings]
+            _send(pipe, {**place, "names": names, "digests": dict(stored.digests), "findings": findings})
+            pipe.write(values.T.data.cast("B"))
 
 
 def _limit(memory_bytes: int, cpu_seconds: int) -> None:
@@ -84,16 +79,6 @@ def _limit(memory_bytes: int, cpu_seconds: int) -> None:
 
 def _send(pipe: BinaryIO, answer: dict[str, Any]) -> None:
     pipe.write(json.dumps(answer).encode("ascii") + b"\n")
-
-
-def _send_image(pipe: BinaryIO, values: NDArray[Any], stored: StoredImage) -> None:
-    """`values` (n_1, n_2, n_3), in the order of Fortran, with place and names as stored."""
-    names = [[row.label, row.name, row.colour] for row in stored.names]
-    answer = {"shape": values.shape, "dtype": values.dtype.str, "affine": stored.affine.tolist(), "names": names}
-    answer["digests"] = dict(stored.digests)
-    answer["findings"] = [[finding.code, finding.message] for finding in stored.findings]
-    _send(pipe, answer)
-    pipe.write(values.T.data.cast("B"))
 
 
 if __name__ == "__main__":

@@ -9,13 +9,18 @@ from pathlib import Path
 
 from palpate.errors import InputDataError
 
-__all__ = ["column_names", "delimited_rows", "whole_number"]
+__all__ = ["column_names", "delimited_rows", "separated_by", "whole_number"]
 
 
 def column_names(text: str, delimiter: str) -> tuple[str, ...]:
     """The names in the first line, in lower case."""
     first = text.splitlines()[0] if text else ""
     return tuple(name.strip().strip('"').lower() for name in first.split(delimiter))
+
+
+def separated_by(text: str, delimiter: str) -> bool:
+    """Whether the first line has a delimiter."""
+    return delimiter in text.partition("\n")[0]
 
 
 def delimited_rows(text: str, path: Path, *, delimiter: str) -> list[Mapping[str, str]]:

@@ -58,17 +58,30 @@ def read(path: Path, grid: VoxelGrid | None) -> StoredImage:
     """
     with sentences(path):
         dataset, sha256 = read_dataset(path)
-        series = series_beside(path, _series_uid(dataset)) or (Series(grid) if grid else None)
+        uids = (
+            str(series.SeriesInstanceUID)
+            for frame in dataset.get("ReferencedFrameOfReferenceSequence", ())
+            for study in frame.get("RTReferencedStudySequence", ())
+            for series in study.get("RTReferencedSeriesSequence", ())
+        )
+        series = series_beside(path, next(uids, "")) or (Series(grid) if grid else None)
         if series is None:
             raise InputDataError(
                 f"the DICOM series that '{path}' was drawn on is not beside it, and without its slices contours have no"
                 " voxels; copy it into the folder of that file, or into one there, or name a grey image on its grid as"
                 " intensities_before or intensities_after of the case"
             )
-        axis = _slice_axis(dataset, series.grid)
+        # the slices lie across the axis along which the first contours run least
+        extent = np.zeros(3)
+        for item in dataset.ROIContourSequence:
+            for contour in (item.get("ContourSequence") or ())[:MOST_TRIED]:
+                extent += np.ptp(series.grid.index(_points(contour)), axis=0)
+        axis = int(np.argmin(extent))
         rows, columns = (n for k, n in enumerate(series.grid.shape) if k != axis)
         shape = (series.grid.shape[axis], rows, columns)
-        structures = _structures(dataset, _to_index(series.grid, axis), path)
+        # RAS mm -> index, the axis of the slices first
+        inverse = np.asarray(np.linalg.inv(series.grid.affine), dtype=np.float64)
+        structures = _structures(dataset, inverse[[axis, *(k for k in range(3) if k != axis), 3]], path)
         findings = _flaws(structures)
         masks = (Mask(each.row, _filled(each, shape)) for each in structures)
         labels, overlaps = merged(masks, shape)
@@ -77,32 +90,9 @@ def read(path: Path, grid: VoxelGrid | None) -> StoredImage:
     return StoredImage(np.moveaxis(labels, 0, axis), series.grid.affine, named, digests, (*findings, *overlaps))
 
 
-def _slice_axis(dataset: Dataset, grid: VoxelGrid) -> int:
-    """The axis of the grid across which the first contours run least."""
-    extent = np.zeros(3)
-    for item in dataset.ROIContourSequence:
-        for contour in (item.get("ContourSequence") or ())[:MOST_TRIED]:
-            extent += np.ptp(grid.index(_points(contour)), axis=0)
-    return int(np.argmin(extent))
-
-
-def _to_index(grid: VoxelGrid, axis: int) -> NDArray[np.float64]:
-    """RAS mm -> index, the axis of the slices first."""
-    inverse = np.asarray(np.linalg.inv(grid.affine), dtype=np.float64)
-    return inverse[[axis, *(k for k in range(3) if k != axis), 3]]
-
-
 def _points(contour: Dataset) -> NDArray[np.float64]:
     """The points of a contour (n, 3), RAS mm."""
     return np.array(contour.ContourData, dtype=np.float64).reshape(-1, 3) * [-1.0, -1.0, 1.0]
-
-
-def _series_uid(dataset: Dataset) -> str:
-    for frame in dataset.get("ReferencedFrameOfReferenceSequence", ()):
-        for study in frame.get("RTReferencedStudySequence", ()):
-            for series in study.get("RTReferencedSeriesSequence", ()):
-                return str(series.SeriesInstanceUID)
-    return ""
 
 
 def _structures(dataset: Dataset, to_index: NDArray[np.float64], path: Path) -> list[_Structure]:

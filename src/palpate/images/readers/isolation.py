@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any, BinaryIO, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, InputDataError, PalpateError, ResourceError
 from palpate.images.finding import Finding
@@ -67,8 +66,12 @@ def read_stored(
     with _reader(_command(path, kind, limits, grid), path, limits) as (pipe, verdict):
         if pipe.readline(len(GREETING)) != GREETING:
             raise _not_started(path)
-        answer = _answer(pipe.readline(MAX_ANSWER))
-        stored = None if answer is None else _stored(answer, pipe, path)
+        line = pipe.readline(MAX_ANSWER)
+        try:  # a process that died before or while it wrote the line leaves none, or half of one
+            answer = json.loads(line) if line.endswith(b"\n") else None
+        except ValueError:
+            answer = None
+        stored = _stored(answer, pipe, path) if isinstance(answer, dict) else None
         if stored is None:
             raise verdict()
         return stored
@@ -89,7 +92,21 @@ def _reader(
 
         def verdict() -> PalpateError:
             """Why the process ended; waits for its end."""
-            return _verdict(process.wait(), path, limits, overdue=overdue.is_set())
+            code = process.wait()
+            name = {-int(number): number.name for number in signal.Signals}.get(code, f"exit code {code}")
+            if overdue.is_set() or name == "SIGXCPU":
+                return ResourceError(
+                    f"reading '{path}' took more than {limits.cpu_seconds} s of processor time, or"
+                    f" {limits.wall_seconds:g} s in all, that one file gets; copy it to a local disk, or it is damaged:"
+                    " export it again"
+                )
+            if name == "SIGKILL":
+                return ResourceError(
+                    f"the system stopped the reading of '{path}', most often because memory is short; crop the image"
+                )
+            return InputDataError(
+                f"the reader of '{path}' crashed ({name}); the file is most likely damaged: export it again"
+            )
 
         timer = threading.Timer(limits.wall_seconds, stop)
         timer.start()
@@ -100,34 +117,6 @@ def _reader(
             process.kill()
 
 
-def _started(command: list[str], path: Path) -> subprocess.Popen[bytes]:
-    try:
-        process = subprocess.Popen(  # noqa: S603 - our own interpreter and module, no shell
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env=_environment(),
-        )
-    except OSError as error:
-        raise _not_started(path) from error
-    _widen(cast("BinaryIO", process.stdout))
-    return process
-
-
-def _widen(pipe: BinaryIO) -> None:
-    """Let the pipe hold more at once; the system may refuse, when its share for this user is used up."""
-    if sys.platform == "linux":
-        with suppress(OSError):
-            fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, PIPE)
-
-
-def _not_started(path: Path) -> ResourceError:
-    return ResourceError(
-        f"the process that reads '{path}' did not start; is Palpate installed in {sys.prefix} and is memory left?"
-    )
-
-
 def _command(path: Path, kind: str, limits: ReadLimits, grid: VoxelGrid | None) -> list[str]:
     # -P: an image's folder, if it is the working folder, must not be searched for modules.
     numbers = [str(limits.memory_bytes), str(limits.cpu_seconds)]
@@ -136,22 +125,30 @@ def _command(path: Path, kind: str, limits: ReadLimits, grid: VoxelGrid | None) 
     return [sys.executable, *module, *numbers, kind, str(path), *place]
 
 
-def _environment() -> dict[str, str]:
-    """Ours, with the places that we import from; one thread, for a pool of them would eat address space."""
-    places = os.pathsep.join(str(Path(place).resolve()) for place in sys.path if place)
-    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    return {**os.environ, **threads, "PYTHONPATH": places}
-
-
-def _answer(line: bytes) -> dict[str, Any] | None:
-    """The line before the voxels; None when the process died before or while it wrote it."""
-    if not line.endswith(b"\n"):
-        return None
+def _started(command: list[str], path: Path) -> subprocess.Popen[bytes]:
     try:
-        answer = json.loads(line)
-    except ValueError:
-        return None
-    return answer if isinstance(answer, dict) else None
+        # our places to import from; one thread, for a pool of them would eat address space
+        places = os.pathsep.join(str(Path(place).resolve()) for place in sys.path if place)
+        threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+        process = subprocess.Popen(  # noqa: S603 - our own interpreter and module, no shell
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env={**os.environ, **threads, "PYTHONPATH": places},
+        )
+    except OSError as error:
+        raise _not_started(path) from error
+    if sys.platform == "linux":
+        with suppress(OSError):
+            fcntl.fcntl(cast("BinaryIO", process.stdout), fcntl.F_SETPIPE_SZ, PIPE)
+    return process
+
+
+def _not_started(path: Path) -> ResourceError:
+    return ResourceError(
+        f"the process that reads '{path}' did not start; is Palpate installed in {sys.prefix} and is memory left?"
+    )
 
 
 def _stored(answer: Mapping[str, Any], pipe: BinaryIO, path: Path) -> StoredImage | None:
@@ -172,28 +169,9 @@ def _stored(answer: Mapping[str, Any], pipe: BinaryIO, path: Path) -> StoredImag
         raise InputDataError(
             f"the process that read '{path}' gave an answer that cannot be used; export the image again"
         )
-    values = _received(pipe, shape, np.dtype(answer["dtype"]), path)
-    return None if values is None else StoredImage(values, affine, names, digests, findings)
-
-
-def _received(pipe: BinaryIO, shape: tuple[int, ...], dtype: np.dtype[Any], path: Path) -> NDArray[Any] | None:
+    dtype = np.dtype(answer["dtype"])
     try:
         content = read_exactly(pipe, math.prod(shape) * dtype.itemsize, path)
     except InputDataError:
         return None
-    return content.view(dtype).reshape(shape, order="F")
-
-
-def _verdict(code: int, path: Path, limits: ReadLimits, *, overdue: bool) -> PalpateError:
-    """Why the process ended before its answer was whole; `code` below zero is a signal's number."""
-    name = {-int(number): number.name for number in signal.Signals}.get(code, f"exit code {code}")
-    if overdue or name == "SIGXCPU":
-        return ResourceError(
-            f"reading '{path}' took more than {limits.cpu_seconds} s of processor time, or {limits.wall_seconds:g} s"
-            " in all, that one file gets; copy it to a local disk, or it is damaged: export it again"
-        )
-    if name == "SIGKILL":
-        return ResourceError(
-            f"the system stopped the reading of '{path}', most often because memory is short; crop the image"
-        )
-    return InputDataError(f"the reader of '{path}' crashed ({name}); the file is most likely damaged: export it again")
+    return StoredImage(content.view(dtype).reshape(shape, order="F"), affine, names, digests, findings)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
+from palpate.images.label_image import corners_apart
 from palpate.images.named_labels import NamedLabel, printable
 from palpate.images.readers.dicom import refused_series
 from palpate.images.readers.merged_masks import Mask, merged
@@ -144,11 +145,8 @@ def _inside(values: NDArray[Any], path: Path) -> NDArray[np.bool_]:
 def _refuse_another_grid(image: StoredImage, other: StoredImage, names: tuple[str, str], folder: Path) -> None:
     here, there = image.values.shape, other.values.shape
     alike = here == there
-    corners = np.array([[*(np.array(c) * (np.array(here) - 1.0)), 1.0] for c in np.ndindex(2, 2, 2)])
-    with np.errstate(all="ignore"):  # what is not finite is refused
-        apart = float(np.linalg.norm((corners @ (image.affine - other.affine).T)[:, :3], axis=1).max())
-        voxel = float(np.linalg.norm(image.affine[:3, :3], axis=0).min())
-    if alike and apart <= SAME_PLACE * voxel:
+    apart, voxel = corners_apart(here, image.affine, other.affine)
+    if alike and apart <= SAME_PLACE * voxel:  # what is not finite is not
         return
     how = f"their corners lie up to {apart:.3g} mm apart" if alike else f"{list(here)} and {list(there)} voxels"
     raise InputDataError(

@@ -21,7 +21,7 @@ from palpate.images.input_file import open_input
 from palpate.images.named_labels import printable
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
 from palpate.images.readers.text_header import beside, counts, header_line, numbers
-from palpate.images.readers.voxel_stream import MAX_OFFSET, VoxelBlock, damaged, read_block
+from palpate.images.readers.voxel_stream import MAX_OFFSET, VoxelBlock, bytes_to_skip, damaged, read_block
 
 __all__ = ["read_metaimage"]
 
@@ -110,7 +110,14 @@ def _block(header: Mapping[str, str], path: Path) -> VoxelBlock:
         )
     dtype = np.dtype(code).newbyteorder(">" if _flag(header, "binarydatabyteordermsb", path) else "<")
     packing = "zlib" if _flag(header, "compresseddata", path) else "raw"
-    return VoxelBlock(sizes, dtype, packing, _skip(header, packing, path))
+    text = header.get("headersize", "0")
+    skip = bytes_to_skip(text, packing)
+    if skip is None or (packing != "raw" and text != "0"):
+        raise InputDataError(
+            f"the header of '{path}' has 'HeaderSize = {printable(text[:30])}', not a number of bytes from 0 to"
+            f" {MAX_OFFSET}; export the image again"
+        )
+    return VoxelBlock(sizes, dtype, packing, skip)
 
 
 def _flag(header: Mapping[str, str], field: str, path: Path, *, default: bool = False) -> bool:
@@ -120,20 +127,6 @@ def _flag(header: Mapping[str, str], field: str, path: Path, *, default: bool = 
             f"the header of '{path}' has '{field} = {printable(value[:30])}', not True or False; correct it"
         )
     return value in ("true", "1")
-
-
-def _skip(header: Mapping[str, str], packing: str, path: Path) -> int:
-    text = header.get("headersize", "0")
-    if text == "-1" and packing == "raw":
-        return -1
-    if not (text.isascii() and text.isdigit() and len(text) <= 12 and int(text) <= MAX_OFFSET) or (
-        packing != "raw" and text != "0"
-    ):
-        raise InputDataError(
-            f"the header of '{path}' has 'HeaderSize = {printable(text[:30])}', not a number of bytes from 0 to"
-            f" {MAX_OFFSET}; export the image again"
-        )
-    return int(text)
 
 
 def _affine(header: Mapping[str, str], path: Path) -> NDArray[np.float64]:

@@ -12,7 +12,6 @@ import io
 import math
 import os
 import zlib
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -23,10 +22,10 @@ from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, InputDataError, ResourceError
 from palpate.images.input_file import open_input
-from palpate.images.label_image import LabelImage, VoxelGrid
+from palpate.images.label_image import LabelImage, VoxelGrid, corners_apart
 from palpate.images.readers.nifti_extension import extension_names
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
-from palpate.images.readers.voxel_stream import MAX_OFFSET, check_end, check_size, damaged, read_exactly
+from palpate.images.readers.voxel_stream import MAX_OFFSET, VoxelBlock, check_end, check_size, damaged, read_exactly
 
 __all__ = ["read_nifti", "write_label_image", "write_scalar_image"]
 
@@ -35,50 +34,35 @@ HEADERS = {348: nibabel.Nifti1Header, 540: nibabel.Nifti2Header}
 MAGIC = {348: b"n+1\0", 540: b"n+2\0\r\n\032\n"}
 
 
-@dataclass(frozen=True, slots=True)
-class _Layout:
-    """What the header says: `shape` and `dtype` of the voxels, where they begin (bytes), their scale, their place."""
-
-    shape: tuple[int, int, int]
-    dtype: np.dtype[Any]
-    offset: int
-    slope: float
-    intercept: float
-    affine: NDArray[np.float64]
-
-    @property
-    def n_bytes(self) -> int:
-        """Size of the voxels, bytes."""
-        return math.prod(self.shape) * self.dtype.itemsize
-
-
 def read_nifti(path: Path) -> StoredImage:
     """Read one image of three axes from `path`; raises `InputDataError` with a sentence for whatever is wrong."""
     try:
         with open_input(path) as file:
-            stream = _uncompressed(file, path)
+            zipped = file.read(2) == b"\x1f\x8b"
+            file.seek(0)
+            if zipped != path.name.lower().endswith(".gz"):
+                is_and_should = ("is compressed", ".nii.gz") if zipped else ("is not compressed by gzip", ".nii")
+                raise InputDataError(
+                    f"'{path}' {is_and_should[0]}, against its ending; rename it to {is_and_should[1]}"
+                )
+            stream = io.BufferedReader(gzip.GzipFile(fileobj=file, mode="rb")) if zipped else file
             header, used = _header(stream, path)
-            layout = _layout(header, path)
+            block, slope, intercept = _block(header, path)
+            affine = _affine(header, path)
             packed = stream is not file
-            check_size(layout.shape, layout.offset + layout.n_bytes, path, available=file.n_bytes, packed=packed)
-            between = read_exactly(stream, layout.offset - used, path).tobytes()
-            values = read_exactly(stream, layout.n_bytes, path).view(layout.dtype)
-            check_end(stream, layout.n_bytes, path)
+            check_size(block.shape, block.skip + block.n_bytes, path, available=file.n_bytes, packed=packed)
+            between = read_exactly(stream, block.skip - used, path).tobytes()
+            values = read_exactly(stream, block.n_bytes, path).view(block.dtype)
+            check_end(stream, block.n_bytes, path)
             digests = {"": file.sha256()}
     except (OSError, EOFError, zlib.error) as error:
         raise damaged(path, error) from error
-    values = _scaled(values.reshape(layout.shape, order="F"), layout)
+    values = values.reshape(block.shape, order="F").astype(block.dtype.newbyteorder("="), copy=False)
+    if (slope, intercept) != (1.0, 0.0):
+        with np.errstate(over="ignore", invalid="ignore"):
+            values = np.asarray(values * slope + intercept)
     names = extension_names(between, header.endianness, path)
-    return StoredImage(values, layout.affine, names, digests)
-
-
-def _uncompressed(file: BinaryIO, path: Path) -> BinaryIO:
-    zipped = file.read(2) == b"\x1f\x8b"
-    file.seek(0)
-    if zipped != path.name.lower().endswith(".gz"):
-        is_and_should = ("is compressed", ".nii.gz") if zipped else ("is not compressed by gzip", ".nii")
-        raise InputDataError(f"'{path}' {is_and_should[0]}, against its ending; rename it to {is_and_should[1]}")
-    return io.BufferedReader(gzip.GzipFile(fileobj=file, mode="rb")) if zipped else file
+    return StoredImage(values, affine, names, digests)
 
 
 def _header(stream: BinaryIO, path: Path) -> tuple[Any, int]:
@@ -98,7 +82,8 @@ def _header(stream: BinaryIO, path: Path) -> tuple[Any, int]:
     raise InputDataError(f"'{path}' does not begin as a NIfTI file does; export the image as NIfTI (.nii.gz)")
 
 
-def _layout(header: Any, path: Path) -> _Layout:
+def _block(header: Any, path: Path) -> tuple[VoxelBlock, float, float]:
+    """What the header says of the voxels, and the slope and intercept of their scale."""
     try:
         dtype = np.dtype(header.get_data_dtype())
         slope, intercept = header.get_slope_inter()
@@ -109,17 +94,6 @@ def _layout(header: Any, path: Path) -> _Layout:
             f"the voxels of '{path}' are of the type {dtype}; only integers and floats of up to 64 bits are read:"
             " export one grey or label channel"
         )
-    return _Layout(
-        shape=_shape(header, path),
-        dtype=dtype,
-        offset=_offset(header, path),
-        slope=1.0 if slope is None else float(slope),
-        intercept=0.0 if intercept is None else float(intercept),
-        affine=_affine(header, path),
-    )
-
-
-def _shape(header: Any, path: Path) -> tuple[int, int, int]:
     dim = [int(n) for n in header["dim"]]
     sizes = dim[1 : 1 + dim[0]] if 1 <= dim[0] <= 7 else []
     if not sizes or min(sizes) < 1:
@@ -129,20 +103,15 @@ def _shape(header: Any, path: Path) -> tuple[int, int, int]:
             f"'{path}' has the sizes {sizes}, but an image of three axes is needed; extract one volume (a time point,"
             " a channel) or stack the slices"
         )
-    return sizes[0], sizes[1], sizes[2]
-
-
-def _offset(header: Any, path: Path) -> int:
-    stated = float(header["vox_offset"])
     first = int(header["sizeof_hdr"]) + 4  # four bytes announce extensions; 0 is written by old programs for this
-    if stated == 0.0:
-        return first
-    if not math.isfinite(stated) or not first <= stated <= MAX_OFFSET:
+    offset = float(header["vox_offset"]) or float(first)
+    if not math.isfinite(offset) or not first <= offset <= MAX_OFFSET:
         raise InputDataError(
-            f"the header of '{path}' puts the first voxel at byte {stated:g}, not between {first} and {MAX_OFFSET};"
+            f"the header of '{path}' puts the first voxel at byte {offset:g}, not between {first} and {MAX_OFFSET};"
             " export the image again"
         )
-    return int(stated)
+    block = VoxelBlock((sizes[0], sizes[1], sizes[2]), dtype, skip=int(offset))
+    return block, 1.0 if slope is None else float(slope), 0.0 if intercept is None else float(intercept)
 
 
 def _affine(header: Any, path: Path) -> NDArray[np.float64]:
@@ -154,7 +123,13 @@ def _affine(header: Any, path: Path) -> NDArray[np.float64]:
     except (HeaderDataError, ValueError) as error:
         raise InputDataError(f"the qform in the header of '{path}' is damaged: {error}; set an sform") from error
     if affine is not None and qform is not None:
-        _refuse_disagreement(affine, qform, header, path)
+        # which of two places is right, nobody can tell here; half a voxel is more than rounding
+        apart, voxel = corners_apart([float(n) for n in header["dim"][1:4]], affine, qform)
+        if apart > 0.5 * voxel:
+            raise InputDataError(
+                f"sform and qform in the header of '{path}' place its corners up to {apart:.3g} mm apart; delete the"
+                " wrong one (set its code to 0), or export the image again"
+            )
     affine = qform if affine is None else affine
     if affine is None:
         raise InputDataError(
@@ -168,28 +143,6 @@ def _affine(header: Any, path: Path) -> NDArray[np.float64]:
     with np.errstate(all="ignore"):
         scaled[:3] *= MILLIMETRES[unit]
     return scaled
-
-
-def _refuse_disagreement(sform: NDArray[np.float64], qform: NDArray[np.float64], header: Any, path: Path) -> None:
-    """Which of two places is right, nobody can tell here; half a voxel is more than rounding."""
-    sizes = np.maximum(np.array(header["dim"][1:4], dtype=float) - 1.0, 0.0)
-    corners = np.array([[*(sizes * np.array(c)), 1.0] for c in np.ndindex(2, 2, 2)])
-    with np.errstate(all="ignore"):
-        apart = float(np.linalg.norm((corners @ (sform - qform).T)[:, :3], axis=1).max())
-        voxel = float(np.linalg.norm(sform[:3, :3], axis=0).min())
-    if apart > 0.5 * voxel:
-        raise InputDataError(
-            f"sform and qform in the header of '{path}' place its corners up to {apart:.3g} mm apart; delete the wrong"
-            " one (set its code to 0), or export the image again"
-        )
-
-
-def _scaled(values: NDArray[Any], layout: _Layout) -> NDArray[Any]:
-    native = values.astype(layout.dtype.newbyteorder("="), copy=False)
-    if layout.slope == 1.0 and layout.intercept == 0.0:
-        return native
-    with np.errstate(over="ignore", invalid="ignore"):
-        return np.asarray(native * layout.slope + layout.intercept)
 
 
 def write_label_image(path: Path | str, image: LabelImage) -> None:
@@ -224,11 +177,7 @@ def _write(path: Path, values: NDArray[Any], grid: VoxelGrid) -> None:
     content: bytes = image.to_bytes()
     if path.name.lower().endswith(".gz"):
         content = gzip.compress(content, compresslevel=6, mtime=0)  # no time stamp: equal images give equal files
-    _replace(path, content)
-
-
-def _replace(path: Path, content: bytes) -> None:
-    """Put `content` at `path` in one step, so that a crash never leaves half a file there."""
+    # in one step, so that a crash never leaves half a file there
     temporary = path.with_name(f".{path.name[:50]}.{os.getpid()}.tmp")
     try:
         with temporary.open("wb") as file:

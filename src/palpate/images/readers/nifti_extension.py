@@ -12,8 +12,8 @@ from typing import Literal
 from xml.parsers import expat
 
 from palpate.errors import InputDataError
-from palpate.images.named_labels import MAX_NAME, NamedLabel, hex_colour, printable
-from palpate.images.readers.text_header import NUMBER
+from palpate.images.named_labels import MAX_NAME, NamedLabel, printable
+from palpate.images.readers.text_header import unit_colour
 
 __all__ = ["extension_names"]
 
@@ -28,24 +28,16 @@ def extension_names(content: bytes, byte_order: Literal["<", ">"], path: Path) -
 
     Raises `InputDataError` for a table that is damaged, too large, or declares a document type.
     """
-    for code, data in _extensions(content, byte_order):
-        text = data.rstrip(b"\0 \r\n\t")
-        if code == 0 and f"<{ROOT}".encode() in text[:1000]:
-            return tuple(_Table(path).read(text))
-    return ()
-
-
-def _extensions(content: bytes, byte_order: str) -> list[tuple[int, bytes]]:
-    """Code and data of each extension, up to the first whose size cannot be."""
-    found: list[tuple[int, bytes]] = []
     place = 4
     while content[:1] not in (b"", b"\0") and place + 8 <= len(content):
         size, code = struct.unpack_from(f"{byte_order}2i", content, place)
-        if not 8 <= size <= len(content) - place:
+        if not 8 <= size <= len(content) - place:  # a size that cannot be: nothing behind it can be found
             break
-        found.append((code, content[place + 8 : place + size]))
+        text = content[place + 8 : place + size].rstrip(b"\0 \r\n\t")
+        if code == 0 and f"<{ROOT}".encode() in text[:1000]:
+            return tuple(_Table(path).read(text))
         place += size
-    return found
+    return ()
 
 
 class _Table:
@@ -103,6 +95,4 @@ class _Table:
         if not (key.isascii() and key.isdigit() and len(key) <= 9) or len(name) > MAX_NAME:
             raise self._refused(f"have the entry '{printable(key[:20])}': '{name[:50]}'")
         parts = [self._attributes.get(colour, "") for colour in ("Red", "Green", "Blue")]
-        plain = all(NUMBER.fullmatch(part) for part in parts)
-        red, green, blue = (float(part) for part in parts) if plain else (-1.0, -1.0, -1.0)
-        return NamedLabel(int(key), name, hex_colour(red, green, blue, top=1.0))
+        return NamedLabel(int(key), name, unit_colour(parts))

@@ -23,7 +23,7 @@ from palpate.images.named_labels import printable
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
 from palpate.images.readers.segments import flattened, segments_of
 from palpate.images.readers.text_header import beside, counts, header_line, numbers
-from palpate.images.readers.voxel_stream import MAX_OFFSET, VoxelBlock, damaged, read_block
+from palpate.images.readers.voxel_stream import MAX_OFFSET, VoxelBlock, bytes_to_skip, damaged, read_block
 
 __all__ = ["read_nrrd"]
 
@@ -100,7 +100,11 @@ def read_nrrd(path: Path) -> StoredImage:
             if name is not None:
                 file = stack.enter_context(open_input(beside(path, name)))
                 files.append(file)
-            _skip_lines(file, header)
+            text = header.fields.get("line skip", "0")
+            if not (text.isascii() and text.isdigit() and len(text) <= 4):
+                raise header.refused("line skip", "it must lie between 0 and 9999; export the image again")
+            for _ in range(int(text)):
+                header_line(file, header.path)
             values = read_block(file, block, path)
             digests = {part: each.sha256() for part, each in zip(("", "voxels"), files, strict=False)}
     except (OSError, EOFError, zlib.error) as error:
@@ -143,26 +147,10 @@ def _block(header: _Header) -> VoxelBlock:
     endian = header.fields.get("endian", "little" if code[1] == "1" else "").lower()
     if endian not in ("little", "big"):
         raise header.refused("endian", "it must be little or big; export the image again")
-    return VoxelBlock(
-        sizes, np.dtype(code).newbyteorder("<" if endian == "little" else ">"), packing, _skip(header, packing)
-    )
-
-
-def _skip(header: _Header, packing: str) -> int:
-    text = header.fields.get("byte skip", "0")
-    if text == "-1" and packing == "raw":
-        return -1
-    if not (text.isascii() and text.isdigit() and len(text) <= 12 and int(text) <= MAX_OFFSET):
+    skip = bytes_to_skip(header.fields.get("byte skip", "0"), packing)
+    if skip is None:
         raise header.refused("byte skip", f"it must lie between 0 and {MAX_OFFSET}; export the image again")
-    return int(text)
-
-
-def _skip_lines(file: BinaryIO, header: _Header) -> None:
-    text = header.fields.get("line skip", "0")
-    if not (text.isascii() and text.isdigit() and len(text) <= 4):
-        raise header.refused("line skip", "it must lie between 0 and 9999; export the image again")
-    for _ in range(int(text)):
-        header_line(file, header.path)
+    return VoxelBlock(sizes, np.dtype(code).newbyteorder("<" if endian == "little" else ">"), packing, skip)
 
 
 def _place(header: _Header) -> _Place:
@@ -183,21 +171,16 @@ def _place(header: _Header) -> _Place:
         affine[:3, column] = _vector(vectors[k][1], header, "space directions")
     origin = VECTOR.fullmatch(header.fields.get("space origin", "(0,0,0)"))
     affine[:3, 3] = _vector((origin and origin[1]) or "", header, "space origin")
-    affine[:3] *= np.array(signs)[:, None] * _unit(header)
+    units = set(re.findall(r'"([^"]*)"', header.fields.get("space units", '"mm"')))
+    if len(units) != 1 or not units <= set(MILLIMETRES):
+        raise header.refused("space units", 'it must be "mm" "mm" "mm"; correct it')
+    affine[:3] *= np.array(signs)[:, None] * MILLIMETRES[units.pop()]
     affine += 0.0  # no minus zero
     return _Place(affine, tuple(k for k in range(len(vectors)) if k not in in_space))
 
 
 def _vector(text: str, header: _Header, field: str) -> NDArray[np.float64]:
     return numbers(text.replace(",", " "), 3, header.path, field=field)
-
-
-def _unit(header: _Header) -> float:
-    """Millimetres of the unit of length, the same along all axes."""
-    units = set(re.findall(r'"([^"]*)"', header.fields.get("space units", '"mm"')))
-    if len(units) != 1 or not units <= set(MILLIMETRES):
-        raise header.refused("space units", 'it must be "mm" "mm" "mm"; correct it')
-    return MILLIMETRES[units.pop()]
 
 
 def _image(values: NDArray[np.generic], header: _Header, place: _Place) -> StoredImage:

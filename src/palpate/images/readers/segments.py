@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
-from palpate.images.named_labels import MAX_LABEL, MAX_NAME, NamedLabel, hex_colour, printable
-from palpate.images.readers.text_header import NUMBER
+from palpate.images.named_labels import MAX_LABEL, MAX_NAME, NamedLabel, printable
+from palpate.images.readers.text_header import unit_colour
 
 __all__ = ["Segment", "flattened", "segments_of"]
 
@@ -48,19 +48,18 @@ def segments_of(keys: Mapping[str, str], path: Path) -> tuple[Segment, ...]:
         (number, entry) for number, entry in sorted(found.items()) if {"ID", "Name", "LabelValue"} & set(entry)
     ]
     old = not any("Layer" in entry or "LabelValue" in entry for _, entry in described)
-    segments = tuple(_segment(entry, number, path, old=old) for number, entry in described)
+    segments = []
+    for number, entry in described:
+        name = printable(entry.get("Name", "").strip())[:MAX_NAME] or f"segment {number + 1}"
+        layer = number if old else _whole(entry.get("Layer", "0"), path, low=0)
+        label = _whole(entry.get("LabelValue", "1"), path, low=1)
+        segments.append(Segment(name, unit_colour(entry.get("Color", "").split()), layer, label))
     if len({(s.layer, s.label) for s in segments}) < len(segments):
         raise InputDataError(
             f"'{path}' has two segments with the same label value in one layer, so one of them is lost; export the"
             " segmentation again"
         )
-    return segments
-
-
-def _segment(entry: Mapping[str, str], number: int, path: Path, *, old: bool) -> Segment:
-    name = printable(entry.get("Name", "").strip())[:MAX_NAME] or f"segment {number + 1}"
-    layer = number if old else _whole(entry.get("Layer", "0"), path, low=0)
-    return Segment(name, _colour(entry.get("Color", "")), layer, _whole(entry.get("LabelValue", "1"), path, low=1))
+    return tuple(segments)
 
 
 def _whole(text: str, path: Path, *, low: int) -> int:
@@ -71,14 +70,6 @@ def _whole(text: str, path: Path, *, low: int) -> int:
             f" from {low} to {MAX_LABEL}: export the segmentation again"
         )
     return int(text)
-
-
-def _colour(text: str) -> str | None:
-    words = text.split()
-    if len(words) != 3 or not all(NUMBER.fullmatch(word) for word in words):
-        return None
-    red, green, blue = (float(word) for word in words)
-    return hex_colour(red, green, blue, top=1.0)
 
 
 def flattened(
@@ -99,10 +90,6 @@ def flattened(
     names = tuple(NamedLabel(label, s.name, s.colour) for label, s in zip(labels, segments, strict=True))
     if len(layers) == 1:
         return layers[0], names
-    return _merged(layers, segments, labels, path), names
-
-
-def _merged(layers: NDArray[Any], segments: tuple[Segment, ...], labels: list[int], path: Path) -> NDArray[np.uint16]:
     merged = np.zeros(layers.shape[1:], dtype=np.uint16)
     for k, layer in enumerate(layers):
         ours = [(s, label) for s, label in zip(segments, labels, strict=True) if s.layer == k]
@@ -117,7 +104,7 @@ def _merged(layers: NDArray[Any], segments: tuple[Segment, ...], labels: list[in
                 " there (3D Slicer: Segment Editor, allow no overlap)"
             )
         merged += mapped
-    return merged
+    return merged, names
 
 
 def _relabelled(layer: NDArray[Any], segments: list[tuple[Segment, int]], path: Path) -> NDArray[np.uint16]:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 
 from palpate.errors import InputDataError
 from palpate.images.named_labels import NamedLabel
-from palpate.images.readers.delimited import column_names, delimited_rows, whole_number
+from palpate.images.readers.delimited import column_names, delimited_rows, separated_by, whole_number
 from palpate.images.readers.table_registry import TableFormat, register_table
 
 __all__ = ["read_bids_table"]
 
-COLOUR = re.compile(r"#[0-9a-fA-F]{6}")
+COLOUR = re.compile(r"#[0-9a-f]{6}")
 
 
 def read_bids_table(text: str, path: Path) -> list[NamedLabel]:
@@ -20,18 +21,12 @@ def read_bids_table(text: str, path: Path) -> list[NamedLabel]:
     missing = {"index", "name"} - set(column_names(text, "\t"))
     if missing:
         raise InputDataError(f"the label table '{path}' lacks the columns {sorted(missing)}; it needs index and name")
-    return [
-        NamedLabel(whole_number(row.get("index", ""), path), row.get("name", ""), _colour(row.get("color", "")))
-        for row in delimited_rows(text, path, delimiter="\t")
-    ]
+    rows = []
+    for row in delimited_rows(text, path, delimiter="\t"):
+        colour = row.get("color", "").lower()
+        label = whole_number(row.get("index", ""), path)
+        rows.append(NamedLabel(label, row.get("name", ""), colour if COLOUR.fullmatch(colour) else None))
+    return rows
 
 
-def _colour(text: str) -> str | None:
-    return text.lower() if COLOUR.fullmatch(text) else None
-
-
-def _recognised(text: str) -> bool:
-    return "\t" in text.partition("\n")[0]
-
-
-register_table(TableFormat("a BIDS dseg.tsv", (".tsv",), _recognised, read_bids_table))
+register_table(TableFormat("a BIDS dseg.tsv", (".tsv",), partial(separated_by, delimiter="\t"), read_bids_table))

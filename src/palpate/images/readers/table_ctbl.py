@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 
 from palpate.images.named_labels import NamedLabel
@@ -22,8 +23,6 @@ def read_ctbl_table(text: str, path: Path) -> list[NamedLabel]:
     return pattern_rows(text, path, ROW, form="the form `1 prostate 255 0 0 255` (no blank in a name)")
 
 
-def _recognised(text: str) -> bool:
-    return begins_with(text, ROW)
-
-
-register_table(TableFormat("3D Slicer's colour table", (".ctbl", ".txt"), _recognised, read_ctbl_table))
+register_table(
+    TableFormat("3D Slicer's colour table", (".ctbl", ".txt"), partial(begins_with, pattern=ROW), read_ctbl_table)
+)

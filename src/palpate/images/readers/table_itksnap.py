@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 
 from palpate.images.named_labels import NamedLabel
@@ -12,7 +13,7 @@ from palpate.images.readers.table_registry import TableFormat, register_table
 __all__ = ["read_itksnap_table"]
 
 ROW = re.compile(
-    r"\s*(?P<label>[0-9]{1,9})\s+" + COLOURS + r'\s+[0-9.eE+-]{1,20}\s+[0-9]\s+[0-9]\s+"(?P<name>[^"]*)"\s*',
+    r"\s*(?P<label>[0-9]{1,9})\s+" + COLOURS + r'\s+[0-9.eE+-]{1,20}\s+[0-9]\s+[0-9]\s+"(?P<name>[^"]*)"\s*'
 )
 QUOTED = re.compile(r'.*".*')
 
@@ -22,8 +23,8 @@ def read_itksnap_table(text: str, path: Path) -> list[NamedLabel]:
     return pattern_rows(text, path, ROW, form='ITK-SNAP\'s form `1 255 0 0 1 1 1 "prostate"`')
 
 
-def _recognised(text: str) -> bool:
-    return begins_with(text, QUOTED)
-
-
-register_table(TableFormat("ITK-SNAP's label description", (".txt", ".label"), _recognised, read_itksnap_table))
+register_table(
+    TableFormat(
+        "ITK-SNAP's label description", (".txt", ".label"), partial(begins_with, pattern=QUOTED), read_itksnap_table
+    )
+)

@@ -33,22 +33,20 @@ def read_json_table(text: str, path: Path) -> list[NamedLabel]:
             pairs = value
     if not pairs:
         raise InputDataError(f'the label table \'{path}\' names no label; write {{"1": "prostate"}}')
-    return [_entry(key, value, path) for key, value in pairs]
-
-
-def _entry(key: str, value: Any, path: Path) -> NamedLabel:
-    """One member, whichever side holds the number."""
-    number, name = (value, key) if isinstance(value, int) and not isinstance(value, bool) else (key, value)
-    plain = isinstance(number, int) or (isinstance(number, str) and DIGITS.fullmatch(number))
-    label = int(number) if plain else -1
-    if not 0 <= label <= MAX_LABEL or not isinstance(name, str) or not name.strip() or len(name) > MAX_NAME:
-        kind = {_Pairs: "an object", list: "a list", int: "a number"}.get(type(value), "")
-        shown = kind or repr(str(value)[:50])
-        raise InputDataError(
-            f"the label table '{path}' has the entry {key[:50]!r}: {shown}; it must be a label from 0"
-            f" to {MAX_LABEL} and a name of 1 to {MAX_NAME} characters"
-        )
-    return NamedLabel(label, name)
+    rows = []
+    for key, value in pairs:  # whichever side holds the number
+        number, name = (value, key) if isinstance(value, int) and not isinstance(value, bool) else (key, value)
+        plain = isinstance(number, int) or (isinstance(number, str) and DIGITS.fullmatch(number))
+        label = int(number) if plain else -1
+        if not 0 <= label <= MAX_LABEL or not isinstance(name, str) or not name.strip() or len(name) > MAX_NAME:
+            kind = {_Pairs: "an object", list: "a list", int: "a number"}.get(type(value), "")
+            shown = kind or repr(str(value)[:50])
+            raise InputDataError(
+                f"the label table '{path}' has the entry {key[:50]!r}: {shown}; it must be a label from 0"
+                f" to {MAX_LABEL} and a name of 1 to {MAX_NAME} characters"
+            )
+        rows.append(NamedLabel(label, name))
+    return rows
 
 
 def _any_text(text: str) -> bool:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 
 from palpate.errors import InputDataError
 from palpate.images.named_labels import NamedLabel, computed_by_spreadsheets, hex_colour
-from palpate.images.readers.delimited import column_names, delimited_rows, whole_number
+from palpate.images.readers.delimited import column_names, delimited_rows, separated_by, whole_number
 from palpate.images.readers.table_registry import TableFormat, register_table
 
 __all__ = ["read_slicer_table", "slicer_table"]
@@ -22,15 +23,17 @@ def read_slicer_table(text: str, path: Path) -> list[NamedLabel]:
     missing = {"labelvalue", "name"} - set(column_names(text, ","))
     if missing:
         raise InputDataError(f"the label table '{path}' lacks the columns {sorted(missing)}; it needs LabelValue, Name")
-    rows = delimited_rows(text, path, delimiter=",")
-    return [
-        NamedLabel(
-            whole_number(row.get("labelvalue", ""), path),
-            _unquoted(row.get("name", "")),
-            _colour([row.get(f"color_{letter}", "") for letter in "rgb"]),
+    found = []
+    for row in delimited_rows(text, path, delimiter=","):
+        name, parts = row.get("name", ""), [row.get(f"color_{letter}", "") for letter in "rgb"]
+        if name.startswith("'") and computed_by_spreadsheets(name[1:]):
+            name = name[1:]
+        plain = all(part.isascii() and part.isdigit() and len(part) <= 3 for part in parts)
+        red, green, blue = map(int, parts) if plain else (-1, -1, -1)
+        found.append(
+            NamedLabel(whole_number(row.get("labelvalue", ""), path), name, hex_colour(red, green, blue, top=255))
         )
-        for row in rows
-    ]
+    return found
 
 
 def slicer_table(rows: Iterable[NamedLabel]) -> str:
@@ -48,19 +51,6 @@ def slicer_table(rows: Iterable[NamedLabel]) -> str:
     return text.getvalue()
 
 
-def _unquoted(name: str) -> str:
-    return name[1:] if name.startswith("'") and computed_by_spreadsheets(name[1:]) else name
-
-
-def _colour(parts: list[str]) -> str | None:
-    if not all(part.isascii() and part.isdigit() and len(part) <= 3 for part in parts):
-        return None
-    red, green, blue = (int(part) for part in parts)
-    return hex_colour(red, green, blue, top=255)
-
-
-def _recognised(text: str) -> bool:
-    return "," in text.partition("\n")[0]
-
-
-register_table(TableFormat("3D Slicer's CSV colour table", (".csv",), _recognised, read_slicer_table))
+register_table(
+    TableFormat("3D Slicer's CSV colour table", (".csv",), partial(separated_by, delimiter=","), read_slicer_table)
+)

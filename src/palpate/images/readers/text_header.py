@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -11,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
-from palpate.images.named_labels import printable
+from palpate.images.named_labels import hex_colour, printable
 
-__all__ = ["NUMBER", "beside", "counts", "header_line", "numbers"]
+__all__ = ["beside", "counts", "header_line", "numbers", "unit_colour"]
 
 # Not what float() takes besides: nan, inf, 1_0, digits of other scripts.
 NUMBER = re.compile(r"[+-]?([0-9]{1,400}\.?[0-9]{0,400}|\.[0-9]{1,400})([eE][+-]?[0-9]{1,9})?")
@@ -49,6 +50,14 @@ def numbers(text: str, n: int, path: Path, *, field: str) -> NDArray[np.float64]
             " needed; export the image again"
         )
     return values
+
+
+def unit_colour(words: Sequence[str]) -> str | None:
+    """Colour #rrggbb of three numbers from 0 to 1; None where they are anything else."""
+    if len(words) != 3 or not all(NUMBER.fullmatch(word) for word in words):
+        return None
+    red, green, blue = (float(word) for word in words)
+    return hex_colour(red, green, blue, top=1.0)
 
 
 def counts(text: str, path: Path, *, field: str) -> tuple[int, ...]:

@@ -30,7 +30,22 @@ def label_values(values: NDArray[Any], path: Path) -> NDArray[Any]:
     Floats are rounded when they are within 1e-3 of an integer. Raises `InputDataError` for what is no label image.
     """
     if values.dtype.kind == "f":
-        values = _rounded(values, path)
+        lost = int(values.size - np.count_nonzero(np.isfinite(values)))
+        if lost:
+            raise InputDataError(
+                f"'{path}' has {lost} of {values.size} voxels that are NaN or infinite; a label is an integer from 0 to"
+                f" {MAX_LABEL}: give those voxels a label (0 for background)"
+            )
+        whole = np.rint(values)
+        away = np.abs(values - whole)
+        worst = np.unravel_index(int(np.argmax(away)), values.shape)
+        if away[worst] > INTEGRAL_TOLERANCE:
+            raise InputDataError(
+                f"'{path}' is no label image: {np.count_nonzero(away > INTEGRAL_TOLERANCE)} of {values.size} voxels are"
+                f" not integers, as {values[worst]:.6g}; threshold a probability map, or resample labels with nearest"
+                " neighbour"
+            )
+        values = whole
     low, high = values.min(), values.max()
     if low < 0 or high > MAX_LABEL:
         raise InputDataError(
@@ -38,24 +53,6 @@ def label_values(values: NDArray[Any], path: Path) -> NDArray[Any]:
             " is this a grey image? Name the label image (segmentation) instead, or renumber its labels"
         )
     return values.astype(np.uint8 if high <= 255 else np.uint16, copy=False)
-
-
-def _rounded(values: NDArray[np.floating[Any]], path: Path) -> NDArray[np.floating[Any]]:
-    lost = int(values.size - np.count_nonzero(np.isfinite(values)))
-    if lost:
-        raise InputDataError(
-            f"'{path}' has {lost} of {values.size} voxels that are NaN or infinite; a label is an integer from 0 to"
-            f" {MAX_LABEL}: give those voxels a label (0 for background)"
-        )
-    whole = np.rint(values)
-    away = np.abs(values - whole)
-    worst = np.unravel_index(int(np.argmax(away)), values.shape)
-    if away[worst] > INTEGRAL_TOLERANCE:
-        raise InputDataError(
-            f"'{path}' is no label image: {np.count_nonzero(away > INTEGRAL_TOLERANCE)} of {values.size} voxels are not"
-            f" integers, as {values[worst]:.6g}; threshold a probability map, or resample labels with nearest neighbour"
-        )
-    return np.asarray(whole)
 
 
 REDUCED: Mapping[str, Callable[[NDArray[Any], Path], NDArray[Any]]] = {

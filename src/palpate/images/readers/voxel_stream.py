@@ -6,7 +6,6 @@ import gzip
 import io
 import math
 import zlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -17,7 +16,17 @@ from numpy.typing import NDArray
 from palpate.errors import InputDataError
 from palpate.images.input_file import InputFile
 
-__all__ = ["MAX_OFFSET", "MAX_VOXELS", "VoxelBlock", "check_end", "check_size", "damaged", "read_block", "read_exactly"]
+__all__ = [
+    "MAX_OFFSET",
+    "MAX_VOXELS",
+    "VoxelBlock",
+    "bytes_to_skip",
+    "check_end",
+    "check_size",
+    "damaged",
+    "read_block",
+    "read_exactly",
+]
 
 MAX_VOXELS = 2**29  # 512 x 512 x 2048, a whole body at 1 mm; a distance map of it would take 4 GiB
 MAX_OFFSET = 2**26  # bytes that may stand between header and voxels
@@ -45,6 +54,14 @@ class VoxelBlock:
         return math.prod(self.shape) * self.dtype.itemsize
 
 
+def bytes_to_skip(text: str, packing: str) -> int | None:
+    """A header's number for `VoxelBlock.skip`, -1 for raw voxels only; None where `text` is no number that can be."""
+    if text == "-1" and packing == "raw":
+        return -1
+    plain = text.isascii() and text.isdigit() and len(text) <= 12 and int(text) <= MAX_OFFSET
+    return int(text) if plain else None
+
+
 def read_block(file: InputFile, block: VoxelBlock, path: Path) -> NDArray[Any]:
     """The voxels (n_1, n_2, n_3), or with more axes, in the machine's byte order, from where `file` stands.
 
@@ -58,7 +75,11 @@ def read_block(file: InputFile, block: VoxelBlock, path: Path) -> NDArray[Any]:
     )
     if block.skip < 0:
         file.seek(file.n_bytes - block.n_bytes)
-    stream = _UNPACKED[block.packing](file)
+    stream: BinaryIO = file
+    if block.packing == "gzip":
+        stream = io.BufferedReader(gzip.GzipFile(fileobj=file, mode="rb"))
+    elif block.packing == "zlib":
+        stream = io.BufferedReader(_Inflated(file), buffer_size=CHUNK)
     read_exactly(stream, max(block.skip, 0), path)
     values = read_exactly(stream, block.n_bytes, path).view(block.dtype)
     check_end(stream, block.n_bytes, path)
@@ -136,21 +157,6 @@ class _Inflated(io.RawIOBase):
             if not packed:
                 raise EOFError("the compressed voxels end before their end mark")
         return 0
-
-
-def _raw(file: BinaryIO) -> BinaryIO:
-    return file
-
-
-def _gunzipped(file: BinaryIO) -> BinaryIO:
-    return io.BufferedReader(gzip.GzipFile(fileobj=file, mode="rb"))
-
-
-def _inflated(file: BinaryIO) -> BinaryIO:
-    return io.BufferedReader(_Inflated(file), buffer_size=CHUNK)
-
-
-_UNPACKED: dict[str, Callable[[BinaryIO], BinaryIO]] = {"raw": _raw, "gzip": _gunzipped, "zlib": _inflated}
 
 
 def _sizes(shape: tuple[int, ...]) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import permutations
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,15 +12,9 @@ Array = NDArray[np.float64]
 IDENTITY4 = np.einsum("ik,jl->ijkl", np.eye(3), np.eye(3))  # dF_ij / dF_kl
 
 
-def _cofactor_tensor() -> Array:
-    """C (9, 81) with d cof_ij / dF_kl = sum over mn of C_mn,ijkl F_mn: products of two permutation symbols."""
-    epsilon = np.zeros((3, 3, 3))
-    for order in permutations(range(3)):
-        epsilon[order] = np.linalg.det(np.eye(3)[list(order)])
-    return np.asarray(np.einsum("ikm,jln->mnijkl", epsilon, epsilon).reshape(9, 81))
-
-
-COFACTOR_TENSOR = _cofactor_tensor()
+# C (9, 81) with d cof_ij / dF_kl = sum over mn of C_mn,ijkl F_mn: products of two permutation symbols
+PERMUTATION = np.fromfunction(lambda i, j, k: 0.5 * (i - j) * (j - k) * (k - i), (3, 3, 3))
+COFACTOR_TENSOR = np.einsum("ikm,jln->mnijkl", PERMUTATION, PERMUTATION).reshape(9, 81)
 
 
 def cofactors(F: Array) -> Array:

@@ -79,15 +79,11 @@ class MooneyRivlin(FiniteStrain):
         log, h, curvature = log_derivatives(F)
         factor = 2.0 * (a + 2.0 * b) + 4.0 * b * log
         logs = factor[:, None, None, None, None] * curvature + 4.0 * b * dyads(h, h)
-        return np.asarray(2.0 * a * IDENTITY4 + 2.0 * b * _second_invariant_part(F) - logs)
-
-
-def _second_invariant_part(F: Array) -> Array:
-    """d(I1 F - F C)_ij / dF_kl = 2 F_ij F_kl + I1 I - (d_ik C_jl + F_il F_kj + (F F^T)_ik d_jl), (n, 3, 3, 3, 3)."""
-    identity = np.eye(3)
-    C, B = np.einsum("nki,nkj->nij", F, F), np.einsum("nik,njk->nij", F, F)
-    result = 2.0 * dyads(F, F) + np.einsum("nii->n", C)[:, None, None, None, None] * IDENTITY4
-    result -= np.einsum("ik,njl->nijkl", identity, C)
-    result -= np.einsum("nil,nkj->nijkl", F, F)
-    result -= np.einsum("nik,jl->nijkl", B, identity)
-    return np.asarray(result)
+        # d(I1 F - F C)_ij / dF_kl = 2 F_ij F_kl + I1 I - (d_ik C_jl + F_il F_kj + (F F^T)_ik d_jl)
+        identity = np.eye(3)
+        C, B = np.einsum("nki,nkj->nij", F, F), np.einsum("nik,njk->nij", F, F)
+        result = 2.0 * dyads(F, F) + np.einsum("nii->n", C)[:, None, None, None, None] * IDENTITY4
+        result -= np.einsum("ik,njl->nijkl", identity, C)
+        result -= np.einsum("nil,nkj->nijkl", F, F)
+        result -= np.einsum("nik,jl->nijkl", B, identity)
+        return np.asarray(2.0 * a * IDENTITY4 + 2.0 * b * result - logs)

@@ -145,14 +145,11 @@ def _level(matrix: sparse.csr_matrix[np.float64], prolongation: sparse.csr_matri
 
 
 def _expect(matrix: sparse.csr_matrix[np.float64], hints: Hints) -> Expectation:
-    return _expected(matrix.shape[0], matrix.nnz, hints.right_hand_sides)
+    return _expect_of_size(matrix.shape[0], hints.right_hand_sides, matrix.nnz)
 
 
-def _expect_of_size(unknowns: int, right_hand_sides: int) -> Expectation:
-    return _expected(unknowns, ENTRIES * unknowns, right_hand_sides)
-
-
-def _expected(unknowns: int, entries: float, right_hand_sides: int) -> Expectation:
+def _expect_of_size(unknowns: int, right_hand_sides: int, entries: float | None = None) -> Expectation:
+    entries = ENTRIES * unknowns if entries is None else entries
     a_step = STEP_ALONE if right_hand_sides == 1 else STEP_OF_MANY
     seconds = entries * (SET_UP + STEPS * right_hand_sides * a_step)
     return Expectation(seconds, entries * BYTES_AN_ENTRY + 40.0 * unknowns * right_hand_sides)

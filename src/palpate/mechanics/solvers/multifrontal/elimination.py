@@ -86,13 +86,6 @@ def children_of(parent: Integers) -> list[list[int]]:
     return found
 
 
-def _relabelled(parent: Integers, order: Integers) -> Integers:
-    """The tree `parent` with its nodes numbered along `order`."""
-    place = np.empty(len(order) + 1, dtype=np.int64)
-    place[order], place[-1] = np.arange(len(order)), -1
-    return place[parent[order]]
-
-
 def column_counts(lower: sparse.csr_matrix[np.float64], parent: Integers, weight: Integers) -> Integers:
     """Unknowns (n,) in each column of the factor, its own included, of a postordered tree; weight (n,) of each row.
 
@@ -110,25 +103,12 @@ def column_counts(lower: sparse.csr_matrix[np.float64], parent: Integers, weight
     delta -= np.bincount(meet, weight[row[same]], minlength=n)
     delta -= np.where(counts > 0, weight, 0)
     sums = np.concatenate([[0.0], np.cumsum(delta)])
-    below = sums[1:] - sums[np.arange(n) + 1 - _subtree_sizes(parent)]
-    return np.asarray(np.rint(below).astype(np.int64) + weight)
-
-
-def _subtree_sizes(parent: Integers) -> Integers:
     sizes = [1] * len(parent)
     for node, above in enumerate(parent.tolist()):
         if above >= 0:
             sizes[above] += sizes[node]
-    return np.array(sizes, dtype=np.int64)
-
-
-def _depths(parent: Integers) -> Integers:
-    depths = [0] * len(parent)
-    above = parent.tolist()
-    for node in range(len(above) - 1, -1, -1):
-        if above[node] >= 0:
-            depths[node] = depths[above[node]] + 1
-    return np.array(depths, dtype=np.int64)
+    below = sums[1:] - sums[np.arange(n) + 1 - np.array(sizes, dtype=np.int64)]
+    return np.asarray(np.rint(below).astype(np.int64) + weight)
 
 
 def _lowest_common_ancestors(parent: Integers, first: Integers, last: Integers) -> Integers:
@@ -138,7 +118,12 @@ def _lowest_common_ancestors(parent: Integers, first: Integers, last: Integers) 
     child of the ancestor; least depths come from a table of those of 1, 2, 4 ... nodes.
     """
     n = len(parent)
-    table = [_depths(parent) * n + np.arange(n)]
+    depths = [0] * len(parent)
+    above = parent.tolist()
+    for node in range(len(above) - 1, -1, -1):
+        if above[node] >= 0:
+            depths[node] = depths[above[node]] + 1
+    table = [np.array(depths, dtype=np.int64) * n + np.arange(n)]
     while 2 ** len(table) <= n:
         before, half = table[-1], 2 ** (len(table) - 1)
         table.append(np.minimum(before, before[np.minimum(np.arange(n) + half, n - 1)]))
@@ -158,17 +143,13 @@ def supernodes(graph: sparse.csr_matrix[np.float64], order: Integers, weight: In
     begins = (tree[:-1] != np.arange(1, len(tree))) | (counts[:-1] != counts[1:] + own[:-1])
     member = np.concatenate([[0], np.cumsum(begins)])
     first = np.flatnonzero(np.diff(member, prepend=-1))
-    parent = _above(tree, member, np.append(first[1:], len(tree)) - 1)
+    last = np.append(first[1:], len(tree)) - 1
+    parent = np.where(tree[last] >= 0, member[tree[last]], -1)
     width = np.bincount(member, own).astype(np.int64)
     into = _merged(parent, width, counts[first])
     kept, number = np.unique(into, return_inverse=True)
     parent = np.where(parent[kept] >= 0, number[parent[kept]], -1)
     return _in_order(lower, nodes, own, number[member], parent)
-
-
-def _above(tree: Integers, member: Integers, last: Integers) -> Integers:
-    """Supernode (n,), or -1, of the parent of each supernode's last node (n,)."""
-    return np.where(tree[last] >= 0, member[tree[last]], -1)
 
 
 def _in_order(
@@ -177,9 +158,17 @@ def _in_order(
     """Supernodes in the postorder of least memory, and their nodes where contributions come in long runs."""
     below = _structures(sparse.csc_matrix(lower), member, parent)
     sizes = np.array([int(weight[rows].sum()) for rows in below])
-    order = postorder(parent, _priority(parent, sizes * sizes))
-    parent, below = _relabelled(parent, order), [below[s] for s in order]
+    kept = sizes * sizes
+    peak, left = kept.tolist(), kept.tolist()
+    for s, children in enumerate(children_of(parent)):
+        held, most = 0, 0
+        for child in sorted(children, key=lambda c: left[c] - peak[c]):
+            most = max(most, held + peak[child])
+            held += left[child]
+        peak[s] = max(most, held + left[s])
+    order = postorder(parent, np.array(peak, dtype=np.int64) - kept)
     place = np.argsort(order)
+    parent, below = np.append(place, -1)[parent[order]], [below[s] for s in order]
     by_member = np.argsort(place[member], kind="stable")
     start = np.searchsorted(place[member][by_member], np.arange(len(order) + 1))
     below = _renumbered(below, by_member)
@@ -191,18 +180,6 @@ def _renumbered(sets: list[Integers], order: Integers) -> list[Integers]:
     """Sets of numbers after those have been put in `order`, sorted."""
     place = np.argsort(order)
     return [np.sort(place[numbers]) for numbers in sets]
-
-
-def _priority(parent: Integers, kept: Integers) -> Integers:
-    """For each tree node what its subtree needs at most beyond what it leaves, `kept` (n,); the neediest go first."""
-    peak, left = kept.tolist(), kept.tolist()
-    for s, children in enumerate(children_of(parent)):
-        held, most = 0, 0
-        for child in sorted(children, key=lambda c: left[c] - peak[c]):
-            most = max(most, held + peak[child])
-            held += left[child]
-        peak[s] = max(most, held + left[s])
-    return np.array(peak, dtype=np.int64) - kept
 
 
 def _reordered(graph: sparse.csr_matrix[np.float64], order: Integers) -> sparse.csr_matrix[np.float64]:
@@ -227,7 +204,7 @@ def _merged(parent: Integers, width: Integers, front: Integers) -> Integers:
             both = widths[child] + widths[s]
             empty = zeros[child] + zeros[s] + widths[child] * (widths[child] + fronts[s] - fronts[child])
             size = both * (widths[child] + fronts[s]) - both * both // 2
-            if both <= SMALL or empty <= _allowed(both) * size:
+            if both <= SMALL or empty <= next(share for limit, share in ZEROS if both <= limit) * size:
                 into[child], widths[s], zeros[s] = s, both, empty
                 fronts[s] += widths[child]
         if above >= 0:
@@ -235,10 +212,6 @@ def _merged(parent: Integers, width: Integers, front: Integers) -> Integers:
     for s in range(n - 1, -1, -1):
         into[s] = into[into[s]]
     return np.array(into, dtype=np.int64)
-
-
-def _allowed(width: int) -> float:
-    return next(share for limit, share in ZEROS if width <= limit)
 
 
 def _structures(lower: sparse.csc_matrix[np.float64], member: Integers, parent: Integers) -> list[Integers]:

@@ -101,7 +101,8 @@ def make_plan(matrix: sparse.csr_matrix[np.float64], threads: int) -> Plan:
     order = _spread(first[nodes.order], own)
     below = [int(own[rows].sum()) for rows in nodes.rows]
     width = np.diff(offset[nodes.start])
-    work = _operations(width, np.array(below))
+    w, m = width.astype(np.float64), np.array(below, dtype=np.float64)
+    work = w**3 / 3.0 + w**2 * m + w * m**2
     steps = elimination_steps(nodes.parent, work, threads)
     places, work_size = memory_places(nodes.parent, [_kept(m) for m in below], steps)
     source, target, bounds = _entries(matrix, nodes, group, first, weight)
@@ -132,12 +133,6 @@ def _spread(first: Integers, count: Integers) -> Integers:
     """first, first + 1 ... (count of them) for each of first (n,), count (n,)."""
     ends = np.cumsum(count)
     return np.repeat(first - ends + count, count) + np.arange(int(ends[-1]) if len(ends) else 0)
-
-
-def _operations(width: Integers, below: Integers) -> NDArray[np.float64]:
-    """Multiplications and additions (n,) of each front."""
-    w, m = width.astype(np.float64), below.astype(np.float64)
-    return w**3 / 3.0 + w**2 * m + w * m**2
 
 
 def _runs(nodes: Supernodes, own: Integers, s: int) -> tuple[tuple[int, int, int], ...]:

@@ -23,25 +23,18 @@ def refined_order(start: Integers, children: list[list[int]], below: list[Intege
     """
     part = np.zeros(int(start[-1]), dtype=np.int64)
     for s in range(len(children)):
-        low, high = int(start[s]), int(start[s + 1])
-        part[low:high] = _refined(low, high, children, below, s)
+        low, high, queue, n_parts = int(start[s]), int(start[s + 1]), children[s], 1
+        while queue and n_parts < high - low:
+            following: list[int] = []
+            for child in sorted(queue, key=lambda c: -len(below[c])):
+                rows = below[child]
+                hit = rows[np.searchsorted(rows, low) : np.searchsorted(rows, high)] - low
+                if len(hit) > 0:
+                    following += children[child]
+                    if len(hit) < high - low:
+                        part[low:high], n_parts = _divided(part[low:high], n_parts, hit)
+            queue = following
     return np.lexsort((part, np.repeat(np.arange(len(children)), np.diff(start))))
-
-
-def _refined(low: int, high: int, children: list[list[int]], below: list[Integers], s: int) -> Integers:
-    """Parts (high - low,), numbered in their order, of the nodes low to high of supernode s."""
-    part, n_parts, queue = np.zeros(high - low, dtype=np.int64), 1, children[s]
-    while queue and n_parts < high - low:
-        following: list[int] = []
-        for child in sorted(queue, key=lambda c: -len(below[c])):
-            rows = below[child]
-            hit = rows[np.searchsorted(rows, low) : np.searchsorted(rows, high)] - low
-            if len(hit) > 0:
-                following += children[child]
-                if len(hit) < high - low:
-                    part, n_parts = _divided(part, n_parts, hit)
-        queue = following
-    return part
 
 
 def _divided(part: Integers, n_parts: int, hit: Integers) -> tuple[Integers, int]:
