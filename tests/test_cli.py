@@ -23,7 +23,16 @@ from palpate.study.earlier import strange_files
 from palpate.study.result import MeshResult, Simulation
 
 FILES = {
-    *("result.json", "report.html", "report-data.npz", "mesh.vtu", "stiffness.nii.gz", "labels.csv", "log.txt"),
+    *(
+        "result.json",
+        "report.html",
+        "report-data.npz",
+        "mesh.vtu",
+        "stiffness.nii.gz",
+        "labels.csv",
+        "case.toml",
+        "log.txt",
+    ),
 }
 
 CASE = """
@@ -42,7 +51,7 @@ youngs_modulus_kpa = 10.0
 
 @pytest.fixture
 def case_file(tmp_path):
-    path = tmp_path / "case.toml"
+    path = tmp_path / "sub-01.toml"
     path.write_text(CASE)
     return path
 
@@ -175,7 +184,7 @@ def test_an_estimate_without_result_still_writes_its_file(case_file, tmp_path, r
     (tmp_path / "mesh.vtu").write_text("earlier")
     assert main(["estimate", str(case_file), "--output", str(tmp_path), "--quiet"]) == 5
     document = json.loads((tmp_path / "result.json").read_text())
-    assert set(document["files"]) == {"report.html", "report-data.npz"}
+    assert set(document["files"]) == {"report.html", "report-data.npz", "case.toml"}
     assert [warning["code"] for warning in document["warnings"]] == ["earlier-files"]
     assert "mesh.vtu" in document["warnings"][0]["message"]
     assert (document["status"], document["reason"]) == (status, "stopped after 40 steps")

@@ -39,7 +39,7 @@ def estimate(tmp_path, monkeypatch, case_result):
         def compute(case, *, progress):
             progress("working")
             meanwhile()
-            return dataclasses.replace(case_result, case=dataclasses.replace(case_result.case, id=case.id))
+            return dataclasses.replace(case_result, case=case)
 
         module.estimate = compute
         (tmp_path / f"{patient}.toml").write_text(CASE.replace("ID", patient))

@@ -22,16 +22,18 @@ Progress = Callable[[str], None]
 
 DOCUMENT, PAGE, DATA = "result.json", "report.html", "report-data.npz"
 ASIDE = tuple(f"{name}.earlier" for name in (PAGE, DATA))
-TARGETS = (DOCUMENT, PAGE, DATA, *ASIDE, "mesh.vtu", "stiffness.nii.gz", "labels.csv")
+TARGETS = (DOCUMENT, PAGE, DATA, *ASIDE, "mesh.vtu", "stiffness.nii.gz", "labels.csv", "case.toml")
 
 
 def estimate(arguments: argparse.Namespace, case: Case | None, outputs: OutputFolder, progress: Progress) -> Outcome:
     """Estimate a case, or images for which a case is written first."""
     from palpate.study import run
+    from palpate.study.case_as_run import refuse_other_case
 
     if case is not None and arguments.labels is not None:
         raise ConfigurationError("--labels goes with images; a case names its label table itself, as [images] names")
     case = case or _case_of_images(arguments, outputs, progress)
+    refuse_other_case(case, outputs)
     outputs.require(f"mesh_{number}.vtu" for number in range(2, len(case.pairs) + 2))
     try:
         result = run.estimate(case, progress=progress)
@@ -95,7 +97,7 @@ def _write_estimate(result: CaseResult, outputs: OutputFolder, progress: Progres
         write_estimate_files(result, staging.area)
         progress("drawing the report")
         _draw(lambda: _case_report(result, staging.area), staging, document)
-        _commit(staging, document)
+        _commit(staging, result.case, document)
     converged = document["status"] == "converged"
     text = f"{estimates_table(document)}\n{warning_lines(document)}{listed(outputs)}"
     complaint = "" if converged else f"{document['status']}: {document['reason']}"
@@ -110,16 +112,17 @@ def _estimation_failed(case: Case, error: EstimationError, outputs: OutputFolder
     document = failure_document(case, error)
     with outputs.staged() as staging:
         _draw(lambda: _failure_report(case, error, staging.area), staging, document)
-        _commit(staging, document)
+        _commit(staging, case, document)
     return Outcome(document, "", error.exit_code, str(error))
 
 
-def _commit(staging: Staging, document: dict[str, Any]) -> None:
+def _commit(staging: Staging, case: Case, document: dict[str, Any]) -> None:
     """Put all files in place with the result that lists them; where space is short for all, without the page."""
+    from palpate.study.case_as_run import stage_case
     from palpate.study.earlier import earlier_files
     from palpate.study.outputs import write_json
 
-    own = document["warnings"]
+    own = [*document["warnings"], *stage_case(case, staging)]
     while True:
         document["files"] = staging.digests()
         earlier = earlier_files(staging.folder, DOCUMENT, document["files"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,8 @@ def read_case(path: Path, overrides: Sequence[str] = ()) -> Case:
         table["tissues"] = {
             name: {"label": name, **tissue} if isinstance(tissue, dict) else tissue for name, tissue in tissues.items()
         }
-    return read_table(Case, table, where=path.name, folder=path.absolute().parent)
+    case = read_table(Case, table, where=path.name, folder=path.absolute().parent)
+    return replace(case, overrides=tuple(overrides))
 
 
 def _read_text(path: Path) -> str:
