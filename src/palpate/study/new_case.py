@@ -42,8 +42,9 @@ class CaseImages:
 
 @dataclass(frozen=True, slots=True)
 class NewCase:
-    """The text of a case.toml, the tissues in it, and what could not be guessed, as sentences."""
+    """The text of a case.toml for `path`, the tissues in it, and what could not be guessed, as sentences."""
 
+    path: Path
     text: str
     tissues: tuple[GuessedTissue, ...]
     questions: tuple[str, ...]
@@ -66,7 +67,7 @@ class NewCase:
         }
 
 
-def write_new_case(images: Sequence[Path], table: Path | None, outputs: OutputFolder) -> tuple[Path, NewCase]:
+def write_new_case(images: Sequence[Path], table: Path | None, outputs: OutputFolder) -> NewCase:
     """Write case.toml for label images (before, after ...), unless it is there and says something else.
 
     Raises `ConfigurationError` when fewer than two images are given or another case.toml is in the way, else as
@@ -76,16 +77,15 @@ def write_new_case(images: Sequence[Path], table: Path | None, outputs: OutputFo
         raise ConfigurationError("name the label image before, then one or more after")
     outputs.require([CASE_NAME])
     case = new_case(CaseImages(images[0], tuple(images[1:]), table), outputs.path)
-    path = outputs.path / CASE_NAME
-    if path.exists() and _content(path) != case.text.encode("utf-8"):
+    if case.path.exists() and _content(case.path) != case.text.encode("utf-8"):
         raise ConfigurationError(
-            f"there is a case already, {path}, and it is not replaced: estimate it with 'palpate estimate {path}', or"
-            " choose another --output"
+            f"there is a case already, {case.path}, and it is not replaced: estimate it with 'palpate estimate"
+            f" {case.path}', or choose another --output"
         )
     with outputs.staged() as staging:
         write_text(staging.area / CASE_NAME, case.text)
         staging.commit()
-    return path, case
+    return case
 
 
 def _content(path: Path) -> bytes:
@@ -123,7 +123,8 @@ def new_case(images: CaseImages, folder: Path) -> NewCase:
         )
     blocks = [_heading(images, folder, questions, notes), _domain(before, tissues), _mesh(before, tissues)]
     blocks += [_tissue(tissue, before) for tissue in tissues]
-    return NewCase("\n\n".join(block for block in blocks if block) + "\n", tissues, questions)
+    text = "\n\n".join(block for block in blocks if block) + "\n"
+    return NewCase(folder / CASE_NAME, text, tissues, questions)
 
 
 def _questions(tissues: Sequence[GuessedTissue]) -> tuple[str, ...]:
