@@ -16,6 +16,7 @@ import pytest
 
 from palpate import errors
 from palpate.cli import main
+from palpate.cli.parser import EXAMPLES, make_parser
 from palpate.images.label_image import LabelImage
 from palpate.report import case_report
 from palpate.study import run
@@ -322,6 +323,35 @@ def test_help_is_quick():
     assert done.returncode == 0
     for command in ("demo", "init", "check", "mesh", "simulate", "estimate", "report"):
         assert command in done.stdout
+
+
+def test_the_help_of_every_command_has_examples_that_its_parser_takes():
+    parser = make_parser()
+    (commands,) = (action.choices for action in parser._actions if isinstance(action.choices, dict))
+    assert set(commands) == set(EXAMPLES)
+    for name, examples in EXAMPLES.items():
+        assert len(examples) == 2
+        for example in examples:
+            assert example in commands[name].format_help()
+            words = example.split(" > ")[0].split()
+            assert words[:2] == ["palpate", name]
+            assert parser.parse_args(words[1:]).command is not None
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_the_completion_of_a_shell_is_printed(shell, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["--print-completion", shell])
+    assert stop.value.code == 0
+    assert "palpate" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("line", "words"), [("palpate est", {"estimate"}), ("palpate init --la", {"--labels"})])
+def test_a_shell_is_told_what_could_stand_at_the_end_of_its_line(tmp_path, line, words):
+    asked = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_IFS": "\n"}
+    command = f"{sys.executable} -m palpate 8> {tmp_path / 'said'}"  # where argcomplete answers
+    subprocess.run(["bash", "-c", command], env=os.environ | asked, check=False, timeout=60)
+    assert {word.strip() for word in (tmp_path / "said").read_text().split("\n")} == words
 
 
 def test_the_package_runs_as_a_module():

@@ -13,7 +13,7 @@ from palpate.study.case import Domain, DriverMotion, Estimate, Mechanics, MeshSe
 from palpate.study.case_file import read_case
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 EXAMPLE, LOADS, *_ = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "case-file.md").read_text(), flags=re.DOTALL)
 
 

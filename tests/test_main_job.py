@@ -8,13 +8,16 @@ import shutil
 import tomllib
 from pathlib import Path
 
+import jsonschema
 import nibabel
 import numpy as np
 import pytest
+import referencing
 
 from palpate.cli import main
 from palpate.images.readers import write_label_image
 from palpate.phantoms.spheres import SpheresOptions, spheres
+from palpate.study.json_schema import SCHEMAS
 
 TRUTH_KPA = {"core": 60.0, "shell": 30.0}
 VOXEL_MM = 1.5
@@ -115,6 +118,12 @@ def test_the_case_in_the_result_is_the_one_beside_it(outputs, result):
     named = {"before": "before.nii.gz", "after": ["after.nii.gz"], "align": "none"}
     assert result["case"] == beside | {"images": named}
     assert result["overrides"] == []
+
+
+def test_the_result_meets_the_schema_that_is_shipped(result):
+    schemas = {name: json.loads((SCHEMAS / name).read_text()) for name in ("case.schema.json", "result.schema.json")}
+    registry = referencing.Registry().with_contents(schemas.items())
+    jsonschema.Draft202012Validator(schemas["result.schema.json"], registry=registry).validate(result)
 
 
 def test_the_truth_lies_within_the_interval(result):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import errno
 import json
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -35,7 +36,12 @@ def run(argv: Sequence[str] | None, signals: Sequence[signal.Signals], mask: Ite
 
     signals: those that interrupt it, blocked now; mask: the signals that stay blocked while it works.
     """
-    arguments = make_parser().parse_args(argv)
+    parser = make_parser()
+    if argv is None and "_ARGCOMPLETE" in os.environ:  # a shell asks what could stand at the end of the line
+        import argcomplete
+
+        argcomplete.autocomplete(parser)
+    arguments = parser.parse_args(argv)
     written: list[str] = []  # what has taken its place, which a signal cannot undo wherever in the run it comes
     outcome = None
     try:
