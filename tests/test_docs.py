@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+import palpate
 from palpate.mechanics.laws.registry import law_parameters
 from palpate.study.case import Domain, DriverMotion, Estimate, Mechanics, MeshSettings
 from palpate.study.case_file import read_case
@@ -45,6 +46,19 @@ def test_the_loads_in_the_docs_can_be_read(tmp_path):
     path = tmp_path / "case.toml"
     path.write_text(f"{EXAMPLE}\n{LOADS}")
     assert [load.kind for load in read_case(path).loads] == ["pressure", "traction", "gravity"]
+
+
+def test_the_reference_of_python_has_every_public_name():
+    named = re.findall(r"^::: palpate\.(\w+)$", (ROOT / "docs" / "api.md").read_text(), flags=re.MULTILINE)
+    assert sorted(set(named) - {"errors"}) == palpate.__all__
+
+
+def test_every_page_is_in_the_contents_of_the_site():
+    contents = re.findall(r"([\w/-]+\.md)$", (ROOT / "mkdocs.yml").read_text(), flags=re.MULTILINE)
+    made = {"commands.md", "security.md", "contributing.md", "changelog.md"}
+    assert sorted(set(contents) - made) == sorted(
+        p.relative_to(ROOT / "docs").as_posix() for p in PAGES if p.parent != ROOT
+    )
 
 
 def test_every_code_of_a_warning_is_explained():
