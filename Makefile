@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo test lint check clean pardiso benchmark-setup
+.PHONY: install demo test lint check clean pardiso benchmark-setup schemas docs dist dist-test minimum
 
 install: $(VENV)/.installed
 
@@ -36,6 +36,40 @@ test: lint
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal
 
 check: test
+
+# case.schema.json, which the package ships, from the dataclasses that read a case.
+schemas: install
+	$(BIN)/python -c "import json; from palpate.study.json_schema import SCHEMAS, case_schema; \
+	  (SCHEMAS / 'case.schema.json').write_text(json.dumps(case_schema(), indent=1) + '\n')"
+
+# The site in build/site; a link that leads nowhere ends it.
+docs: install
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[docs]"
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+# Wheel and sdist in dist/.
+dist: install
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check "build>=1.2"
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist .
+
+# The wheel alone in an empty environment, and the demo in an empty folder away from the repository.
+dist-test: dist
+	rm -rf build/empty build/away
+	$(PYTHON) -m venv build/empty
+	build/empty/bin/python -m pip install --quiet --disable-pip-version-check dist/*.whl
+	mkdir -p build/away
+	wheel=$$PWD/build/empty/bin/palpate; cd build/away && $$wheel demo --output out && $$wheel check out/case.toml
+
+# The quick tests with the oldest versions of all libraries that pyproject.toml allows; old libraries may use what newer
+# ones of others have deprecated.
+MINIMUM := images mesh mechanics observation report export steps study/test_result.py study/test_new_case.py test_cli.py
+minimum: install
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check "uv>=0.5"
+	$(BIN)/uv venv --clear --quiet --python $(PYTHON) build/minimum
+	$(BIN)/uv pip install --quiet --python build/minimum --resolution lowest-direct --editable ".[dev]"
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 build/minimum/bin/python -m pytest -n 2 \
+	  -W default::DeprecationWarning -W default::PendingDeprecationWarning $(addprefix tests/,$(MINIMUM))
 
 clean:
 	rm -rf $(VENV) demo-output build dist .mypy_cache .pytest_cache .ruff_cache

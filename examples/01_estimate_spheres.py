@@ -46,9 +46,9 @@ def main() -> float:
     """Estimate, print what was found, and give the core's Young's modulus (kPa)."""
     with tempfile.TemporaryDirectory() as folder:
         result = palpate.estimate(palpate.read_case(write_case(Path(folder))))
+    sys.stdout.write(f"{result}\n")
     for e in result.estimation.estimates:
-        low, high = e.interval95
-        sys.stdout.write(f"{e.tissue}: {e.value:.1f} kPa (95 %: {low:.1f} to {high:.1f} kPa), {e.verdict}: {e.why}\n")
+        low, high = e.interval95  # None would be an open end
         assert low < TRUTH_KPA[e.tissue] < high
     return result.estimation.estimates[0].value
 

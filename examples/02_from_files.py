@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from palpate import make_mesh, read_case
 from palpate.images import LabelImage, VoxelGrid, write_label_image
-from palpate.study import mesh, read_case
 
 RADIUS, VOXEL = 15.0, 2.0
 CASE = """
@@ -43,7 +43,7 @@ def write_case(folder: Path) -> Path:
 def main() -> float:
     """Mesh the reference state; the organ's volume in the mesh by that of the ball (dimensionless)."""
     with tempfile.TemporaryDirectory() as folder:
-        tets = mesh(read_case(write_case(Path(folder)))).space.mesh
+        tets = make_mesh(read_case(write_case(Path(folder)))).space.mesh
     corners = tets.nodes[tets.tets[tets.region == 0]]
     volume = np.linalg.det(corners[:, 1:] - corners[:, :1]).sum() / 6.0
     share = float(volume / (4.0 / 3.0 * np.pi * RADIUS**3))

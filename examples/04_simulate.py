@@ -12,9 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate import simulate
+from palpate import read_case, simulate
 from palpate.images import LabelImage, VoxelGrid, write_label_image
-from palpate.study import read_case
 
 CASE = """
 images = { before = "before.nii.gz", after = ["shifted.nii.gz"] }
@@ -44,7 +43,7 @@ def write_case(folder: Path) -> Path:
 def main() -> float:
     """Largest displacement (mm)."""
     with tempfile.TemporaryDirectory() as folder:
-        result = simulate(read_case(write_case(Path(folder))), progress=lambda _: None)
+        result = simulate(read_case(write_case(Path(folder))))
     largest = float(np.linalg.norm(result.displacements[-1], axis=1).max())
     changed = np.count_nonzero(result.before.labels != result.after.labels)
     sys.stdout.write(f"largest displacement {largest:.2f} mm; {changed} voxels changed their label\n")

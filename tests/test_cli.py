@@ -14,16 +14,26 @@ import warnings
 
 import pytest
 
-import palpate.study
 from palpate import errors
 from palpate.cli import main
+from palpate.cli.parser import EXAMPLES, make_parser
 from palpate.images.label_image import LabelImage
 from palpate.report import case_report
+from palpate.study import run
 from palpate.study.earlier import strange_files
 from palpate.study.result import MeshResult, Simulation
 
 FILES = {
-    *("result.json", "report.html", "report-data.npz", "mesh.vtu", "stiffness.nii.gz", "labels.csv", "log.txt"),
+    *(
+        "result.json",
+        "report.html",
+        "report-data.npz",
+        "mesh.vtu",
+        "stiffness.nii.gz",
+        "labels.csv",
+        "case.toml",
+        "log.txt",
+    ),
 }
 
 CASE = """
@@ -42,7 +52,7 @@ youngs_modulus_kpa = 10.0
 
 @pytest.fixture
 def case_file(tmp_path):
-    path = tmp_path / "case.toml"
+    path = tmp_path / "sub-01.toml"
     path.write_text(CASE)
     return path
 
@@ -51,16 +61,14 @@ def case_file(tmp_path):
 def runner(monkeypatch, case_result):
     """Put functions in the place of those that compute; each gets the case and the progress callback."""
 
-    def estimate(_, *, progress):
+    def estimate(_, *, progress, truth):
+        assert truth is None
         progress("working")
         return case_result
 
     def install(**functions):
-        module = types.ModuleType("palpate.study.run")
         for name, function in ({"estimate": estimate} | functions).items():
-            setattr(module, name, function)
-        monkeypatch.setitem(sys.modules, "palpate.study.run", module)
-        monkeypatch.setattr(palpate.study, "run", module, raising=False)
+            monkeypatch.setattr(run, name, function)
 
     install()
     return install
@@ -175,7 +183,7 @@ def test_an_estimate_without_result_still_writes_its_file(case_file, tmp_path, r
     (tmp_path / "mesh.vtu").write_text("earlier")
     assert main(["estimate", str(case_file), "--output", str(tmp_path), "--quiet"]) == 5
     document = json.loads((tmp_path / "result.json").read_text())
-    assert set(document["files"]) == {"report.html", "report-data.npz"}
+    assert set(document["files"]) == {"report.html", "report-data.npz", "case.toml"}
     assert [warning["code"] for warning in document["warnings"]] == ["earlier-files"]
     assert "mesh.vtu" in document["warnings"][0]["message"]
     assert (document["status"], document["reason"]) == (status, "stopped after 40 steps")
@@ -315,6 +323,35 @@ def test_help_is_quick():
     assert done.returncode == 0
     for command in ("demo", "init", "check", "mesh", "simulate", "estimate", "report"):
         assert command in done.stdout
+
+
+def test_the_help_of_every_command_has_examples_that_its_parser_takes():
+    parser = make_parser()
+    (commands,) = (action.choices for action in parser._actions if isinstance(action.choices, dict))
+    assert set(commands) == set(EXAMPLES)
+    for name, examples in EXAMPLES.items():
+        assert len(examples) == 2
+        for example in examples:
+            assert example in commands[name].format_help()
+            words = example.split(" > ")[0].split()
+            assert words[:2] == ["palpate", name]
+            assert parser.parse_args(words[1:]).command is not None
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_the_completion_of_a_shell_is_printed(shell, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["--print-completion", shell])
+    assert stop.value.code == 0
+    assert "palpate" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("line", "words"), [("palpate est", {"estimate"}), ("palpate init --la", {"--labels"})])
+def test_a_shell_is_told_what_could_stand_at_the_end_of_its_line(tmp_path, line, words):
+    asked = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_IFS": "\n"}
+    command = f"{sys.executable} -m palpate 8> {tmp_path / 'said'}"  # where argcomplete answers
+    subprocess.run(["bash", "-c", command], env=os.environ | asked, check=False, timeout=60)
+    assert {word.strip() for word in (tmp_path / "said").read_text().split("\n")} == words
 
 
 def test_the_package_runs_as_a_module():

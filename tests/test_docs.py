@@ -8,12 +8,13 @@ from pathlib import Path
 
 import pytest
 
+import palpate
 from palpate.mechanics.laws.registry import law_parameters
 from palpate.study.case import Domain, DriverMotion, Estimate, Mechanics, MeshSettings
 from palpate.study.case_file import read_case
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 EXAMPLE, LOADS, *_ = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "case-file.md").read_text(), flags=re.DOTALL)
 
 
@@ -47,9 +48,22 @@ def test_the_loads_in_the_docs_can_be_read(tmp_path):
     assert [load.kind for load in read_case(path).loads] == ["pressure", "traction", "gravity"]
 
 
+def test_the_reference_of_python_has_every_public_name():
+    named = re.findall(r"^::: palpate\.(\w+)$", (ROOT / "docs" / "api.md").read_text(), flags=re.MULTILINE)
+    assert sorted(set(named) - {"errors"}) == palpate.__all__
+
+
+def test_every_page_is_in_the_contents_of_the_site():
+    contents = re.findall(r"([\w/-]+\.md)$", (ROOT / "mkdocs.yml").read_text(), flags=re.MULTILINE)
+    made = {"commands.md", "security.md", "contributing.md", "changelog.md"}
+    assert sorted(set(contents) - made) == sorted(
+        p.relative_to(ROOT / "docs").as_posix() for p in PAGES if p.parent != ROOT
+    )
+
+
 def test_every_code_of_a_warning_is_explained():
     source = "\n".join(path.read_text() for path in (ROOT / "src").rglob("*.py"))
-    codes = set(re.findall(r'(?:Finding|Remark)\(\s*"([a-z-]+)"', source)) | {"report"}
+    codes = set(re.findall(r'(?:Finding|Remark)\(\s*"([a-z-]+)"', source)) | {"report", "case-file"}
     results = (ROOT / "docs" / "results.md").read_text()
     assert len(codes) > 10
     assert sorted(code for code in codes if f"`{code}`" not in results) == []

@@ -5,15 +5,19 @@ from __future__ import annotations
 import gzip
 import json
 import shutil
+import tomllib
 from pathlib import Path
 
+import jsonschema
 import nibabel
 import numpy as np
 import pytest
+import referencing
 
 from palpate.cli import main
 from palpate.images.readers import write_label_image
 from palpate.phantoms.spheres import SpheresOptions, spheres
+from palpate.study.json_schema import SCHEMAS
 
 TRUTH_KPA = {"core": 60.0, "shell": 30.0}
 VOXEL_MM = 1.5
@@ -52,7 +56,16 @@ edge_length_mm = 8.0
 start_ratios = [1.0, 4.0]
 """
 FILES = {
-    *("result.json", "report.html", "report-data.npz", "mesh.vtu", "stiffness.nii.gz", "labels.csv", "log.txt"),
+    *(
+        "result.json",
+        "report.html",
+        "report-data.npz",
+        "mesh.vtu",
+        "stiffness.nii.gz",
+        "labels.csv",
+        "case.toml",
+        "log.txt",
+    ),
 }
 ESTIMATE_KEYS = {
     *("tissue", "parameter", "unit", "value", "interval95", "interval_kind", "relative_to", "ratio"),
@@ -91,6 +104,26 @@ def result(outputs) -> dict:
 def test_an_estimate_writes_its_files_and_nothing_else(outputs):
     assert {path.name for path in outputs.iterdir()} == FILES
     assert min(path.stat().st_size for path in outputs.iterdir()) > 50
+
+
+def test_the_case_beside_the_result_gives_the_same_numbers(outputs, result, tmp_path):
+    assert main(["estimate", str(outputs / "case.toml"), "--output", str(tmp_path), "--quiet"]) == 0
+    again = json.loads((tmp_path / "result.json").read_text())
+    same = ("status", "estimates", "correlation", "fit", "starts", "outer_loop", "counts", "mesh", "inputs", "case")
+    assert {key: again[key] for key in same} == {key: result[key] for key in same}
+
+
+def test_the_case_in_the_result_is_the_one_beside_it(outputs, result):
+    beside = tomllib.loads((outputs / "case.toml").read_text())
+    named = {"before": "before.nii.gz", "after": ["after.nii.gz"], "align": "none"}
+    assert result["case"] == beside | {"images": named}
+    assert result["overrides"] == []
+
+
+def test_the_result_meets_the_schema_that_is_shipped(result):
+    schemas = {name: json.loads((SCHEMAS / name).read_text()) for name in ("case.schema.json", "result.schema.json")}
+    registry = referencing.Registry().with_contents(schemas.items())
+    jsonschema.Draft202012Validator(schemas["result.schema.json"], registry=registry).validate(result)
 
 
 def test_the_truth_lies_within_the_interval(result):
@@ -254,7 +287,7 @@ BAD_SETTINGS = {
 def _refusal(case: Path, output: Path, capfd, *flags: str) -> tuple[int, str]:
     """Exit code and sentence of an estimate that is refused; earlier outputs must be as they were."""
     output.mkdir(exist_ok=True)
-    earlier = {name: f"earlier {name}" for name in FILES - {"log.txt"}}
+    earlier = {name: f"earlier {name}" for name in FILES - {"log.txt", "case.toml"}}
     for name, content in earlier.items():
         (output / name).write_text(content)
     code = main(["estimate", str(case), "--output", str(output), "--quiet", *flags])

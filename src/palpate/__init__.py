@@ -8,19 +8,22 @@ TYPE_CHECKING = False  # the module typing takes longer to import than all that 
 if TYPE_CHECKING:
     from typing import Any
 
+    from palpate.steps.commands import check, estimate, init, make_mesh, simulate
+    from palpate.steps.results import CaseResult
     from palpate.study.case import Case
     from palpate.study.case_file import read_case
-    from palpate.study.result import CaseResult
-    from palpate.study.run import estimate, simulate
 
-__all__ = ["Case", "CaseResult", "estimate", "read_case", "simulate"]
+__all__ = ["Case", "CaseResult", "check", "estimate", "init", "make_mesh", "read_case", "simulate"]
 
 _HOMES = {
     "Case": "palpate.study.case",
-    "CaseResult": "palpate.study.result",
-    "estimate": "palpate.study.run",
+    "CaseResult": "palpate.steps.results",
+    "check": "palpate.steps.commands",
+    "estimate": "palpate.steps.commands",
+    "init": "palpate.steps.commands",
+    "make_mesh": "palpate.steps.commands",
     "read_case": "palpate.study.case_file",
-    "simulate": "palpate.study.run",
+    "simulate": "palpate.steps.commands",
 }
 
 

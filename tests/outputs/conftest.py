@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
-import types
 
 import pytest
 
-import palpate.study
 from palpate.cli import main
 from palpate.report import case_report
+from palpate.study import run as study_run
 
 CASE = """
 id = "ID"
@@ -30,18 +28,16 @@ youngs_modulus_kpa = 10.0
 @pytest.fixture
 def estimate(tmp_path, monkeypatch, case_result):
     """Run `palpate estimate` of a patient into the folder `out`; `meanwhile` is called in the place of the numbers."""
-    module = types.ModuleType("palpate.study.run")
-    monkeypatch.setitem(sys.modules, "palpate.study.run", module)
-    monkeypatch.setattr(palpate.study, "run", module, raising=False)
     monkeypatch.setattr(case_report, "render", lambda data: f"the page of {data.document['id']}")
 
     def run(patient: str, *flags: str, meanwhile=lambda: None) -> int:
-        def compute(case, *, progress):
+        def compute(case, *, progress, truth):
+            assert truth is None
             progress("working")
             meanwhile()
-            return dataclasses.replace(case_result, case=dataclasses.replace(case_result.case, id=case.id))
+            return dataclasses.replace(case_result, case=case)
 
-        module.estimate = compute
+        monkeypatch.setattr(study_run, "estimate", compute)
         (tmp_path / f"{patient}.toml").write_text(CASE.replace("ID", patient))
         return main(["estimate", str(tmp_path / f"{patient}.toml"), "--output", str(tmp_path / "out"), *flags])
 

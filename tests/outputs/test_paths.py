@@ -6,17 +6,16 @@ import dataclasses
 import os
 import subprocess
 import sys
-import types
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-import palpate.study
 from palpate.cli import main
 from palpate.export.case_files import file_name
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers import write_label_image
+from palpate.study import run
 from palpate.study.case_file import read_case
 from palpate.study.result import MeshResult
 
@@ -50,7 +49,6 @@ def test_a_folder_whose_name_is_too_long_ends_with_6(estimate, tmp_path, capsys,
 
 AS_NOBODY = """
 import os, sys
-import palpate.study
 from palpate.cli import main
 import palpate.cli.entry, palpate.study.new_case, palpate.study.case_file, scipy.linalg
 os.getuid() or os.setuid(65534)
@@ -108,12 +106,8 @@ def test_a_tissue_of_sixty_letters_of_four_bytes_has_its_surface(tmp_path, monke
     mesh = case_result.space.mesh
     named = dataclasses.replace(mesh, tissues=(dataclasses.replace(mesh.tissues[0], name=60 * "𝒜"), *mesh.tissues[1:]))
     space = dataclasses.replace(case_result.space, mesh=named)
-    module = types.ModuleType("palpate.study.run")
-    module.mesh = lambda case, **_: MeshResult(
-        case, space, case_result.mesh_summary, case_result.before, case_result.provenance
-    )
-    monkeypatch.setitem(sys.modules, "palpate.study.run", module)
-    monkeypatch.setattr(palpate.study, "run", module, raising=False)
+    made = MeshResult(case_result.case, space, case_result.mesh_summary, case_result.before, case_result.provenance)
+    monkeypatch.setattr(run, "mesh", lambda _, **__: made)
     (tmp_path / "case.toml").write_text('id = "a"\n[phantom]\nkind = "spheres"\n')
     assert main(["mesh", str(tmp_path / "case.toml"), "--output", str(tmp_path / "out"), "--quiet"]) == 0
     assert [path.name for path in (tmp_path / "out" / "surfaces").glob("00_*")] == [f"00_{15 * '𝒜'}_before.vtp"]

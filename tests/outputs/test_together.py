@@ -18,7 +18,16 @@ from palpate.images.readers import write_label_image
 from palpate.report import case_report
 from palpate.study import journal
 
-FILES = {"result.json", "report.html", "report-data.npz", "mesh.vtu", "stiffness.nii.gz", "labels.csv", "log.txt"}
+FILES = {
+    "result.json",
+    "report.html",
+    "report-data.npz",
+    "mesh.vtu",
+    "stiffness.nii.gz",
+    "labels.csv",
+    "case.toml",
+    "log.txt",
+}
 NO_SPACE = OSError(errno.ENOSPC, "No space left on device")
 
 
@@ -73,9 +82,9 @@ def test_a_disk_that_is_full_after_the_page_costs_the_page_only(estimate, out, m
 
     monkeypatch.setattr("palpate.study.outputs.carry_out", full)
     assert estimate("bert", "--quiet") == 0
-    assert calls == [6, 4]
+    assert calls == [7, 5]
     assert not (out / "report.html").exists()
-    assert set(result(out)["files"]) == {"mesh.vtu", "stiffness.nii.gz", "labels.csv"}
+    assert set(result(out)["files"]) == {"mesh.vtu", "stiffness.nii.gz", "labels.csv", "case.toml"}
 
 
 def test_a_page_that_nobody_vouches_for_is_set_aside(estimate, out, monkeypatch):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from palpate.cli.outcome import Outcome, columns, listed, warning_lines
 
 if TYPE_CHECKING:
     from palpate.study.case import Case
-    from palpate.study.outputs import OutputFolder, Staging
+    from palpate.study.outputs import OutputFolder
 
 __all__ = ["MESH_TARGETS", "SIMULATION_TARGETS", "check", "init", "mesh", "simulate"]
 
@@ -25,20 +25,20 @@ def init(arguments: argparse.Namespace, _: None, outputs: OutputFolder, progress
     from palpate.study.new_case import write_new_case
 
     progress("reading the images")
-    path, case = write_new_case(arguments.images, arguments.labels, outputs)
+    case = write_new_case(arguments.images, arguments.labels, outputs)
     rows = [["tissue", "role", "why"]]
     rows += [[tissue.name, str(tissue.role or "?"), tissue.reason] for tissue in case.tissues]
     questions = "".join(f"question: {question}\n" for question in case.questions)
-    text = f"{columns(rows)}\n{questions}written to {path}; read it, correct it, then: palpate check {path}"
-    return Outcome(case.to_dict() | {"case": str(path)}, text)
+    text = f"{columns(rows)}\n{questions}written to {case.path}; read it, correct it, then: palpate check {case.path}"
+    return Outcome(case.to_dict() | {"case": str(case.path)}, text)
 
 
 def check(arguments: argparse.Namespace, _: None, outputs: None, progress: Progress) -> Outcome:
     """List every problem of a case."""
-    from palpate.study.check import check_case
+    from palpate.steps import commands
 
     del outputs  # it writes nothing
-    found = check_case(arguments.case_file, arguments.set, progress=progress)
+    found = commands.check(arguments.case_file, arguments.set, progress=progress)
     refused = "\n".join(problem.message for problem in found.problems if problem.exit_code)
     complaint = refused if arguments.quiet else ""  # what is refused is said even then, as by any other command
     return Outcome(found.to_dict(), found.text(), found.exit_code, complaint)
@@ -47,14 +47,15 @@ def check(arguments: argparse.Namespace, _: None, outputs: None, progress: Progr
 def mesh(_: argparse.Namespace, case: Case, outputs: OutputFolder, progress: Progress) -> Outcome:
     """Make a mesh and write it."""
     from palpate.export.case_files import write_mesh_files
-    from palpate.study import run
+    from palpate.steps import commands
+    from palpate.steps.saving import save_document
 
-    result = run.mesh(case, progress=progress)
+    result = commands.make_mesh(case, progress=progress)
     progress("writing the mesh")
     document = result.to_dict()
     with outputs.staged() as staging:
         write_mesh_files(result, staging.area)
-        _commit(staging, "mesh.json", document)
+        save_document(staging, "mesh.json", document)
     summary = result.mesh_summary
     text = (
         f"{summary.nodes} nodes, {summary.tets} tetrahedra, {summary.dofs} unknowns; dihedral angles: smallest"
@@ -66,25 +67,14 @@ def mesh(_: argparse.Namespace, case: Case, outputs: OutputFolder, progress: Pro
 def simulate(arguments: argparse.Namespace, case: Case, outputs: OutputFolder, progress: Progress) -> Outcome:
     """Simulate a later state and write it."""
     from palpate.export.case_files import write_simulation_files
-    from palpate.study import run
+    from palpate.steps import commands
+    from palpate.steps.saving import save_document
 
-    result = run.simulate(case, progress=progress, steps=arguments.steps)
+    result = commands.simulate(case, progress=progress, steps=arguments.steps)
     progress("writing the simulated state")
     document = result.to_dict()
     with outputs.staged() as staging:
         write_simulation_files(result, staging.area)
-        _commit(staging, "simulation.json", document)
+        save_document(staging, "simulation.json", document)
     moved = f"the largest displacement is {document['largest_displacement_mm']:.2f} mm"
     return Outcome(document, f"{moved}\n{warning_lines(document)}{listed(outputs)}")
-
-
-def _commit(staging: Staging, name: str, document: dict[str, Any]) -> None:
-    """Put all files in place with the document that lists them; those of the document before it go with that."""
-    from palpate.study.earlier import earlier_files
-    from palpate.study.outputs import write_json
-
-    document["files"] = staging.digests()
-    earlier = earlier_files(staging.folder, name, document["files"])
-    document["warnings"] = [*document["warnings"], *earlier.warnings]
-    write_json(staging.area / name, document)
-    staging.commit(retired=earlier.retired)

@@ -23,9 +23,8 @@ from typing import TextIO
 
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.named_labels import printable
-from palpate.study.journal import recover
-from palpate.study.lock import folder_lock, own_file
-from palpate.study.outputs import OutputFolder, make_folder
+from palpate.study.lock import held_folder, own_file
+from palpate.study.outputs import OutputFolder
 
 __all__ = [
     "LOGGER",
@@ -96,26 +95,9 @@ def output_folder(outputs: OutputFolder, heading: str, *, logs: bool) -> Iterato
     A case or an input that is refused leaves the folder as it was, log and all: its sentence says everything.
     """
     folder = outputs.path
-    made = _missing(folder)
-    make_folder(folder)
-    try:
-        with folder_lock(folder) as locked:
-            recover(folder)
-            with _logged(folder / "log.txt", heading) if logs else nullcontext():
-                _warn_of(folder, locked=locked)
-                yield
-    finally:
-        for path in made:
-            with suppress(OSError):  # not empty: something was written
-                path.rmdir()
-
-
-def _missing(folder: Path) -> list[Path]:
-    """Those of `folder` and its parents that are not there yet, the deepest first."""
-    try:
-        return [path for path in (folder, *folder.parents) if not path.exists()]
-    except OSError:  # a name too long, a folder that may not be searched: making it says so
-        return []
+    with held_folder(folder) as locked, _logged(folder / "log.txt", heading) if logs else nullcontext():
+        _warn_of(folder, locked=locked)
+        yield
 
 
 def _warn_of(folder: Path, *, locked: bool) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import errno
 import json
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -35,7 +36,12 @@ def run(argv: Sequence[str] | None, signals: Sequence[signal.Signals], mask: Ite
 
     signals: those that interrupt it, blocked now; mask: the signals that stay blocked while it works.
     """
-    arguments = make_parser().parse_args(argv)
+    parser = make_parser()
+    if argv is None and "_ARGCOMPLETE" in os.environ:  # a shell asks what could stand at the end of the line
+        import argcomplete
+
+        argcomplete.autocomplete(parser)
+    arguments = parser.parse_args(argv)
     written: list[str] = []  # what has taken its place, which a signal cannot undo wherever in the run it comes
     outcome = None
     try:
@@ -108,7 +114,8 @@ def _case(arguments: argparse.Namespace) -> Case | None:
 
 def _spare_inputs(arguments: argparse.Namespace, case: Case | None, outputs: OutputFolder) -> None:
     """Refuse to write an output in the place of an input."""
-    inputs: list[Path | None] = [*getattr(arguments, "inputs", ()), getattr(arguments, "labels", None)]
+    given = () if case is not None and not arguments.set else getattr(arguments, "inputs", ())  # a case stays as it is
+    inputs: list[Path | None] = [*given, getattr(arguments, "labels", None)]
     if case is not None and case.images is not None:
         images = case.images
         inputs += [images.before, *images.after, images.names, images.intensities_before, *images.intensities_after]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import sys
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
@@ -15,6 +16,26 @@ from palpate.cli.outcome import Outcome
 __all__ = ["make_parser", "version"]
 
 CASE_HELP = "the case: images, tissues, roles"
+EXAMPLES = {
+    "demo": ("palpate demo", "palpate demo --output demo --json > demo.json"),
+    "init": (
+        "palpate init before.nii.gz after.nii.gz --labels names.json --output case",
+        "palpate init masks_before/ masks_after/ --output case",
+    ),
+    "check": ("palpate check case/case.toml", "palpate check case/case.toml --set mesh.edge_length_mm=6 --json"),
+    "mesh": ("palpate mesh case/case.toml --output mesh", "palpate mesh case/case.toml --set mesh.edge_length_mm=6"),
+    "simulate": (
+        "palpate simulate case/case.toml --output later",
+        "palpate simulate case/case.toml --set motion.filling_mm=5 --steps 10",
+    ),
+    "estimate": (
+        "palpate estimate case/case.toml --output out",
+        "palpate estimate out/case.toml --set mechanics.law=linear --output linear",
+    ),
+    "report": ("palpate report out", "palpate report out --json"),
+    "reproduce": ("palpate reproduce table1", "palpate reproduce figure4 --output figure4"),
+    "verify": ("palpate verify --quick", "palpate verify --output verification"),
+}
 
 
 def version() -> str:
@@ -23,6 +44,18 @@ def version() -> str:
         return metadata.version("palpate")
     except metadata.PackageNotFoundError:
         return "(not installed)"
+
+
+class _PrintCompletion(argparse.Action):
+    """Print a shell's completion of `palpate`, and end."""
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: object, values: Any, option: Any = None) -> None:
+        """Print it for the shell `values`."""
+        import argcomplete
+
+        del namespace, option
+        sys.stdout.write(argcomplete.shellcode(["palpate"], shell=values))
+        parser.exit()
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -34,6 +67,12 @@ def make_parser() -> argparse.ArgumentParser:
         " estimation, 6 resources, 130 interrupted. For research only; not a medical device.",
     )
     parser.add_argument("--version", action="version", version=f"palpate {version()}")
+    parser.add_argument(
+        "--print-completion",
+        action=_PrintCompletion,
+        choices=("bash", "zsh", "fish"),
+        help="print what makes the shell complete commands, flags and files: source it at the shell's start",
+    )
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True)
     what = "the whole way on the pelvis that Palpate brings along"
     demo = _command(subparsers, "demo", written.demo, what=what, folder="palpate-demo")
@@ -120,7 +159,11 @@ def _command(
 ) -> argparse.ArgumentParser:
     """A sub-command with the common flags; `folder`: where it writes by default, with a log; None: nowhere."""
     command: argparse.ArgumentParser = subparsers.add_parser(
-        name, help=what, description=what[0].upper() + what[1:] + "."
+        name,
+        help=what,
+        description=what[0].upper() + what[1:] + ".",
+        epilog="\n  ".join(("examples:", *EXAMPLES[name])),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     command.set_defaults(command=function, logs=folder is not None, output=None, makes_folder=True, targets=())
     if folder is not None:

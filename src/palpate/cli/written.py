@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from palpate.cli.console import LOGGER
 from palpate.cli.outcome import Outcome, estimates_table, listed, warning_lines
-from palpate.errors import ConfigurationError, EstimationError, InputDataError, ResourceError
+from palpate.errors import ConfigurationError, EstimationError, InputDataError
 
 if TYPE_CHECKING:
     from palpate.study.case import Case
-    from palpate.study.outputs import OutputFolder, Staging
+    from palpate.study.outputs import OutputFolder
     from palpate.study.result import CaseResult
 
 __all__ = ["DOCUMENT", "PAGE", "TARGETS", "demo", "estimate", "report"]
@@ -22,21 +20,24 @@ Progress = Callable[[str], None]
 
 DOCUMENT, PAGE, DATA = "result.json", "report.html", "report-data.npz"
 ASIDE = tuple(f"{name}.earlier" for name in (PAGE, DATA))
-TARGETS = (DOCUMENT, PAGE, DATA, *ASIDE, "mesh.vtu", "stiffness.nii.gz", "labels.csv")
+TARGETS = (DOCUMENT, PAGE, DATA, *ASIDE, "mesh.vtu", "stiffness.nii.gz", "labels.csv", "case.toml")
 
 
 def estimate(arguments: argparse.Namespace, case: Case | None, outputs: OutputFolder, progress: Progress) -> Outcome:
     """Estimate a case, or images for which a case is written first."""
-    from palpate.study import run
+    from palpate.steps import commands
+    from palpate.steps.saving import save_failure
+    from palpate.study.case_as_run import refuse_other_case
 
     if case is not None and arguments.labels is not None:
         raise ConfigurationError("--labels goes with images; a case names its label table itself, as [images] names")
     case = case or _case_of_images(arguments, outputs, progress)
+    refuse_other_case(case, outputs)
     outputs.require(f"mesh_{number}.vtu" for number in range(2, len(case.pairs) + 2))
     try:
-        result = run.estimate(case, progress=progress)
+        result = commands.estimate(case, progress=progress)
     except EstimationError as error:
-        return _estimation_failed(case, error, outputs)
+        return Outcome(save_failure(case, error, outputs), "", error.exit_code, str(error))
     return _write_estimate(result, outputs, progress)
 
 
@@ -78,84 +79,19 @@ def _case_of_images(arguments: argparse.Namespace, outputs: OutputFolder, progre
     from palpate.study.case_file import read_case
     from palpate.study.new_case import write_new_case
 
-    path, case = write_new_case(arguments.inputs, arguments.labels, outputs)
+    case = write_new_case(arguments.inputs, arguments.labels, outputs)
     for tissue in case.tissues:
         progress(f"{tissue.name}: {tissue.role or '?'}, for {tissue.reason}")
-    progress(f"the case is written to {path}")
-    return read_case(path, arguments.set)
+    progress(f"the case is written to {case.path}")
+    return read_case(case.path, arguments.set)
 
 
 def _write_estimate(result: CaseResult, outputs: OutputFolder, progress: Progress) -> Outcome:
     """Put all outputs of an estimate in place, or all but the page where that cannot be made."""
-    from palpate.export.case_files import write_estimate_files
+    from palpate.steps.saving import save_estimate
 
-    progress("writing mesh and stiffness map")
-    document = result.to_dict()
-    with outputs.staged() as staging:
-        write_estimate_files(result, staging.area)
-        progress("drawing the report")
-        _draw(lambda: _case_report(result, staging.area), staging, document)
-        _commit(staging, document)
+    document = save_estimate(result, outputs, progress=progress)
     converged = document["status"] == "converged"
     text = f"{estimates_table(document)}\n{warning_lines(document)}{listed(outputs)}"
     complaint = "" if converged else f"{document['status']}: {document['reason']}"
     return Outcome(document, text, 0 if converged else EstimationError.exit_code, complaint)
-
-
-def _estimation_failed(case: Case, error: EstimationError, outputs: OutputFolder) -> Outcome:
-    """A result file that says that there is no result, and which files in the folder are not of this run."""
-    from palpate.study.result import failure_document
-
-    LOGGER.error("%s", error, exc_info=error)
-    document = failure_document(case, error)
-    with outputs.staged() as staging:
-        _draw(lambda: _failure_report(case, error, staging.area), staging, document)
-        _commit(staging, document)
-    return Outcome(document, "", error.exit_code, str(error))
-
-
-def _commit(staging: Staging, document: dict[str, Any]) -> None:
-    """Put all files in place with the result that lists them; where space is short for all, without the page."""
-    from palpate.study.earlier import earlier_files
-    from palpate.study.outputs import write_json
-
-    own = document["warnings"]
-    while True:
-        document["files"] = staging.digests()
-        earlier = earlier_files(staging.folder, DOCUMENT, document["files"])
-        document["warnings"] = [*own, *earlier.warnings]
-        try:
-            write_json(staging.area / DOCUMENT, document)
-            return staging.commit(retired=earlier.retired, aside=earlier.aside)
-        except ResourceError as error:
-            if PAGE not in document["files"] or staging.unfinished:
-                raise
-            LOGGER.warning("the report is left out: %s", error)
-            own = [*own, _no_report(error)]
-            staging.discard(PAGE, DATA, DOCUMENT)
-
-
-def _draw(write: Callable[[], Path], staging: Staging, document: dict[str, Any]) -> None:
-    """Make page and data, both or none; a drawing never costs the estimate."""
-    try:
-        write()
-    except Exception as error:
-        LOGGER.exception("the report could not be written")
-        staging.discard(PAGE, DATA)
-        document["warnings"] = [*document["warnings"], _no_report(error)]
-
-
-def _no_report(error: Exception) -> dict[str, str]:
-    return {"code": "report", "message": f"{PAGE} could not be written ({error}); the numbers are unharmed"}
-
-
-def _case_report(result: CaseResult, folder: Path) -> Path:
-    from palpate.report.case_report import write_case_report
-
-    return write_case_report(result, folder)
-
-
-def _failure_report(case: Case, error: EstimationError, folder: Path) -> Path:
-    from palpate.report.case_report import write_failure_report
-
-    return write_failure_report(case, error, folder)

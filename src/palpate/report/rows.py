@@ -9,7 +9,7 @@ from typing import Any
 
 from palpate.inversion import Interval
 
-__all__ = ["Bar", "EstimateRow", "estimate_rows", "interval_text", "number", "scale_marks"]
+__all__ = ["NONE", "Bar", "EstimateRow", "estimate_rows", "interval_text", "main_numbers", "number", "scale_marks"]
 
 NONE = "–"
 BAR = 200.0  # width of a bar, in its own units
@@ -68,7 +68,7 @@ def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tu
     scale = _scale(items) if shown else None
     rows = []
     for item in items:
-        value, interval = _main(item)
+        value, interval = main_numbers(item)
         truth = item["truth"]
         row = EstimateRow(
             tissue=item["tissue"],
@@ -101,7 +101,7 @@ def scale_marks(document: Mapping[str, Any]) -> tuple[tuple[float, str], ...]:
     return tuple(inside[:: math.ceil(len(inside) / 6) or 1])
 
 
-def _main(item: Mapping[str, Any]) -> tuple[float | None, Interval | None]:
+def main_numbers(item: Mapping[str, Any]) -> tuple[float | None, Interval | None]:
     """The number that the tissue is judged by: kPa, or the ratio where there is no kPa."""
     if item["value"] is not None:
         return item["value"], item["interval95"]
@@ -124,7 +124,7 @@ def _scale(items: Iterable[Mapping[str, Any]]) -> tuple[float, float] | None:
     """Natural logarithms of the smallest and the largest number to be shown, with room on both sides."""
     numbers: list[float] = []
     for item in items:
-        value, interval = _main(item)
+        value, interval = main_numbers(item)
         numbers += [n for n in (value, item["truth"], *(interval or ())) if n is not None and n > 0.0]
     if not numbers:
         return None

@@ -12,7 +12,7 @@ from palpate.images.tissue import Role, Tissue
 from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.laws.registry import LAWS, law_from, law_parameters
 from palpate.mechanics.solvers.registry import SOLVERS
-from palpate.study.schema import nearest, rule, shown
+from palpate.study.schema import Rule, nearest, rule, shown
 
 __all__ = [
     "REMAINING",
@@ -312,6 +312,7 @@ class Motion:
 class Case:
     """Everything that one run depends on; one value, checked when it is made.
 
+    `overrides`: those that `read_case` applied, as they were given; two cases that say the same are equal without them.
     Raises `ConfigurationError` when the tissues contradict each other, or images and phantom are both or neither there.
     """
 
@@ -331,6 +332,7 @@ class Case:
     driver: DriverMotion = DriverMotion()
     noise: Noise = Noise()
     estimate: Estimate = Estimate()
+    overrides: tuple[str, ...] = field(default=(), compare=False, metadata={"rule": Rule(unwritten=True)})
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "patient", self.patient or self.id)

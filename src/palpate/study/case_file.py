@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import tomllib
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +21,13 @@ LARGEST_FILE = 100_000  # bytes; a case is a page of text, and one of a hundred 
 MOST_DOTS = 100  # in a line: keys of thousands of parts would take the parser minutes
 
 
-def read_case(path: Path, overrides: Sequence[str] = ()) -> Case:
+def read_case(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Case:
     """The case that the TOML file at `path` describes; paths in it are relative to the file.
 
     Each of `overrides` is `key.path=value` with a TOML value (text may go without quotes); it replaces the file's.
     Raises `ConfigurationError` when the file cannot be read or says something unknown or impossible.
     """
+    path = Path(path)
     table = _parse(_read_text(path), str(path))
     for override in overrides:
         table = _merged(table, _parse_override(override))
@@ -34,7 +37,8 @@ def read_case(path: Path, overrides: Sequence[str] = ()) -> Case:
         table["tissues"] = {
             name: {"label": name, **tissue} if isinstance(tissue, dict) else tissue for name, tissue in tissues.items()
         }
-    return read_table(Case, table, where=path.name, folder=path.absolute().parent)
+    case = read_table(Case, table, where=path.name, folder=path.absolute().parent)
+    return replace(case, overrides=tuple(overrides))
 
 
 def _read_text(path: Path) -> str:

@@ -11,7 +11,7 @@ from palpate.errors import InputDataError
 from palpate.study.journal import is_inside
 from palpate.study.outputs import Digests, read_json, sha256_of
 
-__all__ = ["Earlier", "earlier_files", "strange_files", "vouched"]
+__all__ = ["RESULT", "Earlier", "earlier_files", "strange_files", "vouched"]
 
 RESULT = "result.json"
 DOCUMENTS = (RESULT, "mesh.json", "simulation.json")  # each lists the files of its run

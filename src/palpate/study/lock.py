@@ -11,15 +11,35 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from palpate.errors import ResourceError
+from palpate.study.journal import recover
+from palpate.study.outputs import make_folder
 
 if sys.platform != "win32":
     import fcntl
 
-__all__ = ["folder_lock", "own_file"]
+__all__ = ["folder_lock", "held_folder", "own_file"]
 
 NAME = ".palpate.lock"
 FLAGS = ("O_CREAT", "O_APPEND", "O_NOFOLLOW", "O_NONBLOCK", "O_NOCTTY", "O_CLOEXEC")  # Windows lacks some
 NO_FILE = "is no regular file of that folder alone (a link, a pipe, a folder ...) and is left alone: remove it"
+
+
+@contextmanager
+def held_folder(folder: Path) -> Iterator[bool]:
+    """Make `folder`, hold it as `folder_lock` does, and complete or undo what a killed run left in it.
+
+    One that was made and is left empty vanishes again. Raises as `folder_lock` and `recover` do.
+    """
+    made = _missing(folder)
+    make_folder(folder)
+    try:
+        with folder_lock(folder) as locked:
+            recover(folder)
+            yield locked
+    finally:
+        for path in made:
+            with suppress(OSError):  # not empty: something was written
+                path.rmdir()
 
 
 @contextmanager
@@ -61,6 +81,14 @@ def own_file(path: Path) -> int:
         os.close(file)
         raise _refused(path, NO_FILE)
     return file
+
+
+def _missing(folder: Path) -> list[Path]:
+    """Those of `folder` and its parents that are not there yet, the deepest first."""
+    try:
+        return [path for path in (folder, *folder.parents) if not path.exists()]
+    except OSError:  # a name too long, a folder that may not be searched: making it says so
+        return []
 
 
 def _locked(path: Path) -> tuple[int, bool]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,13 +16,14 @@ from palpate.images.named_labels import printable
 from palpate.images.readers import read_label_image
 from palpate.images.tissue import Role
 from palpate.study.case import REMAINING
+from palpate.study.case_as_run import CASE_NAME
 from palpate.study.class_names import class_names
 from palpate.study.guess import GuessedTissue, guess_tissues
 from palpate.study.outputs import OutputFolder, read_regular, write_text
+from palpate.study.toml_text import relative_path, toml_key, toml_text
 
 __all__ = ["CaseImages", "NewCase", "new_case", "write_new_case"]
 
-CASE_NAME = "case.toml"
 LARGEST_CASE = 1_000_000  # bytes
 MARGIN_MM = 40.0
 CROP_BELOW = 0.6  # a domain of the margin's box is proposed when it saves so much of the image
@@ -43,8 +42,9 @@ class CaseImages:
 
 @dataclass(frozen=True, slots=True)
 class NewCase:
-    """The text of a case.toml, the tissues in it, and what could not be guessed, as sentences."""
+    """The text of a case.toml for `path`, the tissues in it, and what could not be guessed, as sentences."""
 
+    path: Path
     text: str
     tissues: tuple[GuessedTissue, ...]
     questions: tuple[str, ...]
@@ -67,7 +67,7 @@ class NewCase:
         }
 
 
-def write_new_case(images: Sequence[Path], table: Path | None, outputs: OutputFolder) -> tuple[Path, NewCase]:
+def write_new_case(images: Sequence[Path], table: Path | None, outputs: OutputFolder) -> NewCase:
     """Write case.toml for label images (before, after ...), unless it is there and says something else.
 
     Raises `ConfigurationError` when fewer than two images are given or another case.toml is in the way, else as
@@ -77,16 +77,15 @@ def write_new_case(images: Sequence[Path], table: Path | None, outputs: OutputFo
         raise ConfigurationError("name the label image before, then one or more after")
     outputs.require([CASE_NAME])
     case = new_case(CaseImages(images[0], tuple(images[1:]), table), outputs.path)
-    path = outputs.path / CASE_NAME
-    if path.exists() and _content(path) != case.text.encode("utf-8"):
+    if case.path.exists() and _content(case.path) != case.text.encode("utf-8"):
         raise ConfigurationError(
-            f"there is a case already, {path}, and it is not replaced: estimate it with 'palpate estimate {path}', or"
-            " choose another --output"
+            f"there is a case already, {case.path}, and it is not replaced: estimate it with 'palpate estimate"
+            f" {case.path}', or choose another --output"
         )
     with outputs.staged() as staging:
         write_text(staging.area / CASE_NAME, case.text)
         staging.commit()
-    return path, case
+    return case
 
 
 def _content(path: Path) -> bytes:
@@ -124,18 +123,19 @@ def new_case(images: CaseImages, folder: Path) -> NewCase:
         )
     blocks = [_heading(images, folder, questions, notes), _domain(before, tissues), _mesh(before, tissues)]
     blocks += [_tissue(tissue, before) for tissue in tissues]
-    return NewCase("\n\n".join(block for block in blocks if block) + "\n", tissues, questions)
+    text = "\n\n".join(block for block in blocks if block) + "\n"
+    return NewCase(folder / CASE_NAME, text, tissues, questions)
 
 
 def _questions(tissues: Sequence[GuessedTissue]) -> tuple[str, ...]:
     roles = {tissue.role for tissue in tissues}
     asked = [
-        f'[tissues.{_key(t.name)}] role: {t.reason}; write role = "estimate", "known", "driver", "rigid" or'
+        f'[tissues.{toml_key(t.name)}] role: {t.reason}; write role = "estimate", "known", "driver", "rigid" or'
         ' "void" there'
         for t in tissues
         if t.role is None
     ]
-    asked += [f"[tissues.{_key(t.name)}] role: {t.question}" for t in tissues if t.question]
+    asked += [f"[tissues.{toml_key(t.name)}] role: {t.question}" for t in tissues if t.question]
     if Role.ESTIMATE not in roles:
         asked.append('no organ was found to estimate; give role = "estimate" to the tissues whose stiffness you want')
     if Role.DRIVER not in roles:
@@ -156,10 +156,10 @@ def _heading(images: CaseImages, folder: Path, questions: Sequence[str], notes: 
     lines = ["# Made by `palpate init`. Every role is a guess: read the reasons, correct what is wrong."]
     lines += [_comment(f"QUESTION: {question}") for question in questions]
     lines += [_comment(f"NOTE: {note}") for note in notes]
-    lines += ["", "[images]", f"before = {_path(images.before, folder)}"]
-    lines.append(f"after = [{', '.join(_path(path, folder) for path in images.after)}]")
+    lines += ["", "[images]", f"before = {toml_text(relative_path(images.before, folder))}"]
+    lines.append(f"after = [{', '.join(toml_text(relative_path(path, folder)) for path in images.after)}]")
     if images.table:
-        lines.append(f"names = {_path(images.table, folder)}")
+        lines.append(f"names = {toml_text(relative_path(images.table, folder))}")
     return "\n".join(lines)
 
 
@@ -167,15 +167,15 @@ def _tissue(tissue: GuessedTissue, before: LabelImage) -> str:
     named = [before.names.get(label, "") for label in tissue.labels]
     unique = len(named) == 1 and named[0] not in ("", REMAINING) and list(before.names.values()).count(named[0]) == 1
     if not tissue.labels:
-        label: str = _text(REMAINING)
+        label: str = toml_text(REMAINING)
     elif unique:
-        label = _text(named[0])
+        label = toml_text(named[0])
     else:
         label = str(tissue.labels[0]) if len(tissue.labels) == 1 else str(list(tissue.labels))
-    lines = [f"[tissues.{_key(tissue.name)}]", f"label = {label}"]
+    lines = [f"[tissues.{toml_key(tissue.name)}]", f"label = {label}"]
     if tissue.role is None:
         return "\n".join([*lines, _comment(f"role = ?  QUESTION: {tissue.reason}; without a role the case is refused")])
-    lines.append(f"role = {_text(tissue.role)}  {_comment(tissue.reason)}")
+    lines.append(f"role = {toml_text(tissue.role)}  {_comment(tissue.reason)}")
     if tissue.role is Role.KNOWN:
         value = tissue.youngs_modulus_kpa
         if value is None:
@@ -210,37 +210,6 @@ def _mesh(before: LabelImage, tissues: Sequence[GuessedTissue]) -> str:
     diameter = float((6.0 * min(voxels) * before.grid.voxel_volume / np.pi) ** (1.0 / 3.0))
     edge = round(2.0 * min(max(diameter / ORGAN_EDGES, EDGES_MM[0]), EDGES_MM[1])) / 2.0
     return f"[mesh]\nedge_length_mm = {edge:g}  # the smallest organ is as large as a ball of {diameter:.0f} mm"
-
-
-def _path(path: Path, folder: Path) -> str:
-    """A path relative to the folder, with slashes, as a TOML string.
-
-    Links on the way to both are followed first: `..` leads out of the folder that a link leads to.
-    """
-    place, real = path.absolute().parent.resolve() / path.name, folder.resolve()
-    try:
-        relative = os.path.relpath(place, real)
-    except ValueError:  # another drive
-        relative = str(place)
-    if relative.startswith("~"):  # a case's reader takes that for somebody's home
-        relative = str(Path("..", real.name, relative))
-    return _text(Path(relative).as_posix())
-
-
-def _text(value: str) -> str:
-    """`value` as a basic string of TOML; raises `ConfigurationError` for what UTF-8 cannot hold."""
-    try:
-        value.encode("utf-8")
-    except UnicodeEncodeError as error:
-        raise ConfigurationError(
-            f"{value!r} is not UTF-8, so no case file can name it; rename the file or give it an ASCII link"
-        ) from error
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def _key(name: str) -> str:
-    plain = name.isascii() and all(letter.isalnum() or letter in "-_" for letter in name)
-    return name if plain else _text(name)
 
 
 def _comment(text: str) -> str:

@@ -17,6 +17,7 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.case import Case, CaseTissue
+from palpate.study.case_text import case_tables
 from palpate.study.estimation import Estimation, ModulusEstimate, Remark, Start, TissueFit, no_estimate
 
 __all__ = [
@@ -261,6 +262,8 @@ def _closing(case: Case, provenance: Provenance, remarks: tuple[Remark, ...]) ->
         "seconds": dict(provenance.seconds),
         "inputs": {key: {"sha256": digest} for key, digest in provenance.inputs.items()},
         "versions": dict(provenance.versions),
+        "case": case_tables(case, lambda path: path.name),
+        "overrides": list(case.overrides),
         "seed": case.seed,
         "warnings": [{"code": warning.code, "message": warning.message} for warning in remarks],
     }

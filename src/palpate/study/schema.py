@@ -35,7 +35,8 @@ class Rule:
     choices: the values it may have; later: values of the schema that this version does not offer yet;
     between: the least and the largest number, either of which it may be; test: a condition; wanted: what it must be,
     in words, beside the numbers; instead_of: the key that may not stand beside this one; convert: reads a value whose
-    type alone does not say how; collects: keys of the same table, with their ranges, whose numbers the field holds.
+    type alone does not say how; collects: keys of the same table, with their ranges, whose numbers the field holds;
+    unwritten: the field is no key of the table.
     """
 
     choices: tuple[str, ...] = ()
@@ -46,6 +47,7 @@ class Rule:
     instead_of: str = ""
     convert: Callable[[object], object] | None = None
     collects: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    unwritten: bool = False
 
 
 def rule(
@@ -91,7 +93,7 @@ def read_table(kind: type[T], table: Mapping[str, object], *, where: str, folder
     fields = {field.name: field for field in dataclasses.fields(typing.cast("Any", kind))}
     rules = {name: field.metadata.get("rule", Rule()) for name, field in fields.items()}
     collected = {key: name for name, bounds in rules.items() for key in bounds.collects}
-    keys = [*collected, *(name for name in fields if not rules[name].collects)]
+    keys = [*collected, *(name for name, bounds in rules.items() if not bounds.collects and not bounds.unwritten)]
     for key in table:
         if key not in keys:
             raise ConfigurationError(f"unknown key '{shortened(key)}' in {where}: {nearest(key, keys)}")

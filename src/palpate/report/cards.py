@@ -1,0 +1,95 @@
+"""The estimates of a result alone: as lines, as cards for a notebook, as a figure with their intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import jinja2
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from palpate.report.rows import NONE, estimate_rows, interval_text, main_numbers
+
+__all__ = ["moduli_figure", "result_cards", "result_lines"]
+
+GREY = "#888888"
+ROOM = 1.6  # by which factor the axis reaches beyond all numbers, for the arrows of open ends
+STYLE = {"text.parse_math": False, "font.family": "DejaVu Sans"}  # a tissue called $x is a name, not a formula
+
+
+def result_lines(document: Mapping[str, Any]) -> str:
+    """A line a tissue of the document result.json: value with its 95 % interval, verdict and why."""
+    lines = [] if document["status"] == "converged" else [f"{document['status']}: {document['reason']}"]
+    for row in estimate_rows(document, {}):
+        found = "no value"
+        if row.value != NONE:
+            found = f"{row.value} kPa (95 %: {row.interval} kPa)"
+        elif row.ratio != NONE:
+            found = f"{row.ratio} x {row.relative_to} (95 %: {row.ratio_interval})"
+        lines.append(f"{row.tissue}: {found}, {row.verdict}: {row.why}")
+    return "\n".join(lines)
+
+
+def result_cards(document: Mapping[str, Any], colours: Mapping[str, str]) -> str:
+    """HTML with a card a tissue: value, interval, verdict and why, escaped; then the warnings.
+
+    document: result.json; colours: tissue -> #rrggbb.
+    """
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("palpate.report"), autoescape=True, undefined=jinja2.StrictUndefined
+    )
+    template = environment.get_template("cards.html")
+    return str(template.render(document=document, rows=estimate_rows(document, colours)))
+
+
+def moduli_figure(document: Mapping[str, Any], colours: Mapping[str, str]) -> Figure:
+    """A figure of the moduli (kPa, or ratios) with their 95 % intervals; open ends are arrows, truths dashes.
+
+    document, colours: as above. What did not converge is named without a number.
+    """
+    items = [item for item in document["estimates"] if item["parameter"] == "youngs_modulus"]
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(6.4, 1.2 + 0.55 * max(len(items), 1)), layout="constrained")
+        axes = figure.add_subplot()
+        axes.set_xscale("log")
+        _set_scale(axes, items)
+        for row, item in enumerate(items):
+            _draw_item(axes, row, item, colours.get(item["tissue"], GREY))
+        axes.set_yticks(range(len(items)), [f"{item['tissue']}\n{item['verdict']}" for item in items])
+        axes.set_ylim(len(items) - 0.5, -0.5)
+        in_kpa = all(item["unit"] == "kPa" for item in items)
+        axes.set_xlabel("Young's modulus (kPa), 95 % interval" if in_kpa else "ratio of moduli, 95 % interval")
+        axes.grid(visible=True, axis="x", alpha=0.3)
+    return figure
+
+
+def _set_scale(axes: Axes, items: list[Mapping[str, Any]]) -> None:
+    """Limits around all numbers, with ticks that are written out."""
+    numbers = [item["truth"] for item in items]
+    for item in items:
+        value, interval = main_numbers(item)
+        numbers += [value, *(interval or ())]
+    known = [number for number in numbers if number]
+    axes.set_xlim(min(known, default=1.0) / ROOM, max(known, default=1.0) * ROOM)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _draw_item(axes: Axes, row: int, item: Mapping[str, Any], colour: str) -> None:
+    value, interval = main_numbers(item)
+    if item["truth"] is not None:
+        axes.plot([item["truth"]] * 2, [row - 0.3, row + 0.3], color="black", linestyle="--", label="truth")
+    if value is None:
+        axes.text(0.5, row, "no value", transform=axes.get_yaxis_transform(), ha="center", va="center", color=GREY)
+        return
+    low, high = interval or (value, value)
+    ends = axes.get_xlim()
+    axes.plot([low or ends[0], high or ends[1]], [row, row], color=colour, linewidth=5, alpha=0.55, gid="interval")
+    for end, marker, place in ((low, "<", ends[0]), (high, ">", ends[1])):
+        if end is None:
+            axes.plot(place, row, marker=marker, color=colour, markersize=9, clip_on=False, gid="open")
+    axes.plot(value, row, "o", color=colour, markeredgecolor="black", label=f"{value:.3g} ({interval_text(interval)})")

@@ -1,0 +1,1 @@
+"""What the commands do, as functions: the command line and Python take the same steps."""

@@ -1,0 +1,75 @@
+"""The steps of the commands: a new case, its check, its mesh, a simulation, an estimate."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+
+from palpate.steps.results import CaseResult
+from palpate.study import run
+from palpate.study.case import Case
+from palpate.study.check import CheckReport, check_case
+from palpate.study.lock import held_folder
+from palpate.study.new_case import NewCase, write_new_case
+from palpate.study.outputs import OutputFolder
+from palpate.study.result import MeshResult, Simulation
+
+__all__ = ["check", "estimate", "init", "make_mesh", "simulate"]
+
+Progress = Callable[[str], None]
+PathLike = str | os.PathLike[str]
+
+
+def init(
+    before: PathLike, *after: PathLike, labels: PathLike | None = None, output: PathLike = "palpate-output"
+) -> NewCase:
+    """Write a case.toml for label images into the folder `output`, roles guessed from names, as `palpate init` does.
+
+    labels: a label table. The case that is given says where it lies (`path`), who is taken for what and why
+    (`tissues`), and what nobody can guess (`questions`). Raises `InputDataError` for images that cannot be used,
+    `ConfigurationError` where another case.toml is in the way, `ResourceError` where nothing can be written.
+    """
+    outputs = OutputFolder(Path(output))
+    with held_folder(outputs.path):
+        table = None if labels is None else Path(labels)
+        return write_new_case([Path(path) for path in (before, *after)], table, outputs)
+
+
+def check(case_file: PathLike, overrides: Sequence[str] = (), *, progress: Progress = run.silent) -> CheckReport:
+    """Every problem of a case file at once, its organs and what an estimate would cost, as `palpate check` tells.
+
+    overrides: as for `read_case`; progress: is called with a sentence at each stage. Raises nothing for a bad case:
+    that is a problem of the report, too.
+    """
+    return check_case(Path(case_file), overrides, progress=progress)
+
+
+def make_mesh(case: Case, *, progress: Progress = run.silent) -> MeshResult:
+    """The tetrahedra of a case's reference image, passed through the gate on their quality, as `palpate mesh` has them.
+
+    progress: is called with a sentence at each stage. Raises `InputDataError` for images that cannot be used,
+    `GeometryError` for organs that cannot be meshed, `MeshQualityError` for a mesh that fails its gate.
+    """
+    return run.mesh(case, progress=progress)
+
+
+def simulate(case: Case, *, steps: int = 1, progress: Progress = run.silent) -> Simulation:
+    """A later state of a case whose tissues all state their `youngs_modulus_kpa`, under its law, motion and loads.
+
+    steps: how many states to give, each in equilibrium at its share of the motion. Raises as `make_mesh` does, and
+    `ConfigurationError` when a modulus is missing, `NotConverged` where a finite-strain path ends early.
+    """
+    return run.simulate(case, progress=progress, steps=steps)
+
+
+def estimate(case: Case, *, truth: Mapping[str, float] | None = None, progress: Progress = run.silent) -> CaseResult:
+    """The Young's modulus of every `estimate` tissue of a case, with its interval and its verdict.
+
+    truth: true moduli (kPa) by tissue, to stand beside the estimates of a simulation; a phantom brings its own;
+    progress: is called with a sentence at each stage. Raises as `make_mesh` does, and `EstimationError` where there is
+    no result; an iteration that did not converge is a result whose status says so, without values.
+    """
+    found = run.estimate(case, progress=progress, truth=truth)
+    return CaseResult(**{field.name: getattr(found, field.name) for field in fields(found)})

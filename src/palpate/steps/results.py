@@ -1,0 +1,92 @@
+"""A result as it is used in Python: saved, drawn, shown in a notebook, put into a table."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from palpate.errors import ResourceError
+from palpate.report.cards import moduli_figure, result_cards, result_lines
+from palpate.report.colours import tissue_colours
+from palpate.steps.saving import save_estimate
+from palpate.study import result
+from palpate.study.case_as_run import refuse_other_case
+from palpate.study.lock import held_folder
+from palpate.study.outputs import OutputFolder
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+__all__ = ["CaseResult"]
+
+COLUMNS = ("patient", "id", "stage", "status")
+
+
+@dataclass(frozen=True, slots=True)
+class CaseResult(result.CaseResult):
+    """The outcome of `palpate.estimate`: what the study found, and what a person does with it.
+
+    Everything in it is described in `palpate.study.CaseResult`, whose fields it has.
+    """
+
+    def save(self, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
+        """Write result.json, report.html, mesh.vtu ... into `folder`, as `palpate estimate` does, all or none of them.
+
+        Gives the paths that were written. Raises `ConfigurationError` where the folder holds another case.toml of
+        somebody's own, `ResourceError` where another run works there or the disk refuses.
+        """
+        outputs = OutputFolder(Path(folder))
+        with held_folder(outputs.path):
+            refuse_other_case(self.case, outputs)
+            save_estimate(self, outputs)
+        return tuple(outputs.path / name for name in outputs.written)
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """A row a tissue: case, tissue, value and 95 % interval in kPa and as a ratio, verdict, truth.
+
+        An open end of an interval, and a value that was not found, is NaN. Raises `ResourceError` where pandas is not
+        installed.
+        """
+        try:
+            pandas = import_module("pandas")
+        except ImportError as error:
+            raise ResourceError(
+                "a table of results needs pandas, which is not installed: pip install 'palpate[dataframe]'; without it,"
+                " to_dict()['estimates'] holds the same numbers"
+            ) from error
+        document = self.to_dict()
+        heading = {key: document[key] for key in COLUMNS}
+        rows = []
+        for item in document["estimates"]:
+            (low, high), (least, most) = (item[key] or (None, None) for key in ("interval95", "ratio_interval95"))
+            rows.append(
+                heading
+                | {"tissue": item["tissue"], "value_kpa": item["value"], "low_kpa": low, "high_kpa": high}
+                | {"ratio": item["ratio"], "ratio_low": least, "ratio_high": most, "relative_to": item["relative_to"]}
+                | {"verdict": item["verdict"], "why": item["why"], "truth_kpa": item["truth"]}
+            )
+        numbers = ["value_kpa", "low_kpa", "high_kpa", "ratio", "ratio_low", "ratio_high", "truth_kpa"]
+        table: pd.DataFrame = pandas.DataFrame(rows).astype(dict.fromkeys(numbers, float))
+        return table
+
+    def plot(self) -> Figure:
+        """A figure of the moduli with their 95 % intervals on a logarithmic axis; open ends are arrows.
+
+        A figure of its own, which no display is needed for: `figure.savefig("moduli.png")`.
+        """
+        return moduli_figure(self.to_dict(), self._colours())
+
+    def __str__(self) -> str:
+        """A line a tissue: value, interval, verdict and why."""
+        return result_lines(self.to_dict())
+
+    def _repr_html_(self) -> str:
+        """The verdict of each tissue as a card, for notebooks."""
+        return result_cards(self.to_dict(), self._colours())
+
+    def _colours(self) -> dict[str, str]:
+        return {t.name: colour for t, colour in zip(self.tissues, tissue_colours(self.tissues), strict=True)}

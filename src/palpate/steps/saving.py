@@ -1,0 +1,89 @@
+"""The files of an estimate put in place together: numbers, page, mesh and case, all or none."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from palpate.errors import EstimationError, ResourceError
+from palpate.export.case_files import write_estimate_files
+from palpate.report import case_report
+from palpate.study.case import Case
+from palpate.study.case_as_run import stage_case
+from palpate.study.earlier import RESULT, earlier_files
+from palpate.study.outputs import OutputFolder, Staging, write_json
+from palpate.study.result import CaseResult, failure_document
+from palpate.study.run import silent
+
+__all__ = ["DATA", "PAGE", "save_document", "save_estimate", "save_failure"]
+
+LOGGER = logging.getLogger(__name__)
+PAGE, DATA = "report.html", "report-data.npz"
+
+
+def save_estimate(
+    result: CaseResult, outputs: OutputFolder, *, progress: Callable[[str], None] = silent
+) -> dict[str, Any]:
+    """Put all files of an estimate in place in a folder that this process holds; gives the document result.json.
+
+    Where the page cannot be made, a warning of the document says so instead. Raises `ResourceError` where the disk
+    refuses.
+    """
+    progress("writing mesh and stiffness map")
+    document = result.to_dict()
+    with outputs.staged() as staging:
+        write_estimate_files(result, staging.area)
+        progress("drawing the report")
+        _draw(lambda: case_report.write_case_report(result, staging.area), staging, document)
+        _commit_estimate(staging, result.case, document)
+    return document
+
+
+def save_failure(case: Case, error: EstimationError, outputs: OutputFolder) -> dict[str, Any]:
+    """The same for an estimate without a result: a document that says so, and which files are not of this run."""
+    LOGGER.error("%s", error, exc_info=error)
+    document = failure_document(case, error)
+    with outputs.staged() as staging:
+        _draw(lambda: case_report.write_failure_report(case, error, staging.area), staging, document)
+        _commit_estimate(staging, case, document)
+    return document
+
+
+def save_document(staging: Staging, name: str, document: dict[str, Any]) -> None:
+    """Put the staged files in place with the document that lists them; those of the document before it go with that."""
+    document["files"] = staging.digests()
+    earlier = earlier_files(staging.folder, name, document["files"])
+    document["warnings"] = [*document["warnings"], *earlier.warnings]
+    write_json(staging.area / name, document)
+    staging.commit(retired=earlier.retired, aside=earlier.aside)
+
+
+def _commit_estimate(staging: Staging, case: Case, document: dict[str, Any]) -> None:
+    """All files with the case as it was run; where space is short for all, without the page."""
+    own = [*document["warnings"], *stage_case(case, staging)]
+    while True:
+        document["warnings"] = own
+        try:
+            return save_document(staging, RESULT, document)
+        except ResourceError as error:
+            if PAGE not in document["files"] or staging.unfinished:
+                raise
+            LOGGER.warning("the report is left out: %s", error)
+            own = [*own, _no_report(error)]
+            staging.discard(PAGE, DATA, RESULT)
+
+
+def _draw(write: Callable[[], Path], staging: Staging, document: dict[str, Any]) -> None:
+    """Make page and data, both or none; a drawing never costs the estimate."""
+    try:
+        write()
+    except Exception as error:
+        LOGGER.exception("the report could not be written")
+        staging.discard(PAGE, DATA)
+        document["warnings"] = [*document["warnings"], _no_report(error)]
+
+
+def _no_report(error: Exception) -> dict[str, str]:
+    return {"code": "report", "message": f"{PAGE} could not be written ({error}); the numbers are unharmed"}

@@ -1,0 +1,76 @@
+"""case.toml beside a result: written as it was run; a case of somebody's own is never replaced."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+
+from palpate.cli import main
+
+
+def document(out):
+    return json.loads((out / "result.json").read_text())
+
+
+def test_the_case_as_it_was_run_stands_beside_its_result(estimate, out):
+    assert estimate("anna", "--quiet", "--set", "mesh.edge_length_mm=3") == 0
+    tables = tomllib.loads((out / "case.toml").read_text())
+    assert (tables["id"], tables["mesh"]["edge_length_mm"]) == ("anna", 3)
+    assert tables["images"]["before"] == "../before.nii.gz"
+    assert "case.toml" in document(out)["files"]
+    assert document(out)["overrides"] == ["mesh.edge_length_mm=3"]
+    assert document(out)["case"]["mesh"] == {"edge_length_mm": 3.0}
+
+
+def test_the_next_run_in_the_folder_replaces_it(estimate, out):
+    assert estimate("anna", "--quiet") == 0
+    assert estimate("bert", "--quiet") == 0
+    assert tomllib.loads((out / "case.toml").read_text())["id"] == "bert"
+    assert document(out)["warnings"] == [{"code": "example", "message": "a warning to be shown"}]
+
+
+def test_it_can_be_run_again_in_its_own_folder(estimate, out):
+    assert estimate("anna", "--quiet") == 0
+    first = (out / "case.toml").read_bytes()
+    for _ in range(2):
+        assert main(["estimate", str(out / "case.toml"), "--output", str(out), "--quiet"]) == 0
+        assert (out / "case.toml").read_bytes() == first
+
+
+def test_an_input_is_not_replaced_by_the_case_with_its_overrides(estimate, out, capsys):
+    assert estimate("anna", "--quiet") == 0
+    before = (out / "case.toml").read_bytes()
+    capsys.readouterr()
+    assert main(["estimate", str(out / "case.toml"), "--output", str(out), "--set", "seed=3"]) == 2
+    assert "case.toml is an input of this run" in capsys.readouterr().err
+    assert (out / "case.toml").read_bytes() == before
+
+
+def test_a_case_of_somebodys_own_that_says_something_else_is_refused_at_once(estimate, out, capsys):
+    out.mkdir()
+    (out / "case.toml").write_text("# mine")
+    computed = []
+    assert estimate("anna", meanwhile=lambda: computed.append(1)) == 2
+    assert "case.toml is another case than that of this run" in capsys.readouterr().err
+    assert not computed
+    assert (out / "case.toml").read_text() == "# mine"
+
+
+def test_a_case_of_somebodys_own_that_says_the_same_stays_with_its_comments(estimate, out):
+    assert estimate("anna", "--quiet") == 0
+    mine = "# why: see the ward's book\n" + (out / "case.toml").read_text()
+    (out / "result.json").unlink()
+    (out / "case.toml").write_text(mine)
+    for _ in range(2):
+        assert estimate("anna", "--quiet") == 0
+        assert (out / "case.toml").read_text() == mine
+        assert "case.toml" not in document(out)["files"]
+
+
+def test_a_case_that_is_edited_during_the_run_keeps_the_edit_and_is_warned_of(estimate, out):
+    assert estimate("anna", "--quiet") == 0
+    edited = (out / "case.toml").read_text().replace('id = "anna"', 'id = "anna-2"')
+    assert estimate("anna", "--quiet", meanwhile=lambda: (out / "case.toml").write_text(edited)) == 0
+    assert (out / "case.toml").read_text() == edited
+    assert "case-file" in [warning["code"] for warning in document(out)["warnings"]]
+    assert "case.toml" not in document(out)["files"]

@@ -1,0 +1,77 @@
+"""From Python everything goes as on the command line, with the same files and the same refusals."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import palpate
+from palpate.cli import main
+from palpate.errors import ConfigurationError, ResourceError
+from palpate.images.label_image import LabelImage, VoxelGrid
+from palpate.images.readers import write_label_image
+from palpate.study import run
+from palpate.study.lock import folder_lock
+
+NAMES = {"1": "prostate", "2": "rectum", "3": "body"}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    grid = VoxelGrid((24, 24, 24), np.diag([2.0, 2.0, 2.0, 1.0]))
+    for name, wall in (("before", 8), ("after", 9)):
+        labels = np.full(grid.shape, 3)
+        labels[8:16, 12:20, 8:16], labels[8:16, 4:wall, :] = 1, 2
+        write_label_image(tmp_path / f"{name}.nii.gz", LabelImage(labels, grid))
+    (tmp_path / "names.json").write_text(json.dumps(NAMES))
+    return tmp_path
+
+
+def test_a_new_case_is_that_of_the_command(folder):
+    images = [str(folder / f"{name}.nii.gz") for name in ("before", "after")]
+    assert main(["init", *images, "--labels", str(folder / "names.json"), "--output", str(folder / "a")]) == 0
+    case = palpate.init(*images, labels=folder / "names.json", output=folder / "b")
+    assert case.path == folder / "b" / "case.toml"
+    assert case.path.read_text() == (folder / "a" / "case.toml").read_text() == case.text
+    assert [str(tissue.role) for tissue in case.tissues] == ["estimate", "driver", "known"]
+
+
+def test_a_folder_that_is_refused_is_not_left_behind(folder):
+    with pytest.raises(ConfigurationError, match="image before, then one or more after"):
+        palpate.init(folder / "before.nii.gz", output=folder / "new" / "deeper")
+    assert not (folder / "new").exists()
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_a_check_is_that_of_the_command(folder, capfd, kind):
+    case = palpate.init(folder / "before.nii.gz", folder / "after.nii.gz", labels=folder / "names.json", output=folder)
+    code = main(["check", str(case.path), "--json", "--set", "mesh.edge_length_mm=400"])
+    report = palpate.check(kind(case.path), ["mesh.edge_length_mm=400"])
+    assert (report.exit_code, code) == (4, 4)
+    told = json.loads(capfd.readouterr().out)
+    assert [problem["message"] for problem in told["problems"]] == [problem.message for problem in report.problems]
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_a_mesh_is_made_of_a_case_whatever_its_path_is(folder, kind):
+    case = palpate.init(folder / "before.nii.gz", folder / "after.nii.gz", labels=folder / "names.json", output=folder)
+    told: list[str] = []
+    result = palpate.make_mesh(palpate.read_case(kind(case.path), ["mesh.edge_length_mm=8"]), progress=told.append)
+    assert result.mesh_summary.tets == len(result.space.mesh.tets) > 100
+    assert told[0] == "reading and aligning the images"
+
+
+def test_an_estimate_can_be_saved_and_holds_its_folder(tmp_path, monkeypatch, case_result):
+    monkeypatch.setattr(run, "estimate", lambda _, **__: case_result)
+    result = palpate.estimate(case_result.case)
+    assert isinstance(result, palpate.CaseResult)
+    paths = result.save(str(tmp_path / "out"))
+    assert {path.name for path in paths} == {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"result.json", "report.html", "mesh.vtu", "case.toml"} <= {path.name for path in paths}
+    (told,) = result.to_dict()["warnings"]
+    assert json.loads((tmp_path / "out" / "result.json").read_text())["warnings"] == [told]
+    with folder_lock(tmp_path / "out"), pytest.raises(ResourceError, match="another run"):
+        result.save(tmp_path / "out")

@@ -1,0 +1,51 @@
+"""The wheel holds all that runs need: taken apart, it works away from the repository."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+from hatchling.builders.wheel import WheelBuilder
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def unpacked(tmp_path_factory) -> Path:
+    """The folder with what the wheel holds."""
+    folder = tmp_path_factory.mktemp("wheel")
+    (wheel,) = WheelBuilder(str(ROOT)).build(directory=str(folder / "dist"), versions=["standard"])
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(folder / "unpacked")
+    return folder / "unpacked"
+
+
+def run(unpacked: Path, folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run Python in an empty folder, where the unpacked wheel stands before the repository."""
+    environment = os.environ | {"PYTHONPATH": str(unpacked)}
+    command = [sys.executable, "-P", *arguments]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+
+
+def test_a_case_is_made_of_the_demos_images_from_the_wheel(unpacked, tmp_path):
+    done = run(unpacked, tmp_path, "-c", "import palpate; print(palpate.__file__)")
+    assert Path(done.stdout.strip()) == unpacked / "palpate" / "__init__.py"
+    data = unpacked / "palpate" / "experiments" / "data"
+    images = [str(data / f"simulated_{state}.nii.gz") for state in ("before", "after")]
+    done = run(unpacked, tmp_path, "-m", "palpate", "init", *images, "--labels", str(data / "labels.json"), "--quiet")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "[tissues.prostate]" in (tmp_path / "palpate-output" / "case.toml").read_text()
+
+
+def test_every_file_of_the_package_is_in_the_wheel(unpacked):
+    package = ROOT / "src" / "palpate"
+    wanted = {path.relative_to(package) for path in package.rglob("*") if path.is_file() and path.suffix != ".pyc"}
+    assert {path.relative_to(unpacked / "palpate") for path in (unpacked / "palpate").rglob("*") if path.is_file()} == (
+        wanted
+    )
+    licences = {path.name for path in next(unpacked.glob("*.dist-info/licenses")).rglob("*") if path.is_file()}
+    assert {"LICENSE", "NOTICE", "three.LICENSE.txt"} <= licences
