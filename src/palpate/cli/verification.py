@@ -28,7 +28,14 @@ def verify(arguments: argparse.Namespace, _: None, outputs: OutputFolder, progre
     for row in document["problems"]:
         numbers = [_cell(row[key]) for key in ("reference", "value", "error_percent", "tolerance_percent")]
         rows.append(
-            [row["id"], row["quantity"], *numbers[:2], f"{numbers[2]} %", f"{numbers[3]} %", _mark(row["pass"])]
+            [
+                row["id"],
+                row["quantity"],
+                *numbers[:2],
+                f"{numbers[2]} %",
+                f"{numbers[3]} %",
+                "ok" if row["pass"] else "FAILED",
+            ]
         )
     failed = sorted({row["id"] for row in document["problems"] if not row["pass"]})
     text = f"{columns(rows)}\n{document['passed']} checks passed, {document['failed']} failed\n"
@@ -40,7 +47,3 @@ def verify(arguments: argparse.Namespace, _: None, outputs: OutputFolder, progre
 
 def _cell(value: float | None) -> str:
     return "–" if value is None else f"{value:.6g}" if value == 0.0 or abs(value) > 1e-6 else f"{value:.1e}"
-
-
-def _mark(passed: bool) -> str:
-    return "ok" if passed else "FAILED"

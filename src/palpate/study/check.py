@@ -163,7 +163,10 @@ def check_case(path: Path, overrides: Sequence[str], *, progress: Callable[[str]
     for remark in unit_warnings(case):
         problems.add(Problem(remark.code, remark.message))
     progress("reading the images")
-    pairs = _phantom_states(case, problems) if case.phantom else _read_pairs(case, problems)
+    phantom = problems.attempt(lambda: read_states(case)) if case.phantom else None
+    pairs = _read_pairs(case, problems) if case.phantom is None else []
+    if phantom is not None:
+        pairs = [(phantom.before, phantom.after)]
     for number, (before, after) in enumerate(pairs, start=1):
         where = f"pair {number}: " if number > 1 else ""
         _check_pair(problems, before, after, where=where, loaded=bool(case.loads))
@@ -180,11 +183,6 @@ def check_case(path: Path, overrides: Sequence[str], *, progress: Callable[[str]
 
 
 Pair = tuple[Segmentation, tuple[Segmentation, ...]]
-
-
-def _phantom_states(case: Case, problems: _Problems) -> list[Pair]:
-    states = problems.attempt(lambda: read_states(case))
-    return [] if states is None else [(states.before, states.after)]
 
 
 def _read_pairs(case: Case, problems: _Problems) -> list[Pair]:

@@ -82,9 +82,9 @@ def expected_tets(case: Case, before: Segmentation, after: tuple[Segmentation, .
     inside = index >= 0
     edge = case.mesh.edge_length_mm
     sizes = np.full(index.shape, COARSEST * edge)
-    filler = max(
-        (i for i, tissue in enumerate(before.tissues) if tissue.meshed), key=lambda i: _rank(before, i), default=-1
-    )
+    tissues = [i for i, tissue in enumerate(before.tissues) if tissue.meshed]
+    # the mesher's filler: the remaining tissue if it is meshed, else the largest
+    filler = max(tissues, key=lambda i: (not before.tissues[i].labels, before.volume(i)), default=-1)
     for i, tissue in enumerate(before.tissues):
         if i != filler and (index == i).any():
             start = edge * (1.0 if tissue.role in (Role.ESTIMATE, Role.DRIVER) else COARSER)
@@ -97,11 +97,6 @@ def free_memory_gb() -> float | None:
     """Memory that is free on this machine, GB; None where the system does not tell."""
     free = available_memory()
     return None if free is None else free / 1e9
-
-
-def _rank(before: Segmentation, tissue: int) -> tuple[bool, float]:
-    """The mesher's filler: the remaining tissue if it is meshed, else the largest."""
-    return (not before.tissues[tissue].labels, before.volume(tissue))
 
 
 def _lattice(before: Segmentation, box: Box) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -124,7 +124,9 @@ def guess_tissues(before: LabelImage, after: Sequence[LabelImage] = ()) -> tuple
             f"the reference image shows the label {int(present[0])} only: there is no organ in it; check the file"
         )
     sizes = {int(label): int(count) for label, count in zip(present, counts, strict=True)}
-    border = _border_shares(before)
+    layers = [np.take(before.labels, end, axis).ravel() for axis in range(3) for end in (0, -1)]
+    at_border, n = np.unique(np.concatenate(layers), return_counts=True)
+    border = {int(label): float(share) for label, share in zip(at_border, n / n.sum(), strict=True)}
     guesses = [_guess(label, before, after, border) for label in sizes]
     guesses = _with_driver([_checked(guess, after) for guess in guesses], before, after)
     outside = [g for g in guesses if g.role is Role.VOID]
@@ -198,7 +200,8 @@ def _gap(image: LabelImage, labels: tuple[int, ...], organ: tuple[int, ...]) -> 
 def _by_place(label: int, before: LabelImage, after: Sequence[LabelImage], border: dict[int, float]) -> GuessedTissue:
     """A label without a name: what reaches the border is the body or what is outside it; the others are organs."""
     bodies = [other for other in border if other != 0 and border[other] > BORDER_SHARE and not before.names.get(other)]
-    named = any(_is_body(name) for other, name in before.names.items() if other in border)
+    words = _words("body surroundings surrounding other rest soft")
+    named = any(_words_of(name) & words for other, name in before.names.items() if other in border)
     if label == 0 and (bodies or named):
         return GuessedTissue("outside", (0,), Role.VOID, "label 0 lies outside of the body's own label")
     if label == 0 or label == max(bodies, key=lambda other: border[other], default=0):
@@ -212,10 +215,6 @@ def _by_place(label: int, before: LabelImage, after: Sequence[LabelImage], borde
             name, (label,), Role.DRIVER, f"its volume changes by {change:+.0%}, as only a hollow organ's does"
         )
     return GuessedTissue(name, (label,), Role.ESTIMATE, f"without a name; its volume changes by {change:+.1%} only")
-
-
-def _is_body(name: str) -> bool:
-    return bool(_words_of(name) & _words("body surroundings surrounding other rest soft"))
 
 
 def _checked(guess: GuessedTissue, after: Sequence[LabelImage]) -> GuessedTissue:
@@ -265,13 +264,6 @@ def _renamed(guesses: Sequence[GuessedTissue]) -> list[GuessedTissue]:
         taken.add(name)
         found.append(replace(guess, name=name))
     return found
-
-
-def _border_shares(image: LabelImage) -> dict[int, float]:
-    """Share of the image's six outer layers of voxels that each label covers."""
-    layers = [np.take(image.labels, end, axis).ravel() for axis in range(3) for end in (0, -1)]
-    labels, counts = np.unique(np.concatenate(layers), return_counts=True)
-    return {int(label): float(n) / counts.sum() for label, n in zip(labels, counts, strict=True)}
 
 
 def _still(label: int, before: LabelImage, after: Sequence[LabelImage]) -> bool:

@@ -114,10 +114,7 @@ def read_table(kind: type[T], table: Mapping[str, object], *, where: str, folder
     return kind(**values)
 
 
-@cache
-def _hints(kind: type[Any]) -> Mapping[str, Any]:
-    """Types of the fields of a dataclass; to resolve them takes longer than to read its table."""
-    return typing.get_type_hints(kind)
+_hints = cache(typing.get_type_hints)  # to resolve the types of a dataclass takes longer than to read its table
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +162,8 @@ def _check_value(bounds: Rule, value: object, place: _Place) -> None:
     for item in value if isinstance(value, tuple) else (value,):
         if item in bounds.later:
             raise ConfigurationError(
-                f"{place} is '{item}', which this version of Palpate does not offer yet; use {_either(bounds.choices)}"
+                f"{place} is '{item}', which this version of Palpate does not offer yet; use"
+                f" {' or '.join(map(repr, bounds.choices))}"
             )
         if bounds.choices and item not in bounds.choices:
             raise ConfigurationError(f"{place} is {shown(item)}: {nearest(str(item), bounds.choices)}")
@@ -238,7 +236,3 @@ def shown(value: object) -> str:
         return shortened(repr(list(value) if isinstance(value, tuple) else value))
     except ValueError:  # Python does not write out whole numbers of over 4300 digits
         return "a number too long to be shown"
-
-
-def _either(words: tuple[str, ...]) -> str:
-    return " or ".join(f"'{word}'" for word in words)
