@@ -76,7 +76,7 @@ def test_a_disk_full_from_the_start_ends_with_6(estimate, out, monkeypatch, caps
 
     for place, name in ((os, "write"), (Path, "write_bytes"), (os, "fsync")):
         monkeypatch.setattr(place, name, full)
-    monkeypatch.setattr("palpate.images.readers.nifti._replace", lambda *_: None)
+    monkeypatch.setattr("palpate.export.case_files.write_scalar_image", lambda *_: None)
     assert estimate("anna", "--quiet") == 6
     assert "No space left on device; free some space" in capsys.readouterr().err
     assert {path.name for path in out.iterdir()} == {"log.txt"}
