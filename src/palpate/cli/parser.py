@@ -54,7 +54,7 @@ class _PrintCompletion(argparse.Action):
         import argcomplete
 
         del namespace, option
-        sys.stdout.write(argcomplete.shellcode(["palpate"], shell=values))
+        sys.stdout.write(argcomplete.shellcode(["palpate"], True, values))
         parser.exit()
 
 
