@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from palpate.errors import GeometryError, InputDataError
-from palpate.images.label_image import VoxelGrid
-from palpate.images.segmentation import Segmentation
+from palpate.images.label_image import LabelImage, VoxelGrid
+from palpate.images.segmentation import Segmentation, segment
 from palpate.images.tissue import Role, Tissue
 from palpate.study.contacts import contact_findings, front_findings, motion_findings, sides_findings, wall_motion
 from palpate.study.refusals import refuse_lost, refuse_unmeshable
@@ -78,6 +78,15 @@ def test_sides_that_are_exchanged_are_named():
     images = [scene((0, one, (4, 8), (4, 8)), (1, other, (4, 8), (4, 8)), tissues=bones) for one, other in apart]
     assert sides_findings(images[0], "before") == ()
     assert [finding.code for finding in sides_findings(images[1], "before")] == ["sides-exchanged"]
+
+
+def test_sides_of_bones_that_are_one_tissue_are_told_by_their_labels():
+    tissues = (Tissue("bones", Role.RIGID, (1, 2)), Tissue("surroundings", Role.KNOWN, (), 0.45, 10.0))
+    for one, other, found in ((1, 2, []), (2, 1, ["sides-exchanged"])):
+        labels = np.zeros((24, 12, 12), dtype=np.int32)
+        labels[2:6, 4:8, 4:8], labels[18:22, 4:8, 4:8] = one, other
+        image = LabelImage(labels, VoxelGrid((24, 12, 12), np.eye(4)), {1: "hip_left", 2: "hip_right"})
+        assert [finding.code for finding in sides_findings(segment(image, tissues), "before")] == found
 
 
 def test_a_sacrum_in_front_of_the_bladder_is_named():

@@ -20,7 +20,8 @@ __all__ = ["Segmentation", "first_labels", "segment"]
 class Segmentation:
     """`index` (n_x, n_y, n_z) int16: which of `tissues` a voxel of `grid` belongs to.
 
-    `digests`, `findings`: as of `LabelImage`.
+    `digests`, `findings`: as of `LabelImage`; `middles`: the middle (3,) mm of each named label's voxels, of which one
+    tissue may have several.
     """
 
     index: NDArray[np.int16]
@@ -28,6 +29,7 @@ class Segmentation:
     tissues: tuple[Tissue, ...]
     digests: Mapping[str, str] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
+    middles: Mapping[str, NDArray[np.float64]] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         index = np.array(self.index, dtype=np.int16)
@@ -84,4 +86,8 @@ def segment(image: LabelImage, tissues: tuple[Tissue, ...]) -> Segmentation:
         colour = next((image.colours[label] for label in tissue.labels if label in image.colours), None)
         described.append(replace(tissue, called=called or tissue.called, colour=tissue.colour or colour))
     index = table[inverse].reshape(image.labels.shape)
-    return Segmentation(index, image.grid, tuple(described), image.digests, image.findings)
+    counts, codes = np.bincount(inverse.ravel()), inverse.ravel()
+    places = [np.bincount(codes, voxel.ravel()) / counts for voxel in np.indices(index.shape, dtype=np.float32)]
+    world = image.grid.world(np.stack(places, axis=1))
+    middles = {image.names[int(n)]: place for n, place in zip(labels, world, strict=True) if int(n) in image.names}
+    return Segmentation(index, image.grid, tuple(described), image.digests, image.findings, middles)

@@ -85,12 +85,8 @@ def wall_motion(before: Segmentation, after: Segmentation, tissue: int) -> float
 
 
 def sides_findings(segmentation: Segmentation, name: str) -> tuple[Finding, ...]:
-    """A finding when tissues called left lie to the right (+x, RAS) of their namesakes called right."""
-    middles = {
-        tissue.name.lower(): _middle(segmentation, i, axis=0)
-        for i, tissue in enumerate(segmentation.tissues)
-        if ("left" in tissue.name.lower() or "right" in tissue.name.lower()) and segmentation.mask(i).any()
-    }
+    """A finding when tissues or labels called left lie to the right (+x, RAS) of their namesakes called right."""
+    middles = {called.lower(): place for called, place in _middles(segmentation, ("left", "right"), axis=0).items()}
     twins = [(left, left.replace("left", "right")) for left in middles if "left" in left]
     wrong = [left for left, right in twins if right in middles and middles[left] > middles[right]]
     if not wrong:
@@ -104,11 +100,7 @@ def sides_findings(segmentation: Segmentation, name: str) -> tuple[Finding, ...]
 
 def front_findings(segmentation: Segmentation, name: str) -> tuple[Finding, ...]:
     """A finding when a sacrum lies in front (+y, RAS) of a prostate or bladder, as where a file is mirrored."""
-    middles = {
-        tissue.name: _middle(segmentation, i, axis=1)
-        for i, tissue in enumerate(segmentation.tissues)
-        if any(word in tissue.name.lower() for word in (*BEHIND, *IN_FRONT)) and segmentation.mask(i).any()
-    }
+    middles = _middles(segmentation, (*BEHIND, *IN_FRONT), axis=1)
     behind = [tissue for tissue in middles if any(word in tissue.lower() for word in BEHIND)]
     in_front = [tissue for tissue in middles if tissue not in behind]
     wrong = [(a, b) for a in behind for b in in_front if middles[a] > middles[b]]
@@ -145,9 +137,14 @@ def _outside(one: Segmentation, other: Segmentation, tissue: int) -> int:
     return int(np.count_nonzero(other.index[tuple(index[inside].T)] != tissue))
 
 
-def _middle(segmentation: Segmentation, tissue: int, *, axis: int) -> float:
-    """World coordinate of a tissue's centroid along an axis, mm."""
-    return float(segmentation.grid.world(np.argwhere(segmentation.mask(tissue)).mean(axis=0)[None])[0, axis])
+def _middles(segmentation: Segmentation, words: Sequence[str], *, axis: int) -> dict[str, float]:
+    """World coordinate along an axis, mm, of the middle of each tissue and label whose name holds one of the words."""
+    found = {called: float(place[axis]) for called, place in segmentation.middles.items()}
+    for i, tissue in enumerate(segmentation.tissues):
+        if any(word in tissue.name.lower() for word in words) and segmentation.mask(i).any():
+            voxels = np.argwhere(segmentation.mask(i)).mean(axis=0)[None]
+            found[tissue.name] = float(segmentation.grid.world(voxels)[0, axis])
+    return {called: place for called, place in found.items() if any(word in called.lower() for word in words)}
 
 
 def every_finding(before: Segmentation, after: Sequence[Segmentation], *, loaded: bool = False) -> tuple[Finding, ...]:

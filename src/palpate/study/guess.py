@@ -54,6 +54,7 @@ def _words(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
 
+BONE = "is bone"
 RULES = (
     _Rule(_words("background air outside exterior external void"), Role.VOID, "is no part of the body"),
     _Rule(
@@ -69,7 +70,7 @@ RULES = (
             " mandible"
         ),
         Role.RIGID,
-        "is bone",
+        BONE,
     ),
     _Rule(
         _words("rectum anorectum rectal lumen balloon probe transducer"),
@@ -128,7 +129,7 @@ def guess_tissues(before: LabelImage, after: Sequence[LabelImage] = ()) -> tuple
     at_border, n = np.unique(np.concatenate(layers), return_counts=True)
     border = {int(label): float(share) for label, share in zip(at_border, n / n.sum(), strict=True)}
     guesses = [_guess(label, before, after, border) for label in sizes]
-    guesses = _with_driver([_checked(guess, after) for guess in guesses], before, after)
+    guesses = _with_driver(_with_one_skeleton([_checked(guess, after) for guess in guesses]), before, after)
     outside = [g for g in guesses if g.role is Role.VOID]
     rest = [g for g in guesses if g.name == SURROUNDINGS]
     organs = [g for g in guesses if g.role is not Role.VOID and g.name != SURROUNDINGS]
@@ -215,6 +216,20 @@ def _by_place(label: int, before: LabelImage, after: Sequence[LabelImage], borde
             name, (label,), Role.DRIVER, f"its volume changes by {change:+.0%}, as only a hollow organ's does"
         )
     return GuessedTissue(name, (label,), Role.ESTIMATE, f"without a name; its volume changes by {change:+.1%} only")
+
+
+def _with_one_skeleton(guesses: list[GuessedTissue]) -> list[GuessedTissue]:
+    """All that is called bone as one tissue: between two that touch there is no gap to mesh, and they hold together."""
+    bones = [guess for guess in guesses if guess.role is Role.RIGID and guess.reason.endswith(BONE)]
+    if len(bones) < 2:
+        return guesses
+    labels = tuple(sorted(label for bone in bones for label in bone.labels))
+    reason = (
+        f"one rigid piece: {', '.join(bone.name for bone in bones)}; give a tissue of its own to a bone that moves"
+        " against the others"
+    )
+    whole = GuessedTissue("bones", labels, Role.RIGID, reason)
+    return [whole if guess is bones[0] else guess for guess in guesses if guess not in bones[1:]]
 
 
 def _checked(guess: GuessedTissue, after: Sequence[LabelImage]) -> GuessedTissue:

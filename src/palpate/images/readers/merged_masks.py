@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -13,6 +14,7 @@ from palpate.images.named_labels import NamedLabel, printable
 
 __all__ = ["Mask", "merged"]
 
+BODY = frozenset(("body", "external", "outline", "skin"))  # words of a name: all organs lie in that mask
 MOST_SHOWN = 3  # pairs of organs in the sentence
 
 
@@ -28,7 +30,8 @@ def merged(masks: Iterable[Mask], shape: tuple[int, ...]) -> tuple[NDArray[np.ui
     """Labels (n_1, n_2, n_3) of masks of that shape, of which one at a time is held, and a finding on overlaps.
 
     A contested voxel goes to the mask of the fewest voxels, then of the smallest label, so that a tumour stays whole in
-    its gland; the order of the masks does not matter.
+    its gland; the order of the masks does not matter. That organs lie in the mask of the whole body is no overlap that
+    anyone should correct.
     """
     labels = np.zeros(shape, dtype=np.uint16)
     contested = np.zeros(shape, dtype=bool)
@@ -39,12 +42,13 @@ def merged(masks: Iterable[Mask], shape: tuple[int, ...]) -> tuple[NDArray[np.ui
         new = mask.row.label
         sizes[new], names[new] = (int(np.count_nonzero(mask.inside)), new), mask.row.name
         shared = mask.inside & (labels > 0)
-        contested |= shared
         labels[mask.inside & ~shared] = new
         there = labels[shared]
         for rival, count in zip(*np.unique(there, return_counts=True), strict=True):
             smaller, larger = sorted((int(rival), new), key=sizes.__getitem__)
-            overlaps[smaller, larger] = int(count)
+            if not BODY & set(re.split(r"[^a-z]+", names[larger].lower())):
+                overlaps[smaller, larger] = int(count)
+                contested |= shared & (labels == rival)
             there[there == rival] = smaller
         labels[shared] = there
     if not overlaps:
