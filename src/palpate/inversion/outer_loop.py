@@ -46,6 +46,7 @@ POLISH = 1e-5  # decrement of a minimum by a method that does not tell how far t
 WIDTH = 0.05  # of a posterior standard deviation, by which a reweighting may still change it
 AGREED = 0.3  # of that tolerance, to which weights and estimate agree on linearised residuals
 LINEARISED = 1e-4  # decrement of a minimum on them
+STRAIGHT = 0.4  # of ln E, within which linearised residuals are believed
 WITHIN_NOISE = 0.1  # of the posterior's width: a step that finds no smaller value
 NEAR = 0.5  # posterior standard deviations: a step that is shorter ends where derivatives are worth making exact
 LEAST_SD = 0.03  # of ln E, see `_linearisation`
@@ -233,19 +234,29 @@ def _reweighted_minimum(
     """Iteratively reweighted minimisation on the present approximations, and what its last pass changed.
 
     Each pass finds weights and estimate that agree on the linearised residuals, and goes there on the objective itself.
-    It ends where that moves the log-moduli by less than the tolerance and their standard deviations by less than
-    `WIDTH`, or by a tenth of the last outer iteration's step where that is more. The log-moduli go no further than the
+    Where these lead further than residuals are straight, it minimises the objective itself and reweights there. It ends
+    where a pass moves the log-moduli by less than the tolerance and their standard deviations by less than `WIDTH`, or
+    by a tenth of the last outer iteration's step where that is more. The log-moduli go no further than the
     approximations reach.
     """
     n, objective, minimum = now.objective.n_parameters, now.objective, now.minimum
     reach = min(approximation.reach for approximation in objective.approximations)
     theta, bounds = minimum.unknowns[:n], settings.bounds
     near = Bounds(np.maximum(bounds.lower, theta - reach), np.minimum(bounds.upper, theta + reach))
-    forcing, change = max(1.0, FORCING * now.step), np.inf
+    forcing, change, minimised_before = max(1.0, FORCING * now.step), np.inf, False
     for number in range(1, rule.passes + 1):
         before, (weighted, aim, left) = minimum, _agreed(objective, minimum, near, rule, forcing)
-        objective, minimum = _advanced(weighted, minimum, aim.unknowns, replace(settings, bounds=near))
-        change = max(left, _change(before, minimum, rule, n))
+        straight = bool(np.abs(aim.unknowns - before.unknowns)[:n].max() < STRAIGHT)
+        if straight:
+            objective, minimum = _advanced(weighted, minimum, aim.unknowns, replace(settings, bounds=near))
+            change = max(left, _change(before, minimum, rule, n))
+        else:
+            within = forcing * rule.tolerance(before, n) / INNER
+            found = minimised(objective, before.unknowns, replace(settings, bounds=near), within=within)
+            objective = reweighted(objective, found).rematched(found.unknowns)
+            minimum = replace(found, evaluation=objective(found.unknowns)).after(before)
+            change = _change(before, minimum, rule, n) if minimised_before else np.inf  # of minima under two weightings
+        minimised_before = not straight
         if change < forcing or not minimum.converged:
             break
         progress(f"{line}, reweighting {number}: {objective.parameters.in_words(minimum.unknowns)}")
