@@ -94,18 +94,19 @@ def observation_width(*grids: VoxelGrid) -> float:
     return float(max(smoothing_width(*grids), min(1.0, edge)))
 
 
-def distance_map(mask: NDArray[np.bool_], grid: VoxelGrid, *, smoothing_mm: float) -> DistanceMap:
+def distance_map(mask: NDArray[np.bool_], grid: VoxelGrid, *, smoothing_mm: float, far: bool = True) -> DistanceMap:
     """Signed distance map of the voxels in `mask` (n_x, n_y, n_z).
 
     Near the surface the probit of the smoothed indicator, d = -sigma Phi^-1(G_sigma * 1_mask), which is exact for a
-    plane; far from it the Euclidean distance transform, blended over one sigma. `smoothing_mm` is sigma, mm.
+    plane; far from it the Euclidean distance transform, blended over one sigma. `smoothing_mm` is sigma, mm. Without
+    `far` the map ends in planes of 2.5 sigma, for what is asked near the surface: a third of the price.
     """
     sigma = smoothing_mm / grid.spacing
     share = ndimage.gaussian_filter(mask.astype(np.float64), sigma, mode="nearest", truncate=5.0)
     near = -smoothing_mm * special.ndtri(np.clip(share, 1e-12, 1.0 - 1e-12))
-    far = _distance_transform(mask, grid)
     weight = np.clip(np.abs(near) / smoothing_mm - (PROBIT_LIMIT - 1.0), 0.0, 1.0)
-    values = (1.0 - weight) * near + weight * far
+    limit = PROBIT_LIMIT * smoothing_mm
+    values = (1.0 - weight) * near + weight * (_distance_transform(mask, grid) if far else np.clip(near, -limit, limit))
     return DistanceMap(ndimage.spline_filter(values, order=3, mode="mirror"), grid, smoothing_mm)
 
 

@@ -17,17 +17,17 @@ REACH_MM = 25.0  # organs that move further are not found again
 
 
 def tissue_distance_map(
-    segmentation: Segmentation, tissue: int, *, smoothing_mm: float, reach_mm: float = REACH_MM
+    segmentation: Segmentation, tissue: int, *, smoothing_mm: float, reach_mm: float = REACH_MM, far: bool = True
 ) -> DistanceMap:
     """Signed distance map of a tissue by its index; it reaches `reach_mm` beyond the tissue's bounding box.
 
-    `smoothing_mm`: see `distance_map`. Raises `InputDataError` when the image has no voxel of the tissue.
+    `smoothing_mm`, `far`: see `distance_map`. Raises `InputDataError` when the image has no voxel of the tissue.
     """
     mask = segmentation.mask(tissue)
     if not mask.any():
         raise InputDataError(f"tissue '{segmentation.tissues[tissue].name}' has no voxel in the image")
     window = window_around(mask, segmentation.grid, reach_mm=reach_mm)
-    return distance_map(mask[window], cropped(segmentation.grid, window), smoothing_mm=smoothing_mm)
+    return distance_map(mask[window], cropped(segmentation.grid, window), smoothing_mm=smoothing_mm, far=far)
 
 
 def window_around(mask: NDArray[np.bool_], grid: VoxelGrid, *, reach_mm: float) -> tuple[slice, slice, slice]:

@@ -45,6 +45,7 @@ INNER = 20.0  # a minimum is found to so small a part of what a reweighting may 
 POLISH = 1e-5  # decrement of a minimum by a method that does not tell how far the log-moduli are from it
 WIDTH = 0.05  # of a posterior standard deviation, by which a reweighting may still change it
 AGREED = 0.3  # of that tolerance, to which weights and estimate agree on linearised residuals
+FIRST = 10.0  # tolerances, to which they agree there at the least, however far the estimate still is
 LINEARISED = 1e-4  # decrement of a minimum on them
 STRAIGHT = 0.4  # of ln E, within which linearised residuals are believed
 WITHIN_NOISE = 0.1  # of the posterior's width: a step that finds no smaller value
@@ -287,7 +288,7 @@ def _agreed(
         before = found
         found = gauss_newton(linearised, before.unknowns, bounds=bounds, tolerance=LINEARISED, within=within)
         change = _change(before, found, rule, n)
-        if change < AGREED * forcing:
+        if change < AGREED * min(forcing, FIRST):
             break
     return linearised.objective, found, change
 

@@ -204,7 +204,8 @@ def _step(way: _Way, path: NewtonPath, length: float) -> NewtonPath:
     residual, _ = way.residual(path.displacement, fraction + length)
     stiffness = balance.stiffness(path.displacement, path.pressure)
     load = residual + length * np.asarray(balance.free.T @ (stiffness @ way.increment))
-    free, path = _solved(way, path, stiffness, -load, FORCING[0])
+    forcing = float(np.clip(0.3 * _tolerance(way, fraction + length), *FORCING))
+    free, path = _solved(way, path, stiffness, -load, forcing)
     change = np.asarray(balance.free @ free) + length * way.increment
     share = _bearable(way, path, change)
     ahead = min(1.0, fraction + share * length)
@@ -223,10 +224,15 @@ def _bearable(way: _Way, path: NewtonPath, change: Array) -> float:
     raise _StepFailed(f"{worst} would be turned inside out", path)
 
 
+def _tolerance(way: _Way, fraction: float) -> float:
+    """The final tolerance at the end of the way, the one between steps before it."""
+    return way.settings.tolerance if fraction == 1.0 else way.settings.step_tolerance
+
+
 def _correct(way: _Way, path: NewtonPath) -> NewtonPath:
     """Newton's iterations at the path's fraction until the residual is below the tolerance."""
     settings = way.settings
-    tolerance = settings.tolerance if path.fraction == 1.0 else settings.step_tolerance
+    tolerance = _tolerance(way, path.fraction)
     residual, size = way.residual(path.displacement, path.fraction)
     for _ in range(settings.max_iterations):
         path = replace(path, force=max(path.force, size))

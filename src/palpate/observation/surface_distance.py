@@ -181,7 +181,7 @@ class SurfaceDistance:
         rest = np.einsum("qk,qka->qa", target.barycentric, surface.rest[corners])
         excess = np.einsum("qk,qk->q", target.barycentric, self.held.excess[corners])
         maps = [
-            tissue_distance_map(image, surface.tissue, smoothing_mm=width, reach_mm=AROUND * width)
+            tissue_distance_map(image, surface.tissue, smoothing_mm=width, reach_mm=AROUND * width, far=False)
             for image in (before, after)
         ]
         errors, n = np.zeros(len(residuals.values)), len(rest)
