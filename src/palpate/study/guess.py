@@ -115,7 +115,8 @@ LARGE_BOWEL = _words("colon sigmoid")
 def guess_tissues(before: LabelImage, after: Sequence[LabelImage] = ()) -> tuple[GuessedTissue, ...]:
     """Tissues for a case on these images, in the order in which a case should list them.
 
-    A tumour stands before the organ around it, the surroundings before other known tissues, for they set the scale.
+    A tumour stands before the organ around it and a small organ before a large one, for the first keeps what two claim;
+    the surroundings before other known tissues, for they set the scale.
     Labels that belong to no organ of interest are left to the surroundings. Raises `InputDataError` when the image
     shows a single label.
     """
@@ -133,7 +134,8 @@ def guess_tissues(before: LabelImage, after: Sequence[LabelImage] = ()) -> tuple
     outside = [g for g in guesses if g.role is Role.VOID]
     rest = [g for g in guesses if g.name == SURROUNDINGS]
     organs = [g for g in guesses if g.role is not Role.VOID and g.name != SURROUNDINGS]
-    return tuple(_renamed([*sorted(organs, key=_order), *_surroundings(rest, before), *outside]))
+    organs.sort(key=lambda guess: (_order(guess), sum(sizes[label] for label in guess.labels)))
+    return tuple(_renamed([*organs, *_surroundings(rest, before), *outside]))
 
 
 def _guess(label: int, before: LabelImage, after: Sequence[LabelImage], border: dict[int, float]) -> GuessedTissue:
