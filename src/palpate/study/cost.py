@@ -21,11 +21,12 @@ __all__ = ["ExpectedCost", "expected_cost", "expected_tets", "free_memory_gb"]
 
 LATTICE = 96  # points of the lattice along the longest side, on which edge lengths are summed
 # Fitted to the runs of benchmarks/cost.py (docs/command-line.md), on two cores of a 2.1 GHz server.
-TETS_A_CUBE = 22.8  # tetrahedra in a cube of the wanted edge length: 17 in smooth phantoms, 31 in a real pelvis
+TETS_A_CUBE = 19.4  # tetrahedra in a cube of the wanted edge length: 17 in smooth phantoms, 31 in a real pelvis
 UNKNOWNS_A_TET = {"P1": 0.62, "P2": 4.4}
-FIXED_S = 24.0  # start, first solves, intervals, report
-SECONDS_AN_UNKNOWN = 7e-5  # beside the solver, with 90 modes a driver, for each later image; finite strain the same
-SECONDS_A_CUT = 1.4e-4  # of meshing, for each tetrahedron and each tissue that is cut out
+FIXED_S = 18.0  # start, first solves, intervals, report
+SECONDS_AN_UNKNOWN = 1.5e-4  # beside the solver, with 90 modes a driver, for each later image
+FINITE_STRAIN_S = 2.9e-4  # the same of equilibria and their derivatives at finite strain
+SECONDS_A_CUT = 1.65e-4  # of meshing, for each tetrahedron and each tissue that is cut out
 PARALLEL_SHARE = 0.3  # of the time, that more processors shorten
 FIXED_GB = 0.5
 GB_AN_UNKNOWN = 1.8e-5  # beside the factor, with 90 modes
@@ -60,7 +61,7 @@ def expected_cost(case: Case, before: Segmentation, after: tuple[Segmentation, .
     modes = (drivers * case.driver.modes + OVERHEAD_MODES) / (USUAL_MODES + OVERHEAD_MODES)
     work = unknowns * modes * max(len(after), 1)
     finite = case.mechanics.material_law.finite
-    seconds = SECONDS_AN_UNKNOWN * work + SECONDS_A_CUT * tets * (len(before.tissues) - 1)
+    seconds = (SECONDS_AN_UNKNOWN + finite * FINITE_STRAIN_S) * work + SECONDS_A_CUT * tets * (len(before.tissues) - 1)
     gigabytes = GB_AN_UNKNOWN * work + solving.bytes / 1e9
     gigabytes *= FINITE_STRAIN_GB if finite else 1.0
     count = processors()
