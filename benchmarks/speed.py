@@ -26,6 +26,7 @@ import speed_direct as direct
 import speed_peers as peers
 from memory import peak_mb
 from numpy.typing import NDArray
+from speed_default import default_case
 from speed_stages import shares_of_stages
 
 from palpate.images import segment
@@ -56,7 +57,7 @@ from palpate.study import (
     make_body,
 )
 
-PARTS = ("solver", "linear", "nonlinear", "gradient", "posterior", "scaling", "front_end")
+PARTS = ("solver", "linear", "nonlinear", "gradient", "posterior", "scaling", "front_end", "default")
 IN_A_ROW = 20  # gradients, as an optimiser asks for them
 STARTS = (0.5, 1.0, 2.0, 4.0, 8.0)  # moduli to the surroundings'
 SCALING_EDGES = (9.0, 6.0, 4.0, 2.7, 1.85, 1.65)  # mm: 30 k to 1 M unknowns
@@ -321,6 +322,12 @@ def _scaling(sizes: Sizes, seed: int, say: Say) -> Result:
     return {"scaling": rows, "scaling_exponent": exponent}
 
 
+def _default(sizes: Sizes, seed: int, say: Say) -> Result:
+    """A whole estimate at default settings, from label images on disk to the report."""
+    del say
+    return {"default": default_case(seed, quick=sizes == QUICK)}
+
+
 def _one_size(edge_mm: float, seed: int) -> Result:
     """Assembly, one forward solve and two modulus sensitivities with multigrid."""
     options = PelvisOptions(seed=seed)
@@ -374,6 +381,7 @@ PART = {
     "posterior": _posterior,
     "scaling": _scaling,
     "front_end": _front_end,
+    "default": _default,
 }
 
 if __name__ == "__main__":
