@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from palpate.errors import ConfigurationError, EstimationError
 from palpate.inversion.driver import with_learned_prior
 from palpate.inversion.expansion import Expansion, expansion_near
-from palpate.inversion.later_state import InverseProblem, LaterState
+from palpate.inversion.later_state import InverseProblem
 from palpate.inversion.objective import Evaluation, Objective
 from palpate.inversion.optimise import Minimum, Outcome, fit_coefficients, same_minimum
 from palpate.inversion.outer_loop import (
@@ -123,12 +123,13 @@ def invert(
             " tissues; seek none, or leave out the states' `finite_strain` models (`InverseProblem.linear`)"
         )
     middle = np.asarray(np.median(np.stack(settings.starts), axis=0))
-    states, begin = problem.states, np.concatenate([middle, np.zeros(sum(problem.parameters.n_modes))])
-    if any(state.approximation is None for state in states):
-        progress("responses of the full model at the middle start")
-        states, begin = _with_reduced_bases(problem, settings, begin)
+    begin = np.concatenate([middle, np.zeros(sum(problem.parameters.n_modes))])
     rule = rule or (FIRST_GUESS if problem.finite_strain else REPORTED)
-    linear = _linear(Objective(states, problem.parameters), settings, begin, rule, progress)
+    if any(state.approximation is None for state in problem.states):
+        progress("responses of the full model at the middle start")
+        linear = _linear(*_with_reduced_bases(problem, settings, begin), settings, rule, progress)
+    else:
+        linear = _linear(Objective(problem.states, problem.parameters), begin, settings, rule, progress)
     return continue_at_finite_strain(linear, settings, progress=progress) if problem.finite_strain else linear
 
 
@@ -157,8 +158,8 @@ def continue_at_finite_strain(linear: Inversion, settings: InversionSettings, *,
 
 def _with_reduced_bases(
     problem: InverseProblem, settings: InversionSettings, middle: NDArray[np.float64]
-) -> tuple[tuple[LaterState, ...], NDArray[np.float64]]:
-    """The states with reduced bases made at unknowns (n_unknowns,), where their drivers' motion is fitted first."""
+) -> tuple[Objective, NDArray[np.float64]]:
+    """The objective on reduced bases made at unknowns (n_unknowns,), and these with the drivers' motion fitted."""
     parameters = problem.parameters
     bases = [reduced_basis(state.model, parameters.moduli(middle)) for state in problem.states]
     objective = with_first_noise(Objective(problem.states, parameters).under(bases))
@@ -166,11 +167,11 @@ def _with_reduced_bases(
     by_theta = parameters.derivatives(middle)
     triples = zip(problem.states, bases, parameters.coefficients(fitted.unknowns), strict=True)
     states = tuple(s.with_approximation(b.with_modulus_series(q, by_theta)) for s, b, q in triples)
-    return states, fitted.unknowns
+    return Objective(states, parameters), fitted.unknowns
 
 
 def _linear(
-    objective: Objective, settings: InversionSettings, begin: NDArray[np.float64], rule: StopRule, progress: Progress
+    objective: Objective, begin: NDArray[np.float64], settings: InversionSettings, rule: StopRule, progress: Progress
 ) -> Inversion:
     """The estimate of the linear law: every start under the first noise model, the best one followed to its end.
 
@@ -184,8 +185,9 @@ def _linear(
     minima = _from_starts(objective, settings, fitted.unknowns[objective.n_parameters :], progress)
     groups = _groups(minima, objective.n_parameters)
     best = groups[_best(minima)]
-    start = updated(objective, minima[_best(minima)], rule)
-    followed = [run_outer_loop(start, settings, rule, progress=progress, title="linear law")]
+    start = [updated(objective, minima[_best(minima)], rule)]
+    del objective  # and with it its approximations, which are large, when others take their place
+    followed = [run_outer_loop(start.pop(), settings, rule, progress=progress, title="linear law")]
     for group in dict.fromkeys(g for g in groups if g != best):
         member = min((m for m, g in zip(minima, groups, strict=True) if g == group), key=lambda m: m.evaluation.value)
         followed.append(_another(followed[0], member, settings, rule, progress))

@@ -157,6 +157,7 @@ def run_outer_loop(
     at, theta = start.minimum.evaluation, start.minimum.unknowns[: start.objective.n_parameters]
     first = Iterate(theta, at.value, at.misfit_mm2, newton_decrement(at))
     now, refinements = replace(start, minimum=replace(start.minimum, history=(first,), evaluations=0)), 0
+    del start  # and with it its approximations, which are large, when others take their place
     for number in range(1, rule.iterations + 1):
         line = f"{title}, outer iteration {number}"
         progress(f"{line}: {now.objective.parameters.in_words(now.minimum.unknowns)}")
