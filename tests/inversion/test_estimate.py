@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from palpate.inversion import (
     Bounds,
     FittedState,
     InversionSettings,
+    Objective,
     OuterIterate,
     estimate,
     fit_driver,
@@ -225,6 +227,20 @@ def test_no_kind_of_observation_decides_alone_under_which_noise_minima_are_compa
     monkeypatch.setattr(estimate, "minimised", under)
     estimate._values(iterates, twins.settings(1.0))
     assert compared == [pytest.approx(sds[0])] * 2
+
+
+@pytest.mark.parametrize("ratios", [(1.0,), (0.3, 2.0, 8.0)])
+def test_every_evaluation_of_the_objective_is_counted(twins, twin, ratios, monkeypatch):
+    calls = count()
+    evaluated = Objective.__call__
+
+    def counted(objective, unknowns):
+        next(calls)
+        return evaluated(objective, unknowns)
+
+    monkeypatch.setattr(Objective, "__call__", counted)
+    found = invert(twins.voxel_problem(twin), twins.settings(*ratios), progress=twins.silent)
+    assert found.evaluations == next(calls)
 
 
 def test_what_was_spent_on_other_minima_is_counted(twins, voxels, monkeypatch):

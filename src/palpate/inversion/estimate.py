@@ -129,7 +129,7 @@ def invert(
         progress("responses of the full model at the middle start")
         linear = _linear(*_with_reduced_bases(problem, settings, begin), settings, rule, progress)
     else:
-        linear = _linear(Objective(problem.states, problem.parameters), begin, settings, rule, progress)
+        linear = _linear(Objective(problem.states, problem.parameters), begin, 0, settings, rule, progress)
     return continue_at_finite_strain(linear, settings, progress=progress) if problem.finite_strain else linear
 
 
@@ -158,8 +158,8 @@ def continue_at_finite_strain(linear: Inversion, settings: InversionSettings, *,
 
 def _with_reduced_bases(
     problem: InverseProblem, settings: InversionSettings, middle: NDArray[np.float64]
-) -> tuple[Objective, NDArray[np.float64]]:
-    """The objective on reduced bases made at unknowns (n_unknowns,), and these with the drivers' motion fitted."""
+) -> tuple[Objective, NDArray[np.float64], int]:
+    """The objective on reduced bases at unknowns (n_unknowns,); these with the drivers' motion fitted; what that cost."""
     parameters = problem.parameters
     bases = [reduced_basis(state.model, parameters.moduli(middle)) for state in problem.states]
     objective = with_first_noise(Objective(problem.states, parameters).under(bases))
@@ -167,15 +167,21 @@ def _with_reduced_bases(
     by_theta = parameters.derivatives(middle)
     triples = zip(problem.states, bases, parameters.coefficients(fitted.unknowns), strict=True)
     states = tuple(s.with_approximation(b.with_modulus_series(q, by_theta)) for s, b, q in triples)
-    return Objective(states, parameters), fitted.unknowns
+    return Objective(states, parameters), fitted.unknowns, fitted.evaluations
 
 
 def _linear(
-    objective: Objective, begin: NDArray[np.float64], settings: InversionSettings, rule: StopRule, progress: Progress
+    objective: Objective,
+    begin: NDArray[np.float64],
+    evaluations: int,
+    settings: InversionSettings,
+    rule: StopRule,
+    progress: Progress,
 ) -> Inversion:
     """The estimate of the linear law: every start under the first noise model, the best one followed to its end.
 
-    begin (n_unknowns,): the middle start, with drivers' coefficients near the best ones there.
+    begin (n_unknowns,): the middle start, with drivers' coefficients near the best ones there, and what it cost to find
+    them in evaluations.
     """
     still = np.zeros(objective.parameters.n_unknowns)
     objective = with_first_noise(objective).rematched(still)
@@ -185,7 +191,7 @@ def _linear(
     minima = _from_starts(objective, settings, fitted.unknowns[objective.n_parameters :], progress)
     groups = _groups(minima, objective.n_parameters)
     best = groups[_best(minima)]
-    start = [updated(objective, minima[_best(minima)], rule)]
+    start = [updated(objective, replace(minima[_best(minima)], evaluations=0), rule)]
     del objective  # and with it its approximations, which are large, when others take their place
     followed = [run_outer_loop(start.pop(), settings, rule, progress=progress, title="linear law")]
     for group in dict.fromkeys(g for g in groups if g != best):
@@ -194,7 +200,7 @@ def _linear(
     order = [best, *dict.fromkeys(g for g in groups if g != best)]
     triples = zip(settings.starts, minima, groups, strict=True)
     starts = tuple(StartRun(theta, minimum, order.index(group)) for theta, minimum, group in triples)
-    evaluations = 1 + fitted.evaluations + sum(m.evaluations for m in (*minima, *(f.minimum for f in followed)))
+    evaluations += 1 + fitted.evaluations + sum(m.evaluations for m in (*minima, *(f.minimum for f in followed)))
     found = _concluded(followed, starts, rest, settings, 0)
     first = followed[0].counts  # the others' approximations are this one's, extended
     spent = sum((other.counts - first for other in followed[1:]), first)
@@ -244,7 +250,7 @@ def _at_finite_strain(linear: OuterIterate, settings: InversionSettings, progres
         assert state.finite_strain is not None
         first.append(expansion_near(state.finite_strain, basis, place, tolerance=EQUILIBRIUM))
     objective = before.under(first).rematched(unknowns)
-    start = OuterIterate(objective, replace(linear.minimum, evaluation=objective(unknowns)))
+    start = OuterIterate(objective, replace(linear.minimum, evaluation=objective(unknowns), evaluations=1))
     end = run_outer_loop(start, settings, REPORTED, progress=progress, title="finite strain")
     exact = []
     places = end.objective.places(end.minimum.unknowns)
@@ -252,7 +258,7 @@ def _at_finite_strain(linear: OuterIterate, settings: InversionSettings, progres
         assert isinstance(approximation, Expansion)
         exact.append(approximation.at_equilibrium(place, tolerance=ACCURACY))
     final = end.objective.under(exact)
-    evaluation, spent = final(end.minimum.unknowns), end.minimum.evaluations + 2
+    evaluation, spent = final(end.minimum.unknowns), end.minimum.evaluations + 1
     history = linear.minimum.history + end.minimum.history
     minimum = replace(end.minimum, evaluation=evaluation, evaluations=spent, history=history)
     return replace(end, objective=final, minimum=minimum)

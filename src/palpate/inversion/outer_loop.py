@@ -152,11 +152,12 @@ def run_outer_loop(
 
     The approximations of `start` are exact there (see `updated`). Drivers' walls are refined where their surfaces ask
     for it (see `refined_walls`). `title` begins each line of `progress`. The minimum's history is that of the loop
-    alone. Raises `NotConverged` when the full model has no equilibrium where every part of a step leads.
+    alone, its evaluations are added to those of `start`. Raises `NotConverged` when the full model has no equilibrium
+    where every part of a step leads.
     """
     at, theta = start.minimum.evaluation, start.minimum.unknowns[: start.objective.n_parameters]
     first = Iterate(theta, at.value, at.misfit_mm2, newton_decrement(at))
-    now, refinements = replace(start, minimum=replace(start.minimum, history=(first,), evaluations=0)), 0
+    now, refinements = replace(start, minimum=replace(start.minimum, history=(first,))), 0
     del start  # and with it its approximations, which are large, when others take their place
     for number in range(1, rule.iterations + 1):
         line = f"{title}, outer iteration {number}"
@@ -256,7 +257,8 @@ def _reweighted_minimum(
             within = forcing * rule.tolerance(before, n) / INNER
             found = minimised(objective, before.unknowns, replace(settings, bounds=near), within=within)
             objective = reweighted(objective, found).rematched(found.unknowns)
-            minimum = replace(found, evaluation=objective(found.unknowns)).after(before)
+            again, spent = objective(found.unknowns), found.evaluations + 1
+            minimum = replace(found, evaluation=again, evaluations=spent).after(before)
             change = _change(before, minimum, rule, n) if minimised_before else np.inf  # of minima under two weightings
         minimised_before = not straight
         if change < forcing or not minimum.converged:
