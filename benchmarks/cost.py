@@ -23,7 +23,7 @@ from memory import peak_mb
 
 from palpate.experiments.simulated_pelvis import DATA
 from palpate.images import Role, write_label_image
-from palpate.phantoms import PelvisOptions, SpheresOptions, pelvis, spheres
+from palpate.phantoms import PelvisOptions, Scene, SpheresOptions, pelvis, spheres
 from palpate.study import estimate, expected_cost, read_case, read_states
 
 
@@ -98,11 +98,16 @@ def _write_images(folder: Path) -> None:
     }
     for name, scene in scenes.items():
         (folder / name).mkdir()
-        write_label_image(folder / name / "before.nii.gz", scene.before)
-        write_label_image(folder / name / "after.nii.gz", scene.after)
-        seen = [t for t in scene.tissues if t.role in (Role.ESTIMATE, Role.DRIVER)]
-        lines = [f'{t.name} = {{label = {t.labels[0]}, role = "{t.role.value}"}}' for t in seen]
-        (folder / name / "case.toml").write_text(CASE + "\n".join(lines))
+        write_case(folder / name, scene)
+
+
+def write_case(folder: Path, scene: Scene) -> None:
+    """A scene's images and a case of them, as a user has them."""
+    write_label_image(folder / "before.nii.gz", scene.before)
+    write_label_image(folder / "after.nii.gz", scene.after)
+    seen = [t for t in scene.tissues if t.role in (Role.ESTIMATE, Role.DRIVER)]
+    lines = [f'{t.name} = {{label = {t.labels[0]}, role = "{t.role.value}"}}' for t in seen]
+    (folder / "case.toml").write_text(CASE + "\n".join(lines))
 
 
 def _one(run: Run, folder: Path) -> dict[str, object]:

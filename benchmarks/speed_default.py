@@ -11,20 +11,14 @@ import time
 from pathlib import Path
 from typing import Any
 
-from palpate.images import Role, write_label_image
+from cost import write_case
+
 from palpate.phantoms import PelvisOptions, pelvis
 
 __all__ = ["default_case"]
 
 LAWS = ("linear", "neo-hookean")
 FIELD_MM, QUICK_FIELD_MM = 140.0, 110.0
-CASE = """
-[images]
-before = "before.nii.gz"
-after = ["after.nii.gz"]
-[tissues]
-surroundings = {label = "remaining", role = "known", youngs_modulus_kpa = 10.0}
-"""
 
 
 def default_case(seed: int, *, quick: bool) -> dict[str, Any]:
@@ -57,11 +51,7 @@ def _write(folder: Path, seed: int, *, quick: bool) -> None:
     """The images of the case, in a process of its own: their truth needs more memory than an estimate."""
     side = QUICK_FIELD_MM if quick else FIELD_MM
     scene = pelvis(PelvisOptions(seed=seed, field_mm=(side, max(side, 120.0), max(side, 120.0)), truth_edge_mm=4.0))
-    write_label_image(folder / "before.nii.gz", scene.before)
-    write_label_image(folder / "after.nii.gz", scene.after)
-    seen = [t for t in scene.tissues if t.role in (Role.ESTIMATE, Role.DRIVER)]
-    lines = [f'{t.name} = {{label = {t.labels[0]}, role = "{t.role.value}"}}' for t in seen]
-    (folder / "case.toml").write_text(CASE + "\n".join(lines))
+    write_case(folder, scene)
 
 
 if __name__ == "__main__":
