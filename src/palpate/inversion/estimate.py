@@ -159,7 +159,7 @@ def continue_at_finite_strain(linear: Inversion, settings: InversionSettings, *,
 def _with_reduced_bases(
     problem: InverseProblem, settings: InversionSettings, middle: NDArray[np.float64]
 ) -> tuple[Objective, NDArray[np.float64], int]:
-    """The objective on reduced bases at unknowns (n_unknowns,); these with the drivers' motion fitted; what that cost."""
+    """The objective on reduced bases at unknowns (n_unknowns,), these with the drivers' motion fitted, its cost."""
     parameters = problem.parameters
     bases = [reduced_basis(state.model, parameters.moduli(middle)) for state in problem.states]
     objective = with_first_noise(Objective(problem.states, parameters).under(bases))
