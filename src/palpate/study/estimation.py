@@ -13,12 +13,16 @@ from palpate.inversion import Inversion, InversionSettings, Iterate, Outcome, St
 from palpate.mechanics.deformation import deformation_determinants
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit
+from palpate.study.together import ImagePairs, combinations_of, image_pairs_of
 from palpate.uncertainty import (
+    Combination,
     Covariance,
     FittedState,
+    Information,
     Interval,
     covariance_of,
     fixed_correspondence,
+    information,
     log_interval,
     modulus_interval,
 )
@@ -123,7 +127,9 @@ class Estimation:
     correlation (n, n) of the log-moduli; fits: the tissues of each later image; displacements: (n_points, 3) mm of
     each later image; covariance of the log-moduli by its causes;
     outer_loop: the steps from the best start's minimum to the estimate, which all starts of that minimum share;
-    counts: of all starts and minima together; observations: what was compared, in words, by its kind.
+    counts: of all starts and minima together; observations: what was compared, in words, by its kind; information: the
+    directions of the log-moduli by how well they are known; combinations: what is known where single moduli are not;
+    image_pairs: what each of several later images says alone.
     """
 
     status: str
@@ -137,6 +143,9 @@ class Estimation:
     outer_loop: tuple[Iteration, ...] = ()
     remarks: tuple[Remark, ...] = ()
     observations: Mapping[str, str] = field(default_factory=dict)
+    information: Information | None = None
+    combinations: tuple[Combination, ...] = ()
+    image_pairs: ImagePairs | None = None
 
     @property
     def correlation(self) -> NDArray[np.float64]:
@@ -185,6 +194,9 @@ def conclude(
         outer_loop=tuple(_iteration(inversion, iterate) for iterate in minimum.history),
         remarks=(*_remarks(inversion, covariance.total), *_folds(observed)),
         observations={observation.kind: observation.description for observation in objective.observations},
+        information=information(covariance.total),
+        combinations=combinations_of(inversion, covariance.total, within=IDENTIFIED),
+        image_pairs=image_pairs_of(inversion, settings.bounds),
     )
 
 

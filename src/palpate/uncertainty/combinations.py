@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -37,6 +37,11 @@ class Combination:
     kind: str
     value: float
     interval95: tuple[float, float]
+
+    def times(self, scale: float) -> Combination:
+        """The same in another unit."""
+        low, high = self.interval95
+        return replace(self, value=scale * self.value, interval95=(scale * low, scale * high))
 
 
 def information(covariance: NDArray[np.float64]) -> Information:
