@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from palpate.errors import ConfigurationError, ResourceError
-from palpate.images.alignment import RigidMotion, align, moved
-from palpate.images.checks import check_images
+from palpate.findings import Finding
+from palpate.images.alignment import Alignment, RigidMotion, align, moved
+from palpate.images.checks import check_images, later_names
 from palpate.images.distance import DistanceMap, observation_width, smoothing_width
-from palpate.images.finding import Finding
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.images.tissue_distance import tissue_distance_map
@@ -93,7 +93,8 @@ def aligned(
     Raises `InputDataError` as `check_images`, `align` and `refuse_lost` do, `GeometryError` as `refuse_unmeshable`.
     """
     images, bones, findings = [], [], list[Finding]()
-    for number, image in enumerate(after, start=1):
+    names = later_names(len(after))
+    for name, image in zip(names, after, strict=True):
         if method == "none":
             images.append(image)
             bones.append(dict[int, RigidMotion]())
@@ -101,41 +102,46 @@ def aligned(
         alignment = align(before, image)
         images.append(moved(image, alignment.overall.motion.inverse()))
         rigid = {i: t.name for i, t in enumerate(before.tissues) if t.role is Role.RIGID}
-        bones.append({i: alignment.remaining(name) for i, name in rigid.items()})
-        findings += [
-            Finding(
-                "rigid-unseen",
-                f"after image {number}: '{name}' shows too little of its surface for a motion of its own; it moves with"
-                " the other rigid tissues",
-            )
-            for name, fit in alignment.tissues.items()
-            if fit.n_points == 0
-        ]
-        findings += [
-            Finding(
-                "several-bodies",
-                f"after image {number}: a piece of '{name}' lies {off:.1f} mm off the motion of the whole, which"
-                " moves as one body; give each bone its own tissue",
-            )
-            for name, off in alignment.loose.items()
-        ]
-        findings += [
-            Finding(
-                "rotation-undetermined",
-                f"after image {number}: the surface of '{name}' does not show its rotation about"
-                f" {len(fit.undetermined)} of three axes; it is taken as not turning about them",
-            )
-            for name, fit in alignment.tissues.items()
-            if len(fit.undetermined)
-        ]
+        bones.append({i: alignment.remaining(bone) for i, bone in rigid.items()})
+        findings += _alignment_findings(alignment, name)
     findings += check_images(before, images)
     refuse_unmeshable(before, "before")
-    for number, image in enumerate(images, start=1):
-        name = "after" if len(images) == 1 else f"after[{number}]"
+    for name, image in zip(names, images, strict=True):
         refuse_unmeshable(image, name)
         refuse_lost(before, image, name)
     findings += [finding for finding in every_finding(before, images, loaded=loaded) if finding.code in STATED]
     return ImagedStates(before, tuple(images), tuple(bones), tuple(findings))
+
+
+def _alignment_findings(alignment: Alignment, name: str) -> list[Finding]:
+    """What the motion of the bones to the image called `name` rests on, all bones in one finding a cause."""
+    findings = []
+    unseen = [bone for bone, fit in alignment.tissues.items() if fit.n_points == 0]
+    if unseen:
+        text = (
+            f"too little of the surface of {_quoted(unseen)} is seen in '{name}' for a motion of its own, so that it"
+            " moves with the other rigid tissues; a larger field of view shows more"
+        )
+        findings.append(Finding("rigid-unseen", text, place=f"in '{name}' ({_quoted(unseen)})"))
+    if alignment.loose:
+        off = ", ".join(f"'{bone}' {distance:.1f} mm" for bone, distance in alignment.loose.items())
+        text = (
+            f"pieces of a rigid tissue lie off the motion of the whole, which moves as one body, in '{name}': {off};"
+            " give each bone a tissue of its own"
+        )
+        findings.append(Finding("several-bodies", text, place=f"in '{name}' ({off})"))
+    round_ones = [bone for bone, fit in alignment.tissues.items() if len(fit.undetermined)]
+    if round_ones:
+        text = (
+            f"the surface of {_quoted(round_ones)} does not show all of its rotation from 'before' to '{name}', and is"
+            " taken as not turning where it does not; join it to a bone that it moves with, if there is one"
+        )
+        findings.append(Finding("rotation-undetermined", text, place=f"to '{name}' ({_quoted(round_ones)})"))
+    return findings
+
+
+def _quoted(names: Sequence[str]) -> str:
+    return ", ".join(f"'{name}'" for name in names)
 
 
 def make_body(states: ImagedStates, case: Case, *, progress: Callable[[str], None]) -> Body:

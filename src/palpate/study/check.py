@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from palpate.errors import GeometryError, InputDataError, PalpateError, ResourceError
-from palpate.images.checks import check_pair, check_segmentation
-from palpate.images.finding import Finding
+from palpate.findings import Finding, of_pair, one_a_cause, rank
+from palpate.images.checks import check_pair, check_segmentation, later_names
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_intensities
 from palpate.images.segmentation import Segmentation
@@ -106,7 +106,7 @@ class CheckReport:
     def text(self) -> str:
         """The same for people, worst first."""
         lines = [f"refused ({p.exit_code}): {p.message}" for p in self.problems if p.exit_code]
-        lines += [f"warning: {p.message}" for p in self.problems if not p.exit_code]
+        lines += [f"warning ({p.code}): {p.message}" for p in self.problems if not p.exit_code]
         if not lines:
             lines = ["no problem was found"]
         for row in self.organs:
@@ -127,6 +127,7 @@ class _Problems:
 
     def __init__(self) -> None:
         self.found: list[Problem] = []
+        self._findings: list[Finding] = []
 
     def attempt(self, make: Callable[[], T]) -> T | None:
         """What `make` returns; None, and a problem, when it is refused."""
@@ -143,11 +144,15 @@ class _Problems:
         if problem not in self.found:
             self.found.append(problem)
 
-    def warn(self, findings: Sequence[Finding], where: str = "") -> None:
-        """Keep findings; `where` names the pair."""
-        for finding in findings:
-            code = REFUSED_FINDINGS.get(finding.code, 0)
-            self.add(Problem(finding.code, where + finding.message, code))
+    def warn(self, findings: Sequence[Finding], pair: int = 1) -> None:
+        """Keep findings on the images of a pair."""
+        self._findings += of_pair(findings, pair)
+
+    def all(self) -> tuple[Problem, ...]:
+        """Everything that was kept, one a cause, worst first."""
+        found = one_a_cause(self._findings)
+        warned = [Problem(each.code, each.message, REFUSED_FINDINGS.get(each.code, 0)) for each in found]
+        return tuple(sorted([*self.found, *warned], key=lambda problem: (-problem.exit_code, rank(problem.code))))
 
 
 def check_case(path: Path, overrides: Sequence[str], *, progress: Callable[[str], None]) -> CheckReport:
@@ -158,20 +163,18 @@ def check_case(path: Path, overrides: Sequence[str], *, progress: Callable[[str]
     problems = _Problems()
     case = problems.attempt(lambda: read_case(path, overrides))
     if case is None:
-        return CheckReport(path.stem, tuple(problems.found))
+        return CheckReport(path.stem, problems.all())
     problems.attempt(lambda: refuse_what_cannot_be_estimated(case))
-    for remark in unit_warnings(case):
-        problems.add(Problem(remark.code, remark.message))
+    problems.warn(unit_warnings(case))
     progress("reading the images")
     phantom = problems.attempt(lambda: read_states(case)) if case.phantom else None
     pairs = _read_pairs(case, problems) if case.phantom is None else []
     if phantom is not None:
         pairs = [(phantom.before, phantom.after)]
     for number, (before, after) in enumerate(pairs, start=1):
-        where = f"pair {number}: " if number > 1 else ""
-        _check_pair(problems, before, after, where=where, loaded=bool(case.loads))
+        _check_pair(problems, before, after, number=number, loaded=bool(case.loads))
     if not pairs:
-        return CheckReport(case.id, tuple(problems.found))
+        return CheckReport(case.id, problems.all())
     before, after = pairs[0]
     progress("predicting the cost")
     cost = problems.attempt(lambda: expected_cost(case, before, after, n_pairs=len(pairs)))
@@ -179,7 +182,7 @@ def check_case(path: Path, overrides: Sequence[str], *, progress: Callable[[str]
         problems.attempt(lambda: _check_edge(case, before, after))
         problems.found += memory_problems(cost)
     names = ("before", *(f"after[{i}]" for i in range(len(after))))
-    return CheckReport(case.id, tuple(problems.found), names, _organs(before, after), cost)
+    return CheckReport(case.id, problems.all(), names, _organs(before, after), cost)
 
 
 Pair = tuple[Segmentation, tuple[Segmentation, ...]]
@@ -206,10 +209,10 @@ def _read_pairs(case: Case, problems: _Problems) -> list[Pair]:
 
 
 def _check_pair(
-    problems: _Problems, before: Segmentation, after: tuple[Segmentation, ...], *, where: str, loaded: bool
+    problems: _Problems, before: Segmentation, after: tuple[Segmentation, ...], *, number: int, loaded: bool
 ) -> None:
     """Every check on the images of one pair; an organ that is absent is named, and left out of the other checks."""
-    names = ["after" if len(after) == 1 else f"after[{i}]" for i in range(1, len(after) + 1)]
+    names, where = later_names(len(after)), f"pair {number}: " if number > 1 else ""
     absent = _absent([("before", before), *zip(names, after, strict=True)])
     for tissue, images in absent.items():
         text = (
@@ -218,17 +221,17 @@ def _check_pair(
         )
         problems.add(Problem(InputDataError.__name__, text, InputDataError.exit_code))
     before, after = _without(before, absent), tuple(_without(image, absent) for image in after)
-    problems.warn(check_segmentation(before, "before"), where)
+    problems.warn(check_segmentation(before, "before"), number)
     problems.attempt(lambda: refuse_unmeshable(before, "before"))
     for name, image in zip(names, after, strict=True):
-        problems.warn(check_segmentation(image, name), where)
+        problems.warn(check_segmentation(image, name), number)
         problems.attempt(partial(refuse_unmeshable, image, name))
         if not any(tissue.role is Role.RIGID for tissue in image.tissues):  # else only alignment can tell
             problems.attempt(partial(refuse_lost, before, image, name))
         if any(tissue.role in OBSERVED for tissue in before.tissues):
             findings = problems.attempt(partial(check_pair, before, image, name=name))
-            problems.warn(findings or (), where)
-    problems.warn(every_finding(before, after, loaded=loaded), where)
+            problems.warn(findings or (), number)
+    problems.warn(every_finding(before, after, loaded=loaded), number)
 
 
 def _absent(images: Sequence[tuple[str, Segmentation]]) -> dict[str, list[str]]:

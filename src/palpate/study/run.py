@@ -9,12 +9,13 @@ from dataclasses import replace
 import numpy as np
 
 from palpate.errors import ConfigurationError
+from palpate.findings import Finding, of_pair
 from palpate.images.tissue import Role
 from palpate.inversion import Bounds, FittedState, Inversion, InversionSettings, ParameterMap, invert
 from palpate.parallel import blas_on_one_thread
 from palpate.study.body import Body, ImagedStates, joint_problem, make_body
 from palpate.study.case import Case
-from palpate.study.estimation import Estimation, Observed, Remark, conclude
+from palpate.study.estimation import Estimation, Observed, conclude
 from palpate.study.plausibility import estimate_warnings, unit_warnings
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.read import read_pairs, read_states
@@ -154,7 +155,7 @@ def _further(bodies: tuple[Body, ...], estimation: Estimation) -> tuple[PairResu
     return tuple(found)
 
 
-def strain_warnings(case: Case, bodies: tuple[Body, ...], estimation: Estimation) -> tuple[Remark, ...]:
+def strain_warnings(case: Case, bodies: tuple[Body, ...], estimation: Estimation) -> tuple[Finding, ...]:
     """What `linear_strain_warnings` says of the fitted displacements, those of the first body's images first."""
     motions = iter(estimation.displacements)
     moved = [(body.space, [next(motions) for _ in body.states.after]) for body in bodies]
@@ -184,6 +185,6 @@ def _truth(states: ImagedStates) -> Mapping[str, float]:
     }
 
 
-def _remarks(case: Case, *states: ImagedStates) -> tuple[Remark, ...]:
-    findings = [finding for pair in states for finding in pair.findings]
-    return (*unit_warnings(case), *(Remark(finding.code, finding.message) for finding in findings))
+def _remarks(case: Case, *states: ImagedStates) -> tuple[Finding, ...]:
+    pairs = enumerate((pair.findings for pair in states), start=1)
+    return (*unit_warnings(case), *(finding for n, findings in pairs for finding in of_pair(findings, n)))
