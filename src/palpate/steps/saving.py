@@ -10,6 +10,7 @@ from typing import Any
 from palpate.errors import EstimationError, ResourceError
 from palpate.export.case_files import write_estimate_files
 from palpate.findings import Finding, warning_rows
+from palpate.progress import during
 from palpate.report import case_report
 from palpate.study.case import Case
 from palpate.study.case_as_run import stage_case
@@ -32,6 +33,7 @@ def save_estimate(
     Where the page cannot be made, a warning of the document says so instead. Raises `ResourceError` where the disk
     refuses.
     """
+    progress = during("report", progress)
     progress("writing mesh and stiffness map")
     document = result.to_dict()
     with outputs.staged() as staging:

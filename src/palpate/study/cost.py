@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from palpate.mechanics.solvers.registry import expected_of_size
 from palpate.memory import available_memory
 from palpate.mesh import COARSER, COARSEST, GRADING, Box
 from palpate.parallel import processors
+from palpate.progress import STAGES, Stage
 from palpate.study.body import case_domain
 from palpate.study.case import Case
 
@@ -23,7 +25,7 @@ LATTICE = 96  # points of the lattice along the longest side, on which edge leng
 # Fitted to the runs of benchmarks/cost.py (docs/command-line.md), on two cores of a 2.1 GHz server.
 TETS_A_CUBE = 19.4  # tetrahedra in a cube of the wanted edge length: 17 in smooth phantoms, 31 in a real pelvis
 UNKNOWNS_A_TET = {"P1": 0.62, "P2": 4.4}
-FIXED_S = 18.0  # start, first solves, intervals, report
+FIXED_S: Mapping[Stage, float] = {"reading": 4.0, "linear law": 2.0, "intervals": 4.0, "report": 8.0}
 SECONDS_AN_UNKNOWN = 1.5e-4  # beside the solver, with 90 modes a driver, for each later image
 FINITE_STRAIN_S = 2.9e-4  # the same of equilibria and their derivatives at finite strain
 SECONDS_A_CUT = 1.65e-4  # of meshing, for each tetrahedron and each tissue that is cut out
@@ -38,7 +40,10 @@ SERIES = 30  # right-hand sides beside the modes
 
 @dataclass(frozen=True, slots=True)
 class ExpectedCost:
-    """Size of the mesh and of the linear systems, peak memory (GB), time (s), and what they were predicted for."""
+    """Size of the mesh and of the linear systems, peak memory (GB), time (s), and what they were predicted for.
+
+    stages: of the time, what each stage takes (s), in their order.
+    """
 
     tets: int
     unknowns: int
@@ -46,6 +51,7 @@ class ExpectedCost:
     seconds: float
     solver: str
     processors: int
+    stages: Mapping[Stage, float] = field(default_factory=dict)
 
 
 def expected_cost(case: Case, before: Segmentation, after: tuple[Segmentation, ...], *, n_pairs: int) -> ExpectedCost:
@@ -61,18 +67,25 @@ def expected_cost(case: Case, before: Segmentation, after: tuple[Segmentation, .
     modes = (drivers * case.driver.modes + OVERHEAD_MODES) / (USUAL_MODES + OVERHEAD_MODES)
     work = unknowns * modes * max(len(after), 1)
     finite = case.mechanics.material_law.finite
-    seconds = (SECONDS_AN_UNKNOWN + finite * FINITE_STRAIN_S) * work + SECONDS_A_CUT * tets * (len(before.tissues) - 1)
+    stages: dict[Stage, float] = {
+        "meshing": SECONDS_A_CUT * tets * (len(before.tissues) - 1),
+        "linear law": SECONDS_AN_UNKNOWN * work,
+        "finite strain": finite * FINITE_STRAIN_S * work,
+    }
     gigabytes = GB_AN_UNKNOWN * work + solving.bytes / 1e9
     gigabytes *= FINITE_STRAIN_GB if finite else 1.0
     count = processors()
     shorter = 1.0 - PARALLEL_SHARE + PARALLEL_SHARE / count
+    took = {stage: (FIXED_S.get(stage, 0.0) + n_pairs * stages.get(stage, 0.0)) * shorter for stage in STAGES}
+    took["linear law"] += n_pairs * solving.seconds
     return ExpectedCost(
         tets=n_pairs * tets,
         unknowns=n_pairs * unknowns,
         memory_gb=FIXED_GB + n_pairs * gigabytes,
-        seconds=(FIXED_S + n_pairs * seconds) * shorter + n_pairs * solving.seconds,
+        seconds=sum(took.values()),
         solver=solver,
         processors=count,
+        stages=took,
     )
 
 

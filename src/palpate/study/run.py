@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -13,8 +13,10 @@ from palpate.findings import Finding, of_pair
 from palpate.images.tissue import Role
 from palpate.inversion import Bounds, FittedState, Inversion, InversionSettings, ParameterMap, invert
 from palpate.parallel import blas_on_one_thread
+from palpate.progress import Forecast, Progress, about, during
 from palpate.study.body import Body, ImagedStates, joint_problem, make_body
 from palpate.study.case import Case
+from palpate.study.cost import ExpectedCost, expected_cost
 from palpate.study.estimation import Estimation, Observed, conclude
 from palpate.study.plausibility import estimate_warnings, unit_warnings
 from palpate.study.provenance import input_digests, software_versions
@@ -35,8 +37,6 @@ __all__ = [
     "strain_warnings",
 ]
 
-Progress = Callable[[str], None]
-
 
 def silent(message: str) -> None:
     """A listener that says nothing."""
@@ -52,8 +52,10 @@ def estimate(case: Case, *, progress: Progress = silent, truth: Mapping[str, flo
     """
     began = time.perf_counter()
     refuse_what_cannot_be_estimated(case)
-    progress("reading and aligning the images")
+    during("reading", progress)("reading and aligning the images")
     states, further = read_states(case), read_pairs(case)
+    if progress is not silent:
+        progress(_forecast(expected_cost(case, states.before, states.after, n_pairs=1 + len(further))))
     truth = _truth(states) if case.phantom else truth
     inputs = input_digests(case, states.inputs, *(pair.inputs for pair in further))
     seconds = time.perf_counter() - began
@@ -77,14 +79,14 @@ def estimate_states(
     body, each with its own reference state, which are meshed on their own and share the moduli.
     """
     clock = [time.perf_counter()]
-    bodies = tuple(make_body(pair, case, progress=progress) for pair in (states, *further))
+    bodies = tuple(make_body(pair, case, progress=during("meshing", progress)) for pair in (states, *further))
     body = bodies[0]
     clock.append(time.perf_counter())
-    problem = joint_problem(bodies, case, progress=progress)
+    problem = joint_problem(bodies, case, progress=during("linear law", progress))
     clock.append(time.perf_counter())
     settings = inversion_settings(case, problem.parameters)
-    inversion = invert(problem, settings, progress=progress)
-    progress("intervals: residuals' correlation, grid position, driver")
+    inversion = invert(problem, settings, progress=during("linear law", progress))
+    during("intervals", progress)("intervals: residuals' correlation, grid position, driver")
     images = tuple(image.index for pair in bodies for image in pair.states.after)
     observed = Observed(fitted_states(inversion, *bodies), images)
     estimation = conclude(inversion, settings, observed, truth=truth or {}, seed=case.seed)
@@ -119,6 +121,11 @@ def mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
     seconds = {"total": round(time.perf_counter() - began, 3)}
     provenance = Provenance(seconds, inputs, software_versions())
     return MeshResult(case, body.space, mesh_summary(body), states.before, provenance, _remarks(case, states))
+
+
+def _forecast(cost: ExpectedCost) -> Forecast:
+    words = f"about {about(cost.seconds)}, as predicted for {cost.unknowns} unknowns on {cost.processors} processor(s)"
+    return Forecast(words, cost.stages)
 
 
 def inversion_settings(case: Case, parameters: ParameterMap) -> InversionSettings:
