@@ -11,21 +11,11 @@ from numpy.typing import NDArray
 from palpate.errors import ConfigurationError
 from palpate.findings import Finding
 from palpate.images.checks import later_names
-from palpate.inversion import (
-    FittedState,
-    Interval,
-    Inversion,
-    InversionSettings,
-    Iterate,
-    Outcome,
-    StartRun,
-    grid_position_shifts,
-    log_interval,
-    sandwich_covariance,
-)
+from palpate.inversion import Inversion, InversionSettings, Iterate, Outcome, StartRun
 from palpate.mechanics.deformation import deformation_determinants
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit
+from palpate.uncertainty import FittedState, Interval, grid_position_shifts, log_interval, sandwich_covariance
 
 __all__ = [
     "Estimation",
