@@ -100,7 +100,7 @@ def estimate_states(
         states.after,
         Provenance({key: round(float(value), 3) for key, value in seconds.items()}, {}, software_versions()),
         (
-            *_remarks(case, states, *further),
+            *_remarks(case, *bodies),
             *strain_warnings(case, bodies, estimation),
             *estimate_warnings(estimation),
         ),
@@ -117,7 +117,7 @@ def mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
     body = make_body(states, case, progress=progress)
     seconds = {"total": round(time.perf_counter() - began, 3)}
     provenance = Provenance(seconds, inputs, software_versions())
-    return MeshResult(case, body.space, mesh_summary(body), states.before, provenance, _remarks(case, states))
+    return MeshResult(case, body.space, mesh_summary(body), states.before, provenance, _remarks(case, body))
 
 
 def inversion_settings(case: Case, parameters: ParameterMap) -> InversionSettings:
@@ -184,6 +184,9 @@ def _truth(states: ImagedStates) -> Mapping[str, float]:
     }
 
 
-def _remarks(case: Case, *states: ImagedStates) -> tuple[Remark, ...]:
-    findings = [finding for pair in states for finding in pair.findings]
-    return (*unit_warnings(case), *(Remark(finding.code, finding.message) for finding in findings))
+def _remarks(case: Case, *bodies: Body) -> tuple[Remark, ...]:
+    found = [finding for body in bodies for finding in body.states.findings]
+    for number, body in enumerate(bodies, start=1):
+        pair = f"pair {number}: " if number > 1 else ""
+        found += [replace(finding, message=pair + finding.message) for finding in body.findings]
+    return (*unit_warnings(case), *(Remark(finding.code, finding.message) for finding in found))
