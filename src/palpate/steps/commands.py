@@ -23,18 +23,25 @@ PathLike = str | os.PathLike[str]
 
 
 def init(
-    before: PathLike, *after: PathLike, labels: PathLike | None = None, output: PathLike = "palpate-output"
+    before: PathLike,
+    *after: PathLike,
+    labels: PathLike | None = None,
+    ct: Sequence[PathLike] = (),
+    output: PathLike = "palpate-output",
 ) -> NewCase:
     """Write a case.toml for label images into the folder `output`, roles guessed from names, as `palpate init` does.
 
-    labels: a label table. The case that is given says where it lies (`path`), who is taken for what and why
-    (`tissues`), and what nobody can guess (`questions`). Raises `InputDataError` for images that cannot be used,
+    labels: a label table; ct: the CT of `before`, or of each state in turn, which also tells air from tissue in label
+    0. The case that is given says where it lies (`path`), who is taken for what and why (`tissues`), and what nobody
+    can guess (`questions`). Raises `InputDataError` for images that cannot be used,
     `ConfigurationError` where another case.toml is in the way, `ResourceError` where nothing can be written.
     """
     outputs = OutputFolder(Path(output))
     with held_folder(outputs.path):
         table = None if labels is None else Path(labels)
-        return write_new_case([Path(path) for path in (before, *after)], table, outputs)
+        return write_new_case(
+            [Path(path) for path in (before, *after)], table, outputs, cts=[Path(path) for path in ct]
+        )
 
 
 def check(case_file: PathLike, overrides: Sequence[str] = (), *, progress: Progress = run.silent) -> CheckReport:

@@ -6,8 +6,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from palpate.errors import ConfigurationError
-from palpate.images.label_image import VoxelGrid
+from palpate.images.body_in_ct import outside_body
+from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_intensities, read_label_image
 from palpate.images.readers.registry import format_of
@@ -56,18 +59,34 @@ def read_segmentation(
     `names`: the label table (label -> name), if the case has one; an image that brings its own names is read by those.
     `tissues`: those of the reference image, for an image without names. Raises as `read_states` does.
     """
-    image = read_label_image(path, names=names, grid=_given_grid(case, path))
+    image = _with_body(read_label_image(path, names=names, grid=_given_grid(case, path)), case, path)
     return segment(image, case.resolve_tissues(image.names) if tissues is None or image.names else tissues)
 
 
 def _given_grid(case: Case, path: Path) -> VoxelGrid | None:
     """The grid of the grey image of the same state, for files that may lack theirs; None where there is none."""
+    grey = _grey(case, path) if format_of(path).read_on is not None else None
+    return read_intensities(grey)[1] if grey is not None else None
+
+
+def _grey(case: Case, path: Path) -> Path | None:
+    """The grey image of the state that the label image at `path` shows."""
     images = case.images
-    if images is None or format_of(path).read_on is None:
+    if images is None:
         return None
     later = dict(zip(images.after, images.intensities_after, strict=False))
-    grey = images.intensities_before if path == images.before else later.get(path)
-    return read_intensities(grey)[1] if grey is not None else None
+    return images.intensities_before if path == images.before else later.get(path)
+
+
+def _with_body(image: LabelImage, case: Case, path: Path) -> LabelImage:
+    """The image with label 0 inside the body as a label that no tissue claims, if the case wants it so."""
+    if case.images is None or not case.images.body_from_ct:
+        return image
+    body, grey = image.labels == 0, _grey(case, path)
+    if grey is not None:
+        body &= ~outside_body(*read_intensities(grey), image.grid)
+    claimed = [label for tissue in case.resolve_tissues(image.names) for label in tissue.labels]
+    return replace(image, labels=np.where(body, 1 + max(int(image.labels.max()), *claimed), image.labels))
 
 
 def phantom_scene(case: Case) -> Scene:
