@@ -10,7 +10,6 @@ import pytest
 
 from palpate.inversion import (
     Bounds,
-    FittedState,
     InversionSettings,
     Objective,
     OuterIterate,
@@ -19,10 +18,10 @@ from palpate.inversion import (
     gauss_newton,
     invert,
     posterior_sd,
-    sandwich_covariance,
 )
 from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimation import Observed, conclude
+from palpate.uncertainty import FittedState, sandwich_covariance
 
 SHARP = NoiseModel(np.array([1e-6]), np.array([3.0]))
 

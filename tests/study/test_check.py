@@ -35,7 +35,7 @@ def test_every_problem_is_listed_and_the_worst_class_is_the_exit_code(tmp_path):
     )
     assert [sum(word in problem.message for problem in found.problems) for word in words] == [1, 1, 1, 1, 1]
     assert found.exit_code == 3
-    assert found.text().splitlines()[-1].startswith("warning: tissue 'rest'")
+    assert found.text().splitlines()[-1].startswith("warning (units): tissue 'rest'")
 
 
 def test_a_case_that_cannot_be_read_is_a_problem_with_its_code(tmp_path, capsys):

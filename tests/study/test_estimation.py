@@ -7,20 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.inversion import (
-    FittedState,
-    Inversion,
-    Outcome,
-    OuterIterate,
-    gauss_newton,
-    invert,
-    sandwich_covariance,
-)
+from palpate.inversion import Inversion, Outcome, OuterIterate, gauss_newton, invert
 from palpate.inversion.estimate import Candidate
 from palpate.inversion.outer_loop import Convergence
 from palpate.mechanics.forward import SolveCounts
 from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimation import Observed, conclude, hull, verdict
+from palpate.uncertainty import FittedState, sandwich_covariance
 
 NOISE = NoiseModel(np.array([0.03**2]), np.array([3.0]))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,6 +28,7 @@ from palpate.inversion.reweighting import with_first_noise
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.forward import SolveCounts
 from palpate.parallel import blas_on_one_thread
+from palpate.progress import Progress, during
 
 __all__ = ["Candidate", "Inversion", "StartRun", "continue_at_finite_strain", "invert"]
 
@@ -47,8 +48,6 @@ FIRST_GUESS = StopRule(
     far=np.inf,
 )
 EQUILIBRIUM = 1e-5  # of the forces, while the estimate moves
-
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +129,9 @@ def invert(
         linear = _linear(*_with_reduced_bases(problem, settings, begin), settings, rule, progress)
     else:
         linear = _linear(Objective(problem.states, problem.parameters), begin, 0, settings, rule, progress)
-    return continue_at_finite_strain(linear, settings, progress=progress) if problem.finite_strain else linear
+    if not problem.finite_strain:
+        return linear
+    return continue_at_finite_strain(linear, settings, progress=during("finite strain", progress))
 
 
 def continue_at_finite_strain(linear: Inversion, settings: InversionSettings, *, progress: Progress) -> Inversion:

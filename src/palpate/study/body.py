@@ -8,13 +8,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from palpate.errors import ConfigurationError
-from palpate.images.alignment import RigidMotion, align, moved
-from palpate.images.checks import check_images
-from palpate.images.distance import DistanceMap, observation_width
-from palpate.images.finding import Finding
+from palpate.findings import Finding
+from palpate.images.alignment import Alignment, RigidMotion, align, moved
+from palpate.images.checks import check_images, later_names
+from palpate.images.distance import observation_width
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
-from palpate.images.tissue_distance import tissue_distance_map
 from palpate.inversion import InverseProblem, LaterState, parameter_map
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.dilatation import choose_element
@@ -25,14 +24,11 @@ from palpate.mechanics.linear_model import LinearModel, linear_model, with_const
 from palpate.mechanics.newton import NewtonSettings
 from palpate.mesh.quality import MeshQuality
 from palpate.mesh.space import LagrangeSpace, lagrange_space
-from palpate.observation.contract import Observation
+from palpate.observation.contract import ImagedBody
 from palpate.observation.noise_model import NoiseModel
-from palpate.observation.observed_surface import ObservedSurface, observed_surface
 from palpate.observation.prescribed_motion import prescribed_motion
-from palpate.observation.surface_distance import surface_distance
-from palpate.observation.target import surface_target
+from palpate.observation.registry import observations
 from palpate.observation.wall_modes import Wall
-from palpate.parallel import mapped
 from palpate.study.case import Case
 from palpate.study.case_loads import case_loads
 from palpate.study.contacts import every_finding
@@ -48,7 +44,6 @@ __all__ = [
     "joint_problem",
     "make_body",
     "stated_noise",
-    "surface_observations",
 ]
 
 STATED = (
@@ -87,6 +82,11 @@ class Body:
     edge_length_mm: float | None = None
     findings: tuple[Finding, ...] = ()
 
+    def imaged(self, stated_noise: NoiseModel | None = None) -> ImagedBody:
+        """What observations are made of, under the noise that a case states."""
+        states = self.states
+        return ImagedBody(self.space, states.before, states.after, self.smoothing_mm, stated_noise)
+
 
 def aligned(
     before: Segmentation, after: tuple[Segmentation, ...], *, method: str, loaded: bool = False
@@ -99,8 +99,7 @@ def aligned(
     found = brought(before, after, method=method)
     findings, images = [*found.findings, *check_images(before, found.after)], found.after
     refuse_unmeshable(before, "before")
-    for number, image in enumerate(images, start=1):
-        name = "after" if len(images) == 1 else f"after[{number}]"
+    for name, image in zip(later_names(len(images)), images, strict=True):
         refuse_unmeshable(image, name)
         refuse_lost(before, image, name)
     findings += [finding for finding in every_finding(before, images, loaded=loaded) if finding.code in STATED]
@@ -110,7 +109,8 @@ def aligned(
 def brought(before: Segmentation, after: tuple[Segmentation, ...], *, method: str) -> ImagedStates:
     """Bring the later images to the first as `aligned` does, but check nothing; raises `InputDataError` as `align`."""
     images, bones, findings = [], [], list[Finding]()
-    for number, image in enumerate(after, start=1):
+    names = later_names(len(after))
+    for name, image in zip(names, after, strict=True):
         if method == "none":
             images.append(image)
             bones.append(dict[int, RigidMotion]())
@@ -118,34 +118,40 @@ def brought(before: Segmentation, after: tuple[Segmentation, ...], *, method: st
         alignment = align(before, image)
         images.append(moved(image, alignment.overall.motion.inverse()))
         rigid = {i: t.name for i, t in enumerate(before.tissues) if t.role is Role.RIGID}
-        bones.append({i: alignment.remaining(name) for i, name in rigid.items()})
-        findings += [
-            Finding(
-                "rigid-unseen",
-                f"after image {number}: '{name}' shows too little of its surface for a motion of its own; it moves with"
-                " the other rigid tissues",
-            )
-            for name, fit in alignment.tissues.items()
-            if fit.n_points == 0
-        ]
-        findings += [
-            Finding(
-                "several-bodies",
-                f"after image {number}: a piece of '{name}' lies {off:.1f} mm off the motion of the whole, which"
-                " moves as one body; give each bone its own tissue",
-            )
-            for name, off in alignment.loose.items()
-        ]
-        findings += [
-            Finding(
-                "rotation-undetermined",
-                f"after image {number}: the surface of '{name}' does not show its rotation about"
-                f" {len(fit.undetermined)} of three axes; it is taken as not turning about them",
-            )
-            for name, fit in alignment.tissues.items()
-            if len(fit.undetermined)
-        ]
+        bones.append({i: alignment.remaining(bone) for i, bone in rigid.items()})
+        findings += _alignment_findings(alignment, name)
     return ImagedStates(before, tuple(images), tuple(bones), tuple(findings))
+
+
+def _alignment_findings(alignment: Alignment, name: str) -> list[Finding]:
+    """What the motion of the bones to the image called `name` rests on, all bones in one finding a cause."""
+    findings = []
+    unseen = [bone for bone, fit in alignment.tissues.items() if fit.n_points == 0]
+    if unseen:
+        text = (
+            f"too little of the surface of {_quoted(unseen)} is seen in '{name}' for a motion of its own, so that it"
+            " moves with the other rigid tissues; a larger field of view shows more"
+        )
+        findings.append(Finding("rigid-unseen", text, place=f"in '{name}' ({_quoted(unseen)})"))
+    if alignment.loose:
+        off = ", ".join(f"'{bone}' {distance:.1f} mm" for bone, distance in alignment.loose.items())
+        text = (
+            f"pieces of a rigid tissue lie off the motion of the whole, which moves as one body, in '{name}': {off};"
+            " give each bone a tissue of its own"
+        )
+        findings.append(Finding("several-bodies", text, place=f"in '{name}' ({off})"))
+    round_ones = [bone for bone, fit in alignment.tissues.items() if len(fit.undetermined)]
+    if round_ones:
+        text = (
+            f"the surface of {_quoted(round_ones)} does not show all of its rotation from 'before' to '{name}', and is"
+            " taken as not turning where it does not; join it to a bone that it moves with, if there is one"
+        )
+        findings.append(Finding("rotation-undetermined", text, place=f"to '{name}' ({_quoted(round_ones)})"))
+    return findings
+
+
+def _quoted(names: Sequence[str]) -> str:
+    return ", ".join(f"'{name}'" for name in names)
 
 
 def make_body(states: ImagedStates, case: Case, *, progress: Callable[[str], None]) -> Body:
@@ -171,7 +177,7 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Callable[[str
     All bodies have the same tissues in the same order. Raises as `inverse_problem` does.
     """
     noise = stated_noise(case)
-    seen = [(r, o) for r, body in enumerate(bodies) for o in surface_observations(body, stated_noise=noise)]
+    seen = [(r, o) for r, body in enumerate(bodies) for o in observations(body.imaged(noise))]
     progress("assembling one stiffness matrix a tissue")
     pairs = [pair for body in bodies for pair in _models(body, case)]
     models = tuple(model for model, _ in pairs)
@@ -191,28 +197,6 @@ def stated_noise(case: Case) -> NoiseModel | None:
         return None
     length = case.noise.correlation_length_mm or 6.0
     return NoiseModel(np.array([2.0 * case.noise.surface_sd_mm**2]), np.array([length]))
-
-
-def surface_observations(
-    body: Body, surfaces: Sequence[ObservedSurface] | None = None, *, stated_noise: NoiseModel | None = None
-) -> tuple[tuple[Observation, ...], ...]:
-    """The observed surfaces of each later image; `surfaces` None: of all `estimate` tissues and drivers."""
-    tissues = body.space.mesh.tissues
-    observed = [i for i, tissue in enumerate(tissues) if tissue.role in (Role.ESTIMATE, Role.DRIVER)]
-    seen = [observed_surface(body.space, i) for i in observed] if surfaces is None else surfaces
-
-    def maps(image: Segmentation) -> list[DistanceMap]:
-        """The distance map of each surface's tissue."""
-        return mapped(lambda s: tissue_distance_map(image, s.tissue, smoothing_mm=body.smoothing_mm), seen)
-
-    before = maps(body.states.before)
-    return tuple(
-        tuple(
-            surface_distance(surface_target(*of), stated_noise=stated_noise)
-            for of in zip(seen, before, maps(image), strict=True)
-        )
-        for image in body.states.after
-    )
 
 
 def _models(body: Body, case: Case) -> list[tuple[LinearModel, tuple[Wall, ...]]]:

@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from palpate.errors import GeometryError, InputDataError, PalpateError, ResourceError
-from palpate.images.checks import check_pair, check_segmentation
-from palpate.images.finding import Finding
+from palpate.findings import Finding, of_pair, one_a_cause, rank
+from palpate.images.checks import check_pair, check_segmentation, later_names
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_intensities
 from palpate.images.segmentation import Segmentation
@@ -116,7 +116,7 @@ class CheckReport:
     def text(self) -> str:
         """The same for people, worst first."""
         lines = [f"refused ({p.exit_code}): {p.message}" for p in self.problems if p.exit_code]
-        lines += [f"warning: {p.message}" for p in self.problems if not p.exit_code]
+        lines += [f"warning ({p.code}): {p.message}" for p in self.problems if not p.exit_code]
         if not lines:
             lines = ["no problem was found"]
         for row in self.organs:
@@ -136,6 +136,7 @@ class _Problems:
 
     def __init__(self) -> None:
         self.found: list[Problem] = []
+        self._findings: list[Finding] = []
 
     def attempt(self, make: Callable[[], T]) -> T | None:
         """What `make` returns; None, and a problem, when it is refused."""
@@ -152,11 +153,15 @@ class _Problems:
         if problem not in self.found:
             self.found.append(problem)
 
-    def warn(self, findings: Sequence[Finding], where: str = "") -> None:
-        """Keep findings; `where` names the pair."""
-        for finding in findings:
-            code = REFUSED_FINDINGS.get(finding.code, 0)
-            self.add(Problem(finding.code, where + finding.message, code))
+    def warn(self, findings: Sequence[Finding], pair: int = 1) -> None:
+        """Keep findings on the images of a pair."""
+        self._findings += of_pair(findings, pair)
+
+    def all(self) -> tuple[Problem, ...]:
+        """Everything that was kept, one a cause, worst first."""
+        found = one_a_cause(self._findings)
+        warned = [Problem(each.code, each.message, REFUSED_FINDINGS.get(each.code, 0)) for each in found]
+        return tuple(sorted([*self.found, *warned], key=lambda problem: (-problem.exit_code, rank(problem.code))))
 
 
 def check_case(path: Path, overrides: Sequence[str], *, progress: Callable[[str], None]) -> CheckReport:
@@ -168,10 +173,9 @@ def check_case(path: Path, overrides: Sequence[str], *, progress: Callable[[str]
     problems = _Problems()
     case = problems.attempt(lambda: read_case(path, overrides))
     if case is None:
-        return CheckReport(path.stem, tuple(problems.found))
+        return CheckReport(path.stem, problems.all())
     problems.attempt(lambda: refuse_what_cannot_be_estimated(case))
-    for remark in unit_warnings(case):
-        problems.add(Problem(remark.code, remark.message))
+    problems.warn(unit_warnings(case))
     progress("reading the images")
     phantom = problems.attempt(lambda: read_states(case)) if case.phantom else None
     read = _read_pairs(case, problems) if case.phantom is None else []
@@ -180,10 +184,10 @@ def check_case(path: Path, overrides: Sequence[str], *, progress: Callable[[str]
         progress("aligning the images")
     pairs = [_checked_pair(problems, pair, case, number) for number, pair in enumerate(pairs, start=1)]
     if not pairs:
-        return CheckReport(case.id, tuple(problems.found))
+        return CheckReport(case.id, problems.all())
     cost = problems.attempt(lambda: _cost(problems, pairs, case, progress))
     names = ("before", *(f"after[{i}]" for i in range(len(pairs[0].after))))
-    return CheckReport(case.id, tuple(problems.found), names, _organs(pairs[0].before, pairs[0].after), cost)
+    return CheckReport(case.id, problems.all(), names, _organs(pairs[0].before, pairs[0].after), cost)
 
 
 def _cost(
@@ -193,7 +197,7 @@ def _cost(
     first = pairs[0]
     cost = expected_cost(case, first.before, first.after, n_pairs=len(pairs))
     problems.attempt(lambda: refuse_edge(case, case_domain(first.before, first.after, case)))
-    if any(problem.exit_code for problem in problems.found):
+    if any(problem.exit_code for problem in problems.all()):
         return cost
     if lack_of_memory(cost):
         problems.found += memory_problems(cost)
@@ -201,7 +205,7 @@ def _cost(
     bodies = [problems.attempt(partial(make_body, pair, case, progress=progress)) for pair in pairs]
     made = [body for body in bodies if body is not None]
     for number, body in enumerate(made, start=1):
-        problems.warn(body.findings, _where(number))
+        problems.warn(body.findings, number)
         problems.attempt(partial(_observe, body))
     if len(made) == len(pairs):
         sizes = [(body.quality.tets, 3 * len(body.space.points)) for body in made]
@@ -240,17 +244,13 @@ def _read_pairs(case: Case, problems: _Problems) -> list[Pair]:
     return pairs
 
 
-def _where(number: int) -> str:
-    return f"pair {number}: " if number > 1 else ""
-
-
 def _checked_pair(problems: _Problems, states: ImagedStates, case: Case, number: int) -> ImagedStates:
     """The images of one pair, aligned and with every check made on them.
 
     An organ that is absent is named, and left out of the other checks; the images are then not aligned.
     """
-    where, before, after = _where(number), states.before, states.after
-    names = ["after" if len(after) == 1 else f"after[{i}]" for i in range(1, len(after) + 1)]
+    before, after = states.before, states.after
+    names, where = later_names(len(after)), f"pair {number}: " if number > 1 else ""
     absent = _absent([("before", before), *zip(names, after, strict=True)])
     for tissue, images in absent.items():
         text = (
@@ -260,20 +260,20 @@ def _checked_pair(problems: _Problems, states: ImagedStates, case: Case, number:
         problems.add(Problem(InputDataError.__name__, text, InputDataError.exit_code))
     if case.phantom is None and not absent:
         states = problems.attempt(partial(brought, before, after, method=case.align)) or states
-        problems.warn(states.findings, where)
+        problems.warn(states.findings, number)
     in_place = bool(states.bones) or not any(tissue.role is Role.RIGID for tissue in before.tissues)
     before, after = _without(before, absent), tuple(_without(image, absent) for image in states.after)
-    problems.warn(check_segmentation(before, "before"), where)
+    problems.warn(check_segmentation(before, "before"), number)
     problems.attempt(lambda: refuse_unmeshable(before, "before"))
     for name, image in zip(names, after, strict=True):
-        problems.warn(check_segmentation(image, name), where)
+        problems.warn(check_segmentation(image, name), number)
         problems.attempt(partial(refuse_unmeshable, image, name))
         if in_place:
             problems.attempt(partial(refuse_lost, before, image, name))
         if any(tissue.role in OBSERVED for tissue in before.tissues):
             findings = problems.attempt(partial(check_pair, before, image, name=name))
-            problems.warn(findings or (), where)
-    problems.warn(every_finding(before, after, loaded=bool(case.loads)), where)
+            problems.warn(findings or (), number)
+    problems.warn(every_finding(before, after, loaded=bool(case.loads)), number)
     return replace(states, before=before, after=after)
 
 

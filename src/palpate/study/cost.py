@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from palpate.mechanics.solvers.registry import expected_of_size
 from palpate.memory import available_memory, total_memory
 from palpate.mesh import COARSER, COARSEST, GRADING, Box
 from palpate.parallel import processors
+from palpate.progress import STAGES, Stage
 from palpate.study.case import Case
 from palpate.study.domain import case_domain
 
@@ -35,7 +36,7 @@ LATTICE = 96  # points of the lattice along the longest side, on which edge leng
 # Fitted to the runs of benchmarks/cost.py (docs/command-line.md), on two cores of a 2.1 GHz server.
 TETS_A_CUBE = 19.4  # tetrahedra in a cube of the wanted edge length: 17 in smooth phantoms, 31 in a real pelvis
 UNKNOWNS_A_TET = {"P1": 0.62, "P2": 4.4}
-FIXED_S = 18.0  # start, first solves, intervals, report
+FIXED_S: Mapping[Stage, float] = {"reading": 4.0, "linear law": 2.0, "intervals": 4.0, "report": 8.0}
 SECONDS_AN_UNKNOWN = 1.5e-4  # beside the solver, with 90 modes a driver, for each later image
 FINITE_STRAIN_S = 2.9e-4  # the same of equilibria and their derivatives at finite strain
 SECONDS_A_CUT = 1.65e-4  # of meshing, for each tetrahedron and each tissue that is cut out
@@ -50,7 +51,10 @@ SERIES = 30  # right-hand sides beside the modes
 
 @dataclass(frozen=True, slots=True)
 class ExpectedCost:
-    """Size of the mesh and of the linear systems, peak memory (GB), time (s), and what they were predicted for."""
+    """Size of the mesh and of the linear systems, peak memory (GB), time (s), and what they were predicted for.
+
+    stages: of the time, what each stage takes (s), in their order.
+    """
 
     tets: int
     unknowns: int
@@ -58,6 +62,7 @@ class ExpectedCost:
     seconds: float
     solver: str
     processors: int
+    stages: Mapping[Stage, float] = field(default_factory=dict)
 
 
 def expected_cost(case: Case, before: Segmentation, after: tuple[Segmentation, ...], *, n_pairs: int) -> ExpectedCost:
@@ -85,21 +90,22 @@ def cost_of_meshes(
     solver, _ = expected_of_size(largest, case.driver.modes + SERIES, solver=case.mechanics.solver)
     count = processors()
     shorter = 1.0 - PARALLEL_SHARE + PARALLEL_SHARE / count
-    seconds, gigabytes = FIXED_S * shorter, FIXED_GB
+    took, gigabytes = {stage: FIXED_S.get(stage, 0.0) * shorter for stage in STAGES}, FIXED_GB
     for tets, unknowns in meshes:
         _, solving = expected_of_size(unknowns, case.driver.modes + SERIES, solver=solver)
         work = unknowns * modes * max(n_after, 1)
-        computing = (SECONDS_AN_UNKNOWN + finite * FINITE_STRAIN_S) * work
-        meshing = SECONDS_A_CUT * tets * (len(before.tissues) - 1)
-        seconds += (computing + meshing) * shorter + solving.seconds
+        took["meshing"] += SECONDS_A_CUT * tets * (len(before.tissues) - 1) * shorter
+        took["linear law"] += SECONDS_AN_UNKNOWN * work * shorter + solving.seconds
+        took["finite strain"] += finite * FINITE_STRAIN_S * work * shorter
         gigabytes += (GB_AN_UNKNOWN * work + solving.bytes / 1e9) * (FINITE_STRAIN_GB if finite else 1.0)
     return ExpectedCost(
         tets=sum(tets for tets, _ in meshes),
         unknowns=sum(unknowns for _, unknowns in meshes),
         memory_gb=gigabytes,
-        seconds=seconds,
+        seconds=sum(took.values()),
         solver=solver,
         processors=count,
+        stages=took,
     )
 
 

@@ -9,28 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError
-from palpate.inversion import (
-    FittedState,
-    Interval,
-    Inversion,
-    InversionSettings,
-    Iterate,
-    Outcome,
-    StartRun,
-    grid_position_shifts,
-    log_interval,
-    sandwich_covariance,
-)
+from palpate.findings import Finding
+from palpate.images.checks import later_names
+from palpate.inversion import Inversion, InversionSettings, Iterate, Outcome, StartRun
 from palpate.mechanics.deformation import deformation_determinants
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit
+from palpate.uncertainty import FittedState, Interval, grid_position_shifts, log_interval, sandwich_covariance
 
 __all__ = [
     "Estimation",
     "Iteration",
     "ModulusEstimate",
     "Observed",
-    "Remark",
     "Start",
     "TissueFit",
     "conclude",
@@ -44,14 +35,6 @@ AT_BOUND = 1e-6
 STRONG_CORRELATION = 0.99
 IDENTIFIED, WEAK = 2.0, 10.0  # largest ratio of an interval's ends
 AS_GOOD = 0.05  # of the objective: another minimum that is worse by less cannot be excluded
-
-
-@dataclass(frozen=True, slots=True)
-class Remark:
-    """A warning that stands beside a result: a `code` for programs, a `message` for readers."""
-
-    code: str
-    message: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +117,7 @@ class Estimation:
     displacements: tuple[NDArray[np.float64], ...]
     counts: Mapping[str, int]
     outer_loop: tuple[Iteration, ...] = ()
-    remarks: tuple[Remark, ...] = ()
+    remarks: tuple[Finding, ...] = ()
     grid_covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
     observations: Mapping[str, str] = field(default_factory=dict)
 
@@ -343,32 +326,33 @@ def _fits(inversion: Inversion, observed: Observed) -> tuple[tuple[TissueFit, ..
     return tuple(fits)
 
 
-def _folds(observed: Observed) -> tuple[Remark, ...]:
+def _folds(observed: Observed) -> tuple[Finding, ...]:
     """A warning for each later image in which the fitted model turns elements inside out."""
     remarks = []
-    for number, state in enumerate(observed.states, start=1):
+    for name, state in zip(later_names(len(observed.states)), observed.states, strict=True):
         space = state.space
         smallest = deformation_determinants(space, state.displacement).min(axis=1)
         folded = int(np.count_nonzero(smallest <= 0.0))
         if folded:
             worst = space.mesh.nodes[space.mesh.tets[int(smallest.argmin())]].mean(axis=0)
             remarks.append(
-                Remark(
+                Finding(
                     "fold-over",
-                    f"after image {number}: {folded} of {len(smallest)} elements are turned inside out, the worst near"
+                    f"'{name}': {folded} of {len(smallest)} elements are turned inside out, the worst near"
                     f" {np.round(worst).astype(int).tolist()} mm (RAS): the motion is too large there for the law or"
                     " the mesh. Look at the labels there, or set a smaller [mesh] edge_length_mm",
+                    place=f"in '{name}' ({folded})",
                 )
             )
     return tuple(remarks)
 
 
-def _remarks(inversion: Inversion, covariance: NDArray[np.float64]) -> tuple[Remark, ...]:
+def _remarks(inversion: Inversion, covariance: NDArray[np.float64]) -> tuple[Finding, ...]:
     mapping = inversion.objective.parameters
     remarks = []
     if not mapping.absolute:
         remarks.append(
-            Remark(
+            Finding(
                 "ratio-only",
                 f"no tissue's modulus is known, so only ratios to '{mapping.relative_to}' are determined; give one"
                 " tissue role `known` with its youngs_modulus_kpa to get kPa",
@@ -376,7 +360,7 @@ def _remarks(inversion: Inversion, covariance: NDArray[np.float64]) -> tuple[Rem
         )
     if inversion.minimum.converged and inversion.convergence.unmet:
         remarks.append(
-            Remark(
+            Finding(
                 "unsettled",
                 f"the outer loop ended at its largest number of iterations: {'; '.join(inversion.convergence.unmet)};"
                 " the model may not fit the images (edge length, driver modes, law), or [noise] should be given",
@@ -385,7 +369,7 @@ def _remarks(inversion: Inversion, covariance: NDArray[np.float64]) -> tuple[Rem
     lost = [c for c in inversion.candidates if c.minimum.outcome is Outcome.NO_EQUILIBRIUM]
     if lost:
         remarks.append(
-            Remark(
+            Finding(
                 "no-equilibrium",
                 f"{len(lost)} of {len(inversion.candidates)} minima of the linear law have no equilibrium under the"
                 " case's law and are not compared with the others; other [estimate] start_ratios show"
@@ -394,7 +378,7 @@ def _remarks(inversion: Inversion, covariance: NDArray[np.float64]) -> tuple[Rem
         )
     if len(inversion.candidates) - len(lost) > 1:
         remarks.append(
-            Remark(
+            Finding(
                 "several-minima",
                 "the starts ended in different minima; the best fit under one noise model is reported, and the"
                 " intervals reach over all that fit nearly as well",
@@ -406,5 +390,5 @@ def _remarks(inversion: Inversion, covariance: NDArray[np.float64]) -> tuple[Rem
             if abs(covariance[i, j]) > STRONG_CORRELATION * sd[i] * sd[j]:
                 names = f"'{mapping.tissues[j]}' and '{mapping.tissues[i]}'"
                 text = f"the moduli of {names} cannot be told apart by these images; add one that moves them otherwise"
-                remarks.append(Remark("correlated", text))
+                remarks.append(Finding("correlated", text))
     return tuple(remarks)

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from palpate.errors import GeometryError, ResourceError
+from palpate.findings import Finding
 from palpate.images.distance import smoothing_width
-from palpate.images.finding import Finding
 from palpate.images.segmentation import Segmentation
 from palpate.mesh.anatomy import Anatomy, Box, anatomy_of
 from palpate.mesh.quality import MeshQuality, check_mesh
