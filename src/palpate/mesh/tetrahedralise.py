@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +15,7 @@ from palpate.mesh.remeshing import compact, remeshed
 from palpate.mesh.smoothing import smoothed
 from palpate.mesh.snapping import contacts_of, debiased, snapped
 from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh
+from palpate.progress import Progress, silent
 
 __all__ = ["COARSER", "COARSEST", "GRADING", "boundary_of", "tetrahedralise"]
 
@@ -34,15 +33,7 @@ RESCUE_DEG = 10.0
 COARSER = 1.5  # edge length on bones, air and known tissues, in edge lengths
 
 
-Progress = Callable[[str], None]
-
-
-def _silent(message: str) -> None:
-    """Nobody listens."""
-    del message
-
-
-def tetrahedralise(anatomy: Anatomy, *, edge_length_mm: float, progress: Progress = _silent) -> TetMesh:
+def tetrahedralise(anatomy: Anatomy, *, edge_length_mm: float, progress: Progress = silent) -> TetMesh:
     """Conforming tetrahedra of the meshed tissues; hollow tissues (driver, rigid, void) are left out.
 
     `edge_length_mm` holds on the surfaces of `estimate` tissues and drivers; it grows with the distance from them,

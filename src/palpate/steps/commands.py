@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 
+from palpate.progress import Progress, silent
 from palpate.steps.results import CaseResult
 from palpate.study import run
 from palpate.study.case import Case
@@ -18,7 +19,6 @@ from palpate.study.result import MeshResult, Simulation
 
 __all__ = ["check", "estimate", "init", "make_mesh", "simulate"]
 
-Progress = Callable[[str], None]
 PathLike = str | os.PathLike[str]
 
 
@@ -44,7 +44,7 @@ def init(
         )
 
 
-def check(case_file: PathLike, overrides: Sequence[str] = (), *, progress: Progress = run.silent) -> CheckReport:
+def check(case_file: PathLike, overrides: Sequence[str] = (), *, progress: Progress = silent) -> CheckReport:
     """Every problem of a case file at once, its organs and what an estimate would cost, as `palpate check` tells.
 
     overrides: as for `read_case`; progress: is called with a sentence at each stage. Raises nothing for a bad case:
@@ -53,7 +53,7 @@ def check(case_file: PathLike, overrides: Sequence[str] = (), *, progress: Progr
     return check_case(Path(case_file), overrides, progress=progress)
 
 
-def make_mesh(case: Case, *, progress: Progress = run.silent) -> MeshResult:
+def make_mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
     """The tetrahedra of a case's reference image, passed through the gate on their quality, as `palpate mesh` has them.
 
     progress: is called with a sentence at each stage. Raises `InputDataError` for images that cannot be used,
@@ -62,7 +62,7 @@ def make_mesh(case: Case, *, progress: Progress = run.silent) -> MeshResult:
     return run.mesh(case, progress=progress)
 
 
-def simulate(case: Case, *, steps: int = 1, progress: Progress = run.silent) -> Simulation:
+def simulate(case: Case, *, steps: int = 1, progress: Progress = silent) -> Simulation:
     """A later state of a case whose tissues all state their `youngs_modulus_kpa`, under its law, motion and loads.
 
     steps: how many states to give, each in equilibrium at its share of the motion. Raises as `make_mesh` does, and
@@ -71,7 +71,7 @@ def simulate(case: Case, *, steps: int = 1, progress: Progress = run.silent) -> 
     return run.simulate(case, progress=progress, steps=steps)
 
 
-def estimate(case: Case, *, truth: Mapping[str, float] | None = None, progress: Progress = run.silent) -> CaseResult:
+def estimate(case: Case, *, truth: Mapping[str, float] | None = None, progress: Progress = silent) -> CaseResult:
     """The Young's modulus of every `estimate` tissue of a case, with its interval and its verdict.
 
     truth: true moduli (kPa) by tissue, to stand beside the estimates of a simulation; a phantom brings its own;

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -29,6 +29,7 @@ from palpate.observation.noise_model import NoiseModel
 from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.observation.registry import observations
 from palpate.observation.wall_modes import Wall
+from palpate.progress import Progress, silent
 from palpate.study.case import Case
 from palpate.study.case_loads import case_loads
 from palpate.study.contacts import every_finding
@@ -89,14 +90,20 @@ class Body:
 
 
 def aligned(
-    before: Segmentation, after: tuple[Segmentation, ...], *, method: str, loaded: bool = False
+    before: Segmentation,
+    after: tuple[Segmentation, ...],
+    *,
+    method: str,
+    loaded: bool = False,
+    progress: Progress = silent,
 ) -> ImagedStates:
     """Bring the later images to the first on their rigid tissues (`method` "rigid-tissues") and check them all.
 
     `loaded`: whether known loads act on the body, for what is found of its motion.
     Raises `InputDataError` as `check_images`, `align` and `refuse_lost` do, `GeometryError` as `refuse_unmeshable`.
     """
-    found = brought(before, after, method=method)
+    found = brought(before, after, method=method, progress=progress)
+    progress("checking the images")
     findings, images = [*found.findings, *check_images(before, found.after)], found.after
     refuse_unmeshable(before, "before")
     for name, image in zip(later_names(len(images)), images, strict=True):
@@ -106,7 +113,9 @@ def aligned(
     return replace(found, findings=tuple(findings))
 
 
-def brought(before: Segmentation, after: tuple[Segmentation, ...], *, method: str) -> ImagedStates:
+def brought(
+    before: Segmentation, after: tuple[Segmentation, ...], *, method: str, progress: Progress = silent
+) -> ImagedStates:
     """Bring the later images to the first as `aligned` does, but check nothing; raises `InputDataError` as `align`."""
     images, bones, findings = [], [], list[Finding]()
     names = later_names(len(after))
@@ -115,6 +124,7 @@ def brought(before: Segmentation, after: tuple[Segmentation, ...], *, method: st
             images.append(image)
             bones.append(dict[int, RigidMotion]())
             continue
+        progress(f"aligning '{name}' on the rigid tissues")
         alignment = align(before, image)
         images.append(moved(image, alignment.overall.motion.inverse()))
         rigid = {i: t.name for i, t in enumerate(before.tissues) if t.role is Role.RIGID}
@@ -154,7 +164,7 @@ def _quoted(names: Sequence[str]) -> str:
     return ", ".join(f"'{name}'" for name in names)
 
 
-def make_body(states: ImagedStates, case: Case, *, progress: Callable[[str], None]) -> Body:
+def make_body(states: ImagedStates, case: Case, *, progress: Progress) -> Body:
     """Mesh the reference state of the images (see `mesh_reference`); raises as that does."""
     found = mesh_reference(states.before, states.after, case, progress=progress)
     space = lagrange_space(found.mesh, choose_element(case.mechanics.element).space)
@@ -166,16 +176,17 @@ def make_body(states: ImagedStates, case: Case, *, progress: Callable[[str], Non
     return Body(states, space, found.quality, observation_width(*grids), found.edge_length_mm, found.findings)
 
 
-def inverse_problem(body: Body, case: Case, *, progress: Callable[[str], None]) -> InverseProblem:
+def inverse_problem(body: Body, case: Case, *, progress: Progress) -> InverseProblem:
     """Models and targets of every later image; raises `ConfigurationError` when nothing moves the body."""
     return joint_problem((body,), case, progress=progress)
 
 
-def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Callable[[str], None]) -> InverseProblem:
+def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> InverseProblem:
     """The same of several reference states of one patient: one set of moduli, the bodies' images one after the other.
 
     All bodies have the same tissues in the same order. Raises as `inverse_problem` does.
     """
+    progress("distances to the surfaces of all images")
     noise = stated_noise(case)
     seen = [(r, o) for r, body in enumerate(bodies) for o in observations(body.imaged(noise))]
     progress("assembling one stiffness matrix a tissue")

@@ -18,6 +18,7 @@ from palpate.images.readers import read_intensities
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.observation.observed_surface import observed_surface
+from palpate.progress import Progress
 from palpate.study.body import Body, ImagedStates, brought, make_body
 from palpate.study.case import Case
 from palpate.study.case_file import read_case
@@ -164,7 +165,7 @@ class _Problems:
         return tuple(sorted([*self.found, *warned], key=lambda problem: (-problem.exit_code, rank(problem.code))))
 
 
-def check_case(path: Path, overrides: Sequence[str], *, progress: Callable[[str], None]) -> CheckReport:
+def check_case(path: Path, overrides: Sequence[str], *, progress: Progress) -> CheckReport:
     """All problems of the case file at `path` (with overrides as in `read_case`), its organs and its expected cost.
 
     The images are aligned, and meshed if nothing was refused before, as an estimate would. Nothing is solved. Raises
@@ -180,9 +181,7 @@ def check_case(path: Path, overrides: Sequence[str], *, progress: Callable[[str]
     phantom = problems.attempt(lambda: read_states(case)) if case.phantom else None
     read = _read_pairs(case, problems) if case.phantom is None else []
     pairs = [phantom] if phantom is not None else [ImagedStates(before, after, (), ()) for before, after in read]
-    if phantom is None and case.align != "none" and pairs:
-        progress("aligning the images")
-    pairs = [_checked_pair(problems, pair, case, number) for number, pair in enumerate(pairs, start=1)]
+    pairs = [_checked_pair(problems, pair, case, number, progress) for number, pair in enumerate(pairs, start=1)]
     if not pairs:
         return CheckReport(case.id, problems.all())
     cost = problems.attempt(lambda: _cost(problems, pairs, case, progress))
@@ -190,9 +189,7 @@ def check_case(path: Path, overrides: Sequence[str], *, progress: Callable[[str]
     return CheckReport(case.id, problems.all(), names, _organs(pairs[0].before, pairs[0].after), cost)
 
 
-def _cost(
-    problems: _Problems, pairs: Sequence[ImagedStates], case: Case, progress: Callable[[str], None]
-) -> ExpectedCost:
+def _cost(problems: _Problems, pairs: Sequence[ImagedStates], case: Case, progress: Progress) -> ExpectedCost:
     """What an estimate would cost on its very meshes; on meshes of a guessed size where something is refused."""
     first = pairs[0]
     cost = expected_cost(case, first.before, first.after, n_pairs=len(pairs))
@@ -244,7 +241,9 @@ def _read_pairs(case: Case, problems: _Problems) -> list[Pair]:
     return pairs
 
 
-def _checked_pair(problems: _Problems, states: ImagedStates, case: Case, number: int) -> ImagedStates:
+def _checked_pair(
+    problems: _Problems, states: ImagedStates, case: Case, number: int, progress: Progress
+) -> ImagedStates:
     """The images of one pair, aligned and with every check made on them.
 
     An organ that is absent is named, and left out of the other checks; the images are then not aligned.
@@ -259,7 +258,7 @@ def _checked_pair(problems: _Problems, states: ImagedStates, case: Case, number:
         )
         problems.add(Problem(InputDataError.__name__, text, InputDataError.exit_code))
     if case.phantom is None and not absent:
-        states = problems.attempt(partial(brought, before, after, method=case.align)) or states
+        states = problems.attempt(partial(brought, before, after, method=case.align, progress=progress)) or states
         problems.warn(states.findings, number)
     in_place = bool(states.bones) or not any(tissue.role is Role.RIGID for tissue in before.tissues)
     before, after = _without(before, absent), tuple(_without(image, absent) for image in states.after)

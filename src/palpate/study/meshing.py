@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +14,7 @@ from palpate.mesh.anatomy import Anatomy, Box, anatomy_of
 from palpate.mesh.quality import MeshQuality, check_mesh
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.mesh.tetrahedralise import tetrahedralise
+from palpate.progress import Progress
 from palpate.study.case import Case
 from palpate.study.cost import expected_cost, lack_of_memory
 from palpate.study.domain import case_domain
@@ -24,8 +24,6 @@ __all__ = ["ReferenceMesh", "mesh_reference", "refuse_edge"]
 FINER = 0.75  # times an edge length whose mesh is not fit: the next one's
 FINER_MESHES = 2  # at the most
 THIN_VOXELS = 4
-
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,7 @@ from palpate.images.tissue import Tissue
 from palpate.phantoms.pelvis import PelvisOptions, pelvis, pelvis_anatomy
 from palpate.phantoms.scene import Scene
 from palpate.phantoms.spheres import SpheresOptions, spheres, spheres_anatomy
+from palpate.progress import Progress, silent
 from palpate.study.body import ImagedStates, aligned
 from palpate.study.case import Case, CaseTissue
 from palpate.study.provenance import file_digest
@@ -27,7 +28,7 @@ from palpate.study.schema import nearest, shown
 __all__ = ["phantom_scene", "read_pairs", "read_segmentation", "read_states"]
 
 
-def read_states(case: Case) -> ImagedStates:
+def read_states(case: Case, *, progress: Progress = silent) -> ImagedStates:
     """Segmentations of the reference state and of the later states, aligned and checked.
 
     Raises `InputDataError` for images that cannot be used, `ConfigurationError` for tissues that do not fit them.
@@ -38,14 +39,14 @@ def read_states(case: Case) -> ImagedStates:
         return aligned(segment(scene.before, scene.tissues), after, method=case.align, loaded=bool(case.loads))
     if case.images is None:
         raise ConfigurationError(f"case '{case.id}' has neither [images] nor [phantom]")
-    return _read_pair(case, case.images.before, case.images.after, key="")
+    return _read_pair(case, case.images.before, case.images.after, key="", progress=progress)
 
 
-def read_pairs(case: Case) -> tuple[ImagedStates, ...]:
+def read_pairs(case: Case, *, progress: Progress = silent) -> tuple[ImagedStates, ...]:
     """The same of each of the case's further [[pairs]]; their findings begin with the pair's number, from 2."""
     found = []
     for number, pair in enumerate(case.pairs, start=2):
-        states = _read_pair(case, pair.before, pair.after, key=f"pairs[{number - 2}].")
+        states = _read_pair(case, pair.before, pair.after, key=f"pairs[{number - 2}].", progress=progress)
         findings = tuple(replace(f, message=f"pair {number}: {f.message}") for f in states.findings)
         found.append(replace(states, findings=findings))
     return tuple(found)
@@ -127,13 +128,13 @@ def _phantom_tissues(case: Case, options: PelvisOptions | SpheresOptions) -> tup
     return tuple(tissue for tissue in case.tissues if own[tissue.name].meshed)
 
 
-def _read_pair(case: Case, before: Path, after: tuple[Path, ...], *, key: str) -> ImagedStates:
+def _read_pair(case: Case, before: Path, after: tuple[Path, ...], *, key: str, progress: Progress) -> ImagedStates:
     """One pair; `key` begins the keys of its files' digests."""
     table = case.images.names if case.images else None
     names = read_label_table(table) if table else None
     reference = read_segmentation(case, before, names, None)
     later = tuple(read_segmentation(case, path, names, reference.tissues) for path in after)
-    states = aligned(reference, later, method=case.align, loaded=bool(case.loads))
+    states = aligned(reference, later, method=case.align, loaded=bool(case.loads), progress=progress)
     inputs = {"names": names.sha256} if names else {}
     keys = (f"{key}before", *(f"{key}after[{i}]" for i in range(len(later))))
     for name, image, path in zip(keys, (reference, *later), (before, *after), strict=True):
