@@ -56,7 +56,9 @@ Widening = Literal[
     "cut-by-border",
     "touching",
 ]
-Harmless = Literal["front-exchanged", "sides-exchanged", "memory", "report", "case-file", "earlier-files"]
+Harmless = Literal[
+    "finer-mesh", "front-exchanged", "sides-exchanged", "memory", "memory-now", "report", "case-file", "earlier-files"
+]
 Code = Misleading | Widening | Harmless
 
 MISLEADING: tuple[str, ...] = get_args(Misleading)  # can move a modulus by more than its interval

@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 import signal
 import sys
+import threading
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TextIO, cast
 
@@ -28,6 +29,7 @@ __all__ = ["Bar", "Place", "place", "progress_on_stderr"]
 TRUST = 0.1  # of the predicted time: how much of it must be over before its own pace outweighs the prediction
 STEADY = 0.75  # of a stage: beyond, its share creeps, as nobody knows how much longer it takes
 MOST = 0.99
+PATIENCE_S = 8.0
 WIDTH = 32
 
 
@@ -63,20 +65,51 @@ def _creeping(x: float) -> float:
 
 
 @contextmanager
-def progress_on_stderr(*, quiet: bool) -> Iterator[Progress]:
-    """While the block works, what takes its sentences: each goes to the log, and with the seconds so far to stderr."""
+def progress_on_stderr(*, quiet: bool, patience_s: float = PATIENCE_S) -> Iterator[Progress]:
+    """While the block works, what takes its sentences: each goes to the log, and with the seconds so far to stderr.
+
+    Where no bar moves there, a line follows every `patience_s` seconds without a sentence: a library that factorises or
+    remeshes says nothing while it works.
+    """
     bar, began = Bar(), time.monotonic()
+    said: list[tuple[str, float]] = []
 
     def progress(sentence: str) -> None:
         """Tell what happens now."""
         LOGGER.info(sentence)
+        said.append((sentence, time.monotonic()))
         if not quiet:
             bar.tell(sentence, f"[{time.monotonic() - began:6.1f} s] {printable(sentence)}")
 
+    def remind(over: threading.Event) -> None:
+        """Say that the last thing still goes on."""
+        reminded = began
+        while not over.wait(0.1 * patience_s):
+            sentence, since = said[-1] if said else ("starting", began)
+            now = time.monotonic()
+            if now - max(since, reminded) > patience_s and not bar.moves:
+                reminded = now
+                tell(f"[{now - began:6.1f} s] still, after {now - since:.0f} s: {printable(sentence)}", sys.stderr)
+
     try:
-        yield progress
+        with nullcontext() if quiet else _beside(remind):
+            yield progress
     finally:
         bar.close()
+
+
+@contextmanager
+def _beside(work: Callable[[threading.Event], None]) -> Iterator[None]:
+    """While the block works, `work` does in a thread that no signal reaches; it is told when the block is over."""
+    over = threading.Event()
+    thread = threading.Thread(target=work, args=(over,), daemon=True)
+    with _signals_blocked():
+        thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 class Bar:
@@ -87,6 +120,11 @@ class Bar:
         self._seconds: Mapping[Stage, float] = {}
         self._share = 0.0
         self._live: Live | None = None
+
+    @property
+    def moves(self) -> bool:
+        """Whether it is seen."""
+        return self._live is not None
 
     def tell(self, sentence: str, line: str) -> None:
         """Take in what a sentence says of the run, and print its line."""

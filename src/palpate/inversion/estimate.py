@@ -125,8 +125,7 @@ def invert(
     begin = np.concatenate([middle, np.zeros(sum(problem.parameters.n_modes))])
     rule = rule or (FIRST_GUESS if problem.finite_strain else REPORTED)
     if any(state.approximation is None for state in problem.states):
-        progress("responses of the full model at the middle start")
-        linear = _linear(*_with_reduced_bases(problem, settings, begin), settings, rule, progress)
+        linear = _linear(*_with_reduced_bases(problem, settings, begin, progress), settings, rule, progress)
     else:
         linear = _linear(Objective(problem.states, problem.parameters), begin, 0, settings, rule, progress)
     if not problem.finite_strain:
@@ -158,13 +157,18 @@ def continue_at_finite_strain(linear: Inversion, settings: InversionSettings, *,
 
 
 def _with_reduced_bases(
-    problem: InverseProblem, settings: InversionSettings, middle: NDArray[np.float64]
+    problem: InverseProblem, settings: InversionSettings, middle: NDArray[np.float64], progress: Progress
 ) -> tuple[Objective, NDArray[np.float64], int]:
     """The objective on reduced bases at unknowns (n_unknowns,), these with the drivers' motion fitted, its cost."""
     parameters = problem.parameters
-    bases = [reduced_basis(state.model, parameters.moduli(middle)) for state in problem.states]
+    bases = []
+    for number, state in enumerate(problem.states, start=1):
+        progress(f"responses of the full model at the middle start, state {number} of {len(problem.states)}")
+        bases.append(reduced_basis(state.model, parameters.moduli(middle)))
+    progress("the drivers' motion at the middle start")
     objective = with_first_noise(Objective(problem.states, parameters).under(bases))
     fitted = fit_coefficients(objective.rematched(middle), middle, bounds=settings.bounds)
+    progress("how the responses change with the moduli")
     by_theta = parameters.derivatives(middle)
     triples = zip(problem.states, bases, parameters.coefficients(fitted.unknowns), strict=True)
     states = tuple(s.with_approximation(b.with_modulus_series(q, by_theta)) for s, b, q in triples)
@@ -249,10 +253,12 @@ def _at_finite_strain(linear: OuterIterate, settings: InversionSettings, progres
     before = linear.objective
     for state, basis, place in zip(before.states, before.approximations, before.places(unknowns), strict=True):
         assert state.finite_strain is not None
-        first.append(expansion_near(state.finite_strain, basis, place, tolerance=EQUILIBRIUM))
+        found = expansion_near(state.finite_strain, basis, place, tolerance=EQUILIBRIUM, progress=progress)
+        first.append(found)
     objective = before.under(first).rematched(unknowns)
     start = OuterIterate(objective, replace(linear.minimum, evaluation=objective(unknowns), evaluations=1))
     end = run_outer_loop(start, settings, REPORTED, progress=progress, title="finite strain")
+    progress("finite strain: the exact equilibrium at the estimate")
     exact = []
     places = end.objective.places(end.minimum.unknowns)
     for approximation, place in zip(end.objective.approximations, places, strict=True):

@@ -22,6 +22,7 @@ from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.constraint import Constraint
+from palpate.progress import Progress, silent
 
 __all__ = ["Expansion", "expansion_near"]
 
@@ -124,17 +125,21 @@ class Expansion:
         return Expansion(model, there, self.counts + there.counts, self.derivatives_at)
 
 
-def expansion_near(model: FiniteStrainModel, linear: Approximation, at: Place, *, tolerance: float) -> Expansion:
+def expansion_near(
+    model: FiniteStrainModel, linear: Approximation, at: Place, *, tolerance: float, progress: Progress = silent
+) -> Expansion:
     """The expansion around the equilibrium near the linear law's displacement at a place, with all derivatives.
 
     tolerance: of the forces, of every equilibrium that follows. Its factorisation is the only one: it serves all solves
     that stay near. Raises `NotConverged` with the element and the share of the motion where the path ended.
     """
     start = linear.model.solve(at.moduli, at.coefficients).displacement
-    near = from_start(
-        model.to_tolerance(COARSE), at.moduli, at.coefficients, start=start, nearby=linear.factorisation
-    ).refactorised()
+    near = from_start(model.to_tolerance(COARSE), at.moduli, at.coefficients, start=start, nearby=linear.factorisation)
+    progress("finite strain: factorising the tangent stiffness there")
+    near = near.refactorised()
+    progress("finite strain: the equilibrium on it")
     full = model.to_tolerance(tolerance)
     found = from_start(full, at.moduli, at.coefficients, start=near.displacement, nearby=near.factorisation)
+    progress(f"finite strain: derivatives by {len(model.names)} moduli and {len(at.coefficients)} modes")
     derivatives = FirstOrderModel(model.names, at.moduli, at.coefficients, found.values, near.tangent())
     return Expansion(derivatives, found, near.counts + near.tangent_counts + found.counts)

@@ -10,14 +10,13 @@ from typing import Any
 from palpate.errors import EstimationError, ResourceError
 from palpate.export.case_files import write_estimate_files
 from palpate.findings import Finding, warning_rows
-from palpate.progress import during
+from palpate.progress import during, silent
 from palpate.report import case_report
 from palpate.study.case import Case
 from palpate.study.case_as_run import stage_case
 from palpate.study.earlier import RESULT, earlier_files
 from palpate.study.outputs import OutputFolder, Staging, write_json
 from palpate.study.result import CaseResult, failure_document
-from palpate.study.run import silent
 
 __all__ = ["DATA", "PAGE", "save_document", "save_estimate", "save_failure"]
 

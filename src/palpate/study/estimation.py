@@ -15,6 +15,7 @@ from palpate.inversion import Inversion, InversionSettings, Iterate, Outcome, St
 from palpate.mechanics.deformation import deformation_determinants
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit
+from palpate.progress import Progress, silent
 from palpate.uncertainty import FittedState, Interval, grid_position_shifts, log_interval, sandwich_covariance
 
 __all__ = [
@@ -137,7 +138,13 @@ class Observed:
 
 
 def conclude(
-    inversion: Inversion, settings: InversionSettings, observed: Observed, *, truth: Mapping[str, float], seed: int
+    inversion: Inversion,
+    settings: InversionSettings,
+    observed: Observed,
+    *,
+    truth: Mapping[str, float],
+    seed: int,
+    progress: Progress = silent,
 ) -> Estimation:
     """State the result of an inversion; `truth`: true moduli (kPa) by tissue where they are known.
 
@@ -148,9 +155,12 @@ def conclude(
     if objective.parameters.poisson:
         raise ConfigurationError("a result states Young's moduli only: a Poisson's ratio was sought beside them")
     rng = np.random.default_rng(seed)
+    progress(f"intervals: the fitted model as {GRID_DRAWS} random voxel grids show it")
     shifts = grid_position_shifts(objective, minimum.evaluation, observed.states, draws=GRID_DRAWS, rng=rng)
     grid_part = shifts.T @ shifts / len(shifts)
+    progress("intervals: correlation of the residuals")
     covariance = sandwich_covariance(objective, minimum.evaluation) + grid_part
+    progress("the fit of every surface before and after")
     return Estimation(
         status="converged" if minimum.converged else "not converged",
         reason=_reason(inversion),

@@ -40,7 +40,11 @@ SCHEMA = "palpate.result/1"
 
 @dataclass(frozen=True, slots=True)
 class MeshSummary:
-    """Size and quality of a mesh; angles in degrees; volume_error: tissue -> (mesh - image) / image, dimensionless."""
+    """Size and quality of a mesh; angles in degrees; volume_error: tissue -> (mesh - image) / image, dimensionless.
+
+    edge_length_mm: that at the organs, which may be shorter than the case's (finding "finer-mesh"); None where the mesh
+    is a phantom's own.
+    """
 
     nodes: int
     tets: int
@@ -48,6 +52,7 @@ class MeshSummary:
     min_dihedral_deg: float
     p5_dihedral_deg: float
     volume_error: Mapping[str, float]
+    edge_length_mm: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

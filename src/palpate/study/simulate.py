@@ -52,8 +52,8 @@ def simulate(case: Case, *, progress: Progress, steps: int = 1) -> Simulation:
         before, after, summary, remarks = scene.before, scene.after, _plain_summary(space), tuple[Finding, ...]()
         displacements = tuple(scene.displacement * (step / steps) for step in range(1, steps + 1))
     else:
-        progress("reading and aligning the images")
-        states = read_states(case)
+        progress("reading the images")
+        states = read_states(case, progress=progress)
         inputs = input_digests(case, states.inputs)
         tissues = states.before.tissues
         _refuse_unknown(tissues)
@@ -63,7 +63,7 @@ def simulate(case: Case, *, progress: Progress, steps: int = 1) -> Simulation:
         displacements = _steps(body, case, steps, progress)
         last = displacements[-1]
         before, after = (_labels(states.before, space, motion) for motion in (np.zeros_like(last), last))
-        remarks = states.findings
+        remarks = (*states.findings, *body.findings)
     moduli = {t.name: t.youngs_modulus_kpa for t in tissues if t.meshed and t.youngs_modulus_kpa is not None}
     seconds = {"total": round(time.perf_counter() - began, 3)}
     provenance = Provenance(seconds, inputs, software_versions())
