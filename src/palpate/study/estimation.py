@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError
 from palpate.findings import Finding
-from palpate.images.checks import later_names
 from palpate.inversion import Inversion, InversionSettings, Iterate, Outcome, StartRun
-from palpate.mechanics.deformation import deformation_determinants
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit
 from palpate.progress import Progress, silent
+from palpate.study.estimate_findings import fold_findings, inversion_findings
 from palpate.uncertainty import (
     Covariance,
     FittedState,
@@ -41,7 +40,6 @@ __all__ = [
 
 GRID_DRAWS = 8
 AT_BOUND = 1e-6
-STRONG_CORRELATION = 0.99
 IDENTIFIED, WEAK = 2.0, 10.0  # largest ratio of an interval's ends
 AS_GOOD = 0.05  # of the objective: another minimum that is worse by less cannot be excluded
 
@@ -185,7 +183,7 @@ def conclude(
             "evaluations": inversion.evaluations,
         },
         outer_loop=tuple(_iteration(inversion, iterate) for iterate in minimum.history),
-        remarks=(*_remarks(inversion, covariance.total), *_folds(observed)),
+        remarks=(*inversion_findings(inversion, covariance.total), *fold_findings(observed.states)),
         observations={observation.kind: observation.description for observation in objective.observations},
     )
 
@@ -348,71 +346,3 @@ def _fits(inversion: Inversion, observed: Observed) -> tuple[tuple[TissueFit, ..
             )
         )
     return tuple(fits)
-
-
-def _folds(observed: Observed) -> tuple[Finding, ...]:
-    """A warning for each later image in which the fitted model turns elements inside out."""
-    remarks = []
-    for name, state in zip(later_names(len(observed.states)), observed.states, strict=True):
-        space = state.space
-        smallest = deformation_determinants(space, state.displacement).min(axis=1)
-        folded = int(np.count_nonzero(smallest <= 0.0))
-        if folded:
-            worst = space.mesh.nodes[space.mesh.tets[int(smallest.argmin())]].mean(axis=0)
-            remarks.append(
-                Finding(
-                    "fold-over",
-                    f"'{name}': {folded} of {len(smallest)} elements are turned inside out, the worst near"
-                    f" {np.round(worst).astype(int).tolist()} mm (RAS): the motion is too large there for the law or"
-                    " the mesh. Look at the labels there, or set a smaller [mesh] edge_length_mm",
-                    place=f"in '{name}' ({folded})",
-                )
-            )
-    return tuple(remarks)
-
-
-def _remarks(inversion: Inversion, covariance: NDArray[np.float64]) -> tuple[Finding, ...]:
-    mapping = inversion.objective.parameters
-    remarks = []
-    if not mapping.absolute:
-        remarks.append(
-            Finding(
-                "ratio-only",
-                f"no tissue's modulus is known, so only ratios to '{mapping.relative_to}' are determined; give one"
-                " tissue role `known` with its youngs_modulus_kpa to get kPa",
-            )
-        )
-    if inversion.minimum.converged and inversion.convergence.unmet:
-        remarks.append(
-            Finding(
-                "unsettled",
-                f"the outer loop ended at its largest number of iterations: {'; '.join(inversion.convergence.unmet)};"
-                " the model may not fit the images (edge length, driver modes, law), or [noise] should be given",
-            )
-        )
-    lost = [c for c in inversion.candidates if c.minimum.outcome is Outcome.NO_EQUILIBRIUM]
-    if lost:
-        remarks.append(
-            Finding(
-                "no-equilibrium",
-                f"{len(lost)} of {len(inversion.candidates)} minima of the linear law have no equilibrium under the"
-                " case's law and are not compared with the others; other [estimate] start_ratios show"
-                " whether they are minima at all",
-            )
-        )
-    if len(inversion.candidates) - len(lost) > 1:
-        remarks.append(
-            Finding(
-                "several-minima",
-                "the starts ended in different minima; the best fit under one noise model is reported, and the"
-                " intervals reach over all that fit nearly as well",
-            )
-        )
-    sd = np.sqrt(np.diag(covariance))
-    for i in range(len(sd)):
-        for j in range(i):
-            if abs(covariance[i, j]) > STRONG_CORRELATION * sd[i] * sd[j]:
-                names = f"'{mapping.tissues[j]}' and '{mapping.tissues[i]}'"
-                text = f"the moduli of {names} cannot be told apart by these images; add one that moves them otherwise"
-                remarks.append(Finding("correlated", text))
-    return tuple(remarks)
