@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import NotConverged, PalpateError
+from palpate.findings import Finding, one_a_cause, warning_rows
 from palpate.images.label_image import LabelImage
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.case import Case, CaseTissue
 from palpate.study.case_text import case_tables
-from palpate.study.estimation import Estimation, ModulusEstimate, Remark, Start, TissueFit, no_estimate
+from palpate.study.estimation import Estimation, ModulusEstimate, Start, TissueFit, no_estimate
 from palpate.study.together import ImagePairs
 from palpate.uncertainty import Information
 
@@ -41,7 +42,11 @@ SCHEMA = "palpate.result/1"
 
 @dataclass(frozen=True, slots=True)
 class MeshSummary:
-    """Size and quality of a mesh; angles in degrees; volume_error: tissue -> (mesh - image) / image, dimensionless."""
+    """Size and quality of a mesh; angles in degrees; volume_error: tissue -> (mesh - image) / image, dimensionless.
+
+    edge_length_mm: that at the organs, which may be shorter than the case's (finding "finer-mesh"); None where the mesh
+    is a phantom's own.
+    """
 
     nodes: int
     tets: int
@@ -49,6 +54,7 @@ class MeshSummary:
     min_dihedral_deg: float
     p5_dihedral_deg: float
     volume_error: Mapping[str, float]
+    edge_length_mm: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +97,7 @@ class CaseResult:
     before: Segmentation
     after: tuple[Segmentation, ...]
     provenance: Provenance
-    remarks: tuple[Remark, ...] = ()
+    remarks: tuple[Finding, ...] = ()
     note: str = ""
     further: tuple[PairResult, ...] = ()
 
@@ -101,9 +107,9 @@ class CaseResult:
         return self.space.mesh.tissues
 
     @property
-    def all_remarks(self) -> tuple[Remark, ...]:
-        """Warnings of the study and of the estimation, each once."""
-        return tuple(dict.fromkeys((*self.remarks, *self.estimation.remarks)))
+    def all_remarks(self) -> tuple[Finding, ...]:
+        """Warnings of the study and of the estimation, one a cause, in the order of what they cost in the answer."""
+        return one_a_cause((*self.remarks, *self.estimation.remarks))
 
     @property
     def unit(self) -> str:
@@ -150,7 +156,7 @@ class MeshResult:
     mesh_summary: MeshSummary
     before: Segmentation
     provenance: Provenance
-    remarks: tuple[Remark, ...] = ()
+    remarks: tuple[Finding, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON document, schema palpate.mesh/1."""
@@ -174,7 +180,7 @@ class Simulation:
     after: LabelImage
     moduli_kpa: Mapping[str, float]
     provenance: Provenance
-    remarks: tuple[Remark, ...] = ()
+    remarks: tuple[Finding, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON document, schema palpate.simulation/1."""
@@ -265,7 +271,7 @@ def _heading(case: Case, status: str, reason: str) -> dict[str, Any]:
     }
 
 
-def _closing(case: Case, provenance: Provenance, remarks: tuple[Remark, ...]) -> dict[str, Any]:
+def _closing(case: Case, provenance: Provenance, remarks: tuple[Finding, ...]) -> dict[str, Any]:
     return {
         "seconds": dict(provenance.seconds),
         "inputs": {key: {"sha256": digest} for key, digest in provenance.inputs.items()},
@@ -273,7 +279,7 @@ def _closing(case: Case, provenance: Provenance, remarks: tuple[Remark, ...]) ->
         "case": case_tables(case, lambda path: path.name),
         "overrides": list(case.overrides),
         "seed": case.seed,
-        "warnings": [{"code": warning.code, "message": warning.message} for warning in remarks],
+        "warnings": warning_rows(remarks),
     }
 
 
