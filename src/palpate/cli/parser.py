@@ -33,6 +33,10 @@ EXAMPLES = {
         "palpate estimate out/case.toml --set mechanics.law=linear --output linear",
     ),
     "report": ("palpate report out", "palpate report out --json"),
+    "sensitivity": (
+        "palpate sensitivity case/case.toml --output out",
+        "palpate sensitivity case/case.toml --sobol 64 --output out",
+    ),
     "reproduce": ("palpate reproduce table1", "palpate reproduce figure4 --output figure4"),
     "verify": ("palpate verify --quick", "palpate verify --output verification"),
 }
@@ -88,6 +92,7 @@ def make_parser() -> argparse.ArgumentParser:
     simulate.add_argument("--steps", type=_count, default=1, metavar="N", help="write N steps to animate")
     simulate.set_defaults(targets=commands.SIMULATION_TARGETS)
     _add_estimate(subparsers)
+    _add_sensitivity(subparsers)
     _add_report(subparsers)
     _add_reproduce(subparsers)
     _add_verify(subparsers)
@@ -138,6 +143,15 @@ def _add_report(subparsers: Any) -> None:
     command.set_defaults(makes_folder=False, targets=(written.DOCUMENT, written.PAGE))
 
 
+def _add_sensitivity(subparsers: Any) -> None:
+    what = "estimate a case, and each modulus again under changed assumptions; goes on where it was interrupted"
+    command = _command(subparsers, "sensitivity", studies.sensitivity, what=what)
+    _add_case(command)
+    what = "also Sobol indices of N samples an input, a power of 2 (extra `sensitivity`)"
+    command.add_argument("--sobol", type=_power_of_two, default=0, metavar="N", help=what)
+    command.set_defaults(targets=studies.SENSITIVITY_TARGETS)
+
+
 def _add_reproduce(subparsers: Any) -> None:
     what = "compute one of the paper's experiments, its numbers beside ours; goes on where it was interrupted"
     command = _command(subparsers, "reproduce", studies.reproduce, what=what, folder="palpate-reproduce")
@@ -178,6 +192,12 @@ def _command(
     command.add_argument("--json", action="store_true", help="print one JSON document on stdout, and nothing else")
     command.add_argument("--quiet", action="store_true", help="no progress, no table")
     return command
+
+
+def _power_of_two(text: str) -> int:
+    if text not in (powers := [str(2**n) for n in range(3, 17)]):
+        raise argparse.ArgumentTypeError(f"{text[:20]!r} is no power of 2 from {powers[0]} to {powers[-1]}")
+    return int(text)
 
 
 def _count(text: str) -> int:
