@@ -7,15 +7,15 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
-from palpate.report.colours import START_COLOURS
 from palpate.report.report_data import ModelSurface, ReportData
 from palpate.report.svg import INK, draw_svg
 
-__all__ = ["angle_svg", "modulus_svg", "objective_svg", "residual_svg", "waterfall_svg"]
+__all__ = ["START_COLOURS", "angle_svg", "modulus_svg", "objective_svg", "residual_svg", "waterfall_svg"]
 
 SIZE = (3.9, 2.5)
 DASHED = (0, (4, 3))
 BINS = 41
+START_COLOURS = ("#3b7dd8", "#d9822b", "#3a9d5d", "#b0559b", "#8a6d3b", "#4aa3a3", "#c0504d", "#7f7fd0")
 
 
 def residual_svg(data: ReportData, model: ModelSurface, *, voxel_mm: float, name: str) -> str:

@@ -3,32 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.laws.registry import LAWS, law_from, law_parameters
 from palpate.report.report_data import ReportData
+from palpate.report.sources import SOURCES, bibtex, reference_line
 
 __all__ = ["Methods", "methods_text"]
 
-SOURCES = {
-    "yang": "Yang S, Lin MC. Simultaneous Estimation of Elasticity for Multiple Deformable Bodies.",
-    "palpate": "The Palpate developers. Palpate: elasticity of several organs at once from segmented images, version"
-    " {}.",
-    "mmg": "Dapogny C, Dobrzynski C, Frey P. Three-dimensional adaptive domain remeshing, implicit domain meshing, and"
-    " applications to free and moving boundary problems. J Comput Phys 262 (2014) 358-378.",
-    "kernel": "Harbrecht H, Peters M, Schneider R. On the low-rank approximation by the pivoted Cholesky decomposition."
-    " Appl Numer Math 62 (2012) 428-440.",
-    "huber": "Huber PJ. Robust Statistics. Wiley, 1981.",
-    "nocedal": "Nocedal J, Wright SJ. Numerical Optimization, 2nd ed. Springer, 2006.",
-    "byrd": "Byrd RH, Lu P, Nocedal J, Zhu C. A limited memory algorithm for bound constrained optimization. SIAM J Sci"
-    " Comput 16 (1995) 1190-1208.",
-    "reduced": "Quarteroni A, Manzoni A, Negri F. Reduced Basis Methods for Partial Differential Equations. Springer,"
-    " 2016.",
-    "white": "White H. A heteroskedasticity-consistent covariance matrix estimator and a direct test for"
-    " heteroskedasticity. Econometrica 48 (1980) 817-838.",
-}
 ELEMENTS = {
     "P1": "linear tetrahedra",
     "P2": "quadratic tetrahedra",
@@ -40,10 +24,11 @@ OPTIMISERS = {"gauss-newton": ("Gauss-Newton steps in a trust region", "nocedal"
 
 @dataclass(frozen=True, slots=True)
 class Methods:
-    """Paragraphs with numbers in brackets, and the sources that they stand for."""
+    """Paragraphs with numbers in brackets, the sources that they stand for, and these as a BibTeX file."""
 
     paragraphs: tuple[str, ...]
     sources: tuple[str, ...]
+    bibtex: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,8 +56,14 @@ def methods_text(data: ReportData) -> Methods:
             f" moduli. The seed of random numbers was {data.document['seed']}."
         ),
     )
-    version = str(data.document["versions"].get("palpate", ""))
-    return Methods(paragraphs, tuple(SOURCES[key].format(version) for key in cite.cited))
+    own = SOURCES["palpate"]
+    version = {"version": str(data.document["versions"].get("palpate", ""))}
+    sources = SOURCES | {"palpate": replace(own, fields={**version, **own.fields})}
+    return Methods(
+        paragraphs,
+        tuple(reference_line(sources[key]) for key in cite.cited),
+        "\n\n".join(bibtex(key, sources[key]) for key in cite.cited),
+    )
 
 
 def _aim(data: ReportData, cite: _Citations) -> str:

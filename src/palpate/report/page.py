@@ -15,8 +15,14 @@ import jinja2
 import numpy as np
 from markupsafe import Markup, escape
 
-from palpate.report.charts import angle_svg, modulus_svg, objective_svg, residual_svg, waterfall_svg
-from palpate.report.colours import START_COLOURS
+from palpate.report.charts import (
+    START_COLOURS,
+    angle_svg,
+    modulus_svg,
+    objective_svg,
+    residual_svg,
+    waterfall_svg,
+)
 from palpate.report.methods import methods_text
 from palpate.report.payload import payload
 from palpate.report.pictures import mesh_png, organs_png
