@@ -18,7 +18,6 @@ from palpate.study.result import CaseResult
 __all__ = ["Grey", "background", "earlier_grey", "later_grey", "whole_box", "whole_images"]
 
 MOST_WHOLE_GREY = 400_000  # voxels of an image that the check of the alignment shows
-MOST_WHOLE_LABELS = 800_000  # they take a tenth of the page
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,12 +67,12 @@ def background(
     return None if given and not labels else label_volume(image, box)
 
 
-def whole_box(image: Segmentation) -> SliceBox:
-    """The box around all voxels of an image, and its middle."""
-    corners = np.array(np.meshgrid(*[[0, n - 1] for n in image.grid.shape])).reshape(3, -1).T
-    places = image.grid.world(corners.astype(np.float64))
+def whole_box(image: Segmentation, position: NDArray[np.float64] | None = None) -> SliceBox:
+    """The box around the voxels of an image, but for its border; the first planes go through `position` (3,) mm, or its middle."""
+    corners = np.array(np.meshgrid(*[[0.5, n - 1.5] for n in image.grid.shape])).reshape(3, -1).T  # not on the border
+    places = image.grid.world(corners)
     low, high = places.min(axis=0), places.max(axis=0)
-    return SliceBox(low, high, 0.5 * (low + high))
+    return SliceBox(low, high, 0.5 * (low + high) if position is None else position)
 
 
 def whole_images(
@@ -85,5 +84,5 @@ def whole_images(
             grey_volume(grey.values, grey.grid, box, most_voxels=MOST_WHOLE_GREY) for grey in (earlier[1], later[1])
         )
         return first, second
-    first, second = (label_volume(image, box, most_voxels=MOST_WHOLE_LABELS) for image, _ in (earlier, later))
+    first, second = (label_volume(image, box, most_voxels=MOST_VOXELS) for image, _ in (earlier, later))
     return first, second

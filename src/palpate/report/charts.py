@@ -8,6 +8,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from numpy.typing import NDArray
 
 from palpate.report.report_data import ModelSurface, ReportData
+from palpate.report.rows import number
 from palpate.report.svg import INK, draw_svg
 
 __all__ = ["START_COLOURS", "angle_svg", "modulus_svg", "objective_svg", "residual_svg", "waterfall_svg"]
@@ -31,6 +32,8 @@ def residual_svg(data: ReportData, model: ModelSurface, *, voxel_mm: float, name
     reach = max(1.6 * voxel, float(np.percentile(np.abs(np.concatenate([rest, fitted])), 99.0)))
     bins = np.linspace(-reach, reach, BINS)
     share = 100.0 * area / area.sum()
+    spread = [number(float(np.sqrt(np.average(values**2, weights=area))), digits=2) for values in (rest, fitted)]
+    says = f"Signed distances of {tissue.name}: root mean square {spread[0]} mm without a fit, {spread[1]} mm fitted."
 
     def draw(figure: Figure) -> None:
         """The two histograms over each other, values beyond the axis in its outer bins."""
@@ -42,11 +45,11 @@ def residual_svg(data: ReportData, model: ModelSurface, *, voxel_mm: float, name
             axes.axvline(place, color=INK, linewidth=0.9, linestyle=DASHED)
         axes.text(voxel, 1.0, " one voxel", transform=axes.get_xaxis_transform(), fontsize=7.5, va="top")
         axes.set_xlim(-reach, reach)
-        axes.set_xlabel("signed distance to the later image (mm)")
+        axes.set_xlabel("signed distance (mm)")
         axes.set_ylabel("surface (%)")
         axes.yaxis.set_major_locator(MaxNLocator(4))
 
-    return draw_svg(draw, size=SIZE, name=name)
+    return draw_svg(draw, size=SIZE, name=name, says=says)
 
 
 def objective_svg(data: ReportData, *, name: str) -> str:
@@ -54,7 +57,8 @@ def objective_svg(data: ReportData, *, name: str) -> str:
     histories = [start["history_mm2"] for start in data.document["starts"]]
     histories.append(data.document["outer_loop"]["history_mm2"])
     paths = [[_finite(value) for value in history] for history in histories]
-    return draw_svg(lambda figure: _paths(figure, paths, "misfit (mm²)"), size=SIZE, name=name)
+    says = f"Misfit by iteration. {_told(paths, 'mm²')}"
+    return draw_svg(lambda figure: _paths(figure, paths, "misfit (mm²)"), size=SIZE, name=name, says=says)
 
 
 def modulus_svg(data: ReportData, estimate: int, *, name: str) -> str:
@@ -62,6 +66,7 @@ def modulus_svg(data: ReportData, estimate: int, *, name: str) -> str:
     item = data.document["estimates"][estimate]
     paths = [list(path.get(item["tissue"], ())) for path in data.moduli_paths]
     in_kpa = item["unit"] == "kPa"
+    says = f"Stiffness of {item['tissue']} by iteration. {_told(paths, 'kPa' if in_kpa else '')}"
 
     def draw(figure: Figure) -> None:
         """The paths, the 95 % interval as a band and the truth as a dashed line, where they are known."""
@@ -72,7 +77,7 @@ def modulus_svg(data: ReportData, estimate: int, *, name: str) -> str:
         if item["truth"] is not None:
             figure.axes[0].axhline(item["truth"], color=INK, linewidth=1.0, linestyle=DASHED)
 
-    return draw_svg(draw, size=SIZE, name=name)
+    return draw_svg(draw, size=SIZE, name=name, says=says)
 
 
 def waterfall_svg(data: ReportData, *, name: str) -> str:
@@ -80,15 +85,16 @@ def waterfall_svg(data: ReportData, *, name: str) -> str:
     starts = data.document["starts"]
     ends = np.array([_finite(start["objective_mm2"]) for start in starts])
     order = np.argsort(ends, kind="stable")
+    told = ", ".join(f"start {rank + 1} {number(float(ends[rank]), digits=4)}" for rank in order)
 
     def draw(figure: Figure) -> None:
         """The starts as dots on a line."""
         axes = figure.add_axes((0.2, 0.2, 0.77, 0.74))
         axes.plot(range(1, len(order) + 1), ends[order], color=INK, linewidth=0.8, alpha=0.5)
-        for rank, number in enumerate(order, start=1):
-            colour = START_COLOURS[number % len(START_COLOURS)]
-            filled = colour if starts[number]["status"] == "converged" else "none"
-            axes.plot([rank], [ends[number]], "o", color=colour, markerfacecolor=filled, markersize=7)
+        for rank, start in enumerate(order, start=1):
+            colour = START_COLOURS[start % len(START_COLOURS)]
+            filled = colour if starts[start]["status"] == "converged" else "none"
+            axes.plot([rank], [ends[start]], "o", color=colour, markerfacecolor=filled, markersize=7)
         axes.set_xlabel("start, from best to worst")
         axes.set_ylabel("final misfit (mm²)")
         axes.set_xlim(0.5, len(order) + 0.5)
@@ -101,7 +107,8 @@ def waterfall_svg(data: ReportData, *, name: str) -> str:
             axes.yaxis.set_major_locator(MaxNLocator(4))
         axes.grid(visible=True, axis="y")
 
-    return draw_svg(draw, size=SIZE, name=name)
+    says = f"Final misfits from the best to the worst start, mm²: {told}."
+    return draw_svg(draw, size=SIZE, name=name, says=says)
 
 
 def angle_svg(angles: NDArray[np.float32], *, name: str) -> str:
@@ -120,7 +127,18 @@ def angle_svg(angles: NDArray[np.float32], *, name: str) -> str:
         axes.set_ylabel("share (%)")
         axes.yaxis.set_major_locator(MaxNLocator(4))
 
-    return draw_svg(draw, size=SIZE, name=name)
+    least, middle, most = np.percentile(flat, [0.0, 50.0, 100.0])
+    says = f"Dihedral angles of the mesh: from {least:.0f} to {most:.0f} degrees, half of them below {middle:.0f}."
+    return draw_svg(draw, size=SIZE, name=name, says=says)
+
+
+def _told(paths: list[list[float]], unit: str) -> str:
+    """What the lines of `_paths` show, in words: where each begins and ends, in `unit`."""
+    names = [*(f"start {k + 1}" for k in range(len(paths) - 1)), "outer loop"]
+    ends = [
+        f"{name} from {number(path[0])} to {number(path[-1])}" for name, path in zip(names, paths, strict=True) if path
+    ]
+    return f"{'; '.join(ends)} {unit}".strip() + "."
 
 
 def _finite(value: float | None) -> float:
@@ -130,8 +148,8 @@ def _finite(value: float | None) -> float:
 def _paths(figure: Figure, paths: list[list[float]], label: str) -> None:
     """One line a start on a logarithmic axis; the last path, the outer loop's, goes on where the starts end."""
     axes = figure.add_axes((0.17, 0.2, 0.8, 0.74))
-    for number, path in enumerate(paths[:-1]):
-        colour = START_COLOURS[number % len(START_COLOURS)]
+    for start, path in enumerate(paths[:-1]):
+        colour = START_COLOURS[start % len(START_COLOURS)]
         axes.plot(range(len(path)), path, color=colour, linewidth=1.6, marker="o", markersize=3.2)
     first = max((len(path) for path in paths[:-1]), default=0)
     for path in (path for path in paths[-1:] if path):

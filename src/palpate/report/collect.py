@@ -198,7 +198,7 @@ def _indices(result: CaseResult, roles: tuple[Role, ...]) -> tuple[int, ...]:
 
 
 def _with_grey(drawing: _Drawing) -> _Drawing:
-    """The drawing with the grey image of its reference state; one that cannot be read is told of, labels in its place."""
+    """The drawing with the grey image of its reference state; one that cannot be read is told of on the page."""
     try:
         return replace(drawing, grey=earlier_grey(drawing.pair.result))
     except PalpateError as error:
@@ -223,7 +223,7 @@ def _reference(drawing: _Drawing) -> Reference:
         slices=box,
         background=shown,
         surfaces=attempt.part(f"surfaces of {name}", lambda: _surfaces(drawing, result.before), NONE),
-        whole=whole_box(result.before),
+        whole=whole_box(result.before, None if box is None else box.position),
     )
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.laws.registry import LAWS, law_from, law_parameters
+from palpate.report.headline import listed
 from palpate.report.report_data import ReportData
 from palpate.report.sources import SOURCES, bibtex, reference_line
 
@@ -73,13 +74,13 @@ def _aim(data: ReportData, cite: _Citations) -> str:
     on_bones = dict(data.settings).get("alignment") == "rigid-tissues"
     aligned = " The later images were brought to the first on the rigid tissues." if on_bones else ""
     known = [f"{t.name} ({t.given_kpa:g} kPa)" for t in data.tissues if t.given_kpa is not None]
-    moved = f" The motion was driven by {_list(roles['driver'])} (hollow, not meshed)." if "driver" in roles else ""
+    moved = f" The motion was driven by {listed(roles['driver'])} (hollow, not meshed)." if "driver" in roles else ""
     scale = " No modulus was given, so only ratios were found."
     if known or data.unit == "kPa":
-        scale = f" The scale was set by {_list(known or ['the known loads'])}."
+        scale = f" The scale was set by {listed(known or ['the known loads'])}."
     return (
-        f"Young's moduli of {_list(roles.get('estimate', []))} were estimated at once from segmented images of the same"
-        f" body in two or more states with Palpate {cite('palpate')}, whose method starts from"
+        f"Young's moduli of {listed(roles.get('estimate', []))} were estimated at once from segmented images of the"
+        f" same body in two or more states with Palpate {cite('palpate')}, whose method starts from"
         f" {cite('yang')}.{moved}{aligned}{scale}"
     )
 
@@ -102,7 +103,7 @@ def _model(data: ReportData, cite: _Citations) -> str:
         f" A conforming mesh{size} (edge length {settings['edge length at the organs']} at the organs) was cut along"
         f" their zero levels and improved with Mmg {cite('mmg')}.{more} The tissues followed"
         f" {law.description if law else 'the law ' + document['law']} in"
-        f" {ELEMENTS.get(document['element'], str(document['element']))}, with Poisson's ratios of {_list(ratios)};"
+        f" {ELEMENTS.get(document['element'], str(document['element']))}, with Poisson's ratios of {listed(ratios)};"
         " each was one solid, so that the modulus of an organ with a wall around a fluid, as a bladder, is an effective"
         f" one, not its wall's. The outer boundary: {settings['outer boundary']}. The motion of the drivers' walls was"
         f" a Gaussian process in its leading modes ({settings['driver motion']}) {cite('kernel')}, estimated together"
@@ -123,15 +124,9 @@ def _fit(data: ReportData, cite: _Citations) -> str:
     law = _law(data)
     finite = law is not None and law.finite
     onwards = " The linear law gave the start; the fit then went on over expansions around finite-strain equilibria."
-    observed = _list(list(data.document.get("observations", {}).values())) or "what the case's observations compare"
+    observed = listed(list(data.document.get("observations", {}).values())) or "what the case's observations compare"
     return (
         f"The misfit was {observed}. Outliers counted less by Tukey's biweight {cite('huber')}. It was minimised over"
         f" the logarithms of the moduli from {starts} starts by {optimiser} {cite(source)}, on a reduced basis whose"
         f" error was bounded at the estimate {cite('reduced')}.{onwards if finite else ''}"
     )
-
-
-def _list(names: list[str]) -> str:
-    if len(names) < 2:
-        return "".join(names)
-    return ", ".join(names[:-1]) + " and " + names[-1]

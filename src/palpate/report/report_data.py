@@ -191,9 +191,9 @@ class ReportData:
     """One case's report before it is drawn.
 
     document: that of result.json; unit: of the moduli, "kPa" or "ratio"; images: every label image, pair after pair;
-    moduli_paths: of each start, and last of the outer loop, tissue -> moduli by iteration; references: the reference states, that of the mesh first; later: their
-    later images; missing: part of the page ("mesh", or "slices", "surfaces", "background", "distances", "outlines",
-    "alignment" of an image) -> why it is not there.
+    moduli_paths: of each start, and last of the outer loop, tissue -> moduli by iteration; references: the reference
+    states, that of the mesh first; later: their later images; missing: part of the page ("mesh", or "slices",
+    "surfaces", "background", "distances", "outlines", "alignment" of an image) -> why it is not there.
     """
 
     document: Mapping[str, Any]

@@ -52,7 +52,7 @@ def number(value: float | None, *, digits: int = 3) -> str:
         return NONE
     if value == 0.0:
         return "0"
-    magnitude = math.floor(math.log10(abs(value)))
+    magnitude = int(f"{value:.{digits - 1}e}".partition("e")[2])  # of what is left after rounding
     if not -4 <= magnitude < 7:
         return f"{value:.{digits - 1}e}"
     return f"{round(value, digits - 1 - magnitude):.{max(digits - 1 - magnitude, 0)}f}"

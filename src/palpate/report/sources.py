@@ -79,7 +79,8 @@ SOURCES = {
 
 def reference_line(source: Source) -> str:
     """The source as a line of a list of references."""
-    names = ", ".join(f"{family} {_initials(given)}".strip() for family, given in source.authors)
+    authors = ((family, "".join(part[0] for part in given.split())) for family, given in source.authors)
+    names = ", ".join(f"{family} {initials}".strip() for family, initials in authors)
     fields = source.fields
     title = f"{source.title}, {fields['edition']} ed." if "edition" in fields else f"{source.title}."
     rest = ""
@@ -100,7 +101,3 @@ def bibtex(key: str, source: Source) -> str:
         fields["pages"] = fields["pages"].replace("-", "--")
     lines = [f"  {name} = {{{value}}}" for name, value in fields.items()]
     return f"@{source.kind}{{{key},\n" + ",\n".join(lines) + "\n}"
-
-
-def _initials(given: str) -> str:
-    return "".join(part[0] for part in given.split())
