@@ -28,11 +28,12 @@ FLAGS = (
 )
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 MOST_STEPS = 400  # of the tabulator key
-# Every control that can be seen, a group of radio buttons as one; and what has the focus, with whether that can be seen.
+# Every control that can be seen, a group of radio buttons as one; what has the focus, and whether that can be seen.
 CONTROLS = """() => {
   const known = document.querySelectorAll("a[href], button, input, select, textarea, summary, [tabindex='0']");
-  window.keyOf = (e) => e.type === "radio" ? `radio ${e.name}` : `${e.tagName.toLowerCase()} ${[...known].indexOf(e)} ${
-    (e.getAttribute("aria-label") || e.innerText || e.closest("label")?.innerText || e.className || "").trim().slice(0, 40)}`;
+  const named = (e) => e.getAttribute("aria-label") || e.innerText || e.closest("label")?.innerText || e.className;
+  window.keyOf = (e) => e.type === "radio" ? `radio ${e.name}`
+    : `${e.tagName.toLowerCase()} ${[...known].indexOf(e)} ${named(e).trim().slice(0, 40)}`;
   return [...new Set([...known].filter((e) => e.checkVisibility({ visibilityProperty: true })).map(window.keyOf))];
 }"""
 FOCUSED = """() => {
@@ -42,7 +43,8 @@ FOCUSED = """() => {
   return { key: window.keyOf(e), seen };
 }"""
 AXE = """async () => (await axe.run(document, { resultTypes: ["violations"] })).violations
-  .map((v) => ({ id: v.id, impact: v.impact, help: v.help, where: v.nodes.slice(0, 3).map((n) => n.target.join(" ")) }))"""
+  .map((v) => ({ id: v.id, impact: v.impact, help: v.help, where: v.nodes.map((n) => n.target.join(" ")).slice(0, 3) }))
+"""
 
 
 def main() -> None:
@@ -76,7 +78,7 @@ def looked_at(
     browser: Browser, address: str, axe: str, width: int, theme: str, pictures: Path | None
 ) -> dict[str, Any]:
     """What one reader finds: the findings, and how much was looked at."""
-    page = browser.new_page(viewport={"width": width, "height": HEIGHT}, color_scheme=theme)  # type: ignore[arg-type]
+    page = browser.new_page(viewport={"width": width, "height": HEIGHT}, color_scheme=theme)
     findings: list[str] = []
     page.on("console", lambda message: findings.append(f"console, {message.type}: {message.text}"))
     page.on("pageerror", lambda error: findings.append(f"error: {error}"))

@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from palpate.report.scales import Scale, angle_scale, distance_scale
+from palpate.report.scales import Scale, angle_scale, distance_scale, strain_scale
+
+
+@pytest.mark.parametrize("scale", [angle_scale(), strain_scale()])
+def test_a_scale_from_bad_to_good_can_be_told_by_its_brightness_alone(scale):
+    linear = (scale.table / 255.0) ** 2.2
+    luminance = linear @ [0.2126, 0.7152, 0.0722]
+    slope = np.diff(luminance)
+    assert (slope > -0.004).all() or (slope < 0.004).all()  # tables of 8 bits are not smooth to the last one
+    assert abs(luminance[-1] - luminance[0]) > 0.4
 
 
 @pytest.mark.parametrize("scale", [distance_scale(1.5), angle_scale()])

@@ -68,7 +68,7 @@ def background(
 
 
 def whole_box(image: Segmentation, position: NDArray[np.float64] | None = None) -> SliceBox:
-    """The box around the voxels of an image, but for its border; the first planes go through `position` (3,) mm, or its middle."""
+    """The box around an image but for its border; the first planes go through `position` (3,) mm, or its middle."""
     corners = np.array(np.meshgrid(*[[0.5, n - 1.5] for n in image.grid.shape])).reshape(3, -1).T  # not on the border
     places = image.grid.world(corners)
     low, high = places.min(axis=0), places.max(axis=0)
