@@ -122,7 +122,7 @@ def by_keyboard(page: Page, findings: list[str]) -> int:
     """How many controls there are; those that the tabulator key does not reach, and unseen focus, are findings."""
     wanted = set(page.evaluate(CONTROLS))
     page.evaluate("window.scrollTo(0, 0)")
-    reached = set()
+    reached: set[str] = set()
     for _ in range(MOST_STEPS):
         page.keyboard.press("Tab")
         focused = page.evaluate(FOCUSED)

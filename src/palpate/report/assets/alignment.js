@@ -40,7 +40,7 @@ Palpate.Alignment = class extends Palpate.Planes {
     if (share) this.drawVolume(context, view, frame, later, layers);
     context.globalAlpha = 1;
     for (const s of this.reference.surfaces) {
-      if (this.facts.tissues[s.tissue].role === "rigid") this.stroke(context, view, frame, s, layers, { lineWidth: 1.4, dash: [0.1, 3.2], strokeStyle: "#ffd24a" });
+      if (this.facts.tissues[s.tissue].role === "rigid") this.stroke(context, view, frame, s, layers, { lineWidth: 2, dash: [0.1, 3.6], strokeStyle: "#ffd24a" });
     }
     return share <= 0.5 ? this.reference.name : this.later.name;
   }
