@@ -6,7 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from palpate.study.body import Body, ImagedStates, aligned, inverse_problem, make_body, surface_observations
+    from palpate.study.body import Body, ImagedStates, aligned, inverse_problem, make_body
     from palpate.study.case import Case, Domain, DriverMotion, Mechanics, MeshSettings, Phantom
     from palpate.study.case_file import read_case
     from palpate.study.cost import expected_cost
@@ -53,7 +53,6 @@ __all__ = [
     "software_versions",
     "staged",
     "strange_files",
-    "surface_observations",
     "verdict",
     "write_json",
     "write_text",
@@ -91,7 +90,6 @@ _HOMES = {
     "software_versions": "palpate.study.provenance",
     "staged": "palpate.study.outputs",
     "strange_files": "palpate.study.earlier",
-    "surface_observations": "palpate.study.body",
     "verdict": "palpate.study.estimation",
     "write_json": "palpate.study.outputs",
     "write_text": "palpate.study.outputs",

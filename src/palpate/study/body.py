@@ -10,11 +10,10 @@ import numpy as np
 from palpate.errors import ConfigurationError, ResourceError
 from palpate.images.alignment import RigidMotion, align, moved
 from palpate.images.checks import check_images
-from palpate.images.distance import DistanceMap, observation_width, smoothing_width
+from palpate.images.distance import observation_width, smoothing_width
 from palpate.images.finding import Finding
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
-from palpate.images.tissue_distance import tissue_distance_map
 from palpate.inversion import InverseProblem, LaterState, parameter_map
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.dilatation import choose_element
@@ -27,14 +26,11 @@ from palpate.mesh.anatomy import Anatomy, Box, anatomy_of, domain_box, margin_bo
 from palpate.mesh.quality import MeshQuality, check_mesh
 from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.tetrahedralise import tetrahedralise
-from palpate.observation.contract import Observation
+from palpate.observation.contract import ImagedBody
 from palpate.observation.noise_model import NoiseModel
-from palpate.observation.observed_surface import ObservedSurface, observed_surface
 from palpate.observation.prescribed_motion import prescribed_motion
-from palpate.observation.surface_distance import surface_distance
-from palpate.observation.target import surface_target
+from palpate.observation.registry import observations
 from palpate.observation.wall_modes import Wall
-from palpate.parallel import mapped
 from palpate.study.case import Case
 from palpate.study.case_loads import case_loads
 from palpate.study.contacts import every_finding
@@ -49,7 +45,6 @@ __all__ = [
     "joint_problem",
     "make_body",
     "stated_noise",
-    "surface_observations",
 ]
 
 THIN_VOXELS = 4
@@ -82,6 +77,11 @@ class Body:
     space: LagrangeSpace
     quality: MeshQuality
     smoothing_mm: float
+
+    def imaged(self, stated_noise: NoiseModel | None = None) -> ImagedBody:
+        """What observations are made of, under the noise that a case states."""
+        states = self.states
+        return ImagedBody(self.space, states.before, states.after, self.smoothing_mm, stated_noise)
 
 
 def aligned(
@@ -172,7 +172,7 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Callable[[str
     All bodies have the same tissues in the same order. Raises as `inverse_problem` does.
     """
     noise = stated_noise(case)
-    seen = [(r, o) for r, body in enumerate(bodies) for o in surface_observations(body, stated_noise=noise)]
+    seen = [(r, o) for r, body in enumerate(bodies) for o in observations(body.imaged(noise))]
     progress("assembling one stiffness matrix a tissue")
     pairs = [pair for body in bodies for pair in _models(body, case)]
     models = tuple(model for model, _ in pairs)
@@ -192,28 +192,6 @@ def stated_noise(case: Case) -> NoiseModel | None:
         return None
     length = case.noise.correlation_length_mm or 6.0
     return NoiseModel(np.array([2.0 * case.noise.surface_sd_mm**2]), np.array([length]))
-
-
-def surface_observations(
-    body: Body, surfaces: Sequence[ObservedSurface] | None = None, *, stated_noise: NoiseModel | None = None
-) -> tuple[tuple[Observation, ...], ...]:
-    """The observed surfaces of each later image; `surfaces` None: of all `estimate` tissues and drivers."""
-    tissues = body.space.mesh.tissues
-    observed = [i for i, tissue in enumerate(tissues) if tissue.role in (Role.ESTIMATE, Role.DRIVER)]
-    seen = [observed_surface(body.space, i) for i in observed] if surfaces is None else surfaces
-
-    def maps(image: Segmentation) -> list[DistanceMap]:
-        """The distance map of each surface's tissue."""
-        return mapped(lambda s: tissue_distance_map(image, s.tissue, smoothing_mm=body.smoothing_mm), seen)
-
-    before = maps(body.states.before)
-    return tuple(
-        tuple(
-            surface_distance(surface_target(*of), stated_noise=stated_noise)
-            for of in zip(seen, before, maps(image), strict=True)
-        )
-        for image in body.states.after
-    )
 
 
 def _models(body: Body, case: Case) -> list[tuple[LinearModel, tuple[Wall, ...]]]:

@@ -9,21 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError
-from palpate.inversion import (
-    FittedState,
-    Interval,
-    Inversion,
-    InversionSettings,
-    Iterate,
-    Outcome,
-    StartRun,
-    grid_position_shifts,
-    log_interval,
-    sandwich_covariance,
-)
+from palpate.inversion import Inversion, InversionSettings, Iterate, Outcome, StartRun
 from palpate.mechanics.deformation import deformation_determinants
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit
+from palpate.uncertainty import (
+    Covariance,
+    FittedState,
+    Interval,
+    covariance_of,
+    fixed_correspondence,
+    log_interval,
+    modulus_interval,
+)
 
 __all__ = [
     "Estimation",
@@ -88,7 +86,8 @@ class Start:
 class ModulusEstimate:
     """Young's modulus of one tissue, in `unit` (kPa, or a ratio to `relative_to`), with its 95 % interval.
 
-    None in an interval is an open end; `value` is None in ratio mode and when nothing converged.
+    None in an interval is an open end; `value` is None in ratio mode and when nothing converged. variance_shares: of
+    each cause in the variance of ln E; profile: values (kPa, or ratios) with their signed root deviances.
     """
 
     tissue: str
@@ -103,6 +102,8 @@ class ModulusEstimate:
     why: str
     truth: float | None = None
     parameter: str = "youngs_modulus"
+    variance_shares: Mapping[str, float] | None = None
+    profile: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +121,7 @@ class Estimation:
     """Result of one inversion.
 
     correlation (n, n) of the log-moduli; fits: the tissues of each later image; displacements: (n_points, 3) mm of
-    each later image; covariance (n, n) of the log-moduli, grid_covariance (n, n) the part of the voxel grid's place;
+    each later image; covariance of the log-moduli by its causes;
     outer_loop: the steps from the best start's minimum to the estimate, which all starts of that minimum share;
     counts: of all starts and minima together; observations: what was compared, in words, by its kind.
     """
@@ -128,21 +129,21 @@ class Estimation:
     status: str
     reason: str
     estimates: tuple[ModulusEstimate, ...]
-    covariance: NDArray[np.float64]
+    covariance: Covariance
     starts: tuple[Start, ...]
     fits: tuple[tuple[TissueFit, ...], ...]
     displacements: tuple[NDArray[np.float64], ...]
     counts: Mapping[str, int]
     outer_loop: tuple[Iteration, ...] = ()
     remarks: tuple[Remark, ...] = ()
-    grid_covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
     observations: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def correlation(self) -> NDArray[np.float64]:
         """Correlation (n, n) of the log-moduli, dimensionless."""
-        sd = np.sqrt(np.diag(self.covariance))
-        return np.asarray(self.covariance / np.outer(sd, sd))
+        total = self.covariance.total
+        sd = np.sqrt(np.diag(total))
+        return np.asarray(total / np.outer(sd, sd))
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,9 +166,7 @@ def conclude(
     if objective.parameters.poisson:
         raise ConfigurationError("a result states Young's moduli only: a Poisson's ratio was sought beside them")
     rng = np.random.default_rng(seed)
-    shifts = grid_position_shifts(objective, minimum.evaluation, observed.states, draws=GRID_DRAWS, rng=rng)
-    grid_part = shifts.T @ shifts / len(shifts)
-    covariance = sandwich_covariance(objective, minimum.evaluation) + grid_part
+    covariance = covariance_of(objective, minimum.evaluation, observed.states, draws=GRID_DRAWS, rng=rng)
     return Estimation(
         status="converged" if minimum.converged else "not converged",
         reason=_reason(inversion),
@@ -184,8 +183,7 @@ def conclude(
             "evaluations": inversion.evaluations,
         },
         outer_loop=tuple(_iteration(inversion, iterate) for iterate in minimum.history),
-        remarks=(*_remarks(inversion, covariance), *_folds(observed)),
-        grid_covariance=grid_part,
+        remarks=(*_remarks(inversion, covariance.total), *_folds(observed)),
         observations={observation.kind: observation.description for observation in objective.observations},
     )
 
@@ -251,11 +249,12 @@ def _reason(inversion: Inversion) -> str:
 
 
 def _estimates(
-    inversion: Inversion, settings: InversionSettings, covariance: NDArray[np.float64], truth: Mapping[str, float]
+    inversion: Inversion, settings: InversionSettings, covariance: Covariance, truth: Mapping[str, float]
 ) -> tuple[ModulusEstimate, ...]:
     mapping, bounds = inversion.objective.parameters, settings.bounds
     theta, scale = inversion.minimum.unknowns[: mapping.n_parameters], mapping.scale_kpa
-    found = []
+    found, variances = [], np.diag(covariance.total)
+    fixed = fixed_correspondence(inversion.objective, inversion.minimum)
     for i, name in enumerate(mapping.tissues):
         none = no_estimate(
             name,
@@ -269,14 +268,20 @@ def _estimates(
             continue
         ratio = float(np.exp(theta[i]))
         limits = {"lower": float(np.exp(bounds.lower[i])), "upper": float(np.exp(bounds.upper[i]))}
-        sd = float(np.sqrt(covariance[i, i]))
-        interval = hull([log_interval(float(np.exp(t[i])), sd, **limits) for t in _as_good(inversion)])
+        own = modulus_interval(fixed, inversion.minimum, i, variance=float(variances[i]), bounds=bounds)
+        others = [np.exp(t[i]) for t in _as_good(inversion)]
+        interval = hull([own.ends, *(log_interval(float(e), float(np.sqrt(variances[i])), **limits) for e in others)])
         at_bound = bool(np.min(np.abs([theta[i] - bounds.lower[i], theta[i] - bounds.upper[i]])) < AT_BOUND)
         word, why = verdict(interval, at_bound=at_bound, absolute=mapping.absolute)
         low, high = interval
+        unit = scale if mapping.absolute else 1.0
+        points = zip(unit * np.exp(own.profile.theta), own.profile.root, strict=True)
         found.append(
             replace(
                 none,
+                interval_kind=own.kind,
+                variance_shares=covariance.shares(i),
+                profile=tuple((float(value), float(root)) for value, root in points),
                 value=ratio * scale if mapping.absolute else None,
                 interval95=(low and low * scale, high and high * scale) if mapping.absolute else None,
                 ratio=None if mapping.by_load else ratio,
@@ -289,13 +294,13 @@ def _estimates(
 
 
 def _as_good(inversion: Inversion) -> list[NDArray[np.float64]]:
-    """Log-moduli (n_parameters,) of the best minimum and of every other that explains the images nearly as well.
+    """Log-moduli (n_parameters,) of every minimum beside the best one that explains the images nearly as well.
 
     Voxels make the objective rough by some hundredths of it, so that its value alone cannot choose between them.
     """
     n, best = inversion.objective.n_parameters, inversion.candidates[inversion.best]
     limit = (1.0 + AS_GOOD) * best.value
-    good = [c.minimum for c in inversion.candidates if c.minimum.converged and c.value <= limit]
+    good = [c.minimum for c in inversion.candidates if c is not best and c.minimum.converged and c.value <= limit]
     return [minimum.unknowns[:n] for minimum in good]
 
 

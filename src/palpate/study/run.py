@@ -10,7 +10,7 @@ import numpy as np
 
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role
-from palpate.inversion import Bounds, FittedState, Inversion, InversionSettings, ParameterMap, invert
+from palpate.inversion import Bounds, Inversion, InversionSettings, ParameterMap, invert
 from palpate.parallel import blas_on_one_thread
 from palpate.study.body import Body, ImagedStates, joint_problem, make_body
 from palpate.study.case import Case
@@ -22,6 +22,7 @@ from palpate.study.result import CaseResult, MeshResult, PairResult, Provenance,
 from palpate.study.simulate import simulate
 from palpate.study.strain_range import linear_strain_warnings
 from palpate.study.summary import mesh_summary
+from palpate.uncertainty import FittedState
 
 __all__ = [
     "estimate",

@@ -1,0 +1,32 @@
+"""What is known of an estimate: covariance by its causes, profile likelihoods, intervals, samples of the posterior."""
+
+from palpate.uncertainty.covariance import (
+    Covariance,
+    FittedState,
+    covariance_of,
+    gain,
+    grid_position_shifts,
+    imaging_errors,
+    sandwich_covariance,
+)
+from palpate.uncertainty.intervals import NORMAL_95, Interval, ModulusInterval, log_interval, modulus_interval
+from palpate.uncertainty.profile import Profile, fixed_correspondence
+from palpate.uncertainty.sampling import sample_posterior
+
+__all__ = [
+    "NORMAL_95",
+    "Covariance",
+    "FittedState",
+    "Interval",
+    "ModulusInterval",
+    "Profile",
+    "covariance_of",
+    "fixed_correspondence",
+    "gain",
+    "grid_position_shifts",
+    "imaging_errors",
+    "log_interval",
+    "modulus_interval",
+    "sample_posterior",
+    "sandwich_covariance",
+]
