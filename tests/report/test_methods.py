@@ -112,3 +112,12 @@ def test_an_entry_has_balanced_braces_and_its_title(key):
 def test_every_cited_source_has_its_entry(case_result):
     text = methods_text(collect(case_result))
     assert len(re.findall("^@", text.bibtex, flags=re.MULTILINE)) == len(text.sources)
+
+
+def test_an_interval_from_the_profile_is_told_of(case_result):
+    first, second = case_result.estimation.estimates
+    leaning = dataclasses.replace(first, interval_kind="profile")
+    estimation = dataclasses.replace(case_result.estimation, estimates=(leaning, second))
+    told = " ".join(methods_text(collect(dataclasses.replace(case_result, estimation=estimation))).paragraphs)
+    assert "of prostate, whose profile likelihood leans to one side" in told
+    assert "leans" not in " ".join(methods_text(collect(case_result)).paragraphs)

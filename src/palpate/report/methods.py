@@ -52,9 +52,9 @@ def methods_text(data: ReportData) -> Methods:
         _fit(data, cite),
         (
             "The 95 % intervals come from the sandwich covariance of the parameters under spatially correlated"
-            f" residuals {cite('white')}, with the scatter over the voxel grid's position added. They do not cover the"
-            " errors of the mesh, of the material law, of Poisson's ratios, of the boundary condition and of the given"
-            f" moduli. The seed of random numbers was {data.document['seed']}."
+            f" residuals {cite('white')}, with the scatter over the voxel grid's position added{_leaning(data)}. They"
+            " do not cover the errors of the mesh, of the material law, of Poisson's ratios, of the boundary condition"
+            f" and of the given moduli. The seed of random numbers was {data.document['seed']}."
         ),
     )
     own = SOURCES["palpate"]
@@ -65,6 +65,12 @@ def methods_text(data: ReportData) -> Methods:
         tuple(reference_line(sources[key]) for key in cite.cited),
         "\n\n".join(bibtex(key, sources[key]) for key in cite.cited),
     )
+
+
+def _leaning(data: ReportData) -> str:
+    """What was done where the profile likelihood is not symmetric."""
+    own = listed([item["tissue"] for item in data.document["estimates"] if item.get("interval_kind") == "profile"])
+    return f"; of {own}, whose profile likelihood leans to one side, its ends are those of the profile" if own else ""
 
 
 def _aim(data: ReportData, cite: _Citations) -> str:

@@ -20,6 +20,7 @@ from palpate.report.charts import (
     angle_svg,
     modulus_svg,
     objective_svg,
+    profile_svg,
     residual_svg,
     waterfall_svg,
 )
@@ -101,6 +102,11 @@ def render(data: ReportData) -> str:
         mesh_pictures=_mesh_pictures(data),
         moduli=_attempt("the scale of the moduli", lambda: modulus_scale(data)) if data.mesh else None,
         curves=_curves(data),
+        profiles=tuple(
+            _picture(f"Profile of {item['tissue']}", partial(profile_svg, data, i, name=f"profile{i}"))
+            for i, item in enumerate(data.document["estimates"])
+            if data.document["status"] == "converged" and item.get("profile")
+        ),
         angles=(
             _picture("Dihedral angles of the mesh", partial(angle_svg, data.mesh.angles, name="angles"))
             if data.mesh
