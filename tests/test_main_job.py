@@ -63,6 +63,7 @@ FILES = {
         "mesh.vtu",
         "stiffness.nii.gz",
         "labels.csv",
+        "labels.nii.gz",
         "case.toml",
         "log.txt",
     ),
