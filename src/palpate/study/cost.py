@@ -128,20 +128,17 @@ def tets_by_edge(case: Case, before: Segmentation, after: tuple[Segmentation, ..
     filler = max(tissues, key=lambda i: (not before.tissues[i].labels, before.volume(i)), default=-1)
     meshed = np.array([*(tissue.meshed for tissue in before.tissues), False])[index] & (index >= 0)
     surfaces = [
-        (
-            COARSER if tissue.role not in (Role.ESTIMATE, Role.DRIVER) else 1.0,
-            _distance_to_surface(index == i, cell)[meshed],
-        )
+        (1.0 if tissue.role in (Role.ESTIMATE, Role.DRIVER) else COARSER, _distance_to_surface(index == i, cell))
         for i, tissue in enumerate(before.tissues)
         if i != filler and (index == i).any()
     ]
 
     def tets(edge_mm: float) -> int:
         """With edges of that length at the organs."""
-        sizes = np.full(int(np.count_nonzero(meshed)), COARSEST * edge_mm)
+        sizes = np.full(index.shape, COARSEST * edge_mm)
         for start, distance in surfaces:
             sizes = np.minimum(sizes, start * edge_mm + GRADING * distance)
-        return max(int(TETS_A_CUBE * np.prod(cell) * float((sizes**-3.0).sum())), 100)
+        return max(int(TETS_A_CUBE * np.prod(cell) * float((sizes[meshed] ** -3.0).sum())), 100)
 
     return tets
 
