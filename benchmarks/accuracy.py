@@ -171,8 +171,8 @@ def _uncertainty(
     found: Result = {
         "interval95": [e.ratio_interval95 for e in estimation.estimates],
         "verdict": [e.verdict for e in estimation.estimates],
-        "sd": np.sqrt(np.diag(estimation.covariance)).tolist(),
-        "grid_sd": np.sqrt(np.diag(estimation.grid_covariance)).tolist(),
+        "sd": np.sqrt(np.diag(estimation.covariance.total)).tolist(),
+        "grid_sd": np.sqrt(np.diag(estimation.covariance.grid)).tolist(),
     }
     if row.noise is not None:
         found["cramer_rao_sd"] = _cramer_rao_sd(at_truth(inversion, problem, scene), body, scene, row.noise)

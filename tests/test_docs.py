@@ -78,3 +78,9 @@ def test_every_code_of_a_warning_stands_where_the_program_gives_it():
     words = {node.value for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Constant)}
     assert [code for code in CODES if code not in words] == []
     assert len(set(CODES)) == len(CODES)
+
+
+def test_the_readme_answers_a_newcomer_in_the_order_of_the_questions():
+    headings = re.findall(r"^## (.+)$", (ROOT / "README.md").read_text(), flags=re.MULTILINE)
+    wanted = ["What qualifies", "Install", "Two commands", "Result", "Limits", "Accuracy and speed"]
+    assert [heading for heading in headings if heading in wanted] == wanted

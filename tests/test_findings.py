@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from types import SimpleNamespace as Stand
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from palpate.images.segmentation import segment
 from palpate.images.tissue import Role, Tissue
 from palpate.study import body
 from palpate.study.body import aligned
+from palpate.study.estimate_findings import inversion_findings
 
 SEEN = [Finding("thin", f"thin in {image}", "prostate", f"in {image}") for image in ("before", "after[1]", "after[2]")]
 
@@ -63,6 +65,22 @@ def test_bones_in_pieces_unseen_or_round_are_one_warning_each_over_all_bones_and
     assert [each.code for each in of_bones] == ["several-bodies", "rotation-undetermined", "rigid-unseen"]
     assert "'hip' 2.0 mm, 'femur' 1.5 mm" in of_bones[0].message
     assert of_bones[0].message.endswith("also in 'after[2]' ('hip' 2.0 mm, 'femur' 1.5 mm)")
+
+
+def test_moduli_that_depend_on_each_other_are_one_warning_with_every_pair():
+    names = ("prostate", "bladder", "uterus")
+    inversion = Stand(
+        objective=Stand(parameters=Stand(absolute=True, tissues=names)),
+        minimum=Stand(converged=True),
+        convergence=Stand(unmet=()),
+        candidates=[Stand(minimum=Stand(outcome=None))],
+    )
+    sd = np.array([0.1, 0.2, 0.5])
+    correlation = np.array([[1.0, -0.995, 0.5], [-0.995, 1.0, 0.992], [0.5, 0.992, 1.0]])
+    (finding,) = inversion_findings(inversion, correlation * np.outer(sd, sd))
+    assert finding.code == "correlated"
+    assert "'prostate' and 'bladder', of 'bladder' and 'uterus' cannot" in finding.message
+    assert inversion_findings(inversion, np.diag(sd)) == ()
 
 
 NAMED = {"prostate": Role.ESTIMATE, "hip": Role.RIGID, "femur": Role.RIGID, "rest": Role.ESTIMATE}

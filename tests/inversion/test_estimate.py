@@ -271,7 +271,7 @@ def hold(monkeypatch):
     """Minima stay where they are when they are compared: the objective has no second one there."""
 
     def here(objective, start, settings, **_):
-        return gauss_newton(objective, start, bounds=settings.bounds, hold_theta=True)
+        return gauss_newton(objective, start, bounds=settings.bounds, held=True)
 
     monkeypatch.setattr(estimate, "minimised", here)
 

@@ -16,7 +16,8 @@ from palpate.observation.noise_model import NoiseModel
 from palpate.observation.robust_loss import Tukey
 from palpate.phantoms.boundary_noise import smooth_field
 from palpate.uncertainty import FittedState, gain, sandwich_covariance
-from palpate.uncertainty.covariance import grid_position_shifts, imaging_errors, log_interval
+from palpate.uncertainty.covariance import grid_position_shifts, imaging_errors
+from palpate.uncertainty.intervals import log_interval
 
 SD = 0.3
 

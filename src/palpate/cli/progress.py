@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 __all__ = ["Bar", "Place", "place", "progress_on_stderr"]
 
 TRUST = 0.1  # of the predicted time: how much of it must be over before its own pace outweighs the prediction
-STEADY = 0.8  # of a stage: beyond, its share creeps, as nobody knows how much longer it takes
+STEADY = 0.75  # of a stage: beyond, its share creeps, as nobody knows how much longer it takes
 MOST = 0.99
 PATIENCE_S = 8.0
 WIDTH = 32
@@ -49,18 +49,19 @@ def place(seconds: Mapping[Stage, float], begun: Mapping[Stage, float], now: flo
     """
     known = [stage for stage in seconds if stage in begun]
     stage = max(known, key=lambda each: begun[each])
-    names = list(seconds)
+    names, first = list(seconds), min(begun[each] for each in known)
     total, over = sum(seconds.values()), sum(seconds[name] for name in names[: names.index(stage)])
-    took = begun[stage] - min(begun[each] for each in known)
-    pace = (took + TRUST * total) / (over + TRUST * total)
+    trust = TRUST * total
+    pace = (begun[stage] - first + trust) / (over + trust)
+    slower = (now - first + trust) / (over + seconds[stage] + trust)  # at least, where the present one takes long
     there = over + seconds[stage] * _creeping((now - begun[stage]) / max(pace * seconds[stage], 1e-9))
-    return Place(stage, min(there / total, MOST), pace * (total - there))
+    return Place(stage, min(there / total, MOST), max(pace, slower) * (total - there))
 
 
 def _creeping(x: float) -> float:
-    """X up to STEADY, then ever slower towards 1; smooth."""
+    """Follow x up to STEADY, then go ever slower towards 1; its slope is continuous."""
     rest = 1.0 - STEADY
-    return x if x <= STEADY else 1.0 - rest * math.exp(-(x - STEADY) / rest)
+    return x if x <= STEADY else 1.0 - rest**2 / (rest + x - STEADY)
 
 
 @contextmanager

@@ -38,7 +38,7 @@ LATTICE = 96  # points of the lattice along the longest side, on which edge leng
 # Fitted to the runs of benchmarks/cost.py (docs/command-line.md), on two cores of a 2.1 GHz server.
 TETS_A_CUBE = 19.4  # tetrahedra in a cube of the wanted edge length: 17 in smooth phantoms, 31 in a real pelvis
 UNKNOWNS_A_TET = {"P1": 0.62, "P2": 4.4}
-FIXED_S: Mapping[Stage, float] = {"reading": 4.0, "linear law": 2.0, "intervals": 4.0, "report": 8.0}
+FIXED_S: Mapping[Stage, float] = {"reading": 4.0, "linear law": 4.0, "intervals": 4.0, "report": 6.0}
 SECONDS_AN_UNKNOWN = 1.5e-4  # beside the solver, with 90 modes a driver, for each later image
 FINITE_STRAIN_S = 2.9e-4  # the same of equilibria and their derivatives at finite strain
 SECONDS_A_CUT = 1.65e-4  # of meshing, for each tetrahedron and each tissue that is cut out

@@ -20,6 +20,8 @@ from palpate.mesh.space import LagrangeSpace
 from palpate.study.case import Case, CaseTissue
 from palpate.study.case_text import case_tables
 from palpate.study.estimation import Estimation, ModulusEstimate, Start, TissueFit, no_estimate
+from palpate.study.together import ImagePairs
+from palpate.uncertainty import Information
 
 __all__ = [
     "CaseResult",
@@ -130,6 +132,9 @@ class CaseResult:
         document = _heading(self.case, estimation.status, estimation.reason) | {
             "estimates": [_estimate(item, estimation.status) for item in estimation.estimates],
             "correlation": estimation.correlation.tolist(),
+            "information": _information(estimation.information),
+            "combinations": [_plain(pair) for pair in estimation.combinations],
+            "image_pairs": _image_pairs(image_names(self.case), estimation.image_pairs),
             "fit": [_fit(name, fits) for name, fits in zip(image_names(self.case), estimation.fits, strict=False)],
             "starts": [_start(start) for start in estimation.starts],
             "outer_loop": {"history_mm2": [step.objective_mm2 for step in estimation.outer_loop]},
@@ -206,6 +211,9 @@ def failure_document(case: Case, error: PalpateError) -> dict[str, Any]:
             for name in unknown
         ],
         "correlation": [],
+        "information": None,
+        "combinations": [],
+        "image_pairs": None,
         "fit": [],
         "starts": [],
         "outer_loop": {"history_mm2": []},
@@ -282,6 +290,19 @@ def _estimate(item: ModulusEstimate, status: str) -> dict[str, Any]:
         document |= dict.fromkeys(("value", "interval95", "ratio", "ratio_interval95"))
         document["verdict"] = "not identified"
     return document
+
+
+def _information(found: Information | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    return {"singular_values": found.singular_values.tolist(), "directions": found.directions.tolist()}
+
+
+def _image_pairs(names: Sequence[str], found: ImagePairs | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    alone = [{"after": name} | _plain(pair) for name, pair in zip(names, found.alone, strict=False)]
+    return _plain(found) | {"alone": alone}
 
 
 def _fit(name: str, fits: tuple[TissueFit, ...]) -> dict[str, Any]:
