@@ -76,7 +76,7 @@ class FastPath:
 
 def fast_path(objective: Objective, minimum: Minimum, bounds: Bounds) -> FastPath:
     """That of an estimate; raises as `gauss_newton` does."""
-    fixed = fixed_correspondence(objective, minimum)
+    fixed = fixed_correspondence(objective, minimum.unknowns, minimum.evaluation)
     return FastPath(fixed, gauss_newton(fixed, minimum.unknowns, bounds=bounds, tolerance=TOLERANCE), bounds)
 
 
