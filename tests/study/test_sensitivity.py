@@ -228,12 +228,12 @@ def test_the_page_is_whole_escaped_and_without_scripts(document):
 
 def test_a_runaway_ends_in_an_arrow_and_says_so(document):
     changed = [
-        v | {"changes": {GLAND: -5.0}, "at_bound": [GLAND]} if v["cause"] == "edge_length" else v
+        v | {"changes": {GLAND: -7.0}, "at_bound": [GLAND]} if v["cause"] == "edge_length" else v
         for v in document["variations"]
     ]
     rows = tornado_rows(document | {"variations": changed}, GLAND)
     assert rows[0].label == "edge length of the mesh"
-    assert effect_text(rows[0]) == "8.75 mm: -99.3 % (at the search's bound)"
+    assert effect_text(rows[0]) == "8.75 mm: -99.9 % (at the search's bound)"
     assert "<svg" in sensitivity_page(document | {"variations": changed})
 
 

@@ -193,7 +193,7 @@ class SurfaceDistance:
         return errors
 
     def growth_error(self, residuals: Residuals, tissue: str, peers: Sequence[Observation]) -> NDArray[np.float64]:
-        """See `Observation`: -1 on the tissue's own surface, 1 where it touches this one, which it then draws in.
+        """Change (n,) of the residuals: -1 on the tissue's own surface, 1 where it touches this one, and draws it in.
 
         Both directions of the distance see the same: d_after falls by what the surface moves outwards, and so does the
         signed distance of the model from it.

@@ -229,10 +229,9 @@ def _exact(inversion: Inversion, tissues: tuple[Tissue, ...]) -> list[Variation]
     loaded = any(state.model.load.any() for state in inversion.objective.states)
     if len(known) != 1 or loaded or not mapping.absolute:
         return []
+    step = float(np.log(KNOWN_FACTOR))
     return [
-        Variation(
-            "known_modulus", known[0], words, "exact", dict.fromkeys(mapping.tissues, sign * np.log(KNOWN_FACTOR))
-        )
+        Variation("known_modulus", known[0], words, "exact", dict.fromkeys(mapping.tissues, sign * step))
         for sign, words in ((-1.0, f"/ {KNOWN_FACTOR:g}"), (1.0, f"x {KNOWN_FACTOR:g}"))
     ]
 
