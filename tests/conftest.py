@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from palpate.findings import Finding
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.segmentation import segment
 from palpate.images.tissue import Role
@@ -20,7 +21,7 @@ from palpate.mesh.tet_mesh import OUTER, TetMesh
 from palpate.mesh.tetrahedralise import boundary_of
 from palpate.observation.contract import Fit
 from palpate.study.case import Case, CaseTissue, Images
-from palpate.study.estimation import Estimation, Iteration, ModulusEstimate, Remark, Start, TissueFit
+from palpate.study.estimation import Estimation, Iteration, ModulusEstimate, Start, TissueFit
 from palpate.study.result import CaseResult, MeshSummary, Provenance
 from palpate.uncertainty import Covariance
 
@@ -123,7 +124,7 @@ def make_estimation(displacement: np.ndarray) -> Estimation:
         fits=((fit, dataclasses.replace(fit, tissue="bladder")),),
         displacements=(displacement,),
         counts={"forward": 3, "adjoint": 0, "tangent": 2, "factorisations": 4, "evaluations": 9},
-        remarks=(Remark("example", "a warning to be shown"),),
+        remarks=(Finding("example", "a warning to be shown"),),
         observations={"surface distance": "the distance between surfaces"},
     )
 

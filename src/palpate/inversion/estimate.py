@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,6 +29,7 @@ from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium
 from palpate.mechanics.forward import SolveCounts
 from palpate.parallel import blas_on_one_thread
+from palpate.progress import Progress, during
 
 __all__ = ["Candidate", "Inversion", "StartRun", "continue_at_finite_strain", "invert"]
 
@@ -48,8 +49,6 @@ FIRST_GUESS = StopRule(
     far=np.inf,
 )
 EQUILIBRIUM = 1e-5  # of the forces, while the estimate moves
-
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,13 +126,13 @@ def invert(
     begin = np.concatenate([middle, np.zeros(sum(problem.parameters.n_modes))])
     rule = rule or (FIRST_GUESS if problem.finite_strain else REPORTED)
     if any(state.approximation is None for state in problem.states):
-        progress("responses of the full model at the middle start")
-        linear = [_linear(*_with_reduced_bases(problem, settings, begin), settings, rule, progress)]
+        linear = [_linear(*_with_reduced_bases(problem, settings, begin, progress), settings, rule, progress)]
     else:
         linear = [_linear(Objective(problem.states, problem.parameters), begin, 0, settings, rule, progress)]
     if not problem.finite_strain:
         return linear[0]
-    return continue_at_finite_strain(linear.pop(), settings, progress=progress)  # which lets go of its bases
+    at_finite_strain = during("finite strain", progress)
+    return continue_at_finite_strain(linear.pop(), settings, progress=at_finite_strain)  # which lets go of its bases
 
 
 def continue_at_finite_strain(linear: Inversion, settings: InversionSettings, *, progress: Progress) -> Inversion:
@@ -153,8 +152,9 @@ def continue_at_finite_strain(linear: Inversion, settings: InversionSettings, *,
             continue
         try:
             progress("finite strain: the equilibrium at the linear estimate")
-            start = [_expanded(*_coarse(waiting.pop(number)), minimum)]
+            start = [_expanded(*_coarse(waiting.pop(number)), minimum, progress)]
             end = run_outer_loop(start.pop(), settings, REPORTED, progress=progress, title="finite strain")
+            progress("finite strain: the exact equilibrium at the estimate")
             ends[number] = end = _at_equilibrium(end, minimum.history)
             spent, evaluations = spent + end.counts, evaluations + end.minimum.evaluations
         except EstimationError:
@@ -166,13 +166,18 @@ def continue_at_finite_strain(linear: Inversion, settings: InversionSettings, *,
 
 
 def _with_reduced_bases(
-    problem: InverseProblem, settings: InversionSettings, middle: NDArray[np.float64]
+    problem: InverseProblem, settings: InversionSettings, middle: NDArray[np.float64], progress: Progress
 ) -> tuple[Objective, NDArray[np.float64], int]:
     """The objective on reduced bases at unknowns (n_unknowns,), these with the drivers' motion fitted, its cost."""
     parameters = problem.parameters
-    bases = [reduced_basis(state.model, parameters.moduli(middle)) for state in problem.states]
+    bases = []
+    for number, state in enumerate(problem.states, start=1):
+        progress(f"responses of the full model at the middle start, state {number} of {len(problem.states)}")
+        bases.append(reduced_basis(state.model, parameters.moduli(middle)))
+    progress("the drivers' motion at the middle start")
     objective = with_first_noise(Objective(problem.states, parameters).under(bases))
     fitted = fit_coefficients(objective.rematched(middle), middle, bounds=settings.bounds)
+    progress("how the responses change with the moduli")
     by_theta = parameters.derivatives(middle)
     triples = zip(problem.states, bases, parameters.coefficients(fitted.unknowns), strict=True)
     states = tuple(s.with_approximation(b.with_modulus_series(q, by_theta)) for s, b, q in triples)
@@ -264,9 +269,11 @@ def _coarse(linear: OuterIterate) -> tuple[Objective, list[FiniteStrainEquilibri
     return replace(before, states=tuple(states)), found
 
 
-def _expanded(objective: Objective, coarse: Sequence[FiniteStrainEquilibrium], minimum: Minimum) -> OuterIterate:
+def _expanded(
+    objective: Objective, coarse: Sequence[FiniteStrainEquilibrium], minimum: Minimum, progress: Progress
+) -> OuterIterate:
     """A linear minimum on expansions around the equilibria there."""
-    first = [expansion_around(equilibrium, tolerance=EQUILIBRIUM) for equilibrium in coarse]
+    first = [expansion_around(equilibrium, tolerance=EQUILIBRIUM, progress=progress) for equilibrium in coarse]
     objective = objective.under(first).rematched(minimum.unknowns)
     return OuterIterate(objective, replace(minimum, evaluation=objective(minimum.unknowns), evaluations=1))
 

@@ -22,6 +22,7 @@ from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.constraint import Constraint
+from palpate.progress import Progress, silent
 
 __all__ = ["Expansion", "coarse_equilibrium", "expansion_around"]
 
@@ -135,14 +136,17 @@ def coarse_equilibrium(model: FiniteStrainModel, linear: Approximation, at: Plac
     return replace(found, path=replace(found.path, factorisation=None))
 
 
-def expansion_around(coarse: FiniteStrainEquilibrium, *, tolerance: float) -> Expansion:
+def expansion_around(coarse: FiniteStrainEquilibrium, *, tolerance: float, progress: Progress = silent) -> Expansion:
     """The expansion around the equilibrium beside a coarse one, with all derivatives.
 
     tolerance: of the forces, of every equilibrium that follows. Its factorisation is the only one: it serves all solves
     that stay near. Raises `NotConverged` as `coarse_equilibrium` does.
     """
+    progress("finite strain: factorising the tangent stiffness there")
     near = coarse.refactorised()
+    progress("finite strain: the equilibrium on it")
     full, moduli, coefficients = near.model.to_tolerance(tolerance), near.moduli, near.coefficients
     found = from_start(full, moduli, coefficients, start=near.displacement, nearby=near.factorisation)
+    progress(f"finite strain: derivatives by {len(full.names)} moduli and {len(coefficients)} modes")
     derivatives = FirstOrderModel(full.names, moduli, coefficients, found.values, near.tangent())
     return Expansion(derivatives, found, near.counts + near.tangent_counts + found.counts)

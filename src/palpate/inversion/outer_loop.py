@@ -214,6 +214,7 @@ def _iteration(
 ) -> OuterIterate:
     """Reweight and minimise on the present approximations, and update these there, or on a part of the way."""
     objective, found, reweighting = _reweighted_minimum(now, settings, rule, progress, line)
+    progress(f"{line}: the model's error, and the model anew, there")
     n = objective.n_parameters
     tolerance = rule.tolerance(found, n)
     moved = np.abs(found.unknowns - now.minimum.unknowns)[:n]

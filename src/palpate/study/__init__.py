@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from palpate.study.case_file import read_case
     from palpate.study.cost import expected_cost
     from palpate.study.earlier import strange_files
-    from palpate.study.estimation import Observed, Remark, conclude, verdict
+    from palpate.study.estimation import Observed, conclude, verdict
     from palpate.study.journal import recover
     from palpate.study.lock import own_file
     from palpate.study.outputs import make_folder, staged, write_json, write_text
@@ -32,7 +32,6 @@ __all__ = [
     "MeshSettings",
     "Observed",
     "Phantom",
-    "Remark",
     "aligned",
     "conclude",
     "estimate",
@@ -69,7 +68,6 @@ _HOMES = {
     "MeshSettings": "palpate.study.case",
     "Observed": "palpate.study.estimation",
     "Phantom": "palpate.study.case",
-    "Remark": "palpate.study.estimation",
     "aligned": "palpate.study.body",
     "conclude": "palpate.study.estimation",
     "estimate": "palpate.study.run",

@@ -9,16 +9,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError
+from palpate.findings import Finding
 from palpate.inversion import Inversion, InversionSettings, Iterate, Outcome, StartRun
-from palpate.mechanics.deformation import deformation_determinants
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit
+from palpate.progress import Progress, silent
+from palpate.study.estimate_findings import fold_findings, inversion_findings, pair_findings
+from palpate.study.together import ImagePairs, combinations_of, image_pairs_of
 from palpate.uncertainty import (
+    Combination,
     Covariance,
     FittedState,
+    Information,
     Interval,
     covariance_of,
     fixed_correspondence,
+    information,
     log_interval,
     modulus_interval,
 )
@@ -28,7 +34,6 @@ __all__ = [
     "Iteration",
     "ModulusEstimate",
     "Observed",
-    "Remark",
     "Start",
     "TissueFit",
     "conclude",
@@ -39,17 +44,8 @@ __all__ = [
 
 GRID_DRAWS = 8
 AT_BOUND = 1e-6
-STRONG_CORRELATION = 0.99
 IDENTIFIED, WEAK = 2.0, 10.0  # largest ratio of an interval's ends
 AS_GOOD = 0.05  # of the objective: another minimum that is worse by less cannot be excluded
-
-
-@dataclass(frozen=True, slots=True)
-class Remark:
-    """A warning that stands beside a result: a `code` for programs, a `message` for readers."""
-
-    code: str
-    message: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +119,9 @@ class Estimation:
     correlation (n, n) of the log-moduli; fits: the tissues of each later image; displacements: (n_points, 3) mm of
     each later image; covariance of the log-moduli by its causes;
     outer_loop: the steps from the best start's minimum to the estimate, which all starts of that minimum share;
-    counts: of all starts and minima together; observations: what was compared, in words, by its kind.
+    counts: of all starts and minima together; observations: what was compared, in words, by its kind; information: the
+    directions of the log-moduli by how well they are known; combinations: what is known where single moduli are not;
+    image_pairs: what each of several later images says alone.
     """
 
     status: str
@@ -135,8 +133,11 @@ class Estimation:
     displacements: tuple[NDArray[np.float64], ...]
     counts: Mapping[str, int]
     outer_loop: tuple[Iteration, ...] = ()
-    remarks: tuple[Remark, ...] = ()
+    remarks: tuple[Finding, ...] = ()
     observations: Mapping[str, str] = field(default_factory=dict)
+    information: Information | None = None
+    combinations: tuple[Combination, ...] = ()
+    image_pairs: ImagePairs | None = None
 
     @property
     def correlation(self) -> NDArray[np.float64]:
@@ -155,7 +156,13 @@ class Observed:
 
 
 def conclude(
-    inversion: Inversion, settings: InversionSettings, observed: Observed, *, truth: Mapping[str, float], seed: int
+    inversion: Inversion,
+    settings: InversionSettings,
+    observed: Observed,
+    *,
+    truth: Mapping[str, float],
+    seed: int,
+    progress: Progress = silent,
 ) -> Estimation:
     """State the result of an inversion; `truth`: true moduli (kPa) by tissue where they are known.
 
@@ -166,7 +173,15 @@ def conclude(
     if objective.parameters.poisson:
         raise ConfigurationError("a result states Young's moduli only: a Poisson's ratio was sought beside them")
     rng = np.random.default_rng(seed)
+    progress(f"intervals: correlation of the residuals, and the model as {GRID_DRAWS} random voxel grids show it")
     covariance = covariance_of(objective, minimum.evaluation, observed.states, draws=GRID_DRAWS, rng=rng)
+    progress("intervals: profiles, and the fit of every surface before and after")
+    pairs = image_pairs_of(inversion, settings.bounds)
+    findings = (
+        *inversion_findings(inversion, covariance.total),
+        *pair_findings(pairs),
+        *fold_findings(observed.states),
+    )
     return Estimation(
         status="converged" if minimum.converged else "not converged",
         reason=_reason(inversion),
@@ -183,8 +198,11 @@ def conclude(
             "evaluations": inversion.evaluations,
         },
         outer_loop=tuple(_iteration(inversion, iterate) for iterate in minimum.history),
-        remarks=(*_remarks(inversion, covariance.total), *_folds(observed)),
+        remarks=findings,
         observations={observation.kind: observation.description for observation in objective.observations},
+        information=information(covariance.total),
+        combinations=combinations_of(inversion, covariance.total, within=IDENTIFIED),
+        image_pairs=pairs,
     )
 
 
@@ -254,7 +272,7 @@ def _estimates(
     mapping, bounds = inversion.objective.parameters, settings.bounds
     theta, scale = inversion.minimum.unknowns[: mapping.n_parameters], mapping.scale_kpa
     found, variances = [], np.diag(covariance.total)
-    fixed = fixed_correspondence(inversion.objective, inversion.minimum)
+    fixed = fixed_correspondence(inversion.objective, inversion.minimum.unknowns, inversion.minimum.evaluation)
     for i, name in enumerate(mapping.tissues):
         none = no_estimate(
             name,
@@ -346,70 +364,3 @@ def _fits(inversion: Inversion, observed: Observed) -> tuple[tuple[TissueFit, ..
             )
         )
     return tuple(fits)
-
-
-def _folds(observed: Observed) -> tuple[Remark, ...]:
-    """A warning for each later image in which the fitted model turns elements inside out."""
-    remarks = []
-    for number, state in enumerate(observed.states, start=1):
-        space = state.space
-        smallest = deformation_determinants(space, state.displacement).min(axis=1)
-        folded = int(np.count_nonzero(smallest <= 0.0))
-        if folded:
-            worst = space.mesh.nodes[space.mesh.tets[int(smallest.argmin())]].mean(axis=0)
-            remarks.append(
-                Remark(
-                    "fold-over",
-                    f"after image {number}: {folded} of {len(smallest)} elements are turned inside out, the worst near"
-                    f" {np.round(worst).astype(int).tolist()} mm (RAS): the motion is too large there for the law or"
-                    " the mesh. Look at the labels there, or set a smaller [mesh] edge_length_mm",
-                )
-            )
-    return tuple(remarks)
-
-
-def _remarks(inversion: Inversion, covariance: NDArray[np.float64]) -> tuple[Remark, ...]:
-    mapping = inversion.objective.parameters
-    remarks = []
-    if not mapping.absolute:
-        remarks.append(
-            Remark(
-                "ratio-only",
-                f"no tissue's modulus is known, so only ratios to '{mapping.relative_to}' are determined; give one"
-                " tissue role `known` with its youngs_modulus_kpa to get kPa",
-            )
-        )
-    if inversion.minimum.converged and inversion.convergence.unmet:
-        remarks.append(
-            Remark(
-                "unsettled",
-                f"the outer loop ended at its largest number of iterations: {'; '.join(inversion.convergence.unmet)};"
-                " the model may not fit the images (edge length, driver modes, law), or [noise] should be given",
-            )
-        )
-    lost = [c for c in inversion.candidates if c.minimum.outcome is Outcome.NO_EQUILIBRIUM]
-    if lost:
-        remarks.append(
-            Remark(
-                "no-equilibrium",
-                f"{len(lost)} of {len(inversion.candidates)} minima of the linear law have no equilibrium under the"
-                " case's law and are not compared with the others; other [estimate] start_ratios show"
-                " whether they are minima at all",
-            )
-        )
-    if len(inversion.candidates) - len(lost) > 1:
-        remarks.append(
-            Remark(
-                "several-minima",
-                "the starts ended in different minima; the best fit under one noise model is reported, and the"
-                " intervals reach over all that fit nearly as well",
-            )
-        )
-    sd = np.sqrt(np.diag(covariance))
-    for i in range(len(sd)):
-        for j in range(i):
-            if abs(covariance[i, j]) > STRONG_CORRELATION * sd[i] * sd[j]:
-                names = f"'{mapping.tissues[j]}' and '{mapping.tissues[i]}'"
-                text = f"the moduli of {names} cannot be told apart by these images; add one that moves them otherwise"
-                remarks.append(Remark("correlated", text))
-    return tuple(remarks)
