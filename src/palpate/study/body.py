@@ -64,7 +64,8 @@ STATED = (
 class ImagedStates:
     """The reference state and the later states, brought to it; `bones`: each later state's motions by tissue index.
 
-    `inputs`: SHA-256 of each file that was read for them, by its key in `result.json`.
+    `inputs`: SHA-256 of each file that was read for them, by its key in `result.json`; `alignments`: each later
+    state's motion from the first image's world to its own, of all bones as one body; none where nothing was aligned.
     """
 
     before: Segmentation
@@ -72,6 +73,7 @@ class ImagedStates:
     bones: tuple[Mapping[int, RigidMotion], ...]
     findings: tuple[Finding, ...]
     inputs: Mapping[str, str] = field(default_factory=dict)
+    alignments: tuple[RigidMotion, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,13 +94,14 @@ def aligned(
     `loaded`: whether known loads act on the body, for what is found of its motion.
     Raises `InputDataError` as `check_images`, `align` and `refuse_lost` do, `GeometryError` as `refuse_unmeshable`.
     """
-    images, bones, findings = [], [], list[Finding]()
+    images, bones, findings, alignments = [], [], list[Finding](), list[RigidMotion]()
     for number, image in enumerate(after, start=1):
         if method == "none":
             images.append(image)
             bones.append(dict[int, RigidMotion]())
             continue
         alignment = align(before, image)
+        alignments.append(alignment.overall.motion)
         images.append(moved(image, alignment.overall.motion.inverse()))
         rigid = {i: t.name for i, t in enumerate(before.tissues) if t.role is Role.RIGID}
         bones.append({i: alignment.remaining(name) for i, name in rigid.items()})
@@ -135,7 +138,7 @@ def aligned(
         refuse_unmeshable(image, name)
         refuse_lost(before, image, name)
     findings += [finding for finding in every_finding(before, images, loaded=loaded) if finding.code in STATED]
-    return ImagedStates(before, tuple(images), tuple(bones), tuple(findings))
+    return ImagedStates(before, tuple(images), tuple(bones), tuple(findings), alignments=tuple(alignments))
 
 
 def make_body(states: ImagedStates, case: Case, *, progress: Callable[[str], None]) -> Body:

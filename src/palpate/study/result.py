@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import NotConverged, PalpateError
+from palpate.images.alignment import RigidMotion
 from palpate.images.label_image import LabelImage
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
@@ -21,6 +22,7 @@ from palpate.study.case_text import case_tables
 from palpate.study.estimation import Estimation, ModulusEstimate, Remark, Start, TissueFit, no_estimate
 
 __all__ = [
+    "SCHEMA",
     "CaseResult",
     "MeshResult",
     "MeshSummary",
@@ -62,7 +64,7 @@ class Provenance:
 class PairResult:
     """A further pair of images, which shares the moduli: its own mesh, its segmentations, its displacements.
 
-    displacements: one (n_points, 3) mm on `space.points` a later image; before, after: as in `CaseResult`.
+    displacements: one (n_points, 3) mm on `space.points` a later image; before, after, alignments: as in `CaseResult`.
     """
 
     space: LagrangeSpace
@@ -70,6 +72,7 @@ class PairResult:
     before: Segmentation
     after: tuple[Segmentation, ...]
     displacements: tuple[NDArray[np.float64], ...]
+    alignments: tuple[RigidMotion, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +82,8 @@ class CaseResult:
     space: the displacements' points on the mesh of the reference state; before, after: segmentations, the later ones
     brought to the first (aligned), all in RAS mm; remarks: those of the study, beside the estimation's own;
     note: a sentence that must stand wherever the numbers are shown (of what a demo simulates, say);
-    further: the pairs after the first. The estimation's fits and displacements are those of `after`, then theirs.
+    further: the pairs after the first. The estimation's fits and displacements are those of `after`, then theirs;
+    alignments: the motion that takes each of `after` to where its own image has it; empty where nothing was aligned.
     """
 
     case: Case
@@ -92,6 +96,7 @@ class CaseResult:
     remarks: tuple[Remark, ...] = ()
     note: str = ""
     further: tuple[PairResult, ...] = ()
+    alignments: tuple[RigidMotion, ...] = ()
 
     @property
     def tissues(self) -> tuple[Tissue, ...]:
