@@ -50,9 +50,9 @@ def export(
 
 def export_into(outputs: OutputFolder, model: FittedModel, name: str, options: Options) -> None:
     """Put the files of the format `name` in place in a folder that is held; further pairs' in pair_2, pair_3 ..."""
-    write = format_named(name).write
+    form = format_named(name)
     with outputs.staged() as staging:
-        for number, body in enumerate(model.bodies, start=1):
+        for number, body in enumerate(model.bodies if form.every_pair else model.bodies[:1], start=1):
             folder = staging.area if number == 1 else make_folder(staging.area / f"pair_{number}")
-            write(model, body.with_linear_tetrahedra() if options.linear else body, folder, options)
+            form.write(model, body.with_linear_tetrahedra() if options.linear else body, folder, options)
         staging.commit()

@@ -34,10 +34,14 @@ class Write(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """A format: the module of `palpate.export` that writes it, and what it is, in a few words."""
+    """A format: the module of `palpate.export` that writes it, and what it is, in a few words.
+
+    every_pair: whether each pair of images has files of its own.
+    """
 
     module: str
     description: str
+    every_pair: bool = True
 
     @property
     def write(self) -> Write:
@@ -51,7 +55,7 @@ FORMATS = {
     "dicom": Format("dicom", "DICOM Parametric Map and Segmentation, .dcm"),
     "febio": Format("febio", "FEBio 4, .feb"),
     "gmsh": Format("gmsh", "gmsh 4.1 with physical groups, .msh"),
-    "netcdf": Format("netcdf", "posterior samples for ArviZ and xarray, .nc"),
+    "netcdf": Format("netcdf", "posterior samples for ArviZ and xarray, .nc", every_pair=False),
     "obj": Format("obj", "Wavefront surfaces before and after, .obj"),
     "paraview": Format("paraview", "a ParaView script with its data, .py"),
     "ply": Format("ply", "polygon surfaces before and after, .ply"),

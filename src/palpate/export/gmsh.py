@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.formats import Options
-from palpate.export.groups import face_groups, tissue_groups
+from palpate.export.groups import element_faces, face_groups, tissue_groups
 from palpate.export.text_lines import rows
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.outputs import write_text
@@ -43,15 +43,15 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
     for number, displacement in enumerate(body.displacements, start=1):
         heading = f'$NodeData\n1\n"displacement_mm"\n1\n{float(number):g}\n3\n{number}\n3\n{n}\n'
         parts += [heading, rows("%d %.9g %.9g %.9g", np.arange(1, n + 1), displacement), "$EndNodeData\n"]
-    poisson = np.array([tissue.poisson_ratio for tissue in body.tissues])
-    first = 1 + sum(len(triangles) for _, triangles in surfaces)
+    # a triangle has the values of the tetrahedron behind it, for programs that ask a value of every element
+    behind = [element_faces(body.mesh, triangles)[0] for _, triangles in surfaces]
+    region = body.mesh.region[np.concatenate([*behind, *volumes.values()])]
     for name, values in (
         ("youngs_modulus_kpa" if model.unit == "kPa" else "youngs_modulus_ratio", model.moduli),
-        ("poisson_ratio", poisson),
+        ("poisson_ratio", np.array([tissue.poisson_ratio for tissue in body.tissues])),
     ):
-        heading = f'$ElementData\n1\n"{name}"\n1\n0\n3\n0\n1\n{len(space.cells)}\n'
-        tags = first + np.arange(len(space.cells))
-        parts += [heading, rows("%d %.9g", tags, values[body.mesh.region]), "$EndElementData\n"]
+        heading = f'$ElementData\n1\n"{name}"\n1\n0\n3\n0\n1\n{len(region)}\n'
+        parts += [heading, rows("%d %.9g", np.arange(1, len(region) + 1), values[region]), "$EndElementData\n"]
     write_text(folder / "palpate.msh", "".join(parts))
 
 
@@ -93,21 +93,17 @@ def _elements(
     surfaces: list[tuple[tuple[int, ...], NDArray[np.int64]]],
     volumes: dict[str, NDArray[np.int64]],
 ) -> list[str]:
-    """Triangles, then tetrahedra in their own order: the tag of the first follows that of the last triangle."""
-    faces = sum(len(triangles) for _, triangles in surfaces)
-    total = faces + len(space.cells)
-    parts, next_tag = [f"$Elements\n{len(surfaces) + len(volumes)} {total} 1 {total}\n"], 1
-    for tag, (_, triangles) in enumerate(surfaces, start=1):
-        facets = space.facets(triangles) + 1
-        numbers = np.arange(next_tag, next_tag + len(facets))
-        next_tag += len(facets)
-        pattern = " ".join(["%d"] * (1 + facets.shape[1]))
-        parts += [f"2 {tag} {TRIANGLE[space.order]} {len(facets)}\n", rows(pattern, numbers, facets)]
+    """Triangles, then tetrahedra, numbered as they come."""
     order = EDGES[: space.cells.shape[1]]
-    pattern = " ".join(["%d"] * (1 + len(order)))
-    for tag, cells in enumerate(volumes.values(), start=1):
-        parts += [f"3 {tag} {TETRAHEDRON[space.order]} {len(cells)}\n"]
-        parts += [rows(pattern, faces + 1 + cells, space.cells[cells][:, order] + 1)]
+    blocks = [(2, tag, TRIANGLE, space.facets(faces)) for tag, (_, faces) in enumerate(surfaces, start=1)]
+    blocks += [(3, tag, TETRAHEDRON, space.cells[c][:, order]) for tag, c in enumerate(volumes.values(), start=1)]
+    total, first = sum(len(nodes) for *_, nodes in blocks), 1
+    parts = [f"$Elements\n{len(blocks)} {total} 1 {total}\n"]
+    for dimension, tag, kind, nodes in blocks:
+        numbers = np.arange(first, first + len(nodes))
+        first += len(nodes)
+        pattern = " ".join(["%d"] * (1 + nodes.shape[1]))
+        parts += [f"{dimension} {tag} {kind[space.order]} {len(nodes)}\n", rows(pattern, numbers, nodes + 1)]
     return [*parts, "$EndElements\n"]
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate.export.case_files import file_name
 from palpate.export.fitted_model import FittedBody, FittedModel
@@ -42,7 +44,7 @@ def write_states(model: FittedModel, body: FittedBody, folder: Path) -> list[str
     space, region = body.space, body.mesh.region
     poisson = np.array([tissue.poisson_ratio for tissue in body.tissues])
     modulus = "youngs_modulus_kpa" if model.unit == "kPa" else "youngs_modulus_ratio"
-    cells = {
+    cells: dict[str, NDArray[Any]] = {
         "label": first_labels(body.tissues)[region],
         modulus: model.moduli[region],
         "poisson_ratio": poisson[region],
