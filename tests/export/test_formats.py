@@ -182,7 +182,7 @@ def fitted_motion(model, *, linear=False):
 @pytest.mark.parametrize("linear", [False, True])
 def test_febio_has_domains_sets_and_maps_that_refer_to_each_other(exported, model, linear):
     root = ET.parse((exported("febio", linear=True) if linear else exported("febio")) / "palpate.feb").getroot()
-    order = ["Module", "Material", "Mesh", "MeshDomains", "MeshData", "Step", "LoadData", "Output"]
+    order = ["Module", "Material", "Mesh", "MeshDomains", "MeshData", "LoadData", "Step", "Output"]
     assert [child.tag for child in root] == order
     nodes = np.array([[float(x) for x in node.text.split(",")] for node in root.find("Mesh/Nodes")])
     sizes = {}

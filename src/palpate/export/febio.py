@@ -54,15 +54,15 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
     for name in tissue_groups(body.mesh):
         _add(domains, "SolidDomain", name=name, mat=name)
     data = _add(root, "MeshData")
+    curves = _add(root, "LoadData")
     if loads:
         _loads(data, _add(root, "Loads"), loads, len(space.points))
-    steps, curves = _add(root, "Step"), Element("LoadData")
+    steps = _add(root, "Step")
     for number in range(1, len(body.displacements) + 1):
         step = _add(steps, "step", id=number, name=f"later image {number}")
         _control(step)
         _boundary(step, data, body, held, number)
         _curve(curves, number)
-    root.append(curves)
     output = _add(_add(root, "Output"), "plotfile", type="febio")
     for name in ("displacement", "stress"):
         _add(output, "var", type=name)
@@ -103,14 +103,14 @@ def _mesh(mesh: Element, body: FittedBody, space: LagrangeSpace, held: Prescribe
         elements = _add(mesh, "Elements", type=kind, name=name)
         for cell in cells.tolist():
             _add(elements, "elem", ",".join(str(p + 1) for p in space.cells[cell].tolist()), id=cell + 1)
-    for group in face_groups(body.mesh):
-        facets = space.facets(group.triangles)
-        _surface(mesh, group.name, facets)
-        _node_set(mesh, f"{group.name} nodes", np.unique(facets))
+    facets = {group.name: space.facets(group.triangles) for group in face_groups(body.mesh)}
+    pressed = {f"load {n}": load.faces for n, load in enumerate(loads, start=1) if isinstance(load, FollowingPressure)}
+    for name, faces in (facets | pressed).items():
+        _surface(mesh, name, faces)
+    for name, faces in facets.items():
+        _node_set(mesh, f"{name} nodes", np.unique(faces))
     for number, load in enumerate(loads, start=1):
-        if isinstance(load, FollowingPressure):
-            _surface(mesh, f"load {number}", load.faces)
-        else:
+        if not isinstance(load, FollowingPressure):
             _node_set(mesh, f"load {number}", np.arange(len(space.points)))
     _node_set(mesh, "prescribed", held.whole)
     for axis, points in _sliding(held):
@@ -142,16 +142,17 @@ def _boundary(step: Element, data: Element, body: FittedBody, held: Prescribed, 
     boundary = _add(step, "Boundary")
     for axis in range(3):
         name = f"image {number} {AXES[axis]}"
-        values = _add(data, "NodeData", name=name, node_set="prescribed")
+        values = _add(data, "NodeData", name=name, node_set="prescribed", data_type="scalar")
         for place, value in enumerate(way[:, axis].tolist(), start=1):
             _add(values, "node", f"{value:.12g}", lid=place)
-        condition = _add(boundary, "bc", name=name, type="prescribed displacement", node_set="prescribed")
+        condition = _add(boundary, "bc", type="prescribed displacement", node_set="prescribed")
         _add(condition, "dof", AXES[axis])
         _add(condition, "value", name, lc=number, type="map")
-        _add(condition, "relative", int(number > 1))
+        if number > 1:
+            _add(condition, "relative", 1)
     for axis, _ in _sliding(held):
         name = f"sliding {AXES[axis]}"
-        condition = _add(boundary, "bc", name=f"{name}, step {number}", type="zero displacement", node_set=name)
+        condition = _add(boundary, "bc", type="zero displacement", node_set=name)
         for other in range(3):
             _add(condition, f"{AXES[other]}_dof", int(other == axis))
 
@@ -177,10 +178,10 @@ def _control(step: Element) -> None:
     control = _add(step, "Control")
     for key, value in {"analysis": "STATIC", "time_steps": STEPS, "step_size": 1.0 / STEPS}.items():
         _add(control, key, value)
-    _add(control, "solver", type="solid")
     stepper = _add(control, "time_stepper", type="default")
     for name, limit in {"max_retries": 10, "dtmin": 0.001, "dtmax": 1.0 / STEPS}.items():
         _add(stepper, name, limit)
+    _add(control, "solver", type="solid")
 
 
 def _curve(parent: Element, number: int) -> None:
