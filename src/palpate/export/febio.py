@@ -186,7 +186,7 @@ def _control(step: Element) -> None:
 
 def _curve(parent: Element, number: int) -> None:
     """From 0 to 1 in the time of step `number`."""
-    controller = _add(parent, "load_controller", id=number, name=f"LC{number}", type="loadcurve")
+    controller = _add(parent, "load_controller", id=number, type="loadcurve")
     _add(controller, "interpolate", "LINEAR")
     _add(controller, "extend", "CONSTANT")
     points = _add(controller, "points")
