@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import gzip
 import json
 import shutil
+import zipfile
 from dataclasses import fields
 
 import numpy as np
@@ -13,9 +15,11 @@ import pytest
 import palpate
 from palpate.cli import main
 from palpate.errors import ConfigurationError, EstimationError, InputDataError
-from palpate.export.fitted_model import FittedModel, fitted_model
+from palpate.export.fitted_model import fitted_model
+from palpate.export.formats import FORMATS
 from palpate.export.model_file import read_model, seal_of
 from palpate.report import case_report
+from palpate.study.case import Images
 from palpate.study.outputs import sha256_of
 from palpate.study.result import PairResult
 
@@ -165,9 +169,36 @@ def test_several_later_images_are_steps_one_after_the_other(case_result, tmp_pat
     assert {"warp_1.nii.gz", "warp_2.nii.gz"} <= {path.name for path in (tmp_path / "warp").iterdir()}
 
 
-def test_the_model_names_no_input(saved):
-    model = read_model(saved)
-    assert isinstance(model, FittedModel)
-    text = (saved / "model.npz").read_bytes()
-    assert b"sub-01" not in text
-    assert all(tissue.called == () for tissue in model.tissues)
+PLANTED = ("Meyer", "Erika", "ward_7", "hospital", "lobe of M.")
+
+
+def planted_in(path):
+    """Whether a file, or what is packed in it, holds something that was planted."""
+    plain = path.read_bytes()
+    packed = [gzip.decompress(plain)] if plain[:2] == b"\x1f\x8b" else []
+    if plain[:2] == b"PK":
+        with zipfile.ZipFile(path) as archive:
+            packed = [archive.read(name) for name in archive.namelist()]
+    return any(word.encode().lower() in content.lower() for content in (plain, *packed) for word in PLANTED)
+
+
+def test_no_name_or_path_of_an_input_is_in_an_export(case_result, tmp_path, capsys):
+    """Of the case only its tissues' names go on: not its id, a patient, a file, a folder or the labels' own names."""
+    images = Images(tmp_path / "hospital" / "ward_7_before.nii.gz", (tmp_path / "hospital" / "ward_7_after.nii.gz",))
+    case = dataclasses.replace(case_result.case, id="case-of-Meyer", patient="Erika", images=images)
+    mesh = case_result.space.mesh
+    called = tuple(dataclasses.replace(tissue, called=("lobe of M.",)) for tissue in mesh.tissues)
+    space = dataclasses.replace(case_result.space, mesh=dataclasses.replace(mesh, tissues=called))
+    before = dataclasses.replace(case_result.before, tissues=called)
+    planted = dataclasses.replace(case_result, case=case, space=space, before=before, note="told by Erika")
+    folder = save(planted, tmp_path / "hospital" / "result")
+    assert planted_in(folder / "result.json")
+    assert planted_in(folder / "case.toml")
+    assert not planted_in(folder / "model.npz")
+    for name in FORMATS:
+        shared = tmp_path / "shared" / name
+        assert main(["export", str(folder), "--format", name, "--output", str(shared), "--quiet"]) == 0
+        files = [path for path in shared.rglob("*") if path.is_file()]
+        assert files
+        assert [path.name for path in files if planted_in(path)] == []
+    assert capsys.readouterr().err == ""

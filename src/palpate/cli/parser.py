@@ -39,6 +39,7 @@ EXAMPLES = {
     ),
     "report": ("palpate report out", "palpate report out --json"),
     "reproduce": ("palpate reproduce table1", "palpate reproduce figure4 --output figure4"),
+    "view": ("palpate view out", "palpate view out --no-browser"),
     "verify": ("palpate verify --quick", "palpate verify --output verification"),
 }
 
@@ -95,6 +96,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_estimate(subparsers)
     _add_report(subparsers)
     _add_export(subparsers)
+    _add_view(subparsers)
     _add_reproduce(subparsers)
     _add_verify(subparsers)
     return parser
@@ -145,6 +147,13 @@ def _add_export(subparsers: Any) -> None:
     command.add_argument("--linear", action="store_true", help="tetrahedra of four nodes in place of ten")
     command.add_argument("--source", type=Path, metavar="SERIES", help="dicom: the first image's DICOM series")
     command.set_defaults(logs=False)  # which would hold the command with its paths
+
+
+def _add_view(subparsers: Any) -> None:
+    what = "show the report of an estimate and its files in a browser, on this machine alone"
+    command = _command(subparsers, "view", exports.view, what=what, folder=None)
+    command.add_argument("result", type=Path, metavar="DIR", help="the output folder of an estimate")
+    command.add_argument("--no-browser", action="store_true", help="print the address, open nothing")
 
 
 def _formats() -> list[str]:

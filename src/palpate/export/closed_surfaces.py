@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from palpate.export.case_files import file_name
 from palpate.export.fitted_model import FittedBody
+from palpate.images.tissue import Role
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.surface import tissue_surface
 from palpate.observation.observed_surface import SUBTRIANGLES
@@ -34,7 +35,7 @@ class ClosedSurface:
 
 
 def closed_surfaces(body: FittedBody) -> Iterator[ClosedSurface]:
-    """Each tissue's surface before and after each later image; a quadratic face is four triangles.
+    """Each tissue's surface before and after each later image, but for `void`; a quadratic face is four triangles.
 
     Where a hollow tissue leaves the image its wall is closed by a fan of triangles about the middle of its rim.
     """
@@ -45,7 +46,7 @@ def closed_surfaces(body: FittedBody) -> Iterator[ClosedSurface]:
         states[f"after_{number}" if several else "after"] = space.points + displacement
     for number, tissue in enumerate(body.tissues):
         faces = tissue_surface(body.mesh, number).triangles
-        if not len(faces):
+        if not len(faces) or tissue.role is Role.VOID:  # the air around a body is no body
             continue
         used, local = np.unique(_split(space, faces), return_inverse=True)
         triangles = local.reshape(-1, 3)
