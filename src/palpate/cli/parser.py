@@ -106,6 +106,7 @@ def _add_init(subparsers: Any) -> None:
     command = _command(subparsers, "init", commands.init, what="write a case.toml for images, roles guessed from names")
     command.add_argument("images", type=Path, nargs="+", metavar="IMAGE", help="label images: before, then after ...")
     command.add_argument("--labels", type=Path, metavar="TABLE", help="label table: which number is which organ")
+    _add_ct(command)
     command.set_defaults(logs=False, targets=("case.toml",))
 
 
@@ -128,8 +129,14 @@ def _add_estimate(subparsers: Any) -> None:
         help="CASE.TOML, or label images BEFORE AFTER ... for which a case is written first",
     )
     command.add_argument("--labels", type=Path, metavar="TABLE", help="label table, with images")
+    _add_ct(command)
     command.set_defaults(targets=written.TARGETS)
     _add_set(command)
+
+
+def _add_ct(command: argparse.ArgumentParser) -> None:
+    what = "CT of before, or of each image: for the report, and to tell air from tissue in label 0"
+    command.add_argument("--ct", type=Path, nargs="+", default=[], metavar="CT", help=what)
 
 
 def _add_report(subparsers: Any) -> None:

@@ -6,12 +6,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from palpate.study.body import Body, ImagedStates, aligned, inverse_problem, make_body, surface_observations
+    from palpate.study.body import Body, ImagedStates, aligned, inverse_problem, make_body
     from palpate.study.case import Case, Domain, DriverMotion, Mechanics, MeshSettings, Phantom
     from palpate.study.case_file import read_case
     from palpate.study.cost import expected_cost
     from palpate.study.earlier import strange_files
-    from palpate.study.estimation import Observed, Remark, conclude, verdict
+    from palpate.study.estimation import Observed, conclude, verdict
     from palpate.study.journal import recover
     from palpate.study.lock import own_file
     from palpate.study.outputs import make_folder, staged, write_json, write_text
@@ -32,7 +32,6 @@ __all__ = [
     "MeshSettings",
     "Observed",
     "Phantom",
-    "Remark",
     "aligned",
     "conclude",
     "estimate",
@@ -53,7 +52,6 @@ __all__ = [
     "software_versions",
     "staged",
     "strange_files",
-    "surface_observations",
     "verdict",
     "write_json",
     "write_text",
@@ -70,7 +68,6 @@ _HOMES = {
     "MeshSettings": "palpate.study.case",
     "Observed": "palpate.study.estimation",
     "Phantom": "palpate.study.case",
-    "Remark": "palpate.study.estimation",
     "aligned": "palpate.study.body",
     "conclude": "palpate.study.estimation",
     "estimate": "palpate.study.run",
@@ -91,7 +88,6 @@ _HOMES = {
     "software_versions": "palpate.study.provenance",
     "staged": "palpate.study.outputs",
     "strange_files": "palpate.study.earlier",
-    "surface_observations": "palpate.study.body",
     "verdict": "palpate.study.estimation",
     "write_json": "palpate.study.outputs",
     "write_text": "palpate.study.outputs",
