@@ -32,6 +32,7 @@ FILES = {
         "model.npz",
         "stiffness.nii.gz",
         "labels.csv",
+        "labels.nii.gz",
         "case.toml",
         "log.txt",
     ),

@@ -22,6 +22,7 @@ from palpate.export.rasterise import region_image
 from palpate.images.input_file import read_input
 from palpate.images.segmentation import first_labels
 from palpate.images.tissue import Tissue
+from palpate.images.tissue_colours import tissue_colours
 from palpate.study.outputs import write_bytes
 from palpate.study.provenance import software_versions
 
@@ -33,7 +34,6 @@ __all__ = ["write"]
 LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 MOST_SLICES = 5000
 MOST_BYTES = 2**26  # of a slice
-GREY = "#808080"  # of a tissue without a colour
 ORGANS = {  # SNOMED CT, by words in a tissue's name
     "prostate": ("41216001", "Prostate"),
     "bladder": ("89837001", "Bladder"),
@@ -133,6 +133,7 @@ def _segmentation(
     )
     labels = first_labels(body.tissues)
     numbers = {number: place for place, number in enumerate(np.argsort(labels).tolist(), start=1)}
+    colours = tissue_colours(body.tissues)
     segments = [
         highdicom.seg.SegmentDescription(
             segment_number=place,
@@ -141,7 +142,7 @@ def _segmentation(
             segmented_property_type=highdicom.sr.CodedConcept(*_kind(body.tissues[number])),
             algorithm_type="SEMIAUTOMATIC",
             algorithm_identification=algorithm,
-            display_color=highdicom.color.CIELabColor.from_string(body.tissues[number].colour or GREY),
+            display_color=highdicom.color.CIELabColor.from_string(colours[number]),
         )
         for number, place in numbers.items()
     ]

@@ -14,11 +14,10 @@ from palpate.export.rasterise import region_image
 from palpate.images.label_image import LabelImage
 from palpate.images.readers import write_label_image, write_scalar_image
 from palpate.images.tissue import Role
+from palpate.images.tissue_colours import tissue_colours
 from palpate.study.result import CaseResult
 
 __all__ = ["notebook_viewer"]
-
-GREY = "#808080"
 
 
 def notebook_viewer(result: CaseResult, *, background: Path | None = None, opacity: float = 0.6) -> Any:
@@ -59,7 +58,7 @@ def notebook_viewer(result: CaseResult, *, background: Path | None = None, opaci
 
 def _table(ipyniivue: Any, result: CaseResult) -> Any:
     """Colour and name of each tissue in their order; what lies around the body is clear."""
-    colours = [bytes.fromhex((tissue.colour or GREY)[1:]) for tissue in result.tissues]
+    colours = [bytes.fromhex(colour[1:]) for colour in tissue_colours(result.tissues)]
     opaque = [0 if tissue.role is Role.VOID else 255 for tissue in result.tissues]
     table = [part for colour, alpha in zip(colours, opaque, strict=True) for part in (*colour, alpha)]
     names = [tissue.name for tissue in result.tissues]

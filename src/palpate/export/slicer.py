@@ -15,6 +15,7 @@ from palpate.export.rasterise import region_image
 from palpate.images.label_image import LabelImage
 from palpate.images.readers import write_label_image, write_scalar_image
 from palpate.images.segmentation import first_labels
+from palpate.images.tissue_colours import tissue_colours
 from palpate.study.outputs import write_json, write_text
 
 __all__ = ["write"]
@@ -68,7 +69,6 @@ def load():
 
 load()
 '''
-GREY = "#808080"
 
 
 def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
@@ -80,7 +80,8 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
     write_scalar_image(folder / "stiffness.nii.gz", moduli[region_image(body.mesh, body.grid)], body.grid)
     ply.write(model, body, folder, options)
     warp.write(model, body, folder, options)
-    colours = {tissue.name: _rgb(tissue.colour or GREY) for tissue in body.tissues}
+    shown = zip(body.tissues, tissue_colours(body.tissues), strict=True)
+    colours = {tissue.name: _rgb(colour) for tissue, colour in shown}
     roles = {tissue.name: str(tissue.role) for tissue in body.tissues}
     known = model.moduli[np.isfinite(model.moduli)]
     name = "Young's modulus (kPa)" if model.unit == "kPa" else f"Young's modulus (ratio to {model.relative_to})"

@@ -272,7 +272,7 @@ def _estimates(
     mapping, bounds = inversion.objective.parameters, settings.bounds
     theta, scale = inversion.minimum.unknowns[: mapping.n_parameters], mapping.scale_kpa
     found, variances = [], np.diag(covariance.total)
-    fixed = fixed_correspondence(inversion.objective, inversion.minimum)
+    fixed = fixed_correspondence(inversion.objective, inversion.minimum.unknowns, inversion.minimum.evaluation)
     for i, name in enumerate(mapping.tissues):
         none = no_estimate(
             name,
