@@ -7,7 +7,6 @@ strain; its TetrahedronFEMForceField is the linear law. SOFA has no quadratic te
 from __future__ import annotations
 
 import io
-import json
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +23,8 @@ __all__ = ["write"]
 
 SCENE = '''"""A body that Palpate fitted, as a SOFA scene: runSofa -l SofaPython3 scene.py
 
-{units}; stresses in kPa. Beside it: model.npz (arrays), model.json (tissues and groups). Each second of the
-simulation moves walls, bones and the cut of the image on to where the next later image has them.
+Millimetres and kPa (or ratios, as "units" in model.json says); RAS coordinates. Beside it: model.npz (arrays), model.json
+(tissues and groups). Each second of the simulation moves walls, bones and the cut of the image on to where the next later image has them.
 """
 
 import json
@@ -143,8 +142,8 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
         "groups": {f"group_{number}": group.name for number, group in enumerate(face_groups(mesh))},
     }
     write_bytes(folder / "model.npz", memory.getvalue())
-    write_json(folder / "model.json", json.loads(json.dumps(document)))
-    write_text(folder / "scene.py", SCENE.replace("{units}", json.dumps(model.units, ensure_ascii=True)[1:-1]))
+    write_json(folder / "model.json", document)
+    write_text(folder / "scene.py", SCENE)
 
 
 def _tissue(model: FittedModel, number: int, plain: str) -> dict[str, object]:
