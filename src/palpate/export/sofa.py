@@ -23,8 +23,9 @@ __all__ = ["write"]
 
 SCENE = '''"""A body that Palpate fitted, as a SOFA scene: runSofa -l SofaPython3 scene.py
 
-Millimetres and kPa (or ratios, as "units" in model.json says); RAS coordinates. Beside it: model.npz (arrays), model.json
-(tissues and groups). Each second of the simulation moves walls, bones and the cut of the image on to where the next later image has them.
+Millimetres and kPa (or ratios, as "units" in model.json says); RAS coordinates. Beside it: model.npz (arrays) and
+model.json (tissues and groups). Each second of the simulation moves walls, bones and the cut of the image on to where
+the next later image has them.
 """
 
 import json

@@ -44,7 +44,8 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
         field = field_on_grid(space, displacement, grid)
         back = _inverse(field, grid)
         write_displacement_field(folder / f"warp{ending}.nii.gz", _aligned(field, grid, alignment), grid)
-        write_displacement_field(folder / f"inverse_warp{ending}.nii.gz", _unaligned(back, grid, alignment), grid)
+        there = VoxelGrid(grid.shape, alignment @ grid.affine)  # the same box in the later image's world
+        write_displacement_field(folder / f"inverse_warp{ending}.nii.gz", _unaligned(back, grid, alignment), there)
         before, motion = space.points[surface], displacement[surface]
         off = _sampled(field, grid, before) - motion
         returned = _sampled(back, grid, before + motion) + motion
@@ -178,15 +179,16 @@ def _inverse(field: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.float64]
 
 
 def _aligned(field: NDArray[np.float64], grid: VoxelGrid, alignment: NDArray[np.float64]) -> NDArray[np.float64]:
-    """D with x + d = A (x + u): to where the later image itself has the points."""
+    """D with x + d = A (x + u) at the voxel centres x of `grid`: to where the later image itself has the points."""
     places = _centres(grid, np.ones(grid.shape, dtype=bool))
-    moved = (places + field.reshape(-1, 3)) @ alignment[:3, :3].T + alignment[:3, 3]
-    return np.asarray((moved - places).reshape(field.shape))
+    return np.asarray((_by(alignment, places + field.reshape(-1, 3)) - places).reshape(field.shape))
 
 
 def _unaligned(back: NDArray[np.float64], grid: VoxelGrid, alignment: NDArray[np.float64]) -> NDArray[np.float64]:
-    """D with y + d = z + v(z), z = A^-1 y: from where the later image has the points."""
+    """D with y + d = z + v(z), y = A z, at the voxel centres z of `grid`: from where the later image has the points."""
     places = _centres(grid, np.ones(grid.shape, dtype=bool))
-    to_first = np.linalg.inv(alignment)
-    aligned = places @ to_first[:3, :3].T + to_first[:3, 3]
-    return np.asarray((aligned + _sampled(back, grid, aligned) - places).reshape(back.shape))
+    return np.asarray((places + back.reshape(-1, 3) - _by(alignment, places)).reshape(back.shape))
+
+
+def _by(alignment: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(points @ alignment[:3, :3].T + alignment[:3, 3])
