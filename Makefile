@@ -89,6 +89,7 @@ export-check: install
 	command -v ccx > /dev/null || { [ "$$(id -u)" = 0 ] && command -v apt-get > /dev/null && \
 	  apt-get install --yes --no-install-recommends calculix-ccx; } || \
 	  echo "CalculiX is not installed: its lines will have no figure"
+	$(BIN)/python -m pytest tests/export/test_notebook.py
 	$(BIN)/python benchmarks/export_check.py
 
 clean:
