@@ -26,9 +26,11 @@ from palpate.export.fitted_model import fitted_model
 from palpate.export.groups import element_faces, face_groups, plain_names
 from palpate.images.alignment import RigidMotion
 from palpate.images.label_image import VoxelGrid
+from palpate.mechanics.laws.contract import energy
 from palpate.mesh.space import lagrange_space
 from palpate.mesh.surface import triangle_normals
 from palpate.mesh.tet_mesh import FACES
+from palpate.study.case import CaseLoad
 
 VOLUME = 1e-4  # relative
 LPS = np.array([-1.0, -1.0, 1.0])
@@ -370,3 +372,62 @@ def test_the_scripts_of_viewers_load_files_that_are_there(exported, monkeypatch,
     assert len(loaded) >= (12 if name == "slicer" else 1)
     assert all((folder / path).is_file() for path in loaded)
     assert json.loads((folder / "scene.json").read_text())["schema"] == f"palpate.{name}/1"
+
+
+def with_mechanics(result, law, loads=()):
+    mechanics = dataclasses.replace(result.case.mechanics, law=law)
+    return dataclasses.replace(result, case=dataclasses.replace(result.case, mechanics=mechanics, loads=loads))
+
+
+def test_febio_and_sofa_have_our_energies(case_result, tmp_path):
+    """The formulae of their manuals, with the constants of the files, give the energy that we compute."""
+    F = np.eye(3) + 0.15 * np.random.default_rng(2).standard_normal((4, 3, 3))
+    C = np.einsum("nki,nkj->nij", F, F)
+    first, log = np.einsum("nii->n", C), np.log(np.linalg.det(F))
+    second = 0.5 * (first**2 - np.einsum("nij,nij->n", C, C))
+    shear, lame = 58.9 / 2.9, 58.9 * 0.45 / (1.45 * 0.1)
+    result = with_mechanics(case_result, "mooney-rivlin")
+    palpate.export(result, tmp_path, format="febio", linear=True)
+    material = ET.parse(tmp_path / "palpate.feb").find("Material/material")
+    assert material.get("type") == "coupled Mooney-Rivlin"
+    c1, c2, k = (float(material.find(key).text) for key in ("c1", "c2", "k"))
+    theirs = c1 * (first - 3) + c2 * (second - 3) - 2 * (c1 + 2 * c2) * log + k / 2 * log**2
+    ours = energy(result.case.mechanics.material_law, F, mu=shear, lame=lame)
+    np.testing.assert_allclose(theirs, ours, rtol=1e-9)
+    palpate.export(case_result, tmp_path / "sofa", format="sofa")
+    tissue = json.loads((tmp_path / "sofa" / "model.json").read_text())["tissues"][0]
+    mu, lame_there = map(float, tissue["parameters"]["ParameterSet"].split())
+    theirs = mu / 2 * (first - 3) - mu * log + lame_there / 2 * log**2
+    np.testing.assert_allclose(
+        theirs, energy(case_result.case.mechanics.material_law, F, mu=shear, lame=lame), rtol=1e-9
+    )
+
+
+def test_the_linear_law_is_a_linear_step(case_result, tmp_path):
+    palpate.export(with_mechanics(case_result, "linear"), tmp_path, format="abaqus", linear=True)
+    text = (tmp_path / "palpate.inp").read_text()
+    assert "*MATERIAL, NAME=PROSTATE\n*ELASTIC\n58.9, 0.45\n" in text
+    assert "NLGEOM" not in text
+
+
+def test_known_loads_keep_their_sum(case_result, tmp_path, model):
+    """Weight as forces on nodes, a pressure on the faces of the outer boundary; SOFA's scene says that it has none."""
+    weight = CaseLoad("gravity", acceleration_m_s2=(0.0, -9.81, 0.0))
+    pressed = CaseLoad("pressure", surface="outer", pressure_kpa=2.0)
+    result = with_mechanics(case_result, "neo-hookean", (weight, pressed))
+    palpate.export(result, tmp_path / "abaqus", format="abaqus", linear=True)
+    text = (tmp_path / "abaqus" / "palpate.inp").read_text()
+    rows = text.split("*CLOAD\n")[1].split("*")[0].split("\n")[:-1]
+    forces = np.array([[float(x) for x in row.split(",")] for row in rows])
+    assert set(forces[:, 1]) == {2.0}
+    mass_kg = 1e-6 * model.bodies[0].mesh.volumes.sum()
+    assert forces[:, 2].sum() == pytest.approx(-9.81e3 * mass_kg, rel=1e-6)  # mN
+    faces = text.split("*DLOAD\n")[1].split("*")[0].split("\n")[:-1]
+    (outer,) = [group for group in face_groups(model.bodies[0].mesh) if group.name == "outer boundary"]
+    assert len(faces) == len(outer.triangles)
+    assert all(row.endswith(", 2") for row in faces)
+    palpate.export(result, tmp_path / "febio", format="febio", linear=True)
+    root = ET.parse(tmp_path / "febio" / "palpate.feb").getroot()
+    assert [load.get("type") for load in root.find("Loads")] == ["nodal_force", "pressure"]
+    with pytest.raises(ConfigurationError, match="neither known loads"):
+        palpate.export(result, tmp_path / "sofa", format="sofa")
