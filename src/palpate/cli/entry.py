@@ -91,10 +91,10 @@ def _run(arguments: argparse.Namespace, written: list[str]) -> Outcome:
     command: Callable[..., Outcome] = arguments.command
     case = _case(arguments)
     progress = Console(arguments.quiet).progress
-    if arguments.output is None:
+    if arguments.output is None or getattr(arguments, "task", None) is not None:  # a task's folder is another run's
         return command(arguments, case, None, progress)
     if not arguments.makes_folder and not arguments.output.is_dir():
-        raise InputDataError(f"there is no folder {arguments.output}; name the output folder of an estimate")
+        raise InputDataError(f"there is no folder {arguments.output}; name the output folder of an earlier run")
     heading = f"palpate {version()}: {' '.join(sys.argv[1:])}"
     outputs = OutputFolder(arguments.output, written)
     with output_folder(outputs, heading, logs=arguments.logs):

@@ -19,7 +19,7 @@ from palpate.study.case import Case
 
 __all__ = ["ExpectedCost", "expected_cost", "expected_tets", "free_memory_gb"]
 
-LATTICE = 96  # points of the lattice along the longest side, on which edge lengths are summed
+LATTICE = 96  # points of the lattice along the longest side, on which edge lengths are summed: a second or so
 # Fitted to the runs of benchmarks/cost.py (docs/command-line.md), on two cores of a 2.1 GHz server.
 TETS_A_CUBE = 19.4  # tetrahedra in a cube of the wanted edge length: 17 in smooth phantoms, 31 in a real pelvis
 UNKNOWNS_A_TET = {"P1": 0.62, "P2": 4.4}
@@ -48,13 +48,15 @@ class ExpectedCost:
     processors: int
 
 
-def expected_cost(case: Case, before: Segmentation, after: tuple[Segmentation, ...], *, n_pairs: int) -> ExpectedCost:
+def expected_cost(
+    case: Case, before: Segmentation, after: tuple[Segmentation, ...], *, n_pairs: int, lattice: int = LATTICE
+) -> ExpectedCost:
     """The cost of estimating a case on this machine, from its first pair of images; further pairs cost the same each.
 
     Tetrahedra from the sum of 1 / h^3 over the meshed volume, h the mesher's own edge length there; memory and time
     from unknowns, modes, images and solver, with measured constants. The report is included, other programs are not.
     """
-    tets = expected_tets(case, before, after)
+    tets = expected_tets(case, before, after, lattice=lattice)
     unknowns = int(tets * UNKNOWNS_A_TET.get(case.mechanics.element, UNKNOWNS_A_TET["P2"]))
     solver, solving = expected_of_size(unknowns, case.driver.modes + SERIES, solver=case.mechanics.solver)
     drivers = max(sum(tissue.role is Role.DRIVER for tissue in before.tissues), 1)
@@ -76,10 +78,10 @@ def expected_cost(case: Case, before: Segmentation, after: tuple[Segmentation, .
     )
 
 
-def expected_tets(case: Case, before: Segmentation, after: tuple[Segmentation, ...]) -> int:
-    """Number of tetrahedra in the mesh of a reference state."""
+def expected_tets(case: Case, before: Segmentation, after: tuple[Segmentation, ...], *, lattice: int = LATTICE) -> int:
+    """Number of tetrahedra in the mesh of a reference state; `lattice`: points along the longest side, to sum over."""
     box = case_domain(before, after, case)
-    index, cell = _lattice(before, box)
+    index, cell = _lattice(before, box, lattice)
     inside = index >= 0
     edge = case.mesh.edge_length_mm
     sizes = np.full(index.shape, COARSEST * edge)
@@ -100,9 +102,9 @@ def free_memory_gb() -> float | None:
     return None if free is None else free / 1e9
 
 
-def _lattice(before: Segmentation, box: Box) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _lattice(before: Segmentation, box: Box, points: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Tissue (n_1, n_2, n_3) at the middles of cells that fill the box, -1 outside the image; their edges (3,) mm."""
-    counts = np.maximum(np.ceil(box.lengths / box.lengths.max() * LATTICE), 4).astype(int)
+    counts = np.maximum(np.ceil(box.lengths / box.lengths.max() * points), 4).astype(int)
     cell = box.lengths / counts
     ticks = [(np.arange(n) + 0.5) * size for n, size in zip(counts, cell, strict=True)]
     local = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)

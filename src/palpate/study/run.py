@@ -42,10 +42,22 @@ def silent(message: str) -> None:
     del message
 
 
-def estimate(case: Case, *, progress: Progress = silent, truth: Mapping[str, float] | None = None) -> CaseResult:
+def unconditional(states: ImagedStates, n_pairs: int) -> None:
+    """An estimate goes on once its images are read, whatever they show."""
+    del states, n_pairs
+
+
+def estimate(
+    case: Case,
+    *,
+    progress: Progress = silent,
+    truth: Mapping[str, float] | None = None,
+    condition: Callable[[ImagedStates, int], None] = unconditional,
+) -> CaseResult:
     """Estimate the Young's modulus of every `estimate` tissue of a case, from its images or its phantom.
 
-    `truth`: true moduli (kPa) by tissue, to stand beside the estimates of a simulation; a phantom brings its own.
+    `truth`: true moduli (kPa) by tissue, to stand beside the estimates of a simulation; a phantom brings its own;
+    `condition`: is asked once the images are read, with the first states and the number of pairs, and may raise.
     Raises `PalpateError`s of reading, meshing and solving; an iteration that did not converge is no error but a
     result whose status says so, with no values.
     """
@@ -53,6 +65,7 @@ def estimate(case: Case, *, progress: Progress = silent, truth: Mapping[str, flo
     refuse_what_cannot_be_estimated(case)
     progress("reading and aligning the images")
     states, further = read_states(case), read_pairs(case)
+    condition(states, 1 + len(further))
     truth = _truth(states) if case.phantom else truth
     inputs = input_digests(case, states.inputs, *(pair.inputs for pair in further))
     seconds = time.perf_counter() - began
