@@ -42,7 +42,7 @@ def cohort_page(records: Sequence[Record], document: Mapping[str, Any], *, creat
     environment.filters["interval"] = lambda ends: interval_text(None if ends is None else tuple(ends))
     charts = {tissue: _charts(document, tissue, place) for place, tissue in enumerate(document["organs"])}
     shown = [record for record in records if record.state == "failed"] + [r for r in records if r.state != "failed"]
-    return environment.get_template("cohort.html").render(
+    page: str = environment.get_template("cohort.html").render(
         records=shown[:MOST_ROWS],
         left_out=len(shown[MOST_ROWS:]),
         document=document,
@@ -51,6 +51,7 @@ def cohort_page(records: Sequence[Record], document: Mapping[str, Any], *, creat
         version=version,
         policy=POLICY,
     )
+    return page
 
 
 def _charts(document: Mapping[str, Any], tissue: str, place: int) -> tuple[_Chart, ...]:

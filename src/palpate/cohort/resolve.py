@@ -62,7 +62,8 @@ def row_key(row: Row, overrides: Iterable[str] = ()) -> str:
         case = case_of(row, overrides)
         tables: Any = case_tables(replace(case, patient=case.id, stage=None), _content)
     except PalpateError as error:
-        tables = [asdict(replace(row, covariates={})), str(error)]
+        said = replace(row, patient=row.id, session="", stage=None, covariates={})
+        tables = [asdict(said), str(error)]
     versions = {name: found for name, found in software_versions().items() if name not in NOT_NUMERICAL}
     text = json.dumps({"case": tables, "versions": versions}, sort_keys=True)
     return hashlib.sha256(text.encode("utf-8", errors="surrogatepass")).hexdigest()

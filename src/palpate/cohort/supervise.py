@@ -21,6 +21,7 @@ __all__ = ["ESTIMATE", "Supervisor"]
 ESTIMATE = "palpate.cohort.work:estimate_row"
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 LOOK_S = 0.1  # how often memory is looked at
+START_S = 600.0  # for the warm process to import what it needs
 BEFORE_PREDICTION_S = 3600.0  # for the images, each of which has limits of its own
 MUCH = 0.5  # of the limit on memory: a child that the system kills beyond that was most likely too large
 READ_SIZE = 65536
@@ -41,7 +42,6 @@ class Supervisor:
 
     def attempt(self, task: Task) -> Outcome:
         """What one attempt of a task comes to; whatever happens to the child is an outcome, and the next one is new."""
-        began = time.monotonic()
         watch = _Watch(task)
         try:
             process = self._started()
@@ -49,10 +49,10 @@ class Supervisor:
             while watch.ended is None:
                 for message in self._heard(process, LOOK_S):
                     watch.hear(message)
-                watch.look(time.monotonic() - began)
+                watch.look()
         except (OSError, EOFError):
             self._drop()
-        return watch.verdict(time.monotonic() - began)
+        return watch.verdict()
 
     def close(self) -> None:
         """End the process, and with it the child; from any thread."""
@@ -98,6 +98,7 @@ class _Watch:
 
     task: Task
     pid: int = 0
+    began: float = field(default_factory=time.monotonic)  # of the child, once there is one
     expected_gb: float | None = None
     memory_gb: float = float("inf")  # limits
     seconds: float = BEFORE_PREDICTION_S
@@ -116,7 +117,7 @@ class _Watch:
     def hear(self, message: dict[str, Any]) -> None:
         """Take one message."""
         if "pid" in message:
-            self.pid = int(message["pid"])
+            self.pid, self.began = int(message["pid"]), time.monotonic()
         elif "expected" in message:
             self.expected_gb, seconds = map(float, message["expected"])
             self.memory_gb = self.task.limits.memory_for(self.expected_gb)
@@ -126,8 +127,11 @@ class _Watch:
         else:
             self.ended, self.peak_gb = int(message["ended"]), max(float(message["peak_gb"]), self.peak_gb)
 
-    def look(self, seconds: float) -> None:
-        """End the child when it runs over a limit."""
+    def look(self) -> None:
+        """End the child when it runs over a limit; raises `EOFError` when none comes."""
+        seconds = time.monotonic() - self.began
+        if not self.pid and seconds > START_S:
+            raise EOFError
         if self.ended is not None or self.outcome is not None or not self.pid or self.stopped:
             return
         try:
@@ -148,8 +152,9 @@ class _Watch:
             except OSError:  # it has just ended, or its group has
                 continue
 
-    def verdict(self, seconds: float) -> Outcome:
+    def verdict(self) -> Outcome:
         """The outcome that the child told, or what its end means."""
+        seconds = time.monotonic() - self.began
         told = self.outcome if self.outcome is not None and not self.stopped else self._sudden_end()
         expected = told.expected_gb if self.expected_gb is None else self.expected_gb
         return told.took(seconds, expected_gb=expected, peak_gb=round(self.peak_gb, 3))

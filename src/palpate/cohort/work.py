@@ -13,12 +13,13 @@ from palpate.cohort.resolve import case_of, row_key
 from palpate.cohort.task import Outcome, Task, failure_class_of
 from palpate.errors import EstimationError, InputDataError, PalpateError
 from palpate.images.named_labels import printable
+from palpate.memory import peak_memory_gb
 from palpate.steps.saving import save_estimate, save_failure
 from palpate.study import run
 from palpate.study.body import ImagedStates
 from palpate.study.case import Case
 from palpate.study.case_as_run import refuse_other_case
-from palpate.study.cost import ExpectedCost, expected_cost
+from palpate.study.cost import expected_cost
 from palpate.study.outputs import OutputFolder
 
 __all__ = ["RoomError", "Tell", "estimate_row"]
@@ -72,10 +73,14 @@ def _attempt(task: Task, tell: Tell) -> Outcome:
 
 
 def _estimated(task: Task, case: Case, key: str, outputs: OutputFolder, tell: Tell) -> Outcome:
+    began, expected = time.monotonic(), list[float]()
+
     def condition(states: ImagedStates, n_pairs: int) -> None:
         """Say what the estimate will take, and leave it when that is not there."""
         cost = expected_cost(case, states.before, states.after, n_pairs=n_pairs, lattice=LATTICE)
-        _refuse_without_room(task, cost)
+        if task.room_gb is not None and cost.memory_gb > task.room_gb:
+            raise RoomError(cost.memory_gb)
+        expected.append(cost.memory_gb)
         tell(cost.memory_gb, cost.seconds)
 
     try:
@@ -83,20 +88,16 @@ def _estimated(task: Task, case: Case, key: str, outputs: OutputFolder, tell: Te
     except EstimationError as error:
         save_failure(case, error, outputs)
         raise
-    began = time.perf_counter()
     document = save_estimate(result, outputs, progress=LOGGER.info)
     if row_key(task.row, task.overrides) != key:
         raise InputDataError("an input was changed while it was used; run the cohort again, with --resume")
     if document["status"] != "converged":
         return Outcome.failed(task, "solver", f"{document['status']}: {printable(document['reason'])}")
-    LOGGER.info("files written in %.1f s", time.perf_counter() - began)
     outcome = Outcome(task.row.id, "done", key, message=" ".join(task.remarks), attempts=task.attempt)
-    return write_mark(outputs.path, outcome)
-
-
-def _refuse_without_room(task: Task, cost: ExpectedCost) -> None:
-    if task.room_gb is not None and cost.memory_gb > task.room_gb:
-        raise RoomError(cost.memory_gb)
+    took = outcome.took(
+        time.monotonic() - began, expected_gb=expected[0] if expected else None, peak_gb=peak_memory_gb()
+    )
+    return write_mark(outputs.path, took)
 
 
 def _coarser(case: Case, factor: float) -> Case:

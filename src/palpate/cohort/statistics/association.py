@@ -17,6 +17,7 @@ from scipy import stats
 __all__ = ["Association", "PerPatient", "PerScan", "association", "pearson_p", "points_behind"]
 
 DRAWS = 2000
+TAU_DRAWS = 500  # of them, for Kendall's tau, which takes long
 MOST_POINTS = 2000
 FEWEST = 3  # points of a correlation
 
@@ -73,9 +74,9 @@ def association(values: Sequence[Array], stages: Array, *, seed: int) -> Associa
     words = _undefined(stages, medians, "patient"), _undefined(of_scans, scans, "scan")
     draws = [] if words[0] or words[1] else _draws(stages, medians, seed)
 
-    def interval(of: Callable[[Array, Array], float]) -> Interval | None:
+    def interval(of: Callable[[Array, Array], float], most: int = DRAWS) -> Interval | None:
         """Of a statistic of the patients' stages and medians."""
-        return _middle([of(stages[d], medians[d]) for d in draws])
+        return _middle([of(stages[d], medians[d]) for d in draws[:most]])
 
     of_all = [
         _r(np.repeat(stages[d], [len(values[i]) for i in d]), np.concatenate([values[i] for i in d])) for d in draws
@@ -98,7 +99,7 @@ def association(values: Sequence[Array], stages: Array, *, seed: int) -> Associa
         tau=float(ordered.statistic),
         tau_p=float(ordered.pvalue),
         rho_interval95=interval(lambda x, y: _r(stats.rankdata(x), stats.rankdata(y))),
-        tau_interval95=interval(lambda x, y: float(stats.kendalltau(x, y).statistic)),
+        tau_interval95=interval(lambda x, y: float(stats.kendalltau(x, y).statistic), TAU_DRAWS),
     )
     return Association(per_scan, per_patient)
 
