@@ -62,6 +62,16 @@ def make_table(folder: Path, rows: int, *, bodies: int = 3) -> Path:
     return table
 
 
+def make_stub_table(folder: Path, rows: int) -> Path:
+    """A table of rows that only write files, for a third of a second each; gives its path."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "template.toml").write_text(TEMPLATE)
+    lines = [f"r{row},P{row // 2},{row % 2},{1 + row // 2 % 3},b{row}.nii.gz,a.nii.gz,0.3" for row in range(rows)]
+    table = folder / "cohort.csv"
+    table.write_text("\n".join(["id,patient,session,stage,before,after,seconds", *lines]) + "\n")
+    return table
+
+
 def numbers_of(folder: Path) -> dict[str, Any]:
     """What must be the same in two runs of a cohort: every number of every result, nothing of time or place."""
     found: dict[str, Any] = {}

@@ -2,6 +2,7 @@
 
     python benchmarks/cohort_kills.py --engine local --runs 100    # hours: each run computes small real cases
     python benchmarks/cohort_kills.py --engine dask --runs 100
+    python benchmarks/cohort_kills.py --engine local --runs 100 --stub    # minutes: rows that only write files
 
 Each run is killed once at a random moment of its time: the whole run, a warm worker, the child that computes, or (dask)
 the scheduler or a Dask worker; then resumed until it ends by itself. Its results must be those of the undisturbed run
@@ -26,13 +27,14 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from cohort_case import make_table, numbers_of
+from cohort_case import make_stub_table, make_table, numbers_of
 
 PALPATE = [sys.executable, "-m", "palpate"]
 MOST_RESUMES = 6
 TARGETS = {"local": ("run", "worker", "child"), "dask": ("run", "scheduler", "dask worker", "worker", "child")}
 QUIET = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
 WARM = "palpate.cohort.warm"
+STUB = Path(__file__).with_name("cohort_stub.py")
 
 
 class Cluster:
@@ -71,7 +73,9 @@ class Cluster:
 
     @staticmethod
     def _popen(arguments: list[str]) -> subprocess.Popen[bytes]:
-        return subprocess.Popen([sys.executable, "-m", "distributed.cli.dask_" + arguments[0], *arguments[1:]], **QUIET)  # type: ignore[call-overload,no-any-return]
+        command = [sys.executable, "-m", "distributed.cli.dask_" + arguments[0], *arguments[1:]]
+        environment = {**os.environ, "PYTHONPATH": str(STUB.parent)}
+        return subprocess.Popen(command, env=environment, **QUIET)  # type: ignore[call-overload,no-any-return]
 
 
 def children(pid: int) -> list[int]:
@@ -113,7 +117,11 @@ def victim(target: str, run: int, cluster: Cluster | None) -> int | None:
 
 
 def cohort(table: Path, output: Path, cluster: Cluster | None, *more: str) -> subprocess.Popen[bytes]:
-    """Start the command."""
+    """Start the command, or the same with rows that only write files."""
+    if "stub" in table.parent.name:
+        scheduler = [] if cluster is None else ["--scheduler", cluster.address]
+        command = [sys.executable, str(STUB), "run", str(table), str(output), *scheduler, *more]
+        return subprocess.Popen(command, **QUIET)  # type: ignore[call-overload,no-any-return]
     engine = ["--workers", "2"] if cluster is None else ["--engine", "dask", "--scheduler", cluster.address]
     command = [*PALPATE, "cohort", str(table), "--template", str(table.with_name("template.toml"))]
     return subprocess.Popen([*command, "--output", str(output), *engine, "--quiet", *more], **QUIET)  # type: ignore[call-overload,no-any-return]
@@ -169,12 +177,14 @@ def main() -> int:
     parser.add_argument("--engine", choices=tuple(TARGETS), default="local")
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--rows", type=int, default=3)
+    parser.add_argument("--stub", action="store_true", help="rows that only write files")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--port", type=int, default=18786)
     arguments = parser.parse_args()
     random.seed(arguments.seed)
     with tempfile.TemporaryDirectory() as place, clusters(arguments.engine, arguments.port) as cluster:
-        table = make_table(Path(place) / "data", arguments.rows)
+        folder = Path(place) / ("stub" if arguments.stub else "data")
+        table = make_stub_table(folder, arguments.rows) if arguments.stub else make_table(folder, arguments.rows)
         output = Path(place) / "study"
         began = time.monotonic()
         if cohort(table, output, cluster).wait() != 0:
@@ -190,7 +200,13 @@ def main() -> int:
             if wrong or told["exit_codes"][-1] != 0:
                 faults.append(told | {"fault": wrong})
             print(json.dumps({"run": number + 1} | told | {"fault": wrong}), file=sys.stderr, flush=True)
-    summary = {"engine": arguments.engine, "runs": arguments.runs, "rows": arguments.rows, "kills": dict(kills)}
+    summary = {
+        "engine": arguments.engine,
+        "runs": arguments.runs,
+        "rows": arguments.rows,
+        "stub": arguments.stub,
+        "kills": dict(kills),
+    }
     print(json.dumps(summary | {"undisturbed_s": round(whole, 1), "faults": faults}, indent=1))
     return 1 if faults else 0
 
