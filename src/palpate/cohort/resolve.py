@@ -78,15 +78,15 @@ def _content(path: Path) -> str:
     """Digest of an input: a file, with those of its folder where it may be read with them, or a folder's files."""
     try:
         if path.is_dir():
-            return _of_folder(path)
-        beside = _of_folder(path.parent) if path.suffix.lower() in HEADERS and path.exists() else ""
-        return _of_file(path) + beside
+            return _of_files(path.iterdir())
+        beside = path.suffix.lower() in HEADERS and path.exists()  # a DICOM series may be one folder below
+        return _of_file(path) + (_of_files([*path.parent.glob("*"), *path.parent.glob("*/*")]) if beside else "")
     except OSError as error:
         return f"unreadable: {error.strerror}"
 
 
-def _of_folder(folder: Path) -> str:
-    files = sorted(path for path in folder.iterdir() if path.is_file())
+def _of_files(paths: Iterable[Path]) -> str:
+    files = sorted(path for path in paths if path.is_file())
     text = "\n".join(f"{path.name} {_of_file(path)}" for path in files)
     return hashlib.sha256(text.encode("utf-8", errors="surrogateescape")).hexdigest()
 
