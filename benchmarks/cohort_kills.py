@@ -132,7 +132,9 @@ def disturbed(table: Path, output: Path, cluster: Cluster | None, target: str, a
     shutil.rmtree(output, ignore_errors=True)
     run = cohort(table, output, cluster)
     time.sleep(after)
-    pid = victim(target, run.pid, cluster) if run.poll() is None else None
+    pid = None
+    while run.poll() is None and (pid := victim(target, run.pid, cluster)) is None:
+        time.sleep(0.01)  # it has not begun, or is between two rows
     if pid is not None:
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
