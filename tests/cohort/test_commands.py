@@ -59,6 +59,17 @@ def test_a_missing_library_is_named_before_anything_is_computed(table, tmp_path,
     assert "pip install 'palpate[cluster]'" in capsys.readouterr().err
 
 
+def test_a_table_of_somebodys_own_is_never_replaced(table, tmp_path, capsys):
+    assert main(["cohort", str(table), "--output", str(tmp_path)]) == 2
+    assert "is an input of this run" in capsys.readouterr().err
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/cohort.csv").write_text("mine")
+    assert main(["cohort", str(table), "--output", str(tmp_path / "out")]) == 2
+    assert "of no cohort of Palpate's" in capsys.readouterr().err
+    assert (tmp_path / "out/cohort.csv").read_text() == "mine"
+    assert table.read_text() == TABLE
+
+
 def test_there_is_no_status_of_a_folder_without_a_cohort(tmp_path, capsys):
     assert main(["status", str(tmp_path)]) == 3
     assert "plan.json" in capsys.readouterr().err

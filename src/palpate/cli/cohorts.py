@@ -21,19 +21,21 @@ __all__ = ["TARGETS", "cohort", "statistics", "status"]
 
 Progress = Callable[[str], None]
 
+INTERRUPTED = "the plan and the rows that are done, with which --resume goes on"
 TARGETS = ("cohort.csv", "cohort.parquet", "cohort.html", "statistics.json", "plan.json")
 
 
 def cohort(arguments: argparse.Namespace, _: None, outputs: OutputFolder | None, progress: Progress) -> Outcome:
     """Compute the rows of a table, or a part of them that SLURM asks for."""
-    from palpate.cohort.run import Options, run_cohort
     from palpate.cohort.tables import require_tables
-    from palpate.cohort.task import Limits
 
     if arguments.task is not None:
         return _task(arguments, progress)
-    assert outputs is not None
     require_tables()
+    from palpate.cohort.run import Options, run_cohort
+    from palpate.cohort.task import Limits
+
+    assert outputs is not None
     rows = _rows(arguments)
     engine = _engine(arguments, outputs.path)
     options = Options(
@@ -43,7 +45,11 @@ def cohort(arguments: argparse.Namespace, _: None, outputs: OutputFolder | None,
         only_failed=arguments.only_failed,
         workers=arguments.workers,
     )
-    records = run_cohort(rows, outputs.path, engine, options, progress=progress)
+    try:
+        records = run_cohort(rows, outputs.path, engine, options, progress=progress)
+    except KeyboardInterrupt:
+        outputs.written.append(INTERRUPTED)
+        raise
     return _told(records, outputs.path)
 
 
@@ -58,6 +64,9 @@ def status(arguments: argparse.Namespace, _: None, outputs: None, progress: Prog
 
 def statistics(_: argparse.Namespace, case: None, outputs: OutputFolder, progress: Progress) -> Outcome:
     """Compute the statistics of a cohort from its files."""
+    from palpate.cohort.tables import require_tables
+
+    require_tables()
     from palpate.cohort.closing import close_cohort
     from palpate.cohort.plan import read_plan
     from palpate.study.outputs import read_json

@@ -115,7 +115,7 @@ def _case(arguments: argparse.Namespace) -> Case | None:
 def _spare_inputs(arguments: argparse.Namespace, case: Case | None, outputs: OutputFolder) -> None:
     """Refuse to write an output in the place of an input."""
     given = () if case is not None and not arguments.set else getattr(arguments, "inputs", ())  # a case stays as it is
-    inputs: list[Path | None] = [*given, getattr(arguments, "labels", None)]
+    inputs: list[Path | None] = [*given, *(getattr(arguments, name, None) for name in ("labels", "table", "template"))]
     if case is not None and case.images is not None:
         images = case.images
         inputs += [images.before, *images.after, images.names, images.intensities_before, *images.intensities_after]

@@ -118,7 +118,7 @@ def forest_svg(patients: Patients, tissue: str, unit: str, *, name: str) -> str:
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_xlabel(_axis(unit))
 
-    return draw_svg(draw, size=(6.4, height), name=name)
+    return draw_svg(draw, size=(SIZE[0], height), name=name)
 
 
 def _stages(patients: Patients, tissue: str) -> list[int]:

@@ -16,6 +16,7 @@ from palpate.cohort.mark import MARK
 from palpate.cohort.plan import CASES, PLAN, Plan, make_plan, write_plan
 from palpate.cohort.progress import Tally
 from palpate.cohort.records import Record
+from palpate.cohort.tables import CSV, PARQUET
 from palpate.cohort.task import Limits, Outcome, Row
 from palpate.errors import ConfigurationError, PalpateError
 from palpate.study.outputs import make_folder
@@ -55,6 +56,9 @@ def run_cohort(
             f"{folder} has a cohort already: --resume goes on with it, --only-failed computes what failed there again;"
             " or choose another --output folder"
         )
+    foreign = [name for name in (CSV, PARQUET) if not (folder / PLAN).exists() and (folder / name).exists()]
+    if foreign:
+        raise ConfigurationError(f"{folder / foreign[0]} is of no cohort of Palpate's, and would be replaced: move it")
     progress(f"{len(rows)} rows: reading what each depends on")
     began = datetime.now(UTC).isoformat(timespec="seconds")
     plan = make_plan(rows, options.overrides, engine=engine.name, workers=options.workers, began=began)
@@ -64,7 +68,7 @@ def run_cohort(
     for number in wanted:
         (folder / CASES / rows[number].id / MARK).unlink(missing_ok=True)
     write_plan(plan, folder)
-    kept = Counter(mark.state for number, mark in enumerate(marks) if mark is not None and number not in set(wanted))
+    kept = Counter(mark.state for mark in marks if mark is not None and not _is_wanted(mark, options))
     if kept:
         progress(f"{kept['done']} done and {kept['failed']} failed before; {len(wanted)} to compute")
     tally = Tally(len(rows), len(wanted), kept)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import queue
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 from palpate.cohort.engines.packing import Place, packed
 from palpate.cohort.supervise import ESTIMATE, Supervisor
 from palpate.cohort.task import Outcome, Task
+from palpate.errors import ResourceError
 from palpate.memory import available_memory
 from palpate.parallel import processors
 
@@ -38,7 +40,9 @@ class LocalEngine:
         return "local"
 
     def outcomes(self, tasks: Sequence[Task]) -> Iterator[Outcome]:
-        """The outcome of each task; memory is shared by what is predicted, with a few workers at most."""
+        """The outcome of each task; memory is shared by what is predicted. Raises `ResourceError` on Windows."""
+        if not hasattr(os, "fork"):
+            raise ResourceError("cohorts need a system that forks processes: Linux or macOS, or a Dask worker on one")
         workers = max(min(self.workers or processors(), len(tasks)), 1)
         threads = max(processors() // workers, 1)
         pool = _Processes([Supervisor(self.work, threads) for _ in range(workers)], self._memory_gb())
