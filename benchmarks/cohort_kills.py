@@ -24,17 +24,24 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 from cohort_case import make_stub_table, make_table, numbers_of
 
+from cohort_stub import WORK, run
+from palpate.cohort.engines.contract import Engine
+from palpate.cohort.engines.dask import DaskEngine
+from palpate.cohort.engines.local import LocalEngine
+from palpate.errors import PalpateError
+
 PALPATE = [sys.executable, "-m", "palpate"]
 MOST_RESUMES = 6
 TARGETS = {"local": ("run", "worker", "child"), "dask": ("run", "scheduler", "dask worker", "worker", "child")}
 QUIET = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+NOTHING = "nothing"
 WARM = "palpate.cohort.warm"
-STUB = Path(__file__).with_name("cohort_stub.py")
 
 
 class Cluster:
@@ -74,7 +81,7 @@ class Cluster:
     @staticmethod
     def _popen(arguments: list[str]) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", "distributed.cli.dask_" + arguments[0], *arguments[1:]]
-        environment = {**os.environ, "PYTHONPATH": str(STUB.parent)}
+        environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
         return subprocess.Popen(command, env=environment, **QUIET)  # type: ignore[call-overload,no-any-return]
 
 
@@ -116,12 +123,38 @@ def victim(target: str, run: int, cluster: Cluster | None) -> int | None:
     return random.choice(choices) if choices else None
 
 
-def cohort(table: Path, output: Path, cluster: Cluster | None, *more: str) -> subprocess.Popen[bytes]:
+class Forked:
+    """A run of stub work in a child of this process, which has imported everything; what is needed of a `Popen`."""
+
+    def __init__(self, table: Path, output: Path, scheduler: str | None, resume: bool) -> None:
+        engine = DaskEngine(scheduler, 2, WORK) if scheduler else LocalEngine(2, work=WORK)
+        options = {"engine": engine, "resume": resume}
+        self._process = get_context("fork").Process(target=_stub_run, args=(table, output), kwargs=options)
+        self._process.start()
+        self.pid = int(self._process.pid or 0)
+
+    def poll(self) -> int | None:
+        """Exit code; None while it runs."""
+        return self._process.exitcode
+
+    def wait(self) -> int:
+        """Exit code, when it has ended."""
+        self._process.join()
+        return int(self._process.exitcode or 0)
+
+
+def _stub_run(table: Path, output: Path, *, engine: Engine, resume: bool) -> None:
+    os.setpgid(0, 0)
+    try:
+        raise SystemExit(run(table, output, engine=engine, resume=resume))
+    except PalpateError:
+        raise SystemExit(6) from None
+
+
+def cohort(table: Path, output: Path, cluster: Cluster | None, *more: str) -> Forked | subprocess.Popen[bytes]:
     """Start the command, or the same with rows that only write files."""
     if "stub" in table.parent.name:
-        scheduler = [] if cluster is None else ["--scheduler", cluster.address]
-        command = [sys.executable, str(STUB), "run", str(table), str(output), *scheduler, *more]
-        return subprocess.Popen(command, **QUIET)  # type: ignore[call-overload,no-any-return]
+        return Forked(table, output, None if cluster is None else cluster.address, "--resume" in more)
     engine = ["--workers", "2"] if cluster is None else ["--engine", "dask", "--scheduler", cluster.address]
     command = [*PALPATE, "cohort", str(table), "--template", str(table.with_name("template.toml"))]
     return subprocess.Popen([*command, "--output", str(output), *engine, "--quiet", *more], **QUIET)  # type: ignore[call-overload,no-any-return]
@@ -130,22 +163,22 @@ def cohort(table: Path, output: Path, cluster: Cluster | None, *more: str) -> su
 def disturbed(table: Path, output: Path, cluster: Cluster | None, target: str, after: float) -> dict[str, Any]:
     """One run that is killed at a moment, and resumed until it ends by itself."""
     shutil.rmtree(output, ignore_errors=True)
-    run = cohort(table, output, cluster)
+    started = cohort(table, output, cluster)
     time.sleep(after)
     pid = None
-    while run.poll() is None and (pid := victim(target, run.pid, cluster)) is None:
+    while started.poll() is None and (pid := victim(target, started.pid, cluster)) is None:
         time.sleep(0.01)  # it has not begun, or is between two rows
     if pid is not None:
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
-    codes = [run.wait()]
+    codes = [started.wait()]
     while codes[-1] != 0 and len(codes) <= MOST_RESUMES:
         if cluster is not None:
             cluster.start()
         codes.append(cohort(table, output, cluster, "--resume").wait())
     if cluster is not None:
         cluster.start()
-    return {"target": target if pid is not None else "nothing", "after_s": round(after, 2), "exit_codes": codes}
+    return {"target": target if pid is not None else NOTHING, "after_s": round(after, 2), "exit_codes": codes}
 
 
 def fault(output: Path, reference: dict[str, Any]) -> str:
@@ -196,7 +229,9 @@ def main() -> int:
         faults = []
         for number in range(arguments.runs):
             target = TARGETS[arguments.engine][number % len(TARGETS[arguments.engine])]
-            told = disturbed(table, output, cluster, target, random.uniform(0.0, whole))
+            told: dict[str, Any] = {"target": NOTHING}
+            while told["target"] == NOTHING:  # the run had ended by that moment
+                told = disturbed(table, output, cluster, target, random.uniform(0.0, 0.8 * whole))
             kills[told["target"]] += 1
             wrong = fault(output, reference)
             if wrong or told["exit_codes"][-1] != 0:
