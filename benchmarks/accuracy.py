@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 
 from palpate.images import Role
 from palpate.inversion import (
-    FittedState,
     InverseProblem,
     Inversion,
     InversionSettings,
@@ -33,13 +32,13 @@ from palpate.inversion import (
     Place,
     continue_at_finite_strain,
     exact_approximation,
-    imaging_errors,
     invert,
 )
 from palpate.mesh import LagrangeSpace, triangle_normals
 from palpate.observation import NoiseModel, fit_noise_model, observed_surface
 from palpate.phantoms import Noise, Scene
 from palpate.study import Body, Observed, conclude, fitted_states
+from palpate.uncertainty import FittedState, imaging_errors
 
 Array = NDArray[np.float64]
 Result = dict[str, Any]  # a line of JSON
@@ -172,8 +171,8 @@ def _uncertainty(
     found: Result = {
         "interval95": [e.ratio_interval95 for e in estimation.estimates],
         "verdict": [e.verdict for e in estimation.estimates],
-        "sd": np.sqrt(np.diag(estimation.covariance)).tolist(),
-        "grid_sd": np.sqrt(np.diag(estimation.grid_covariance)).tolist(),
+        "sd": np.sqrt(np.diag(estimation.covariance.total)).tolist(),
+        "grid_sd": np.sqrt(np.diag(estimation.covariance.grid)).tolist(),
     }
     if row.noise is not None:
         found["cramer_rao_sd"] = _cramer_rao_sd(at_truth(inversion, problem, scene), body, scene, row.noise)

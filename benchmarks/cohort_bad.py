@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 from cohort_case import TEMPLATE, make_table
 
-from palpate.images.readers import read_label_image, write_label_image
+from palpate.images import LabelImage, read_label_image, write_label_image
 
 BAD = ("usage", "input", "geometry", "solver", "resources", "crash", "timeout", "lost")
 SIGNALS = {"crash": signal.SIGSEGV, "timeout": signal.SIGSTOP, "lost": signal.SIGKILL}
@@ -42,7 +42,7 @@ def spoil(table: Path) -> None:
     inside = np.argwhere(labels == 1)
     labels[labels == 1] = 2
     labels[tuple(inside[:20].T)] = 1
-    write_label_image(folder / "thin.nii.gz", type(whole)(labels, whole.grid))
+    write_label_image(folder / "thin.nii.gz", LabelImage(labels, whole.grid))
     images = '[images]\nbefore = "before_0.nii.gz"\nafter = ["after_0.nii.gz"]\n'
     noisy = TEMPLATE.replace("surface_sd_mm = 0.5", "surface_sd_mm = 100.0\ncorrelation_length_mm = 100.0")
     (folder / "noisy.toml").write_text(noisy + images)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from palpate.images.readers import write_label_image
-from palpate.phantoms.spheres import SpheresOptions, spheres
-from palpate.study.outputs import read_json
+from palpate.images import write_label_image
+from palpate.phantoms import SpheresOptions, spheres
+from palpate.study import read_json
 
 TEMPLATE = """\
 [tissues.core]

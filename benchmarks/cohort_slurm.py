@@ -19,7 +19,7 @@ from typing import Any
 
 from cohort_case import make_table, numbers_of
 
-from palpate.study.outputs import read_json
+from palpate.study import read_json
 
 
 def cohort(table: Path, output: Path, *more: str) -> dict[str, Any]:

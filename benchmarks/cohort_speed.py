@@ -22,7 +22,7 @@ from typing import Any
 
 from cohort_case import make_table
 
-from palpate.study.outputs import read_json
+from palpate.study import read_json
 
 LINE = re.compile(r"^\[ *([0-9.]+) s\] (.*)$")
 

@@ -26,7 +26,7 @@ from palpate.cohort.progress import status_of
 from palpate.cohort.run import Options, run_cohort
 from palpate.cohort.table import read_table
 from palpate.cohort.task import Row
-from palpate.study.lock import held_folder
+from palpate.study import held_folder
 
 WORK = "cohort_stub_work:stub"
 

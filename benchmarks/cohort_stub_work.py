@@ -9,7 +9,7 @@ from typing import Any
 
 from palpate.cohort.mark import held_soon, read_mark, write_mark
 from palpate.cohort.task import Outcome, Task
-from palpate.study.outputs import staged, write_json
+from palpate.study import staged, write_json
 
 SIZE = 20_000  # characters of a result.json
 

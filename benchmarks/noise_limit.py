@@ -21,8 +21,8 @@ from cramer_rao import cramer_rao, efficient_gain, model_to_image, target_of
 from numpy.typing import NDArray
 
 from palpate.images import segment
-from palpate.inversion import Evaluation, gain, invert
-from palpate.observation import NoiseModel
+from palpate.inversion import Evaluation, invert
+from palpate.observation import NoiseModel, surface_distances
 from palpate.phantoms import pelvis_grid, reimaged
 from palpate.study import (
     Case,
@@ -32,8 +32,8 @@ from palpate.study import (
     aligned,
     fitted_states,
     inversion_settings,
-    surface_observations,
 )
+from palpate.uncertainty import gain
 
 ROW = ROWS["finite-noise"]
 CELLS_MM = (0.0, 2.0, 4.0, 6.0, 8.0)
@@ -76,7 +76,7 @@ def main() -> int:
         imaged = reimaged(replace(scene, seed=scene.seed + 1000 * draw), pelvis_grid(noisy), noise=NOISE)
         before, after = (segment(image, scene.tissues) for image in (imaged.before, imaged.after))
         states = aligned(before, (after,), method="none")
-        targets = [target_of(o) for o in surface_observations(replace(body, states=states), surfaces)[0]]
+        targets = [target_of(o) for o in surface_distances(replace(body, states=states).imaged(), surfaces)[0]]
         errors = np.concatenate(
             [
                 target.after.at(line.residuals.places[model_to_image(line)]) - target.rest_distance

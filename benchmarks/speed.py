@@ -39,8 +39,6 @@ from palpate.inversion import (
     invert,
     posterior_sd,
     reduced_basis,
-    sample_posterior,
-    sandwich_covariance,
 )
 from palpate.mechanics import expected_of_size, linear_model, outer_constraint
 from palpate.mesh import lagrange_space, tetrahedralise
@@ -56,6 +54,7 @@ from palpate.study import (
     inversion_settings,
     make_body,
 )
+from palpate.uncertainty import sample_posterior, sandwich_covariance
 
 PARTS = ("solver", "linear", "nonlinear", "gradient", "posterior", "scaling", "front_end", "default")
 IN_A_ROW = 20  # gradients, as an optimiser asks for them

@@ -20,7 +20,7 @@ STAGES = {  # functions whose time, with all that they call, is a stage of its o
     "tetrahedra remeshed": ("remeshing.py", "remeshed"),
     "surfaces fitted, tetrahedra smoothed": ("tetrahedralise.py", "_fitted"),
     "mesh gate": ("quality.py", "check_mesh"),
-    "distance maps and targets": ("body.py", "surface_observations"),
+    "distance maps and targets": ("surface_distance.py", "surface_distances"),
     "wall modes": ("prescribed_motion.py", "prescribed_motion"),
     "stiffness assembled": ("linear_model.py", "linear_model"),
     "finite-strain model": ("finite_strain.py", "finite_strain_model"),

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from palpate.findings import Finding
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.segmentation import segment
 from palpate.images.tissue import Role
@@ -20,8 +21,9 @@ from palpate.mesh.tet_mesh import OUTER, TetMesh
 from palpate.mesh.tetrahedralise import boundary_of
 from palpate.observation.contract import Fit
 from palpate.study.case import Case, CaseTissue, Images
-from palpate.study.estimation import Estimation, Iteration, ModulusEstimate, Remark, Start, TissueFit
+from palpate.study.estimation import Estimation, Iteration, ModulusEstimate, Start, TissueFit
 from palpate.study.result import CaseResult, MeshSummary, Provenance
+from palpate.uncertainty import Covariance
 
 sys.path.insert(0, str(Path(__file__).parent))  # tests are no package; dicom_files.py lies here
 
@@ -117,12 +119,12 @@ def make_estimation(displacement: np.ndarray) -> Estimation:
         status="converged",
         reason="the decrement fell under its tolerance",
         estimates=(make_estimate("prostate", 58.9, 60.0), make_estimate("bladder", 31.2)),
-        covariance=np.array([[0.01, -0.003], [-0.003, 0.06]]),
+        covariance=Covariance(np.array([[0.01, -0.003], [-0.003, 0.06]]), np.zeros((2, 2)), np.zeros((2, 2))),
         starts=tuple(make_start(ratio) for ratio in (0.5, 2.0, 8.0)),
         fits=((fit, dataclasses.replace(fit, tissue="bladder")),),
         displacements=(displacement,),
         counts={"forward": 3, "adjoint": 0, "tangent": 2, "factorisations": 4, "evaluations": 9},
-        remarks=(Remark("example", "a warning to be shown"),),
+        remarks=(Finding("example", "a warning to be shown"),),
         observations={"surface distance": "the distance between surfaces"},
     )
 

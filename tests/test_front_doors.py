@@ -9,7 +9,18 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-LAYERS = ("export", "images", "inversion", "mechanics", "mesh", "observation", "phantoms", "report", "study")
+LAYERS = (
+    "export",
+    "images",
+    "inversion",
+    "mechanics",
+    "mesh",
+    "observation",
+    "phantoms",
+    "report",
+    "study",
+    "uncertainty",
+)
 SCRIPTS = sorted(
     path.relative_to(ROOT)
     for folder in ("benchmarks", "examples", "src/palpate/experiments")

@@ -69,7 +69,7 @@ FILES = {
 }
 ESTIMATE_KEYS = {
     *("tissue", "parameter", "unit", "value", "interval95", "interval_kind", "relative_to", "ratio"),
-    *("ratio_interval95", "verdict", "why", "truth"),
+    *("ratio_interval95", "verdict", "why", "truth", "variance_shares", "profile"),
 }
 KEYS = {
     *("schema", "id", "status", "reason", "law", "element", "method", "estimates", "correlation", "fit", "starts"),
@@ -144,7 +144,11 @@ def test_the_result_has_every_key_of_its_schema(result):
     assert set(shell) == ESTIMATE_KEYS
     assert (shell["tissue"], shell["unit"], shell["relative_to"]) == ("shell", "kPa", "surroundings")
     assert shell["verdict"] in {"identified", "weak"}
-    assert shell["interval_kind"] == "linearised"
+    assert shell["interval_kind"] in {"linearised", "profile"}
+    assert sum(shell["variance_shares"].values()) == pytest.approx(1.0)
+    values, roots = zip(*shell["profile"], strict=True)
+    assert sorted(values) == list(values)
+    assert sorted(roots) == list(roots)
     assert np.diag(result["correlation"]) == pytest.approx(1.0)
     (fit,) = result["fit"]
     assert fit["after"] == "after.nii.gz"

@@ -1,4 +1,4 @@
-"""Memory that a computation may still take."""
+"""Memory: what this machine has, and what of it a computation may still take."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ except ImportError:  # Windows
 else:
     TOLD = True
 
-__all__ = ["available_memory", "peak_memory_gb"]
+__all__ = ["available_memory", "peak_memory_gb", "total_memory"]
 
 # Control groups, version 2 and 1, as a container sees its own: limit, use, and the line of its caches in memory.stat.
 CGROUPS = (
@@ -39,11 +39,27 @@ def peak_memory_gb() -> float | None:
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9, 3)
 
 
-def _of_machine() -> float | None:
+def total_memory() -> float | None:
+    """Bytes that this machine has, or its control group may have, whatever runs; None where the system does not tell.
+
+    What is decided by it is the same from run to run.
+    """
+    found = [_of_machine("MemTotal:"), *(_limit(limit) for limit, _, _ in CGROUPS)]
+    return min((amount for amount in found if amount is not None), default=None)
+
+
+def _of_machine(line: str = "MemAvailable:") -> float | None:
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        return next(float(line.split()[1]) for line in lines if line.startswith("MemAvailable:")) * 1024.0
+        return next(float(found.split()[1]) for found in lines if found.startswith(line)) * 1024.0
     except (OSError, StopIteration, ValueError):
+        return None
+
+
+def _limit(path: str) -> float | None:
+    try:
+        return float(Path(path).read_text(encoding="ascii"))
+    except (OSError, ValueError):  # "max": no limit
         return None
 
 

@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
+from palpate.findings import Finding
 from palpate.images.checks import check_images, check_pair, check_segmentation
-from palpate.images.finding import Finding
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers import read_label_image
 from palpate.images.segmentation import Segmentation, segment

@@ -12,7 +12,7 @@ import pytest
 
 import palpate.inversion
 from palpate.inversion import Approximation, ExactApproximation, Place, ReducedBasis, exact_approximation, reduced_basis
-from palpate.inversion.expansion import Expansion, expansion_near
+from palpate.inversion.expansion import Expansion, coarse_equilibrium, expansion_around
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_model
 from palpate.mechanics.forward import SolveCounts
@@ -55,7 +55,7 @@ def of_reduced_basis(body, at):
 
 
 def of_expansion(body, at):
-    return expansion_near(body.finite, of_reduced_basis(body, at), at, tolerance=ACCURACY)
+    return expansion_around(coarse_equilibrium(body.finite, of_reduced_basis(body, at), at), tolerance=ACCURACY)
 
 
 def of_exact(body, at):

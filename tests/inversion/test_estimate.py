@@ -10,7 +10,6 @@ import pytest
 
 from palpate.inversion import (
     Bounds,
-    FittedState,
     InversionSettings,
     Objective,
     OuterIterate,
@@ -19,10 +18,10 @@ from palpate.inversion import (
     gauss_newton,
     invert,
     posterior_sd,
-    sandwich_covariance,
 )
 from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimation import Observed, conclude
+from palpate.uncertainty import FittedState, sandwich_covariance
 
 SHARP = NoiseModel(np.array([1e-6]), np.array([3.0]))
 
@@ -272,7 +271,7 @@ def hold(monkeypatch):
     """Minima stay where they are when they are compared: the objective has no second one there."""
 
     def here(objective, start, settings, **_):
-        return gauss_newton(objective, start, bounds=settings.bounds, hold_theta=True)
+        return gauss_newton(objective, start, bounds=settings.bounds, held=True)
 
     monkeypatch.setattr(estimate, "minimised", here)
 

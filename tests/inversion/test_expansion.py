@@ -100,7 +100,7 @@ def test_a_motion_without_equilibrium_ends_the_estimate_where_it_is_the_best_one
     def lost(*_):
         raise NotConverged("folded")
 
-    monkeypatch.setattr(estimate, "_at_finite_strain", lost)
+    monkeypatch.setattr(estimate, "_coarse", lost)
     with pytest.raises(NotConverged, match="folded"):
         continue_at_finite_strain(linear, settings, progress=twins.silent)
 
@@ -112,14 +112,14 @@ def test_a_secondary_minimum_without_equilibrium_does_not_end_a_good_estimate(tw
     elsewhere = replace(first.iterate, minimum=replace(first.minimum, unknowns=away))
     starts = (linear.starts[0], replace(linear.starts[1], candidate=1))
     both = replace(linear, candidates=(first, estimate.Candidate(elsewhere, first.value - 100.0)), starts=starts)
-    whole = estimate._at_finite_strain
+    whole = estimate._coarse
 
-    def only_the_best(iterate, *others):
+    def only_the_best(iterate):
         if iterate is elsewhere:
             raise NotConverged("folded")
-        return whole(iterate, *others)
+        return whole(iterate)
 
-    monkeypatch.setattr(estimate, "_at_finite_strain", only_the_best)
+    monkeypatch.setattr(estimate, "_coarse", only_the_best)
     found = continue_at_finite_strain(both, settings, progress=twins.silent)
     assert found.minimum.converged
     assert np.abs(found.minimum.unknowns[:2] - twins.TRUTH).max() < 1e-3

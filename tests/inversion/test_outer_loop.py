@@ -8,7 +8,18 @@ from itertools import count
 import numpy as np
 import pytest
 
-from palpate.inversion import Outcome, OuterIterate, Place, exact_approximation, invert, reduced_basis, reweighted
+from palpate.inversion import (
+    Objective,
+    Outcome,
+    OuterIterate,
+    Place,
+    exact_approximation,
+    fit_coefficients,
+    invert,
+    reduced_basis,
+    reweighted,
+    with_first_noise,
+)
 from palpate.inversion import outer_loop as loop
 from palpate.inversion.optimise import posterior_sd
 from palpate.inversion.outer_loop import Convergence, Criterion, StopRule, minimised
@@ -17,6 +28,11 @@ from palpate.inversion.outer_loop import Convergence, Criterion, StopRule, minim
 @pytest.fixture(scope="module")
 def found(twins, voxels):
     return invert(voxels, twins.settings(0.5), progress=twins.silent)
+
+
+@pytest.fixture(scope="module")
+def settings_from_far(twins):
+    return twins.settings(0.1)
 
 
 def moved(one, other, rule=None):
@@ -54,6 +70,25 @@ def test_the_history_is_that_of_the_loop_alone_and_begins_where_a_start_ended(fo
     assert len(history) > 1
     assert np.array_equal(history[0].theta, start.minimum.unknowns[:2])
     assert not set(map(id, history)) & set(map(id, start.minimum.history))
+
+
+def test_where_the_reach_cuts_the_step_short_nothing_is_reweighted(twins, twin, settings_from_far):
+    """What is still motion would pass for noise."""
+    problem = twins.exact_problem(twin)
+    unknowns = np.concatenate([settings_from_far.starts[0], np.zeros(len(twin.coefficients))])
+    at_rest = exact_approximation(twin.model, None, Place(problem.parameters.moduli(unknowns), unknowns[2:]))
+    objective = with_first_noise(Objective(problem.states, problem.parameters).under([at_rest])).rematched(unknowns)
+    filled = fit_coefficients(objective, unknowns, bounds=settings_from_far.bounds)
+    exact = at_rest.update(*objective.places(filled.unknowns))  # a body at rest shows no modulus
+    objective = objective.under([exact]).rematched(filled.unknowns)
+    start = OuterIterate(objective, replace(filled, evaluation=objective(filled.unknowns)))
+    one = StopRule(iterations=1)
+    end = loop.run_outer_loop(start, settings_from_far, one, progress=twins.silent, title="")
+    assert np.abs(end.minimum.unknowns - unknowns)[:2].max() == pytest.approx(exact.reach)
+    assert end.objective.noise == objective.noise
+    assert Criterion.REWEIGHTING in end.convergence.unmet
+    end = loop.run_outer_loop(start, settings_from_far, StopRule(), progress=twins.silent, title="")
+    assert end.minimum.unknowns[:2] == pytest.approx(twins.TRUTH, abs=1e-4)
 
 
 def test_weights_that_never_agree_are_not_called_convergence(twins, voxels, monkeypatch):

@@ -1,7 +1,12 @@
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from palpate.errors import MeshQualityError
+from palpate.images.label_image import VoxelGrid
+from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.mesh.anatomy import Anatomy, Box
 from palpate.mesh.cutting import graded_grid
@@ -15,20 +20,20 @@ ORGAN = Tissue("organ", Role.ESTIMATE, (1,))
 
 
 class Below:
-    """The half space below a height."""
+    """The half space below a height; `slope`: that of its level set."""
 
-    def __init__(self, height):
-        self.height = height
+    def __init__(self, height, slope=1.0):
+        self.height, self.slope = height, slope
 
     def at(self, points):
-        return points[:, 2] - self.height
+        return self.slope * (points[:, 2] - self.height)
 
     def gradient_at(self, points):
-        return np.tile([0.0, 0.0, 1.0], (len(points), 1))
+        return np.tile([0.0, 0.0, self.slope], (len(points), 1))
 
 
-def _anatomy(height=10.0):
-    return Anatomy((ORGAN, REST), (Below(height), None), BOX)
+def _anatomy(height=10.0, slope=1.0):
+    return Anatomy((ORGAN, REST), (Below(height, slope), None), BOX)
 
 
 def _mesh(nodes=None, tets=None, keep=slice(None)):
@@ -47,8 +52,9 @@ def test_the_regular_tetrahedron_has_its_known_angle():
     assert np.allclose(dihedral_angles(mesh), np.degrees(np.arccos(1 / 3)))
 
 
-def test_volumes_of_level_sets_are_exact_for_planes():
-    volumes = level_set_volumes(_anatomy(7.3))
+@pytest.mark.parametrize("slope", [1.0, 0.6])
+def test_volumes_of_level_sets_are_exact_for_planes_whatever_their_slope(slope):
+    volumes = level_set_volumes(_anatomy(7.3, slope))
     assert volumes["organ"] == pytest.approx(7.3 * 400.0, rel=1e-6)
     assert sum(volumes.values()) == pytest.approx(8000.0)
 
@@ -66,6 +72,33 @@ def test_a_wrong_volume_names_the_region():
     with pytest.raises(MeshQualityError, match=r"'organ'.*voxels"):
         check_mesh(_mesh(), _anatomy(), voxel_volumes={"organ": 4500.0})
     assert check_mesh(_mesh(), _anatomy(), voxel_volumes={"organ": 4500.0}, thin=("organ",)).tets
+
+
+def _image(height, spacing=(1.0, 2.0, 0.5)):
+    """The half space in voxels that fill the box."""
+    affine = np.diag([*spacing, 1.0])
+    affine[:3, 3] = 0.5 * np.array(spacing)
+    grid = VoxelGrid(tuple(int(20 / edge) for edge in spacing), affine)
+    index = np.zeros(grid.shape, dtype=np.int16)
+    index[:, :, int(height / spacing[2]) :] = 1
+    return Segmentation(index, grid, (ORGAN, REST))
+
+
+def test_where_mesh_and_image_differ_is_named_in_millimetres_voxels_and_slices():
+    image = _image(10.0)
+    index = image.index.copy()
+    index[15:, :3, 20:30] = 0  # the organ of the image has a bump that the mesh lacks
+    with pytest.raises(MeshQualityError) as refused:
+        check_mesh(_mesh(), _anatomy(), voxel_volumes={"organ": 4150.0}, image=replace(image, index=index))
+    found = re.search(
+        r"'organ'.*near RAS \[(.*?)\] mm \(voxel \[(.*?)\], .*; axial slice (\d+) of 40", str(refused.value)
+    )
+    place, voxel, number = found[1].split(","), found[2].split(","), int(found[3])
+    place, voxel = np.array(place, dtype=float), np.array(voxel, dtype=int)
+    assert np.abs(place - image.grid.world(voxel[None].astype(float))[0]).max() < 0.06
+    assert index[tuple(voxel)] == 0
+    assert image.index[tuple(voxel)] == 1
+    assert number == voxel[2] + 1
 
 
 def test_an_inverted_tetrahedron_is_found_where_it_is():

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from palpate.errors import InputDataError, NotConverged
+from palpate.findings import Finding
 from palpate.images.readers import write_scalar_image
 from palpate.report import collect as collect_module
 from palpate.report import page as page_module
 from palpate.report.case_report import redrawn_page, write_case_report, write_failure_report
 from palpate.report.pairs import drawn_images
 from palpate.study.case import Mechanics
-from palpate.study.estimation import Remark
 
 EVIL = '</script><img src=x onerror=alert(1)>$\\frac{"&'
 
@@ -246,7 +246,7 @@ def test_methods_and_provenance_are_there(page):
 
 
 def test_warnings_of_one_code_are_folded(case_result, tmp_path):
-    remarks = tuple(Remark("example", f"warning number {i}") for i in range(5))
+    remarks = tuple(Finding("example", f"warning number {i}") for i in range(5))
     page = write_case_report(dataclasses.replace(case_result, remarks=remarks), tmp_path).read_text()
     assert "5 more like this" in page
     assert all(f"warning number {i}" in page for i in range(5))

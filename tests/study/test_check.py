@@ -35,7 +35,7 @@ def test_every_problem_is_listed_and_the_worst_class_is_the_exit_code(tmp_path):
     )
     assert [sum(word in problem.message for problem in found.problems) for word in words] == [1, 1, 1, 1, 1]
     assert found.exit_code == 3
-    assert found.text().splitlines()[-1].startswith("warning: tissue 'rest'")
+    assert found.text().splitlines()[-1].startswith("warning (units): tissue 'rest'")
 
 
 def test_a_case_that_cannot_be_read_is_a_problem_with_its_code(tmp_path, capsys):
@@ -73,13 +73,23 @@ def test_cost_is_that_of_the_solver_that_will_run(case_result, monkeypatch):
     assert plain.solver.startswith("multifrontal")
     assert iterated.solver == "multigrid"
     assert iterated.seconds > plain.seconds
-    monkeypatch.setattr(registry, "available_memory", lambda: 1.0)
+    monkeypatch.setattr(registry, "total_memory", lambda: 1.0)
     assert expected_cost(case, before, after, n_pairs=1).solver != "multifrontal"
+
+
+def test_what_else_runs_does_not_change_what_is_expected(case_result, monkeypatch):
+    case, before, after = case_result.case, case_result.before, case_result.after
+    plain = expected_cost(case, before, after, n_pairs=1)
+    for module in (registry, cost):
+        monkeypatch.setattr(module, "available_memory", lambda: 1e3)
+    assert expected_cost(case, before, after, n_pairs=1) == plain
+    assert [problem.code for problem in check.memory_problems(plain)] == ["memory-now"]
 
 
 @pytest.mark.parametrize(("share", "code"), [(100.0, None), (1.0, 0), (0.1, 6)])
 def test_memory_that_will_not_do_is_told_before(case_result, monkeypatch, share, code):
     needed = expected_cost(case_result.case, case_result.before, case_result.after, n_pairs=1)
-    monkeypatch.setattr(check, "free_memory_gb", lambda: share * needed.memory_gb)
+    for module in (cost, check):
+        monkeypatch.setattr(module, "machine_memory_gb", lambda: share * needed.memory_gb)
     found = [problem.exit_code for problem in check.memory_problems(needed)]
     assert found == ([] if code is None else [code])

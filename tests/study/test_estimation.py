@@ -7,20 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.inversion import (
-    FittedState,
-    Inversion,
-    Outcome,
-    OuterIterate,
-    gauss_newton,
-    invert,
-    sandwich_covariance,
-)
+from palpate.inversion import Inversion, Outcome, OuterIterate, gauss_newton, invert
 from palpate.inversion.estimate import Candidate
 from palpate.inversion.outer_loop import Convergence
 from palpate.mechanics.forward import SolveCounts
 from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimation import Observed, conclude, hull, verdict
+from palpate.uncertainty import FittedState, sandwich_covariance
 
 NOISE = NoiseModel(np.array([0.03**2]), np.array([3.0]))
 
@@ -87,7 +80,7 @@ def test_moduli_are_stated_in_kpa_and_as_ratios(estimation):
 
 
 def test_the_interval_is_that_of_the_covariance(estimation):
-    sd = np.sqrt(np.diag(estimation.covariance))
+    sd = np.sqrt(np.diag(estimation.covariance.total))
     widths = [np.log(e.ratio_interval95[1] / e.ratio_interval95[0]) for e in estimation.estimates]
     assert widths == pytest.approx(2.0 * 1.96 * sd, rel=1e-4)
     assert np.diag(estimation.correlation) == pytest.approx(1.0)
@@ -100,16 +93,16 @@ def test_the_place_of_the_grid_adds_to_what_the_noise_leaves(twins, twin, voxels
     found = Inversion((Candidate(OuterIterate(objective, minimum), 0.0),), 0, (), minimum.evaluation, 0, SolveCounts())
     estimation = stated(found, settings, observed)
     residuals = sandwich_covariance(objective, minimum.evaluation)
-    grid = estimation.covariance - residuals
-    assert grid == pytest.approx(estimation.grid_covariance)
+    grid = estimation.covariance.total - residuals
+    assert grid == pytest.approx(estimation.covariance.grid)
     assert np.all(np.diag(grid) > 1e-3 * np.diag(residuals))
     assert np.linalg.eigvalsh(grid).min() > -1e-12
 
 
 def test_surfaces_without_voxels_leave_nothing_to_the_place_of_the_grid(estimation, inversion):
-    assert not estimation.grid_covariance.any()
+    assert not estimation.covariance.grid.any()
     residuals = sandwich_covariance(inversion.objective, inversion.minimum.evaluation)
-    assert np.array_equal(estimation.covariance, residuals)
+    assert np.array_equal(estimation.covariance.total, residuals)
 
 
 def test_every_start_is_told(estimation):
@@ -230,7 +223,7 @@ def test_an_estimate_whose_outer_loop_ran_out_says_what_is_open(estimation, inve
 
 def test_the_same_seed_gives_the_same_statement(inversion, settings, observed, estimation):
     again = stated(inversion, settings, observed)
-    assert np.array_equal(again.covariance, estimation.covariance)
+    assert np.array_equal(again.covariance.total, estimation.covariance.total)
 
 
 @pytest.mark.parametrize(("worse_by", "counts"), [(0.01, True), (0.5, False)])

@@ -13,6 +13,7 @@ from palpate.images.tissue import Role
 from palpate.report.collect import collect_failure
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.result import MeshResult, Simulation, failure_document
+from palpate.uncertainty import Covariance
 
 KEYS = {
     "schema", "id", "status", "reason", "law", "element", "method", "estimates", "correlation", "fit", "starts",
@@ -20,7 +21,7 @@ KEYS = {
 }  # fmt: skip
 ESTIMATE_KEYS = {
     "tissue", "parameter", "unit", "value", "interval95", "interval_kind", "relative_to", "ratio", "ratio_interval95",
-    "verdict", "why", "truth",
+    "verdict", "why", "truth", "variance_shares", "profile",
 }  # fmt: skip
 
 
@@ -46,7 +47,7 @@ def test_the_document_has_the_fixed_keys(case_result):
 
 
 def test_the_document_is_strict_json(case_result):
-    broken = with_estimation(case_result, covariance=np.full((2, 2), np.nan))
+    broken = with_estimation(case_result, covariance=Covariance(*np.full((3, 2, 2), np.nan)))
     document = broken.to_dict()
     assert json.loads(json.dumps(document, allow_nan=False)) == document
     assert document["correlation"] == [[None, None], [None, None]]

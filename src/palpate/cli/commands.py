@@ -25,7 +25,7 @@ def init(arguments: argparse.Namespace, _: None, outputs: OutputFolder, progress
     from palpate.study.new_case import write_new_case
 
     progress("reading the images")
-    case = write_new_case(arguments.images, arguments.labels, outputs)
+    case = write_new_case(arguments.images, arguments.labels, outputs, cts=arguments.ct)
     rows = [["tissue", "role", "why"]]
     rows += [[tissue.name, str(tissue.role or "?"), tissue.reason] for tissue in case.tissues]
     questions = "".join(f"question: {question}\n" for question in case.questions)

@@ -1,4 +1,4 @@
-"""Where a run talks while it works: progress on stderr, details in the log, standard output kept free.
+"""What a run says is kept apart: sentences on stderr, details in the log, standard output free for results.
 
 What is said to a person never decides a run: a terminal that is closed, a full disk or a reader that has left takes the
 words and nothing else.
@@ -13,24 +13,21 @@ import os
 import signal
 import sys
 import threading
-import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 from typing import TextIO
 
 from palpate.errors import ConfigurationError, InputDataError
-from palpate.images.named_labels import printable
 from palpate.study.lock import held_folder, own_file
 from palpate.study.outputs import OutputFolder
 
 __all__ = [
     "LOGGER",
-    "Console",
     "close_log",
     "close_streams",
+    "give_up",
     "interruptible",
     "log_is_open",
     "output_folder",
@@ -42,20 +39,6 @@ LOGGER.addHandler(logging.NullHandler())  # before there is a log file, messages
 UNLOCKED = "the file system of %s knows no locks: a second run in the folder would not be noticed, so start none there"
 
 
-@dataclass(frozen=True, slots=True)
-class Console:
-    """How a run talks while it works: progress on stderr, unless it was asked to be quiet."""
-
-    quiet: bool
-    began: float = field(default_factory=time.monotonic)
-
-    def progress(self, message: str) -> None:
-        """Tell what happens now, with the seconds since the start."""
-        LOGGER.info(message)
-        if not self.quiet:
-            tell(f"[{time.monotonic() - self.began:6.1f} s] {printable(message)}", sys.stderr)
-
-
 def tell(text: str, stream: TextIO | None) -> OSError | None:
     """Print lines on a standard stream; letters that it cannot hold are escaped. Gives why they were not printed."""
     if stream is None:  # closed from the start
@@ -65,7 +48,7 @@ def tell(text: str, stream: TextIO | None) -> OSError | None:
         stream.write(text.encode(encoding, "backslashreplace").decode(encoding) + "\n")
         stream.flush()
     except (OSError, ValueError) as error:  # ValueError: closed meanwhile
-        _give_up(stream)
+        give_up(stream)
         return error if isinstance(error, OSError) else OSError(errno.EBADF, str(error))
     return None
 
@@ -77,10 +60,10 @@ def close_streams() -> None:
             if stream is not None:
                 stream.flush()
         except (OSError, ValueError):
-            _give_up(stream)
+            give_up(stream)
 
 
-def _give_up(stream: TextIO) -> None:
+def give_up(stream: TextIO) -> None:
     """What a stream still holds leads nowhere."""
     with suppress(OSError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)

@@ -66,8 +66,8 @@ def columns(rows: Sequence[Sequence[str]]) -> str:
 
 
 def warning_lines(document: Mapping[str, Any]) -> str:
-    """The document's warnings, a line each."""
-    return "".join(f"warning: {warning['message']}\n" for warning in document["warnings"])
+    """The document's warnings, a line each with its code; docs/warnings.md tells of all codes."""
+    return "".join(f"warning ({warning['code']}): {warning['message']}\n" for warning in document["warnings"])
 
 
 def printable_lines(text: str) -> str:

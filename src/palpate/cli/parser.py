@@ -105,6 +105,7 @@ def _add_init(subparsers: Any) -> None:
     command = _command(subparsers, "init", commands.init, what="write a case.toml for images, roles guessed from names")
     command.add_argument("images", type=Path, nargs="+", metavar="IMAGE", help="label images: before, then after ...")
     command.add_argument("--labels", type=Path, metavar="TABLE", help="label table: which number is which organ")
+    _add_ct(command)
     command.set_defaults(logs=False, targets=("case.toml",))
 
 
@@ -127,8 +128,14 @@ def _add_estimate(subparsers: Any) -> None:
         help="CASE.TOML, or label images BEFORE AFTER ... for which a case is written first",
     )
     command.add_argument("--labels", type=Path, metavar="TABLE", help="label table, with images")
+    _add_ct(command)
     command.set_defaults(targets=written.TARGETS)
     _add_set(command)
+
+
+def _add_ct(command: argparse.ArgumentParser) -> None:
+    what = "CT of before, or of each image: for the report, and to tell air from tissue in label 0"
+    command.add_argument("--ct", type=Path, nargs="+", default=[], metavar="CT", help=what)
 
 
 def _add_report(subparsers: Any) -> None:
@@ -160,7 +167,7 @@ def _add_cohort(subparsers: Any) -> None:
     command.add_argument("--time-limit", type=_positive, metavar="S", help="of each case; default: by its prediction")
     command.add_argument("--reference", metavar="SESSION", help="of BIDS derivatives; default: each patient's first")
     command.add_argument("--task", type=int, metavar="N", help="what --engine slurm starts: part N of its job array")
-    command.set_defaults(targets=cohorts.TARGETS)
+    command.set_defaults(targets=cohorts.TARGETS, patience_s=300.0)
     _add_set(command)
     what = "say where a cohort stands"
     status = _command(subparsers, "status", cohorts.status, what=what, folder=None)

@@ -31,6 +31,8 @@ def estimate(arguments: argparse.Namespace, case: Case | None, outputs: OutputFo
 
     if case is not None and arguments.labels is not None:
         raise ConfigurationError("--labels goes with images; a case names its label table itself, as [images] names")
+    if case is not None and arguments.ct:
+        raise ConfigurationError("--ct goes with images; a case names its CTs itself, as [images] intensities_before")
     case = case or _case_of_images(arguments, outputs, progress)
     refuse_other_case(case, outputs)
     outputs.require(f"mesh_{number}.vtu" for number in range(2, len(case.pairs) + 2))
@@ -79,7 +81,7 @@ def _case_of_images(arguments: argparse.Namespace, outputs: OutputFolder, progre
     from palpate.study.case_file import read_case
     from palpate.study.new_case import write_new_case
 
-    case = write_new_case(arguments.inputs, arguments.labels, outputs)
+    case = write_new_case(arguments.inputs, arguments.labels, outputs, cts=arguments.ct)
     for tissue in case.tissues:
         progress(f"{tissue.name}: {tissue.role or '?'}, for {tissue.reason}")
     progress(f"the case is written to {case.path}")

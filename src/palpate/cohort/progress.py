@@ -11,6 +11,7 @@ from typing import Any
 
 from palpate.cohort.plan import CASES, Plan, read_plan
 from palpate.cohort.task import Outcome
+from palpate.progress import about
 from palpate.study.lock import is_held
 
 __all__ = ["Status", "Tally", "status_of"]
@@ -48,7 +49,7 @@ class Status:
         failed = f"{sum(self.failed.values())} failed" + (f" ({classes})" if classes else "")
         parts = [f"{self.rows} rows: {self.done} done", failed, f"{self.running} running", f"{self.waiting} waiting"]
         if self.seconds_left is not None and self.waiting + self.running:
-            parts.append(f"about {duration(self.seconds_left)} left")
+            parts.append(f"{about(self.seconds_left)} left")
         return ", ".join(parts)
 
 
@@ -93,11 +94,4 @@ class Tally:
         seconds = (time.monotonic() - self.began) / self.ended * self.left
         what = f"failed ({outcome.failure_class}): {outcome.message}" if outcome.state == "failed" else "done"
         counts = f"{self.states['done']} done, {self.states['failed']} failed, {self.left} to go of {self.rows}"
-        return f"{outcome.id}: {what} [{counts}{f', about {duration(seconds)} left' if self.left else ''}]"
-
-
-def duration(seconds: float) -> str:
-    """Seconds, minutes or hours, as people say it."""
-    if seconds < 100.0:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60.0:.0f} min" if seconds < 6000.0 else f"{seconds / 3600.0:.1f} h"
+        return f"{outcome.id}: {what} [{counts}{f', {about(seconds)} left' if self.left else ''}]"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -19,12 +19,12 @@ from palpate.cohort.records import Record
 from palpate.cohort.tables import CSV, PARQUET
 from palpate.cohort.task import Limits, Outcome, Row
 from palpate.errors import ConfigurationError, PalpateError
+from palpate.progress import Progress
 from palpate.study.outputs import make_folder
 
 __all__ = ["Options", "run_cohort"]
 
 LOGGER = logging.getLogger(__name__)
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,16 +16,14 @@ from palpate.images.named_labels import printable
 from palpate.memory import peak_memory_gb
 from palpate.steps.saving import save_estimate, save_failure
 from palpate.study import run
-from palpate.study.body import ImagedStates
 from palpate.study.case import Case
 from palpate.study.case_as_run import refuse_other_case
-from palpate.study.cost import expected_cost
+from palpate.study.cost import ExpectedCost
 from palpate.study.outputs import OutputFolder
 
 __all__ = ["RoomError", "Tell", "estimate_row"]
 
 LOGGER = logging.getLogger(__name__)
-LATTICE = 48  # for the prediction: within a few per cent of that of `check`, in a tenth of the time
 
 Tell = Callable[[float, float], None]  # is told the predicted memory (GB) and time (s), before they are taken
 
@@ -75,9 +73,8 @@ def _attempt(task: Task, tell: Tell) -> Outcome:
 def _estimated(task: Task, case: Case, key: str, outputs: OutputFolder, tell: Tell) -> Outcome:
     began, expected = time.monotonic(), list[float]()
 
-    def condition(states: ImagedStates, n_pairs: int) -> None:
+    def condition(cost: ExpectedCost) -> None:
         """Say what the estimate will take, and leave it when that is not there."""
-        cost = expected_cost(case, states.before, states.after, n_pairs=n_pairs, lattice=LATTICE)
         if task.room_gb is not None and cost.memory_gb > task.room_gb:
             raise RoomError(cost.memory_gb)
         expected.append(cost.memory_gb)

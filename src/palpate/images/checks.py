@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from palpate.errors import InputDataError
-from palpate.images.finding import Finding
+from palpate.findings import Finding
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 
-__all__ = ["check_images", "check_pair", "check_segmentation"]
+__all__ = ["check_images", "check_pair", "check_segmentation", "later_names"]
 
 OBSERVED = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
 VOLUME_CHANGE = 0.05  # no modulus explains a filling between the scans
@@ -37,22 +37,28 @@ def check_images(before: Segmentation, after: Sequence[Segmentation]) -> tuple[F
 
     Raises `InputDataError` as `check_pair` does; names the later state by its number, from 1, when there are several.
     """
-    names = ["after" if len(after) == 1 else f"after[{i}]" for i in range(1, len(after) + 1)]
     findings = list(check_segmentation(before, "before"))
-    for name, image in zip(names, after, strict=True):
+    for name, image in zip(later_names(len(after)), after, strict=True):
         findings += check_segmentation(image, name)
         findings += check_pair(before, image, name=name)
     return tuple(findings)
 
 
+def later_names(count: int) -> list[str]:
+    """What the later images of a pair are called in sentences: "after", or "after[1]", "after[2]" ... of several."""
+    return ["after"] if count == 1 else [f"after[{number}]" for number in range(1, count + 1)]
+
+
 def check_segmentation(segmentation: Segmentation, name: str) -> tuple[Finding, ...]:
     """Findings on one image, called `name` in the text: its reading, voxel size, cut, small or thin organs, islands."""
-    findings = [replace(finding, message=f"'{name}': {finding.message}") for finding in segmentation.findings]
+    findings = [
+        replace(finding, message=f"'{name}': {finding.message}", place=f"'{name}'") for finding in segmentation.findings
+    ]
     spacing = segmentation.grid.spacing
     if not SPACING_MM[0] <= float(spacing.min()) <= float(spacing.max()) <= SPACING_MM[1]:
         size = " x ".join(f"{edge:.4g}" for edge in spacing)
         text = f"'{name}' has voxels of {size} mm; is its header in metres or micrometres? Set its unit of length"
-        findings.append(Finding("voxel-size", text))
+        findings.append(Finding("voxel-size", text, place=f"'{name}'"))
     for i, tissue in enumerate(segmentation.tissues):
         if tissue.role not in OBSERVED:
             continue
@@ -69,7 +75,7 @@ def check_segmentation(segmentation: Segmentation, name: str) -> tuple[Finding, 
                     f"'{tissue.name}' has {count} separate pieces in '{name}', {sizes[:-1].sum() / sizes.sum():.2%} of"
                     " it outside the largest; remove stray voxels from the labels"
                 )
-                findings.append(Finding("islands", text))
+                findings.append(Finding("islands", text, tissue.name, f"in '{name}' ({count})"))
     return tuple(findings)
 
 
@@ -122,11 +128,12 @@ def _cut_by_border(mask: NDArray[np.bool_], tissue: Tissue, name: str) -> list[F
     if not touching:
         return []
     surface = touching + sum(int(np.count_nonzero(np.diff(mask, axis=axis))) for axis in range(3))
+    share = f"{touching / surface:.1%}"
     text = (
-        f"'{tissue.name}' reaches the border of '{name}': {touching / surface:.1%} of its surface is a cut of the"
-        " image, which says nothing about its stiffness; a larger field of view is better"
+        f"'{tissue.name}' reaches the border of '{name}': {share} of its surface is a cut of the image, which says"
+        " nothing about its stiffness; a larger field of view is better"
     )
-    return [Finding("cut-by-border", text)]
+    return [Finding("cut-by-border", text, tissue.name, f"in '{name}' ({share})")]
 
 
 def _touching(mask: NDArray[np.bool_]) -> int:
@@ -139,7 +146,7 @@ def _too_thin(mask: NDArray[np.bool_], box: tuple[slice, ...], tissue: Tissue, n
     count = int(np.count_nonzero(mask[box]))
     if count < SMALL_VOXELS:
         text = f"'{tissue.name}' has only {count} voxels in '{name}'; its surface cannot be trusted: use finer images"
-        return [Finding("too-small", text)]
+        return [Finding("too-small", text, tissue.name, f"in '{name}' ({count})")]
     window = tuple(slice(max(s.start - THIN_VOXELS, 0), s.stop + THIN_VOXELS) for s in box)
     missing = [
         (max(THIN_VOXELS - s.start, 0), max(s.stop + THIN_VOXELS - n, 0)) for s, n in zip(box, mask.shape, strict=True)
@@ -154,7 +161,7 @@ def _too_thin(mask: NDArray[np.bool_], box: tuple[slice, ...], tissue: Tissue, n
         f"{share:.0%} of '{tissue.name}' in '{name}' is thinner than {THIN_VOXELS} voxels; its surface there is known"
         " to about half a voxel only: use finer images, or join it to its neighbour"
     )
-    return [Finding("thin", text)]
+    return [Finding("thin", text, tissue.name, f"in '{name}' ({share:.0%})")]
 
 
 def _common_part(before: Segmentation, after: Segmentation, name: str) -> list[Finding]:
@@ -169,7 +176,7 @@ def _common_part(before: Segmentation, after: Segmentation, name: str) -> list[F
     if share >= COMMON_SHARE:
         return []
     text = f"'before' and '{name}' share only {share:.0%} of the smaller image; what lies outside of it is left out"
-    return [Finding("little-in-common", text)]
+    return [Finding("little-in-common", text, place=f"'{name}' ({share:.0%})")]
 
 
 def _share_inside(grid: VoxelGrid, other: VoxelGrid) -> float:
@@ -208,7 +215,7 @@ def _mirrored(before: Segmentation, after: Segmentation, observed: Sequence[int]
     )
     if best - plain >= MIRROR_CERTAIN:
         raise InputDataError(text)
-    return [Finding("mirrored", text)]
+    return [Finding("mirrored", text, place=f"'{name}'")]
 
 
 def _sample(segmentation: Segmentation, tissue: int) -> NDArray[np.float64]:
@@ -236,7 +243,7 @@ def _shifts(before: Segmentation, after: Segmentation, observed: Sequence[int], 
                 f"'{before.tissues[i].name}' moves by {length:.1f} mm from 'before' to '{name}', more than its size of"
                 f" {size:.1f} mm; check that its label means the same organ, and that the images are aligned"
             )
-            findings.append(Finding("large-shift", text))
+            findings.append(Finding("large-shift", text, before.tissues[i].name, f"to '{name}' ({length:.1f} mm)"))
     return findings
 
 
@@ -250,9 +257,11 @@ def _volume_change(before: Segmentation, after: Segmentation, i: int, name: str)
         f" '{name}' ({after.volume(i) / 1000.0:.4g} mL); a filling between the scans is no deformation that a modulus"
         " explains: give a hollow organ the role driver"
     )
+    place = f"to '{name}' ({change:+.1%})"
     if any(_touching(image.mask(i)) for image in (before, after)):
-        return [Finding("volume-change", text + "; here the image's border cuts the organ, which may be the cause")]
+        text += "; here the image's border cuts the organ, which may be the cause"
+        return [Finding("volume-change", text, tissue.name, place)]
     if abs(change) > VOLUME_IMPLAUSIBLE:
         text += "; so large a change is implausible for one organ: check that the label means the same in both images"
-        return [Finding("volume-implausible", text)]
-    return [Finding("volume-change", text)]
+        return [Finding("volume-implausible", text, tissue.name, place)]
+    return [Finding("volume-change", text, tissue.name, place)]

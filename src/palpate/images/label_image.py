@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
-from palpate.images.finding import Finding
+from palpate.findings import Finding
 
 __all__ = ["LabelImage", "VoxelGrid", "corners_apart"]
 

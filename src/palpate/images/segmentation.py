@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, InputDataError
-from palpate.images.finding import Finding
+from palpate.findings import Finding
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.tissue import Tissue
 

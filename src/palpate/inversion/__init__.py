@@ -1,4 +1,4 @@
-"""The inverse problem: from later states and what is observed of them to moduli with intervals and verdicts."""
+"""The inverse problem: from later states and what is observed of them to the moduli that explain them."""
 
 from palpate.inversion.approximation import Approximation, ExactApproximation, Place, exact_approximation
 from palpate.inversion.driver_fit import fit_driver
@@ -18,26 +18,12 @@ from palpate.inversion.outer_loop import InversionSettings, OuterIterate, StopRu
 from palpate.inversion.parameters import ParameterMap, parameter_map
 from palpate.inversion.reduced_basis import ReducedBasis, reduced_basis
 from palpate.inversion.reweighting import reweighted, with_first_noise
-from palpate.inversion.sampling import sample_posterior
-from palpate.inversion.uncertainty import (
-    NORMAL_95,
-    FittedState,
-    Interval,
-    gain,
-    grid_position_shifts,
-    imaging_errors,
-    log_interval,
-    sandwich_covariance,
-)
 
 __all__ = [
-    "NORMAL_95",
     "Approximation",
     "Bounds",
     "Evaluation",
     "ExactApproximation",
-    "FittedState",
-    "Interval",
     "InverseProblem",
     "Inversion",
     "InversionSettings",
@@ -57,18 +43,12 @@ __all__ = [
     "exact_approximation",
     "fit_coefficients",
     "fit_driver",
-    "gain",
     "gauss_newton",
-    "grid_position_shifts",
-    "imaging_errors",
     "invert",
-    "log_interval",
     "parameter_map",
     "posterior_sd",
     "reduced_basis",
     "reweighted",
     "run_outer_loop",
-    "sample_posterior",
-    "sandwich_covariance",
     "with_first_noise",
 ]

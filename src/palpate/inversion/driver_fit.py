@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from palpate.errors import NotConverged
 from palpate.inversion.approximation import Approximation, Place
 from palpate.inversion.driver import with_learned_prior
-from palpate.inversion.expansion import expansion_near
+from palpate.inversion.expansion import coarse_equilibrium, expansion_around
 from palpate.inversion.later_state import InverseProblem
 from palpate.inversion.objective import Objective
 from palpate.inversion.optimise import Bounds, fit_coefficients
@@ -43,7 +43,8 @@ def fit_driver(
     first = []
     for state, basis, q in zip(problem.states, linear, amounts, strict=True):
         assert state.finite_strain is not None
-        first.append(expansion_near(state.finite_strain, basis, Place(moduli, q), tolerance=ACCURACY))
+        coarse = coarse_equilibrium(state.finite_strain, basis, Place(moduli, q))
+        first.append(expansion_around(coarse, tolerance=ACCURACY))
     amounts = _fitted(held, first, np.concatenate(amounts))
     found = []
     for near, q in zip([expansion.equilibrium for expansion in first], amounts, strict=True):

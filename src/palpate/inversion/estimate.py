@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, EstimationError
 from palpate.inversion.driver import with_learned_prior
-from palpate.inversion.expansion import Expansion, expansion_near
-from palpate.inversion.later_state import InverseProblem
+from palpate.inversion.expansion import Expansion, coarse_equilibrium, expansion_around
+from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import Evaluation, Objective
-from palpate.inversion.optimise import Minimum, Outcome, fit_coefficients, same_minimum
+from palpate.inversion.optimise import Iterate, Minimum, Outcome, fit_coefficients, same_minimum
 from palpate.inversion.outer_loop import (
     Convergence,
     InversionSettings,
@@ -26,8 +26,10 @@ from palpate.inversion.outer_loop import (
 from palpate.inversion.reduced_basis import reduced_basis
 from palpate.inversion.reweighting import with_first_noise
 from palpate.mechanics.equilibrium import ACCURACY
+from palpate.mechanics.finite_strain import FiniteStrainEquilibrium
 from palpate.mechanics.forward import SolveCounts
 from palpate.parallel import blas_on_one_thread
+from palpate.progress import Progress, during
 
 __all__ = ["Candidate", "Inversion", "StartRun", "continue_at_finite_strain", "invert"]
 
@@ -47,8 +49,6 @@ FIRST_GUESS = StopRule(
     far=np.inf,
 )
 EQUILIBRIUM = 1e-5  # of the forces, while the estimate moves
-
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,11 +126,13 @@ def invert(
     begin = np.concatenate([middle, np.zeros(sum(problem.parameters.n_modes))])
     rule = rule or (FIRST_GUESS if problem.finite_strain else REPORTED)
     if any(state.approximation is None for state in problem.states):
-        progress("responses of the full model at the middle start")
-        linear = _linear(*_with_reduced_bases(problem, settings, begin), settings, rule, progress)
+        linear = [_linear(*_with_reduced_bases(problem, settings, begin, progress), settings, rule, progress)]
     else:
-        linear = _linear(Objective(problem.states, problem.parameters), begin, 0, settings, rule, progress)
-    return continue_at_finite_strain(linear, settings, progress=progress) if problem.finite_strain else linear
+        linear = [_linear(Objective(problem.states, problem.parameters), begin, 0, settings, rule, progress)]
+    if not problem.finite_strain:
+        return linear[0]
+    at_finite_strain = during("finite strain", progress)
+    return continue_at_finite_strain(linear.pop(), settings, progress=at_finite_strain)  # which lets go of its bases
 
 
 def continue_at_finite_strain(linear: Inversion, settings: InversionSettings, *, progress: Progress) -> Inversion:
@@ -140,30 +142,42 @@ def continue_at_finite_strain(linear: Inversion, settings: InversionSettings, *,
     the comparison. Raises `NotConverged` when the best one's equilibrium is not found, with the element and the share
     of the motion where it ended.
     """
-    ends, spent, evaluations = list[OuterIterate](), linear.counts, linear.evaluations
-    for number, candidate in enumerate(linear.candidates):
-        end = candidate.iterate
-        if number == linear.best or candidate.minimum.converged:
-            try:
-                end = _at_finite_strain(candidate.iterate, settings, progress)
-                spent, evaluations = spent + end.counts, evaluations + end.minimum.evaluations
-            except EstimationError:
-                if number == linear.best:
-                    raise
-                end = replace(end, minimum=replace(end.minimum, outcome=Outcome.NO_EQUILIBRIUM))
-        ends.append(end)
-    found = _concluded(ends, linear.starts, linear.rest, settings, linear.best)
+    waiting = {number: candidate.iterate for number, candidate in enumerate(linear.candidates)}
+    linear = replace(linear, candidates=())  # and with them their reduced bases, which are large, one by one
+    ends, spent, evaluations = dict[int, OuterIterate](), linear.counts, linear.evaluations
+    for number in sorted(waiting, key=lambda k: k != linear.best):
+        minimum = waiting[number].minimum
+        if number != linear.best and not minimum.converged:
+            ends[number] = waiting.pop(number)
+            continue
+        try:
+            progress("finite strain: the equilibrium at the linear estimate")
+            start = [_expanded(*_coarse(waiting.pop(number)), minimum, progress)]
+            end = run_outer_loop(start.pop(), settings, REPORTED, progress=progress, title="finite strain")
+            progress("finite strain: the exact equilibrium at the estimate")
+            ends[number] = end = _at_equilibrium(end, minimum.history)
+            spent, evaluations = spent + end.counts, evaluations + end.minimum.evaluations
+        except EstimationError:
+            if number == linear.best:
+                raise
+            ends[number] = replace(ends[linear.best], minimum=replace(minimum, outcome=Outcome.NO_EQUILIBRIUM))
+    found = _concluded([ends[number] for number in sorted(ends)], linear.starts, linear.rest, settings, linear.best)
     return replace(found, evaluations=found.evaluations + evaluations, counts=spent)
 
 
 def _with_reduced_bases(
-    problem: InverseProblem, settings: InversionSettings, middle: NDArray[np.float64]
+    problem: InverseProblem, settings: InversionSettings, middle: NDArray[np.float64], progress: Progress
 ) -> tuple[Objective, NDArray[np.float64], int]:
     """The objective on reduced bases at unknowns (n_unknowns,), these with the drivers' motion fitted, its cost."""
     parameters = problem.parameters
-    bases = [reduced_basis(state.model, parameters.moduli(middle)) for state in problem.states]
+    bases = []
+    for number, state in enumerate(problem.states, start=1):
+        progress(f"responses of the full model at the middle start, state {number} of {len(problem.states)}")
+        bases.append(reduced_basis(state.model, parameters.moduli(middle)))
+    progress("the drivers' motion at the middle start")
     objective = with_first_noise(Objective(problem.states, parameters).under(bases))
     fitted = fit_coefficients(objective.rematched(middle), middle, bounds=settings.bounds)
+    progress("how the responses change with the moduli")
     by_theta = parameters.derivatives(middle)
     triples = zip(problem.states, bases, parameters.coefficients(fitted.unknowns), strict=True)
     states = tuple(s.with_approximation(b.with_modulus_series(q, by_theta)) for s, b, q in triples)
@@ -241,17 +255,31 @@ def _another(
     return replace(best, minimum=found)
 
 
-def _at_finite_strain(linear: OuterIterate, settings: InversionSettings, progress: Progress) -> OuterIterate:
-    """The outer loop on expansions around the equilibria at a linear minimum, ended at exact equilibria."""
-    progress("finite strain: the equilibrium at the linear estimate")
-    unknowns, first = linear.minimum.unknowns, list[Expansion]()
-    before = linear.objective
-    for state, basis, place in zip(before.states, before.approximations, before.places(unknowns), strict=True):
+def _coarse(linear: OuterIterate) -> tuple[Objective, list[FiniteStrainEquilibrium]]:
+    """The objective of a linear minimum on no approximation, and the coarse equilibria there of every state.
+
+    Its states bend as the linear law does.
+    """
+    before, places = linear.objective, linear.objective.places(linear.minimum.unknowns)
+    found, states = list[FiniteStrainEquilibrium](), list[LaterState]()
+    for state, basis, place in zip(before.states, before.approximations, places, strict=True):
         assert state.finite_strain is not None
-        first.append(expansion_near(state.finite_strain, basis, place, tolerance=EQUILIBRIUM))
-    objective = before.under(first).rematched(unknowns)
-    start = OuterIterate(objective, replace(linear.minimum, evaluation=objective(unknowns), evaluations=1))
-    end = run_outer_loop(start, settings, REPORTED, progress=progress, title="finite strain")
+        found.append(coarse_equilibrium(state.finite_strain, basis, place))
+        states.append(replace(state, approximation=None, bending=state.observed))
+    return replace(before, states=tuple(states)), found
+
+
+def _expanded(
+    objective: Objective, coarse: Sequence[FiniteStrainEquilibrium], minimum: Minimum, progress: Progress
+) -> OuterIterate:
+    """A linear minimum on expansions around the equilibria there."""
+    first = [expansion_around(equilibrium, tolerance=EQUILIBRIUM, progress=progress) for equilibrium in coarse]
+    objective = objective.under(first).rematched(minimum.unknowns)
+    return OuterIterate(objective, replace(minimum, evaluation=objective(minimum.unknowns), evaluations=1))
+
+
+def _at_equilibrium(end: OuterIterate, before: tuple[Iterate, ...]) -> OuterIterate:
+    """The end of an outer loop at exact equilibria; `before`: the way to where it began."""
     exact = []
     places = end.objective.places(end.minimum.unknowns)
     for approximation, place in zip(end.objective.approximations, places, strict=True):
@@ -259,7 +287,7 @@ def _at_finite_strain(linear: OuterIterate, settings: InversionSettings, progres
         exact.append(approximation.at_equilibrium(place, tolerance=ACCURACY))
     final = end.objective.under(exact)
     evaluation, spent = final(end.minimum.unknowns), end.minimum.evaluations + 1
-    history = linear.minimum.history + end.minimum.history
+    history = before + end.minimum.history
     minimum = replace(end.minimum, evaluation=evaluation, evaluations=spent, history=history)
     return replace(end, objective=final, minimum=minimum)
 

@@ -22,8 +22,9 @@ from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.constraint import Constraint
+from palpate.progress import Progress, silent
 
-__all__ = ["Expansion", "expansion_near"]
+__all__ = ["Expansion", "coarse_equilibrium", "expansion_around"]
 
 REACH = 0.8  # of ln E, within which it is trusted
 COARSE = 3e-2  # of the forces: for the equilibrium whose stiffness is factorised
@@ -124,17 +125,28 @@ class Expansion:
         return Expansion(model, there, self.counts + there.counts, self.derivatives_at)
 
 
-def expansion_near(model: FiniteStrainModel, linear: Approximation, at: Place, *, tolerance: float) -> Expansion:
-    """The expansion around the equilibrium near the linear law's displacement at a place, with all derivatives.
+def coarse_equilibrium(model: FiniteStrainModel, linear: Approximation, at: Place) -> FiniteStrainEquilibrium:
+    """The equilibrium near the linear law's displacement at a place, to 3 % of the forces, where an expansion begins.
 
-    tolerance: of the forces, of every equilibrium that follows. Its factorisation is the only one: it serves all solves
-    that stay near. Raises `NotConverged` with the element and the share of the motion where the path ended.
+    It keeps no factorisation. Raises `NotConverged` with the element and the share of the motion where the path ended.
     """
     start = linear.model.solve(at.moduli, at.coefficients).displacement
-    near = from_start(
-        model.to_tolerance(COARSE), at.moduli, at.coefficients, start=start, nearby=linear.factorisation
-    ).refactorised()
-    full = model.to_tolerance(tolerance)
-    found = from_start(full, at.moduli, at.coefficients, start=near.displacement, nearby=near.factorisation)
-    derivatives = FirstOrderModel(model.names, at.moduli, at.coefficients, found.values, near.tangent())
+    rough, nearby = model.to_tolerance(COARSE), linear.factorisation
+    found = from_start(rough, at.moduli, at.coefficients, start=start, nearby=nearby)
+    return replace(found, path=replace(found.path, factorisation=None))
+
+
+def expansion_around(coarse: FiniteStrainEquilibrium, *, tolerance: float, progress: Progress = silent) -> Expansion:
+    """The expansion around the equilibrium beside a coarse one, with all derivatives.
+
+    tolerance: of the forces, of every equilibrium that follows. Its factorisation is the only one: it serves all solves
+    that stay near. Raises `NotConverged` as `coarse_equilibrium` does.
+    """
+    progress("finite strain: factorising the tangent stiffness there")
+    near = coarse.refactorised()
+    progress("finite strain: the equilibrium on it")
+    full, moduli, coefficients = near.model.to_tolerance(tolerance), near.moduli, near.coefficients
+    found = from_start(full, moduli, coefficients, start=near.displacement, nearby=near.factorisation)
+    progress(f"finite strain: derivatives by {len(full.names)} moduli and {len(coefficients)} modes")
+    derivatives = FirstOrderModel(full.names, moduli, coefficients, found.values, near.tangent())
     return Expansion(derivatives, found, near.counts + near.tangent_counts + found.counts)

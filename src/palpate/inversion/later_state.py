@@ -28,7 +28,8 @@ class LaterState:
     model: the body under the linear law; finite_strain: under the law that the estimate is continued to, None where
     that is the linear one; walls: the drivers' walls, whose prior is learned from the images, none where the modes' own
     prior holds; reference: number of the rest state that it belongs to; observed: the approximation's model at the
-    observed unknowns alone, one observation after the other.
+    observed unknowns alone, one observation after the other; bending: the linear law's one, whose curvature an
+    expansion under another law lacks.
     """
 
     model: LinearModel
@@ -38,6 +39,7 @@ class LaterState:
     reference: int = 0
     approximation: Approximation | None = field(default=None, repr=False)
     observed: ForwardModel | None = field(default=None, repr=False)
+    bending: ForwardModel | None = field(default=None, repr=False)
 
     @property
     def constraint(self) -> Constraint:

@@ -153,7 +153,7 @@ def fit_coefficients(
     To a decrement of `tolerance`, by default what serves where the moduli are going to change; they are left where they
     are after `max_steps`.
     """
-    return gauss_newton(objective, begin, bounds=bounds, hold_theta=True, tolerance=tolerance, max_steps=max_steps)
+    return gauss_newton(objective, begin, bounds=bounds, held=True, tolerance=tolerance, max_steps=max_steps)
 
 
 def gauss_newton(
@@ -161,7 +161,7 @@ def gauss_newton(
     start: NDArray[np.float64],
     *,
     bounds: Bounds,
-    hold_theta: bool = False,
+    held: NDArray[np.bool_] | bool = False,
     tolerance: float = 1e-3,
     within: NDArray[np.float64] | float = np.inf,
     known: Sequence[Minimum] = (),
@@ -174,7 +174,8 @@ def gauss_newton(
     -s.d / 2, the reduction that the quadratic model still promises in units of log-likelihood. It ends when that is
     under `tolerance` and the step to the model's minimum moves each log-modulus by less than `within` (one number, or
     (n_parameters,)), or where steps within the noise of closest points lower the decrement no more: then where that was
-    least; or where it has met one of the `known` minima. `hold_theta` moves the drivers' coefficients only.
+    least; or where it has met one of the `known` minima. `held`: the log-moduli (n_parameters,), or all
+    of them, that keep their values.
     """
     unknowns, region, history = start.copy(), _Region(), list[Iterate]()
     now, evaluations, outcome = objective(unknowns), 1, Outcome.STEPS
@@ -183,7 +184,7 @@ def gauss_newton(
         if not np.isfinite(now.value):
             outcome = Outcome.NOT_FINITE
             break
-        free = _free(objective, unknowns, now, bounds, hold_theta)
+        free = _free(objective, unknowns, now, bounds, held)
         decrement = newton_decrement(now, free)
         history.append(Iterate(unknowns[: objective.n_parameters], now.value, now.misfit_mm2, decrement))
         whole = _step(now, free, objective.n_parameters, WHOLE)[: objective.n_parameters]
@@ -242,13 +243,17 @@ def _search(
 
 
 def _free(
-    objective: LeastSquares, unknowns: NDArray[np.float64], now: Evaluation, bounds: Bounds, hold_theta: bool
+    objective: LeastSquares,
+    unknowns: NDArray[np.float64],
+    now: Evaluation,
+    bounds: Bounds,
+    held: NDArray[np.bool_] | bool,
 ) -> NDArray[np.bool_]:
-    """Unknowns that may move: not a log-modulus at a bound that pulls outwards, nor any when theta is held."""
+    """Unknowns that may move: not a log-modulus at a bound that pulls outwards, nor a held one."""
     n = objective.n_parameters
     theta, slope = unknowns[:n], now.score[:n]
-    held = ((theta <= bounds.lower) & (slope > 0.0)) | ((theta >= bounds.upper) & (slope < 0.0)) | hold_theta
-    return np.concatenate([~held, np.ones(len(unknowns) - n, dtype=bool)])
+    still = ((theta <= bounds.lower) & (slope > 0.0)) | ((theta >= bounds.upper) & (slope < 0.0)) | held
+    return np.concatenate([~still, np.ones(len(unknowns) - n, dtype=bool)])
 
 
 def newton_decrement(now: Evaluation, free: NDArray[np.bool_] | slice = slice(None)) -> float:
@@ -302,7 +307,7 @@ def lbfgs(
     curvature at the start, falls under the square root of `tolerance`.
     """
     n = objective.n_parameters
-    first = gauss_newton(objective, start, bounds=bounds, hold_theta=True, tolerance=tolerance)
+    first = gauss_newton(objective, start, bounds=bounds, held=True, tolerance=tolerance)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(first.evaluation.matrix)[:n], 1e-30))
     profile = dict[bytes, Minimum]()  # of pure answers: what was asked before changes none
 
@@ -311,7 +316,7 @@ def lbfgs(
         key = scaled.tobytes()
         if key not in profile:
             unknowns = np.concatenate([scaled * scale, first.unknowns[n:]])
-            profile[key] = gauss_newton(objective, unknowns, bounds=bounds, hold_theta=True, tolerance=tolerance)
+            profile[key] = gauss_newton(objective, unknowns, bounds=bounds, held=True, tolerance=tolerance)
         return profile[key]
 
     def value_and_slope(scaled: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:

@@ -214,6 +214,7 @@ def _iteration(
 ) -> OuterIterate:
     """Reweight and minimise on the present approximations, and update these there, or on a part of the way."""
     objective, found, reweighting = _reweighted_minimum(now, settings, rule, progress, line)
+    progress(f"{line}: the model's error, and the model anew, there")
     n = objective.n_parameters
     tolerance = rule.tolerance(found, n)
     moved = np.abs(found.unknowns - now.minimum.unknowns)[:n]
@@ -240,7 +241,8 @@ def _reweighted_minimum(
     Where these lead further than residuals are straight, it minimises the objective itself and reweights there. It ends
     where a pass moves the log-moduli by less than the tolerance and their standard deviations by less than `WIDTH`, or
     by a tenth of the last outer iteration's step where that is more. The log-moduli go no further than the
-    approximations reach.
+    approximations reach; where that cuts a step short nothing is reweighted: what is still motion would pass for noise,
+    and where noise is believed to be large the drivers are no longer made to follow their walls.
     """
     n, objective, minimum = now.objective.n_parameters, now.objective, now.minimum
     reach = min(approximation.reach for approximation in objective.approximations)
@@ -248,7 +250,7 @@ def _reweighted_minimum(
     near = Bounds(np.maximum(bounds.lower, theta - reach), np.minimum(bounds.upper, theta + reach))
     forcing, change, minimised_before = max(1.0, FORCING * now.step), np.inf, False
     for number in range(1, rule.passes + 1):
-        before, (weighted, aim, left) = minimum, _agreed(objective, minimum, near, rule, forcing)
+        before, (weighted, aim, left) = minimum, _agreed(objective, minimum, near, bounds, rule, forcing)
         straight = bool(np.abs(aim.unknowns - before.unknowns)[:n].max() < STRAIGHT)
         if straight:
             objective, minimum = _advanced(weighted, minimum, aim.unknowns, replace(settings, bounds=near))
@@ -256,12 +258,13 @@ def _reweighted_minimum(
         else:
             within = forcing * rule.tolerance(before, n) / INNER
             found = minimised(objective, before.unknowns, replace(settings, bounds=near), within=within)
-            objective = reweighted(objective, found).rematched(found.unknowns)
+            weighted = objective if _cut_short(found, near, bounds) else reweighted(objective, found)
+            objective = weighted.rematched(found.unknowns)
             again, spent = objective(found.unknowns), found.evaluations + 1
             minimum = replace(found, evaluation=again, evaluations=spent).after(before)
             change = _change(before, minimum, rule, n) if minimised_before else np.inf  # of minima under two weightings
         minimised_before = not straight
-        if change < forcing or not minimum.converged:
+        if change < forcing or not minimum.converged or _cut_short(minimum, near, bounds):
             break
         progress(f"{line}, reweighting {number}: {objective.parameters.in_words(minimum.unknowns)}")
     return objective, minimum, change
@@ -276,24 +279,34 @@ def _change(before: Minimum, minimum: Minimum, rule: StopRule, n_parameters: int
 
 
 def _agreed(
-    objective: Objective, minimum: Minimum, bounds: Bounds, rule: StopRule, forcing: float
+    objective: Objective, minimum: Minimum, near: Bounds, bounds: Bounds, rule: StopRule, forcing: float
 ) -> tuple[Objective, Minimum, float]:
     """Weights and an estimate that agree with each other on the residuals linear around `minimum`; their last change.
 
-    First the estimate under the present weights: what an updated model misses elsewhere would pass for noise.
+    First the estimate under the present weights: what an updated model misses elsewhere would pass for noise. `near`:
+    how far the approximations reach within the `bounds`.
     """
     n = objective.n_parameters
     linearised = LinearisedObjective(objective, minimum.unknowns, minimum.evaluation)
     within = forcing * rule.tolerance(minimum, n) / INNER
-    found = gauss_newton(linearised, minimum.unknowns, bounds=bounds, tolerance=LINEARISED, within=within)
+    found = gauss_newton(linearised, minimum.unknowns, bounds=near, tolerance=LINEARISED, within=within)
+    if _cut_short(found, near, bounds):
+        return objective, found, np.inf
     for _ in range(rule.passes):
         linearised = replace(linearised, objective=reweighted(linearised.objective, found))
         before = found
-        found = gauss_newton(linearised, before.unknowns, bounds=bounds, tolerance=LINEARISED, within=within)
+        found = gauss_newton(linearised, before.unknowns, bounds=near, tolerance=LINEARISED, within=within)
         change = _change(before, found, rule, n)
         if change < AGREED * min(forcing, FIRST):
             break
     return linearised.objective, found, change
+
+
+def _cut_short(minimum: Minimum, near: Bounds, bounds: Bounds) -> bool:
+    """Whether the reach of the approximations, and no bound of the search, holds a log-modulus back."""
+    theta = minimum.unknowns[: len(near.lower)]
+    low, high = (theta <= near.lower) & (near.lower > bounds.lower), (theta >= near.upper) & (near.upper < bounds.upper)
+    return bool(np.any(low | high))
 
 
 def _advanced(

@@ -50,7 +50,7 @@ class Restriction:
     """From a matrix K (n_dof, n_dof) to F^T K F: by `places` (nnz,) of its entries where F only selects."""
 
     free: sparse.csr_matrix[np.float64]
-    places: NDArray[np.int64] | None
+    places: NDArray[np.int32] | None
     indices: NDArray[np.int32]
     indptr: NDArray[np.int32]
 
@@ -71,7 +71,8 @@ def restriction(constraint: Constraint, pattern: sparse.csr_matrix[np.float64]) 
     empty = np.zeros(0, dtype=np.int32)
     if not (np.all(np.diff(columns.indptr) == 1) and np.all(columns.data == 1.0)):
         return Restriction(free, None, empty, empty)
-    numbered = sparse.csr_matrix((np.arange(pattern.nnz), pattern.indices, pattern.indptr), shape=pattern.shape)
+    numbers = np.arange(pattern.nnz, dtype=np.int32)
+    numbered = sparse.csr_matrix((numbers, pattern.indices, pattern.indptr), shape=pattern.shape)
     chosen = sparse.csr_matrix(numbered[columns.indices][:, columns.indices])
     chosen.sort_indices()
-    return Restriction(free, np.asarray(chosen.data, dtype=np.int64), chosen.indices, chosen.indptr)
+    return Restriction(free, np.asarray(chosen.data), chosen.indices, chosen.indptr)

@@ -29,6 +29,7 @@ __all__ = [
 RANK_TOLERANCE = 1e-10  # of the largest singular value of the normalised snapshots
 WELL_CONDITIONED = 1e-12  # of the Gram matrix' largest eigenvalue: above it Cholesky's factor orthogonalises safely
 CHUNK = 64  # basis vectors multiplied with a stiffness at once
+ROWS = 4096  # of them, made orthogonal at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +37,7 @@ class ReducedModel:
     """A linear model on m basis vectors; implements `ForwardModel`.
 
     Per region at 1 kPa: stiffness (n_regions, m, m) and coupling (n_regions, m, n_modes + 1), mN/mm; load (m,) mN.
-    Outputs (rows):
-    output_basis (n_outputs, m), output_given (n_outputs, n_modes + 1) mm: modes and, last, the offset.
+    Outputs (rows): output_basis (n_outputs, m), output_modes (n_outputs, n_modes) and output_offset (n_outputs,), mm.
     """
 
     names: tuple[str, ...]
@@ -45,7 +45,8 @@ class ReducedModel:
     coupling: NDArray[np.float64]
     load: NDArray[np.float64]
     output_basis: NDArray[np.float64]
-    output_given: NDArray[np.float64]
+    output_modes: NDArray[np.float64]
+    output_offset: NDArray[np.float64]
 
     @property
     def n_regions(self) -> int:
@@ -64,14 +65,16 @@ class ReducedModel:
 
     def at(self, dofs: NDArray[np.int64]) -> ReducedModel:
         """The same model with the outputs `dofs` (n,) only, by their place among the present outputs."""
-        return replace(self, output_basis=self.output_basis[dofs], output_given=self.output_given[dofs])
+        basis, modes, offset = self.output_basis[dofs], self.output_modes[dofs], self.output_offset[dofs]
+        return replace(self, output_basis=basis, output_modes=modes, output_offset=offset)
 
     def through(self, operator: sparse.csr_matrix[np.float64]) -> ReducedModel:
         """The same model with the outputs H u for an operator H (n, n_outputs), such as a surface interpolation."""
         return replace(
             self,
             output_basis=np.asarray(operator @ self.output_basis),
-            output_given=np.asarray(operator @ self.output_given),
+            output_modes=np.asarray(operator @ self.output_modes),
+            output_offset=np.asarray(operator @ self.output_offset),
         )
 
     def system(self, moduli: NDArray[np.float64]) -> ReducedSystem:
@@ -126,14 +129,16 @@ class ReducedSystem:
 
     def responses(self) -> NDArray[np.float64]:
         """Outputs (n_outputs, n_modes + 1) mm for each unit mode without the offset and, last, for the offset."""
-        return np.asarray(self.model.output_given + self.model.output_basis @ self.amplitudes)
+        model = self.model
+        given = np.column_stack([model.output_modes, model.output_offset])
+        return np.asarray(given + model.output_basis @ self.amplitudes)
 
     def solve(self, coefficients: NDArray[np.float64]) -> ReducedEquilibrium:
         """Equilibrium at mode coefficients (n_modes,), dimensionless: no further solve."""
         checked = checked_coefficients(coefficients, self.model.n_modes)
-        weights = np.append(checked, 1.0)
-        amplitude = self.amplitudes @ weights
-        values = self.model.output_given @ weights + self.model.output_basis @ amplitude
+        amplitude = self.amplitudes @ np.append(checked, 1.0)
+        given = self.model.output_modes @ checked + self.model.output_offset
+        values = given + self.model.output_basis @ amplitude
         values.setflags(write=False)
         return ReducedEquilibrium(self, checked, amplitude, values)
 
@@ -157,7 +162,7 @@ class ReducedEquilibrium(DenseEquilibrium):
         by_modulus = system.backward(-self._modulus_forces())
         amplitudes = np.concatenate([by_modulus, system.amplitudes[:, :-1]], axis=1)
         tangent = model.output_basis @ amplitudes
-        tangent[:, model.n_regions :] += model.output_given[:, :-1]
+        tangent[:, model.n_regions :] += model.output_modes
         return np.asarray(tangent)
 
     def adjoint(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -166,7 +171,7 @@ class ReducedEquilibrium(DenseEquilibrium):
         reduced = model.output_basis.T @ gradient
         adjoint = self.system.backward(reduced[:, None])[:, 0]
         by_modulus = -self._modulus_forces().T @ adjoint
-        by_mode = self.system.amplitudes[:, :-1].T @ reduced + model.output_given[:, :-1].T @ gradient
+        by_mode = self.system.amplitudes[:, :-1].T @ reduced + model.output_modes.T @ gradient
         return np.concatenate([by_modulus, by_mode])
 
     def _modulus_forces(self) -> NDArray[np.float64]:
@@ -178,25 +183,29 @@ class ReducedEquilibrium(DenseEquilibrium):
 
 @dataclass(frozen=True, slots=True)
 class Projection:
-    """A linear model on the span of orthonormal `vectors` (n_free, m): the reduced model, and what extends it."""
+    """A linear model on the span of orthonormal vectors: the reduced model, and what extends it."""
 
     model: LinearModel
-    vectors: NDArray[np.float64]
     reduced: ReducedModel
+
+    @property
+    def vectors(self) -> NDArray[np.float64]:
+        """The orthonormal vectors V (n_free, m), from the outputs F V: kept twice they would be the largest of all."""
+        return np.asarray(self.model.constraint.free.T @ self.reduced.output_basis)
 
     def extended(self, snapshots: NDArray[np.float64]) -> Projection:
         """The projection on the span of the present vectors and of snapshots (n_free, k) mm.
 
         Only what the snapshots add is multiplied with the stiffness. Raises `ConfigurationError` for other rows.
         """
-        fresh = _complement(self.vectors, _checked(self.model, snapshots))
+        vectors = self.vectors
+        fresh = _complement(vectors, _checked(self.model, snapshots))
         if not fresh.shape[1]:
             return self
         model, old = self.model, self.reduced
-        images = [_product(matrix, fresh) for matrix in model.free_stiffness]
-        stiffness = np.stack(
-            [_bordered(a, self.vectors.T @ y, fresh.T @ y) for a, y in zip(old.stiffness, images, strict=True)]
-        )
+        sides = [_products(matrix, (vectors, fresh), fresh) for matrix in model.free_stiffness]
+        del vectors
+        stiffness = np.stack([_bordered(a, *side) for a, side in zip(old.stiffness, sides, strict=True)])
         reduced = replace(
             old,
             stiffness=stiffness,
@@ -204,13 +213,13 @@ class Projection:
             load=np.concatenate([old.load, fresh.T @ model.free_load]),
             output_basis=np.concatenate([old.output_basis, model.constraint.free @ fresh], axis=1),
         )
-        return Projection(model, np.concatenate([self.vectors, fresh], axis=1), reduced)
+        return Projection(model, reduced)
 
     def under(self, model: LinearModel) -> Projection:
         """The same vectors for a `model` of the same body with other modes or another offset."""
-        given = np.column_stack([model.constraint.modes, model.constraint.offset])
-        reduced = replace(self.reduced, coupling=_coupling(model, self.vectors), output_given=given)
-        return Projection(model, self.vectors, reduced)
+        constraint, coupling = model.constraint, _coupling(model, self.vectors)
+        modes, offset = constraint.modes, constraint.offset
+        return Projection(model, replace(self.reduced, coupling=coupling, output_modes=modes, output_offset=offset))
 
 
 def projection(model: LinearModel, snapshots: NDArray[np.float64]) -> Projection:
@@ -219,13 +228,12 @@ def projection(model: LinearModel, snapshots: NDArray[np.float64]) -> Projection
     They are made orthonormal and their rank cut; raises `ConfigurationError` when their rows are not n_free.
     """
     vectors = orthonormal_basis(_checked(model, snapshots))
-    products = [vectors.T @ _product(matrix, vectors) for matrix in model.free_stiffness]
+    products = [_products(matrix, (vectors,), vectors)[0] for matrix in model.free_stiffness]
     stiffness = np.stack([0.5 * (product + product.T) for product in products])
-    given = np.column_stack([model.constraint.modes, model.constraint.offset])
-    load = np.asarray(vectors.T @ model.free_load)
-    outputs = np.asarray(model.constraint.free @ vectors)
-    reduced = ReducedModel(model.names, stiffness, _coupling(model, vectors), load, outputs, given)
-    return Projection(model, vectors, reduced)
+    load, coupling = np.asarray(vectors.T @ model.free_load), _coupling(model, vectors)
+    outputs, constraint = np.asarray(model.constraint.free @ vectors), model.constraint
+    reduced = ReducedModel(model.names, stiffness, coupling, load, outputs, constraint.modes, constraint.offset)
+    return Projection(model, reduced)
 
 
 def orthonormal_basis(snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -238,19 +246,23 @@ def orthonormal_basis(snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
     lengths = np.linalg.norm(snapshots, axis=0)
     if snapshots.ndim != 2 or not np.all(np.isfinite(lengths)) or not np.any(lengths > 0.0):
         raise ConfigurationError(f"a reduced basis needs finite, non-zero snapshots (n, k); got {snapshots.shape}")
-    scaled = snapshots[:, lengths > 0.0] / lengths[lengths > 0.0]
+    scaled = np.asarray(snapshots[:, lengths > 0.0] / lengths[lengths > 0.0])
     sizes = np.linalg.eigvalsh(scaled.T @ scaled)
     if sizes[0] > WELL_CONDITIONED * sizes[-1]:
-        return _through_gram(_through_gram(scaled))
+        for _ in range(2):
+            _through_gram(scaled)
+        return scaled
     q, r = np.linalg.qr(scaled)
     rotation, values, _ = np.linalg.svd(r)
     return np.asarray(q @ rotation[:, : int(np.sum(values > RANK_TOLERANCE * values[0]))])
 
 
-def _through_gram(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """V R^-1 (n, k) with V^T V = R^T R."""
+def _through_gram(vectors: NDArray[np.float64]) -> None:
+    """V R^-1 in place of V (n, k), with V^T V = R^T R: a second copy would be among the largest there are."""
     factor = linalg.cholesky(vectors.T @ vectors, check_finite=False)
-    return np.asarray(vectors @ linalg.solve_triangular(factor, np.eye(len(factor)), check_finite=False))
+    inverse = linalg.solve_triangular(factor, np.eye(len(factor)), check_finite=False)
+    for start in range(0, len(vectors), ROWS):
+        vectors[start : start + ROWS] = vectors[start : start + ROWS] @ inverse
 
 
 def _complement(vectors: NDArray[np.float64], snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -285,12 +297,17 @@ def _bordered(
     return np.block([[block, side], [side.T, 0.5 * (corner + corner.T)]])
 
 
-def _product(matrix: sparse.csr_matrix[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A V (n, k); a tissue's stiffness is empty but for its own rows, which alone are touched."""
+def _products(
+    matrix: sparse.csr_matrix[np.float64], sides: tuple[NDArray[np.float64], ...], vectors: NDArray[np.float64]
+) -> list[NDArray[np.float64]]:
+    """S^T A V (m, k) for each of `sides` S (n, m); a tissue's stiffness A is empty but for its own rows."""
     touched = np.flatnonzero(np.diff(matrix.indptr))
-    inner, rows = sparse.csr_matrix(matrix[touched][:, touched]), vectors[touched]
-    result = np.zeros_like(vectors)
+    inner = sparse.csr_matrix(matrix[touched][:, touched])
+    own = [side[touched] for side in sides]
+    results = [np.empty((side.shape[1], vectors.shape[1])) for side in sides]
     for start in range(0, vectors.shape[1], CHUNK):
-        part = np.ascontiguousarray(rows[:, start : start + CHUNK])
-        result[touched, start : start + CHUNK] = np.asarray(inner @ part)
-    return result
+        columns = slice(start, start + CHUNK)
+        image = np.asarray(inner @ np.ascontiguousarray(vectors[touched, columns]))
+        for result, side in zip(results, own, strict=True):
+            result[:, columns] = side.T @ image
+    return results

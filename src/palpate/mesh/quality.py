@@ -9,10 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import MeshQualityError
+from palpate.images.label_image import VoxelGrid
+from palpate.images.segmentation import Segmentation
 from palpate.mesh.anatomy import Anatomy
 from palpate.mesh.cutting import face_pieces
 from palpate.mesh.dihedral import tet_dihedrals
-from palpate.mesh.tet_mesh import TetMesh
+from palpate.mesh.places import in_words, largest_difference
+from palpate.mesh.tet_mesh import FACES, TetMesh
 
 __all__ = ["MeshQuality", "check_mesh", "dihedral_angles", "level_set_volumes", "mesh_quality"]
 
@@ -21,6 +24,7 @@ P5_DIHEDRAL_DEG = 25.0
 LEVEL_SET_TOLERANCE = 0.01
 VOXEL_TOLERANCE = 0.03
 COARSE_CELL_MM = 8.0
+LEAST_SLOPE = 0.25  # of a level set next to its surface, where two surfaces of an organ nearly meet
 FINE_CELLS = 8  # fine cells along the side of a coarse one
 
 
@@ -84,16 +88,22 @@ def mesh_quality(mesh: TetMesh, anatomy: Anatomy, *, voxel_volumes: Mapping[str,
 
 
 def check_mesh(
-    mesh: TetMesh, anatomy: Anatomy, *, voxel_volumes: Mapping[str, float] | None = None, thin: tuple[str, ...] = ()
+    mesh: TetMesh,
+    anatomy: Anatomy,
+    *,
+    voxel_volumes: Mapping[str, float] | None = None,
+    thin: tuple[str, ...] = (),
+    image: Segmentation | None = None,
 ) -> MeshQuality:
     """The gate: the mesh's quality, or `MeshQualityError` that names every region and place that fails.
 
     Smallest dihedral angle >= 5 degrees, 5th percentile >= 25; every region within 1 % of its level set's volume and
     within 3 % of its voxels' (regions in `thin`, under four voxels thick: only reported); no inverted tetrahedron; one
-    piece; no face in more than two tetrahedra. `voxel_volumes`: tissue name -> mm^3 inside the box.
+    piece; no face in more than two tetrahedra. `voxel_volumes`: tissue name -> mm^3 inside the box; `image`: the one
+    that was meshed, to name voxels and slices.
     """
     quality = mesh_quality(mesh, anatomy, voxel_volumes=voxel_volumes)
-    failures = _shape_failures(quality)
+    failures = _shape_failures(quality, mesh, image.grid if image else None)
     checks = (
         ("level set", quality.volume_error, LEVEL_SET_TOLERANCE),
         ("voxels", quality.voxel_volume_error, VOXEL_TOLERANCE),
@@ -101,44 +111,71 @@ def check_mesh(
     for of, errors, limit in checks:
         for name, error in errors.items():
             if abs(error) > limit and name not in thin:
+                place = largest_difference(mesh, image, mesh.tissue_index(name)) if image else None
+                where = f", most of it near {in_words(place, image.grid)}" if image and place is not None else ""
                 failures.append(
                     f"region '{name}' of {quality.volume[name]:.0f} mm^3 differs by {100 * error:+.1f} % from the"
-                    f" volume of its {of} (limit {100 * limit:g} %)"
+                    f" volume of its {of} (limit {100 * limit:g} %){where}"
                 )
     if failures:
-        raise MeshQualityError(
-            f"the mesh of {quality.tets} tetrahedra is not fit to compute with: {'; '.join(failures)};"
-            " try a smaller mesh.edge_length_mm, or repair the labels at that place"
-        )
+        raise MeshQualityError(f"the mesh of {quality.tets} tetrahedra does not pass its gate: {'; '.join(failures)}")
     return quality
 
 
 def level_set_volumes(anatomy: Anatomy) -> dict[str, float]:
     """Volume (mm^3) of each tissue inside the box, from the level sets alone: tissue name -> mm^3.
 
-    Cells of 8 mm that a surface crosses are divided into 1 mm ones; of a fine cell the share
-    clip(1/2 - phi / edge, 0, 1) counts as inside.
+    Cells of 8 mm that a surface crosses are divided into 1 mm ones, these again into halves where a surface crosses
+    them; of a cell the share clip(1/2 - d / edge, 0, 1) counts as inside, d the distance to the surface.
     """
     lengths = anatomy.box.lengths
     counts = np.ceil(lengths / COARSE_CELL_MM).astype(int)
-    centres = _cell_centres(counts) * (lengths / counts)
+    size = lengths / counts
+    centres = _cell_centres(counts) * size
     values = anatomy.values(anatomy.box.world(centres))
-    reach = float(np.linalg.norm(lengths / counts))
-    cell = float(np.prod(lengths / counts))
+    reach = float(np.linalg.norm(size))
+    cell = float(np.prod(size))
     crossed = (np.abs(values) < reach).any(axis=0)
     total = cell * _shares(values[:, ~crossed], 1e-9).sum(axis=1)
-    fine = (_cell_centres(np.full(3, FINE_CELLS)) / FINE_CELLS - 0.5) * (lengths / counts)
+    edge = cell ** (1 / 3) / FINE_CELLS
     for block in np.array_split(np.flatnonzero(crossed), max(1, int(crossed.sum()) // 200)):
-        points = anatomy.box.world((centres[block][:, None] + fine).reshape(-1, 3))
-        edge = cell ** (1 / 3) / FINE_CELLS
-        inside = np.repeat(values[:, block], FINE_CELLS**3, axis=1)
-        for rank, tissue in enumerate(anatomy.priority):
-            near, phi = np.abs(inside[rank]) < reach, anatomy.level_sets[tissue]
-            if phi is not None and near.any():
-                inside[rank, near] = phi.at(points[near])
-        total += cell / FINE_CELLS**3 * _shares(inside, edge).sum(axis=1)
+        local, inside = _divided(anatomy, centres[block], values[:, block], FINE_CELLS, size, within_mm=reach)
+        near = (np.abs(inside) < edge).any(axis=0)
+        total += cell / FINE_CELLS**3 * _shares(inside[:, ~near], edge).sum(axis=1)
+        fine = size / FINE_CELLS
+        _, inside = _divided(anatomy, local[near], inside[:, near], 2, fine, within_mm=float(np.linalg.norm(fine)))
+        total += cell / (2 * FINE_CELLS) ** 3 * _shares(inside, 0.5 * edge).sum(axis=1)
     order = (*anatomy.priority, anatomy.filler)
     return {anatomy.tissues[i].name: float(total[rank]) for rank, i in enumerate(order)}
+
+
+def _divided(
+    anatomy: Anatomy,
+    centres: NDArray[np.float64],
+    values: NDArray[np.float64],
+    n: int,
+    size: NDArray[np.float64],
+    *,
+    within_mm: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Centres (n^3 n_cells, 3) mm along the box's axes of the n^3 parts of each cell, and distances to surfaces there.
+
+    `centres` (n_cells, 3), `values` (n_surfaces, n_cells) mm and `size` (3,) mm are the cells'; a distance is new where
+    the cell's own is less than `within_mm`: |phi| / |grad phi| next to the surface, where phi alone would be a bias.
+    """
+    parts = (_cell_centres(np.full(3, n)) / n - 0.5) * size
+    local = (centres[:, None] + parts).reshape(-1, 3)
+    points, inside = anatomy.box.world(local), np.repeat(values, n**3, axis=1)
+    for rank, tissue in enumerate(anatomy.priority):
+        near, phi = np.abs(inside[rank]) < within_mm, anatomy.level_sets[tissue]
+        if phi is None or not near.any():
+            continue
+        distance = phi.at(points[near])
+        close = np.abs(distance) < float(size.max()) / n
+        slope = np.linalg.norm(phi.gradient_at(points[near][close]), axis=1)
+        distance[close] /= np.maximum(slope, LEAST_SLOPE)
+        inside[rank, near] = distance
+    return local, inside
 
 
 def _cell_centres(counts: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -161,19 +198,39 @@ def _errors(volume: Mapping[str, float], target: Mapping[str, float]) -> dict[st
     return {name: volume[name] / target[name] - 1.0 for name in volume if target.get(name, 0.0) > 0.0}
 
 
-def _shape_failures(quality: MeshQuality) -> list[str]:
-    where = f"in '{quality.worst_tissue}' near RAS {np.round(quality.worst_place, 1).tolist()} mm"
+def _shape_failures(quality: MeshQuality, mesh: TetMesh, grid: VoxelGrid | None) -> list[str]:
+    where = f"in '{quality.worst_tissue}' near {in_words(np.array(quality.worst_place), grid)}"
     failures = []
     if quality.min_volume <= 0.0:
         failures.append(f"an inverted tetrahedron of {quality.min_volume:.3g} mm^3, the worst one {where}")
     if quality.min_dihedral_deg < MIN_DIHEDRAL_DEG:
         failures.append(f"a dihedral angle of {quality.min_dihedral_deg:.1f} deg (limit {MIN_DIHEDRAL_DEG:g}) {where}")
     if quality.p5_dihedral_deg < P5_DIHEDRAL_DEG:
+        flat = mesh.region[dihedral_angles(mesh).min(axis=1) < P5_DIHEDRAL_DEG]
+        most = mesh.tissues[int(np.bincount(flat).argmax())].name
         failures.append(
-            f"5 % of the tetrahedra have an angle below {quality.p5_dihedral_deg:.1f} deg (limit {P5_DIHEDRAL_DEG:g})"
+            f"5 % of the tetrahedra have an angle below {quality.p5_dihedral_deg:.1f} deg (limit {P5_DIHEDRAL_DEG:g}),"
+            f" most of them in '{most}', the worst {where}"
         )
     if quality.components != 1:
-        failures.append(f"it falls into {quality.components} pieces that share no face")
+        piece, _ = face_pieces(mesh.tets)
+        loose = piece != np.bincount(piece).argmax()
+        failures.append(
+            f"it falls into {quality.components} pieces that share no face, one of them {_around(mesh, loose, grid)}"
+        )
     if quality.overfull_faces:
-        failures.append(f"{quality.overfull_faces} faces belong to more than two tetrahedra")
+        _, number, count = np.unique(
+            np.sort(mesh.tets[:, FACES].reshape(-1, 3), axis=1), axis=0, return_inverse=True, return_counts=True
+        )
+        over = np.asarray((count[number.ravel()] > 2).reshape(-1, 4).any(axis=1))
+        failures.append(
+            f"{quality.overfull_faces} faces belong to more than two tetrahedra, one {_around(mesh, over, grid)}"
+        )
     return failures
+
+
+def _around(mesh: TetMesh, chosen: NDArray[np.bool_], grid: VoxelGrid | None) -> str:
+    """Tissue and place of the first of the chosen (n_tets,) tetrahedra."""
+    first = int(np.flatnonzero(chosen)[0])
+    middle = mesh.nodes[mesh.tets[first]].mean(axis=0)
+    return f"in '{mesh.tissues[mesh.region[first]].name}' near {in_words(middle, grid)}"

@@ -15,6 +15,7 @@ from palpate.mesh.remeshing import compact, remeshed
 from palpate.mesh.smoothing import smoothed
 from palpate.mesh.snapping import contacts_of, debiased, snapped
 from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh
+from palpate.progress import Progress, silent
 
 __all__ = ["COARSER", "COARSEST", "GRADING", "boundary_of", "tetrahedralise"]
 
@@ -32,11 +33,12 @@ RESCUE_DEG = 10.0
 COARSER = 1.5  # edge length on bones, air and known tissues, in edge lengths
 
 
-def tetrahedralise(anatomy: Anatomy, *, edge_length_mm: float) -> TetMesh:
+def tetrahedralise(anatomy: Anatomy, *, edge_length_mm: float, progress: Progress = silent) -> TetMesh:
     """Conforming tetrahedra of the meshed tissues; hollow tissues (driver, rigid, void) are left out.
 
     `edge_length_mm` holds on the surfaces of `estimate` tissues and drivers; it grows with the distance from them,
-    to four times as much. Surface nodes lie on the level sets. Deterministic.
+    to four times as much. Surface nodes lie on the level sets. Deterministic. `progress` is called with a sentence at
+    each step.
     Raises `GeometryError` when nothing is left to mesh or the remeshing fails.
     """
     if not 0.0 < edge_length_mm < float(anatomy.box.lengths.min()):
@@ -47,9 +49,14 @@ def tetrahedralise(anatomy: Anatomy, *, edge_length_mm: float) -> TetMesh:
     # the first without a bad angle, or the best: a gap as wide as the closing's reach closes in patches
     grid, best_angle = None, -np.inf
     failure = GeometryError("no attempt at meshing was made")
-    for gap in GAPS:
+    for number, gap in enumerate(GAPS, start=1):
+
+        def say(step: str, line: str = f"meshing, attempt {number} of at most {len(GAPS)}") -> None:
+            """What happens in this attempt."""
+            progress(f"{line}: {step}")
+
         try:
-            attempt = _grid(closed(anatomy, gap_mm=gap * edge_length_mm), edge_length_mm)
+            attempt = _grid(closed(anatomy, gap_mm=gap * edge_length_mm), edge_length_mm, say)
         except GeometryError as error:
             failure = error
             continue
@@ -65,7 +72,8 @@ def tetrahedralise(anatomy: Anatomy, *, edge_length_mm: float) -> TetMesh:
     return TetMesh(grid.nodes, grid.tets, grid.region, boundary, beyond, anatomy.tissues)
 
 
-def _grid(anatomy: Anatomy, edge_length_mm: float) -> Grid:
+def _grid(anatomy: Anatomy, edge_length_mm: float, progress: Progress) -> Grid:
+    progress("a graded grid, cut along every surface")
     cut_grid = _cut_grid(anatomy, edge_length_mm)
     keep = np.array([tissue.meshed for tissue in anatomy.tissues])[cut_grid.region]
     if not keep.any():
@@ -75,11 +83,19 @@ def _grid(anatomy: Anatomy, edge_length_mm: float) -> Grid:
     volume = np.bincount(piece, signed_volumes(cut_grid.nodes, tets))
     keep = volume[piece] > CRUMB * volume.sum()
     grid = compact(cut_grid.nodes, tets[keep], region[keep])
-    grid = _fitted(_remeshed(grid, anatomy, edge_length_mm), anatomy, edge_length_mm)
+    grid = _better(grid, anatomy, edge_length_mm, progress)
     try:
-        return _fitted(_remeshed(grid, anatomy, edge_length_mm), anatomy, edge_length_mm)
+        return _better(grid, anatomy, edge_length_mm, progress)
     except GeometryError:  # the second remeshing only saves tetrahedra; its input is a mesh already
         return grid
+
+
+def _better(grid: Grid, anatomy: Anatomy, edge_length_mm: float, progress: Progress) -> Grid:
+    """The grid remeshed, its surfaces put back where they belong."""
+    progress(f"remeshing {len(grid.tets)} tetrahedra")
+    grid = _remeshed(grid, anatomy, edge_length_mm)
+    progress(f"fitting the surfaces of {len(grid.tets)} tetrahedra")
+    return _fitted(grid, anatomy, edge_length_mm)
 
 
 def _remeshed(grid: Grid, anatomy: Anatomy, edge_length_mm: float) -> Grid:

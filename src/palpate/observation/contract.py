@@ -11,10 +11,26 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from palpate.images.segmentation import Segmentation
+from palpate.mesh.space import LagrangeSpace
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.robust_loss import Tukey
 
-__all__ = ["Fit", "Observation", "Residuals", "Weighting"]
+__all__ = ["Fit", "ImagedBody", "Observation", "Residuals", "Weighting"]
+
+
+@dataclass(frozen=True, slots=True)
+class ImagedBody:
+    """A meshed body with its image at rest and the later ones, all that observations are made of.
+
+    smoothing_mm: width of every distance map that is compared; stated_noise: that of the case, None where the residuals
+    are to tell.
+    """
+
+    space: LagrangeSpace
+    before: Segmentation
+    after: tuple[Segmentation, ...]
+    smoothing_mm: float
+    stated_noise: NoiseModel | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,16 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import EstimationError
+from palpate.images.distance import DistanceMap
 from palpate.images.segmentation import Segmentation
+from palpate.images.tissue import Role
 from palpate.images.tissue_distance import tissue_distance_map
-from palpate.observation.contract import Fit, Residuals, Weighting
+from palpate.observation.contract import Fit, ImagedBody, Residuals, Weighting
 from palpate.observation.noise_model import EXACT_NOISE, SEGMENTATION_NOISE, NoiseModel, fit_noise_model
+from palpate.observation.observed_surface import ObservedSurface, observed_surface
 from palpate.observation.robust_loss import Tukey
 from palpate.observation.surface_residuals import Correspondence, correspondence, surface_residuals
-from palpate.observation.target import SurfaceTarget
+from palpate.observation.target import SurfaceTarget, surface_target
 from palpate.observation.wall_correction import wall_correction
+from palpate.parallel import mapped
 
-__all__ = ["SurfaceDistance", "robust_loss", "surface_distance"]
+__all__ = ["SurfaceDistance", "robust_loss", "surface_distance", "surface_distances"]
 
 TUKEY = 4.685  # cutoff in standard deviations, 95 % efficient for normal errors (Huber 1981)
 MAD = 1.4826  # standard deviations of a normal law in one median absolute deviation
@@ -211,6 +215,28 @@ def surface_distance(target: SurfaceTarget, *, stated_noise: NoiseModel | None =
     noise = stated_noise or SEGMENTATION_NOISE
     made = SurfaceDistance(target, _everywhere(target), noise, Weighting(1.0, Tukey()), stated_noise)
     return made.with_noise(made.first_noise((made,)))
+
+
+def surface_distances(
+    imaged: ImagedBody, surfaces: Sequence[ObservedSurface] | None = None
+) -> tuple[tuple[SurfaceDistance, ...], ...]:
+    """Those of each later image; `surfaces` None: of all `estimate` tissues and drivers."""
+    tissues = imaged.space.mesh.tissues
+    shown = [i for i, tissue in enumerate(tissues) if tissue.role in (Role.ESTIMATE, Role.DRIVER)]
+    seen = [observed_surface(imaged.space, i) for i in shown] if surfaces is None else surfaces
+
+    def maps(image: Segmentation) -> list[DistanceMap]:
+        """The distance map of each surface's tissue."""
+        return mapped(lambda s: tissue_distance_map(image, s.tissue, smoothing_mm=imaged.smoothing_mm), seen)
+
+    before = maps(imaged.before)
+    return tuple(
+        tuple(
+            surface_distance(surface_target(*of), stated_noise=imaged.stated_noise)
+            for of in zip(seen, before, maps(image), strict=True)
+        )
+        for image in imaged.after
+    )
 
 
 def robust_loss(values: NDArray[np.float64], target: SurfaceTarget) -> Tukey:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from palpate.inversion import Interval
+from palpate.uncertainty import Interval
 
 __all__ = ["NONE", "Bar", "EstimateRow", "estimate_rows", "interval_text", "main_numbers", "number", "scale_marks"]
 

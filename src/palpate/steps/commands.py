@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 
+from palpate.progress import Progress, silent
 from palpate.steps.results import CaseResult
 from palpate.study import run
 from palpate.study.case import Case
@@ -18,26 +19,32 @@ from palpate.study.result import MeshResult, Simulation
 
 __all__ = ["check", "estimate", "init", "make_mesh", "simulate"]
 
-Progress = Callable[[str], None]
 PathLike = str | os.PathLike[str]
 
 
 def init(
-    before: PathLike, *after: PathLike, labels: PathLike | None = None, output: PathLike = "palpate-output"
+    before: PathLike,
+    *after: PathLike,
+    labels: PathLike | None = None,
+    ct: Sequence[PathLike] = (),
+    output: PathLike = "palpate-output",
 ) -> NewCase:
     """Write a case.toml for label images into the folder `output`, roles guessed from names, as `palpate init` does.
 
-    labels: a label table. The case that is given says where it lies (`path`), who is taken for what and why
-    (`tissues`), and what nobody can guess (`questions`). Raises `InputDataError` for images that cannot be used,
+    labels: a label table; ct: the CT of `before`, or of each state in turn, which also tells air from tissue in label
+    0. The case that is given says where it lies (`path`), who is taken for what and why (`tissues`), and what nobody
+    can guess (`questions`). Raises `InputDataError` for images that cannot be used,
     `ConfigurationError` where another case.toml is in the way, `ResourceError` where nothing can be written.
     """
     outputs = OutputFolder(Path(output))
     with held_folder(outputs.path):
         table = None if labels is None else Path(labels)
-        return write_new_case([Path(path) for path in (before, *after)], table, outputs)
+        return write_new_case(
+            [Path(path) for path in (before, *after)], table, outputs, cts=[Path(path) for path in ct]
+        )
 
 
-def check(case_file: PathLike, overrides: Sequence[str] = (), *, progress: Progress = run.silent) -> CheckReport:
+def check(case_file: PathLike, overrides: Sequence[str] = (), *, progress: Progress = silent) -> CheckReport:
     """Every problem of a case file at once, its organs and what an estimate would cost, as `palpate check` tells.
 
     overrides: as for `read_case`; progress: is called with a sentence at each stage. Raises nothing for a bad case:
@@ -46,7 +53,7 @@ def check(case_file: PathLike, overrides: Sequence[str] = (), *, progress: Progr
     return check_case(Path(case_file), overrides, progress=progress)
 
 
-def make_mesh(case: Case, *, progress: Progress = run.silent) -> MeshResult:
+def make_mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
     """The tetrahedra of a case's reference image, passed through the gate on their quality, as `palpate mesh` has them.
 
     progress: is called with a sentence at each stage. Raises `InputDataError` for images that cannot be used,
@@ -55,7 +62,7 @@ def make_mesh(case: Case, *, progress: Progress = run.silent) -> MeshResult:
     return run.mesh(case, progress=progress)
 
 
-def simulate(case: Case, *, steps: int = 1, progress: Progress = run.silent) -> Simulation:
+def simulate(case: Case, *, steps: int = 1, progress: Progress = silent) -> Simulation:
     """A later state of a case whose tissues all state their `youngs_modulus_kpa`, under its law, motion and loads.
 
     steps: how many states to give, each in equilibrium at its share of the motion. Raises as `make_mesh` does, and
@@ -64,7 +71,7 @@ def simulate(case: Case, *, steps: int = 1, progress: Progress = run.silent) -> 
     return run.simulate(case, progress=progress, steps=steps)
 
 
-def estimate(case: Case, *, truth: Mapping[str, float] | None = None, progress: Progress = run.silent) -> CaseResult:
+def estimate(case: Case, *, truth: Mapping[str, float] | None = None, progress: Progress = silent) -> CaseResult:
     """The Young's modulus of every `estimate` tissue of a case, with its interval and its verdict.
 
     truth: true moduli (kPa) by tissue, to stand beside the estimates of a simulation; a phantom brings its own;

@@ -9,13 +9,14 @@ from typing import Any
 
 from palpate.errors import EstimationError, ResourceError
 from palpate.export.case_files import write_estimate_files
+from palpate.findings import Finding, warning_rows
+from palpate.progress import during, silent
 from palpate.report import case_report
 from palpate.study.case import Case
 from palpate.study.case_as_run import stage_case
 from palpate.study.earlier import RESULT, earlier_files
 from palpate.study.outputs import OutputFolder, Staging, write_json
 from palpate.study.result import CaseResult, failure_document
-from palpate.study.run import silent
 
 __all__ = ["DATA", "PAGE", "save_document", "save_estimate", "save_failure"]
 
@@ -31,6 +32,7 @@ def save_estimate(
     Where the page cannot be made, a warning of the document says so instead. Raises `ResourceError` where the disk
     refuses.
     """
+    progress = during("report", progress)
     progress("writing mesh and stiffness map")
     document = result.to_dict()
     with outputs.staged() as staging:
@@ -55,14 +57,14 @@ def save_document(staging: Staging, name: str, document: dict[str, Any]) -> None
     """Put the staged files in place with the document that lists them; those of the document before it go with that."""
     document["files"] = staging.digests()
     earlier = earlier_files(staging.folder, name, document["files"])
-    document["warnings"] = [*document["warnings"], *earlier.warnings]
+    document["warnings"] = warning_rows(earlier.warnings, beside=document["warnings"])
     write_json(staging.area / name, document)
     staging.commit(retired=earlier.retired, aside=earlier.aside)
 
 
 def _commit_estimate(staging: Staging, case: Case, document: dict[str, Any]) -> None:
     """All files with the case as it was run; where space is short for all, without the page."""
-    own = [*document["warnings"], *stage_case(case, staging)]
+    own = warning_rows(stage_case(case, staging), beside=document["warnings"])
     while True:
         document["warnings"] = own
         try:
@@ -71,7 +73,7 @@ def _commit_estimate(staging: Staging, case: Case, document: dict[str, Any]) -> 
             if PAGE not in document["files"] or staging.unfinished:
                 raise
             LOGGER.warning("the report is left out: %s", error)
-            own = [*own, _no_report(error)]
+            own = warning_rows([_no_report(error)], beside=own)
             staging.discard(PAGE, DATA, RESULT)
 
 
@@ -82,8 +84,8 @@ def _draw(write: Callable[[], Path], staging: Staging, document: dict[str, Any])
     except Exception as error:
         LOGGER.exception("the report could not be written")
         staging.discard(PAGE, DATA)
-        document["warnings"] = [*document["warnings"], _no_report(error)]
+        document["warnings"] = warning_rows([_no_report(error)], beside=document["warnings"])
 
 
-def _no_report(error: Exception) -> dict[str, str]:
-    return {"code": "report", "message": f"{PAGE} could not be written ({error}); the numbers are unharmed"}
+def _no_report(error: Exception) -> Finding:
+    return Finding("report", f"{PAGE} could not be written ({error}); the numbers are unharmed")

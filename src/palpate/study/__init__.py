@@ -6,15 +6,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from palpate.study.body import Body, ImagedStates, aligned, inverse_problem, make_body, surface_observations
+    from palpate.study.body import Body, ImagedStates, aligned, inverse_problem, make_body
     from palpate.study.case import Case, Domain, DriverMotion, Mechanics, MeshSettings, Phantom
     from palpate.study.case_file import read_case
     from palpate.study.cost import expected_cost
     from palpate.study.earlier import strange_files
-    from palpate.study.estimation import Observed, Remark, conclude, verdict
+    from palpate.study.estimation import Observed, conclude, verdict
     from palpate.study.journal import recover
-    from palpate.study.lock import own_file
-    from palpate.study.outputs import make_folder, staged, write_json, write_text
+    from palpate.study.lock import held_folder, own_file
+    from palpate.study.outputs import make_folder, read_json, staged, write_json, write_text
     from palpate.study.provenance import software_versions
     from palpate.study.read import read_states
     from palpate.study.result import CaseResult, failure_document
@@ -32,7 +32,6 @@ __all__ = [
     "MeshSettings",
     "Observed",
     "Phantom",
-    "Remark",
     "aligned",
     "conclude",
     "estimate",
@@ -41,6 +40,7 @@ __all__ = [
     "failure_document",
     "filled",
     "fitted_states",
+    "held_folder",
     "inverse_problem",
     "inversion_settings",
     "make_body",
@@ -48,12 +48,12 @@ __all__ = [
     "mesh",
     "own_file",
     "read_case",
+    "read_json",
     "read_states",
     "recover",
     "software_versions",
     "staged",
     "strange_files",
-    "surface_observations",
     "verdict",
     "write_json",
     "write_text",
@@ -70,7 +70,6 @@ _HOMES = {
     "MeshSettings": "palpate.study.case",
     "Observed": "palpate.study.estimation",
     "Phantom": "palpate.study.case",
-    "Remark": "palpate.study.estimation",
     "aligned": "palpate.study.body",
     "conclude": "palpate.study.estimation",
     "estimate": "palpate.study.run",
@@ -79,6 +78,7 @@ _HOMES = {
     "failure_document": "palpate.study.result",
     "filled": "palpate.study.simulate",
     "fitted_states": "palpate.study.run",
+    "held_folder": "palpate.study.lock",
     "inverse_problem": "palpate.study.body",
     "inversion_settings": "palpate.study.run",
     "make_body": "palpate.study.body",
@@ -86,12 +86,12 @@ _HOMES = {
     "mesh": "palpate.study.run",
     "own_file": "palpate.study.lock",
     "read_case": "palpate.study.case_file",
+    "read_json": "palpate.study.outputs",
     "read_states": "palpate.study.read",
     "recover": "palpate.study.journal",
     "software_versions": "palpate.study.provenance",
     "staged": "palpate.study.outputs",
     "strange_files": "palpate.study.earlier",
-    "surface_observations": "palpate.study.body",
     "verdict": "palpate.study.estimation",
     "write_json": "palpate.study.outputs",
     "write_text": "palpate.study.outputs",

@@ -81,7 +81,9 @@ def is_tissue_name(name: str) -> bool:
 class Images:
     """Label images: `before` the reference state, `after` the later states; `names` a label table; grey images.
 
-    `after` may be left out where [motion] says how the driver moves, or [[loads]] act.
+    `after` may be left out where [motion] says how the driver moves, or [[loads]] act. `body_from_ct`: label 0 is air,
+    or what the body lies on, only outside the body that the grey image of its state shows, a CT in HU; inside it, and
+    where a state has none, it is of the remaining tissue.
     """
 
     before: Path
@@ -90,6 +92,11 @@ class Images:
     intensities_before: Path | None = None
     intensities_after: tuple[Path, ...] = ()
     align: str | None = field(default=None, metadata=rule(choices=("rigid-tissues", "none")))
+    body_from_ct: bool = False
+
+    def __post_init__(self) -> None:
+        if self.body_from_ct and self.intensities_before is None:
+            raise ConfigurationError("[images] body_from_ct needs the CT of the reference state: intensities_before")
 
 
 @dataclass(frozen=True, slots=True)
@@ -384,6 +391,11 @@ class Case:
         if len(remaining) > 1:
             raise ConfigurationError(
                 f"tissues {shown(remaining)} all have label = '{REMAINING}'; only one can be the rest"
+            )
+        if self.images is not None and self.images.body_from_ct and not remaining:
+            raise ConfigurationError(
+                "[images] body_from_ct gives label 0 inside the body to the remaining tissue, and there is none: give"
+                " one tissue label = 'remaining'"
             )
         _check_claims([(t.name, (t.label,) if isinstance(t.label, str) else t.label) for t in self.tissues])
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from palpate.errors import ConfigurationError, PalpateError
+from palpate.findings import Finding
 from palpate.study.case import Case
 from palpate.study.case_file import read_case
 from palpate.study.case_text import case_tables, case_text
@@ -32,7 +33,7 @@ def refuse_other_case(case: Case, outputs: OutputFolder) -> None:
         )
 
 
-def stage_case(case: Case, staging: Staging) -> tuple[dict[str, str], ...]:
+def stage_case(case: Case, staging: Staging) -> tuple[Finding, ...]:
     """Stage case.toml as it was run, unless one of somebody's own in the folder says the same.
 
     Gives the warnings of a result without it: it was changed meanwhile, or a path cannot be written in TOML.
@@ -42,11 +43,12 @@ def stage_case(case: Case, staging: Staging) -> tuple[dict[str, str], ...]:
     if not own and _says(path, case):
         return ()
     if not own and not (case.overrides and CASE_NAME in staging.written):  # by `palpate init`, in the same run
-        return (_warning(f"{path.name} in the output folder was changed during the run and is not the case of it"),)
+        text = f"{path.name} in the output folder was changed during the run and is not the case of it"
+        return (Finding("case-file", text),)
     try:
         write_text(staging.area / CASE_NAME, case_text(case, staging.folder))
     except ConfigurationError as error:
-        return (_warning(f"the case of this run could not be written: {error}"),)
+        return (Finding("case-file", f"the case of this run could not be written: {error}"),)
     return ()
 
 
@@ -62,7 +64,3 @@ def _says(path: Path, case: Case) -> bool:
         return relative_path(file, path.parent)
 
     return case_tables(found, place) == case_tables(case, place)
-
-
-def _warning(message: str) -> dict[str, str]:
-    return {"code": "case-file", "message": message}

@@ -1,4 +1,4 @@
-"""Every problem of a case at once, before anything is computed: files, tissues, organs, expected cost."""
+"""Every problem of a case at once, before anything is solved: files, tissues, organs, mesh, expected cost."""
 
 from __future__ import annotations
 
@@ -11,17 +11,29 @@ from typing import Any, TypeVar
 import numpy as np
 
 from palpate.errors import GeometryError, InputDataError, PalpateError, ResourceError
-from palpate.images.checks import check_pair, check_segmentation
-from palpate.images.finding import Finding
+from palpate.findings import Finding, of_pair, one_a_cause, rank
+from palpate.images.checks import check_pair, check_segmentation, later_names
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_intensities
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
-from palpate.study.body import case_domain
+from palpate.observation.observed_surface import observed_surface
+from palpate.progress import Progress
+from palpate.study.body import Body, ImagedStates, brought, make_body
 from palpate.study.case import Case
 from palpate.study.case_file import read_case
 from palpate.study.contacts import every_finding
-from palpate.study.cost import ExpectedCost, expected_cost, free_memory_gb
+from palpate.study.cost import (
+    MEMORY_FACTOR,
+    ExpectedCost,
+    cost_of_meshes,
+    expected_cost,
+    free_memory_gb,
+    lack_of_memory,
+    machine_memory_gb,
+)
+from palpate.study.domain import case_domain
+from palpate.study.meshing import refuse_edge
 from palpate.study.plausibility import unit_warnings
 from palpate.study.read import read_segmentation, read_states
 from palpate.study.refusals import refuse_lost, refuse_unmeshable
@@ -32,7 +44,6 @@ __all__ = ["CheckReport", "Problem", "check_case", "memory_problems"]
 T = TypeVar("T")
 OBSERVED = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
 REFUSED_FINDINGS = {"hardly-observed": GeometryError.exit_code}  # what an estimate refuses, found here as a finding
-MEMORY_FACTOR = 2.0  # how far the prediction may be off
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +117,7 @@ class CheckReport:
     def text(self) -> str:
         """The same for people, worst first."""
         lines = [f"refused ({p.exit_code}): {p.message}" for p in self.problems if p.exit_code]
-        lines += [f"warning: {p.message}" for p in self.problems if not p.exit_code]
+        lines += [f"warning ({p.code}): {p.message}" for p in self.problems if not p.exit_code]
         if not lines:
             lines = ["no problem was found"]
         for row in self.organs:
@@ -116,8 +127,7 @@ class CheckReport:
             cost = self.cost
             lines.append(
                 f"expected: {cost.tets} tetrahedra, {cost.unknowns} unknowns, {cost.memory_gb:.1f} GB,"
-                f" {cost.seconds / 60.0:.1f} min with {cost.solver} on {cost.processors} processor(s); each a rough"
-                " guess, often within a factor of two"
+                f" {cost.seconds / 60.0:.1f} min with {cost.solver} on {cost.processors} processor(s)"
             )
         return "\n".join(lines)
 
@@ -127,6 +137,7 @@ class _Problems:
 
     def __init__(self) -> None:
         self.found: list[Problem] = []
+        self._findings: list[Finding] = []
 
     def attempt(self, make: Callable[[], T]) -> T | None:
         """What `make` returns; None, and a problem, when it is refused."""
@@ -143,43 +154,68 @@ class _Problems:
         if problem not in self.found:
             self.found.append(problem)
 
-    def warn(self, findings: Sequence[Finding], where: str = "") -> None:
-        """Keep findings; `where` names the pair."""
-        for finding in findings:
-            code = REFUSED_FINDINGS.get(finding.code, 0)
-            self.add(Problem(finding.code, where + finding.message, code))
+    def warn(self, findings: Sequence[Finding], pair: int = 1) -> None:
+        """Keep findings on the images of a pair."""
+        self._findings += of_pair(findings, pair)
+
+    def all(self) -> tuple[Problem, ...]:
+        """Everything that was kept, one a cause, worst first."""
+        found = one_a_cause(self._findings)
+        warned = [Problem(each.code, each.message, REFUSED_FINDINGS.get(each.code, 0)) for each in found]
+        return tuple(sorted([*self.found, *warned], key=lambda problem: (-problem.exit_code, rank(problem.code))))
 
 
-def check_case(path: Path, overrides: Sequence[str], *, progress: Callable[[str], None]) -> CheckReport:
+def check_case(path: Path, overrides: Sequence[str], *, progress: Progress) -> CheckReport:
     """All problems of the case file at `path` (with overrides as in `read_case`), its organs and its expected cost.
 
-    Nothing is meshed or solved, and images are not aligned. Raises nothing for a bad case: that is a problem, too.
+    The images are aligned, and meshed if nothing was refused before, as an estimate would. Nothing is solved. Raises
+    nothing for a bad case: that is a problem, too.
     """
     problems = _Problems()
     case = problems.attempt(lambda: read_case(path, overrides))
     if case is None:
-        return CheckReport(path.stem, tuple(problems.found))
+        return CheckReport(path.stem, problems.all())
     problems.attempt(lambda: refuse_what_cannot_be_estimated(case))
-    for remark in unit_warnings(case):
-        problems.add(Problem(remark.code, remark.message))
+    problems.warn(unit_warnings(case))
     progress("reading the images")
     phantom = problems.attempt(lambda: read_states(case)) if case.phantom else None
-    pairs = _read_pairs(case, problems) if case.phantom is None else []
-    if phantom is not None:
-        pairs = [(phantom.before, phantom.after)]
-    for number, (before, after) in enumerate(pairs, start=1):
-        where = f"pair {number}: " if number > 1 else ""
-        _check_pair(problems, before, after, where=where, loaded=bool(case.loads))
+    read = _read_pairs(case, problems) if case.phantom is None else []
+    pairs = [phantom] if phantom is not None else [ImagedStates(before, after, (), ()) for before, after in read]
+    pairs = [_checked_pair(problems, pair, case, number, progress) for number, pair in enumerate(pairs, start=1)]
     if not pairs:
-        return CheckReport(case.id, tuple(problems.found))
-    before, after = pairs[0]
-    progress("predicting the cost")
-    cost = problems.attempt(lambda: expected_cost(case, before, after, n_pairs=len(pairs)))
-    if cost is not None:
-        problems.attempt(lambda: _check_edge(case, before, after))
+        return CheckReport(case.id, problems.all())
+    cost = problems.attempt(lambda: _cost(problems, pairs, case, progress))
+    names = ("before", *(f"after[{i}]" for i in range(len(pairs[0].after))))
+    return CheckReport(case.id, problems.all(), names, _organs(pairs[0].before, pairs[0].after), cost)
+
+
+def _cost(problems: _Problems, pairs: Sequence[ImagedStates], case: Case, progress: Progress) -> ExpectedCost:
+    """What an estimate would cost on its very meshes; on meshes of a guessed size where something is refused."""
+    first = pairs[0]
+    cost = expected_cost(case, first.before, first.after, n_pairs=len(pairs))
+    problems.attempt(lambda: refuse_edge(case, case_domain(first.before, first.after, case)))
+    if any(problem.exit_code for problem in problems.all()):
+        return cost
+    if lack_of_memory(cost):
         problems.found += memory_problems(cost)
-    names = ("before", *(f"after[{i}]" for i in range(len(after))))
-    return CheckReport(case.id, tuple(problems.found), names, _organs(before, after), cost)
+        return cost
+    bodies = [problems.attempt(partial(make_body, pair, case, progress=progress)) for pair in pairs]
+    made = [body for body in bodies if body is not None]
+    for number, body in enumerate(made, start=1):
+        problems.warn(body.findings, number)
+        problems.attempt(partial(_observe, body))
+    if len(made) == len(pairs):
+        sizes = [(body.quality.tets, 3 * len(body.space.points)) for body in made]
+        cost = cost_of_meshes(case, first.before, sizes, n_after=len(first.after))
+    problems.found += memory_problems(cost)
+    return cost
+
+
+def _observe(body: Body) -> None:
+    """Refuse what the mesh leaves nothing of to observe."""
+    for i, tissue in enumerate(body.space.mesh.tissues):
+        if tissue.role in (Role.ESTIMATE, Role.DRIVER):
+            observed_surface(body.space, i)
 
 
 Pair = tuple[Segmentation, tuple[Segmentation, ...]]
@@ -205,11 +241,15 @@ def _read_pairs(case: Case, problems: _Problems) -> list[Pair]:
     return pairs
 
 
-def _check_pair(
-    problems: _Problems, before: Segmentation, after: tuple[Segmentation, ...], *, where: str, loaded: bool
-) -> None:
-    """Every check on the images of one pair; an organ that is absent is named, and left out of the other checks."""
-    names = ["after" if len(after) == 1 else f"after[{i}]" for i in range(1, len(after) + 1)]
+def _checked_pair(
+    problems: _Problems, states: ImagedStates, case: Case, number: int, progress: Progress
+) -> ImagedStates:
+    """The images of one pair, aligned and with every check made on them.
+
+    An organ that is absent is named, and left out of the other checks; the images are then not aligned.
+    """
+    before, after = states.before, states.after
+    names, where = later_names(len(after)), f"pair {number}: " if number > 1 else ""
     absent = _absent([("before", before), *zip(names, after, strict=True)])
     for tissue, images in absent.items():
         text = (
@@ -217,18 +257,23 @@ def _check_pair(
             " seen in both states: check its label in the image, or take the tissue out of the case"
         )
         problems.add(Problem(InputDataError.__name__, text, InputDataError.exit_code))
-    before, after = _without(before, absent), tuple(_without(image, absent) for image in after)
-    problems.warn(check_segmentation(before, "before"), where)
+    if case.phantom is None and not absent:
+        states = problems.attempt(partial(brought, before, after, method=case.align, progress=progress)) or states
+        problems.warn(states.findings, number)
+    in_place = bool(states.bones) or not any(tissue.role is Role.RIGID for tissue in before.tissues)
+    before, after = _without(before, absent), tuple(_without(image, absent) for image in states.after)
+    problems.warn(check_segmentation(before, "before"), number)
     problems.attempt(lambda: refuse_unmeshable(before, "before"))
     for name, image in zip(names, after, strict=True):
-        problems.warn(check_segmentation(image, name), where)
+        problems.warn(check_segmentation(image, name), number)
         problems.attempt(partial(refuse_unmeshable, image, name))
-        if not any(tissue.role is Role.RIGID for tissue in image.tissues):  # else only alignment can tell
+        if in_place:
             problems.attempt(partial(refuse_lost, before, image, name))
         if any(tissue.role in OBSERVED for tissue in before.tissues):
             findings = problems.attempt(partial(check_pair, before, image, name=name))
-            problems.warn(findings or (), where)
-    problems.warn(every_finding(before, after, loaded=loaded), where)
+            problems.warn(findings or (), number)
+    problems.warn(every_finding(before, after, loaded=bool(case.loads)), number)
+    return replace(states, before=before, after=after)
 
 
 def _absent(images: Sequence[tuple[str, Segmentation]]) -> dict[str, list[str]]:
@@ -248,28 +293,23 @@ def _without(image: Segmentation, absent: dict[str, list[str]]) -> Segmentation:
     return replace(image, tissues=tissues)
 
 
-def _check_edge(case: Case, before: Segmentation, after: tuple[Segmentation, ...]) -> None:
-    """As the mesher says it."""
-    lengths = case_domain(before, after, case).lengths
-    edge = case.mesh.edge_length_mm
-    if edge >= float(lengths.min()):
-        raise GeometryError(
-            f"mesh.edge_length_mm is {edge}; it must be positive and less than the smallest side of the domain,"
-            f" {lengths.min():.1f} mm"
-        )
-
-
 def memory_problems(cost: ExpectedCost) -> list[Problem]:
-    """A problem when the memory that is free may not do; it is refused where even half of the need is not there."""
-    free = free_memory_gb()
-    if free is None or cost.memory_gb < free / MEMORY_FACTOR:
-        return []
-    text = (
-        f"about {cost.memory_gb:.1f} GB of memory will be needed and {free:.1f} GB are free; make mesh.edge_length_mm"
-        ' larger, or domain.extent = "margin" with a smaller margin_mm'
-    )
-    beyond = cost.memory_gb > MEMORY_FACTOR * free
-    return [Problem("memory", text, ResourceError.exit_code if beyond else 0)]
+    """A problem when this machine's memory may not do, refused where it will not; else when too little is free now."""
+    has, free = machine_memory_gb(), free_memory_gb()
+    advice = 'make mesh.edge_length_mm larger, or domain.extent = "margin" with a smaller margin_mm'
+    lack = lack_of_memory(cost)
+    if lack:
+        return [Problem("memory", f"{lack}; {advice}", ResourceError.exit_code)]
+    if has is not None and cost.memory_gb > has / MEMORY_FACTOR:
+        text = f"about {cost.memory_gb:.1f} GB of memory will be needed and this machine has {has:.1f} GB; {advice}"
+        return [Problem("memory", text)]
+    if free is not None and cost.memory_gb > free / MEMORY_FACTOR:
+        text = (
+            f"about {cost.memory_gb:.1f} GB of memory will be needed and at the moment {free:.1f} GB are free: end"
+            " other programs, or wait for them"
+        )
+        return [Problem("memory-now", text)]
+    return []
 
 
 def _organs(before: Segmentation, after: tuple[Segmentation, ...]) -> tuple[OrganRow, ...]:

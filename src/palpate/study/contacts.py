@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.images.finding import Finding
+from palpate.findings import Finding
+from palpate.images.checks import later_names
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 
@@ -43,7 +44,7 @@ def contact_findings(segmentation: Segmentation) -> tuple[Finding, ...]:
             f"'{tissue.name}' touches {words}; those faces say nothing about its stiffness, and {left:.0%} of its"
             " surface is left to observe"
         )
-        findings.append(Finding("touching" if left >= LEAST_OBSERVED else "hardly-observed", text))
+        findings.append(Finding("touching" if left >= LEAST_OBSERVED else "hardly-observed", text, tissue.name))
     return tuple(findings)
 
 
@@ -66,7 +67,7 @@ def motion_findings(
         " mm): the motion is not above the noise of the voxels, and intervals will be wide; use a pair with more"
         f" {'load' if loaded else 'filling'}"
     )
-    return (Finding("motion-below-noise", text),)
+    return (Finding("motion-below-noise", text, place=f"to '{name}'"),)
 
 
 def wall_motion(before: Segmentation, after: Segmentation, tissue: int) -> float:
@@ -95,7 +96,7 @@ def sides_findings(segmentation: Segmentation, name: str) -> tuple[Finding, ...]
         f"in '{name}', {', '.join(repr(left) for left in wrong)} lies to the right of its namesake: left and right are"
         " exchanged in the names or in the header; stiffness does not mind, but check the image's orientation"
     )
-    return (Finding("sides-exchanged", text),)
+    return (Finding("sides-exchanged", text, place=f"in '{name}'"),)
 
 
 def front_findings(segmentation: Segmentation, name: str) -> tuple[Finding, ...]:
@@ -110,7 +111,7 @@ def front_findings(segmentation: Segmentation, name: str) -> tuple[Finding, ...]
         f"in '{name}', '{wrong[0][0]}' lies in front of '{wrong[0][1]}': the file is mirrored front to back, or its"
         " header is wrong; stiffness does not mind where all images are so, but check the images' orientation"
     )
-    return (Finding("front-exchanged", text),)
+    return (Finding("front-exchanged", text, place=f"in '{name}'"),)
 
 
 def _shared_faces(segmentation: Segmentation) -> NDArray[np.float64]:
@@ -152,10 +153,9 @@ def every_finding(before: Segmentation, after: Sequence[Segmentation], *, loaded
 
     `loaded`: as of `motion_findings`.
     """
-    names = ["after" if len(after) == 1 else f"after[{i}]" for i in range(1, len(after) + 1)]
     motions = [
         finding
-        for name, image in zip(names, after, strict=True)
+        for name, image in zip(later_names(len(after)), after, strict=True)
         for finding in motion_findings(before, image, name, loaded=loaded)
     ]
     sides = (*sides_findings(before, "before"), *front_findings(before, "before"))

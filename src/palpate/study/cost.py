@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,19 +12,31 @@ from scipy import ndimage
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.mechanics.solvers.registry import expected_of_size
-from palpate.memory import available_memory
+from palpate.memory import available_memory, total_memory
 from palpate.mesh import COARSER, COARSEST, GRADING, Box
 from palpate.parallel import processors
-from palpate.study.body import case_domain
+from palpate.progress import STAGES, Stage
 from palpate.study.case import Case
+from palpate.study.domain import case_domain
 
-__all__ = ["ExpectedCost", "expected_cost", "expected_tets", "free_memory_gb"]
+__all__ = [
+    "MEMORY_FACTOR",
+    "ExpectedCost",
+    "cost_of_meshes",
+    "expected_cost",
+    "expected_tets",
+    "free_memory_gb",
+    "lack_of_memory",
+    "machine_memory_gb",
+]
 
-LATTICE = 96  # points of the lattice along the longest side, on which edge lengths are summed: a second or so
+MEMORY_FACTOR = 1.5  # how far the predicted memory may be off
+
+LATTICE = 96  # points of the lattice along the longest side, on which edge lengths are summed
 # Fitted to the runs of benchmarks/cost.py (docs/command-line.md), on two cores of a 2.1 GHz server.
 TETS_A_CUBE = 19.4  # tetrahedra in a cube of the wanted edge length: 17 in smooth phantoms, 31 in a real pelvis
 UNKNOWNS_A_TET = {"P1": 0.62, "P2": 4.4}
-FIXED_S = 18.0  # start, first solves, intervals, report
+FIXED_S: Mapping[Stage, float] = {"reading": 4.0, "linear law": 4.0, "intervals": 4.0, "report": 6.0}
 SECONDS_AN_UNKNOWN = 1.5e-4  # beside the solver, with 90 modes a driver, for each later image
 FINITE_STRAIN_S = 2.9e-4  # the same of equilibria and their derivatives at finite strain
 SECONDS_A_CUT = 1.65e-4  # of meshing, for each tetrahedron and each tissue that is cut out
@@ -38,7 +51,10 @@ SERIES = 30  # right-hand sides beside the modes
 
 @dataclass(frozen=True, slots=True)
 class ExpectedCost:
-    """Size of the mesh and of the linear systems, peak memory (GB), time (s), and what they were predicted for."""
+    """Size of the mesh and of the linear systems, peak memory (GB), time (s), and what they were predicted for.
+
+    stages: of the time, what each stage takes (s), in their order.
+    """
 
     tets: int
     unknowns: int
@@ -46,42 +62,57 @@ class ExpectedCost:
     seconds: float
     solver: str
     processors: int
+    stages: Mapping[Stage, float] = field(default_factory=dict)
 
 
-def expected_cost(
-    case: Case, before: Segmentation, after: tuple[Segmentation, ...], *, n_pairs: int, lattice: int = LATTICE
-) -> ExpectedCost:
+def expected_cost(case: Case, before: Segmentation, after: tuple[Segmentation, ...], *, n_pairs: int) -> ExpectedCost:
     """The cost of estimating a case on this machine, from its first pair of images; further pairs cost the same each.
 
-    Tetrahedra from the sum of 1 / h^3 over the meshed volume, h the mesher's own edge length there; memory and time
-    from unknowns, modes, images and solver, with measured constants. The report is included, other programs are not.
+    Nothing is meshed: tetrahedra from the sum of 1 / h^3 over the meshed volume, h the mesher's own edge length there.
     """
-    tets = expected_tets(case, before, after, lattice=lattice)
+    tets = expected_tets(case, before, after)
     unknowns = int(tets * UNKNOWNS_A_TET.get(case.mechanics.element, UNKNOWNS_A_TET["P2"]))
-    solver, solving = expected_of_size(unknowns, case.driver.modes + SERIES, solver=case.mechanics.solver)
+    return cost_of_meshes(case, before, [(tets, unknowns)] * n_pairs, n_after=len(after))
+
+
+def cost_of_meshes(
+    case: Case, before: Segmentation, meshes: Sequence[tuple[int, int]], *, n_after: int
+) -> ExpectedCost:
+    """The same of known meshes: tetrahedra and unknowns of each pair, of which each has `n_after` later images.
+
+    Memory and time from unknowns, modes, images and solver, with measured constants. The report is included, other
+    programs are not.
+    """
     drivers = max(sum(tissue.role is Role.DRIVER for tissue in before.tissues), 1)
     modes = (drivers * case.driver.modes + OVERHEAD_MODES) / (USUAL_MODES + OVERHEAD_MODES)
-    work = unknowns * modes * max(len(after), 1)
     finite = case.mechanics.material_law.finite
-    seconds = (SECONDS_AN_UNKNOWN + finite * FINITE_STRAIN_S) * work + SECONDS_A_CUT * tets * (len(before.tissues) - 1)
-    gigabytes = GB_AN_UNKNOWN * work + solving.bytes / 1e9
-    gigabytes *= FINITE_STRAIN_GB if finite else 1.0
+    largest = max(unknowns for _, unknowns in meshes)
+    solver, _ = expected_of_size(largest, case.driver.modes + SERIES, solver=case.mechanics.solver)
     count = processors()
     shorter = 1.0 - PARALLEL_SHARE + PARALLEL_SHARE / count
+    took, gigabytes = {stage: FIXED_S.get(stage, 0.0) * shorter for stage in STAGES}, FIXED_GB
+    for tets, unknowns in meshes:
+        _, solving = expected_of_size(unknowns, case.driver.modes + SERIES, solver=solver)
+        work = unknowns * modes * max(n_after, 1)
+        took["meshing"] += SECONDS_A_CUT * tets * (len(before.tissues) - 1) * shorter
+        took["linear law"] += SECONDS_AN_UNKNOWN * work * shorter + solving.seconds
+        took["finite strain"] += finite * FINITE_STRAIN_S * work * shorter
+        gigabytes += (GB_AN_UNKNOWN * work + solving.bytes / 1e9) * (FINITE_STRAIN_GB if finite else 1.0)
     return ExpectedCost(
-        tets=n_pairs * tets,
-        unknowns=n_pairs * unknowns,
-        memory_gb=FIXED_GB + n_pairs * gigabytes,
-        seconds=(FIXED_S + n_pairs * seconds) * shorter + n_pairs * solving.seconds,
+        tets=sum(tets for tets, _ in meshes),
+        unknowns=sum(unknowns for _, unknowns in meshes),
+        memory_gb=gigabytes,
+        seconds=sum(took.values()),
         solver=solver,
         processors=count,
+        stages=took,
     )
 
 
-def expected_tets(case: Case, before: Segmentation, after: tuple[Segmentation, ...], *, lattice: int = LATTICE) -> int:
-    """Number of tetrahedra in the mesh of a reference state; `lattice`: points along the longest side, to sum over."""
+def expected_tets(case: Case, before: Segmentation, after: tuple[Segmentation, ...]) -> int:
+    """Number of tetrahedra in the mesh of a reference state."""
     box = case_domain(before, after, case)
-    index, cell = _lattice(before, box, lattice)
+    index, cell = _lattice(before, box)
     inside = index >= 0
     edge = case.mesh.edge_length_mm
     sizes = np.full(index.shape, COARSEST * edge)
@@ -96,15 +127,29 @@ def expected_tets(case: Case, before: Segmentation, after: tuple[Segmentation, .
     return max(int(TETS_A_CUBE * np.prod(cell) * float((sizes[meshed] ** -3.0).sum())), 100)
 
 
+def machine_memory_gb() -> float | None:
+    """Memory that this machine has, GB; None where the system does not tell."""
+    total = total_memory()
+    return None if total is None else total / 1e9
+
+
 def free_memory_gb() -> float | None:
-    """Memory that is free on this machine, GB; None where the system does not tell."""
+    """Memory that is free on this machine at the moment, GB; None where the system does not tell."""
     free = available_memory()
     return None if free is None else free / 1e9
 
 
-def _lattice(before: Segmentation, box: Box, points: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def lack_of_memory(cost: ExpectedCost) -> str:
+    """What a run lacks that this machine cannot hold even if the prediction is `MEMORY_FACTOR` too high; else empty."""
+    has = machine_memory_gb()
+    if has is None or cost.memory_gb <= MEMORY_FACTOR * has:
+        return ""
+    return f"about {cost.memory_gb:.1f} GB of memory would be needed and this machine has {has:.1f} GB"
+
+
+def _lattice(before: Segmentation, box: Box) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Tissue (n_1, n_2, n_3) at the middles of cells that fill the box, -1 outside the image; their edges (3,) mm."""
-    counts = np.maximum(np.ceil(box.lengths / box.lengths.max() * points), 4).astype(int)
+    counts = np.maximum(np.ceil(box.lengths / box.lengths.max() * LATTICE), 4).astype(int)
     cell = box.lengths / counts
     ticks = [(np.arange(n) + 0.5) * size for n, size in zip(counts, cell, strict=True)]
     local = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.errors import InputDataError
+from palpate.findings import Finding
 from palpate.study.journal import is_inside
 from palpate.study.outputs import Digests, read_json, sha256_of
 
@@ -29,7 +30,7 @@ class Earlier:
 
     retired: tuple[str, ...]
     aside: tuple[str, ...]
-    warnings: tuple[dict[str, str], ...]
+    warnings: tuple[Finding, ...]
 
 
 def earlier_files(folder: Path, document: str, files: Digests) -> Earlier:
@@ -84,5 +85,5 @@ def _is_file(path: Path, sha256: str | None) -> bool:
     return path.is_file() and not path.is_symlink() and sha256 == sha256_of(path)
 
 
-def _warning(message: str) -> dict[str, str]:
-    return {"code": "earlier-files", "message": message}
+def _warning(message: str) -> Finding:
+    return Finding("earlier-files", message)

@@ -9,28 +9,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError
-from palpate.inversion import (
-    FittedState,
-    Interval,
-    Inversion,
-    InversionSettings,
-    Iterate,
-    Outcome,
-    StartRun,
-    grid_position_shifts,
-    log_interval,
-    sandwich_covariance,
-)
-from palpate.mechanics.deformation import deformation_determinants
+from palpate.findings import Finding
+from palpate.inversion import Inversion, InversionSettings, Iterate, Outcome, StartRun
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit
+from palpate.progress import Progress, silent
+from palpate.study.estimate_findings import fold_findings, inversion_findings
+from palpate.study.together import ImagePairs, combinations_of, image_pairs_of
+from palpate.uncertainty import (
+    Combination,
+    Covariance,
+    FittedState,
+    Information,
+    Interval,
+    covariance_of,
+    fixed_correspondence,
+    information,
+    log_interval,
+    modulus_interval,
+)
 
 __all__ = [
     "Estimation",
     "Iteration",
     "ModulusEstimate",
     "Observed",
-    "Remark",
     "Start",
     "TissueFit",
     "conclude",
@@ -41,17 +44,8 @@ __all__ = [
 
 GRID_DRAWS = 8
 AT_BOUND = 1e-6
-STRONG_CORRELATION = 0.99
 IDENTIFIED, WEAK = 2.0, 10.0  # largest ratio of an interval's ends
 AS_GOOD = 0.05  # of the objective: another minimum that is worse by less cannot be excluded
-
-
-@dataclass(frozen=True, slots=True)
-class Remark:
-    """A warning that stands beside a result: a `code` for programs, a `message` for readers."""
-
-    code: str
-    message: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +82,8 @@ class Start:
 class ModulusEstimate:
     """Young's modulus of one tissue, in `unit` (kPa, or a ratio to `relative_to`), with its 95 % interval.
 
-    None in an interval is an open end; `value` is None in ratio mode and when nothing converged.
+    None in an interval is an open end; `value` is None in ratio mode and when nothing converged. variance_shares: of
+    each cause in the variance of ln E; profile: values (kPa, or ratios) with their signed root deviances.
     """
 
     tissue: str
@@ -103,6 +98,8 @@ class ModulusEstimate:
     why: str
     truth: float | None = None
     parameter: str = "youngs_modulus"
+    variance_shares: Mapping[str, float] | None = None
+    profile: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,29 +117,34 @@ class Estimation:
     """Result of one inversion.
 
     correlation (n, n) of the log-moduli; fits: the tissues of each later image; displacements: (n_points, 3) mm of
-    each later image; covariance (n, n) of the log-moduli, grid_covariance (n, n) the part of the voxel grid's place;
+    each later image; covariance of the log-moduli by its causes;
     outer_loop: the steps from the best start's minimum to the estimate, which all starts of that minimum share;
-    counts: of all starts and minima together; observations: what was compared, in words, by its kind.
+    counts: of all starts and minima together; observations: what was compared, in words, by its kind; information: the
+    directions of the log-moduli by how well they are known; combinations: what is known where single moduli are not;
+    image_pairs: what each of several later images says alone.
     """
 
     status: str
     reason: str
     estimates: tuple[ModulusEstimate, ...]
-    covariance: NDArray[np.float64]
+    covariance: Covariance
     starts: tuple[Start, ...]
     fits: tuple[tuple[TissueFit, ...], ...]
     displacements: tuple[NDArray[np.float64], ...]
     counts: Mapping[str, int]
     outer_loop: tuple[Iteration, ...] = ()
-    remarks: tuple[Remark, ...] = ()
-    grid_covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    remarks: tuple[Finding, ...] = ()
     observations: Mapping[str, str] = field(default_factory=dict)
+    information: Information | None = None
+    combinations: tuple[Combination, ...] = ()
+    image_pairs: ImagePairs | None = None
 
     @property
     def correlation(self) -> NDArray[np.float64]:
         """Correlation (n, n) of the log-moduli, dimensionless."""
-        sd = np.sqrt(np.diag(self.covariance))
-        return np.asarray(self.covariance / np.outer(sd, sd))
+        total = self.covariance.total
+        sd = np.sqrt(np.diag(total))
+        return np.asarray(total / np.outer(sd, sd))
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +156,13 @@ class Observed:
 
 
 def conclude(
-    inversion: Inversion, settings: InversionSettings, observed: Observed, *, truth: Mapping[str, float], seed: int
+    inversion: Inversion,
+    settings: InversionSettings,
+    observed: Observed,
+    *,
+    truth: Mapping[str, float],
+    seed: int,
+    progress: Progress = silent,
 ) -> Estimation:
     """State the result of an inversion; `truth`: true moduli (kPa) by tissue where they are known.
 
@@ -165,9 +173,9 @@ def conclude(
     if objective.parameters.poisson:
         raise ConfigurationError("a result states Young's moduli only: a Poisson's ratio was sought beside them")
     rng = np.random.default_rng(seed)
-    shifts = grid_position_shifts(objective, minimum.evaluation, observed.states, draws=GRID_DRAWS, rng=rng)
-    grid_part = shifts.T @ shifts / len(shifts)
-    covariance = sandwich_covariance(objective, minimum.evaluation) + grid_part
+    progress(f"intervals: correlation of the residuals, and the model as {GRID_DRAWS} random voxel grids show it")
+    covariance = covariance_of(objective, minimum.evaluation, observed.states, draws=GRID_DRAWS, rng=rng)
+    progress("intervals: profiles, and the fit of every surface before and after")
     return Estimation(
         status="converged" if minimum.converged else "not converged",
         reason=_reason(inversion),
@@ -184,9 +192,11 @@ def conclude(
             "evaluations": inversion.evaluations,
         },
         outer_loop=tuple(_iteration(inversion, iterate) for iterate in minimum.history),
-        remarks=(*_remarks(inversion, covariance), *_folds(observed)),
-        grid_covariance=grid_part,
+        remarks=(*inversion_findings(inversion, covariance.total), *fold_findings(observed.states)),
         observations={observation.kind: observation.description for observation in objective.observations},
+        information=information(covariance.total),
+        combinations=combinations_of(inversion, covariance.total, within=IDENTIFIED),
+        image_pairs=image_pairs_of(inversion, settings.bounds),
     )
 
 
@@ -251,11 +261,12 @@ def _reason(inversion: Inversion) -> str:
 
 
 def _estimates(
-    inversion: Inversion, settings: InversionSettings, covariance: NDArray[np.float64], truth: Mapping[str, float]
+    inversion: Inversion, settings: InversionSettings, covariance: Covariance, truth: Mapping[str, float]
 ) -> tuple[ModulusEstimate, ...]:
     mapping, bounds = inversion.objective.parameters, settings.bounds
     theta, scale = inversion.minimum.unknowns[: mapping.n_parameters], mapping.scale_kpa
-    found = []
+    found, variances = [], np.diag(covariance.total)
+    fixed = fixed_correspondence(inversion.objective, inversion.minimum)
     for i, name in enumerate(mapping.tissues):
         none = no_estimate(
             name,
@@ -269,14 +280,20 @@ def _estimates(
             continue
         ratio = float(np.exp(theta[i]))
         limits = {"lower": float(np.exp(bounds.lower[i])), "upper": float(np.exp(bounds.upper[i]))}
-        sd = float(np.sqrt(covariance[i, i]))
-        interval = hull([log_interval(float(np.exp(t[i])), sd, **limits) for t in _as_good(inversion)])
+        own = modulus_interval(fixed, inversion.minimum, i, variance=float(variances[i]), bounds=bounds)
+        others = [np.exp(t[i]) for t in _as_good(inversion)]
+        interval = hull([own.ends, *(log_interval(float(e), float(np.sqrt(variances[i])), **limits) for e in others)])
         at_bound = bool(np.min(np.abs([theta[i] - bounds.lower[i], theta[i] - bounds.upper[i]])) < AT_BOUND)
         word, why = verdict(interval, at_bound=at_bound, absolute=mapping.absolute)
         low, high = interval
+        unit = scale if mapping.absolute else 1.0
+        points = zip(unit * np.exp(own.profile.theta), own.profile.root, strict=True)
         found.append(
             replace(
                 none,
+                interval_kind=own.kind,
+                variance_shares=covariance.shares(i),
+                profile=tuple((float(value), float(root)) for value, root in points),
                 value=ratio * scale if mapping.absolute else None,
                 interval95=(low and low * scale, high and high * scale) if mapping.absolute else None,
                 ratio=None if mapping.by_load else ratio,
@@ -289,13 +306,13 @@ def _estimates(
 
 
 def _as_good(inversion: Inversion) -> list[NDArray[np.float64]]:
-    """Log-moduli (n_parameters,) of the best minimum and of every other that explains the images nearly as well.
+    """Log-moduli (n_parameters,) of every minimum beside the best one that explains the images nearly as well.
 
     Voxels make the objective rough by some hundredths of it, so that its value alone cannot choose between them.
     """
     n, best = inversion.objective.n_parameters, inversion.candidates[inversion.best]
     limit = (1.0 + AS_GOOD) * best.value
-    good = [c.minimum for c in inversion.candidates if c.minimum.converged and c.value <= limit]
+    good = [c.minimum for c in inversion.candidates if c is not best and c.minimum.converged and c.value <= limit]
     return [minimum.unknowns[:n] for minimum in good]
 
 
@@ -341,70 +358,3 @@ def _fits(inversion: Inversion, observed: Observed) -> tuple[tuple[TissueFit, ..
             )
         )
     return tuple(fits)
-
-
-def _folds(observed: Observed) -> tuple[Remark, ...]:
-    """A warning for each later image in which the fitted model turns elements inside out."""
-    remarks = []
-    for number, state in enumerate(observed.states, start=1):
-        space = state.space
-        smallest = deformation_determinants(space, state.displacement).min(axis=1)
-        folded = int(np.count_nonzero(smallest <= 0.0))
-        if folded:
-            worst = space.mesh.nodes[space.mesh.tets[int(smallest.argmin())]].mean(axis=0)
-            remarks.append(
-                Remark(
-                    "fold-over",
-                    f"after image {number}: {folded} of {len(smallest)} elements are turned inside out, the worst near"
-                    f" {np.round(worst).astype(int).tolist()} mm (RAS): the motion is too large there for the law or"
-                    " the mesh. Look at the labels there, or set a smaller [mesh] edge_length_mm",
-                )
-            )
-    return tuple(remarks)
-
-
-def _remarks(inversion: Inversion, covariance: NDArray[np.float64]) -> tuple[Remark, ...]:
-    mapping = inversion.objective.parameters
-    remarks = []
-    if not mapping.absolute:
-        remarks.append(
-            Remark(
-                "ratio-only",
-                f"no tissue's modulus is known, so only ratios to '{mapping.relative_to}' are determined; give one"
-                " tissue role `known` with its youngs_modulus_kpa to get kPa",
-            )
-        )
-    if inversion.minimum.converged and inversion.convergence.unmet:
-        remarks.append(
-            Remark(
-                "unsettled",
-                f"the outer loop ended at its largest number of iterations: {'; '.join(inversion.convergence.unmet)};"
-                " the model may not fit the images (edge length, driver modes, law), or [noise] should be given",
-            )
-        )
-    lost = [c for c in inversion.candidates if c.minimum.outcome is Outcome.NO_EQUILIBRIUM]
-    if lost:
-        remarks.append(
-            Remark(
-                "no-equilibrium",
-                f"{len(lost)} of {len(inversion.candidates)} minima of the linear law have no equilibrium under the"
-                " case's law and are not compared with the others; other [estimate] start_ratios show"
-                " whether they are minima at all",
-            )
-        )
-    if len(inversion.candidates) - len(lost) > 1:
-        remarks.append(
-            Remark(
-                "several-minima",
-                "the starts ended in different minima; the best fit under one noise model is reported, and the"
-                " intervals reach over all that fit nearly as well",
-            )
-        )
-    sd = np.sqrt(np.diag(covariance))
-    for i in range(len(sd)):
-        for j in range(i):
-            if abs(covariance[i, j]) > STRONG_CORRELATION * sd[i] * sd[j]:
-                names = f"'{mapping.tissues[j]}' and '{mapping.tissues[i]}'"
-                text = f"the moduli of {names} cannot be told apart by these images; add one that moves them otherwise"
-                remarks.append(Remark("correlated", text))
-    return tuple(remarks)

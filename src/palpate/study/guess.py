@@ -108,6 +108,7 @@ RULES = (
     ),
 )
 
+UNLABELLED = _words("background clear label unlabelled unlabeled none")
 PELVIC = _words("prostate prostatic bladder uterus cervix ovary vesicle vesicles")
 LARGE_BOWEL = _words("colon sigmoid")
 
@@ -143,6 +144,8 @@ def _guess(label: int, before: LabelImage, after: Sequence[LabelImage], border: 
     if not name:
         return _by_place(label, before, after, border)
     words = _words_of(name)
+    if label == 0 and words <= UNLABELLED:  # as tables call what no organ is, inside the body and outside
+        return _by_place(label, before, after, border)
     for rule in RULES:
         found = sorted(words & rule.words)
         if found:

@@ -13,31 +13,38 @@ from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.label_image import LabelImage
 from palpate.images.label_table import read_label_table
 from palpate.images.named_labels import printable
-from palpate.images.readers import read_label_image
+from palpate.images.readers import read_intensities, read_label_image
 from palpate.images.tissue import Role
+from palpate.study.background import Background, background_of
 from palpate.study.case import REMAINING
 from palpate.study.case_as_run import CASE_NAME
 from palpate.study.class_names import class_names
 from palpate.study.guess import GuessedTissue, guess_tissues
 from palpate.study.outputs import OutputFolder, read_regular, write_text
+from palpate.study.proposed_mesh import MARGIN_MM, proposed_edge, proposed_window
 from palpate.study.toml_text import relative_path, toml_key, toml_text
 
 __all__ = ["CaseImages", "NewCase", "new_case", "write_new_case"]
 
 LARGEST_CASE = 1_000_000  # bytes
-MARGIN_MM = 40.0
-CROP_BELOW = 0.6  # a domain of the margin's box is proposed when it saves so much of the image
-EDGES_MM = (3.0, 8.0)
-ORGAN_EDGES = 6.0  # edges of tetrahedra across the smallest organ
+WIDE_MM = 250.0  # of an image: more than the body of many
+ROLES = (
+    "  estimate: its stiffness is wanted; its surface is looked at in all images",
+    "  known:    its youngs_modulus_kpa is given; the first one sets the scale of all results",
+    "  driver:   hollow; not meshed; the motion of its wall between the images moves the others",
+    "  rigid:    bone; not meshed; held, or moved as one body by what the images show",
+    "  void:     air, and what lies outside the body; not meshed; a free surface",
+)
 
 
 @dataclass(frozen=True, slots=True)
 class CaseImages:
-    """The files of a case to be: label images, and a label table if there is one."""
+    """The files of a case to be: label images, a label table if there is one, CTs of the first or of all states."""
 
     before: Path
     after: tuple[Path, ...]
     table: Path | None = None
+    cts: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,16 +74,22 @@ class NewCase:
         }
 
 
-def write_new_case(images: Sequence[Path], table: Path | None, outputs: OutputFolder) -> NewCase:
+def write_new_case(
+    images: Sequence[Path], table: Path | None, outputs: OutputFolder, *, cts: Sequence[Path] = ()
+) -> NewCase:
     """Write case.toml for label images (before, after ...), unless it is there and says something else.
 
-    Raises `ConfigurationError` when fewer than two images are given or another case.toml is in the way, else as
-    `new_case` does.
+    Raises `ConfigurationError` when fewer than two images are given, more CTs than images, or another case.toml is in
+    the way, else as `new_case` does.
     """
     if len(images) < 2:
         raise ConfigurationError("name the label image before, then one or more after")
+    if len(cts) > len(images):
+        raise ConfigurationError(
+            f"{len(cts)} CTs were given for {len(images)} label images: name that of before, then those of after"
+        )
     outputs.require([CASE_NAME])
-    case = new_case(CaseImages(images[0], tuple(images[1:]), table), outputs.path)
+    case = new_case(CaseImages(images[0], tuple(images[1:]), table, tuple(cts)), outputs.path)
     if case.path.exists() and _content(case.path) != case.text.encode("utf-8"):
         raise ConfigurationError(
             f"there is a case already, {case.path}, and it is not replaced: estimate it with 'palpate estimate"
@@ -113,6 +126,11 @@ def new_case(images: CaseImages, folder: Path) -> NewCase:
             )
     known = class_names(before)
     tissues = guess_tissues(replace(before, names=known.names) if known.names else before, after)
+    window = proposed_window(before, tissues)
+    background = _background(images, before, window, tissues)
+    guessed = tissues
+    if background is not None and background.has_air:
+        tissues = (*guessed, _air(background, guessed))
     questions = _questions(tissues)
     named = zip((images.before, *images.after), (before, *after), strict=True)
     notes = [f"'{path.name}': {finding.message}" for path, image in named for finding in image.findings]
@@ -121,10 +139,35 @@ def new_case(images: CaseImages, folder: Path) -> NewCase:
             "the labels have no names; their numbers were taken for those of TotalSegmentator's task"
             f" '{known.task}', for {known.pairs} pairs of left and right lie as its names say"
         )
-    blocks = [_heading(images, folder, questions, notes), _domain(before, tissues), _mesh(before, tissues)]
+    if background is not None and not background.seen and _shows_whole_slices(before):
+        questions = (*questions, background.in_words)
+    elif background is not None:
+        notes.append(background.in_words)
+    from_ct = background is not None and background.has_air
+    blocks = [_heading(questions, notes), _images(images, folder, from_ct=from_ct), _domain(before, window)]
+    blocks += [_mesh(before, after, guessed, cropped=bool(blocks[-1]))]
     blocks += [_tissue(tissue, before) for tissue in tissues]
     text = "\n\n".join(block for block in blocks if block) + "\n"
     return NewCase(folder / CASE_NAME, text, tissues, questions)
+
+
+def _background(
+    images: CaseImages, before: LabelImage, window: tuple[slice, ...], tissues: Sequence[GuessedTissue]
+) -> Background | None:
+    """Label 0 where it is taken for surroundings; None where a tissue has it."""
+    if any(0 in tissue.labels for tissue in tissues) or not any(not tissue.labels for tissue in tissues):
+        return None
+    return background_of(before, window, read_intensities(images.cts[0]) if images.cts else None)
+
+
+def _air(background: Background, tissues: Sequence[GuessedTissue]) -> GuessedTissue:
+    name = next(name for name in ("air", "air around", "label 0") if name not in {t.name for t in tissues})
+    return GuessedTissue(name, (0,), Role.VOID, background.in_words)
+
+
+def _shows_whole_slices(before: LabelImage) -> bool:
+    """Whether an image is so wide that it must show what lies around the body, too."""
+    return bool((np.array(before.labels.shape) * before.grid.spacing)[:2].max() > WIDE_MM)
 
 
 def _questions(tissues: Sequence[GuessedTissue]) -> tuple[str, ...]:
@@ -152,14 +195,26 @@ def _questions(tissues: Sequence[GuessedTissue]) -> tuple[str, ...]:
     return tuple(asked)
 
 
-def _heading(images: CaseImages, folder: Path, questions: Sequence[str], notes: Sequence[str]) -> str:
+def _heading(questions: Sequence[str], notes: Sequence[str]) -> str:
     lines = ["# Made by `palpate init`. Every role is a guess: read the reasons, correct what is wrong."]
+    lines += [f"# {line}" for line in ROLES]
     lines += [_comment(f"QUESTION: {question}") for question in questions]
     lines += [_comment(f"NOTE: {note}") for note in notes]
-    lines += ["", "[images]", f"before = {toml_text(relative_path(images.before, folder))}"]
+    return "\n".join(lines)
+
+
+def _images(images: CaseImages, folder: Path, *, from_ct: bool) -> str:
+    lines = ["[images]", f"before = {toml_text(relative_path(images.before, folder))}"]
     lines.append(f"after = [{', '.join(toml_text(relative_path(path, folder)) for path in images.after)}]")
     if images.table:
         lines.append(f"names = {toml_text(relative_path(images.table, folder))}")
+    if images.cts:
+        lines.append(f"intensities_before = {toml_text(relative_path(images.cts[0], folder))}")
+    if images.cts[1:]:
+        later = ", ".join(toml_text(relative_path(path, folder)) for path in images.cts[1:])
+        lines.append(f"intensities_after = [{later}]")
+    if from_ct:
+        lines.append("body_from_ct = true  # label 0 inside the body is of the remaining tissue, outside it is void")
     return "\n".join(lines)
 
 
@@ -187,29 +242,17 @@ def _tissue(tissue: GuessedTissue, before: LabelImage) -> str:
     return "\n".join(lines)
 
 
-def _domain(before: LabelImage, tissues: Sequence[GuessedTissue]) -> str:
+def _domain(before: LabelImage, window: tuple[slice, ...]) -> str:
     """A box around the organs where the image is much larger."""
-    shown = [label for t in tissues if t.role in (Role.ESTIMATE, Role.DRIVER) for label in t.labels]
-    places = np.argwhere(np.isin(before.labels, shown))
-    if not len(places):
-        return ""
-    margin = MARGIN_MM / before.grid.spacing
-    shape = np.array(before.labels.shape)
-    low, high = np.maximum(places.min(axis=0) - margin, 0), np.minimum(places.max(axis=0) + 1 + margin, shape)
-    share = float(np.prod(high - low) / np.prod(shape))
-    if share > CROP_BELOW:
-        return ""
-    return f'[domain]\nextent = "margin"  # {MARGIN_MM:g} mm around the organs: {share:.0%} of the image'
+    share = float(np.prod([s.stop - s.start for s in window]) / before.labels.size)
+    return f'[domain]\nextent = "margin"  # {MARGIN_MM:g} mm around the organs: {share:.0%} of the image' * (
+        share < 1.0
+    )
 
 
-def _mesh(before: LabelImage, tissues: Sequence[GuessedTissue]) -> str:
-    """An edge length by the smallest organ."""
-    voxels = [np.count_nonzero(np.isin(before.labels, t.labels)) for t in tissues if t.role is Role.ESTIMATE]
-    if not voxels:
-        return ""
-    diameter = float((6.0 * min(voxels) * before.grid.voxel_volume / np.pi) ** (1.0 / 3.0))
-    edge = round(2.0 * min(max(diameter / ORGAN_EDGES, EDGES_MM[0]), EDGES_MM[1])) / 2.0
-    return f"[mesh]\nedge_length_mm = {edge:g}  # the smallest organ is as large as a ball of {diameter:.0f} mm"
+def _mesh(before: LabelImage, after: Sequence[LabelImage], tissues: Sequence[GuessedTissue], *, cropped: bool) -> str:
+    proposed = proposed_edge(before, after, tissues, cropped=cropped)
+    return f"[mesh]\nedge_length_mm = {proposed[0]:g}  # {proposed[1]}" if proposed else ""
 
 
 def _comment(text: str) -> str:

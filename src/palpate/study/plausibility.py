@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+from palpate.findings import Finding
 from palpate.images.tissue import Role
 from palpate.study.case import Case
-from palpate.study.estimation import Estimation, Remark
+from palpate.study.estimation import Estimation
 
 __all__ = [
     "PUBLISHED",
@@ -151,7 +152,7 @@ def usual_modulus(name: str) -> UsualModulus | None:
     return UsualModulus(round((entry.low * entry.high) ** 0.5, 3), f"{entry.method}; {entry.source}")
 
 
-def plausibility_warnings(moduli_kpa: Mapping[str, float]) -> tuple[Remark, ...]:
+def plausibility_warnings(moduli_kpa: Mapping[str, float]) -> tuple[Finding, ...]:
     """Warnings on moduli (tissue name -> kPa) far outside what was published, each naming its source.
 
     A bladder is not compared with its wall: meshed as one solid it has an effective modulus, which none published.
@@ -159,14 +160,14 @@ def plausibility_warnings(moduli_kpa: Mapping[str, float]) -> tuple[Remark, ...]
     return tuple(warning for name, value in moduli_kpa.items() for warning in _out_of_range(name, value))
 
 
-def estimate_warnings(estimation: Estimation) -> tuple[Remark, ...]:
+def estimate_warnings(estimation: Estimation) -> tuple[Finding, ...]:
     """`plausibility_warnings` on what was estimated; none where the search did not converge: they would tell moduli."""
     if estimation.status != "converged":
         return ()
     return plausibility_warnings({e.tissue: e.value for e in estimation.estimates if e.value is not None})
 
 
-def unit_warnings(case: Case) -> tuple[Remark, ...]:
+def unit_warnings(case: Case) -> tuple[Finding, ...]:
     """Warnings on moduli in the case that look as if they were given in Pa or in MPa."""
     low, high = SOFT_TISSUE_KPA
     given = [(t.name, t.youngs_modulus_kpa) for t in case.tissues if t.youngs_modulus_kpa and t.role is not Role.RIGID]
@@ -175,7 +176,7 @@ def unit_warnings(case: Case) -> tuple[Remark, ...]:
         if not low <= value <= high:
             unit, factor = ("Pa", 1e-3) if value > high else ("MPa", 1e3)
             hints.append(
-                Remark(
+                Finding(
                     "units",
                     f"tissue '{name}': youngs_modulus_kpa = {value:g} is unusual for soft tissue ({low:g} to {high:g}"
                     f" kPa); if you meant {value:g} {unit}, write {value * factor:g}",
@@ -184,7 +185,7 @@ def unit_warnings(case: Case) -> tuple[Remark, ...]:
     return tuple(hints)
 
 
-def _out_of_range(name: str, value: float) -> Iterable[Remark]:
+def _out_of_range(name: str, value: float) -> Iterable[Finding]:
     walls = "wall" in name.lower()
     entries = [entry for entry in published_for(name) if walls or not entry.tissue.endswith("wall")]
     if not entries:
@@ -193,7 +194,7 @@ def _out_of_range(name: str, value: float) -> Iterable[Remark]:
     if low / MARGIN <= value <= high * MARGIN:
         return
     closest = min(entries, key=lambda entry: min(abs(value - entry.low), abs(value - entry.high)))
-    yield Remark(
+    yield Finding(
         "implausible-stiffness",
         f"{name}: {value:.3g} kPa lies more than {MARGIN:g} times outside the published range for {closest.tissue}"
         f" ({low:g} to {high:g} kPa; nearest: {closest.method}; {closest.source}). Check the `known` tissue's modulus,"

@@ -6,8 +6,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from palpate.errors import ConfigurationError
-from palpate.images.label_image import VoxelGrid
+from palpate.images.body_in_ct import outside_body
+from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_intensities, read_label_image
 from palpate.images.readers.registry import format_of
@@ -16,6 +19,7 @@ from palpate.images.tissue import Tissue
 from palpate.phantoms.pelvis import PelvisOptions, pelvis, pelvis_anatomy
 from palpate.phantoms.scene import Scene
 from palpate.phantoms.spheres import SpheresOptions, spheres, spheres_anatomy
+from palpate.progress import Progress, silent
 from palpate.study.body import ImagedStates, aligned
 from palpate.study.case import Case, CaseTissue
 from palpate.study.provenance import file_digest
@@ -24,7 +28,7 @@ from palpate.study.schema import nearest, shown
 __all__ = ["phantom_scene", "read_pairs", "read_segmentation", "read_states"]
 
 
-def read_states(case: Case) -> ImagedStates:
+def read_states(case: Case, *, progress: Progress = silent) -> ImagedStates:
     """Segmentations of the reference state and of the later states, aligned and checked.
 
     Raises `InputDataError` for images that cannot be used, `ConfigurationError` for tissues that do not fit them.
@@ -35,14 +39,14 @@ def read_states(case: Case) -> ImagedStates:
         return aligned(segment(scene.before, scene.tissues), after, method=case.align, loaded=bool(case.loads))
     if case.images is None:
         raise ConfigurationError(f"case '{case.id}' has neither [images] nor [phantom]")
-    return _read_pair(case, case.images.before, case.images.after, key="")
+    return _read_pair(case, case.images.before, case.images.after, key="", progress=progress)
 
 
-def read_pairs(case: Case) -> tuple[ImagedStates, ...]:
+def read_pairs(case: Case, *, progress: Progress = silent) -> tuple[ImagedStates, ...]:
     """The same of each of the case's further [[pairs]]; their findings begin with the pair's number, from 2."""
     found = []
     for number, pair in enumerate(case.pairs, start=2):
-        states = _read_pair(case, pair.before, pair.after, key=f"pairs[{number - 2}].")
+        states = _read_pair(case, pair.before, pair.after, key=f"pairs[{number - 2}].", progress=progress)
         findings = tuple(replace(f, message=f"pair {number}: {f.message}") for f in states.findings)
         found.append(replace(states, findings=findings))
     return tuple(found)
@@ -56,18 +60,34 @@ def read_segmentation(
     `names`: the label table (label -> name), if the case has one; an image that brings its own names is read by those.
     `tissues`: those of the reference image, for an image without names. Raises as `read_states` does.
     """
-    image = read_label_image(path, names=names, grid=_given_grid(case, path))
+    image = _with_body(read_label_image(path, names=names, grid=_given_grid(case, path)), case, path)
     return segment(image, case.resolve_tissues(image.names) if tissues is None or image.names else tissues)
 
 
 def _given_grid(case: Case, path: Path) -> VoxelGrid | None:
     """The grid of the grey image of the same state, for files that may lack theirs; None where there is none."""
+    grey = _grey(case, path) if format_of(path).read_on is not None else None
+    return read_intensities(grey)[1] if grey is not None else None
+
+
+def _grey(case: Case, path: Path) -> Path | None:
+    """The grey image of the state that the label image at `path` shows."""
     images = case.images
-    if images is None or format_of(path).read_on is None:
+    if images is None:
         return None
     later = dict(zip(images.after, images.intensities_after, strict=False))
-    grey = images.intensities_before if path == images.before else later.get(path)
-    return read_intensities(grey)[1] if grey is not None else None
+    return images.intensities_before if path == images.before else later.get(path)
+
+
+def _with_body(image: LabelImage, case: Case, path: Path) -> LabelImage:
+    """The image with label 0 inside the body as a label that no tissue claims, if the case wants it so."""
+    if case.images is None or not case.images.body_from_ct:
+        return image
+    body, grey = image.labels == 0, _grey(case, path)
+    if grey is not None:
+        body &= ~outside_body(*read_intensities(grey), image.grid)
+    claimed = [label for tissue in case.resolve_tissues(image.names) for label in tissue.labels]
+    return replace(image, labels=np.where(body, 1 + max(int(image.labels.max()), *claimed), image.labels))
 
 
 def phantom_scene(case: Case) -> Scene:
@@ -108,13 +128,13 @@ def _phantom_tissues(case: Case, options: PelvisOptions | SpheresOptions) -> tup
     return tuple(tissue for tissue in case.tissues if own[tissue.name].meshed)
 
 
-def _read_pair(case: Case, before: Path, after: tuple[Path, ...], *, key: str) -> ImagedStates:
+def _read_pair(case: Case, before: Path, after: tuple[Path, ...], *, key: str, progress: Progress) -> ImagedStates:
     """One pair; `key` begins the keys of its files' digests."""
     table = case.images.names if case.images else None
     names = read_label_table(table) if table else None
     reference = read_segmentation(case, before, names, None)
     later = tuple(read_segmentation(case, path, names, reference.tissues) for path in after)
-    states = aligned(reference, later, method=case.align, loaded=bool(case.loads))
+    states = aligned(reference, later, method=case.align, loaded=bool(case.loads), progress=progress)
     inputs = {"names": names.sha256} if names else {}
     keys = (f"{key}before", *(f"{key}after[{i}]" for i in range(len(later))))
     for name, image, path in zip(keys, (reference, *later), (before, *after), strict=True):

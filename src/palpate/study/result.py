@@ -12,13 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import NotConverged, PalpateError
+from palpate.findings import Finding, one_a_cause, warning_rows
 from palpate.images.label_image import LabelImage
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.case import Case, CaseTissue
 from palpate.study.case_text import case_tables
-from palpate.study.estimation import Estimation, ModulusEstimate, Remark, Start, TissueFit, no_estimate
+from palpate.study.estimation import Estimation, ModulusEstimate, Start, TissueFit, no_estimate
+from palpate.study.together import ImagePairs
+from palpate.uncertainty import Information
 
 __all__ = [
     "CaseResult",
@@ -39,7 +42,11 @@ SCHEMA = "palpate.result/1"
 
 @dataclass(frozen=True, slots=True)
 class MeshSummary:
-    """Size and quality of a mesh; angles in degrees; volume_error: tissue -> (mesh - image) / image, dimensionless."""
+    """Size and quality of a mesh; angles in degrees; volume_error: tissue -> (mesh - image) / image, dimensionless.
+
+    edge_length_mm: that at the organs, which may be shorter than the case's (finding "finer-mesh"); None where the mesh
+    is a phantom's own.
+    """
 
     nodes: int
     tets: int
@@ -47,6 +54,7 @@ class MeshSummary:
     min_dihedral_deg: float
     p5_dihedral_deg: float
     volume_error: Mapping[str, float]
+    edge_length_mm: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +97,7 @@ class CaseResult:
     before: Segmentation
     after: tuple[Segmentation, ...]
     provenance: Provenance
-    remarks: tuple[Remark, ...] = ()
+    remarks: tuple[Finding, ...] = ()
     note: str = ""
     further: tuple[PairResult, ...] = ()
 
@@ -99,9 +107,9 @@ class CaseResult:
         return self.space.mesh.tissues
 
     @property
-    def all_remarks(self) -> tuple[Remark, ...]:
-        """Warnings of the study and of the estimation, each once."""
-        return tuple(dict.fromkeys((*self.remarks, *self.estimation.remarks)))
+    def all_remarks(self) -> tuple[Finding, ...]:
+        """Warnings of the study and of the estimation, one a cause, in the order of what they cost in the answer."""
+        return one_a_cause((*self.remarks, *self.estimation.remarks))
 
     @property
     def unit(self) -> str:
@@ -124,6 +132,9 @@ class CaseResult:
         document = _heading(self.case, estimation.status, estimation.reason) | {
             "estimates": [_estimate(item, estimation.status) for item in estimation.estimates],
             "correlation": estimation.correlation.tolist(),
+            "information": _information(estimation.information),
+            "combinations": [_plain(pair) for pair in estimation.combinations],
+            "image_pairs": _image_pairs(image_names(self.case), estimation.image_pairs),
             "fit": [_fit(name, fits) for name, fits in zip(image_names(self.case), estimation.fits, strict=False)],
             "starts": [_start(start) for start in estimation.starts],
             "outer_loop": {"history_mm2": [step.objective_mm2 for step in estimation.outer_loop]},
@@ -145,7 +156,7 @@ class MeshResult:
     mesh_summary: MeshSummary
     before: Segmentation
     provenance: Provenance
-    remarks: tuple[Remark, ...] = ()
+    remarks: tuple[Finding, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON document, schema palpate.mesh/1."""
@@ -169,7 +180,7 @@ class Simulation:
     after: LabelImage
     moduli_kpa: Mapping[str, float]
     provenance: Provenance
-    remarks: tuple[Remark, ...] = ()
+    remarks: tuple[Finding, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON document, schema palpate.simulation/1."""
@@ -200,6 +211,9 @@ def failure_document(case: Case, error: PalpateError) -> dict[str, Any]:
             for name in unknown
         ],
         "correlation": [],
+        "information": None,
+        "combinations": [],
+        "image_pairs": None,
         "fit": [],
         "starts": [],
         "outer_loop": {"history_mm2": []},
@@ -257,7 +271,7 @@ def _heading(case: Case, status: str, reason: str) -> dict[str, Any]:
     }
 
 
-def _closing(case: Case, provenance: Provenance, remarks: tuple[Remark, ...]) -> dict[str, Any]:
+def _closing(case: Case, provenance: Provenance, remarks: tuple[Finding, ...]) -> dict[str, Any]:
     return {
         "seconds": dict(provenance.seconds),
         "inputs": {key: {"sha256": digest} for key, digest in provenance.inputs.items()},
@@ -265,7 +279,7 @@ def _closing(case: Case, provenance: Provenance, remarks: tuple[Remark, ...]) ->
         "case": case_tables(case, lambda path: path.name),
         "overrides": list(case.overrides),
         "seed": case.seed,
-        "warnings": [{"code": warning.code, "message": warning.message} for warning in remarks],
+        "warnings": warning_rows(remarks),
     }
 
 
@@ -276,6 +290,19 @@ def _estimate(item: ModulusEstimate, status: str) -> dict[str, Any]:
         document |= dict.fromkeys(("value", "interval95", "ratio", "ratio_interval95"))
         document["verdict"] = "not identified"
     return document
+
+
+def _information(found: Information | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    return {"singular_values": found.singular_values.tolist(), "directions": found.directions.tolist()}
+
+
+def _image_pairs(names: Sequence[str], found: ImagePairs | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    alone = [{"after": name} | _plain(pair) for name, pair in zip(names, found.alone, strict=False)]
+    return _plain(found) | {"alone": alone}
 
 
 def _fit(name: str, fits: tuple[TissueFit, ...]) -> dict[str, Any]:

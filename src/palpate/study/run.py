@@ -9,12 +9,15 @@ from dataclasses import replace
 import numpy as np
 
 from palpate.errors import ConfigurationError
+from palpate.findings import Finding, of_pair
 from palpate.images.tissue import Role
-from palpate.inversion import Bounds, FittedState, Inversion, InversionSettings, ParameterMap, invert
+from palpate.inversion import Bounds, Inversion, InversionSettings, ParameterMap, invert
 from palpate.parallel import blas_on_one_thread
+from palpate.progress import Forecast, Progress, about, during, silent
 from palpate.study.body import Body, ImagedStates, joint_problem, make_body
 from palpate.study.case import Case
-from palpate.study.estimation import Estimation, Observed, Remark, conclude
+from palpate.study.cost import ExpectedCost, cost_of_meshes, expected_cost
+from palpate.study.estimation import Estimation, Observed, conclude
 from palpate.study.plausibility import estimate_warnings, unit_warnings
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.read import read_pairs, read_states
@@ -22,6 +25,7 @@ from palpate.study.result import CaseResult, MeshResult, PairResult, Provenance,
 from palpate.study.simulate import simulate
 from palpate.study.strain_range import linear_strain_warnings
 from palpate.study.summary import mesh_summary
+from palpate.uncertainty import FittedState
 
 __all__ = [
     "estimate",
@@ -34,17 +38,10 @@ __all__ = [
     "strain_warnings",
 ]
 
-Progress = Callable[[str], None]
 
-
-def silent(message: str) -> None:
-    """A listener that says nothing."""
-    del message
-
-
-def unconditional(states: ImagedStates, n_pairs: int) -> None:
-    """An estimate goes on once its images are read, whatever they show."""
-    del states, n_pairs
+def unconditional(cost: ExpectedCost) -> None:
+    """An estimate goes on once its images are read, whatever it costs."""
+    del cost
 
 
 def estimate(
@@ -52,20 +49,24 @@ def estimate(
     *,
     progress: Progress = silent,
     truth: Mapping[str, float] | None = None,
-    condition: Callable[[ImagedStates, int], None] = unconditional,
+    condition: Callable[[ExpectedCost], None] = unconditional,
 ) -> CaseResult:
     """Estimate the Young's modulus of every `estimate` tissue of a case, from its images or its phantom.
 
     `truth`: true moduli (kPa) by tissue, to stand beside the estimates of a simulation; a phantom brings its own;
-    `condition`: is asked once the images are read, with the first states and the number of pairs, and may raise.
+    `condition`: is asked with what is expected to be taken, once the images are read, and may raise.
     Raises `PalpateError`s of reading, meshing and solving; an iteration that did not converge is no error but a
     result whose status says so, with no values.
     """
     began = time.perf_counter()
     refuse_what_cannot_be_estimated(case)
-    progress("reading and aligning the images")
-    states, further = read_states(case), read_pairs(case)
-    condition(states, 1 + len(further))
+    during("reading", progress)("reading the images")
+    reading = during("reading", progress)
+    states, further = read_states(case, progress=reading), read_pairs(case, progress=reading)
+    if progress is not silent or condition is not unconditional:
+        cost = expected_cost(case, states.before, states.after, n_pairs=1 + len(further))
+        condition(cost)
+        progress(_forecast(cost))
     truth = _truth(states) if case.phantom else truth
     inputs = input_digests(case, states.inputs, *(pair.inputs for pair in further))
     seconds = time.perf_counter() - began
@@ -89,17 +90,20 @@ def estimate_states(
     body, each with its own reference state, which are meshed on their own and share the moduli.
     """
     clock = [time.perf_counter()]
-    bodies = tuple(make_body(pair, case, progress=progress) for pair in (states, *further))
+    bodies = tuple(make_body(pair, case, progress=during("meshing", progress)) for pair in (states, *further))
     body = bodies[0]
+    if progress is not silent:
+        sizes = [(made.quality.tets, 3 * len(made.space.points)) for made in bodies]
+        progress(_forecast(cost_of_meshes(case, states.before, sizes, n_after=len(states.after))))
     clock.append(time.perf_counter())
-    problem = joint_problem(bodies, case, progress=progress)
+    problem = joint_problem(bodies, case, progress=during("linear law", progress))
     clock.append(time.perf_counter())
     settings = inversion_settings(case, problem.parameters)
-    inversion = invert(problem, settings, progress=progress)
-    progress("intervals: residuals' correlation, grid position, driver")
+    inversion = invert(problem, settings, progress=during("linear law", progress))
     images = tuple(image.index for pair in bodies for image in pair.states.after)
     observed = Observed(fitted_states(inversion, *bodies), images)
-    estimation = conclude(inversion, settings, observed, truth=truth or {}, seed=case.seed)
+    stating = during("intervals", progress)
+    estimation = conclude(inversion, settings, observed, truth=truth or {}, seed=case.seed, progress=stating)
     clock.append(time.perf_counter())
     stages = np.diff(clock)
     seconds = {"read": read_seconds, "mesh": stages[0], "assemble": stages[1], "estimate": stages[2]}
@@ -113,7 +117,7 @@ def estimate_states(
         states.after,
         Provenance({key: round(float(value), 3) for key, value in seconds.items()}, {}, software_versions()),
         (
-            *_remarks(case, states, *further),
+            *_remarks(case, *bodies),
             *strain_warnings(case, bodies, estimation),
             *estimate_warnings(estimation),
         ),
@@ -124,13 +128,18 @@ def estimate_states(
 def mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
     """Mesh the reference state of a case and pass it through the gate."""
     began = time.perf_counter()
-    progress("reading and aligning the images")
-    states = read_states(case)
+    progress("reading the images")
+    states = read_states(case, progress=progress)
     inputs = input_digests(case, states.inputs)
     body = make_body(states, case, progress=progress)
     seconds = {"total": round(time.perf_counter() - began, 3)}
     provenance = Provenance(seconds, inputs, software_versions())
-    return MeshResult(case, body.space, mesh_summary(body), states.before, provenance, _remarks(case, states))
+    return MeshResult(case, body.space, mesh_summary(body), states.before, provenance, _remarks(case, body))
+
+
+def _forecast(cost: ExpectedCost) -> Forecast:
+    words = f"about {about(cost.seconds)}, as predicted for {cost.unknowns} unknowns on {cost.processors} processor(s)"
+    return Forecast(words, cost.stages)
 
 
 def inversion_settings(case: Case, parameters: ParameterMap) -> InversionSettings:
@@ -167,7 +176,7 @@ def _further(bodies: tuple[Body, ...], estimation: Estimation) -> tuple[PairResu
     return tuple(found)
 
 
-def strain_warnings(case: Case, bodies: tuple[Body, ...], estimation: Estimation) -> tuple[Remark, ...]:
+def strain_warnings(case: Case, bodies: tuple[Body, ...], estimation: Estimation) -> tuple[Finding, ...]:
     """What `linear_strain_warnings` says of the fitted displacements, those of the first body's images first."""
     motions = iter(estimation.displacements)
     moved = [(body.space, [next(motions) for _ in body.states.after]) for body in bodies]
@@ -197,6 +206,6 @@ def _truth(states: ImagedStates) -> Mapping[str, float]:
     }
 
 
-def _remarks(case: Case, *states: ImagedStates) -> tuple[Remark, ...]:
-    findings = [finding for pair in states for finding in pair.findings]
-    return (*unit_warnings(case), *(Remark(finding.code, finding.message) for finding in findings))
+def _remarks(case: Case, *bodies: Body) -> tuple[Finding, ...]:
+    pairs = enumerate(((*body.states.findings, *body.findings) for body in bodies), start=1)
+    return (*unit_warnings(case), *(finding for n, findings in pairs for finding in of_pair(findings, n)))

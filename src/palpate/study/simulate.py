@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError
+from palpate.findings import Finding
 from palpate.images.label_image import LabelImage
 from palpate.images.segmentation import Segmentation, first_labels
 from palpate.images.tissue import Role, Tissue
@@ -25,7 +26,6 @@ from palpate.phantoms.wall_filling import wall_filling
 from palpate.study.body import Body, inverse_problem, make_body
 from palpate.study.case import Case, Mechanics
 from palpate.study.case_loads import case_loads
-from palpate.study.estimation import Remark
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.read import phantom_scene, read_states
 from palpate.study.result import MeshSummary, Provenance, Simulation
@@ -49,11 +49,11 @@ def simulate(case: Case, *, progress: Progress, steps: int = 1) -> Simulation:
     if case.phantom is not None:
         scene = phantom_scene(case)
         space, tissues = scene.space, scene.tissues
-        before, after, summary, remarks = scene.before, scene.after, _plain_summary(space), tuple[Remark, ...]()
+        before, after, summary, remarks = scene.before, scene.after, _plain_summary(space), tuple[Finding, ...]()
         displacements = tuple(scene.displacement * (step / steps) for step in range(1, steps + 1))
     else:
-        progress("reading and aligning the images")
-        states = read_states(case)
+        progress("reading the images")
+        states = read_states(case, progress=progress)
         inputs = input_digests(case, states.inputs)
         tissues = states.before.tissues
         _refuse_unknown(tissues)
@@ -63,7 +63,7 @@ def simulate(case: Case, *, progress: Progress, steps: int = 1) -> Simulation:
         displacements = _steps(body, case, steps, progress)
         last = displacements[-1]
         before, after = (_labels(states.before, space, motion) for motion in (np.zeros_like(last), last))
-        remarks = tuple(Remark(finding.code, finding.message) for finding in states.findings)
+        remarks = (*states.findings, *body.findings)
     moduli = {t.name: t.youngs_modulus_kpa for t in tissues if t.meshed and t.youngs_modulus_kpa is not None}
     seconds = {"total": round(time.perf_counter() - began, 3)}
     provenance = Provenance(seconds, inputs, software_versions())

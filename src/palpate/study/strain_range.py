@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.findings import Finding
 from palpate.mechanics.deformation import largest_strains
 from palpate.mechanics.laws.contract import Law
 from palpate.mesh.space import LagrangeSpace
-from palpate.study.estimation import Remark
 
 __all__ = ["LINEAR_RANGE", "linear_strain_warnings"]
 
@@ -20,7 +20,7 @@ MOST_BEYOND = 0.01  # share of the meshed volume
 
 def linear_strain_warnings(
     law: Law, *moved: tuple[LagrangeSpace, Sequence[NDArray[np.float64]]], images: Sequence[str]
-) -> tuple[Remark, ...]:
+) -> tuple[Finding, ...]:
     """A warning when the linear `law` was used where more than 1 % of the meshed volume strains by more than 10 %.
 
     moved: each body's space with its displacements (n_points, 3) mm, one a later image; images: a name of each later
@@ -34,7 +34,7 @@ def linear_strain_warnings(
     if share <= MOST_BEYOND:
         return ()
     return (
-        Remark(
+        Finding(
             "linear-strains",
             f"{image}: {100 * share:.1f} % of the meshed volume strains by more than {100 * LINEAR_RANGE:.0f} % (99th"
             f" percentile {100 * tail:.0f} %), beyond the range of the linear law, whose moduli can then be wrong by"

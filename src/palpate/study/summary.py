@@ -18,4 +18,5 @@ def mesh_summary(body: Body) -> MeshSummary:
         quality.min_dihedral_deg,
         quality.p5_dihedral_deg,
         quality.volume_error,
+        body.edge_length_mm,
     )

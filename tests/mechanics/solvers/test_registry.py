@@ -136,6 +136,9 @@ def test_the_fastest_solver_that_finds_its_memory_is_chosen(monkeypatch, free, c
     expecting(monkeypatch, multifrontal=(1.0, 0.8e9), multifrontal_single=(2.0, 0.4e9), multigrid=(9.0, 1e6))
     monkeypatch.setattr(registry, "available_memory", lambda: free)
     assert factorise(laplacian(5)).solver == chosen
+    monkeypatch.setattr(registry, "available_memory", lambda: 1e12)
+    monkeypatch.setattr(registry, "total_memory", lambda: free * registry.USABLE / registry.SHARE)
+    assert factorise(laplacian(5)).solver == chosen
     assert registry.expected_of_size(5, 1)[0] == chosen
     assert factorise(laplacian(5), solver="multigrid").solver == "multigrid"
 

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from palpate.experiments.reproduce.table import Entry
 from palpate.images import VoxelGrid, segment
-from palpate.inversion import Bounds, Inversion, InversionSettings, ParameterMap, log_interval, sandwich_covariance
+from palpate.inversion import Bounds, Inversion, InversionSettings, ParameterMap
 from palpate.mesh import LagrangeSpace
 from palpate.phantoms import imaged
 from palpate.study import Body, ImagedStates, Observed, aligned, conclude, fitted_states, verdict
+from palpate.uncertainty import log_interval, sandwich_covariance
 
 __all__ = ["entries_from_surfaces", "entries_from_voxels", "from_half", "imaged_states", "with_motions"]
 

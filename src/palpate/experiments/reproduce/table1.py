@@ -29,9 +29,9 @@ from palpate.experiments.reproduce.table import COLUMNS, Entry, Table, TableRow,
 from palpate.inversion import InverseProblem, Inversion, InversionSettings, LaterState, invert, parameter_map
 from palpate.mechanics import LinearModel, linear_model, with_constraint
 from palpate.mesh import LagrangeSpace
-from palpate.observation import Observation, observed_surface, surface_distance
+from palpate.observation import Observation, observed_surface, surface_distance, surface_distances
 from palpate.phantoms import target_of_truth
-from palpate.study import Case, Mechanics, MeshSettings, Phantom, make_body, surface_observations
+from palpate.study import Case, Mechanics, MeshSettings, Phantom, make_body
 
 __all__ = ["Table1Settings", "table1"]
 
@@ -188,7 +188,7 @@ class _Case:
         body = make_body(states, case, progress=progress)
         model = _pulled_by(_model(body.space), self.stress_kpa)
         surfaces = tuple(observed_surface(body.space, number) for number in range(len(BODIES)))
-        inversion, settings = self.inverted(model, surface_observations(body, surfaces)[0], progress)
+        inversion, settings = self.inverted(model, surface_distances(body.imaged(), surfaces)[0], progress)
         return entries_from_voxels(inversion, settings, body, self.truth, seed=self.seed)
 
     def inverted(

@@ -34,7 +34,7 @@ from palpate.mechanics import (
     weighted_sum,
 )
 from palpate.mesh import LagrangeSpace, anatomy_of, check_mesh, lagrange_space, tetrahedralise
-from palpate.observation import observed_surface, prescribed_motion, surface_distance
+from palpate.observation import observations, observed_surface, prescribed_motion, surface_distance
 from palpate.phantoms import target_of_truth
 from palpate.study import (
     Body,
@@ -45,7 +45,6 @@ from palpate.study import (
     MeshSettings,
     Phantom,
     inverse_problem,
-    surface_observations,
 )
 
 __all__ = ["SURROUNDINGS_KPA", "Table2Settings", "table2"]
@@ -324,7 +323,7 @@ class _Imaged:
         """What the label images alone say of both organs."""
         imaged_later = with_motions(self.body.states, self.bench.fine.space, self.later(kpa))
         body = replace(self.body, states=imaged_later)
-        pairs = zip(self.problem.states, surface_observations(body), strict=True)
+        pairs = zip(self.problem.states, observations(body.imaged()), strict=True)
         states = tuple(state.with_observations(seen).with_approximation(self.basis) for state, seen in pairs)
         truth, problem = dict.fromkeys(ORGANS, kpa), replace(self.problem, states=states)
         settings = from_half(problem.parameters, truth)

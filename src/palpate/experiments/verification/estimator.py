@@ -10,22 +10,13 @@ from palpate.experiments.verification.inflation import NEO, NU, bore_of, inflate
 from palpate.experiments.verification.problem import Check, Problem
 from palpate.experiments.verification.structured_meshes import known, octant_mesh
 from palpate.experiments.verification.twin import TRUTH, noise_of, settings_from, twin_model, twin_problem
-from palpate.inversion import (
-    NORMAL_95,
-    Inversion,
-    InversionSettings,
-    Objective,
-    gauss_newton,
-    invert,
-    log_interval,
-    sandwich_covariance,
-    with_first_noise,
-)
+from palpate.inversion import Inversion, InversionSettings, Objective, gauss_newton, invert, with_first_noise
 from palpate.mechanics import ForwardModel, LinearModel
 from palpate.mesh import lagrange_space
 from palpate.observation import NoiseModel
 from palpate.phantoms import smooth_field
 from palpate.study import verdict
+from palpate.uncertainty import NORMAL_95, log_interval, sandwich_covariance
 
 __all__ = ["ESTIMATOR_PROBLEMS", "coverage", "gradient_error", "recovered"]
 

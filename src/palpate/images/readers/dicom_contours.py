@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydicom.dataset import Dataset
 
 from palpate.errors import InputDataError
-from palpate.images.finding import Finding
+from palpate.findings import Finding
 from palpate.images.label_image import VoxelGrid
 from palpate.images.named_labels import MAX_LABEL, MAX_NAME, NamedLabel, hex_colour, printable
 from palpate.images.readers.dicom_dataset import Series, read_dataset, sentences, series_beside

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydicom.dataset import Dataset
 
 from palpate.errors import InputDataError
-from palpate.images.finding import Finding
+from palpate.findings import Finding
 from palpate.images.label_image import VoxelGrid
 from palpate.images.named_labels import MAX_NAME, NamedLabel, hex_colour, printable
 from palpate.images.readers.canonical import to_canonical

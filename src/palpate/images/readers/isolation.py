@@ -22,7 +22,7 @@ from typing import Any, BinaryIO, cast
 import numpy as np
 
 from palpate.errors import ConfigurationError, InputDataError, PalpateError, ResourceError
-from palpate.images.finding import Finding
+from palpate.findings import Finding, known_code
 from palpate.images.label_image import VoxelGrid
 from palpate.images.named_labels import NamedLabel, printable
 from palpate.images.readers.registry import ImageFormat, StoredImage
@@ -160,7 +160,7 @@ def _stored(answer: Mapping[str, Any], pipe: BinaryIO, path: Path) -> StoredImag
         affine = np.array(answer["affine"], dtype=np.float64)
         names = tuple(NamedLabel(int(k), str(name), None if c is None else str(c)) for k, name, c in answer["names"])
         digests = {printable(str(part)): str(digest) for part, digest in answer.get("digests", {}).items()}
-        findings = tuple(Finding(str(code), printable(str(text))) for code, text in answer.get("findings", ()))
+        findings = tuple(Finding(known_code(code), printable(str(text))) for code, text in answer.get("findings", ()))
         placed = len(shape) == 3 and min(shape) > 0 and affine.shape == (4, 4)
         valid = placed and DTYPE.fullmatch(answer["dtype"]) and all(map(DIGEST.fullmatch, digests.values()))
     except (AttributeError, KeyError, TypeError, ValueError):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.images.finding import Finding
+from palpate.findings import Finding
 from palpate.images.named_labels import NamedLabel, printable
 
 __all__ = ["Mask", "merged"]

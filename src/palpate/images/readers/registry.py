@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, InputDataError
-from palpate.images.finding import Finding
+from palpate.findings import Finding
 from palpate.images.input_file import open_input
 from palpate.images.label_image import VoxelGrid
 from palpate.images.named_labels import NamedLabel

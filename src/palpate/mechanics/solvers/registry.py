@@ -13,7 +13,7 @@ from palpate.mechanics.solvers import multigrid
 from palpate.mechanics.solvers.contract import Coarser, Expectation, Factorisation, Hints
 from palpate.mechanics.solvers.multifrontal import solver as multifrontal
 from palpate.mechanics.solvers.products import times
-from palpate.memory import available_memory
+from palpate.memory import available_memory, total_memory
 
 __all__ = ["SOLVERS", "expected_of_size", "factorise"]
 
@@ -21,6 +21,7 @@ SOLVERS = {solver.name: solver for solver in (multifrontal.SOLVER, multifrontal.
 TOLERANCE = 1e-8  # of a residual, relative to its right-hand side
 LARGEST_CONDITION = 1e13  # beyond it a direct solution has lost three digits of four to rounding
 USABLE = 0.8  # of the memory that is free: the rest is for what comes with the solutions
+SHARE = 0.5  # of all memory, so that the choice is the same whatever else runs, unless memory is short
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,10 +72,11 @@ def factorise(
     """Make the symmetric positive definite `matrix` (n, n), mN/mm, ready to be solved with.
 
     solver: a name of `SOLVERS`, or "auto": the one that is expected to take the least time for the factorisation and
-    for `right_hand_sides`, among those whose memory is free. near_nullspace (n, k), mm: displacements of little energy
-    (the rigid motions), which multigrid needs to converge fast; coarser: the linear displacements among quadratic ones,
-    which halve its iterations. Raises `SolverError` for a singular or indefinite matrix, `ConfigurationError` for an
-    unknown name, `ResourceError` where memory does not suffice.
+    for `right_hand_sides`, among those that need no more than half of the machine's memory and find it free.
+    near_nullspace (n, k), mm: displacements of little energy (the rigid motions), which multigrid needs to converge
+    fast; coarser: the linear displacements among quadratic ones, which halve its iterations. Raises `SolverError` for a
+    singular or indefinite matrix, `ConfigurationError` for an unknown name, `ResourceError` where memory does not
+    suffice.
     """
     if solver != "auto" and solver not in SOLVERS:
         raise ConfigurationError(f"solver is '{solver}'; it must be 'auto' or one of {sorted(SOLVERS)}")
@@ -84,7 +86,9 @@ def factorise(
         raise SolverError("the stiffness is not finite: check the moduli and the mesh's volumes")
     hints = Hints(near_nullspace, coarser, right_hand_sides)
     if solver == "auto":
-        solver = _fastest({name: known.expect(matrix, hints) for name, known in SOLVERS.items()})
+        free = available_memory()
+        room = min(_room(), np.inf if free is None else USABLE * free)
+        solver = _fastest({name: known.expect(matrix, hints) for name, known in SOLVERS.items()}, room)
     chosen = SOLVERS[solver]
     checked = CheckedFactorisation(matrix, chosen.factorise(matrix, hints), chosen.name)
     if chosen.direct:
@@ -93,16 +97,23 @@ def factorise(
 
 
 def expected_of_size(unknowns: int, right_hand_sides: int, *, solver: str = "auto") -> tuple[str, Expectation]:
-    """The solver that quadratic tetrahedra of so many unknowns will have on this machine, and what it will take."""
+    """The solver that quadratic tetrahedra of so many unknowns will have on this machine, and what it will take.
+
+    It does not depend on what else runs: `factorise` takes another only where the memory for this one is not free.
+    """
     expected = {name: known.expect_of_size(unknowns, right_hand_sides) for name, known in SOLVERS.items()}
-    chosen = _fastest(expected) if solver == "auto" else solver
+    chosen = _fastest(expected, _room()) if solver == "auto" else solver
     return chosen, expected[chosen]
 
 
-def _fastest(expected: dict[str, Expectation]) -> str:
-    """The solver of least expected time whose memory is free; where none is, the one that takes least."""
-    free = available_memory()
-    room = np.inf if free is None else USABLE * free
+def _room() -> float:
+    """Bytes that a factorisation may take on this machine."""
+    total = total_memory()
+    return np.inf if total is None else SHARE * total
+
+
+def _fastest(expected: dict[str, Expectation], room: float) -> str:
+    """The solver of least expected time that needs no more than `room` bytes; else the one that takes least."""
     fitting = [name for name in expected if expected[name].bytes <= room]
     if not fitting:
         return min(expected, key=lambda name: expected[name].bytes)

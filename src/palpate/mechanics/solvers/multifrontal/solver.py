@@ -33,7 +33,7 @@ __all__ = ["MIXED", "SOLVER", "plan_of"]
 KEPT_PLANS = 2  # of a linear and a finite-strain model of one mesh
 HOPELESS = 4.0  # times the free memory; a pattern of such a size is not analysed to know more exactly
 TOLERANCE = 1e-10  # of the residual, relative, to which solutions by single-precision factors are refined
-AT_ONCE = 48  # right-hand sides refined together; each takes eight vectors
+AT_ONCE = 32  # right-hand sides refined together; each takes eight vectors
 MAX_REFINEMENTS = 8  # steps of conjugate gradients; where they do not suffice, double precision costs less
 
 

@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 
 from palpate.errors import EstimationError
-from palpate.inversion import FittedState, LaterState, Objective, ParameterMap, gain, sandwich_covariance
+from palpate.inversion import LaterState, Objective, ParameterMap
 from palpate.inversion.objective import Evaluation, Linearisation, deciding_directions
 from palpate.inversion.optimise import Minimum, Outcome, posterior_sd
-from palpate.inversion.uncertainty import grid_position_shifts, imaging_errors, log_interval
 from palpate.observation.contract import Residuals, Weighting
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.robust_loss import Tukey
 from palpate.phantoms.boundary_noise import smooth_field
+from palpate.uncertainty import FittedState, gain, sandwich_covariance
+from palpate.uncertainty.covariance import grid_position_shifts, imaging_errors
+from palpate.uncertainty.intervals import log_interval
 
 SD = 0.3
 

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from palpate.errors import ConfigurationError
-from palpate.inversion import Bounds, gauss_newton, sample_posterior
-from palpate.inversion.sampling import frozen_posterior
+from palpate.inversion import Bounds, gauss_newton
 from palpate.observation.noise_model import NoiseModel
+from palpate.uncertainty import sample_posterior
+from palpate.uncertainty.sampling import frozen_posterior
 
 WIDE = Bounds(np.full(2, np.log(0.02)), np.full(2, np.log(200.0)))
 NOISE = NoiseModel(np.array([0.05**2]), np.array([3.0]))
@@ -70,8 +71,8 @@ def test_no_sample_leaves_the_bounds_and_a_seed_repeats_the_chain(objective, min
 
 
 def test_where_the_frozen_posterior_is_off_the_closest_points_are_chosen_anew(objective, minimum, rng, monkeypatch):
-    monkeypatch.setattr("palpate.inversion.sampling.GAP", -1.0)
-    monkeypatch.setattr("palpate.inversion.sampling.BETWEEN_CHECKS", 20)
+    monkeypatch.setattr("palpate.uncertainty.sampling.GAP", -1.0)
+    monkeypatch.setattr("palpate.uncertainty.sampling.BETWEEN_CHECKS", 20)
     samples = sample_posterior(objective, minimum, bounds=WIDE, evaluations=100, rng=rng)
     assert samples.refreshed == 5
 

@@ -10,13 +10,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from palpate.inversion import Evaluation, LaterState, Objective, ParameterMap, sandwich_covariance
+from palpate.inversion import Evaluation, LaterState, Objective, ParameterMap
 from palpate.inversion.objective import Linearisation
 from palpate.observation.contract import Residuals, Weighting
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.robust_loss import Tukey
 from palpate.observation.surface_distance import SurfaceDistance
 from palpate.phantoms.boundary_noise import smooth_field
+from palpate.uncertainty import sandwich_covariance
 
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "cramer_rao.py"
 NOISE = NoiseModel(np.array([0.3**2]), np.array([5.0]))

@@ -87,7 +87,7 @@ def frozen_posterior(
                 f"the posterior is sampled on reduced models; state {number} has a {type(model).__name__}"
             )
         lines = [line for line in evaluation.lines if line.state == number]
-        answer = np.concatenate([model.output_basis, model.output_given], axis=1)
+        answer = np.column_stack([model.output_basis, model.output_modes, model.output_offset])
         values = model.solve(moduli, coefficients).values
         form = np.zeros((answer.shape[1],) * 2)
         for rows, line in zip(state.slices, lines, strict=True):

@@ -1,4 +1,4 @@
-"""How uncertain the estimate is: covariance under correlated residuals, the voxel grid, intervals."""
+"""How uncertain the estimate is: covariance under correlated residuals, the drivers' prior, the voxels' place."""
 
 from __future__ import annotations
 
@@ -17,19 +17,14 @@ from palpate.observation.noise_model import NoiseModel
 from palpate.parallel import mapped
 
 __all__ = [
-    "NORMAL_95",
+    "Covariance",
     "FittedState",
-    "Interval",
+    "covariance_of",
     "gain",
     "grid_position_shifts",
     "imaging_errors",
-    "log_interval",
     "sandwich_covariance",
 ]
-
-Interval = tuple[float | None, float | None]
-
-NORMAL_95 = 1.959964
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +46,43 @@ def gain(evaluation: Evaluation, n_parameters: int) -> tuple[NDArray[np.float64]
     return tuple(rows[:, s.columns] @ (s.precision * s.weights[:, None] * s.jacobian).T for s in evaluation.lines)
 
 
+@dataclass(frozen=True, slots=True)
+class Covariance:
+    """Of the log-moduli, (n_parameters, n_parameters) each, by its independent causes.
+
+    noise: of the residuals; prior: what is believed of the drivers' motion, and of the moduli; grid: the place of the
+    voxels.
+    """
+
+    noise: NDArray[np.float64]
+    prior: NDArray[np.float64]
+    grid: NDArray[np.float64]
+
+    @property
+    def total(self) -> NDArray[np.float64]:
+        """Their sum."""
+        return self.noise + self.prior + self.grid
+
+    def shares(self, number: int) -> dict[str, float]:
+        """Share of each cause, 0 to 1, in the variance of the log-modulus with a `number`."""
+        parts = {"noise": self.noise, "prior": self.prior, "grid": self.grid}
+        return {name: float(part[number, number] / self.total[number, number]) for name, part in parts.items()}
+
+
+def covariance_of(
+    objective: Objective,
+    evaluation: Evaluation,
+    states: tuple[FittedState, ...],
+    *,
+    draws: int,
+    rng: np.random.Generator,
+) -> Covariance:
+    """All that is known of the log-moduli's errors: the sandwich, and the scatter over so many grid positions."""
+    noise, prior = _sandwich(objective, evaluation)
+    shifts = grid_position_shifts(objective, evaluation, states, draws=draws, rng=rng)
+    return Covariance(noise, prior, shifts.T @ shifts / len(shifts))
+
+
 def sandwich_covariance(objective: Objective, evaluation: Evaluation) -> NDArray[np.float64]:
     """Covariance (n_parameters, n_parameters) of the log-moduli: H^-1 (J^T W C W J + P) H^-1.
 
@@ -60,6 +92,11 @@ def sandwich_covariance(objective: Objective, evaluation: Evaluation) -> NDArray
     independent, that of the rest state is the same for all states that have it, at the material place. Later states
     that move alike do not average it away, opposite ones do.
     """
+    return sum(_sandwich(objective, evaluation), np.zeros((objective.n_parameters,) * 2))
+
+
+def _sandwich(objective: Objective, evaluation: Evaluation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Its two parts, (n_parameters, n_parameters) each: by the residuals, and by the prior."""
     n = objective.n_parameters
     inverse = evaluation.covariance_columns(n)
     data = np.zeros((n, n))
@@ -71,7 +108,7 @@ def sandwich_covariance(objective: Objective, evaluation: Evaluation) -> NDArray
             for key in dict.fromkeys(groups):
                 group = [pair for pair, own in zip(of_kind, groups, strict=True) if own == key]
                 data += 0.5 * _propagated(noise, group, at_rest=at_rest)
-    return np.asarray(data + inverse.T @ evaluation.prior @ inverse)
+    return data, np.asarray(inverse.T @ evaluation.prior @ inverse)
 
 
 def _propagated(
@@ -123,12 +160,6 @@ def imaging_errors(
         lines: list[Linearisation] = [line for line in evaluation.lines if line.state == s]
         errors += [line.observation.imaging_error(line.residuals, rest[state.reference], after) for line in lines]
     return errors
-
-
-def log_interval(centre: float, sd: float, *, lower: float, upper: float) -> Interval:
-    """95 % interval exp(ln centre +- 1.96 sd); an end beyond the bounds (lower, upper), in `centre`'s unit, is open."""
-    low, high = centre * np.exp(-NORMAL_95 * sd), centre * np.exp(NORMAL_95 * sd)
-    return (float(low) if low > lower else None, float(high) if high < upper else None)
 
 
 def _imaged(

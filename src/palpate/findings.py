@@ -1,0 +1,129 @@
+"""What the user should know of images and results: every warning there is, ordered by what it costs in the answer.
+
+The codes stand here once. What each says, where it comes from and what to do is told in docs/warnings.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Literal, cast, get_args
+
+__all__ = [
+    "CODES",
+    "HARMLESS",
+    "MISLEADING",
+    "WIDENING",
+    "Code",
+    "Finding",
+    "known_code",
+    "of_pair",
+    "one_a_cause",
+    "rank",
+    "warning_rows",
+]
+
+Misleading = Literal[
+    "mirrored",
+    "voxel-size",
+    "large-shift",
+    "volume-implausible",
+    "fold-over",
+    "implausible-stiffness",
+    "units",
+    "linear-strains",
+    "volume-change",
+    "several-bodies",
+    "open-contours",
+    "overlap",
+    "unsettled",
+    "too-small",
+    "thin",
+    "islands",
+    "sparse-contours",
+    "cropped",
+    "rotation-undetermined",
+    "rigid-unseen",
+    "no-equilibrium",
+]
+Widening = Literal[
+    "ratio-only",
+    "hardly-observed",
+    "motion-below-noise",
+    "correlated",
+    "several-minima",
+    "little-in-common",
+    "cut-by-border",
+    "touching",
+]
+Harmless = Literal[
+    "finer-mesh", "front-exchanged", "sides-exchanged", "memory", "memory-now", "report", "case-file", "earlier-files"
+]
+Code = Misleading | Widening | Harmless
+
+MISLEADING: tuple[str, ...] = get_args(Misleading)  # can move a modulus by more than its interval
+WIDENING: tuple[str, ...] = get_args(Widening)  # less is found than other images would show
+HARMLESS: tuple[str, ...] = get_args(Harmless)  # the numbers are as good as without
+CODES = (*MISLEADING, *WIDENING, *HARMLESS)
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something the user should know: `code` for programs, `message` a sentence with advice.
+
+    about: the tissue, say, that it is about; place: where it was seen, in words that go on after "also" ("in 'after'").
+    Findings of one code about one thing in several places have one cause.
+    """
+
+    code: Code
+    message: str
+    about: str = ""
+    place: str = ""
+
+
+def one_a_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """One finding a cause, the one found first, which names the other places; what costs most in the answer is first.
+
+    Codes of other programs' readers come last.
+    """
+    causes: dict[tuple[str, ...], list[Finding]] = {}
+    for finding in findings:
+        key = (finding.code, finding.about) if finding.place else (finding.code, finding.about, finding.message)
+        places = causes.setdefault(key, [])
+        if finding not in places:
+            places.append(finding)
+    ranked = sorted(causes.values(), key=lambda places: rank(places[0].code))
+    return tuple(_with_places(first, [other.place for other in others if other.place]) for first, *others in ranked)
+
+
+def known_code(code: str) -> Code:
+    """The code itself; raises `ValueError` where no warning has it."""
+    if code not in CODES:
+        raise ValueError(f"no warning has the code {code!r}")
+    return cast("Code", code)
+
+
+def of_pair(findings: Iterable[Finding], number: int) -> tuple[Finding, ...]:
+    """The findings on the images of a pair; from the second on, number 2, they say so."""
+    if number == 1:
+        return tuple(findings)
+    said = "pair {}: {}"
+    return tuple(
+        replace(each, message=said.format(number, each.message), place=each.place and said.format(number, each.place))
+        for each in findings
+    )
+
+
+def warning_rows(findings: Iterable[Finding], *, beside: Iterable[Mapping[str, str]] = ()) -> list[dict[str, str]]:
+    """`warnings` of a JSON document, one a cause; `beside`: those that it has already."""
+    rows = [{"code": finding.code, "message": finding.message} for finding in one_a_cause(findings)]
+    return sorted([*map(dict, beside), *rows], key=lambda row: rank(row["code"]))
+
+
+def rank(code: str) -> int:
+    """The place of a code among all, from 0: what costs more in the answer is lower; an unknown one is last."""
+    return CODES.index(code) if code in CODES else len(CODES)
+
+
+def _with_places(finding: Finding, places: list[str]) -> Finding:
+    return replace(finding, message=f"{finding.message}; also {', '.join(places)}") if places else finding

@@ -1,0 +1,91 @@
+"""What an estimate finds out about itself: ratios only, what is not settled, several minima, folds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.findings import Finding
+from palpate.images.checks import later_names
+from palpate.inversion import Inversion, Outcome
+from palpate.mechanics.deformation import deformation_determinants
+from palpate.uncertainty import FittedState
+
+__all__ = ["fold_findings", "inversion_findings"]
+
+STRONG_CORRELATION = 0.99
+
+
+def inversion_findings(inversion: Inversion, covariance: NDArray[np.float64]) -> tuple[Finding, ...]:
+    """What the search itself tells of its result; covariance (n, n) of the log-moduli."""
+    mapping = inversion.objective.parameters
+    findings = []
+    if not mapping.absolute:
+        findings.append(
+            Finding(
+                "ratio-only",
+                f"no tissue's modulus is known, so only ratios to '{mapping.relative_to}' are determined; give one"
+                " tissue role `known` with its youngs_modulus_kpa to get kPa",
+            )
+        )
+    if inversion.minimum.converged and inversion.convergence.unmet:
+        findings.append(
+            Finding(
+                "unsettled",
+                f"the outer loop ended at its largest number of iterations: {'; '.join(inversion.convergence.unmet)};"
+                " the model may not fit the images (edge length, driver modes, law), or [noise] should be given",
+            )
+        )
+    lost = [c for c in inversion.candidates if c.minimum.outcome is Outcome.NO_EQUILIBRIUM]
+    if lost:
+        findings.append(
+            Finding(
+                "no-equilibrium",
+                f"{len(lost)} of {len(inversion.candidates)} minima of the linear law have no equilibrium under the"
+                " case's law and are not compared with the others; other [estimate] start_ratios show"
+                " whether they are minima at all",
+            )
+        )
+    if len(inversion.candidates) - len(lost) > 1:
+        findings.append(
+            Finding(
+                "several-minima",
+                "the starts ended in different minima; the best fit under one noise model is reported, and the"
+                " intervals reach over all that fit nearly as well",
+            )
+        )
+    alike = _alike(mapping.tissues, covariance)
+    if alike:
+        text = f"the moduli of {', of '.join(alike)} cannot be told apart by these images"
+        findings.append(Finding("correlated", f"{text}; add some that move them otherwise"))
+    return tuple(findings)
+
+
+def _alike(tissues: Sequence[str], covariance: NDArray[np.float64]) -> list[str]:
+    """Pairs of tissues whose log-moduli depend on each other nearly wholly."""
+    sd = np.sqrt(np.diag(covariance))
+    pairs = np.argwhere(np.tril(np.abs(covariance) > STRONG_CORRELATION * np.outer(sd, sd), -1))
+    return [f"'{tissues[j]}' and '{tissues[i]}'" for i, j in pairs.tolist()]
+
+
+def fold_findings(states: Sequence[FittedState]) -> tuple[Finding, ...]:
+    """A finding for each later image in which the fitted model turns elements inside out."""
+    findings = []
+    for name, state in zip(later_names(len(states)), states, strict=True):
+        space = state.space
+        smallest = deformation_determinants(space, state.displacement).min(axis=1)
+        folded = int(np.count_nonzero(smallest <= 0.0))
+        if folded:
+            worst = space.mesh.nodes[space.mesh.tets[int(smallest.argmin())]].mean(axis=0)
+            findings.append(
+                Finding(
+                    "fold-over",
+                    f"'{name}': {folded} of {len(smallest)} elements are turned inside out, the worst near"
+                    f" {np.round(worst).astype(int).tolist()} mm (RAS): the motion is too large there for the law or"
+                    " the mesh. Look at the labels there, or set a smaller [mesh] edge_length_mm",
+                    place=f"in '{name}' ({folded})",
+                )
+            )
+    return tuple(findings)

@@ -1,0 +1,127 @@
+"""The reference state of a case meshed: with the case's edge length, or a shorter one where that mesh is not fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from palpate.errors import GeometryError, ResourceError
+from palpate.findings import Finding
+from palpate.images.distance import smoothing_width
+from palpate.images.segmentation import Segmentation
+from palpate.mesh.anatomy import Anatomy, Box, anatomy_of
+from palpate.mesh.quality import MeshQuality, check_mesh
+from palpate.mesh.tet_mesh import TetMesh
+from palpate.mesh.tetrahedralise import tetrahedralise
+from palpate.progress import Progress
+from palpate.study.case import Case
+from palpate.study.cost import expected_cost, lack_of_memory
+from palpate.study.domain import case_domain
+
+__all__ = ["ReferenceMesh", "mesh_reference", "refuse_edge"]
+
+FINER = 0.75  # times an edge length whose mesh is not fit: the next one's
+FINER_MESHES = 2  # at the most
+THIN_VOXELS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceMesh:
+    """A mesh that has passed its gate, its edge length at the organs, and what the user should know of it."""
+
+    mesh: TetMesh
+    quality: MeshQuality
+    edge_length_mm: float
+    findings: tuple[Finding, ...] = ()
+
+
+def mesh_reference(
+    before: Segmentation, after: tuple[Segmentation, ...], case: Case, *, progress: Progress
+) -> ReferenceMesh:
+    """Mesh `before` inside the domain that it shares with the later images.
+
+    A mesh that fails its gate, or that Mmg gives up, is followed by one of 0.75 times the edge length, at most twice
+    and where this machine has the memory for an estimate on it; the finding "finer-mesh" tells of it. Raises
+    `GeometryError` when none is fit, `ResourceError` where the mesher stops for want of memory.
+    """
+    box = case_domain(before, after, case)
+    refuse_edge(case, box)
+    progress(f"surfaces of {len(before.tissues)} tissues in {np.round(box.lengths).astype(int).tolist()} mm")
+    width = smoothing_width(before.grid, *(image.grid for image in after))
+    anatomy = anatomy_of(before, box=box, smoothing_mm=width)
+    asked = case.mesh.edge_length_mm
+    edges = [round(asked * FINER**number, 3) for number in range(FINER_MESHES + 1)]
+    failure: GeometryError | None = None
+    for edge in edges:
+        finer = replace(case, mesh=replace(case.mesh, edge_length_mm=edge))
+        lack = lack_of_memory(expected_cost(finer, before, after, n_pairs=1)) if failure else ""
+        if lack:
+            raise GeometryError(f"{failure}; a mesh of {edge:g} mm was not tried: {lack}") from failure
+        progress(f"meshing at {edge:g} mm" + (f", for the mesh before was not fit: {failure}" if failure else ""))
+        try:
+            mesh, quality = _fit_mesh(before, anatomy, edge, progress)
+        except GeometryError as error:
+            failure = error
+        else:
+            return ReferenceMesh(mesh, quality, edge, _finer(asked, edge, failure))
+    raise type(failure or GeometryError())(
+        f"no mesh is fit to compute with, neither at mesh.edge_length_mm = {asked:g} nor at"
+        f" {' and '.join(f'{edge:g}' for edge in edges[1:])} mm, where {failure}; repair the labels at that place, or"
+        " try another edge length"
+    ) from failure
+
+
+def refuse_edge(case: Case, box: Box) -> None:
+    """Raise `GeometryError` for an edge length that the domain has no room for."""
+    edge = case.mesh.edge_length_mm
+    if edge >= float(box.lengths.min()):
+        raise GeometryError(
+            f"mesh.edge_length_mm is {edge}; it must be positive and less than the smallest side of the domain,"
+            f" {box.lengths.min():.1f} mm"
+        )
+
+
+def _finer(asked: float, edge: float, failure: GeometryError | None) -> tuple[Finding, ...]:
+    if failure is None:
+        return ()
+    text = (
+        f"the mesh has edges of {edge:g} mm, for a coarser one was not fit to compute with: {failure}. With"
+        f" mesh.edge_length_mm = {edge:g} in place of {asked:g} the attempt is saved; a repair of the labels at that"
+        " place may allow coarser meshes"
+    )
+    return (Finding("finer-mesh", text),)
+
+
+def _fit_mesh(
+    before: Segmentation, anatomy: Anatomy, edge_length_mm: float, progress: Progress
+) -> tuple[TetMesh, MeshQuality]:
+    """A mesh that passed its gate, with its quality; voxels are counted inside the domain."""
+    try:
+        mesh = tetrahedralise(anatomy, edge_length_mm=edge_length_mm, progress=progress)
+    except RuntimeError as error:  # Mmg's own words, which do not tell a lack of memory from a bad surface
+        raise ResourceError(
+            f"the mesher stopped ({error}), most likely for want of memory; make mesh.edge_length_mm larger, or the"
+            ' domain smaller (domain.extent = "margin")'
+        ) from error
+    progress("measuring the mesh against its gate")
+    index = np.argwhere(np.ones(before.grid.shape, dtype=bool))
+    local = anatomy.box.local(before.grid.world(index.astype(float)))
+    inside = np.all((local > 0.0) & (local < anatomy.box.lengths), axis=1).reshape(before.grid.shape)
+    volumes = {
+        tissue.name: float(np.count_nonzero(inside & before.mask(i))) * before.grid.voxel_volume
+        for i, tissue in enumerate(before.tissues)
+        if tissue.meshed
+    }
+    return mesh, check_mesh(mesh, anatomy, voxel_volumes=volumes, thin=_thin(before), image=before)
+
+
+def _thin(before: Segmentation) -> tuple[str, ...]:
+    """Names of meshed tissues that are under four voxels thick along some axis."""
+    thin = []
+    for i, tissue in enumerate(before.tissues):
+        mask = before.mask(i)
+        spans = [np.flatnonzero(mask.any(axis=tuple({0, 1, 2} - {a}))) for a in range(3)]
+        if tissue.meshed and min(span[-1] - span[0] + 1 for span in spans if len(span)) < THIN_VOXELS:
+            thin.append(tissue.name)
+    return tuple(thin)

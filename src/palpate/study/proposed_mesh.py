@@ -1,0 +1,79 @@
+"""What a case to be should mesh: a box around the organs, and an edge length that suits them and the memory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from palpate.images.label_image import LabelImage
+from palpate.images.segmentation import segment
+from palpate.images.tissue import Role
+from palpate.study.case import REMAINING, Case, CaseTissue, Domain, Images, MeshSettings
+from palpate.study.cost import MEMORY_FACTOR, expected_cost, machine_memory_gb
+from palpate.study.guess import GuessedTissue
+
+__all__ = ["MARGIN_MM", "proposed_edge", "proposed_window"]
+
+MARGIN_MM = 40.0
+CROP_BELOW = 0.6  # a domain of the margin's box is proposed when it saves so much of the image
+EDGES_MM = (3.0, 8.0)
+ORGAN_EDGES = 6.0  # edges of tetrahedra across the smallest organ
+STEP_MM, LONGEST_MM = 0.5, 12.0  # in which edges grow until the memory does, and where that ends
+SOME_KPA = 1.0  # a modulus, on which no size depends
+
+
+def proposed_window(before: LabelImage, tissues: Sequence[GuessedTissue]) -> tuple[slice, ...]:
+    """The voxels within `MARGIN_MM` of organs and drivers; all of them where that saves little."""
+    whole = tuple(slice(0, n) for n in before.labels.shape)
+    shown = [label for t in tissues if t.role in (Role.ESTIMATE, Role.DRIVER) for label in t.labels]
+    places = np.argwhere(np.isin(before.labels, shown))
+    if not len(places):
+        return whole
+    margin = MARGIN_MM / before.grid.spacing
+    shape = np.array(before.labels.shape)
+    low, high = np.maximum(places.min(axis=0) - margin, 0), np.minimum(places.max(axis=0) + 1 + margin, shape)
+    if float(np.prod((high - low) / shape)) > CROP_BELOW:
+        return whole
+    return tuple(slice(int(a), int(np.ceil(b))) for a, b in zip(low, high, strict=True))
+
+
+def proposed_edge(
+    before: LabelImage, after: Sequence[LabelImage], tissues: Sequence[GuessedTissue], *, cropped: bool
+) -> tuple[float, str] | None:
+    """An edge length, mm, by the smallest organ, or a longer one for which this machine has the memory; and why.
+
+    `cropped`: whether only the margin around the organs is meshed. None where there is no organ.
+    """
+    voxels = [np.count_nonzero(np.isin(before.labels, t.labels)) for t in tissues if t.role is Role.ESTIMATE]
+    if not voxels:
+        return None
+    diameter = float((6.0 * min(voxels) * before.grid.voxel_volume / np.pi) ** (1.0 / 3.0))
+    wanted = round(2.0 * min(max(diameter / ORGAN_EDGES, EDGES_MM[0]), EDGES_MM[1])) / 2.0
+    why = f"the smallest organ is as large as a ball of {diameter:.0f} mm"
+    has, edge = machine_memory_gb(), wanted
+    case = _case(tissues, cropped=cropped)
+    first, *later = (segment(image, case.resolve_tissues({})) for image in (before, *after))
+    while has is not None and edge < LONGEST_MM:
+        needed = expected_cost(replace(case, mesh=MeshSettings(edge)), first, tuple(later), n_pairs=1).memory_gb
+        if MEMORY_FACTOR * needed <= has:
+            break
+        edge += STEP_MM
+    if edge > wanted:
+        why += f"; {wanted:g} mm would suit it, but this machine has {has:.0f} GB of memory"
+    return edge, why
+
+
+def _case(tissues: Sequence[GuessedTissue], *, cropped: bool) -> Case:
+    """The case as far as its size depends on it; a tissue without a role is taken for a known one."""
+    return Case(
+        id="proposed",
+        images=Images(Path("before"), (Path("after"),)),
+        tissues=tuple(
+            CaseTissue(t.name, t.labels or REMAINING, t.role or Role.KNOWN, youngs_modulus_kpa=SOME_KPA)
+            for t in tissues
+        ),
+        domain=Domain("margin" if cropped else "image", MARGIN_MM),
+    )

@@ -1,0 +1,81 @@
+"""What is stated of several moduli, and of several image pairs, together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.inversion import Bounds, Inversion
+from palpate.uncertainty import NORMAL_95, Agreement, Combination, agreement, known_pairs, pair_estimates
+
+__all__ = ["ImagePairs", "PairAlone", "combinations_of", "image_pairs_of"]
+
+
+@dataclass(frozen=True, slots=True)
+class PairAlone:
+    """What one later image says alone: moduli (kPa, or ratios) with their 95 % intervals.
+
+    outlier: whether the others contradict it; influence: by how many standard deviations it moves the mean of all.
+    """
+
+    moduli: Mapping[str, float]
+    interval95: Mapping[str, tuple[float, float]]
+    outlier: bool
+    influence: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class ImagePairs:
+    """Several later images of one body, each alone and the mean of those that agree.
+
+    heterogeneity_p: probability of differences so large if all had the same moduli; within_cv: within-subject
+    coefficient of variation; mean, mean_interval95: random-effects mean of those that are no outliers.
+    """
+
+    alone: tuple[PairAlone, ...]
+    heterogeneity_p: float
+    within_cv: Mapping[str, float]
+    mean: Mapping[str, float]
+    mean_interval95: Mapping[str, tuple[float, float]]
+
+
+def image_pairs_of(inversion: Inversion, bounds: Bounds) -> ImagePairs | None:
+    """Of two or more later images of a converged estimate; else None."""
+    mapping = inversion.objective.parameters
+    if len(inversion.objective.states) < 2 or not inversion.minimum.converged:
+        return None
+    pairs = pair_estimates(inversion.objective, inversion.minimum, bounds)
+    found: Agreement = agreement(pairs)
+    scale = mapping.scale_kpa if mapping.absolute else 1.0
+    names = mapping.tissues
+
+    def stated(
+        theta: NDArray[np.float64], covariance: NDArray[np.float64]
+    ) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+        """Values and 95 % intervals by tissue, of log-moduli (n,) with their covariance (n, n)."""
+        half = NORMAL_95 * np.sqrt(np.diag(covariance))
+        ends = scale * np.exp(np.stack([theta - half, theta, theta + half]))
+        low, middle, high = (dict(zip(names, row.tolist(), strict=True)) for row in ends)
+        return middle, {name: (low[name], high[name]) for name in names}
+
+    alone = []
+    for pair, outlier, influence in zip(pairs, found.outlier.tolist(), found.influence, strict=True):
+        values, intervals = stated(pair.theta, pair.covariance)
+        alone.append(PairAlone(values, intervals, outlier, dict(zip(names, influence.tolist(), strict=True))))
+    mean, mean_interval = stated(found.theta, found.covariance)
+    within = dict(zip(names, found.within_cv.tolist(), strict=True))
+    return ImagePairs(tuple(alone), found.heterogeneity, within, mean, mean_interval)
+
+
+def combinations_of(inversion: Inversion, covariance: NDArray[np.float64], *, within: float) -> tuple[Combination, ...]:
+    """Ratios (dimensionless) and geometric means (kPa, or ratios) known within a factor; covariance (n, n) of ln E."""
+    mapping = inversion.objective.parameters
+    if not inversion.minimum.converged:
+        return ()
+    theta = inversion.minimum.unknowns[: mapping.n_parameters]
+    scale = mapping.scale_kpa if mapping.absolute else 1.0
+    found = known_pairs(mapping.tissues, theta, covariance, within=within)
+    return tuple(pair.times(scale) if pair.kind == "geometric mean" else pair for pair in found)

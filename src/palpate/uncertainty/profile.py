@@ -1,0 +1,164 @@
+"""The profile likelihood of a modulus: what the images say of each of its values, all other unknowns at their best.
+
+An ellipse around the minimum takes the objective for a parabola of ln E. It is none where an organ is so stiff, or so
+soft, that its modulus hardly matters any more: there the profile is flat on one side, and its interval leans that way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import SolverError
+from palpate.inversion import Bounds, Evaluation, Linearisation, Minimum, Objective, gauss_newton
+from palpate.mechanics.curved import CurvedModel
+from palpate.mechanics.first_order import FirstOrderModel
+from palpate.mechanics.forward import ForwardModel
+
+__all__ = ["FixedCorrespondence", "Profile", "fixed_correspondence", "profile"]
+
+TRIALS = 12  # points on each side of the estimate
+NEAR = 0.05  # of the level, to which an end is found before a line to the estimate corrects it
+FURTHEST = 2.0  # times the distance of the last point: more is not extrapolated
+
+
+@dataclass(frozen=True, slots=True)
+class FixedCorrespondence:
+    """An objective whose closest points are those of one evaluation; the model bends as it does.
+
+    Residuals are r_0 + S (u(E, q) - u_0) with the smooth Jacobians S by the displacement, and count by the robust
+    weights w_0 there, as in the Gauss-Newton matrix: J = 1/2 sum_j precision w_0j r_j^2 + prior. What re-chosen closest
+    points add, some tenths of a unit, is noise beside its second derivative, and far away a robust loss would take
+    every residual for an outlier. models: of each state, at its observed unknowns; displacements: u_0 (n_dofs,) mm of
+    each line.
+    """
+
+    objective: Objective
+    models: tuple[ForwardModel, ...]
+    lines: tuple[Linearisation, ...]
+    displacements: tuple[NDArray[np.float64], ...]
+
+    @property
+    def n_parameters(self) -> int:
+        """Number of log-moduli among the unknowns."""
+        return self.objective.n_parameters
+
+    def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
+        """J at `unknowns` (n_unknowns,) with gradient and Gauss-Newton matrix; raises `SolverError`."""
+        mapping, lines = self.objective.parameters, list[Linearisation]()
+        left = iter(zip(self.lines, self.displacements, strict=True))
+        moduli, coefficients = mapping.moduli(unknowns), mapping.coefficients(unknowns)
+        for state, model, q in zip(self.objective.states, self.models, coefficients, strict=True):
+            there = model.solve(moduli, q)
+            tangent = mapping.by_unknowns(there.tangent(), unknowns)
+            for rows, (line, before) in zip(state.slices, left, strict=False):
+                smooth = line.residuals.smooth_jacobian
+                values = line.residuals.values + smooth @ (there.values[rows] - before)
+                jacobian = np.asarray(smooth @ tangent[rows])
+                gradient = np.asarray(jacobian.T @ (line.precision * line.weights * values))
+                residuals = replace(line.residuals, values=values)
+                lines.append(replace(line, residuals=residuals, jacobian=jacobian, gradient=gradient))
+        found = self.objective.assembled(unknowns, lines)
+        away = float((unknowns - mapping.prior_centre) @ found.prior_score)
+        squares = sum(line.precision * float(line.weights @ line.residuals.values**2) for line in lines)
+        return replace(found, value=0.5 * (away + squares))
+
+
+def fixed_correspondence(objective: Objective, minimum: Minimum) -> FixedCorrespondence:
+    """The objective with the closest points of a minimum; expansions bend as the linear law does (`CurvedModel`)."""
+    models, displacements = list[ForwardModel](), list[NDArray[np.float64]]()
+    mapping = objective.parameters
+    moduli, coefficients = mapping.moduli(minimum.unknowns), mapping.coefficients(minimum.unknowns)
+    for state, q in zip(objective.states, coefficients, strict=True):
+        model, like = state.observed, state.bending
+        assert model is not None, "an objective is made of states with approximations"
+        values = model.solve(moduli, q).values
+        displacements += [values[rows] for rows in state.slices]
+        models.append(CurvedModel.of(model, like) if like and isinstance(model, FirstOrderModel) else model)
+    return FixedCorrespondence(objective, tuple(models), minimum.evaluation.lines, tuple(displacements))
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """Signed root deviance r (n,) at values theta (n,) of one log-modulus, both ascending.
+
+    r^2 = 2 (min J(theta) - min J) / s with the ratio s of its variance to that of the Gauss-Newton matrix: what is
+    known of correlated residuals and of the voxels' place counts as in the ellipse, at whose ends r = 1.96 where J is a
+    parabola. low, high: ln E where |r| is the level; None where the search's bound is reached before.
+    """
+
+    theta: NDArray[np.float64]
+    root: NDArray[np.float64]
+    low: float | None
+    high: float | None
+
+
+def profile(
+    fixed: FixedCorrespondence, minimum: Minimum, number: int, *, variance: float, bounds: Bounds, level: float
+) -> Profile:
+    """The profile of the log-modulus with a `number`, as far as |r| = `level` or its bound, on both sides.
+
+    `variance` of the log-modulus by all that is known (see `sandwich_covariance`). The deviance is scaled so that its
+    curvature is one over that (Chandler & Bate, Biometrika 94 (2007) 167-183, section 3, vertically). A value at which
+    the model cannot be solved ends the search as a bound does.
+    """
+    least = gauss_newton(fixed, minimum.unknowns, bounds=bounds, tolerance=1e-6)
+    scale = float(least.evaluation.covariance_columns(number + 1)[number, number]) / variance
+    sides = [
+        _side(fixed, least, number, bounds=bounds, scale=scale, level=level, first=sign * level * np.sqrt(variance))
+        for sign in (-1.0, 1.0)
+    ]
+    (low_points, low), (high_points, high) = sides
+    points = np.array(sorted([*low_points, (float(least.unknowns[number]), 0.0), *high_points]))
+    return Profile(points[:, 0], points[:, 1], low, high)
+
+
+def _side(
+    fixed: FixedCorrespondence,
+    least: Minimum,
+    number: int,
+    *,
+    bounds: Bounds,
+    scale: float,
+    level: float,
+    first: float,
+) -> tuple[list[tuple[float, float]], float | None]:
+    """Points (theta, r) on one side of the minimum, and where |r| is the level; None at the bound.
+
+    The root deviance is nearly straight: the next point is where a line through the minimum and the last one, or
+    through the last two around the level, meets it.
+    """
+    sign, centre = float(np.sign(first)), float(least.unknowns[number])
+    bound = float((bounds.lower if sign < 0.0 else bounds.upper)[number])
+    held = np.arange(fixed.n_parameters) == number
+    unknowns, points, inside, outside = least.unknowns, list[tuple[float, float]](), (0.0, 0.0), None
+    distance = abs(first)
+    if bound == centre:
+        return [], None
+    for _ in range(TRIALS):
+        at_bound = distance >= abs(bound - centre)
+        distance = min(distance, abs(bound - centre))
+        start = unknowns.copy()
+        start[number] = centre + sign * distance
+        try:
+            found = gauss_newton(fixed, start, bounds=bounds, held=held, tolerance=1e-4)
+        except SolverError:
+            return points, None
+        root = float(np.sqrt(max(2.0 * scale * (found.evaluation.value - least.evaluation.value), 0.0)))
+        points.append((centre + sign * distance, sign * root))
+        if abs(root - level) < NEAR * level:
+            return points, centre + sign * distance * level / root
+        if root < level:
+            if at_bound:
+                return points, None
+            inside, unknowns = (distance, root), found.unknowns
+        else:
+            outside = (distance, root)
+        if outside is None:
+            distance *= min(level / max(root, 1e-3), FURTHEST)
+        else:
+            (near, low), (far, high) = inside, outside
+            distance = near + (far - near) * float(np.clip((level - low) / (high - low), 0.1, 0.9))
+    return points, centre + sign * distance

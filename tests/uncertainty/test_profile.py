@@ -1,0 +1,126 @@
+"""The profile of a modulus: an ellipse where the model is straight, the posterior's own lean where it bends."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from palpate.inversion import Bounds, gauss_newton
+from palpate.mechanics.curved import CurvedModel
+from palpate.mechanics.finite_strain import finite_strain_model
+from palpate.mechanics.first_order import expanded
+from palpate.mechanics.laws.registry import law_named
+from palpate.observation.noise_model import NoiseModel
+from palpate.uncertainty import NORMAL_95, sample_posterior
+from palpate.uncertainty.profile import fixed_correspondence, profile
+
+WIDE = Bounds(np.full(2, np.log(0.02)), np.full(2, np.log(200.0)))
+WEAK = NoiseModel(np.array([0.18**2]), np.array([3.0]))
+
+
+@pytest.fixture(scope="module")
+def objective(twins, twin):
+    """With so much noise that the moduli are known to a factor of two at the most."""
+    return twins.objective_of(twins.exact_problem(twin, noise=WEAK), twin.coefficients).rematched(twin.unknowns)
+
+
+@pytest.fixture(scope="module")
+def minimum(objective, twin):
+    return gauss_newton(objective, twin.unknowns, bounds=WIDE, tolerance=1e-8)
+
+
+@pytest.fixture(scope="module")
+def variance(minimum):
+    return np.diag(minimum.evaluation.covariance_columns(2))
+
+
+def profiled(objective, minimum, number, variance, bounds=WIDE):
+    fixed = fixed_correspondence(objective, minimum)
+    return profile(fixed, minimum, number, variance=variance, bounds=bounds, level=NORMAL_95)
+
+
+def straight(objective, minimum):
+    """The objective with every state's model to first order around the minimum."""
+    mapping, states = objective.parameters, []
+    moduli = mapping.moduli(minimum.unknowns)
+    for state, q in zip(objective.states, mapping.coefficients(minimum.unknowns), strict=True):
+        names = state.model.names
+        there = expanded(state.observed.solve(moduli, q), names=names, moduli=moduli, coefficients=q)
+        states.append(replace(state, observed=there))
+    return replace(objective, states=tuple(states))
+
+
+def test_where_the_model_is_straight_the_ends_are_those_of_the_ellipse(objective, minimum, variance):
+    for number in range(2):
+        found = profiled(straight(objective, minimum), minimum, number, variance[number])
+        half = NORMAL_95 * np.sqrt(variance[number])
+        centre = minimum.unknowns[number]
+        assert (found.low, found.high) == pytest.approx((centre - half, centre + half), abs=0.02 * half)
+        assert np.all(np.diff(found.theta) > 0.0)
+        assert np.all(np.diff(found.root) > 0.0)
+
+
+def test_at_the_ends_the_objective_is_higher_by_the_level_at_its_best(objective, minimum, variance):
+    fixed, least = fixed_correspondence(objective, minimum), minimum.evaluation.value
+    found = profiled(objective, minimum, 0, variance[0])
+    for end in (found.low, found.high):
+        start = minimum.unknowns.copy()
+        start[0] = end
+        best = gauss_newton(fixed, start, bounds=WIDE, held=np.array([True, False]), tolerance=1e-8)
+        assert best.unknowns[0] == end
+        assert 2.0 * (best.evaluation.value - least) == pytest.approx(NORMAL_95**2, rel=0.05)
+
+
+def test_a_wider_variance_widens_the_interval(objective, minimum, variance):
+    narrow, wide = (profiled(objective, minimum, 0, share * variance[0]) for share in (1.0, 1.5))
+    assert wide.low < narrow.low < narrow.high < wide.high
+
+
+def test_it_leans_as_the_posterior_does(objective, minimum, variance, rng):
+    samples = sample_posterior(objective, minimum.unknowns, bounds=WIDE, evaluations=20000, rng=rng)
+    for number, sampled in enumerate(samples.interval()):
+        found, centre = profiled(objective, minimum, number, variance[number]), minimum.unknowns[number]
+        lean = (found.high - centre) / (centre - found.low)
+        assert abs(np.log(lean)) > 0.05  # or there would be nothing to show
+        assert np.sign(np.log(lean)) == np.sign(np.log((sampled[1] - centre) / (centre - sampled[0])))
+        width = found.high - found.low
+        assert (found.low, found.high) == pytest.approx(tuple(sampled), abs=0.15 * width)
+
+
+def test_an_end_beyond_the_bounds_is_open(objective, minimum, variance):
+    centre, sd = minimum.unknowns[:2], np.sqrt(variance)
+    near = Bounds(WIDE.lower, centre + np.array([1.0, 20.0]) * sd)
+    found = profiled(objective, minimum, 0, variance[0], bounds=near)
+    assert found.high is None
+    assert found.theta[-1] == near.upper[0]
+    assert found.low is not None
+
+
+@pytest.fixture(scope="module")
+def bodies(twins):
+    """The same body under the linear and under the neo-Hookean law, at one place."""
+    twin = twins.make_twin(element="P1", seed=8)
+    law = finite_strain_model(twin.model.space, twin.model.constraint, law_named("neo-hookean"))
+    return twin.model, law, twin.moduli, 0.7 * twin.coefficients
+
+
+def test_an_expansion_that_bends_is_exact_at_its_place_with_its_derivatives(bodies):
+    linear, law, moduli, q = bodies
+    expansion = expanded(law.solve(moduli, q), names=linear.names, moduli=moduli, coefficients=q)
+    there = CurvedModel.of(expansion, linear).solve(moduli, q)
+    assert there.values == pytest.approx(expansion.values, abs=1e-12)
+    assert there.tangent() == pytest.approx(expansion.derivatives, abs=1e-9)
+    load = np.sin(np.arange(len(there.values)))
+    assert there.adjoint(load) == pytest.approx(there.tangent().T @ load, rel=1e-7, abs=1e-9)
+
+
+@pytest.mark.parametrize("factor", [0.3, 3.0])
+def test_it_is_nearer_to_the_law_far_away_than_the_expansion_alone(bodies, factor):
+    linear, law, moduli, q = bodies
+    expansion = expanded(law.solve(moduli, q), names=linear.names, moduli=moduli, coefficients=q)
+    far = moduli * np.array([factor, 1.0, 1.0])
+    exact = law.solve(far, q).values
+    bent, plain = (of.solve(far, q).values for of in (CurvedModel.of(expansion, linear), expansion))
+    assert np.linalg.norm(bent - exact) < 0.6 * np.linalg.norm(plain - exact)
