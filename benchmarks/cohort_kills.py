@@ -81,7 +81,8 @@ class Cluster:
     @staticmethod
     def _popen(arguments: list[str]) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", "distributed.cli.dask_" + arguments[0], *arguments[1:]]
-        environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+        places = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(places)}
         return subprocess.Popen(command, env=environment, **QUIET)  # type: ignore[call-overload,no-any-return]
 
 
