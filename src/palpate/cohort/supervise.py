@@ -19,6 +19,8 @@ from palpate.errors import ResourceError
 __all__ = ["ESTIMATE", "Supervisor"]
 
 ESTIMATE = "palpate.cohort.work:estimate_row"
+# One thread for each row: several would sum in another order, and the numbers would tell in their last digits how many
+# workers there were, and where.
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 LOOK_S = 0.1  # how often memory is looked at
 START_S = 600.0  # for the warm process to import what it needs
@@ -29,13 +31,12 @@ READ_SIZE = 65536
 
 @dataclass(slots=True)
 class Supervisor:
-    """Runs tasks one after the other with the function `work` ("module:function"), on that many threads each.
+    """Runs tasks one after the other with the function `work` ("module:function"), on one thread each.
 
     Holds a process that has imported the work and forks a child for each task; `close` ends both.
     """
 
     work: str = ESTIMATE
-    threads: int = 1
     _process: subprocess.Popen[bytes] | None = None
     _rest: bytes = b""
     _closed: bool = False
@@ -72,7 +73,7 @@ class Supervisor:
             raise EOFError
         if self._process is None or self._process.poll() is not None:
             self._drop()
-            self._process = _start(self.work, self.threads)
+            self._process = _start(self.work)
         return self._process
 
     def _send(self, process: subprocess.Popen[bytes], task: Task) -> None:
@@ -183,9 +184,9 @@ class _Watch:
         )
 
 
-def _start(work: str, threads: int) -> subprocess.Popen[bytes]:
+def _start(work: str) -> subprocess.Popen[bytes]:
     places = os.pathsep.join(str(Path(place).resolve()) for place in sys.path if place)
-    environment = {**os.environ, **dict.fromkeys(THREADS, str(threads)), "PYTHONPATH": places}
+    environment = {**os.environ, **dict.fromkeys(THREADS, "1"), "PYTHONPATH": places}
     command = [sys.executable, "-P", "-W", "ignore", "-m", "palpate.cohort.warm", work]
     try:
         return subprocess.Popen(  # noqa: S603 - our own interpreter and module, no shell

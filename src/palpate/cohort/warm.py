@@ -56,8 +56,12 @@ def main(work: str) -> None:
         child = os.fork()
         if child == 0:
             _be_child(function, Task.from_json(line), answers)
-        _say(answers, {"pid": child})
-        _wait(child, woken, answers)
+        try:
+            _say(answers, {"pid": child})
+            _wait(child, woken, answers)
+        except BrokenPipeError:  # nobody listens any more
+            _end_group(child)
+            os._exit(1)
 
 
 def reader_of_lines(file: int) -> Any:

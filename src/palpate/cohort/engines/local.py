@@ -44,8 +44,7 @@ class LocalEngine:
         if not hasattr(os, "fork"):
             raise ResourceError("cohorts need a system that forks processes: Linux or macOS, or a Dask worker on one")
         workers = max(min(self.workers or processors(), len(tasks)), 1)
-        threads = max(processors() // workers, 1)
-        pool = _Processes([Supervisor(self.work, threads) for _ in range(workers)], self._memory_gb())
+        pool = _Processes([Supervisor(self.work) for _ in range(workers)], self._memory_gb())
         try:
             yield from packed(pool, tasks)
         finally:
