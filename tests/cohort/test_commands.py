@@ -72,7 +72,7 @@ def test_a_table_of_somebodys_own_is_never_replaced(table, tmp_path, capsys):
 
 def test_there_is_no_status_of_a_folder_without_a_cohort(tmp_path, capsys):
     assert main(["status", str(tmp_path)]) == 3
-    assert "plan.json" in capsys.readouterr().err
+    assert "so no cohort" in capsys.readouterr().err
 
 
 SBATCH = """#!{python}

@@ -18,8 +18,15 @@ from palpate.cohort.mark import read_mark
 from palpate.cohort.progress import status_of
 from palpate.cohort.run import Options, run_cohort
 from palpate.cohort.supervise import Supervisor
-from palpate.cohort.task import Limits, Outcome, Row, Task
-from palpate.errors import ConfigurationError, ResourceError
+from palpate.cohort.task import FAILURE_CLASSES, Limits, Outcome, Row, Task, failure_class_of
+from palpate.errors import (
+    ConfigurationError,
+    InputDataError,
+    MeshQualityError,
+    NotConverged,
+    PalpateError,
+    ResourceError,
+)
 
 STUB = "cohort_stub:work"
 
@@ -119,6 +126,24 @@ def test_a_child_dies_with_whoever_started_it_and_leaves_no_half_result(tmp_path
     assert supervisor.attempt(task(tmp_path)).state == "done"
     supervisor.close()
     assert supervisor.attempt(task(tmp_path)).failure_class == "lost"
+
+
+@pytest.mark.parametrize(
+    ("error", "name"),
+    [
+        (ConfigurationError(), "usage"),
+        (InputDataError(), "input"),
+        (MeshQualityError(), "geometry"),
+        (NotConverged(), "solver"),
+        (ResourceError(), "resources"),
+        (MemoryError(), "resources"),
+        (ZeroDivisionError(), "crash"),
+        (PalpateError(), "crash"),
+    ],
+)
+def test_the_class_of_a_failure_is_that_of_its_exit_code(error, name):
+    assert failure_class_of(error) == name
+    assert name in FAILURE_CLASSES
 
 
 def test_tasks_are_json(tmp_path):

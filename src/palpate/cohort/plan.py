@@ -64,6 +64,8 @@ def write_plan(plan: Plan, folder: Path) -> None:
 
 def read_plan(folder: Path) -> Plan:
     """The plan that `write_plan` wrote; raises `InputDataError` when there is none."""
+    if not (folder / PLAN).is_file():
+        raise InputDataError(f"there is no {folder / PLAN}, so no cohort; name the --output folder of palpate cohort")
     content = read_json(folder / PLAN)
     try:
         content.pop("schema")
