@@ -163,7 +163,7 @@ class _Watch:
     def _sudden_end(self) -> Outcome:
         task, limit = self.task, self.memory_gb
         if self.stopped == "time":
-            return Outcome.failed(task, "timeout", f"it took more than the {self.seconds:.0f} s that it was given.")
+            return Outcome.failed(task, "timeout", f"it took more than the {self.seconds:g} s that it was given.")
         if self.stopped == "memory":
             text = f"it took more than the {limit:.1f} GB of memory that it was given."
             return Outcome.failed(task, "resources", text, cause="memory")
