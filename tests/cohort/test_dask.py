@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import sys
+import types
+
 import pytest
 
 from palpate.cohort.engines import dask
-from palpate.cohort.engines.dask import attempt_on_worker
+from palpate.cohort.engines.dask import DaskEngine, attempt_on_worker
 from palpate.cohort.engines.packing import packed
 from palpate.cohort.task import Limits, Outcome, Row, Task
 from palpate.errors import ResourceError
@@ -45,7 +49,7 @@ class Client:
         assert function is attempt_on_worker
         assert not allow_other_workers
         assert not pure
-        assert work == "a:b"
+        assert ":" in work
         future = Future(Task.from_json(task), workers[0])
         self.futures.append(future)
         if workers[0] == "immortal":
@@ -88,9 +92,16 @@ def test_a_row_that_every_worker_dies_of_is_lost(tmp_path):
     assert (tmp_path / "heavy/done.json").exists()
 
 
-def test_a_scheduler_that_is_gone_ends_the_run(tmp_path):
+def test_a_scheduler_that_is_gone_ends_the_run(tmp_path, monkeypatch):
+    distributed = types.SimpleNamespace(Client=lambda *_, **__: contextlib.nullcontext(client))
+    monkeypatch.setitem(sys.modules, "distributed", distributed)
+    client = Client(mortal=0, status="closed")
     with pytest.raises(ResourceError, match="--resume"):
-        list(packed(dask._Cluster(Client(mortal=0, status="closed"), "a:b", None), tasks(tmp_path, "a")))
+        list(DaskEngine("tcp://here:1").outcomes(tasks(tmp_path, "a")))
+    client = Client(mortal=0)
+    monkeypatch.setattr(Future, "result", lambda _: (_ for _ in ()).throw(ConnectionResetError()))
+    with pytest.raises(ResourceError, match="tcp://here:1 is gone"):
+        list(DaskEngine("tcp://here:1").outcomes(tasks(tmp_path, "a")))
 
 
 def test_without_workers_rows_wait(tmp_path):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 import time
 from collections.abc import Hashable, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError
 from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib import import_module
@@ -71,7 +73,10 @@ class DaskEngine:
                 client = stack.enter_context(distributed.Client(address, set_as_default=False))
             except (OSError, ValueError) as error:
                 raise ResourceError(f"no Dask scheduler answers at {self.scheduler}: {error}") from error
-            yield from packed(_Cluster(client, self.work, self.workers), tasks)
+            try:
+                yield from packed(_Cluster(client, self.work, self.workers), tasks)
+            except (OSError, CancelledError, asyncio.CancelledError) as error:  # in the midst of a question to it
+                raise ResourceError(GONE.format(self.scheduler or LOOPBACK)) from error
 
 
 def attempt_on_worker(task: str, work: str) -> dict[str, Any]:
@@ -93,7 +98,7 @@ class _Cluster:
         self._where: dict[Hashable, str] = {}
 
     def places(self) -> Mapping[str, Place]:
-        """The workers that there are, by their addresses; waits for the first."""
+        """The workers that there are, by their addresses; waits for the first. Raises `OSError` without scheduler."""
         end = time.monotonic() + PATIENCE_S
         while not (workers := self._workers()) and time.monotonic() < end:
             time.sleep(MOMENT_S)
@@ -102,9 +107,7 @@ class _Cluster:
 
     def _workers(self) -> Mapping[str, Any]:
         if self._client.status != "running":
-            raise ResourceError(
-                GONE.format(self._client.scheduler.address if self._client.scheduler else "its address")
-            )
+            raise OSError("the connection is lost")
         try:
             found: Mapping[str, Any] = self._client.scheduler_info(n_workers=-1)["workers"]
         except TypeError:  # before 2025.4 it names them all
