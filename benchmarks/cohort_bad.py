@@ -3,7 +3,7 @@
     python benchmarks/cohort_bad.py              # 80 rows, 8 of them bad
     python benchmarks/cohort_bad.py --rows 16
 
-Wrong are: a stage, an image cut short, an organ of a few voxels, noise that leaves nothing to estimate, a mesh too
+Wrong are: a stage, an image cut short, an organ of a few voxels, noise that leaves nothing to estimate, voxels too
 fine for the memory limit; and while they run, children are crashed (SIGSEGV), stopped until their time is over, and
 killed as often as they are started. Prints JSON; exit code 1 where a row came to something else.
 """
@@ -25,11 +25,12 @@ from pathlib import Path
 import numpy as np
 from cohort_case import TEMPLATE, make_table
 
-from palpate.images import LabelImage, read_label_image, write_label_image
+from palpate.images import LabelImage, VoxelGrid, read_label_image, write_label_image
 
 BAD = ("usage", "input", "geometry", "solver", "resources", "crash", "timeout", "lost")
 SIGNALS = {"crash": signal.SIGSEGV, "timeout": signal.SIGSTOP, "lost": signal.SIGKILL}
-MEMORY_GB, SECONDS = 2.0, 180.0
+MEMORY_GB, SECONDS = 1.5, 300.0
+FINE = 14  # voxels along the edge of one: images that do not fit
 
 
 def spoil(table: Path) -> None:
@@ -46,7 +47,14 @@ def spoil(table: Path) -> None:
     images = '[images]\nbefore = "before_0.nii.gz"\nafter = ["after_0.nii.gz"]\n'
     noisy = TEMPLATE.replace("surface_sd_mm = 0.5", "surface_sd_mm = 100.0\ncorrelation_length_mm = 100.0")
     (folder / "noisy.toml").write_text(noisy + images)
-    (folder / "fine.toml").write_text(TEMPLATE.replace("edge_length_mm = 11.0", "edge_length_mm = 0.7") + images)
+    for name in ("before_0", "after_0"):
+        coarse = read_label_image(folder / f"{name}.nii.gz")
+        fine = coarse.labels.repeat(FINE, 0).repeat(FINE, 1).repeat(FINE, 2)
+        affine = coarse.grid.affine @ np.diag([1.0 / FINE, 1.0 / FINE, 1.0 / FINE, 1.0])
+        write_label_image(folder / f"fine_{name}.nii.gz", LabelImage(fine, VoxelGrid(fine.shape, affine)))
+    (folder / "fine.toml").write_text(
+        TEMPLATE + images.replace("before_0", "fine_before_0").replace("after_0", "fine_after_0")
+    )
     rows = list(csv.DictReader(table.read_text().splitlines()))
     changes = {
         "usage": {"stage": "high"},

@@ -184,7 +184,10 @@ def disturbed(table: Path, output: Path, cluster: Cluster | None, target: str, a
 
 def fault(output: Path, reference: dict[str, Any]) -> str:
     """What is wrong with a resumed run; empty when it is that which nobody disturbed."""
-    found = numbers_of(output)
+    try:
+        found = numbers_of(output)
+    except PalpateError as error:
+        return str(error)
     if found != reference:
         return f"other numbers: {sorted(name for name in reference if found.get(name) != reference[name])}"
     if len((output / "cohort.csv").read_text().splitlines()) != len(reference) + 1:
@@ -218,6 +221,7 @@ def main() -> int:
     parser.add_argument("--port", type=int, default=18786)
     arguments = parser.parse_args()
     random.seed(arguments.seed)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(130))  # the cluster ends with this process
     with tempfile.TemporaryDirectory() as place, clusters(arguments.engine, arguments.port) as cluster:
         folder = Path(place) / ("stub" if arguments.stub else "data")
         table = make_stub_table(folder, arguments.rows) if arguments.stub else make_table(folder, arguments.rows)
