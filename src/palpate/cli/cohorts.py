@@ -22,6 +22,7 @@ __all__ = ["TARGETS", "cohort", "statistics", "status"]
 Progress = Callable[[str], None]
 
 INTERRUPTED = "the plan and the rows that are done, with which --resume goes on"
+MOST_TOLD = 20  # failed rows
 TARGETS = ("cohort.csv", "cohort.parquet", "cohort.html", "statistics.json", "plan.json")
 
 
@@ -132,11 +133,10 @@ def _told(records: Sequence[Record], folder: Path) -> Outcome:
     ]
     found = read_json(folder / "statistics.json")
     document["statistics"] = found
-    lines = [
-        f"{record.row.id} failed ({record.failure_class}): {record.message}"
-        for record in records
-        if record.failure_class
-    ]
+    failed = [record for record in records if record.failure_class]
+    lines = [f"{record.row.id} failed ({record.failure_class}): {record.message}" for record in failed[:MOST_TOLD]]
+    if len(failed) > MOST_TOLD:
+        lines.append(f"and {len(failed) - MOST_TOLD} more, which stand in cohort.csv")
     summary = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
     text = "\n".join([*lines, _associations(found), summary, f"written to {folder}: {', '.join(TARGETS[:-1])}, cases/"])
     left = f"{counts['waiting']} rows are waiting: --resume goes on with them" if counts["waiting"] else ""
