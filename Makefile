@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo test lint check clean pardiso benchmark-setup schemas docs dist dist-test minimum
+.PHONY: install demo test lint check clean pardiso benchmark-setup schemas docs dist dist-test minimum report-check
 
 install: $(VENV)/.installed
 
@@ -36,6 +36,18 @@ test: lint
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal
 
 check: test
+
+# A report in a Chromium (BROWSER, else playwright's own or the system's): console, axe-core, keyboard, width.
+REPORT ?= demo-output/report.html
+AXE := build/axe/package/axe.min.js
+report-check: install $(AXE)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[browser]"
+	$(BIN)/python benchmarks/report_check.py $(REPORT) --axe $(AXE) --pictures build/report-check \
+	  $(if $(BROWSER),--browser $(BROWSER))
+
+$(AXE):
+	mkdir -p build/axe
+	cd build/axe && npm pack --silent axe-core@4 && tar xzf axe-core-*.tgz
 
 # case.schema.json, which the package ships, from the dataclasses that read a case.
 schemas: install

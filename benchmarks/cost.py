@@ -1,9 +1,12 @@
-"""What `palpate check` predicts that an estimate will cost, beside what it costs: tetrahedra, seconds, memory.
+"""What `palpate check` predicts that an estimate will cost, beside what it costs: unknowns, seconds, memory.
 
-    python benchmarks/cost.py [--cases N,N,...] [--json]
+    python benchmarks/cost.py [--cases N,N,...] [--mesh-only] [--json]
 
-Each case runs in a process of its own, from label images on disk, so that its peak memory is its own. The constants of
-`palpate.study.cost` are fitted to these runs. Simulated data.
+Each case runs in a process of its own, from label images on disk, so that its peak memory is its own. `check` meshes:
+its unknowns are those of the run. The guess before the mesh, by which `init` chooses an edge length, is told beside
+them. The constants of `palpate.study.cost` are fitted to these runs, so times are worth something on a quiet machine
+only; `--mesh-only` needs none and solves nothing. The random pelves are only meshed: what moves them is no mechanics.
+Simulated data.
 """
 
 from __future__ import annotations
@@ -14,17 +17,19 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from memory import peak_mb
+from random_pelves import random_pelvis, write_images
 
+from palpate import check, init, make_mesh
 from palpate.experiments.simulated_pelvis import DATA
 from palpate.images import Role, write_label_image
 from palpate.phantoms import PelvisOptions, Scene, SpheresOptions, pelvis, spheres
-from palpate.study import estimate, expected_cost, read_case, read_states
+from palpate.study import Case, ExpectedCost, estimate, expected_cost, read_case, read_states
 
 
 @dataclass(frozen=True)
@@ -51,6 +56,18 @@ RUNS = (
     Run("pelvis", 5.5, law="neo-hookean"),
     Run("demo", 8.0, fitted=False),
     Run("pelvis", 6.5, law="neo-hookean", fitted=False),
+    Run("spheres", 5.0, law="neo-hookean", fitted=False),
+    Run("pelvis", 10.0, modes=30, fitted=False),
+    Run("pelvis", 7.0, modes=150, fitted=False),
+    Run("pelvis", 7.0, fitted=False),
+    Run("pelvis", 7.0, solver="multigrid", fitted=False),
+    Run("bones", 8.0, fitted=False),
+    Run("bones", 6.5, law="neo-hookean", fitted=False),
+    Run("thick", 8.0, fitted=False),
+    Run("thick", 6.0, law="neo-hookean", fitted=False),
+    Run("demo", 12.0, fitted=False),
+    Run("demo", 10.0, law="neo-hookean", fitted=False),
+    *(Run(f"random {seed}", edge, fitted=False) for seed, edge in ((0, 6.0), (5, 8.0), (9, 7.0), (12, 6.5), (17, 8.0))),
 )
 CASE = """
 [images]
@@ -66,20 +83,22 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cases", default=",".join(str(i) for i in range(len(RUNS))), help="numbers, from 0")
     parser.add_argument("--json", action="store_true", help="print one JSON document")
+    parser.add_argument("--mesh-only", action="store_true", help="no estimate: unknowns alone")
     parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
     parser.add_argument("--images", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.images:
-        _write_images(Path(arguments.images))
+        _write_images(Path(arguments.images), {RUNS[int(number)].body for number in arguments.cases.split(",")})
         return 0
     if arguments.one:
-        print(json.dumps(_one(RUNS[int(arguments.one[0])], Path(arguments.one[1]))))
+        print(json.dumps(_one(RUNS[int(arguments.one[0])], Path(arguments.one[1]), solve=not arguments.mesh_only)))
         return 0
     rows = []
     with tempfile.TemporaryDirectory() as folder:
-        _child("--images", folder)
+        _child("--images", folder, "--cases", arguments.cases)
+        only = ["--mesh-only"] * arguments.mesh_only
         for number in arguments.cases.split(","):
-            rows.append(json.loads(_child("--one", number, folder)))
+            rows.append(json.loads(_child("--one", number, folder, *only)))
             print(_line(rows[-1]), file=sys.stderr, flush=True)
     print(json.dumps({"runs": rows}, indent=1) if arguments.json else "\n".join([*HEAD, *(_line(row) for row in rows)]))
     return 0
@@ -90,27 +109,37 @@ def _child(*arguments: str) -> str:
     return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
 
 
-def _write_images(folder: Path) -> None:
-    """The label images of both phantoms, whose truths need more memory than their estimates."""
-    scenes = {
-        "spheres": spheres(SpheresOptions(seed=2, truth_edge_mm=5.0)),
-        "pelvis": pelvis(PelvisOptions(seed=1, truth_edge_mm=4.0)),
-    }
-    for name, scene in scenes.items():
+SCENES: dict[str, Callable[[], Scene]] = {
+    "spheres": lambda: spheres(SpheresOptions(seed=2, truth_edge_mm=5.0)),
+    "pelvis": lambda: pelvis(PelvisOptions(seed=1, truth_edge_mm=4.0)),
+    "bones": lambda: pelvis(PelvisOptions(seed=3, truth_edge_mm=4.0, bones=True, tumour=True)),
+    "thick": lambda: pelvis(PelvisOptions(seed=4, truth_edge_mm=4.0, spacing_mm=(1.0, 1.0, 4.0))),
+}
+
+
+def _write_images(folder: Path, bodies: Collection[str]) -> None:
+    """The label images of the phantoms, whose truths need more memory than their estimates."""
+    for name in bodies:
+        if name == "demo":
+            continue
         (folder / name).mkdir()
-        write_case(folder / name, scene)
+        if name in SCENES:
+            write_case(folder / name, SCENES[name]())
+            continue
+        before, after, table = write_images(folder / name, random_pelvis(int(name.split()[1])))
+        init(before, after, labels=table, output=folder / name)
 
 
 def write_case(folder: Path, scene: Scene) -> None:
     """A scene's images and a case of them, as a user has them."""
     write_label_image(folder / "before.nii.gz", scene.before)
     write_label_image(folder / "after.nii.gz", scene.after)
-    seen = [t for t in scene.tissues if t.role in (Role.ESTIMATE, Role.DRIVER)]
-    lines = [f'{t.name} = {{label = {t.labels[0]}, role = "{t.role.value}"}}' for t in seen]
+    seen = [t for t in scene.tissues if t.role in (Role.ESTIMATE, Role.DRIVER, Role.RIGID)]
+    lines = [f'"{t.name}" = {{label = {t.labels[0]}, role = "{t.role.value}"}}' for t in seen]
     (folder / "case.toml").write_text(CASE + "\n".join(lines))
 
 
-def _one(run: Run, folder: Path) -> dict[str, object]:
+def _one(run: Run, folder: Path, *, solve: bool) -> dict[str, object]:
     path = DATA / "demo.toml" if run.body == "demo" else folder / run.body / "case.toml"
     settings = {
         "mesh.edge_length_mm": run.edge_mm,
@@ -119,36 +148,50 @@ def _one(run: Run, folder: Path) -> dict[str, object]:
         "mechanics.element": f'"{run.element}"',
         "mechanics.solver": f'"{run.solver}"',
     }
-    case = read_case(path, [f"{key}={value}" for key, value in settings.items()])
+    overrides = [f"{key}={value}" for key, value in settings.items()]
+    case = read_case(path, overrides)
     states = read_states(case)
-    predicted = expected_cost(case, states.before, states.after, n_pairs=1)
-    began = time.perf_counter()
-    result = estimate(case)
-    return {
+    guessed = expected_cost(case, states.before, states.after, n_pairs=1)
+    predicted = check(path, overrides).cost or guessed
+    row = {
         **{key: getattr(run, key) for key in ("body", "edge_mm", "modes", "law", "element", "fitted")},
         "solver": predicted.solver,
         "processors": predicted.processors,
-        "unknowns": 3 * len(result.space.points),
         "organs": len(states.before.tissues),
-        "tets": [predicted.tets, len(result.space.mesh.tets)],
+    }
+    if not solve or run.body.startswith("random"):
+        found = make_mesh(case).mesh_summary.dofs
+        return row | {"unknowns": [guessed.unknowns, predicted.unknowns, found], "seconds": [], "memory_gb": []}
+    return row | _estimated(case, guessed, predicted)
+
+
+def _estimated(case: Case, guessed: ExpectedCost, predicted: ExpectedCost) -> dict[str, object]:
+    """What the estimate of a case took, after what was predicted."""
+    began, earlier = time.perf_counter(), peak_mb()
+    result = estimate(case)
+    return {
+        "unknowns": [guessed.unknowns, predicted.unknowns, result.mesh_summary.dofs],
+        "tets": len(result.space.mesh.tets),
         "seconds": [round(predicted.seconds, 1), round(time.perf_counter() - began, 1)],
         "memory_gb": [round(predicted.memory_gb, 2), round(peak_mb() / 1024.0, 2)],
+        "memory_of_check_gb": round(earlier / 1024.0, 2),
         "stages_s": dict(result.provenance.seconds),
         "status": result.estimation.status,
     }
 
 
-WHAT = ("tetrahedra", "time, s", "memory, GB")
-PAIRS = (f"{what}: {how}" for what in WHAT for how in ("predicted", "found"))
-COLUMNS = ("case", "edge, mm", "modes", "solver", *PAIRS)
+COLUMNS = (
+    *("case", "edge, mm", "modes", "solver", "unknowns: guessed", "`check`", "found"),
+    *("time, s: `check`", "found", "memory, GB: `check`", "found"),
+)
 HEAD = (f"| {' | '.join(COLUMNS)} |", "|" + "---|" * len(COLUMNS))
 
 
 def _line(row: dict[str, Any]) -> str:
     plain = {"linear": "", "neo-hookean": ", neo-Hookean"}[row["law"]] + (", P1" if row["element"] == "P1" else "")
     name = f"{row['body']}{plain}{'' if row['fitted'] else ', not fitted'}"
-    cells = [name, f"{row['edge_mm']:g}", str(row["modes"]), row["solver"]]
-    cells += [f"{value:g}" for key in ("tets", "seconds", "memory_gb") for value in np.asarray(row[key])]
+    cells = [name, f"{row['edge_mm']:g}", str(row["modes"]), row["solver"], *map(str, row["unknowns"])]
+    cells += [f"{value:g}" for key in ("seconds", "memory_gb") for value in row[key]] or ["-"] * 4
     return f"| {' | '.join(cells)} |"
 
 

@@ -20,6 +20,7 @@ from palpate.study import staged
 
 SIZES = {
     "labels.csv": 1_000,
+    "labels.nii.gz": 1_000_000,
     "mesh.vtu": 2_500_000,
     "report-data.npz": 4_000_000,
     "report.html": 6_500_000,

@@ -31,6 +31,7 @@ FILES = {
         "mesh.vtu",
         "stiffness.nii.gz",
         "labels.csv",
+        "labels.nii.gz",
         "case.toml",
         "log.txt",
     ),

@@ -63,6 +63,7 @@ FILES = {
         "mesh.vtu",
         "stiffness.nii.gz",
         "labels.csv",
+        "labels.nii.gz",
         "case.toml",
         "log.txt",
     ),
@@ -157,7 +158,8 @@ def test_the_result_has_every_key_of_its_schema(result):
     assert len(result["starts"]) == 2
     assert {"start", "end", "objective_mm2", "status", "iterations"} <= set(result["starts"][0])
     assert {"forward", "adjoint", "tangent", "factorisations", "evaluations"} == set(result["counts"])
-    assert {"nodes", "tets", "dofs", "min_dihedral_deg", "p5_dihedral_deg", "volume_error"} == set(result["mesh"])
+    figures = {"nodes", "tets", "dofs", "min_dihedral_deg", "p5_dihedral_deg", "volume_error", "edge_length_mm"}
+    assert figures == set(result["mesh"])
     assert {"read", "mesh", "assemble", "estimate", "total"} == set(result["seconds"])
     assert {"before", "after[0]"} == set(result["inputs"])
     assert {"python", "palpate", "numpy"} <= set(result["versions"])

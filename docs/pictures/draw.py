@@ -14,8 +14,8 @@ from pathlib import Path
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
-WIDTH = 1100  # pixels
-PICTURES = {"demo.png": ("#result", "#slices"), "report.jpg": ("#slices", "#organs")}
+WIDTH, HEIGHT, GAP = 1100, 2600, 16  # pixels; all of a part at once
+PICTURES = {"demo.png": ("#result .verdicts", "#slices"), "report.jpg": ("#slices", "#organs")}
 
 
 def main() -> None:
@@ -26,14 +26,18 @@ def main() -> None:
     arguments = parser.parse_args()
     with sync_playwright() as play:
         browser = play.chromium.launch(executable_path=arguments.browser, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": WIDTH, "height": 1400}, color_scheme="light")
+        page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, color_scheme="light")
         page.goto((arguments.folder / "report.html").resolve().as_uri())
-        page.wait_for_timeout(1500)
         for name, sections in PICTURES.items():
-            parts = [Image.open(io.BytesIO(page.locator(place).first.screenshot())) for place in sections]
-            whole = Image.new("RGB", (max(p.width for p in parts), sum(p.height for p in parts)), "white")
-            for part, top in zip(parts, (0, parts[0].height), strict=True):
-                whole.paste(part, (0, top))
+            parts = []
+            for place in sections:
+                page.locator(place).first.scroll_into_view_if_needed()
+                page.wait_for_timeout(1500)  # until its moving figures stand
+                parts.append(Image.open(io.BytesIO(page.locator(place).first.screenshot())))
+            width, height = max(p.width for p in parts), sum(p.height for p in parts) + GAP
+            whole = Image.new("RGB", (width, height), "white")
+            for part, top in zip(parts, (0, parts[0].height + GAP), strict=True):
+                whole.paste(part, ((width - part.width) // 2, top))
             whole.save(Path(__file__).with_name(name), quality=85)
         browser.close()
 

@@ -12,6 +12,7 @@ import pytest
 from palpate.export.case_files import file_name, write_estimate_files, write_mesh_files, write_simulation_files
 from palpate.export.rasterise import region_image
 from palpate.images.label_image import LabelImage, VoxelGrid
+from palpate.images.label_table import read_label_table
 from palpate.images.tissue import Role
 from palpate.study.result import MeshResult, Simulation
 
@@ -57,10 +58,21 @@ def test_the_mesh_carries_label_modulus_and_poissons_ratio(tmp_path, case_result
     write_estimate_files(case_result, tmp_path)
     mesh = meshio.read(tmp_path / "mesh.vtu")
     region = case_result.space.mesh.region
-    np.testing.assert_array_equal(mesh.cell_data["label"][0], np.array([1, 2, 3, 0])[region])
+    np.testing.assert_array_equal(mesh.cell_data["label"][0], np.array([1, 2, 3, 4])[region])
     np.testing.assert_array_equal(mesh.cell_data["youngs_modulus_kpa"][0], np.array([58.9, 31.2, 0, 10.0])[region])
     assert set(mesh.cell_data["poisson_ratio"][0]) == {0.45}
     np.testing.assert_array_equal(mesh.point_data["displacement_mm"], case_result.estimation.displacements[0])
+
+
+def test_the_table_and_the_cells_name_the_voxels_of_the_label_image(tmp_path, case_result):
+    write_estimate_files(case_result, tmp_path)
+    table = read_label_table(tmp_path / "labels.csv")
+    image = nibabel.load(tmp_path / "labels.nii.gz")
+    np.testing.assert_allclose(image.affine, case_result.before.grid.affine, atol=1e-6)
+    for number, name in table.items():
+        tissue = [t.name for t in case_result.tissues].index(name)
+        np.testing.assert_array_equal(np.asarray(image.dataobj) == number, case_result.before.index == tissue)
+    assert set(meshio.read(tmp_path / "mesh.vtu").cell_data["label"][0]) <= set(table)
 
 
 def test_the_mesh_carries_the_strain_of_its_displacement(tmp_path, case_result):

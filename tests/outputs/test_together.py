@@ -25,6 +25,7 @@ FILES = {
     "mesh.vtu",
     "stiffness.nii.gz",
     "labels.csv",
+    "labels.nii.gz",
     "case.toml",
     "log.txt",
 }
@@ -82,9 +83,9 @@ def test_a_disk_that_is_full_after_the_page_costs_the_page_only(estimate, out, m
 
     monkeypatch.setattr("palpate.study.outputs.carry_out", full)
     assert estimate("bert", "--quiet") == 0
-    assert calls == [7, 5]
+    assert calls == [8, 6]
     assert not (out / "report.html").exists()
-    assert set(result(out)["files"]) == {"mesh.vtu", "stiffness.nii.gz", "labels.csv", "case.toml"}
+    assert set(result(out)["files"]) == {"mesh.vtu", "stiffness.nii.gz", "labels.csv", "labels.nii.gz", "case.toml"}
 
 
 def test_a_page_that_nobody_vouches_for_is_set_aside(estimate, out, monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import io
 import shutil
 from pathlib import Path
@@ -11,6 +12,7 @@ import matplotlib.image as mpimg
 import numpy as np
 import pytest
 
+from palpate.images.readers import write_scalar_image
 from palpate.report.case_report import write_case_report
 
 playwright = pytest.importorskip("playwright.sync_api", reason="no playwright; pip install palpate[browser]")
@@ -164,14 +166,15 @@ def test_layers_and_states_can_be_told_apart(opened):
     figure = alive(page, "slices")
     canvas = figure.locator("canvas").nth(2)
     both = pixels(canvas)
-    figure.locator(".modes label", has_text="after").click()
+    figure.locator(".modes label", has_text="after.nii.gz").click()
     after = pixels(canvas)
-    figure.locator(".modes label", has_text="before").click()
+    figure.locator(".modes label", has_text="before.nii.gz").click()
     before = pixels(canvas)
     assert changed(after, before) > 0.005
     assert changed(both, before) > 0.005
+    figure.locator(".modes label", has_text="after.nii.gz").click()
     figure.locator(".t-model").uncheck()
-    assert changed(before, pixels(canvas)) > 0.002
+    assert changed(after, pixels(canvas)) > 0.002
 
 
 def test_the_slices_of_a_second_pair_lie_in_its_own_body(browser, two_pairs, tmp_path):
@@ -180,6 +183,7 @@ def test_the_slices_of_a_second_pair_lie_in_its_own_body(browser, two_pairs, tmp
     page.on("console", lambda message: complaints.append(message.text))
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.goto(write_case_report(two_pairs, tmp_path).as_uri())
+    alive(page, "slices")
     found = page.locator("section.slices").nth(1)
     found.scroll_into_view_if_needed()
     page.wait_for_selector("section.slices[data-later='1'][data-state=live]")
@@ -205,6 +209,90 @@ def test_flicker_shows_both_states_in_turn(opened):
     assert max(changed(shots[0], shot) for shot in shots) > 0.005
 
 
+def test_one_image_fades_into_the_other_by_hand_and_by_itself(opened):
+    page = opened()
+    figure = alive(page, "alignment")
+    canvas, fade, play = figure.locator("canvas").nth(2), figure.locator(".fade"), figure.locator(".play")
+    earlier = pixels(canvas)
+    fade.fill("100")
+    later = pixels(canvas)
+    assert changed(earlier, later) > 0.005
+    play.click()
+    page.wait_for_timeout(2200)
+    assert 0 <= float(fade.input_value()) < 95
+    assert play.inner_text() == "Stop"
+    play.click()
+    held = fade.input_value()
+    page.wait_for_timeout(300)
+    assert fade.input_value() == held
+
+
+def test_bodies_go_from_one_state_to_the_other_with_arrows(opened):
+    page = opened()
+    figure = alive(page, "organs")
+    canvas, share = figure.locator("canvas"), figure.locator(".motion")
+    fitted = pixels(canvas)
+    share.focus()
+    page.keyboard.press("Home")
+    page.wait_for_timeout(300)
+    assert share.input_value() == "0"
+    assert "0 % of the motion to after.nii.gz" in figure.inner_text()
+    rest = pixels(canvas)
+    halves = [part.reshape(rest.shape[0], 2, rest.shape[1] // 2, 3) for part in (rest, fitted)]
+    assert changed(halves[0][:, 0], halves[0][:, 1]) < 0.05  # both pictures show the earlier state
+    assert changed(halves[1][:, 0], halves[1][:, 1]) > 0.05
+    figure.locator(".arrows").select_option("3")
+    page.wait_for_timeout(300)
+    assert changed(rest, pixels(canvas)) > 0.02
+
+
+def test_the_later_image_can_be_told_from_the_model(opened):
+    page = opened()
+    figure = alive(page, "organs")
+    canvas = figure.locator("canvas")
+    plain = pixels(canvas)
+    figure.locator("[data-show=image]").check()
+    page.wait_for_timeout(300)
+    lined = pixels(canvas)
+    new = np.abs(lined - plain).max(axis=2) > 0.2
+    assert new.mean() > 0.005
+    green = lined[new]
+    assert np.median(green[:, 1] - green[:, 0]) > 0.1  # of no colour that the distances have
+
+
+def test_window_and_level_change_the_greys(browser, case_result, tmp_path):
+    grid = case_result.before.grid
+    write_scalar_image(tmp_path / "ct.nii.gz", np.random.default_rng(4).normal(40, 400, grid.shape), grid)
+    images = dataclasses.replace(case_result.case.images, intensities_before=tmp_path / "ct.nii.gz")
+    result = dataclasses.replace(case_result, case=dataclasses.replace(case_result.case, images=images))
+    page = browser.new_page(viewport={"width": 1100, "height": 900})
+    complaints = []
+    page.on("console", lambda message: complaints.append(message.text))
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.goto(write_case_report(result, tmp_path).as_uri())
+    figure = alive(page, "slices")
+    canvas = figure.locator("canvas").first
+    soft = drawn(canvas)
+    figure.locator("[data-window='400 1800']").click()
+    bone = drawn(canvas)
+    assert bone.std() < 0.7 * soft.std()
+    figure.locator("[data-window='40 400']").click()
+    figure.locator(".window-width").fill("1")
+    assert drawn(canvas).std() > soft.std()
+    figure.locator(".modes label", has_text="after.nii.gz").click()
+    assert drawn(canvas)[60:90, 20:60].max() == 0.0  # no grey image of that state, and none of another in its place
+    page.close()
+    assert not complaints
+
+
+def test_the_methods_and_their_bibtex_can_be_copied(opened):
+    page = opened(permissions=["clipboard-read", "clipboard-write"])
+    for name, begin in (("methods-text", "Young's moduli of"), ("bibtex", "@software{palpate,")):
+        page.locator(f"[data-copy={name}]").click()
+        page.wait_for_timeout(200)
+        assert page.evaluate("navigator.clipboard.readText()").startswith(begin)
+
+
 @pytest.mark.parametrize(("scheme", "dark"), [("light", False), ("dark", True)])
 def test_the_page_is_light_or_dark_as_the_reader_likes(opened, scheme, dark):
     page = opened(color_scheme=scheme)
@@ -218,13 +306,13 @@ def test_the_page_is_light_or_dark_as_the_reader_likes(opened, scheme, dark):
 
 def test_a_telephone_shows_it_without_scrolling_sideways(opened):
     page = opened(viewport={"width": 390, "height": 844}, is_mobile=True, has_touch=True)
-    for section in ("slices", "organs", "mesh"):
+    for section in ("alignment", "slices", "organs", "mesh"):
         alive(page, section)
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
 
 
 def pictures_stand(page):
-    for section, count in (("slices", 3), ("organs", 2), ("mesh", 3)):
+    for section, count in (("alignment", 3), ("slices", 3), ("organs", 2), ("mesh", 3)):
         still = page.locator(f"section.{section} .still")
         assert still.locator("img:visible, figure > svg:visible").count() == count
         assert page.locator(f"section.{section} canvas:visible").count() == 0
@@ -232,7 +320,7 @@ def pictures_stand(page):
 
 def test_paper_gets_the_pictures(opened):
     page = opened()
-    for section in ("slices", "organs", "mesh"):
+    for section in ("alignment", "slices", "organs", "mesh"):
         alive(page, section)
     page.emulate_media(media="print")
     pictures_stand(page)

@@ -20,6 +20,7 @@ from palpate.report import collect as collect_module
 from palpate.report import page as page_module
 from palpate.report.case_report import redrawn_page, write_case_report, write_failure_report
 from palpate.report.pairs import drawn_images
+from palpate.report.rows import number
 from palpate.study.case import Mechanics
 
 EVIL = '</script><img src=x onerror=alert(1)>$\\frac{"&'
@@ -75,7 +76,7 @@ def test_the_policy_allows_the_pages_own_scripts_and_no_other(page):
     scripts = re.findall(r"<script>(.*?)</script>", page, flags=re.DOTALL)
     policy = next(a["content"] for _, a in tags(page) if a.get("http-equiv") == "Content-Security-Policy")
     digests = {base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts}
-    assert len(scripts) == 7
+    assert len(scripts) == 8
     assert digests == set(re.findall(r"'sha256-([^']+)'", policy))
     assert "unsafe-inline" not in policy.split("script-src")[1].split(";")[0]
 
@@ -106,7 +107,11 @@ def test_every_later_image_has_its_own_figures(case_result, tmp_path):
         ),
     )
     page = write_case_report(result, tmp_path).read_text()
-    for title in ("Slices: before, second.nii.gz", "Slices: before, third.nii.gz", "distance to third.nii.gz"):
+    for title in (
+        "Slices: before.nii.gz, second.nii.gz",
+        "Slices: before.nii.gz, third.nii.gz",
+        "3D: distance to third",
+    ):
         assert title in page
     names = [attributes["id"] for _, attributes in tags(page) if "id" in attributes]
     assert len(names) == len(set(names))
@@ -116,7 +121,7 @@ def test_every_pair_has_its_own_figures_from_its_own_images(two_pairs, tmp_path)
     page = write_case_report(two_pairs, tmp_path).read_text()
     assert "Slices: one/before.nii.gz, first.nii.gz, model" in page
     assert "Slices: two/before.nii.gz, second.nii.gz, model" in page
-    assert page.count("distance to first.nii.gz") == page.count("distance to second.nii.gz") == 1
+    assert page.count("3D: distance to first.nii.gz") == page.count("3D: distance to second.nii.gz") == 1
     assert "the mesh of the first pair" in page
     facts = json.loads(re.search(r'id="facts">(.*?)</script>', page, flags=re.DOTALL).group(1))
     assert [later["reference"] for later in facts["later"]] == [0, 1]
@@ -145,7 +150,7 @@ def test_what_is_not_drawn_is_told_of(case_result, tmp_path, monkeypatch):
     monkeypatch.setattr(collect_module, "MOST_LATER", 1)
     page = write_case_report(result, tmp_path).read_text()
     assert "1 of 2 later images are drawn" in page
-    assert "Slices: before, third.nii.gz" not in page
+    assert "Slices: before.nii.gz, third.nii.gz" not in page
 
 
 def with_name(result, name):
@@ -169,15 +174,24 @@ def test_a_name_can_neither_inject_markup_nor_stop_the_drawing(case_result, tmp_
     page = write_case_report(with_name(case_result, EVIL), tmp_path).read_text(encoding="utf-8")
     found = tags(page)
     assert not [tag for tag, attributes in found if "onerror" in attributes or attributes.get("src") == "x"]
-    assert len([tag for tag, _ in found if tag == "script"]) == 9  # the page's seven, and two of data
+    assert len([tag for tag, _ in found if tag == "script"]) == 10  # the page's eight, and two of data
     assert "could not be" not in page[: page.index("<script")]
     assert "&lt;/script&gt;" in page
     facts = re.search(r'id="facts">(.*?)</script>', page, flags=re.DOTALL).group(1)
     assert json.loads(facts)["tissues"][0]["name"] == EVIL
 
 
-FIGURES = ("slice_svg", "organs_png", "mesh_png", "residual_svg", "objective_svg", "waterfall_svg", "angle_svg")
-FAILING = 3 + 2 + 3 + 3 + 1 + 1 + 1  # pictures that these draw for one later image of three organs
+FIGURES = (
+    "slice_svg",
+    "alignment_svg",
+    "organs_png",
+    "mesh_png",
+    "residual_svg",
+    "objective_svg",
+    "waterfall_svg",
+    "angle_svg",
+)
+FAILING = 3 + 3 + 2 + 3 + 3 + 1 + 1 + 1  # pictures that these draw for one later image of three organs
 
 
 def fail(*_, **__):
@@ -194,7 +208,7 @@ def test_figures_that_fail_leave_a_sentence_each_and_a_warning(case_result, tmp_
 
 
 def test_data_that_cannot_be_made_leave_sentences(case_result, tmp_path, monkeypatch):
-    for part in ("image_surface", "model_surface", "label_volume", "tet_dihedrals"):
+    for part in ("image_surface", "model_surface", "background", "whole_images", "tet_dihedrals"):
         monkeypatch.setattr(collect_module, part, fail)
     page = write_case_report(case_result, tmp_path).read_text()
     assert page.count("could not be made (RuntimeError: no &lt;canvas&gt;)") >= 3
@@ -252,6 +266,17 @@ def test_warnings_of_one_code_are_folded(case_result, tmp_path):
     assert all(f"warning number {i}" in page for i in range(5))
 
 
+def test_warnings_stand_under_what_they_cost(case_result, tmp_path):
+    found = [Finding(code, f"said by {code}") for code in ("earlier-files", "cut-by-border", "thin", "mirrored")]
+    estimation = dataclasses.replace(case_result.estimation, remarks=())
+    result = dataclasses.replace(case_result, estimation=estimation, remarks=tuple(found))
+    page = write_case_report(result, tmp_path).read_text()
+    order = ["more than its interval", "said by mirrored", "said by thin"]
+    order += ["narrower intervals", "said by cut-by-border", "as good as without", "said by earlier-files"]
+    places = [page.index(words) for words in order]
+    assert places == sorted(places)
+
+
 def test_what_did_not_converge_shows_no_number(case_result, tmp_path):
     estimation = dataclasses.replace(case_result.estimation, status="not converged", reason="it stopped early")
     page = write_case_report(dataclasses.replace(case_result, estimation=estimation), tmp_path).read_text()
@@ -267,7 +292,7 @@ def test_an_estimate_that_failed_has_a_report_too(case_result, tmp_path):
     page = write_failure_report(case_result.case, NotConverged("stopped <here>"), tmp_path).read_text()
     assert "stopped &lt;here&gt;" in page
     assert "Yang S, Lin MC" not in page
-    assert "not-converged" in page
+    assert "There is no result: the search for the stiffness did not come to an end." in page
 
 
 def test_a_grey_image_lies_under_the_contours(case_result, tmp_path):
@@ -299,3 +324,72 @@ def test_open_intervals_and_ratios_are_shown_as_such(case_result, tmp_path):
     assert "&gt; 2.00" in page
     assert "ratio only" in page
     assert "only ratios can be found" in page
+
+
+def test_every_chart_says_what_it_shows_to_who_cannot_see_it(page):
+    body = page[: page.index("<script")]
+    charts = [attributes for tag, attributes in tags(body) if tag == "svg" and attributes.get("role") == "img"]
+    named = [attributes["aria-label"] for attributes in charts]
+    assert len(re.findall(r"<figure[^>]*><figcaption>[^<]*</figcaption><svg", body)) <= len(charts)
+    assert all(len(name) > 10 for name in named)
+    assert len(set(named)) == len(named)
+    silent = [a for tag, a in tags(body) if tag == "svg" and a.get("role") != "img" and a.get("aria-hidden") != "true"]
+    assert not silent
+
+
+def test_every_control_has_a_name(page):
+    body = page[: page.index("<script")]
+    outside = re.sub(r"<label.*?</label>", "", body, flags=re.DOTALL)
+    for tag, attributes in tags(outside):
+        if tag in ("input", "select", "canvas"):
+            assert attributes.get("aria-label"), attributes
+    assert all(attributes.get("alt") for tag, attributes in tags(body) if tag == "img")
+
+
+def test_an_image_has_one_name_wherever_it_is_told_of(case_result, tmp_path):
+    images = dataclasses.replace(
+        case_result.case.images, before=Path("one/scan.nii.gz"), after=(Path("two/scan.nii.gz"),)
+    )
+    result = dataclasses.replace(case_result, case=dataclasses.replace(case_result.case, images=images))
+    page = write_case_report(result, tmp_path).read_text()
+    words = re.sub(r"<[^>]*>", " ", page[page.index("<main>") : page.index("<script")])
+    named = set(re.findall(r"[\w/]*scan\.nii\.gz", words))
+    assert named == {"one/scan.nii.gz", "two/scan.nii.gz"}
+    assert {fit["after"] for fit in result.to_dict()["fit"]} == {"two/scan.nii.gz"}
+    assert not re.search(r"\b(earlier|later) image\b|\b(before|after) fitting\b", words)
+
+
+def test_the_banner_counts_the_warnings_and_leads_to_them(page, case_result):
+    assert len(case_result.to_dict()["warnings"]) == 1
+    assert '<a href="#warnings">1 warning</a>' in page
+    assert 'id="warnings"' in page
+
+
+def test_the_images_stand_in_a_table_with_voxels_and_volumes(page, case_result):
+    table = page[page.index('id="images"') : page.index("</table>", page.index('id="images"'))]
+    grid = case_result.before.grid
+    assert " × ".join(map(str, grid.shape)) in table
+    for image in (case_result.before, *case_result.after):
+        assert f"{number(image.volume(0) / 1000.0)}" in table
+    assert "palpate 0.1.0" in page[page.index('id="images"') : page.index('class="alignment"')]
+
+
+def test_the_methods_can_be_copied_with_their_bibtex(page):
+    copied = re.findall(r'data-copy="([^"]+)"', page)
+    assert copied == ["methods-text", "bibtex"]
+    names = {attributes.get("id") for _, attributes in tags(page)}
+    assert set(copied) <= names
+    assert "@software{palpate," in page
+
+
+def test_the_profile_and_the_causes_of_the_variance_are_shown_where_they_are_known(case_result, tmp_path):
+    first, second = case_result.estimation.estimates
+    shares = {"noise": 0.6, "prior": 0.1, "grid": 0.3}
+    seen = dataclasses.replace(first, variance_shares=shares, profile=((40.0, -2.5), (58.9, 0.0), (75.0, 1.96)))
+    estimation = dataclasses.replace(case_result.estimation, estimates=(seen, second))
+    page = write_case_report(dataclasses.replace(case_result, estimation=estimation), tmp_path).read_text()
+    assert page.count("Profile likelihood of") == 1
+    assert "Profile likelihood of prostate: lowest at 58.9, 95 % interval 47.1 to 73.6." in page
+    assert page.count("its variance:") == 1
+    assert "the drivers&#39; motion 10 %" in page
+    assert "could not be drawn" not in page[: page.index("<script")]

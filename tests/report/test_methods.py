@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from pathlib import Path
+
+import pytest
 
 from palpate.report.collect import collect
 from palpate.report.methods import methods_text
+from palpate.report.sources import SOURCES, bibtex, reference_line
 from palpate.study.case import CaseLoad, Mechanics
 
 
@@ -72,3 +76,48 @@ def test_another_optimiser_is_another_source(case_result):
     text = methods_text(collect(dataclasses.replace(case_result, case=case)))
     assert any("Byrd" in source for source in text.sources)
     assert not any("Nocedal J, Wright" in source for source in text.sources)
+
+
+def test_the_bibtex_of_palpate_is_that_of_citation_cff(case_result):
+    citation = (Path(__file__).parents[2] / "CITATION.cff").read_text()
+    entry = methods_text(collect(case_result)).bibtex.partition("\n\n")[0]
+    fields = dict(re.findall(r"^  (\w+) = \{(.*)\},?$", entry, flags=re.MULTILINE))
+    stated = dict(re.findall(r'^([\w-]+): "?(.*?)"?$', citation, flags=re.MULTILINE))
+    assert entry.startswith("@software{palpate,")
+    assert fields["title"] == f"{{{stated['title']}}}"
+    assert fields["url"] == stated["repository-code"]
+    assert fields["version"] == stated["version"] == case_result.to_dict()["versions"]["palpate"]
+    authors = citation[citation.index("authors:") : citation.index("keywords:")]
+    author = re.search('name: "(.*)"', authors).group(1)
+    assert fields["author"] == f"{{{author}}}"
+
+
+def test_the_bibtex_of_the_paper_is_that_of_citation_cff():
+    citation = (Path(__file__).parents[2] / "CITATION.cff").read_text()
+    first = citation[citation.index("references:") : citation.index("TotalSegmentator")]
+    yang = SOURCES["yang"]
+    assert yang.title == re.search('title: "(.*)"', first).group(1)
+    names = zip(re.findall("family-names: (.*)", first), re.findall("given-names: (.*)", first), strict=True)
+    assert yang.authors == tuple(names)
+
+
+@pytest.mark.parametrize("key", SOURCES)
+def test_an_entry_has_balanced_braces_and_its_title(key):
+    entry = bibtex(key, SOURCES[key])
+    assert entry.count("{") == entry.count("}")
+    assert SOURCES[key].title in entry
+    assert SOURCES[key].title in reference_line(SOURCES[key])
+
+
+def test_every_cited_source_has_its_entry(case_result):
+    text = methods_text(collect(case_result))
+    assert len(re.findall("^@", text.bibtex, flags=re.MULTILINE)) == len(text.sources)
+
+
+def test_an_interval_from_the_profile_is_told_of(case_result):
+    first, second = case_result.estimation.estimates
+    leaning = dataclasses.replace(first, interval_kind="profile")
+    estimation = dataclasses.replace(case_result.estimation, estimates=(leaning, second))
+    told = " ".join(methods_text(collect(dataclasses.replace(case_result, estimation=estimation))).paragraphs)
+    assert "of prostate, whose profile likelihood leans to one side" in told
+    assert "leans" not in " ".join(methods_text(collect(case_result)).paragraphs)

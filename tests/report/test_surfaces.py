@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,8 @@ from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.images.tissue_distance import tissue_distance_map
-from palpate.report.surfaces import image_surface, model_surface
+from palpate.report.inputs import bone_distances
+from palpate.report.surfaces import carried_outline, image_surface, model_surface
 
 TURNED = np.array([[0, 1.5, 0, -5.0], [1.0, 0, 0, -5.0], [0, 0, -2.0, 50.0], [0, 0, 0, 1]])
 
@@ -55,3 +58,45 @@ def test_the_true_motion_brings_the_model_onto_the_later_image(case_result):
     np.testing.assert_allclose(model.distance_fitted[seen], whole[seen], atol=1e-3)
     rest, fitted = (np.sqrt(np.nanmean(d**2)) for d in (model.distance_rest, model.distance_fitted))
     assert fitted < 0.6 * rest  # the fixture's mesh is a staircase; what moved is 0.6 mm in the mean
+
+
+def test_an_outline_is_carried_as_the_model_moves(case_result):
+    displacement = case_result.space.points @ np.diag([0.02, -0.01, 0.03]) + [1.0, 2.0, -0.5]
+    estimation = dataclasses.replace(case_result.estimation, displacements=(displacement,))
+    result = dataclasses.replace(case_result, estimation=estimation)
+    outline = image_surface(result.before, 0, smoothing_mm=1.2)
+    carried = carried_outline(result, outline, 0)
+    np.testing.assert_array_equal(carried.triangles, outline.triangles)
+    motion = carried.points - outline.points
+    # an outline lies beside the staircase of the fixture's mesh, by 4 mm at the most, and moves as its nearest point
+    expected = outline.points @ np.diag([0.02, -0.01, 0.03]) + [1.0, 2.0, -0.5]
+    assert np.abs(motion - expected).max() < 0.03 * 4.0
+    assert np.abs(motion - expected).mean() < 0.03
+
+
+def test_a_uniform_motion_carries_every_outline_exactly(case_result):
+    motion = np.array([1.0, 2.0, -0.5])
+    displacement = np.tile(motion, (len(case_result.space.points), 1))
+    estimation = dataclasses.replace(case_result.estimation, displacements=(displacement,))
+    outline = image_surface(case_result.before, 1, smoothing_mm=1.2)
+    carried = carried_outline(dataclasses.replace(case_result, estimation=estimation), outline, 0)
+    np.testing.assert_allclose(
+        carried.points - outline.points, np.broadcast_to([1.0, 2.0, -0.5], outline.points.shape), atol=1e-5
+    )
+
+
+@pytest.mark.parametrize("shift", [0.0, 1.5])
+def test_bones_are_as_far_off_as_they_were_shifted(case_result, shift):
+    before, _ = ball(15.0)
+    rigid = tuple(dataclasses.replace(t, role=Role.RIGID) for t in before.tissues)
+    affine = before.grid.affine.copy()
+    affine[0, 3] += shift
+    later = Segmentation(before.index, VoxelGrid(before.grid.shape, affine), rigid)
+    mesh = dataclasses.replace(case_result.space.mesh, tissues=rigid)
+    space = dataclasses.replace(case_result.space, mesh=mesh)
+    result = dataclasses.replace(case_result, space=space, before=before, after=(later,))
+    surfaces = [(image_surface(image, 1, smoothing_mm=1.2),) for image in (before, later)]
+    (bone,) = bone_distances(result, 0, *surfaces)
+    # of a shifted ball: |cos| of the angle to the shift times that, half of it in the mean
+    assert bone.mean_mm == pytest.approx(0.5 * shift, abs=0.05)
+    assert 0.85 * shift <= bone.p95_mm <= shift + 1e-6

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 
+import nibabel
 import numpy as np
 import pytest
 
@@ -15,12 +17,13 @@ from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_label_image, write_label_image
 from palpate.images.tissue import Role
 from palpate.images.totalsegmentator import CLASSES
-from palpate.study import check
+from palpate.study import check, cost, proposed_mesh
 from palpate.study.case_file import read_case
 from palpate.study.class_names import class_names
+from palpate.study.cost import expected_cost
 from palpate.study.guess import guess_tissues
 from palpate.study.new_case import CaseImages, new_case
-from palpate.study.read import read_segmentation
+from palpate.study.read import read_segmentation, read_states
 
 GRID = VoxelGrid((30, 30, 30), np.diag([2.0, 2.0, 2.0, 1.0]))
 NAMES = {1: "Prostate", 2: "urinary_bladder", 3: "rectum", 4: "femur_left", 5: "colon", 6: "prostateTumour", 9: "body"}
@@ -159,6 +162,101 @@ def test_names_that_toml_could_stumble_over_survive(folder):
     (folder / "case.toml").write_text(new_case(images, folder).text)
     tissues = read_case(folder / "case.toml").tissues
     assert {tissue.name for tissue in tissues} >= {names["1"], names["2"], names["3"]}
+
+
+def write_ct(path, labels_shown, *, inside=40.0, outside=-1000.0):
+    """A CT of the body of `labels`, on a table."""
+    hounsfield = np.where(labels_shown == 0, outside, inside)
+    hounsfield[:, 0, :] = inside  # a table of one voxel, which does not touch the body
+    nibabel.save(nibabel.Nifti1Image(hounsfield.astype(np.float32), GRID.affine), path)
+
+
+@pytest.fixture
+def bodiless(tmp_path):
+    """The seven boxes without the label of the body, and CTs of both states."""
+    for name, filled in (("b", False), ("a", True)):
+        array = labels(filled=filled)
+        write_ct(tmp_path / f"{name}_ct.nii.gz", array)
+        write_label_image(tmp_path / f"{name}.nii.gz", LabelImage(np.where(array == 9, 0, array), GRID))
+    (tmp_path / "names.json").write_text(json.dumps({str(k): v for k, v in NAMES.items() if k != 9}))
+    return tmp_path
+
+
+def bodiless_case(folder, *cts):
+    images = CaseImages(folder / "b.nii.gz", (folder / "a.nii.gz",), folder / "names.json", cts)
+    return new_case(images, folder)
+
+
+def test_what_a_ct_shows_to_be_air_is_void_and_the_rest_of_label_0_is_tissue(bodiless):
+    case = bodiless_case(bodiless, bodiless / "b_ct.nii.gz", bodiless / "a_ct.nii.gz")
+    (bodiless / "case.toml").write_text(case.text)
+    read = read_case(bodiless / "case.toml")
+    for path, filled in ((read.images.before, False), (read.images.after[0], True)):
+        found = read_segmentation(read, path, read_label_table(read.images.names), None)
+        names = [tissue.name for tissue in found.tissues]
+        array = labels(filled=filled)
+        assert np.array_equal(found.mask(names.index("air")), array == 0)
+        assert np.array_equal(found.mask(names.index("surroundings")), np.isin(array, [5, 9]))
+    share = np.count_nonzero(labels() == 0) / np.count_nonzero(np.isin(labels(), [0, 9]))
+    assert f"is air around the body for {share:.1%} of its volume" in case.text
+    assert 'intensities_after = ["a_ct.nii.gz"]' in case.text
+
+
+@pytest.mark.parametrize("ct", [None, {"inside": 300.0, "outside": 0.0}])
+def test_without_a_ct_the_case_says_how_much_of_label_0_no_label_tells_from_air(bodiless, ct):
+    if ct is not None:  # an MR image shows no air in Hounsfield units
+        write_ct(bodiless / "mr.nii.gz", labels(), **ct)
+    case = bodiless_case(bodiless, *([bodiless / "mr.nii.gz"] if ct else []))
+    shown = np.argwhere(np.isin(labels(), [1, 2, 3, 4, 5, 6]))
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    within = np.prod(high - low + 1) / labels().size  # the hull is smaller than the box around the labels
+    (note,) = [line for line in case.text.splitlines() if line.startswith("# NOTE: label 0")]
+    beyond = int(re.search(r"(\d+)% of its volume lies beyond", note)[1]) / 100
+    assert 1.0 - within < beyond < 1.0
+    assert Role.VOID not in [tissue.role for tissue in case.tissues]
+    assert "give the CT" in note
+
+
+def test_in_an_image_wider_than_a_body_air_is_asked_for(bodiless):
+    wide = VoxelGrid((30, 30, 30), np.diag([10.0, 10.0, 2.0, 1.0]))
+    for name, filled in (("b", False), ("a", True)):
+        array = labels(filled=filled)
+        write_label_image(bodiless / f"{name}.nii.gz", LabelImage(np.where(array == 9, 0, array), wide))
+    assert [question for question in bodiless_case(bodiless).questions if "label 0" in question]
+
+
+def test_a_background_without_a_body_is_no_air():
+    array = np.where(labels() == 9, 0, labels())
+    guesses = guess_tissues(LabelImage(array, GRID, {0: "background", **{k: v for k, v in NAMES.items() if k != 9}}))
+    assert [(g.name, g.role) for g in guesses if not g.labels] == [("surroundings", Role.KNOWN)]
+    assert guess_tissues(LabelImage(array, GRID, {0: "air", **NAMES}))[-1].role is Role.VOID
+
+
+def test_the_proposed_mesh_fits_the_memory_of_the_machine(folder, monkeypatch):
+    has_gb = 1.0
+    monkeypatch.setattr(cost, "LATTICE", 24)
+    images = CaseImages(folder / "b.nii.gz", (folder / "a.nii.gz",), folder / "names.json")
+
+    def edge_and_memory(text):
+        (folder / "case.toml").write_text(text)
+        case = read_case(folder / "case.toml")
+        return case.mesh.edge_length_mm, [problem.code for problem in _memory(case)]
+
+    def _memory(case):
+        states = read_states(case)
+        return check.memory_problems(expected_cost(case, states.before, states.after, n_pairs=1))
+
+    roomy, _ = edge_and_memory(new_case(images, folder).text)
+    for module in (cost, check, proposed_mesh):
+        monkeypatch.setattr(module, "machine_memory_gb", lambda: has_gb)
+        monkeypatch.setattr(module, "free_memory_gb", lambda: 64.0, raising=False)
+    text = new_case(images, folder).text
+    edge, problems = edge_and_memory(text)
+    assert edge > roomy
+    assert problems == []
+    assert f"this machine has {has_gb:.0f} GB" in text
+    _, before = edge_and_memory(text.replace(f"edge_length_mm = {edge:g}", f"edge_length_mm = {edge - 0.5:g}"))
+    assert before == ["memory"]
 
 
 COLON = {1: "prostate", 2: "urinary_bladder", 3: "colon", 4: "femur_left", 9: "body"}

@@ -9,9 +9,13 @@ import pytest
 
 from palpate.errors import ConfigurationError
 from palpate.inversion import Bounds, gauss_newton
+from palpate.mechanics.finite_strain import finite_strain_model
+from palpate.mechanics.first_order import expanded
+from palpate.mechanics.laws.registry import law_named
 from palpate.observation.noise_model import NoiseModel
 from palpate.uncertainty import sample_posterior
-from palpate.uncertainty.sampling import frozen_posterior
+from palpate.uncertainty.profile import fixed_correspondence
+from palpate.uncertainty.sampling import frozen_posterior, posterior_chains
 
 WIDE = Bounds(np.full(2, np.log(0.02)), np.full(2, np.log(200.0)))
 NOISE = NoiseModel(np.array([0.05**2]), np.array([3.0]))
@@ -81,3 +85,36 @@ def test_a_full_model_is_refused(objective, minimum, twin):
     states = (replace(objective.states[0], observed=twin.model),)
     with pytest.raises(ConfigurationError, match="LinearModel"):
         frozen_posterior(replace(objective, states=states), minimum)
+
+
+def test_chains_have_the_covariance_that_is_asked_and_agree_with_each_other(objective, minimum, rng):
+    evaluation, wanted = objective(minimum), np.array([[4e-4, 1e-4], [1e-4, 9e-4]])
+    frozen = frozen_posterior(objective, minimum, evaluation)
+    given = {"bounds": WIDE, "chains": 4, "draws": 500, "rng": rng}
+    theta = posterior_chains(frozen, minimum, evaluation, wanted, **given)
+    assert theta.shape == (4, 500, 2)
+    together = theta.reshape(-1, 2)
+    assert together.mean(axis=0) == pytest.approx(minimum[:2], abs=0.004)
+    assert np.cov(together.T) == pytest.approx(wanted, rel=0.3, abs=5e-5)
+    within, between = theta.std(axis=1).mean(axis=0), theta.mean(axis=1).std(axis=0)
+    assert np.all(between < 0.25 * within)
+
+
+def test_an_expansion_that_bends_is_frozen_with_its_own_value_far_away(twins, rng):
+    """As the objective with the same closest points has it, residual by residual."""
+    twin = twins.make_twin(element="P1", seed=8)
+    problem, law = twins.exact_problem(twin, noise=NOISE), law_named("neo-hookean")
+    plain = twins.objective_of(problem, twin.coefficients)
+    moduli, q = twin.moduli, 0.5 * twin.coefficients
+    there = finite_strain_model(twin.model.space, twin.model.constraint, law).solve(moduli, q)
+    first = expanded(there, names=twin.model.names, moduli=moduli, coefficients=q)
+    (state,) = plain.states
+    dofs = np.concatenate([observation.dofs for observation in state.observations])
+    bent = replace(plain, states=(replace(state, observed=first.at(dofs), bending=state.observed),))
+    unknowns = np.concatenate([twins.TRUTH, q])
+    bent = bent.rematched(unknowns)
+    evaluation = bent(unknowns)
+    frozen, fixed = frozen_posterior(bent, unknowns, evaluation), fixed_correspondence(bent, unknowns, evaluation)
+    away = unknowns + 0.5 * rng.standard_normal(len(unknowns))
+    assert frozen(away) == pytest.approx(fixed(away).value, rel=1e-9)
+    assert frozen(unknowns) == pytest.approx(fixed(unknowns).value, rel=1e-9)

@@ -16,7 +16,7 @@ __all__ = ["MESH_TARGETS", "SIMULATION_TARGETS", "check", "init", "mesh", "simul
 
 Progress = Callable[[str], None]
 
-MESH_TARGETS = ("mesh.json", "mesh.vtu", "labels.csv")
+MESH_TARGETS = ("mesh.json", "mesh.vtu", "labels.csv", "labels.nii.gz")
 SIMULATION_TARGETS = ("simulation.json", "mesh.vtu", "labels.csv", "mesh.pvd", "before.nii.gz", "after.nii.gz")
 
 

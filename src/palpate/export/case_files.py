@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from palpate.export.label_table import write_label_table
 from palpate.export.rasterise import region_image
 from palpate.export.vtk_xml import write_pvd, write_vtp, write_vtu
+from palpate.images.label_image import LabelImage
 from palpate.images.readers import write_label_image, write_scalar_image
-from palpate.images.segmentation import first_labels
+from palpate.images.segmentation import Segmentation, first_labels
 from palpate.mechanics.deformation import largest_strains
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.surface import tissue_surface
@@ -27,7 +28,7 @@ MOST_BYTES = 60  # of a tissue's name in a file's: file systems count bytes, not
 
 
 def write_estimate_files(result: CaseResult, folder: Path) -> tuple[Path, ...]:
-    """Write mesh.vtu (displacement of the last image), stiffness.nii.gz (`result.unit`) and labels.csv to `folder`.
+    """Write mesh.vtu (displacement of the last image), stiffness.nii.gz (`result.unit`), labels.nii.gz and labels.csv.
 
     Each further pair has its own mesh_2.vtu, mesh_3.vtu ... Returns the paths written; raises `ResourceError` when the
     disk refuses.
@@ -38,7 +39,7 @@ def write_estimate_files(result: CaseResult, folder: Path) -> tuple[Path, ...]:
     stiffness = np.append(result.stiffness, np.nan)  # region -1 takes the last entry, NaN
     region = region_image(result.space.mesh, result.before.grid)
     write_scalar_image(paths[1], stiffness[region], result.before.grid)
-    paths.append(write_label_table(folder / "labels.csv", result.tissues))
+    paths += _write_labels(result.before, folder)
     for number, pair in enumerate(result.further, start=2):
         paths.append(folder / f"mesh_{number}.vtu")
         _write_fitted(paths[-1], result, pair.space, pair.displacements)
@@ -66,15 +67,15 @@ def _write_moved(
 
 
 def write_mesh_files(result: MeshResult, folder: Path) -> tuple[Path, ...]:
-    """Write mesh.vtu (moduli: NaN where the case gives none), labels.csv and a surface of each tissue; as above."""
+    """Write mesh.vtu (moduli: NaN where the case gives none), labels as above and a surface of each tissue."""
     make_folder(folder)
     mesh, space = result.space.mesh, result.space
     given = np.array([tissue.youngs_modulus_kpa or np.nan for tissue in mesh.tissues])
     path = folder / "mesh.vtu"
     still = np.zeros_like(space.points)
     write_vtu(path, space, point_data={"displacement_mm": still}, cell_data=_cell_data(mesh, given))
-    table = write_label_table(folder / "labels.csv", mesh.tissues)
-    return (path, table, *_write_surfaces(space, still, folder / "surfaces", ending="before"))
+    labels = _write_labels(result.before, folder)
+    return (path, *labels, *_write_surfaces(space, still, folder / "surfaces", ending="before"))
 
 
 def write_simulation_files(result: Simulation, folder: Path) -> tuple[Path, ...]:
@@ -102,6 +103,13 @@ def write_simulation_files(result: Simulation, folder: Path) -> tuple[Path, ...]
         write_pvd(folder / "mesh.pvd", [(float(t), f"steps/{path.name}") for t, path in zip(times, steps, strict=True)])
         paths += [folder / "mesh.pvd", *steps]
     return tuple(paths)
+
+
+def _write_labels(before: Segmentation, folder: Path) -> tuple[Path, Path]:
+    """The earlier image with our numbers of the tissues, and the table that names them."""
+    image, numbers = folder / "labels.nii.gz", first_labels(before.tissues)
+    write_label_image(image, LabelImage(numbers[before.index], before.grid))
+    return image, write_label_table(folder / "labels.csv", before.tissues)
 
 
 def file_name(name: str) -> str:

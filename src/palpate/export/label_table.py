@@ -8,17 +8,18 @@ from palpate.images.named_labels import NamedLabel
 from palpate.images.readers.table_slicer import slicer_table
 from palpate.images.segmentation import first_labels
 from palpate.images.tissue import Tissue
+from palpate.images.tissue_colours import tissue_colours
 from palpate.study.outputs import write_text
 
 __all__ = ["write_label_table"]
 
 
 def write_label_table(path: Path, tissues: tuple[Tissue, ...]) -> Path:
-    """Write number, name and, where the case's label table gave one, colour of each tissue as 3D Slicer's CSV.
+    """Write number, name and colour of each tissue, but for the background's, as 3D Slicer's CSV.
 
     Returns the path; raises `ResourceError` when the disk refuses.
     """
-    labels = zip(first_labels(tissues), tissues, strict=True)
-    rows = sorted((NamedLabel(int(label), t.name, t.colour) for label, t in labels), key=lambda row: row.label)
-    write_text(path, slicer_table(rows))
+    described = zip(first_labels(tissues), tissues, tissue_colours(tissues), strict=True)
+    rows = [NamedLabel(int(number), tissue.name, colour) for number, tissue, colour in described if number]
+    write_text(path, slicer_table(sorted(rows, key=lambda row: row.label)))
     return path

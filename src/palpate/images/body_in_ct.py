@@ -9,7 +9,7 @@ from scipy import ndimage
 from palpate.errors import InputDataError
 from palpate.images.label_image import VoxelGrid
 
-__all__ = ["outside_body"]
+__all__ = ["outside_body", "shows_air"]
 
 AIR_HU = -400.0  # half way from air to fat and muscle
 CERTAINLY_AIR_HU = -500.0  # which a CT of a body has and an MR image has not
@@ -23,7 +23,7 @@ def outside_body(values: NDArray[np.float32], grid: VoxelGrid, on: VoxelGrid) ->
     The body is the largest piece above -400 HU that is left when thin sheets are opened away, with the cavities that
     it encloses. What the CT does not show counts as body. Raises `InputDataError` for an image that is not in HU.
     """
-    if not float(values.min(initial=0.0)) < CERTAINLY_AIR_HU:
+    if not shows_air(values):
         raise InputDataError(
             f"the grey image has no value under {CERTAINLY_AIR_HU:g}, so it shows no air or is no CT in Hounsfield"
             " units; body_from_ct cannot find the body in it: leave it out"
@@ -36,7 +36,8 @@ def outside_body(values: NDArray[np.float32], grid: VoxelGrid, on: VoxelGrid) ->
     around = np.pad(solid, [(r, r) for r in reach], mode="edge")  # where the image ends, the body goes on
     parts, count = ndimage.label(ndimage.binary_opening(around, ball))
     core = parts == 1 + np.argmax(np.bincount(parts.ravel(), minlength=2)[1:]) if count else around
-    body = (ndimage.binary_dilation(core, ball) & around)[tuple(slice(r, -r) for r in reach)]
+    body = ndimage.binary_dilation(core, iterations=2 * int(reach.max()), mask=around)  # the corners again
+    body = body[tuple(slice(r, -r) for r in reach)]
     parts, _ = ndimage.label(~body)
     faces = [np.take(parts, end, axis).ravel() for axis in range(3) for end in (0, -1)]
     reached = np.setdiff1d(np.unique(np.concatenate(faces)), [0])
@@ -45,6 +46,11 @@ def outside_body(values: NDArray[np.float32], grid: VoxelGrid, on: VoxelGrid) ->
         np.isin(parts, reached).astype(np.uint8), there[:3, :3], there[:3, 3], on.shape, order=0, mode="constant"
     )
     return np.asarray(shown > 0)
+
+
+def shows_air(values: NDArray[np.float32]) -> bool:
+    """Whether a grey image (n_x, n_y, n_z) has values that only air has in a CT, HU."""
+    return float(values.min(initial=0.0)) < CERTAINLY_AIR_HU
 
 
 def _ball(reach: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.findings import Finding
 from palpate.images.label_image import LabelImage, VoxelGrid
-from palpate.images.tissue import Tissue
+from palpate.images.tissue import Role, Tissue
 
 __all__ = ["Segmentation", "first_labels", "segment"]
 
@@ -46,13 +47,19 @@ class Segmentation:
 
 
 def first_labels(tissues: tuple[Tissue, ...]) -> NDArray[np.int32]:
-    """Smallest label of each tissue (n_tissues,), by which our files know it.
+    """Number of each tissue (n_tissues,), by which our files know it: its smallest label other than 0.
 
-    The remaining tissue gets the smallest number that no other claims.
+    A tissue without such a label gets the smallest number from 1 on that no other claims: 0 is what programs take for
+    the background. So it is left to the first `void` tissue that has no label other than 0.
     """
     claimed = {label for tissue in tissues for label in tissue.labels}
-    free = next(number for number in range(len(claimed) + 1) if number not in claimed)
-    return np.array([min(tissue.labels, default=free) for tissue in tissues], dtype=np.int32)
+    free = (number for number in count(1) if number not in claimed)
+    background = next((i for i, t in enumerate(tissues) if t.role is Role.VOID and not any(t.labels)), None)
+    numbers = [
+        0 if i == background else min((label for label in tissue.labels if label), default=0) or next(free)
+        for i, tissue in enumerate(tissues)
+    ]
+    return np.array(numbers, dtype=np.int32)
 
 
 def segment(image: LabelImage, tissues: tuple[Tissue, ...]) -> Segmentation:

@@ -25,7 +25,7 @@ __all__ = ["read_archive", "write_archive"]
 
 T = TypeVar("T")
 
-FORMAT = "palpate.report-data/3"
+FORMAT = "palpate.report-data/4"
 LARGEST_FILE = 1 << 30  # bytes
 MOST_BYTES = 1 << 30  # of all arrays together, unpacked
 MOST_ARRAYS = 4096

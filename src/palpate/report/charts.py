@@ -6,16 +6,27 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
 
-from palpate.report.colours import START_COLOURS
 from palpate.report.report_data import ModelSurface, ReportData
+from palpate.report.rows import interval_text, main_numbers, number
 from palpate.report.svg import INK, draw_svg
 
-__all__ = ["angle_svg", "modulus_svg", "objective_svg", "residual_svg", "waterfall_svg"]
+__all__ = [
+    "START_COLOURS",
+    "angle_svg",
+    "modulus_svg",
+    "objective_svg",
+    "profile_svg",
+    "residual_svg",
+    "waterfall_svg",
+]
 
 SIZE = (3.9, 2.5)
 DASHED = (0, (4, 3))
 BINS = 41
+LIMIT = 1.96**2  # deviance at the ends of a 95 % interval
+START_COLOURS = ("#3b7dd8", "#d9822b", "#3a9d5d", "#b0559b", "#8a6d3b", "#4aa3a3", "#c0504d", "#7f7fd0")
 
 
 def residual_svg(data: ReportData, model: ModelSurface, *, voxel_mm: float, name: str) -> str:
@@ -31,6 +42,8 @@ def residual_svg(data: ReportData, model: ModelSurface, *, voxel_mm: float, name
     reach = max(1.6 * voxel, float(np.percentile(np.abs(np.concatenate([rest, fitted])), 99.0)))
     bins = np.linspace(-reach, reach, BINS)
     share = 100.0 * area / area.sum()
+    spread = [number(float(np.sqrt(np.average(values**2, weights=area))), digits=2) for values in (rest, fitted)]
+    says = f"Signed distances of {tissue.name}: root mean square {spread[0]} mm without a fit, {spread[1]} mm fitted."
 
     def draw(figure: Figure) -> None:
         """The two histograms over each other, values beyond the axis in its outer bins."""
@@ -42,11 +55,11 @@ def residual_svg(data: ReportData, model: ModelSurface, *, voxel_mm: float, name
             axes.axvline(place, color=INK, linewidth=0.9, linestyle=DASHED)
         axes.text(voxel, 1.0, " one voxel", transform=axes.get_xaxis_transform(), fontsize=7.5, va="top")
         axes.set_xlim(-reach, reach)
-        axes.set_xlabel("signed distance to the later image (mm)")
+        axes.set_xlabel("signed distance (mm)")
         axes.set_ylabel("surface (%)")
         axes.yaxis.set_major_locator(MaxNLocator(4))
 
-    return draw_svg(draw, size=SIZE, name=name)
+    return draw_svg(draw, size=SIZE, name=name, says=says)
 
 
 def objective_svg(data: ReportData, *, name: str) -> str:
@@ -54,7 +67,8 @@ def objective_svg(data: ReportData, *, name: str) -> str:
     histories = [start["history_mm2"] for start in data.document["starts"]]
     histories.append(data.document["outer_loop"]["history_mm2"])
     paths = [[_finite(value) for value in history] for history in histories]
-    return draw_svg(lambda figure: _paths(figure, paths, "misfit (mm²)"), size=SIZE, name=name)
+    says = f"Misfit by iteration. {_told(paths, 'mm²')}"
+    return draw_svg(lambda figure: _paths(figure, paths, "misfit (mm²)"), size=SIZE, name=name, says=says)
 
 
 def modulus_svg(data: ReportData, estimate: int, *, name: str) -> str:
@@ -62,6 +76,7 @@ def modulus_svg(data: ReportData, estimate: int, *, name: str) -> str:
     item = data.document["estimates"][estimate]
     paths = [list(path.get(item["tissue"], ())) for path in data.moduli_paths]
     in_kpa = item["unit"] == "kPa"
+    says = f"Stiffness of {item['tissue']} by iteration. {_told(paths, 'kPa' if in_kpa else '')}"
 
     def draw(figure: Figure) -> None:
         """The paths, the 95 % interval as a band and the truth as a dashed line, where they are known."""
@@ -72,7 +87,45 @@ def modulus_svg(data: ReportData, estimate: int, *, name: str) -> str:
         if item["truth"] is not None:
             figure.axes[0].axhline(item["truth"], color=INK, linewidth=1.0, linestyle=DASHED)
 
-    return draw_svg(draw, size=SIZE, name=name)
+    return draw_svg(draw, size=SIZE, name=name, says=says)
+
+
+def profile_svg(data: ReportData, estimate: int, *, name: str) -> str:
+    """Deviance of one estimate (its number) at each value of its modulus, all else at its best, as SVG.
+
+    Between the points that were computed its signed root is monotone in ln E; the interval is a band, and the dashed
+    line the deviance 1.96^2 at the ends of a profile's.
+    """
+    item = data.document["estimates"][estimate]
+    in_kpa, colour = item["unit"] == "kPa", next(t.colour for t in data.tissues if t.name == item["tissue"])
+    value, interval = main_numbers(item)
+    at, root = np.array(sorted(item["profile"]), dtype=np.float64).T
+    fine = np.linspace(np.log(at[0]), np.log(at[-1]), 201)
+    between = PchipInterpolator(np.log(at), root)(fine)
+
+    def draw(figure: Figure) -> None:
+        """The profile with its points, the interval and the estimate."""
+        axes = figure.add_axes((0.14, 0.2, 0.83, 0.74))
+        room = (at[-1] / at[0]) ** 0.12
+        ends = (at[0] / room, at[-1] * room)
+        low, high = interval or (None, None)
+        axes.axvspan(low or ends[0], high or ends[1], color=INK, alpha=0.1, linewidth=0)
+        axes.plot(np.exp(fine), between**2, color=colour, linewidth=1.6)
+        axes.plot(at, root**2, "o", color=colour, markersize=3.2)
+        axes.axhline(LIMIT, color=INK, linewidth=0.9, linestyle=DASHED)
+        axes.plot([np.nan if value is None else value], [0.0], "o", color=colour, markeredgecolor=INK, clip_on=False)
+        axes.set_xscale("log")
+        axes.set_xlim(*ends)
+        axes.set_ylim(0.0, 1.6 * LIMIT)
+        axes.xaxis.set_major_locator(MaxNLocator(6))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda tick, _: f"{tick:.3g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.set_xlabel("E (kPa)" if in_kpa else f"E / {item['relative_to'][:24]}")
+        axes.set_ylabel("deviance")
+        axes.yaxis.set_major_locator(MaxNLocator(4))
+
+    told = f"lowest at {number(value)}, 95 % interval {interval_text(interval)}"
+    return draw_svg(draw, size=SIZE, name=name, says=f"Profile likelihood of {item['tissue']}: {told}.")
 
 
 def waterfall_svg(data: ReportData, *, name: str) -> str:
@@ -80,15 +133,16 @@ def waterfall_svg(data: ReportData, *, name: str) -> str:
     starts = data.document["starts"]
     ends = np.array([_finite(start["objective_mm2"]) for start in starts])
     order = np.argsort(ends, kind="stable")
+    told = ", ".join(f"start {rank + 1} {number(float(ends[rank]), digits=4)}" for rank in order)
 
     def draw(figure: Figure) -> None:
         """The starts as dots on a line."""
         axes = figure.add_axes((0.2, 0.2, 0.77, 0.74))
         axes.plot(range(1, len(order) + 1), ends[order], color=INK, linewidth=0.8, alpha=0.5)
-        for rank, number in enumerate(order, start=1):
-            colour = START_COLOURS[number % len(START_COLOURS)]
-            filled = colour if starts[number]["status"] == "converged" else "none"
-            axes.plot([rank], [ends[number]], "o", color=colour, markerfacecolor=filled, markersize=7)
+        for rank, start in enumerate(order, start=1):
+            colour = START_COLOURS[start % len(START_COLOURS)]
+            filled = colour if starts[start]["status"] == "converged" else "none"
+            axes.plot([rank], [ends[start]], "o", color=colour, markerfacecolor=filled, markersize=7)
         axes.set_xlabel("start, from best to worst")
         axes.set_ylabel("final misfit (mm²)")
         axes.set_xlim(0.5, len(order) + 0.5)
@@ -101,7 +155,8 @@ def waterfall_svg(data: ReportData, *, name: str) -> str:
             axes.yaxis.set_major_locator(MaxNLocator(4))
         axes.grid(visible=True, axis="y")
 
-    return draw_svg(draw, size=SIZE, name=name)
+    says = f"Final misfits from the best to the worst start, mm²: {told}."
+    return draw_svg(draw, size=SIZE, name=name, says=says)
 
 
 def angle_svg(angles: NDArray[np.float32], *, name: str) -> str:
@@ -120,7 +175,18 @@ def angle_svg(angles: NDArray[np.float32], *, name: str) -> str:
         axes.set_ylabel("share (%)")
         axes.yaxis.set_major_locator(MaxNLocator(4))
 
-    return draw_svg(draw, size=SIZE, name=name)
+    least, middle, most = np.percentile(flat, [0.0, 50.0, 100.0])
+    says = f"Dihedral angles of the mesh: from {least:.0f} to {most:.0f} degrees, half of them below {middle:.0f}."
+    return draw_svg(draw, size=SIZE, name=name, says=says)
+
+
+def _told(paths: list[list[float]], unit: str) -> str:
+    """What the lines of `_paths` show, in words: where each begins and ends, in `unit`."""
+    names = [*(f"start {k + 1}" for k in range(len(paths) - 1)), "outer loop"]
+    ends = [
+        f"{name} from {number(path[0])} to {number(path[-1])}" for name, path in zip(names, paths, strict=True) if path
+    ]
+    return f"{'; '.join(ends)} {unit}".strip() + "."
 
 
 def _finite(value: float | None) -> float:
@@ -130,8 +196,8 @@ def _finite(value: float | None) -> float:
 def _paths(figure: Figure, paths: list[list[float]], label: str) -> None:
     """One line a start on a logarithmic axis; the last path, the outer loop's, goes on where the starts end."""
     axes = figure.add_axes((0.17, 0.2, 0.8, 0.74))
-    for number, path in enumerate(paths[:-1]):
-        colour = START_COLOURS[number % len(START_COLOURS)]
+    for start, path in enumerate(paths[:-1]):
+        colour = START_COLOURS[start % len(START_COLOURS)]
         axes.plot(range(len(path)), path, color=colour, linewidth=1.6, marker="o", markersize=3.2)
     first = max((len(path) for path in paths[:-1]), default=0)
     for path in (path for path in paths[-1:] if path):

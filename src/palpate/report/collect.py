@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import TypeVar
 
@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 
 from palpate.errors import PalpateError
 from palpate.images.label_image import VoxelGrid
-from palpate.images.readers import read_intensities
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
+from palpate.images.tissue_colours import tissue_colours
 from palpate.mechanics.deformation import largest_strains
 from palpate.mesh.dihedral import tet_dihedrals
-from palpate.report.colours import tissue_colours
+from palpate.report.backgrounds import Grey, background, earlier_grey, later_grey, whole_box, whole_images
+from palpate.report.inputs import bone_distances, input_images
 from palpate.report.pairs import ImagePair, drawn_images, image_pairs
 from palpate.report.report_data import (
     LaterImage,
@@ -29,11 +30,9 @@ from palpate.report.report_data import (
     ReportTissue,
     SliceBox,
     TriangleSurface,
-    Volume,
 )
-from palpate.report.surfaces import MOST_TRIANGLES, contour_width, image_surface, model_surface
-from palpate.report.volume import MOST_VOXELS, grey_volume, label_volume
-from palpate.study.case import Case, CaseLoad, Images
+from palpate.report.surfaces import MOST_TRIANGLES, carried_outline, contour_width, image_surface, model_surface
+from palpate.study.case import Case, CaseLoad
 from palpate.study.result import CaseResult, failure_document, stated_unit
 
 __all__ = ["collect", "collect_failure"]
@@ -69,24 +68,32 @@ class _Attempt:
 
 @dataclass(frozen=True, slots=True)
 class _Drawing:
-    """A pair of images to be drawn, its number, the triangles that one surface may have, and where failures go."""
+    """A pair of images to be drawn, its number, the triangles that one surface may have, and where failures go.
+
+    grey: of the reference state; unread: whether there is one that could not be read.
+    """
 
     pair: ImagePair
     number: int
     most_triangles: int
     attempt: _Attempt
+    grey: Grey | None = None
+    unread: bool = False
 
 
 def collect(result: CaseResult) -> ReportData:
     """The report's data of a result; never fails for the sake of a figure."""
     attempt = _Attempt()
     pairs = image_pairs(result)
+    images = input_images(pairs)
     drawn = drawn_images([len(pair.after) for pair in pairs], MOST_LATER)
     pairs = pairs[: max(len({number for number, _ in drawn}), 1)]
     surfaces = max((len(pairs) + len(drawn)) * len(_indices(result, SHOWN)), 1)
-    drawings = [_Drawing(pair, number, ALL_TRIANGLES // surfaces, attempt) for number, pair in enumerate(pairs)]
+    drawings = [
+        _with_grey(_Drawing(pair, number, ALL_TRIANGLES // surfaces, attempt)) for number, pair in enumerate(pairs)
+    ]
     references = tuple(_reference(drawing) for drawing in drawings)
-    later = tuple(_later(drawings[number], after, references[number].slices) for number, after in drawn)
+    later = tuple(_later(drawings[number], after, references[number]) for number, after in drawn)
     mesh = attempt.part("mesh", lambda: _mesh(result), None)
     names = [estimate.tissue for estimate in result.estimation.estimates]
     histories = [*(start.history for start in result.estimation.starts), result.estimation.outer_loop]
@@ -96,6 +103,7 @@ def collect(result: CaseResult) -> ReportData:
         settings=_settings(result.case),
         tissues=_tissues(result.tissues, result.stiffness),
         unit=result.unit,
+        images=images,
         moduli_paths=tuple(
             {name: tuple(float(step.moduli.get(name, math.nan)) for step in history) for name in names}
             for history in histories
@@ -189,17 +197,33 @@ def _indices(result: CaseResult, roles: tuple[Role, ...]) -> tuple[int, ...]:
     return tuple(i for i, tissue in enumerate(result.tissues) if tissue.role in roles)
 
 
+def _with_grey(drawing: _Drawing) -> _Drawing:
+    """The drawing with the grey image of its reference state; one that cannot be read is told of on the page."""
+    try:
+        return replace(drawing, grey=earlier_grey(drawing.pair.result))
+    except PalpateError as error:
+        LOGGER.warning("the grey image is left out of the report: %s", error)
+        words = f"The labels stand in place of the grey image: {error}"
+        drawing.attempt.missing[f"background of {drawing.pair.before}"] = words
+        return replace(drawing, unread=True)
+
+
 def _reference(drawing: _Drawing) -> Reference:
     pair, attempt = drawing.pair, drawing.attempt
     result, name = pair.result, pair.before
     box = attempt.part(f"slices of {name}", lambda: _slice_box(result), None)
-    background = None if box is None else attempt.part(f"background of {name}", lambda: _background(drawing, box), None)
+    shown = attempt.part(
+        f"background of {name}",
+        lambda: None if box is None else background(result, drawing.grey, result.before, box, labels=drawing.unread),
+        None,
+    )
     return Reference(
         name=name,
         voxel_mm=float(max(image.grid.spacing.max() for image in (result.before, *result.after))),
         slices=box,
-        background=background,
+        background=shown,
         surfaces=attempt.part(f"surfaces of {name}", lambda: _surfaces(drawing, result.before), NONE),
+        whole=whole_box(result.before, None if box is None else box.position),
     )
 
 
@@ -214,60 +238,37 @@ def _surfaces(drawing: _Drawing, image: Segmentation) -> tuple[TriangleSurface, 
     return tuple(surface for surface in found if len(surface.triangles))
 
 
-def _later(drawing: _Drawing, after: int, box: SliceBox | None) -> LaterImage:
+def _later(drawing: _Drawing, after: int, reference: Reference) -> LaterImage:
     result, attempt, name = drawing.pair.result, drawing.attempt, drawing.pair.after[after]
-    fitted = after < len(result.estimation.displacements)
+    fitted, image = after < len(result.estimation.displacements), result.after[after]
+    surfaces = attempt.part(f"surfaces of {name}", lambda: _surfaces(drawing, image), NONE)
+    moving = [s for s in reference.surfaces if result.tissues[s.tissue].role in MOVING] if fitted else []
+    grey, box = attempt.part(f"background of {name}", lambda: later_grey(result, after), None), reference.slices
+    whole = reference.whole or whole_box(result.before)
     return LaterImage(
         name=name,
         reference=drawing.number,
-        surfaces=attempt.part(f"surfaces of {name}", lambda: _surfaces(drawing, result.after[after]), NONE),
+        surfaces=surfaces,
         model=attempt.part(
             f"distances of {name}",
             lambda: tuple(model_surface(result, i, after) for i in _indices(result, MOVING)) if fitted else (),
             (),
         ),
-        background=attempt.part(f"background of {name}", lambda: _later_background(result, after, box), None),
+        background=attempt.part(
+            f"background of {name}", lambda: None if box is None else background(result, grey, image, box), None
+        ),
+        outlines=attempt.part(
+            f"outlines of {name}", lambda: tuple(carried_outline(result, s, after) for s in moving), NONE
+        ),
+        both=attempt.part(
+            f"alignment of {name}",
+            lambda: whole_images(whole, (result.before, drawing.grey), (image, grey)),
+            (),
+        ),
+        bones=attempt.part(
+            f"alignment of {name}", lambda: bone_distances(result, after, reference.surfaces, surfaces), ()
+        ),
     )
-
-
-def _background(drawing: _Drawing, box: SliceBox) -> Volume:
-    """The earlier grey image, or the labels where there is none or it cannot be read, which the page then says."""
-    result = drawing.pair.result
-    images, before = result.case.images, result.before
-    if images is not None and images.intensities_before is not None:
-        try:
-            digest = result.provenance.inputs.get("intensities_before")
-            values, grid = read_intensities(images.intensities_before, sha256=digest)
-            return grey_volume(values, grid, box, most_voxels=_most_voxels(images))
-        except PalpateError as error:
-            LOGGER.warning("the grey image is left out of the report: %s", error)
-            words = f"The labels stand in place of the grey image: {error}"
-            drawing.attempt.missing[f"background of {drawing.pair.before}"] = words
-    return label_volume(before, box)
-
-
-def _most_voxels(images: Images) -> float:
-    """What one grey image may take of the page, which holds them all."""
-    return MOST_VOXELS / (1 + min(len(images.intensities_after), MOST_LATER))
-
-
-def _later_background(result: CaseResult, after: int, box: SliceBox | None) -> Volume | None:
-    """The later labels or grey values; None where only the earlier grey values are there.
-
-    A later grey image lies where its label image was brought to, which is known when both have one grid.
-    """
-    images, aligned = result.case.images, result.after[after].grid
-    if box is None:
-        return None
-    if images is None or images.intensities_before is None:
-        return label_volume(result.after[after], box)
-    if after >= len(images.intensities_after):
-        return None
-    digest = result.provenance.inputs.get(f"intensities_after[{after}]")
-    values, grid = read_intensities(images.intensities_after[after], sha256=digest)
-    if values.shape != aligned.shape or not np.allclose(grid.spacing, aligned.spacing, rtol=1e-3):
-        raise ValueError("the later grey image is not on the grid of its label image")
-    return grey_volume(values, aligned, box, most_voxels=_most_voxels(images))
 
 
 def _mesh(result: CaseResult) -> MeshPicture:

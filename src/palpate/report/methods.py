@@ -3,32 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.laws.registry import LAWS, law_from, law_parameters
+from palpate.report.headline import listed
 from palpate.report.report_data import ReportData
+from palpate.report.sources import SOURCES, bibtex, reference_line
 
 __all__ = ["Methods", "methods_text"]
 
-SOURCES = {
-    "yang": "Yang S, Lin MC. Simultaneous Estimation of Elasticity for Multiple Deformable Bodies.",
-    "palpate": "The Palpate developers. Palpate: elasticity of several organs at once from segmented images, version"
-    " {}.",
-    "mmg": "Dapogny C, Dobrzynski C, Frey P. Three-dimensional adaptive domain remeshing, implicit domain meshing, and"
-    " applications to free and moving boundary problems. J Comput Phys 262 (2014) 358-378.",
-    "kernel": "Harbrecht H, Peters M, Schneider R. On the low-rank approximation by the pivoted Cholesky decomposition."
-    " Appl Numer Math 62 (2012) 428-440.",
-    "huber": "Huber PJ. Robust Statistics. Wiley, 1981.",
-    "nocedal": "Nocedal J, Wright SJ. Numerical Optimization, 2nd ed. Springer, 2006.",
-    "byrd": "Byrd RH, Lu P, Nocedal J, Zhu C. A limited memory algorithm for bound constrained optimization. SIAM J Sci"
-    " Comput 16 (1995) 1190-1208.",
-    "reduced": "Quarteroni A, Manzoni A, Negri F. Reduced Basis Methods for Partial Differential Equations. Springer,"
-    " 2016.",
-    "white": "White H. A heteroskedasticity-consistent covariance matrix estimator and a direct test for"
-    " heteroskedasticity. Econometrica 48 (1980) 817-838.",
-}
 ELEMENTS = {
     "P1": "linear tetrahedra",
     "P2": "quadratic tetrahedra",
@@ -40,10 +25,11 @@ OPTIMISERS = {"gauss-newton": ("Gauss-Newton steps in a trust region", "nocedal"
 
 @dataclass(frozen=True, slots=True)
 class Methods:
-    """Paragraphs with numbers in brackets, and the sources that they stand for."""
+    """Paragraphs with numbers in brackets, the sources that they stand for, and these as a BibTeX file."""
 
     paragraphs: tuple[str, ...]
     sources: tuple[str, ...]
+    bibtex: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,13 +52,25 @@ def methods_text(data: ReportData) -> Methods:
         _fit(data, cite),
         (
             "The 95 % intervals come from the sandwich covariance of the parameters under spatially correlated"
-            f" residuals {cite('white')}, with the scatter over the voxel grid's position added. They do not cover the"
-            " errors of the mesh, of the material law, of Poisson's ratios, of the boundary condition and of the given"
-            f" moduli. The seed of random numbers was {data.document['seed']}."
+            f" residuals {cite('white')}, with the scatter over the voxel grid's position added{_leaning(data)}. They"
+            " do not cover the errors of the mesh, of the material law, of Poisson's ratios, of the boundary condition"
+            f" and of the given moduli. The seed of random numbers was {data.document['seed']}."
         ),
     )
-    version = str(data.document["versions"].get("palpate", ""))
-    return Methods(paragraphs, tuple(SOURCES[key].format(version) for key in cite.cited))
+    own = SOURCES["palpate"]
+    version = {"version": str(data.document["versions"].get("palpate", ""))}
+    sources = SOURCES | {"palpate": replace(own, fields={**version, **own.fields})}
+    return Methods(
+        paragraphs,
+        tuple(reference_line(sources[key]) for key in cite.cited),
+        "\n\n".join(bibtex(key, sources[key]) for key in cite.cited),
+    )
+
+
+def _leaning(data: ReportData) -> str:
+    """What was done where the profile likelihood is not symmetric."""
+    own = listed([item["tissue"] for item in data.document["estimates"] if item.get("interval_kind") == "profile"])
+    return f"; of {own}, whose profile likelihood leans to one side, its ends are those of the profile" if own else ""
 
 
 def _aim(data: ReportData, cite: _Citations) -> str:
@@ -82,13 +80,13 @@ def _aim(data: ReportData, cite: _Citations) -> str:
     on_bones = dict(data.settings).get("alignment") == "rigid-tissues"
     aligned = " The later images were brought to the first on the rigid tissues." if on_bones else ""
     known = [f"{t.name} ({t.given_kpa:g} kPa)" for t in data.tissues if t.given_kpa is not None]
-    moved = f" The motion was driven by {_list(roles['driver'])} (hollow, not meshed)." if "driver" in roles else ""
+    moved = f" The motion was driven by {listed(roles['driver'])} (hollow, not meshed)." if "driver" in roles else ""
     scale = " No modulus was given, so only ratios were found."
     if known or data.unit == "kPa":
-        scale = f" The scale was set by {_list(known or ['the known loads'])}."
+        scale = f" The scale was set by {listed(known or ['the known loads'])}."
     return (
-        f"Young's moduli of {_list(roles.get('estimate', []))} were estimated at once from segmented images of the same"
-        f" body in two or more states with Palpate {cite('palpate')}, whose method starts from"
+        f"Young's moduli of {listed(roles.get('estimate', []))} were estimated at once from segmented images of the"
+        f" same body in two or more states with Palpate {cite('palpate')}, whose method starts from"
         f" {cite('yang')}.{moved}{aligned}{scale}"
     )
 
@@ -111,7 +109,7 @@ def _model(data: ReportData, cite: _Citations) -> str:
         f" A conforming mesh{size} (edge length {settings['edge length at the organs']} at the organs) was cut along"
         f" their zero levels and improved with Mmg {cite('mmg')}.{more} The tissues followed"
         f" {law.description if law else 'the law ' + document['law']} in"
-        f" {ELEMENTS.get(document['element'], str(document['element']))}, with Poisson's ratios of {_list(ratios)};"
+        f" {ELEMENTS.get(document['element'], str(document['element']))}, with Poisson's ratios of {listed(ratios)};"
         " each was one solid, so that the modulus of an organ with a wall around a fluid, as a bladder, is an effective"
         f" one, not its wall's. The outer boundary: {settings['outer boundary']}. The motion of the drivers' walls was"
         f" a Gaussian process in its leading modes ({settings['driver motion']}) {cite('kernel')}, estimated together"
@@ -132,15 +130,9 @@ def _fit(data: ReportData, cite: _Citations) -> str:
     law = _law(data)
     finite = law is not None and law.finite
     onwards = " The linear law gave the start; the fit then went on over expansions around finite-strain equilibria."
-    observed = _list(list(data.document.get("observations", {}).values())) or "what the case's observations compare"
+    observed = listed(list(data.document.get("observations", {}).values())) or "what the case's observations compare"
     return (
         f"The misfit was {observed}. Outliers counted less by Tukey's biweight {cite('huber')}. It was minimised over"
         f" the logarithms of the moduli from {starts} starts by {optimiser} {cite(source)}, on a reduced basis whose"
         f" error was bounded at the estimate {cite('reduced')}.{onwards if finite else ''}"
     )
-
-
-def _list(names: list[str]) -> str:
-    if len(names) < 2:
-        return "".join(names)
-    return ", ".join(names[:-1]) + " and " + names[-1]

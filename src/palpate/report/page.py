@@ -15,22 +15,39 @@ import jinja2
 import numpy as np
 from markupsafe import Markup, escape
 
-from palpate.report.charts import angle_svg, modulus_svg, objective_svg, residual_svg, waterfall_svg
-from palpate.report.colours import START_COLOURS
+from palpate.findings import HARMLESS, WIDENING
+from palpate.report.charts import (
+    START_COLOURS,
+    angle_svg,
+    modulus_svg,
+    objective_svg,
+    profile_svg,
+    residual_svg,
+    waterfall_svg,
+)
+from palpate.report.headline import headline
 from palpate.report.methods import methods_text
 from palpate.report.payload import payload
 from palpate.report.pictures import mesh_png, organs_png
-from palpate.report.report_data import LaterImage, Reference, ReportData
+from palpate.report.report_data import LaterImage, Reference, ReportData, SliceBox
 from palpate.report.rows import estimate_rows, number, scale_marks
 from palpate.report.scales import Scale, angle_scale, distance_scale, modulus_scale, strain_scale
 from palpate.report.section import VIEWS
-from palpate.report.slices import contour_names, first_planes, slice_svg
+from palpate.report.slices import alignment_svg, contour_names, first_planes, slice_svg
 
 __all__ = ["Picture", "render"]
 
 T = TypeVar("T")
 LOGGER = logging.getLogger(__name__)
-SCRIPTS = ("three.min.js", "report.js", "slices.js", "viewer.js", "organs.js", "mesh.js", "start.js")
+SCRIPTS = ("three.min.js", "report.js", "slices.js", "alignment.js", "viewer.js", "organs.js", "mesh.js", "start.js")
+COSTS: tuple[tuple[str, Callable[[str], bool]], ...] = (  # a code that is not ours may cost as much as any
+    (
+        "The result stands, but each of these can move a modulus by more than its interval.",
+        lambda code: code not in (*WIDENING, *HARMLESS),
+    ),
+    ("Of the images: others would give narrower intervals, or values in kPa.", lambda code: code in WIDENING),
+    ("The numbers are as good as without these.", lambda code: code in HARMLESS),
+)
 POLICY = (
     "default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data:; base-uri 'none';"
     " form-action 'none'"
@@ -51,6 +68,8 @@ class _Later:
     """The figures of one later image."""
 
     name: str
+    alignment: tuple[Picture, ...]
+    whole_widths: str
     slices: tuple[Picture, ...]
     organs: tuple[Picture, ...]
     residuals: tuple[Picture, ...]
@@ -71,6 +90,12 @@ def render(data: ReportData) -> str:
     page = environment.get_template("case.html").render(
         data=data,
         document=data.document,
+        headline=headline(data.document),
+        inputs=tuple(
+            tuple(image for image in data.images if image.pair == pair)
+            for pair in sorted({image.pair for image in data.images})
+        ),
+        aligned=dict(data.settings).get("alignment") == "rigid-tissues",
         policy=_policy(scripts),
         scripts=scripts,
         live=live if scripts else None,
@@ -86,6 +111,11 @@ def render(data: ReportData) -> str:
         mesh_pictures=_mesh_pictures(data),
         moduli=_attempt("the scale of the moduli", lambda: modulus_scale(data)) if data.mesh else None,
         curves=_curves(data),
+        profiles=tuple(
+            _picture(f"Profile of {item['tissue']}", partial(profile_svg, data, i, name=f"profile{i}"))
+            for i, item in enumerate(data.document["estimates"])
+            if data.document["status"] == "converged" and item.get("profile")
+        ),
         angles=(
             _picture("Dihedral angles of the mesh", partial(angle_svg, data.mesh.angles, name="angles"))
             if data.mesh
@@ -114,27 +144,36 @@ def _policy(scripts: tuple[Markup, ...]) -> Markup:
     return Markup(POLICY.format(hashes=hashes))  # noqa: S704 - our own words and base64
 
 
-def _warnings(data: ReportData) -> tuple[tuple[str, tuple[str, ...]], ...]:
-    """Code and messages of the warnings, those of one code together."""
+def _warnings(data: ReportData) -> tuple[tuple[str, tuple[tuple[str, tuple[str, ...]], ...]], ...]:
+    """A caption with the codes and messages of the warnings under it, those of one code together, for each cost."""
     groups: dict[str, list[str]] = {}
     for warning in data.document["warnings"]:
         groups.setdefault(str(warning["code"]), []).append(str(warning["message"]))
-    return tuple((code, tuple(messages)) for code, messages in groups.items())
+    said = {code: (code, tuple(messages)) for code, messages in groups.items()}
+    if data.document["status"] != "converged":
+        return (("There is no result; these were noticed on the way.", tuple(said.values())),)
+    costs = ((caption, tuple(said[code] for code in said if fits(code))) for caption, fits in COSTS)
+    return tuple((caption, codes) for caption, codes in costs if codes)
 
 
 def _later(data: ReportData, k: int, later: LaterImage) -> _Later:
     reference = data.references[later.reference]
     planes = first_planes(reference.slices) if reference.slices else ()
-    box = reference.slices
+    whole = reference.whole if later.both else None
     return _Later(
         name=later.name,
+        alignment=tuple(
+            _picture(plane.view.name, partial(alignment_svg, data, plane, later, name=f"a{k}{plane.view.name}"))
+            for plane in (first_planes(whole) if whole else ())
+        ),
+        whole_widths=_widths(whole),
         slices=tuple(
             _picture(plane.view.name, partial(slice_svg, data, plane, later, name=f"s{k}{plane.view.name}"))
             for plane in planes
         ),
         organs=(
-            _photograph("before fitting", partial(organs_png, data, later, fitted=False)),
-            _photograph("after fitting", partial(organs_png, data, later, fitted=True)),
+            _photograph(f"as in {reference.name}", partial(organs_png, data, later, fitted=False)),
+            _photograph(f"fitted to {later.name}", partial(organs_png, data, later, fitted=True)),
         ),
         residuals=tuple(
             _picture(
@@ -145,9 +184,13 @@ def _later(data: ReportData, k: int, later: LaterImage) -> _Later:
         ),
         scale=distance_scale(reference.voxel_mm),
         reference=reference,
-        # of the columns, so that all show a millimetre in the same size
-        widths="" if box is None else " ".join(f"{box.high[v.across] - box.low[v.across]:.1f}fr" for v in VIEWS),
+        widths=_widths(reference.slices),
     )
+
+
+def _widths(box: SliceBox | None) -> str:
+    """Of the columns of three slices, as CSS, so that all show a millimetre in the same size."""
+    return "" if box is None else " ".join(f"{box.high[v.across] - box.low[v.across]:.1f}fr" for v in VIEWS)
 
 
 def _mesh_pictures(data: ReportData) -> tuple[Picture, ...]:

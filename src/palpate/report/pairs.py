@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from palpate.study.case import Images
-from palpate.study.result import CaseResult, distinct_names, image_names
+from palpate.study.result import CaseResult, pair_names
 
 __all__ = ["ImagePair", "drawn_images", "image_pairs"]
 
@@ -23,8 +23,6 @@ class ImagePair:
 def image_pairs(result: CaseResult) -> tuple[ImagePair, ...]:
     """The first pair of the result, then its further ones."""
     images = result.case.images
-    befores = distinct_names([images.before, *(pair.before for pair in result.case.pairs)]) if images else ["before"]
-    names = iter(image_names(result.case))
     sources = result.case.pairs if images else ()
     results = [result]
     for pair, source in zip(result.further, sources, strict=False):
@@ -40,8 +38,8 @@ def image_pairs(result: CaseResult) -> tuple[ImagePair, ...]:
         )
         results.append(alone)
     return tuple(
-        ImagePair(one, before, tuple(next(names, f"after {k + 1}") for k in range(len(one.after))))
-        for one, before in zip(results, befores, strict=False)
+        ImagePair(one, before, tuple(after[k] if k < len(after) else f"after {k + 1}" for k in range(len(one.after))))
+        for one, (before, after) in zip(results, pair_names(result.case), strict=False)
     )
 
 

@@ -12,7 +12,16 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from palpate.report.report_data import LaterImage, MeshPicture, Reference, ReportData, TriangleSurface, Volume
+from palpate.report.report_data import (
+    GREY_STEPS,
+    LaterImage,
+    MeshPicture,
+    Reference,
+    ReportData,
+    SliceBox,
+    TriangleSurface,
+    Volume,
+)
 from palpate.report.scales import Scale, angle_scale, distance_scale, modulus_scale, strain_scale
 from palpate.report.section import VIEWS
 
@@ -33,17 +42,17 @@ class Payload:
 
 @dataclass(frozen=True, slots=True)
 class _Packer:
-    """Collects arrays one behind the other; points are whole multiples of `step` mm from `low` (3,) mm."""
+    """Collects arrays one behind the other, equal ones once; points are multiples of `step` mm from `low` (3,) mm."""
 
     low: NDArray[np.float64]
     step: float
-    chunks: list[bytes] = field(default_factory=list)
+    chunks: dict[bytes, int] = field(default_factory=dict)  # -> where each begins
 
     def add(self, array: NDArray[Any]) -> dict[str, Any]:
         """Where and what the array, as (n, 3) mm or (n,), is in the block; it begins at a multiple of four bytes."""
         raw = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")).tobytes()
-        offset = sum(map(len, self.chunks))
-        self.chunks.append(raw + bytes(-len(raw) % 4))
+        chunk = raw + bytes(-len(raw) % 4)
+        offset = self.chunks.setdefault(chunk, sum(map(len, self.chunks)))
         return {"type": array.dtype.name, "offset": offset, "length": array.size}
 
     def points(self, points: NDArray[np.float32]) -> dict[str, Any]:
@@ -92,6 +101,7 @@ def _quantum(data: ReportData) -> tuple[NDArray[np.float64], float]:
     """Corner (3,) mm and step (mm) of a lattice that holds every point."""
     images: list[Reference | LaterImage] = [*data.references, *data.later]
     clouds = [surface.points for image in images for surface in image.surfaces]
+    clouds += [surface.points for later in data.later for surface in later.outlines]
     clouds += [p for later in data.later for m in later.model for p in (m.rest, m.fitted)]
     clouds += [data.mesh.nodes] if data.mesh else []
     clouds = [cloud for cloud in clouds if len(cloud)]
@@ -103,23 +113,33 @@ def _quantum(data: ReportData) -> tuple[NDArray[np.float64], float]:
 
 
 def _reference(reference: Reference, packer: _Packer) -> dict[str, Any]:
-    box = reference.slices
     return {
-        "box": {name: getattr(box, name).tolist() for name in ("low", "high", "position")} if box else None,
+        "name": reference.name,
+        "box": _box(reference.slices),
+        "whole": _box(reference.whole),
         "background": _volume(reference.background, packer),
         "surfaces": [_surface(surface, packer) for surface in reference.surfaces],
     }
 
 
+def _box(box: SliceBox | None) -> dict[str, list[float]] | None:
+    return None if box is None else {name: getattr(box, name).tolist() for name in ("low", "high", "position")}
+
+
 def _volume(volume: Volume | None, packer: _Packer) -> dict[str, Any] | None:
     if volume is None:
         return None
+    values = volume.values if volume.kind == "grey" else volume.values.astype(np.uint8)
     return {
         "kind": volume.kind,
         "shape": volume.values.shape,
         "origin": volume.origin.tolist(),
         "step": volume.step.tolist(),
-        "values": packer.add(volume.values),
+        "values": packer.add(values),
+        "span": volume.span,
+        "steps": GREY_STEPS,
+        "window": volume.window,
+        "unit": volume.unit,
     }
 
 
@@ -137,6 +157,8 @@ def _later(data: ReportData, later: LaterImage, packer: _Packer) -> dict[str, An
         "reference": later.reference,
         "background": _volume(later.background, packer),
         "surfaces": [_surface(surface, packer) for surface in later.surfaces],
+        "outlines": [_surface(surface, packer) for surface in later.outlines],
+        "both": [_volume(volume, packer) for volume in later.both],
         "model": [
             {
                 "tissue": model.tissue,

@@ -14,6 +14,9 @@ from palpate.images.label_image import VoxelGrid
 from palpate.report.archive import read_archive, write_archive
 
 __all__ = [
+    "GREY_STEPS",
+    "BoneDistance",
+    "InputImage",
     "LaterImage",
     "MeshPicture",
     "ModelSurface",
@@ -24,6 +27,8 @@ __all__ = [
     "TriangleSurface",
     "Volume",
 ]
+
+GREY_STEPS = 1023  # from the darkest to the brightest value that a volume keeps
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,15 +75,19 @@ class ModelSurface:
 
 @dataclass(frozen=True, slots=True)
 class Volume:
-    """Bytes (n_x, n_y, n_z) on a grid along the axes of the world; `origin` (3,) mm and `step` (3,) mm of its voxels.
+    """Values (n_x, n_y, n_z) on a grid along the axes of the world; `origin` (3,) mm and `step` (3,) mm of its voxels.
 
-    kind "grey": 0 black to 255 white; kind "labels": the tissue's index + 1, 0 outside of the image.
+    kind "labels": the tissue's index + 1, 0 outside of the image; kind "grey": steps from 0 to GREY_STEPS, which stand
+    for the image's values span[0] to span[1], in `unit`; window: the values that are shown black and white at first.
     """
 
     kind: str
-    values: NDArray[np.uint8]
+    values: NDArray[np.uint16]
     origin: NDArray[np.float64]
     step: NDArray[np.float64]
+    span: tuple[float, float] = (0.0, 1.0)
+    window: tuple[float, float] = (0.0, 1.0)
+    unit: str = ""
 
     @property
     def grid(self) -> VoxelGrid:
@@ -87,6 +96,11 @@ class Volume:
         affine = np.diag([*self.step, 1.0])
         affine[:3, 3] = self.origin
         return VoxelGrid((nx, ny, nz), affine)
+
+    def shade(self, steps: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Brightness, 0 to 1, of a grey volume's steps in its window; arrays of any shape, dimensionless."""
+        values = self.span[0] + steps * ((self.span[1] - self.span[0]) / GREY_STEPS)
+        return np.asarray(np.clip((values - self.window[0]) / (self.window[1] - self.window[0]), 0.0, 1.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +116,7 @@ class SliceBox:
 class Reference:
     """The reference state of a pair of images: what its slices show, its grey values or labels, its surfaces.
 
-    voxel_mm: the largest edge of a voxel in it and its later images.
+    voxel_mm: the largest edge of a voxel in it and its later images; whole: the box of the whole image.
     """
 
     name: str
@@ -110,13 +124,25 @@ class Reference:
     slices: SliceBox | None = None
     background: Volume | None = None
     surfaces: tuple[TriangleSurface, ...] = ()
+    whole: SliceBox | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class BoneDistance:
+    """How far the surface of a rigid tissue (index) lies from that of the aligned later image, mm: mean and 95 %."""
+
+    tissue: int
+    mean_mm: float
+    p95_mm: float
 
 
 @dataclass(frozen=True, slots=True)
 class LaterImage:
     """One later image: its name, its surfaces, the model fitted to it, its grey values or labels.
 
-    reference: number of its reference state.
+    reference: number of its reference state; outlines: the reference state's surfaces of what moves, carried by the
+    fitted motion; both: the whole of the reference state's image and of this one, of one kind; bones: of every rigid
+    tissue that both show.
     """
 
     name: str
@@ -124,6 +150,25 @@ class LaterImage:
     surfaces: tuple[TriangleSurface, ...] = ()
     model: tuple[ModelSurface, ...] = ()
     background: Volume | None = None
+    outlines: tuple[TriangleSurface, ...] = ()
+    both: tuple[Volume, ...] = ()
+    bones: tuple[BoneDistance, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class InputImage:
+    """One label image of the case: its name, number of its pair, its voxels and their edges (mm), SHA-256 of its file.
+
+    later: whether it shows a later state; volumes_ml: of each tissue, by counting voxels, ml.
+    """
+
+    name: str
+    pair: int
+    later: bool
+    shape: tuple[int, int, int]
+    spacing_mm: tuple[float, float, float]
+    volumes_ml: tuple[float, ...]
+    sha256: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,10 +190,10 @@ class MeshPicture:
 class ReportData:
     """One case's report before it is drawn.
 
-    document: that of result.json; unit: of the moduli, "kPa" or "ratio"; moduli_paths: of each start, and last of the
-    outer loop, tissue -> moduli by iteration; references: the reference states, that of the mesh first; later: their
-    later images; missing: part of the page ("mesh", or "slices", "surfaces", "background", "distances" of an image) ->
-    why it is not there.
+    document: that of result.json; unit: of the moduli, "kPa" or "ratio"; images: every label image, pair after pair;
+    moduli_paths: of each start, and last of the outer loop, tissue -> moduli by iteration; references: the reference
+    states, that of the mesh first; later: their later images; missing: part of the page ("mesh", or "slices",
+    "surfaces", "background", "distances", "outlines", "alignment" of an image) -> why it is not there.
     """
 
     document: Mapping[str, Any]
@@ -156,6 +201,7 @@ class ReportData:
     settings: tuple[tuple[str, str], ...]
     tissues: tuple[ReportTissue, ...]
     unit: str
+    images: tuple[InputImage, ...] = ()
     moduli_paths: tuple[Mapping[str, tuple[float, ...]], ...] = ()
     references: tuple[Reference, ...] = ()
     later: tuple[LaterImage, ...] = ()

@@ -13,6 +13,7 @@ __all__ = ["NONE", "Bar", "EstimateRow", "estimate_rows", "interval_text", "main
 
 NONE = "–"
 BAR = 200.0  # width of a bar, in its own units
+CAUSES = {"noise": "the surfaces' noise", "prior": "the drivers' motion", "grid": "the voxels' place"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +30,7 @@ class Bar:
 
 @dataclass(frozen=True, slots=True)
 class EstimateRow:
-    """One tissue of the result table, all texts."""
+    """One tissue of the result table, all texts; shares: of each cause in the variance."""
 
     tissue: str
     colour: str
@@ -44,6 +45,7 @@ class EstimateRow:
     truth: str
     error: str
     bar: Bar | None
+    shares: str
 
 
 def number(value: float | None, *, digits: int = 3) -> str:
@@ -52,7 +54,7 @@ def number(value: float | None, *, digits: int = 3) -> str:
         return NONE
     if value == 0.0:
         return "0"
-    magnitude = math.floor(math.log10(abs(value)))
+    magnitude = int(f"{value:.{digits - 1}e}".partition("e")[2])  # of what is left after rounding
     if not -4 <= magnitude < 7:
         return f"{value:.{digits - 1}e}"
     return f"{round(value, digits - 1 - magnitude):.{max(digits - 1 - magnitude, 0)}f}"
@@ -84,6 +86,7 @@ def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tu
             truth=number(truth),
             error=f"{100.0 * (value / truth - 1.0):+.1f} %" if shown and value and truth else NONE,
             bar=_bar(value, interval, truth=truth, scale=scale) if scale and value else None,
+            shares=", ".join(f"{CAUSES[c]} {100 * s:.0f} %" for c, s in (item.get("variance_shares") or {}).items()),
         )
         rows.append(row)
     return tuple(rows)

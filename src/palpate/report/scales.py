@@ -61,7 +61,7 @@ def distance_scale(voxel_mm: float) -> Scale:
         (voxel_mm, f"+{voxel_mm:.3g} (voxel)"),
         (size, f"≥ +{size:.3g}"),
     )
-    return Scale("coolwarm", -size, size, False, "signed distance to the later image (mm)", ticks)
+    return Scale("coolwarm", -size, size, False, "signed distance (mm)", ticks)
 
 
 def modulus_scale(data: ReportData) -> Scale:
@@ -76,9 +76,12 @@ def modulus_scale(data: ReportData) -> Scale:
 
 
 def angle_scale() -> Scale:
-    """Smallest dihedral angle of a tetrahedron, degrees; 5 is what the mesh's gate asks for."""
+    """Smallest dihedral angle of a tetrahedron, degrees; 5 is what the mesh's gate asks for.
+
+    Dark is bad and bright is good, whatever colours one sees.
+    """
     ticks = tuple((float(angle), f"{angle}°") for angle in (5, 20, 40, 60))
-    return Scale("RdYlGn", 0.0, 70.0, False, "smallest dihedral angle (degrees)", ticks)
+    return Scale("cividis", 0.0, 70.0, False, "smallest dihedral angle (degrees)", ticks)
 
 
 def strain_scale() -> Scale:

@@ -12,13 +12,14 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from palpate.report.report_data import LaterImage, ReportData, SliceBox, TriangleSurface
+from palpate.report.report_data import LaterImage, ReportData, SliceBox, TriangleSurface, Volume
 from palpate.report.section import VIEWS, Plane, cut_image, joined
 from palpate.report.svg import draw_svg
 
-__all__ = ["contour_names", "first_planes", "slice_svg"]
+__all__ = ["alignment_svg", "contour_names", "first_planes", "slice_svg"]
 
 WIDTH_INCHES = 4.6
+ROLE_LEVELS = {"rigid": 1.0, "estimate": 0.6, "driver": 0.4, "known": 0.2, "void": 0.0}  # bones are what is aligned
 OUTLINE = (withStroke(linewidth=1.5, foreground="#000000", alpha=0.7),)  # letters stay readable on bright bone
 
 
@@ -35,63 +36,99 @@ def contour_names(data: ReportData) -> tuple[tuple[str, str], ...]:
 
 def slice_svg(data: ReportData, plane: Plane, later: LaterImage, *, name: str) -> str:
     """One slice as SVG: the earlier image under the contours of both images and of the model fitted to `later`."""
-    across, up = (float(plane.high[axis] - plane.low[axis]) for axis in (plane.view.across, plane.view.up))
+    reference = data.references[later.reference]
 
     def draw(figure: Figure) -> None:
         """Grey values, contours and furniture, one over the other."""
         axes = figure.add_axes((0, 0, 1, 1))
-        _background(axes, data, plane, number=later.reference)
+        across, up = plane.axes
+        shades = np.zeros((2, 2, 3)) if reference.background is None else _shades(data, reference.background, plane)
+        axes.imshow(shades, extent=(across[0], across[-1], up[0], up[-1]), origin="lower", interpolation="none")
         for surface in later.surfaces:
             _lines(axes, data, plane, surface, gid="layer-after", linewidth=4.0, alpha=0.5)
-        for surface in data.references[later.reference].surfaces:
+        for surface in reference.surfaces:
             _lines(axes, data, plane, surface, gid="layer-before", linewidth=1.0, linestyle=(0, (1, 1.6)))
-        for model in later.model:
-            lines = joined(model.fitted.astype(np.float64), model.triangles.astype(np.int64), plane)
-            _add(axes, lines, gid="layer-model", colors=["white"], linewidth=1.0)
-        view = plane.view
-        axes.set_xlim(plane.high[view.across], plane.low[view.across])
-        axes.set_ylim(plane.low[view.up], plane.high[view.up])
-        axes.set_axis_off()
-        places = ((0.025, 0.5), (0.975, 0.5), (0.5, 0.97), (0.5, 0.03))
-        for letter, (x, y) in zip(view.letters, places, strict=True):
-            _write(axes, x, y, letter, ha="center", va="center", fontweight="bold")
-        where = f"{'xyz'[view.normal]} = {plane.position:.0f} mm"
-        _write(axes, 0.975, 0.03, where, ha="right", va="center", fontsize=7)
-        width = float(plane.high[view.across] - plane.low[view.across])
-        bar = next(size for size in (50.0, 20.0, 10.0, 5.0, 1.0, 0.0) if size < 0.4 * width)
-        left, bottom = plane.high[view.across] - 0.06 * width, plane.low[view.up] + 0.06 * width
-        stroke = [withStroke(linewidth=3.4, foreground="#000000")]
-        ends = [left, left - bar]
-        axes.plot(ends, [bottom] * 2, color="white", linewidth=2.0, solid_capstyle="butt", path_effects=stroke)
-        place = (left, bottom + 0.015 * width)
-        axes.text(*place, f"{bar:g} mm", color="white", ha="left", va="bottom", fontsize=8, path_effects=OUTLINE)
+        for outline in later.outlines:
+            _lines(axes, data, plane, outline, gid="layer-model", colors=["white"], linewidth=1.0)
+        _furnish(axes, plane)
 
-    return draw_svg(draw, size=(WIDTH_INCHES, WIDTH_INCHES * up / across), name=name)
+    where = f"{plane.view.name.capitalize()} slice at {'xyz'[plane.view.normal]} = {plane.position:.0f} mm"
+    says = f"{where}: {reference.name} under the outlines of {reference.name}, {later.name} and the fitted model."
+    return draw_svg(draw, size=_size(plane), name=name, says=says)
 
 
-def _background(axes: Axes, data: ReportData, plane: Plane, *, number: int) -> None:
-    """The earlier image of reference state `number`."""
-    across, up = plane.axes
-    extent = (across[0], across[-1], up[0], up[-1])
-    volume = data.references[number].background
-    if volume is None:
-        axes.imshow(np.zeros((2, 2)), cmap="gray", extent=extent, origin="lower")
-        return
-    cut = np.nan_to_num(cut_image(volume.values, volume.grid, plane, order=1 if volume.kind == "grey" else 0))
+def alignment_svg(data: ReportData, plane: Plane, later: LaterImage, *, name: str) -> str:
+    """One slice as SVG: the earlier image in cyan over the later one in red, so that what agrees is grey.
+
+    Raises `ValueError` when there are not both.
+    """
+    if len(later.both) != 2:
+        raise ValueError("there are no images to be compared")
+
+    def draw(figure: Figure) -> None:
+        """Both images in one picture, and its furniture."""
+        axes = figure.add_axes((0, 0, 1, 1))
+        first, second = (_brightness(data, volume, plane) for volume in later.both)
+        across, up = plane.axes
+        both = np.stack([second, first, first], axis=2)
+        axes.imshow(both, extent=(across[0], across[-1], up[0], up[-1]), origin="lower", interpolation="none")
+        _furnish(axes, plane)
+
+    reference = data.references[later.reference].name
+    says = f"{plane.view.name.capitalize()} slice: {reference} in cyan over {later.name} in red; what agrees is grey."
+    return draw_svg(draw, size=_size(plane), name=name, says=says)
+
+
+def _size(plane: Plane) -> tuple[float, float]:
+    """Of a picture of the plane, inches."""
+    across, up = (float(plane.high[axis] - plane.low[axis]) for axis in (plane.view.across, plane.view.up))
+    return WIDTH_INCHES, WIDTH_INCHES * up / across
+
+
+def _furnish(axes: Axes, plane: Plane) -> None:
+    """Letters of the sides, a bar of millimetres, and where the plane lies."""
+    view = plane.view
+    axes.set_xlim(plane.high[view.across], plane.low[view.across])
+    axes.set_ylim(plane.low[view.up], plane.high[view.up])
+    axes.set_axis_off()
+    places = ((0.025, 0.5), (0.975, 0.5), (0.5, 0.97), (0.5, 0.03))
+    for letter, (x, y) in zip(view.letters, places, strict=True):
+        _write(axes, x, y, letter, ha="center", va="center", fontweight="bold")
+    where = f"{'xyz'[view.normal]} = {plane.position:.0f} mm"
+    _write(axes, 0.975, 0.03, where, ha="right", va="center", fontsize=7)
+    width = float(plane.high[view.across] - plane.low[view.across])
+    bar = next(size for size in (50.0, 20.0, 10.0, 5.0, 1.0, 0.0) if size < 0.4 * width)
+    left, bottom = plane.high[view.across] - 0.06 * width, plane.low[view.up] + 0.06 * width
+    stroke = [withStroke(linewidth=3.4, foreground="#000000")]
+    ends = [left, left - bar]
+    axes.plot(ends, [bottom] * 2, color="white", linewidth=2.0, solid_capstyle="butt", path_effects=stroke)
+    place = (left, bottom + 0.015 * width)
+    axes.text(*place, f"{bar:g} mm", color="white", ha="left", va="bottom", fontsize=8, path_effects=OUTLINE)
+
+
+def _shades(data: ReportData, volume: Volume, plane: Plane) -> NDArray[np.float64]:
+    """Colours (n_up, n_across, 3), 0 to 1, of a volume on the plane's pixels: its window of greys, or its tissues'."""
     if volume.kind == "grey":
-        axes.imshow(cut, cmap="gray", vmin=0, vmax=255, extent=extent, origin="lower", interpolation="none")
-        return
-    colours = np.array([(0.0, 0.0, 0.0), *(0.06 + 0.3 * np.array(to_rgb(tissue.colour)) for tissue in data.tissues)])
-    axes.imshow(colours[np.rint(cut).astype(int)], extent=extent, origin="lower", interpolation="none")
+        return np.repeat(_brightness(data, volume, plane)[..., None], 3, axis=2)
+    colours = [(0.0, 0.0, 0.0), *(0.06 + 0.3 * np.array(to_rgb(tissue.colour)) for tissue in data.tissues)]
+    steps = np.nan_to_num(cut_image(volume.values, volume.grid, plane, order=0))
+    return np.asarray(np.array(colours)[np.rint(steps).astype(int)])
+
+
+def _brightness(data: ReportData, volume: Volume, plane: Plane) -> NDArray[np.float64]:
+    """Brightness (n_up, n_across), 0 to 1: of a volume's greys in its window, or of its tissues by their role."""
+    if volume.kind == "grey":
+        return volume.shade(np.nan_to_num(cut_image(volume.values, volume.grid, plane)))
+    levels = np.array([0.0, *(ROLE_LEVELS[tissue.role] for tissue in data.tissues)])
+    steps = np.nan_to_num(cut_image(volume.values, volume.grid, plane, order=0))
+    return np.asarray(levels[np.rint(steps).astype(int)])
 
 
 def _lines(axes: Axes, data: ReportData, plane: Plane, surface: TriangleSurface, *, gid: str, **style: Any) -> None:
     lines = joined(surface.points.astype(np.float64), surface.triangles.astype(np.int64), plane)
-    _add(axes, lines, gid=gid, colors=[data.tissues[surface.tissue].colour], **style)
-
-
-def _add(axes: Axes, lines: list[NDArray[np.float64]], *, gid: str, **style: Any) -> None:
-    collection = LineCollection(lines, capstyle="round", **style)
+    collection = LineCollection(
+        lines, **{"colors": [data.tissues[surface.tissue].colour], "capstyle": "round", "joinstyle": "round"} | style
+    )
     collection.set_gid(gid)
     axes.add_collection(collection, autolim=False)
 

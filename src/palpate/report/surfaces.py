@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import igl
 import numpy as np
 from scipy import ndimage
@@ -9,12 +11,12 @@ from scipy import ndimage
 from palpate.images.distance import observation_width, smoothing_width
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue_distance import cropped, tissue_distance_map, window_around
-from palpate.mesh.surface import triangle_normals
+from palpate.mesh.surface import tissue_surface, triangle_normals
 from palpate.observation.observed_surface import observed_surface
 from palpate.report.report_data import ModelSurface, TriangleSurface
 from palpate.study.result import CaseResult
 
-__all__ = ["MOST_TRIANGLES", "contour_width", "image_surface", "model_surface"]
+__all__ = ["MOST_TRIANGLES", "carried_outline", "contour_width", "image_surface", "model_surface"]
 
 MOST_TRIANGLES = 40_000  # of one surface
 ROOM_MM = 10.0  # around a surface, so that what lies beyond its distance map changes nothing there
@@ -72,6 +74,21 @@ def model_surface(result: CaseResult, tissue: int, after: int) -> ModelSurface:
         distance_fitted=(later.at(fitted) - level + hidden).astype(np.float32),
         area=area.astype(np.float32),
     )
+
+
+def carried_outline(result: CaseResult, outline: TriangleSurface, after: int) -> TriangleSurface:
+    """A surface of the earlier image as the motion fitted to later image number `after` carries it.
+
+    Each point moves as the nearest one of its tissue's surface in the mesh, whose own edges where organs touch are as
+    coarse as its tetrahedra; so the outline keeps the image's shape, and lies on the later one's where the fit is good.
+    """
+    space, points = result.space, outline.points.astype(np.float64)
+    faces = np.ascontiguousarray(tissue_surface(space.mesh, outline.tissue).triangles, dtype=np.int64)
+    _, nearest, places = igl.point_mesh_squared_distance(points, space.mesh.nodes, faces)
+    corners = faces[nearest]
+    weights = igl.barycentric_coordinates(places, *(np.ascontiguousarray(space.mesh.nodes[c]) for c in corners.T))
+    motion = space.interpolation(corners, weights) @ result.estimation.displacements[after]
+    return replace(outline, points=(points + motion).astype(np.float32))
 
 
 def contour_width(result: CaseResult) -> float:

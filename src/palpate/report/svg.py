@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable
 
 import matplotlib as mpl
+from markupsafe import escape
 from matplotlib.figure import Figure
 
 __all__ = ["INK", "draw_svg"]
@@ -36,8 +37,8 @@ STYLE = {
 }
 
 
-def draw_svg(draw: Callable[[Figure], None], *, size: tuple[float, float], name: str) -> str:
-    """The SVG element that `draw` paints on an empty figure of `size` (inches).
+def draw_svg(draw: Callable[[Figure], None], *, size: tuple[float, float], name: str, says: str) -> str:
+    """The SVG element that `draw` paints on an empty figure of `size` (inches), and that `says` this to who cannot see.
 
     `name`, unique in the page, keeps the figure's identifiers apart from those of others. Elements that `draw` gave
     the gid "layer-X" get the class "layer-X". No state of matplotlib outlives the call.
@@ -57,4 +58,5 @@ def draw_svg(draw: Callable[[Figure], None], *, size: tuple[float, float], name:
     element = re.sub(r'\bid="', f'id="{name}-', element)
     element = re.sub(r"url\(#", f"url(#{name}-", element)
     element = re.sub(r'(xlink:)?href="#', f'href="#{name}-', element)
+    element = element.replace("<svg", f'<svg role="img" aria-label="{escape(says)}"', 1)
     return element.replace(INK, "currentColor")

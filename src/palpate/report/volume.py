@@ -1,4 +1,4 @@
-"""The images behind the slices, as bytes on a grid along the axes of the world."""
+"""The images behind the slices, as whole numbers on a grid along the axes of the world."""
 
 from __future__ import annotations
 
@@ -11,37 +11,44 @@ from scipy import ndimage
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue_distance import cropped, window_of
-from palpate.report.report_data import SliceBox, Volume
+from palpate.report.report_data import GREY_STEPS, SliceBox, Volume
 
 __all__ = ["MOST_VOXELS", "grey_volume", "label_volume"]
 
 MOST_VOXELS = 2_500_000  # what a page can carry and a telephone can hold
 CT_WINDOW = (-160.0, 240.0)  # Hounsfield units in which soft tissues differ
+CT_SPAN = (-1024.0, 3072.0)  # Hounsfield units from air to metal, which clips nothing in four to a step
+CT_AIR = -500.0  # an image with less is a CT
 MOST_TISSUES = 254
 
 
 def grey_volume(values: NDArray[Any], grid: VoxelGrid, box: SliceBox, *, most_voxels: float = MOST_VOXELS) -> Volume:
-    """The part of a grey image (n_x, n_y, n_z) on `grid` that lies in `box`, its soft tissue spread over the greys.
+    """The part of a grey image (n_x, n_y, n_z) on `grid` that lies in `box`: a CT with its soft tissue in the window.
 
-    It is sampled more coarsely than the image where it had over `most_voxels`.
+    Of another image the window is the middle 98 per cent of its values, the span all of them. It is sampled more
+    coarsely than the image where it had over `most_voxels`.
     """
     step = _step(grid, box, most_voxels)
     cut = _cut(values, grid, box, step=step, order=1)
     finite = cut[np.isfinite(cut)]
-    low, high = 0.0, 1.0
-    if len(finite):  # shown black and white: a soft-tissue window for a CT, else the middle 98 percent
-        low, high = CT_WINDOW if finite.min() < -500.0 else np.percentile(finite, [1.0, 99.0]).tolist()
-        high = max(high, low + 1e-6)
-    shade = np.clip((cut - low) / (high - low), 0.0, 1.0)
-    return Volume("grey", np.rint(255.0 * np.nan_to_num(shade)).astype(np.uint8), box.low, step)
+    unit, span, window = "", (0.0, 1.0), (0.0, 1.0)
+    if len(finite) and finite.min() < CT_AIR:
+        unit, span, window = "HU", CT_SPAN, CT_WINDOW
+    elif len(finite):
+        least, low, high, most = np.percentile(finite, [0.0, 1.0, 99.0, 100.0]).tolist()
+        window = (low, max(high, low + 1e-6))
+        span = (least, max(most, window[1]))
+    share = np.clip((cut - span[0]) / (span[1] - span[0]), 0.0, 1.0)
+    steps = np.rint(GREY_STEPS * np.nan_to_num(share)).astype(np.uint16)
+    return Volume("grey", steps, box.low, step, span, window, unit)
 
 
-def label_volume(image: Segmentation, box: SliceBox) -> Volume:
-    """The part of a segmentation that lies in `box`: tissue index + 1, 0 outside."""
-    step = _step(image.grid, box, MOST_VOXELS)
+def label_volume(image: Segmentation, box: SliceBox, *, most_voxels: float = MOST_VOXELS) -> Volume:
+    """The part of a segmentation that lies in `box`: tissue index + 1, 0 outside; sampled as above."""
+    step = _step(image.grid, box, most_voxels)
     cut = _cut(image.index, image.grid, box, step=step, order=0)
     number = np.where(np.isnan(cut) | (cut >= MOST_TISSUES), -1.0, cut) + 1.0
-    return Volume("labels", number.astype(np.uint8), box.low, step)
+    return Volume("labels", number.astype(np.uint16), box.low, step)
 
 
 def _step(grid: VoxelGrid, box: SliceBox, most_voxels: float) -> NDArray[np.float64]:

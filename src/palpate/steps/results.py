@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from palpate.errors import ResourceError
+from palpate.images.tissue_colours import tissue_colours
 from palpate.report.cards import moduli_figure, result_cards, result_lines
-from palpate.report.colours import tissue_colours
 from palpate.steps.saving import save_estimate
 from palpate.study import result
 from palpate.study.case_as_run import refuse_other_case

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from palpate.study.body import Body, ImagedStates, aligned, inverse_problem, make_body
     from palpate.study.case import Case, Domain, DriverMotion, Mechanics, MeshSettings, Phantom
     from palpate.study.case_file import read_case
-    from palpate.study.cost import expected_cost
+    from palpate.study.cost import ExpectedCost, expected_cost
     from palpate.study.earlier import strange_files
     from palpate.study.estimation import Observed, conclude, verdict
     from palpate.study.journal import recover
@@ -27,6 +27,7 @@ __all__ = [
     "CaseResult",
     "Domain",
     "DriverMotion",
+    "ExpectedCost",
     "ImagedStates",
     "Mechanics",
     "MeshSettings",
@@ -65,6 +66,7 @@ _HOMES = {
     "CaseResult": "palpate.study.result",
     "Domain": "palpate.study.case",
     "DriverMotion": "palpate.study.case",
+    "ExpectedCost": "palpate.study.cost",
     "ImagedStates": "palpate.study.body",
     "Mechanics": "palpate.study.case",
     "MeshSettings": "palpate.study.case",

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from palpate.images.body_in_ct import outside_body
+from palpate.images.body_in_ct import outside_body, shows_air
 from palpate.images.label_image import LabelImage, VoxelGrid
 
 __all__ = ["Background", "background_of"]
@@ -51,15 +51,15 @@ class Background:
 def background_of(
     image: LabelImage, window: tuple[slice, ...], ct: tuple[NDArray[np.float32], VoxelGrid] | None
 ) -> Background | None:
-    """Label 0 of the part `window` of `image`; `ct`: HU and their grid. None where there is no label 0.
+    """Label 0 of the part `window` of `image`; `ct`: HU (nx, ny, nz) and their grid. None where there is no label 0.
 
-    Raises `InputDataError` as `outside_body` does.
+    A grey image without air, as of an MR, tells nothing.
     """
     zero = image.labels[window] == 0
     if not zero.any():
         return None
     share = float(zero.mean())
-    if ct is not None:
+    if ct is not None and shows_air(ct[0]):
         outside = outside_body(*ct, image.grid)[window]
         return Background(share, float(np.count_nonzero(outside & zero) / np.count_nonzero(zero)), seen=True)
     return Background(share, _beyond_hull(np.argwhere(image.labels != 0), _places(zero, window)), seen=False)

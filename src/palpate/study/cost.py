@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,10 +24,12 @@ __all__ = [
     "ExpectedCost",
     "cost_of_meshes",
     "expected_cost",
+    "expected_size",
     "expected_tets",
     "free_memory_gb",
     "lack_of_memory",
     "machine_memory_gb",
+    "tets_by_edge",
 ]
 
 MEMORY_FACTOR = 1.5  # how far the predicted memory may be off
@@ -70,9 +72,13 @@ def expected_cost(case: Case, before: Segmentation, after: tuple[Segmentation, .
 
     Nothing is meshed: tetrahedra from the sum of 1 / h^3 over the meshed volume, h the mesher's own edge length there.
     """
-    tets = expected_tets(case, before, after)
-    unknowns = int(tets * UNKNOWNS_A_TET.get(case.mechanics.element, UNKNOWNS_A_TET["P2"]))
-    return cost_of_meshes(case, before, [(tets, unknowns)] * n_pairs, n_after=len(after))
+    size = expected_size(case, expected_tets(case, before, after))
+    return cost_of_meshes(case, before, [size] * n_pairs, n_after=len(after))
+
+
+def expected_size(case: Case, tets: int) -> tuple[int, int]:
+    """So many tetrahedra, and the unknowns that they bring."""
+    return tets, int(tets * UNKNOWNS_A_TET.get(case.mechanics.element, UNKNOWNS_A_TET["P2"]))
 
 
 def cost_of_meshes(
@@ -111,20 +117,30 @@ def cost_of_meshes(
 
 def expected_tets(case: Case, before: Segmentation, after: tuple[Segmentation, ...]) -> int:
     """Number of tetrahedra in the mesh of a reference state."""
-    box = case_domain(before, after, case)
-    index, cell = _lattice(before, box)
-    inside = index >= 0
-    edge = case.mesh.edge_length_mm
-    sizes = np.full(index.shape, COARSEST * edge)
+    return tets_by_edge(case, before, after)(case.mesh.edge_length_mm)
+
+
+def tets_by_edge(case: Case, before: Segmentation, after: tuple[Segmentation, ...]) -> Callable[[float], int]:
+    """The same as a function of the edge length, mm: distances to the organs are computed once."""
+    index, cell = _lattice(before, case_domain(before, after, case))
     tissues = [i for i, tissue in enumerate(before.tissues) if tissue.meshed]
     # the mesher's filler: the remaining tissue if it is meshed, else the largest
     filler = max(tissues, key=lambda i: (not before.tissues[i].labels, before.volume(i)), default=-1)
-    for i, tissue in enumerate(before.tissues):
-        if i != filler and (index == i).any():
-            start = edge * (1.0 if tissue.role in (Role.ESTIMATE, Role.DRIVER) else COARSER)
-            sizes = np.minimum(sizes, start + GRADING * _distance_to_surface(index == i, cell))
-    meshed = np.array([*(tissue.meshed for tissue in before.tissues), False])[index] & inside
-    return max(int(TETS_A_CUBE * np.prod(cell) * float((sizes[meshed] ** -3.0).sum())), 100)
+    meshed = np.array([*(tissue.meshed for tissue in before.tissues), False])[index] & (index >= 0)
+    surfaces = [
+        (1.0 if tissue.role in (Role.ESTIMATE, Role.DRIVER) else COARSER, _distance_to_surface(index == i, cell))
+        for i, tissue in enumerate(before.tissues)
+        if i != filler and (index == i).any()
+    ]
+
+    def tets(edge_mm: float) -> int:
+        """With edges of that length at the organs."""
+        sizes = np.full(index.shape, COARSEST * edge_mm)
+        for start, distance in surfaces:
+            sizes = np.minimum(sizes, start * edge_mm + GRADING * distance)
+        return max(int(TETS_A_CUBE * np.prod(cell) * float((sizes[meshed] ** -3.0).sum())), 100)
+
+    return tets
 
 
 def machine_memory_gb() -> float | None:

@@ -11,11 +11,13 @@ from palpate.findings import Finding
 from palpate.images.checks import later_names
 from palpate.inversion import Inversion, Outcome
 from palpate.mechanics.deformation import deformation_determinants
+from palpate.study.together import ImagePairs
 from palpate.uncertainty import FittedState
 
-__all__ = ["fold_findings", "inversion_findings"]
+__all__ = ["fold_findings", "inversion_findings", "pair_findings"]
 
 STRONG_CORRELATION = 0.99
+HETEROGENEOUS = 0.01  # probability of such differences between image pairs that have the same moduli
 
 
 def inversion_findings(inversion: Inversion, covariance: NDArray[np.float64]) -> tuple[Finding, ...]:
@@ -60,6 +62,25 @@ def inversion_findings(inversion: Inversion, covariance: NDArray[np.float64]) ->
     if alike:
         text = f"the moduli of {', of '.join(alike)} cannot be told apart by these images"
         findings.append(Finding("correlated", f"{text}; add some that move them otherwise"))
+    return tuple(findings)
+
+
+def pair_findings(pairs: ImagePairs | None) -> tuple[Finding, ...]:
+    """A finding for each later image that the others contradict, and one where the rest differs by more than noise."""
+    if pairs is None:
+        return ()
+    findings = []
+    for name, pair in zip(later_names(len(pairs.alone)), pairs.alone, strict=True):
+        if pair.outlier:
+            moved = ", ".join(f"{tissue} by {by:+.1f}" for tissue, by in pair.influence.items())
+            mean = ", ".join(f"{tissue} {value:.3g}" for tissue, value in pairs.mean.items())
+            text = f"'{name}' contradicts the other later images: it moves the mean of {moved} standard deviations;"
+            advice = f"{text} without it the mean is {mean}. Look at its labels, or leave it out"
+            findings.append(Finding("pair-outlier", advice, place=f"in '{name}'"))
+    if pairs.heterogeneity_p < HETEROGENEOUS:
+        text = f"the later images differ by more than their noise (p = {pairs.heterogeneity_p:.1g})"
+        advice = f"{text}: read the mean over them, `image_pairs` in result.json, whose interval holds the differences"
+        findings.append(Finding("heterogeneous", advice))
     return tuple(findings)
 
 

@@ -14,7 +14,7 @@ from palpate.inversion import Inversion, InversionSettings, Iterate, Outcome, St
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit
 from palpate.progress import Progress, silent
-from palpate.study.estimate_findings import fold_findings, inversion_findings
+from palpate.study.estimate_findings import fold_findings, inversion_findings, pair_findings
 from palpate.study.together import ImagePairs, combinations_of, image_pairs_of
 from palpate.uncertainty import (
     Combination,
@@ -176,6 +176,12 @@ def conclude(
     progress(f"intervals: correlation of the residuals, and the model as {GRID_DRAWS} random voxel grids show it")
     covariance = covariance_of(objective, minimum.evaluation, observed.states, draws=GRID_DRAWS, rng=rng)
     progress("intervals: profiles, and the fit of every surface before and after")
+    pairs = image_pairs_of(inversion, settings.bounds)
+    findings = (
+        *inversion_findings(inversion, covariance.total),
+        *pair_findings(pairs),
+        *fold_findings(observed.states),
+    )
     return Estimation(
         status="converged" if minimum.converged else "not converged",
         reason=_reason(inversion),
@@ -192,11 +198,11 @@ def conclude(
             "evaluations": inversion.evaluations,
         },
         outer_loop=tuple(_iteration(inversion, iterate) for iterate in minimum.history),
-        remarks=(*inversion_findings(inversion, covariance.total), *fold_findings(observed.states)),
+        remarks=findings,
         observations={observation.kind: observation.description for observation in objective.observations},
         information=information(covariance.total),
         combinations=combinations_of(inversion, covariance.total, within=IDENTIFIED),
-        image_pairs=image_pairs_of(inversion, settings.bounds),
+        image_pairs=pairs,
     )
 
 
@@ -266,7 +272,7 @@ def _estimates(
     mapping, bounds = inversion.objective.parameters, settings.bounds
     theta, scale = inversion.minimum.unknowns[: mapping.n_parameters], mapping.scale_kpa
     found, variances = [], np.diag(covariance.total)
-    fixed = fixed_correspondence(inversion.objective, inversion.minimum)
+    fixed = fixed_correspondence(inversion.objective, inversion.minimum.unknowns, inversion.minimum.evaluation)
     for i, name in enumerate(mapping.tissues):
         none = no_estimate(
             name,

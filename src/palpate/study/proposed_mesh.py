@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +10,8 @@ import numpy as np
 from palpate.images.label_image import LabelImage
 from palpate.images.segmentation import segment
 from palpate.images.tissue import Role
-from palpate.study.case import REMAINING, Case, CaseTissue, Domain, Images, MeshSettings
-from palpate.study.cost import MEMORY_FACTOR, expected_cost, machine_memory_gb
+from palpate.study.case import REMAINING, Case, CaseTissue, Domain, Images
+from palpate.study.cost import MEMORY_FACTOR, cost_of_meshes, expected_size, machine_memory_gb, tets_by_edge
 from palpate.study.guess import GuessedTissue
 
 __all__ = ["MARGIN_MM", "proposed_edge", "proposed_window"]
@@ -56,10 +55,13 @@ def proposed_edge(
     has, edge = machine_memory_gb(), wanted
     case = _case(tissues, cropped=cropped)
     first, *later = (segment(image, case.resolve_tissues({})) for image in (before, *after))
-    while has is not None and edge < LONGEST_MM:
-        needed = expected_cost(replace(case, mesh=MeshSettings(edge)), first, tuple(later), n_pairs=1).memory_gb
-        if MEMORY_FACTOR * needed <= has:
-            break
+    tets = tets_by_edge(case, first, tuple(later))
+
+    def memory_gb(edge_mm: float) -> float:
+        """That an estimate with such edges needs."""
+        return cost_of_meshes(case, first, [expected_size(case, tets(edge_mm))], n_after=len(later)).memory_gb
+
+    while has is not None and edge < LONGEST_MM and MEMORY_FACTOR * memory_gb(edge) > has:
         edge += STEP_MM
     if edge > wanted:
         why += f"; {wanted:g} mm would suit it, but this machine has {has:.0f} GB of memory"

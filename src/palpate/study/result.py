@@ -34,6 +34,7 @@ __all__ = [
     "failure_document",
     "image_names",
     "json_object",
+    "pair_names",
     "stated_unit",
 ]
 
@@ -327,18 +328,29 @@ def _start(start: Start) -> dict[str, Any]:
 
 
 def image_names(case: Case) -> list[str]:
-    """A name for each later image of the case, pair after pair: its file's, with its folder's where two are alike."""
+    """A name for each later image of the case, pair after pair, as in `pair_names`."""
+    return [name for _, later in pair_names(case) for name in later]
+
+
+def pair_names(case: Case) -> list[tuple[str, tuple[str, ...]]]:
+    """Names of the images of each pair, the reference state's and the later ones': their files', no two alike."""
     if case.images is None:
-        return ["after"]
-    return distinct_names(
-        [path for paths in (case.images.after, *(pair.after for pair in case.pairs)) for path in paths]
-    )
+        return [("before", ("after",))]
+    pairs = [(case.images.before, case.images.after), *((pair.before, pair.after) for pair in case.pairs)]
+    names = iter(distinct_names([path for before, after in pairs for path in (before, *after)]))
+    return [(next(names), tuple(next(names) for _ in after)) for _, after in pairs]
 
 
 def distinct_names(paths: Sequence[Path]) -> list[str]:
-    """Names of files, with their folder's where two are alike."""
-    plain = [path.name for path in paths]
-    return [f"{path.parent.name}/{path.name}" if plain.count(path.name) > 1 else path.name for path in paths]
+    """Names of files, with as many of their folders' as it takes to tell two of one name apart."""
+    names = [path.name for path in paths]
+    deepest = max((len(path.parts) for path in paths), default=0)
+    for depth in range(2, deepest + 1):
+        alike = [name for name in names if names.count(name) > 1]
+        names = [
+            "/".join(path.parts[-depth:]) if name in alike else name for path, name in zip(paths, names, strict=True)
+        ]
+    return names
 
 
 def _stiffness(tissue: Tissue, estimate: ModulusEstimate | None, unit: str) -> float:

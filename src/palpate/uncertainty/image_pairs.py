@@ -132,7 +132,8 @@ def _alone(objective: Objective, minimum: Minimum, bounds: Bounds, s: int) -> Pa
     alone = Objective((objective.states[s],), parameters)
     seen = [line for line in minimum.evaluation.lines if line.state == s]
     lines = tuple(replace(line, state=0, columns=np.searchsorted(own, line.columns)) for line in seen)
-    there = replace(minimum, unknowns=minimum.unknowns[own], evaluation=replace(minimum.evaluation, lines=lines))
-    found = gauss_newton(fixed_correspondence(alone, there), there.unknowns, bounds=bounds, tolerance=1e-4)
+    start = minimum.unknowns[own]
+    fixed = fixed_correspondence(alone, start, replace(minimum.evaluation, lines=lines))
+    found = gauss_newton(fixed, start, bounds=bounds, tolerance=1e-4)
     covariance = sandwich_covariance(alone, found.evaluation)
     return PairEstimate(found.unknowns[:n], covariance, found.converged)

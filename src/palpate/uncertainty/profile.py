@@ -66,18 +66,23 @@ class FixedCorrespondence:
         return replace(found, value=0.5 * (away + squares))
 
 
-def fixed_correspondence(objective: Objective, minimum: Minimum) -> FixedCorrespondence:
-    """The objective with the closest points of a minimum; expansions bend as the linear law does (`CurvedModel`)."""
+def fixed_correspondence(
+    objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation
+) -> FixedCorrespondence:
+    """The objective with the closest points and weights of an evaluation at `unknowns` (n_unknowns,).
+
+    Expansions bend as the linear law does (`CurvedModel`).
+    """
     models, displacements = list[ForwardModel](), list[NDArray[np.float64]]()
     mapping = objective.parameters
-    moduli, coefficients = mapping.moduli(minimum.unknowns), mapping.coefficients(minimum.unknowns)
+    moduli, coefficients = mapping.moduli(unknowns), mapping.coefficients(unknowns)
     for state, q in zip(objective.states, coefficients, strict=True):
         model, like = state.observed, state.bending
         assert model is not None, "an objective is made of states with approximations"
         values = model.solve(moduli, q).values
         displacements += [values[rows] for rows in state.slices]
         models.append(CurvedModel.of(model, like) if like and isinstance(model, FirstOrderModel) else model)
-    return FixedCorrespondence(objective, tuple(models), minimum.evaluation.lines, tuple(displacements))
+    return FixedCorrespondence(objective, tuple(models), evaluation.lines, tuple(displacements))
 
 
 @dataclass(frozen=True, slots=True)

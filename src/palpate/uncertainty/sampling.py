@@ -15,11 +15,16 @@ from scipy import linalg
 from palpate.errors import ConfigurationError, EstimationError
 from palpate.inversion.objective import Evaluation, Objective
 from palpate.inversion.optimise import Bounds
+from palpate.mechanics.curved import CurvedModel
+from palpate.mechanics.forward import ForwardModel
 from palpate.mechanics.reduced import ReducedModel
+from palpate.uncertainty.profile import fixed_correspondence
 
-__all__ = ["FrozenPosterior", "PosteriorSamples", "frozen_posterior", "sample_posterior"]
+__all__ = ["FrozenPosterior", "PosteriorSamples", "frozen_posterior", "posterior_chains", "sample_posterior"]
 
 STEP = 0.35  # of a proposal, in standard deviations of the posterior
+THIN = 10  # steps of a draw that is kept
+SPREAD = 1.5  # standard deviations, by which chains start apart
 BETWEEN_CHECKS = 4000  # evaluations
 GAP = 1.0  # of log-likelihood, that the frozen posterior may be off; re-chosen closest points alone make some tenths
 
@@ -28,12 +33,12 @@ GAP = 1.0  # of log-likelihood, that the frozen posterior may be off; re-chosen 
 class FrozenPosterior:
     """Minus log-posterior 1/2 sum_s z_s^T Q_s z_s + 1/2 (x - m)^T P (x - m), dimensionless, of unknowns x (n,).
 
-    z_s = [a, q, 1] of each state s: amplitudes a (m,) of its reduced model `models[s]` and mode coefficients q;
-    forms: Q_s (m + n_modes + 1, m + n_modes + 1); prior: P (n, n).
+    z_s = [a, q, 1] of each state s: amplitudes a (m,) of its reduced model `models[s]` and mode coefficients q; of a
+    `CurvedModel`, whose expansion adds to that, [a, q, ln E - ln E_0, 1]. forms: Q_s (k, k); prior: P (n, n).
     """
 
     objective: Objective
-    models: tuple[ReducedModel, ...]
+    models: tuple[ReducedModel | CurvedModel, ...]
     forms: tuple[NDArray[np.float64], ...]
     prior: NDArray[np.float64]
 
@@ -44,8 +49,7 @@ class FrozenPosterior:
         total = 0.5 * float(away @ self.prior @ away)
         parts = zip(self.models, self.forms, parameters.coefficients(unknowns), strict=True)
         for model, form, coefficients in parts:
-            given = np.append(coefficients, 1.0)
-            state = np.concatenate([model.amplitude(moduli, given), given])
+            state = np.append(_coordinates(model, moduli, coefficients), 1.0)
             total += 0.5 * float(state @ form @ state)
         return total
 
@@ -75,30 +79,57 @@ def frozen_posterior(
     """The posterior with the closest points and weights at `unknowns` (n,), under the objective's own prior of them.
 
     Residuals are point-to-plane, r + n.(u - u_0), as in the Gauss-Newton matrix. evaluation: that of the objective
-    there, where it is known. Raises `ConfigurationError` for models that are not reduced ones.
+    there, where it is known. Raises `ConfigurationError` for models that are neither reduced ones nor bent by one.
     """
     evaluation = evaluation or objective(unknowns)
     parameters = objective.parameters
-    moduli, models, forms = parameters.moduli(unknowns), [], []
-    for number, coefficients in enumerate(parameters.coefficients(unknowns)):
-        state, model = objective.states[number], objective.states[number].observed
-        if not isinstance(model, ReducedModel):
+    moduli, coefficients = parameters.moduli(unknowns), parameters.coefficients(unknowns)
+    models, forms = [], []
+    for number, model in enumerate(fixed_correspondence(objective, unknowns, evaluation).models):
+        if not isinstance(_reduced(model), ReducedModel):
             raise ConfigurationError(
                 f"the posterior is sampled on reduced models; state {number} has a {type(model).__name__}"
             )
+        assert isinstance(model, ReducedModel | CurvedModel)
         lines = [line for line in evaluation.lines if line.state == number]
-        answer = np.column_stack([model.output_basis, model.output_modes, model.output_offset])
-        values = model.solve(moduli, coefficients).values
-        form = np.zeros((answer.shape[1],) * 2)
-        for rows, line in zip(state.slices, lines, strict=True):
-            normal = line.residuals.smooth_jacobian
-            design = np.asarray(normal @ answer[rows])
-            design[:, -1] += line.residuals.values - normal @ values[rows]
+        answer, state = _answer(model), _coordinates(model, moduli, coefficients[number])
+        form = np.zeros((len(state) + 1,) * 2)
+        for rows, line in zip(objective.states[number].slices, lines, strict=True):
+            moved = np.asarray(line.residuals.smooth_jacobian @ answer[rows])
+            design = np.column_stack([moved, line.residuals.values - moved @ state])
             design *= np.sqrt(line.precision * line.weights)[:, None]
             form += design.T @ design
         models.append(model)
         forms.append(form)
     return FrozenPosterior(objective, tuple(models), tuple(forms), evaluation.prior)
+
+
+def _reduced(model: ForwardModel) -> ForwardModel:
+    """The model whose amplitudes are coordinates."""
+    return model.like if isinstance(model, CurvedModel) else model
+
+
+def _coordinates(
+    model: ReducedModel | CurvedModel, moduli: NDArray[np.float64], coefficients: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """[a, q], and [a, q, ln E - ln E_0] of a model that an expansion adds to."""
+    reduced = _reduced(model)
+    assert isinstance(reduced, ReducedModel)
+    found = [reduced.amplitude(moduli, np.append(coefficients, 1.0)), coefficients]
+    if isinstance(model, CurvedModel):
+        found.append(np.log(moduli / model.expansion.moduli))
+    return np.concatenate(found)
+
+
+def _answer(model: ReducedModel | CurvedModel) -> NDArray[np.float64]:
+    """Derivatives (n_outputs, k) mm of the outputs by the coordinates."""
+    reduced = _reduced(model)
+    assert isinstance(reduced, ReducedModel)
+    if not isinstance(model, CurvedModel):
+        return np.concatenate([reduced.output_basis, reduced.output_modes], axis=1)
+    rest = model.expansion.derivatives - model.straight.derivatives
+    by_modulus, by_mode = rest[:, : model.n_regions], rest[:, model.n_regions :]
+    return np.concatenate([reduced.output_basis, reduced.output_modes + by_mode, by_modulus], axis=1)
 
 
 def sample_posterior(
@@ -118,13 +149,7 @@ def sample_posterior(
     """
     evaluation = objective(start)
     frozen = frozen_posterior(objective, start, evaluation)
-    try:
-        laplace = _Laplace(start, linalg.cholesky(evaluation.matrix, lower=True))
-    except linalg.LinAlgError as error:
-        raise EstimationError(
-            f"the Gauss-Newton matrix is not positive definite ({error}): some modulus moves nothing at this place, so"
-            " its posterior cannot be sampled; start at a minimum"
-        ) from error
+    laplace = _laplace(start, evaluation)
     anchor = evaluation.value - frozen(start)
     now, chain, counts, gap, refreshed = start, [], 0, 0.0, 0
     for done in range(0, evaluations, BETWEEN_CHECKS):
@@ -138,6 +163,49 @@ def sample_posterior(
             frozen = frozen_posterior(objective, now)
             anchor, refreshed = objective.value(now) - frozen(now), refreshed + 1
     return PosteriorSamples(np.concatenate(chain), counts / evaluations, refreshed, gap)
+
+
+def posterior_chains(
+    frozen: FrozenPosterior,
+    start: NDArray[np.float64],
+    evaluation: Evaluation,
+    covariance: NDArray[np.float64],
+    *,
+    bounds: Bounds,
+    chains: int,
+    draws: int,
+    rng: np.random.Generator,
+) -> NDArray[np.float64]:
+    """Log-moduli (chains, draws, n_parameters) of a frozen posterior, spread as all that is known of them is.
+
+    evaluation: of the objective at the minimum `start` (n,); covariance (n_parameters, n_parameters): of the log-moduli
+    by correlated residuals, prior and grid, to which the samples are stretched about the minimum, as their own spread
+    at the minimum is that of the Gauss-Newton matrix (the open-faced sandwich: Shaby, J. Comput. Graph. Stat. 23 (2014)
+    853-876). Every chain starts elsewhere, at 1.5 standard deviations, and leaves out a tenth of its draws; a draw is
+    the last of ten steps. Raises `EstimationError` where a modulus moves nothing.
+    """
+    n = frozen.objective.n_parameters
+    laplace = _laplace(start, evaluation)
+    own = np.linalg.cholesky(evaluation.covariance_columns(n)[:n])
+    stretch = np.linalg.cholesky(covariance) @ np.linalg.inv(own)
+    found = []
+    for generator in rng.spawn(chains):
+        away = start + SPREAD * laplace.draws(1, generator)[0]
+        away[:n] = np.clip(away[:n], bounds.lower, bounds.upper)
+        warm, steps = THIN * (draws // 10), THIN * draws
+        theta, _, _ = _chain(frozen, laplace, away, bounds=bounds, steps=warm + steps, rng=generator)
+        found.append(start[:n] + (theta[warm + THIN - 1 :: THIN] - start[:n]) @ stretch.T)
+    return np.stack(found)
+
+
+def _laplace(start: NDArray[np.float64], evaluation: Evaluation) -> _Laplace:
+    try:
+        return _Laplace(start, linalg.cholesky(evaluation.matrix, lower=True))
+    except linalg.LinAlgError as error:
+        raise EstimationError(
+            f"the Gauss-Newton matrix is not positive definite ({error}): some modulus moves nothing at this place, so"
+            " its posterior cannot be sampled; start at a minimum"
+        ) from error
 
 
 @dataclass(frozen=True, slots=True)

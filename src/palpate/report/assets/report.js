@@ -35,6 +35,8 @@ Palpate.load = async () => {
   for (const later of facts.later) {
     later.surfaces = later.surfaces.map(surface);
     later.background = volume(later.background);
+    later.both = later.both.map(volume);
+    later.outlines = later.outlines.map(surface);
     later.scale = Palpate.scale(later.scale);
     later.model = later.model.map((m) => ({
       tissue: m.tissue, triangles: array(m.triangles), rest: points(m.rest), fitted: points(m.fitted),
@@ -79,13 +81,41 @@ Palpate.replace = (live, still) => {
   still.classList.add("replaced");
 };
 
+// A colour of the page's theme, and who must be told when it changes.
+Palpate.css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+Palpate.themed = [];
+Palpate.onTheme = (tell) => Palpate.themed.push(tell);
+
 Palpate.theme = () => {
   const root = document.documentElement, button = document.getElementById("theme");
-  const order = ["auto", "light", "dark"];
+  const order = ["auto", "light", "dark"], tell = () => Palpate.themed.forEach((listener) => listener());
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", tell);
   button.hidden = false;
   button.addEventListener("click", () => {
     const next = order[(order.indexOf(root.dataset.theme || "auto") + 1) % order.length];
     root.dataset.theme = next;
     button.textContent = `Theme: ${next}`;
+    tell();
   });
+};
+
+// Buttons that put a text of the page on the clipboard; where that is not allowed, they mark it for the reader to copy.
+Palpate.copies = () => {
+  for (const row of document.querySelectorAll(".copies")) {
+    row.hidden = false;
+    for (const button of row.querySelectorAll("[data-copy]")) {
+      button.addEventListener("click", async () => {
+        const source = document.getElementById(button.dataset.copy), told = row.querySelector("[role=status]");
+        const folded = source.closest("details");
+        if (folded) folded.open = true;
+        try {
+          await navigator.clipboard.writeText(source.innerText);
+          told.textContent = "Copied.";
+        } catch {
+          getSelection().selectAllChildren(source);
+          told.textContent = "Marked: copy it with Ctrl-C.";
+        }
+      });
+    }
+  }
 };

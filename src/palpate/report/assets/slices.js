@@ -58,47 +58,54 @@ Palpate.join = (segments, next, place) => {
 };
 
 // One slice of a volume as a picture of its own pixels; grey values between two layers are blended.
-Palpate.layer = (volume, view, position, tissues) => {
-  const [nx, ny, nz] = volume.shape, size = [nx, ny, nz], jump = [ny * nz, nz, 1];
-  const w = size[view.across], h = size[view.up], n = size[view.normal];
+// greys: brightness (0 to 255) of each step of a grey volume; colours: [r, g, b] of each number of a label volume.
+Palpate.layer = (volume, view, position, greys, colours) => {
+  const { shape, origin, step } = volume, jump = [shape[1] * shape[2], shape[2], 1];
+  const w = shape[view.across], h = shape[view.up], n = shape[view.normal];
   const canvas = document.createElement("canvas");
   canvas.width = w; canvas.height = h;
-  const context = canvas.getContext("2d"), image = context.createImageData(w, h);
-  const depth = (position - volume.origin[view.normal]) / volume.step[view.normal];
-  const grey = volume.kind === "grey";
+  const context = canvas.getContext("2d"), image = context.createImageData(w, h), grey = volume.kind === "grey";
+  const depth = (position - origin[view.normal]) / step[view.normal];
   const lower = Math.min(Math.max(grey ? Math.floor(depth) : Math.round(depth), 0), n - 1);
   const upper = Math.min(lower + 1, n - 1), share = grey ? Math.min(Math.max(depth - lower, 0), 1) : 0;
-  const colours = [[0, 0, 0], ...tissues.map((t) => Palpate.rgb(t.colour).map((c) => 255 * (0.06 + 0.3 * c)))];
-  for (let row = 0; row < h; row++) {
-    for (let column = 0; column < w; column++) {
+  const { values } = volume, { data } = image;
+  for (let row = 0, at = 0; row < h; row++) {
+    for (let column = 0; column < w; column++, at += 4) {
       const base = (w - 1 - column) * jump[view.across] + (h - 1 - row) * jump[view.up];
-      const value = volume.values[base + lower * jump[view.normal]];
-      const shown = grey ? (1 - share) * value + share * volume.values[base + upper * jump[view.normal]] : value;
-      const colour = grey ? [shown, shown, shown] : colours[shown] || colours[0];
-      image.data.set([...colour, 255], 4 * (row * w + column));
+      const value = values[base + lower * jump[view.normal]];
+      if (grey) {
+        data[at] = data[at + 1] = data[at + 2] = greys[Math.round((1 - share) * value + share * values[base + upper * jump[view.normal]])];
+      } else {
+        const colour = colours[value] || colours[0];
+        for (let k = 0; k < 3; k++) data[at + k] = colour[k];
+      }
+      data[at + 3] = 255;
     }
   }
   context.putImageData(image, 0, 0);
   return canvas;
 };
 
-Palpate.Slices = class {
-  constructor(facts, number, section) {
+// Three linked planes through a box; those who extend it say what they show: `volumes` and `paintPlane`.
+Palpate.Planes = class {
+  constructor(facts, number, section, box) {
     this.facts = facts;
     this.later = facts.later[number];
     this.reference = facts.references[this.later.reference];
     this.section = section;
-    this.position = [...this.reference.box.position];
-    this.phase = "after";
-    this.figures = [...section.querySelectorAll(".slice-live")].map((figure, i) => this.prepare(figure, facts.views[i]));
-    for (const input of section.querySelectorAll(".legend input")) input.addEventListener("change", () => this.draw());
-    for (const input of section.querySelectorAll(".modes input")) input.addEventListener("change", () => this.flicker());
-    new ResizeObserver(() => this.draw()).observe(section);
+    this.box = box;
+    this.position = [...box.position];
+  }
+
+  start() {
+    this.figures = [...this.section.querySelectorAll(".slice-live")].map((figure, i) => this.prepare(figure, this.facts.views[i]));
+    this.prepareGreys();
+    new ResizeObserver(() => this.draw()).observe(this.section);
     this.draw();
   }
 
   prepare(figure, view) {
-    const { box } = this.reference, axis = view.normal;
+    const { box } = this, axis = view.normal;
     const canvas = figure.querySelector("canvas"), slider = figure.querySelector("input");
     Object.assign(slider, { min: box.low[axis], max: box.high[axis], step: 0.5, value: this.position[axis] });
     slider.addEventListener("input", () => { this.position[axis] = Number(slider.value); this.draw(); });
@@ -110,7 +117,7 @@ Palpate.Slices = class {
 
   // A click takes the two other planes through the point.
   point(event, view, canvas) {
-    const { low, high } = this.reference.box, frame = canvas.getBoundingClientRect();
+    const { low, high } = this.box, frame = canvas.getBoundingClientRect();
     const x = Math.min(Math.max((event.clientX - frame.left) / frame.width, 0), 1);
     const y = Math.min(Math.max((event.clientY - frame.top) / frame.height, 0), 1);
     this.position[view.across] = high[view.across] - x * (high[view.across] - low[view.across]);
@@ -118,6 +125,124 @@ Palpate.Slices = class {
     for (const figure of this.figures) figure.slider.value = this.position[figure.view.normal];
     this.draw();
   }
+
+  // Window and level of the grey values, where there are some: one for all images of the section.
+  prepareGreys() {
+    const row = this.section.querySelector(".greys"), volume = this.volumes().find((v) => v && v.kind === "grey");
+    if (!row || !volume) return;
+    const width = row.querySelector(".window-width"), level = row.querySelector(".window-level"), told = row.querySelector("output");
+    const [least, most] = volume.span, step = volume.unit === "HU" ? 1 : (most - least) / volume.steps;
+    Object.assign(width, { min: step, max: most - least, step });
+    Object.assign(level, { min: least, max: most, step });
+    const set = () => {
+      this.window = [Number(level.value) - Number(width.value) / 2, Number(level.value) + Number(width.value) / 2];
+      const words = this.window.map((value) => Number(value.toPrecision(3))).join(" to ");
+      told.textContent = `${words} ${volume.unit}`;
+      width.setAttribute("aria-valuetext", told.textContent); level.setAttribute("aria-valuetext", told.textContent);
+    };
+    const show = ([low, high]) => { width.value = high - low; level.value = (low + high) / 2; set(); this.draw(); };
+    for (const input of [width, level]) input.addEventListener("input", () => { set(); this.draw(); });
+    for (const button of row.querySelectorAll("[data-window]")) {
+      const [middle, wide] = button.dataset.window.split(" ").map(Number);
+      button.addEventListener("click", () => show(button.dataset.window === "first" ? volume.window : [middle - wide / 2, middle + wide / 2]));
+    }
+    width.value = volume.window[1] - volume.window[0];
+    level.value = (volume.window[0] + volume.window[1]) / 2;
+    set();
+  }
+
+  greys(volume) {
+    const [low, high] = this.window || volume.window, [least, most] = volume.span;
+    return Uint8ClampedArray.from({ length: volume.steps + 1 }, (_, i) => 255 * (least + (i * (most - least)) / volume.steps - low) / (high - low));
+  }
+
+  // Dark enough for lines to stand out.
+  labelColours() { return [[0, 0, 0], ...this.facts.tissues.map((t) => Palpate.rgb(t.colour).map((c) => 255 * (0.06 + 0.3 * c)))]; }
+
+  draw() {
+    for (const figure of this.figures) this.drawFigure(figure);
+  }
+
+  drawFigure({ canvas, view, layers }) {
+    const { low, high } = this.box;
+    const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
+    if (!width) return;
+    canvas.width = Math.round(width * ratio); canvas.height = Math.round(height * ratio);
+    const context = canvas.getContext("2d");
+    context.scale(ratio, ratio);
+    const scale = width / (high[view.across] - low[view.across]);
+    const frame = { scale, width, height, x: (mm) => (high[view.across] - mm) * scale, y: (mm) => (high[view.up] - mm) * scale };
+    context.fillStyle = "#000";
+    context.fillRect(0, 0, width, height);
+    this.drawFurniture(context, view, frame, this.paintPlane(context, view, frame, layers));
+  }
+
+  // A volume on a plane, from a picture that is kept until plane or greys change.
+  drawVolume(context, view, frame, volume, layers) {
+    const kept = layers.get(volume), key = `${this.position[view.normal]} ${volume.kind === "grey" ? this.window : ""}`;
+    if (!kept || kept.key !== key) {
+      const grey = volume.kind === "grey";
+      const picture = Palpate.layer(volume, view, this.position[view.normal], grey && this.greys(volume), !grey && this.labelColours());
+      layers.set(volume, { key, picture });
+    }
+    context.imageSmoothingEnabled = volume.kind === "grey";
+    const half = (k) => volume.step[k] / 2, last = (k) => volume.origin[k] + (volume.shape[k] - 1) * volume.step[k];
+    const left = frame.x(last(view.across) + half(view.across)), top = frame.y(last(view.up) + half(view.up));
+    const wide = volume.shape[view.across] * volume.step[view.across] * frame.scale;
+    context.drawImage(layers.get(volume).picture, left, top, wide, volume.shape[view.up] * volume.step[view.up] * frame.scale);
+  }
+
+  stroke(context, view, frame, surface, layers, style) {
+    const at = this.position[view.normal];
+    if (!layers.has(surface) || layers.get(surface).at !== at) {
+      layers.set(surface, { at, lines: Palpate.cut(surface.points, surface.triangles, view.normal, at, view.across, view.up) });
+    }
+    Object.assign(context, { lineJoin: "round", lineCap: "round", globalAlpha: 1, strokeStyle: this.facts.tissues[surface.tissue].colour }, style);
+    context.setLineDash(style.dash || []);
+    context.beginPath();
+    for (const line of layers.get(surface).lines) {
+      line.forEach(([a, b], i) => (i ? context.lineTo(frame.x(a), frame.y(b)) : context.moveTo(frame.x(a), frame.y(b))));
+    }
+    context.stroke();
+    context.globalAlpha = 1;
+    context.setLineDash([]);
+  }
+
+  drawFurniture(context, view, frame, title) {
+    const { width, height, scale } = frame;
+    const write = (text, x, y, align, font) => {
+      Object.assign(context, { font, textAlign: align, textBaseline: "middle", lineWidth: 3, strokeStyle: "rgba(0,0,0,.75)", fillStyle: "#fff" });
+      context.strokeText(text, x, y, width - 20);
+      context.fillText(text, x, y, width - 20);
+    };
+    const bold = "bold 14px system-ui, sans-serif", small = "12px system-ui, sans-serif";
+    context.strokeStyle = "rgba(255,255,255,.28)";
+    context.lineWidth = 1;
+    context.beginPath();
+    context.moveTo(frame.x(this.position[view.across]), 0); context.lineTo(frame.x(this.position[view.across]), height);
+    context.moveTo(0, frame.y(this.position[view.up])); context.lineTo(width, frame.y(this.position[view.up]));
+    context.stroke();
+    [[10, height / 2], [width - 10, height / 2], [width / 2, 30], [width / 2, height - 12]].forEach(([x, y], i) => write(view.letters[i], x, y, "center", bold));
+    const bar = [50, 20, 10, 5, 1].find((mm) => mm * scale < 0.4 * width) || 1;
+    context.fillStyle = "#000"; context.fillRect(13, height - 17, bar * scale + 2, 5);
+    context.fillStyle = "#fff"; context.fillRect(14, height - 16, bar * scale, 3);
+    write(`${bar} mm`, 14, height - 27, "left", small);
+    write(`${"xyz"[view.normal]} = ${this.position[view.normal].toFixed(1)} mm`, width - 10, height - 14, "right", small);
+    write(title, 10, 12, "left", small);
+  }
+};
+
+// The organs' outlines over the image of one state or the other.
+Palpate.Slices = class extends Palpate.Planes {
+  constructor(facts, number, section) {
+    super(facts, number, section, facts.references[facts.later[number].reference].box);
+    this.phase = "after";
+    for (const input of section.querySelectorAll(".legend input")) input.addEventListener("change", () => this.draw());
+    for (const input of section.querySelectorAll(".modes input")) input.addEventListener("change", () => this.flicker());
+    this.start();
+  }
+
+  volumes() { return [this.reference.background, this.later.background]; }
 
   get mode() { return this.section.querySelector(".modes input:checked").value; }
 
@@ -134,89 +259,19 @@ Palpate.Slices = class {
     this.draw();
   }
 
-  draw() {
+  paintPlane(context, view, frame, layers) {
     const shown = this.mode === "flicker" ? this.phase : this.mode;
-    for (const figure of this.figures) this.drawFigure(figure, shown);
-  }
-
-  drawFigure({ canvas, view, layers }, shown) {
-    const { low, high } = this.reference.box;
-    const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
-    if (!width) return;
-    canvas.width = Math.round(width * ratio); canvas.height = Math.round(height * ratio);
-    const context = canvas.getContext("2d");
-    context.scale(ratio, ratio);
-    const scale = width / (high[view.across] - low[view.across]);
-    const frame = { scale, width, height, x: (mm) => (high[view.across] - mm) * scale, y: (mm) => (high[view.up] - mm) * scale };
-    this.drawImage(context, view, frame, shown, layers);
-    this.drawContours(context, view, frame, shown);
-    this.drawFurniture(context, view, frame, shown);
-  }
-
-  drawImage(context, view, frame, shown, layers) {
-    const volume = (shown === "after" && this.later.background) || this.reference.background;
-    context.fillStyle = "#000";
-    context.fillRect(0, 0, frame.width, frame.height);
-    if (!volume) return;
-    const key = `${volume === this.reference.background} ${this.position[view.normal]}`;
-    if (layers.get("key") !== key) {
-      layers.set("key", key);
-      layers.set("picture", Palpate.layer(volume, view, this.position[view.normal], this.facts.tissues));
-    }
-    context.imageSmoothingEnabled = volume.kind === "grey";
-    const half = (k) => volume.step[k] / 2, last = (k) => volume.origin[k] + (volume.shape[k] - 1) * volume.step[k];
-    const left = frame.x(last(view.across) + half(view.across)), top = frame.y(last(view.up) + half(view.up));
-    const wide = volume.shape[view.across] * volume.step[view.across] * frame.scale;
-    context.drawImage(layers.get("picture"), left, top, wide, volume.shape[view.up] * volume.step[view.up] * frame.scale);
-  }
-
-  drawContours(context, view, frame, shown) {
-    const at = this.position[view.normal];
-    const stroke = (points, triangles, style) => {
-      Object.assign(context, { lineJoin: "round", lineCap: "round", globalAlpha: 1 }, style);
-      context.setLineDash(style.dash || []);
-      context.beginPath();
-      for (const line of Palpate.cut(points, triangles, view.normal, at, view.across, view.up)) {
-        line.forEach(([a, b], i) => (i ? context.lineTo(frame.x(a), frame.y(b)) : context.moveTo(frame.x(a), frame.y(b))));
-      }
-      context.stroke();
-    };
-    const colour = (surface) => this.facts.tissues[surface.tissue].colour;
+    const image = shown === "after" ? this.later : this.reference, volume = image.background;
+    if (volume) this.drawVolume(context, view, frame, volume, layers);
     if (this.shows("after") && shown !== "before") {
-      for (const s of this.later.surfaces) stroke(s.points, s.triangles, { strokeStyle: colour(s), lineWidth: 5.5, globalAlpha: 0.5 });
+      for (const s of this.later.surfaces) this.stroke(context, view, frame, s, layers, { lineWidth: 5.5, globalAlpha: 0.5 });
     }
     if (this.shows("before") && shown !== "after") {
-      for (const s of this.reference.surfaces) stroke(s.points, s.triangles, { strokeStyle: colour(s), lineWidth: 2.1, dash: [0.1, 3.9] });
+      for (const s of this.reference.surfaces) this.stroke(context, view, frame, s, layers, { lineWidth: 2.1, dash: [0.1, 3.9] });
     }
-    if (this.shows("model") && this.later.model.length) {
-      for (const m of this.later.model) {
-        stroke(shown === "before" ? m.rest : m.fitted, m.triangles, { strokeStyle: "#fff", lineWidth: 1.3 });
-      }
+    if (this.shows("model") && shown !== "before") {
+      for (const s of this.later.outlines) this.stroke(context, view, frame, s, layers, { lineWidth: 1.3, strokeStyle: "#fff" });
     }
-    context.globalAlpha = 1;
-    context.setLineDash([]);
-  }
-
-  drawFurniture(context, view, frame, shown) {
-    const { width, height, scale } = frame;
-    const write = (text, x, y, align, font) => {
-      Object.assign(context, { font, textAlign: align, textBaseline: "middle", lineWidth: 3, strokeStyle: "rgba(0,0,0,.75)", fillStyle: "#fff" });
-      context.strokeText(text, x, y);
-      context.fillText(text, x, y);
-    };
-    const bold = "bold 14px system-ui, sans-serif", small = "12px system-ui, sans-serif";
-    context.strokeStyle = "rgba(255,255,255,.28)";
-    context.lineWidth = 1;
-    context.beginPath();
-    context.moveTo(frame.x(this.position[view.across]), 0); context.lineTo(frame.x(this.position[view.across]), height);
-    context.moveTo(0, frame.y(this.position[view.up])); context.lineTo(width, frame.y(this.position[view.up]));
-    context.stroke();
-    [[10, height / 2], [width - 10, height / 2], [width / 2, 12], [width / 2, height - 12]].forEach(([x, y], i) => write(view.letters[i], x, y, "center", bold));
-    const bar = [50, 20, 10, 5, 1].find((mm) => mm * scale < 0.4 * width) || 1;
-    context.fillStyle = "#000"; context.fillRect(13, height - 17, bar * scale + 2, 5);
-    context.fillStyle = "#fff"; context.fillRect(14, height - 16, bar * scale, 3);
-    write(`${bar} mm`, 14, height - 27, "left", small);
-    write(`${"xyz"[view.normal]} = ${this.position[view.normal].toFixed(1)} mm`, width - 10, height - 14, "right", small);
-    if (shown !== "overlay") write(shown === "before" ? "earlier image" : "later image", 12, 14, "left", small);
+    return volume ? image.name : `${image.name}: no grey image given`;
   }
 };

@@ -2,6 +2,7 @@
 // Start every moving figure when it comes near the window; one that fails leaves its picture where it is.
 (async () => {
   Palpate.theme();
+  Palpate.copies();
   const facts = await Palpate.load();
   const soon = (section, start) => {
     const observer = new IntersectionObserver((entries) => {
@@ -24,6 +25,10 @@
   for (const section of document.querySelectorAll("section.slices")) {
     const number = Number(section.dataset.later);
     if (facts.references[facts.later[number].reference].box) soon(section, () => new Palpate.Slices(facts, number, section));
+  }
+  for (const section of document.querySelectorAll("section.alignment")) {
+    const number = Number(section.dataset.later);
+    if (facts.later[number].both.length) soon(section, () => new Palpate.Alignment(facts, number, section));
   }
   if (!Palpate.supportsWebGL()) return;
   for (const section of document.querySelectorAll("section.organs")) {

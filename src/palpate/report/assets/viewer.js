@@ -56,8 +56,13 @@ Palpate.Viewer = class {
     this.draw();
   }
 
-  // Arrow keys turn the body by ten degrees, so that it needs no mouse.
+  // Arrow keys turn the body by ten degrees, plus and minus bring it nearer and farther, so that it needs no mouse.
   key(event) {
+    const nearer = { "+": 1.2, "=": 1.2, "-": 1 / 1.2 }[event.key];
+    if (nearer && !event.ctrlKey && !event.metaKey) {
+      this.camera.zoom = Math.min(Math.max(this.camera.zoom * nearer, 0.2), 20);
+      this.draw();
+    }
     const turn = { ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
     if (!turn) return;
     event.preventDefault();

@@ -1,4 +1,4 @@
-"""One colour a tissue, the same in every figure and table of a report."""
+"""One colour a tissue, the same in every figure and table."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections import Counter
 
 from palpate.images.tissue import Role, Tissue
 
-__all__ = ["START_COLOURS", "tissue_colours"]
+__all__ = ["tissue_colours"]
 
 # They stay apart on black, on white and for the colour-blind; after Okabe & Ito, "Color Universal Design" (2008).
 ORGANS = ("#e69f00", "#56b4e9", "#cc79a7", "#2ba888", "#d55e00", "#8f8ff0", "#c5b800")
@@ -15,7 +15,6 @@ KNOWN = ("#6d7278", "#85786c", "#6c8075", "#7b6f85")
 RIGID = "#cfc8b8"
 VOID = "#303438"
 DARKEST = 64  # of the brightest channel of a tissue's own colour
-START_COLOURS = ("#3b7dd8", "#d9822b", "#3a9d5d", "#b0559b", "#8a6d3b", "#4aa3a3", "#c0504d", "#7f7fd0")
 
 
 def tissue_colours(tissues: tuple[Tissue, ...]) -> tuple[str, ...]:

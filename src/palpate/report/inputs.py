@@ -1,0 +1,58 @@
+"""The images that a result comes from, and how well the bones of the later ones lie on those of the first."""
+
+from __future__ import annotations
+
+import igl
+import numpy as np
+
+from palpate.images.segmentation import Segmentation
+from palpate.images.tissue import Role
+from palpate.report.pairs import ImagePair
+from palpate.report.report_data import BoneDistance, InputImage, TriangleSurface
+from palpate.study.result import CaseResult
+
+__all__ = ["bone_distances", "input_images"]
+
+BORDER_VOXELS = 3.0  # nearer to the later image's border its surface is cut
+
+
+def input_images(pairs: tuple[ImagePair, ...]) -> tuple[InputImage, ...]:
+    """Every label image of the pairs with its voxels and its organs' volumes."""
+    found = []
+    for number, pair in enumerate(pairs):
+        key = "" if number == 0 else f"pairs[{number - 1}]."
+        keys = (f"{key}before", *(f"{key}after[{i}]" for i in range(len(pair.after))))
+        images = (pair.result.before, *pair.result.after)
+        digests = [pair.result.provenance.inputs.get(name, "") for name in keys]
+        for later, (name, image, sha256) in enumerate(zip((pair.before, *pair.after), images, digests, strict=True)):
+            found.append(_described(name, number, image, later=later > 0, sha256=sha256))
+    return tuple(found)
+
+
+def _described(name: str, pair: int, image: Segmentation, *, later: bool, sha256: str) -> InputImage:
+    counts = np.bincount(image.index.ravel(), minlength=len(image.tissues))
+    x, y, z = (float(edge) for edge in image.grid.spacing)
+    volumes = tuple((counts * (image.grid.voxel_volume / 1000.0)).tolist())
+    return InputImage(name, pair, later, image.grid.shape, (x, y, z), volumes, sha256)
+
+
+def bone_distances(
+    result: CaseResult, after: int, earlier: tuple[TriangleSurface, ...], later: tuple[TriangleSurface, ...]
+) -> tuple[BoneDistance, ...]:
+    """Distances (mm) of the rigid tissues' surfaces from those of the aligned later image, where that shows them."""
+    grid, target = result.after[after].grid, {surface.tissue: surface for surface in later}
+    found = []
+    for surface in earlier:
+        if result.tissues[surface.tissue].role is not Role.RIGID or surface.tissue not in target:
+            continue
+        points = surface.points.astype(np.float64)
+        place = grid.index(points)
+        points = points[((place > BORDER_VOXELS) & (place < np.array(grid.shape) - 1 - BORDER_VOXELS)).all(axis=1)]
+        if len(points):
+            other = target[surface.tissue]
+            squared = igl.point_mesh_squared_distance(
+                points, other.points.astype(np.float64), other.triangles.astype(np.int64)
+            )[0]
+            distance = np.sqrt(squared)
+            found.append(BoneDistance(surface.tissue, float(distance.mean()), float(np.percentile(distance, 95.0))))
+    return tuple(found)

@@ -1,0 +1,73 @@
+"""What stands behind the lines: every state's own picture, or none; and like over like where both are compared."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from palpate.images.readers import write_scalar_image
+from palpate.report.collect import collect
+
+
+@pytest.fixture
+def with_grey(case_result, tmp_path):
+    """The result with grey images of some states: the earlier one of the values 40, the later one of 90."""
+
+    def given(*, before, after):
+        grid = case_result.before.grid
+        for name, value in (("before", 40.0), ("after", 90.0)):
+            values = np.full(grid.shape, value)
+            values[:2], values[2:4] = -900.0, 1500.0
+            write_scalar_image(tmp_path / f"{name}.nii.gz", values, grid)
+        images = dataclasses.replace(
+            case_result.case.images,
+            intensities_before=tmp_path / "before.nii.gz" if before else None,
+            intensities_after=(tmp_path / "after.nii.gz",) if after else (),
+        )
+        return collect(dataclasses.replace(case_result, case=dataclasses.replace(case_result.case, images=images)))
+
+    return given
+
+
+def middle(volume):
+    """The image's value in the middle of a grey volume."""
+    step = volume.values[tuple(n // 2 for n in volume.values.shape)]
+    return volume.span[0] + step * (volume.span[1] - volume.span[0]) / 1023
+
+
+def test_every_state_shows_its_own_grey_image(with_grey):
+    data = with_grey(before=True, after=True)
+    assert middle(data.references[0].background) == pytest.approx(40.0, abs=2.1)
+    assert middle(data.later[0].background) == pytest.approx(90.0, abs=2.1)
+    assert [middle(volume) for volume in data.later[0].both] == pytest.approx([40.0, 90.0], abs=2.1)
+
+
+def test_a_state_without_a_grey_image_shows_none_of_another_state(with_grey):
+    data = with_grey(before=True, after=False)
+    assert data.references[0].background.kind == "grey"
+    assert data.later[0].background is None
+    data = with_grey(before=False, after=True)
+    assert data.references[0].background is None
+    assert data.later[0].background.kind == "grey"
+
+
+@pytest.mark.parametrize(("before", "after"), [(True, False), (False, True), (False, False)])
+def test_the_alignment_lays_labels_over_labels_where_a_grey_image_is_missing(with_grey, before, after):
+    assert [volume.kind for volume in with_grey(before=before, after=after).later[0].both] == ["labels", "labels"]
+
+
+def test_without_any_grey_image_both_states_show_their_labels(case_result):
+    data = collect(case_result)
+    assert data.references[0].background.kind == data.later[0].background.kind == "labels"
+
+
+def test_a_ct_opens_with_soft_tissue_in_its_window_and_keeps_the_rest(with_grey):
+    volume = with_grey(before=True, after=False).references[0].background
+    assert (volume.window, volume.unit) == ((-160.0, 240.0), "HU")
+    assert volume.shade(np.array([0.0, 1023.0])).tolist() == [0.0, 1.0]
+    step = (volume.span[1] - volume.span[0]) / 1023
+    assert float(volume.shade(np.array((40.0 - volume.span[0]) / step))) == pytest.approx(0.5)
+    assert volume.span[0] <= -900.0
+    assert volume.span[1] >= 1500.0

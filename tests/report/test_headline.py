@@ -1,0 +1,63 @@
+"""The banner: what came out in plain words, never a result where there is none."""
+
+from __future__ import annotations
+
+import pytest
+
+from palpate.report.headline import headline, listed
+
+
+def document(*verdicts, status="converged", warnings=0, minima=(0, 0)):
+    return {
+        "status": status,
+        "reason": "the decrement fell under its tolerance",
+        "estimates": [{"tissue": f"organ {i}", "verdict": verdict} for i, verdict in enumerate(verdicts)],
+        "warnings": [{"code": "a", "message": "b"}] * warnings,
+        "starts": [{"minimum": minimum} for minimum in minima],
+    }
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "warnings", "kind"),
+    [
+        (("identified", "identified"), 0, "good"),
+        (("ratio only", "identified"), 0, "good"),
+        (("identified", "weak"), 0, "fair"),
+        (("identified",), 1, "fair"),
+        (("not identified",), 0, "fair"),
+    ],
+)
+def test_only_what_can_be_used_as_it_stands_is_good(verdicts, warnings, kind):
+    assert headline(document(*verdicts, warnings=warnings)).kind == kind
+
+
+def test_every_tissue_is_named_once_with_what_its_verdict_means():
+    said = " ".join(headline(document("identified", "not identified", "identified")).sentences)
+    assert "fix the stiffness of organ 0 and organ 2." in said
+    assert "do not fix organ 1: do not use that number" in said
+    assert said.count("organ") == 3
+
+
+@pytest.mark.parametrize("status", ["not converged", "failed"])
+def test_without_convergence_there_is_no_result(status):
+    banner = headline(document("identified", status=status))
+    assert banner.kind == "bad"
+    assert banner.title.startswith("There is no result")
+    assert banner.sentences == ("the decrement fell under its tolerance",)
+
+
+@pytest.mark.parametrize(("count", "words"), [(0, "No warnings."), (1, "1 warning"), (3, "3 warnings")])
+def test_warnings_are_counted(count, words):
+    assert headline(document("weak", warnings=count)).warnings == words
+
+
+def test_starts_that_disagree_are_told_of():
+    assert "2 different answers" in " ".join(headline(document("weak", minima=(0, 1, 0))).sentences)
+    assert "same answer from all 3" in " ".join(headline(document("weak", minima=(0, 0, 0))).sentences)
+
+
+@pytest.mark.parametrize(
+    ("names", "words"), [([], ""), (["a"], "a"), (["a", "b"], "a and b"), (["a", "b", "c"], "a, b and c")]
+)
+def test_names_stand_as_in_a_sentence(names, words):
+    assert listed(names) == words

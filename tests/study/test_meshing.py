@@ -1,0 +1,113 @@
+"""Meshes of reference states: shorter edges where a mesh is not fit, which `check` finds as an estimate does."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from palpate.errors import GeometryError, MeshQualityError
+from palpate.images.label_image import LabelImage
+from palpate.images.readers import write_label_image
+from palpate.progress import silent
+from palpate.study import cost, meshing
+from palpate.study.body import ImagedStates, make_body
+from palpate.study.case_text import case_text
+from palpate.study.check import check_case
+from palpate.study.meshing import mesh_reference
+
+
+@pytest.fixture
+def tried(case_result, monkeypatch):
+    """The edge lengths that are tried where only those under 2.5 mm are fit."""
+    edges = []
+
+    def fit(*arguments):
+        edge_length_mm = arguments[2]
+        edges.append(edge_length_mm)
+        if edge_length_mm > 2.5:
+            raise MeshQualityError(f"a dihedral angle at {edge_length_mm:g} mm")
+        return case_result.space.mesh, Quality()
+
+    monkeypatch.setattr(meshing, "_fit_mesh", fit)
+    monkeypatch.setattr(cost, "machine_memory_gb", lambda: 1e3)
+    return edges
+
+
+@dataclasses.dataclass
+class Quality:
+    tets: int = 5000
+    min_dihedral_deg: float = 20.0
+
+
+def with_edge(case, edge):
+    return dataclasses.replace(case, mesh=dataclasses.replace(case.mesh, edge_length_mm=edge))
+
+
+def mesh_of(result, edge, progress=silent):
+    return mesh_reference(result.before, result.after, with_edge(result.case, edge), progress=progress)
+
+
+def test_a_mesh_that_is_fit_is_made_once_and_nothing_is_said(case_result, tried):
+    found = mesh_of(case_result, 2.0)
+    assert (tried, found.edge_length_mm, found.findings) == ([2.0], 2.0, ())
+
+
+def test_a_mesh_that_is_not_fit_is_followed_by_finer_ones_which_the_result_tells(case_result, tried):
+    told = []
+    found = mesh_of(case_result, 4.0, told.append)
+    assert tried == [4.0, 3.0, 2.25]
+    assert found.edge_length_mm == 2.25
+    (finding,) = found.findings
+    assert finding.code == "finer-mesh"
+    assert "mesh.edge_length_mm = 2.25 in place of 4" in finding.message
+    assert "a dihedral angle at 3 mm" in finding.message
+    assert any("not fit: a dihedral angle at 4 mm" in line for line in told)
+
+
+def test_after_two_finer_meshes_the_last_refusal_stands_with_all_that_was_tried(case_result, tried):
+    with pytest.raises(MeshQualityError, match=r"= 5 nor at 3.75 and 2.812 mm, where a dihedral angle at 2.812 mm"):
+        mesh_of(case_result, 5.0)
+    assert len(tried) == 3
+
+
+def test_no_finer_mesh_is_tried_that_the_machine_has_no_memory_for(case_result, tried, monkeypatch):
+    monkeypatch.setattr(cost, "machine_memory_gb", lambda: 0.01)
+    with pytest.raises(GeometryError, match=r"at 4 mm; a mesh of 3 mm was not tried: about .* GB of memory would be"):
+        mesh_of(case_result, 4.0)
+    assert tried == [4.0]
+
+
+@pytest.fixture
+def on_disk(case_result, tmp_path):
+    """The case with its images, without anything meshed."""
+    for name, image in (("before", case_result.before), ("after", case_result.after[0])):
+        labels = LabelImage(image.index.astype("int32") + 1, image.grid)
+        write_label_image(tmp_path / f"{name}.nii.gz", labels)
+    images = dataclasses.replace(
+        case_result.case.images, before=tmp_path / "before.nii.gz", after=(tmp_path / "after.nii.gz",)
+    )
+    case = dataclasses.replace(case_result.case, images=images)
+    (tmp_path / "case.toml").write_text(case_text(case, tmp_path))
+    return tmp_path / "case.toml"
+
+
+@pytest.mark.parametrize(("edge", "code"), [(4.0, 0), (6.0, 4)])
+def test_check_makes_the_mesh_of_the_estimate_and_predicts_its_cost(case_result, on_disk, tried, edge, code):
+    found = check_case(on_disk, [f"mesh.edge_length_mm={edge}"], progress=silent)
+    assert found.exit_code == code
+    assert len(tried) == 3
+    states = ImagedStates(case_result.before, case_result.after, ({},), ())
+    if code:
+        assert [problem.code for problem in found.problems if problem.exit_code] == ["MeshQualityError"]
+        assert found.cost.tets != Quality.tets  # that of a mesh of the wanted size, roughly
+    else:
+        body = make_body(states, with_edge(case_result.case, edge), progress=silent)
+        assert (found.cost.tets, found.cost.unknowns) == (Quality.tets, 3 * len(body.space.points))
+        assert "finer-mesh" in [problem.code for problem in found.problems]
+
+
+@pytest.mark.usefixtures("tried")
+def test_check_says_the_same_twice(on_disk):
+    first, second = (check_case(on_disk, [], progress=silent).to_dict() for _ in range(2))
+    assert first == second

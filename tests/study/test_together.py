@@ -1,0 +1,63 @@
+"""Several later images and several moduli together, as a result states them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from palpate.inversion import invert
+from palpate.observation.noise_model import NoiseModel
+from palpate.study.estimate_findings import pair_findings
+from palpate.study.together import ImagePairs, PairAlone, combinations_of, image_pairs_of
+
+NOISE = NoiseModel(np.array([0.1**2]), np.array([3.0]))
+
+
+@pytest.fixture(scope="module")
+def settings(twins):
+    return twins.settings(2.0)
+
+
+@pytest.fixture(scope="module")
+def both(twins, settings):
+    """Two motions of one body."""
+    problem = twins.exact_problem(*(twins.make_twin(seed=seed) for seed in (5, 8)), noise=NOISE)
+    return invert(problem, settings, progress=twins.silent)
+
+
+@pytest.fixture(scope="module")
+def single(twins, twin, settings):
+    return invert(twins.exact_problem(twin, noise=NOISE), settings, progress=twins.silent)
+
+
+def test_later_images_are_stated_in_kpa_each_alone(both, settings):
+    found = image_pairs_of(both, settings.bounds)
+    assert len(found.alone) == 2
+    for pair in found.alone:
+        low, high = pair.interval95["gland"]
+        assert low < 30.0 < high
+        assert low < pair.moduli["gland"] < high
+    low, high = found.mean_interval95["gland"]
+    assert high / low < min(pair.interval95["gland"][1] / pair.interval95["gland"][0] for pair in found.alone)
+    assert pair_findings(found) == ()
+
+
+def test_one_later_image_has_no_other_to_agree_with(single, settings):
+    assert image_pairs_of(single, settings.bounds) is None
+    assert pair_findings(None) == ()
+
+
+def test_a_mean_is_in_kpa_and_a_ratio_has_no_unit(single):
+    wide = np.array([[1.0, -0.995], [-0.995, 1.0]])
+    (mean,) = combinations_of(single, wide, within=2.0)
+    (ratio,) = combinations_of(single, np.abs(wide), within=2.0)
+    assert (mean.kind, mean.value) == ("geometric mean", pytest.approx(np.sqrt(30.0 * 20.0), rel=0.05))
+    assert (ratio.kind, ratio.value) == ("ratio", pytest.approx(1.5, rel=0.1))
+
+
+def test_an_image_that_contradicts_the_others_is_named_with_what_they_say():
+    alone = [PairAlone({"p": 30.0}, {"p": (27.0, 33.0)}, number == 1, {"p": 4.0 * number}) for number in range(3)]
+    first, second = pair_findings(ImagePairs(tuple(alone), 1e-4, {"p": 0.1}, {"p": 31.0}, {"p": (29.0, 33.0)}))
+    assert (first.code, second.code) == ("pair-outlier", "heterogeneous")
+    assert "'after[2]' contradicts" in first.message
+    assert "p 31" in first.message
