@@ -88,7 +88,7 @@ def scatter_svg(patients: Patients, tissue: str, unit: str, line: Mapping[str, A
         _label(axes, unit)
 
     says = (
-        f"Each patient's modulus of {tissue} with its 95 % interval against the stage, in {unit}, and the weighted line"
+        f"Each patient's modulus of {tissue} with its 95 % interval against the stage, {unit}, with the weighted line"
     )
     return draw_svg(draw, size=SIZE, name=name, says=says)
 
