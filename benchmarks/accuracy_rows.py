@@ -8,7 +8,7 @@ import numpy as np
 
 from palpate.images import Role, segment
 from palpate.inversion import InverseProblem, InversionSettings, LaterState, parameter_map
-from palpate.mechanics import linear_model, outer_constraint
+from palpate.mechanics import ACCURACY, NewtonSettings, finite_strain_model, linear_model, outer_constraint
 from palpate.mesh import LagrangeSpace, lagrange_space, tetrahedralise
 from palpate.observation import observed_surface, prescribed_motion, surface_distance
 from palpate.phantoms import (
@@ -162,4 +162,6 @@ def _from_surfaces(
     observed = [i for i, t in enumerate(scene.tissues) if t.role in (Role.ESTIMATE, Role.DRIVER)]
     seen = tuple(surface_distance(exact_target(scene, observed_surface(space, i))) for i in observed)
     mapping = parameter_map(scene.tissues, model.regions, [model.n_modes])
-    return space, InverseProblem((LaterState(model, seen, walls=motion.walls),), mapping)
+    law = case.mechanics.material_law
+    finite = finite_strain_model(space, constraint, law, settings=NewtonSettings(ACCURACY)) if law.finite else None
+    return space, InverseProblem((LaterState(model, seen, finite, walls=motion.walls),), mapping)

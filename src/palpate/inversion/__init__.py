@@ -4,7 +4,7 @@ from palpate.inversion.approximation import Approximation, ExactApproximation, P
 from palpate.inversion.driver_fit import fit_driver
 from palpate.inversion.estimate import Inversion, StartRun, continue_at_finite_strain, invert
 from palpate.inversion.later_state import InverseProblem, LaterState
-from palpate.inversion.objective import Evaluation, Linearisation, Objective
+from palpate.inversion.objective import Evaluation, Linearisation, LinearisedObjective, Objective
 from palpate.inversion.optimise import (
     Bounds,
     Iterate,
@@ -30,6 +30,7 @@ __all__ = [
     "Iterate",
     "LaterState",
     "Linearisation",
+    "LinearisedObjective",
     "Minimum",
     "Objective",
     "Outcome",

@@ -12,7 +12,7 @@ from palpate.uncertainty.covariance import (
 )
 from palpate.uncertainty.image_pairs import Agreement, PairEstimate, agreement, pair_estimates
 from palpate.uncertainty.intervals import NORMAL_95, Interval, ModulusInterval, log_interval, modulus_interval
-from palpate.uncertainty.profile import Profile, fixed_correspondence
+from palpate.uncertainty.profile import FixedCorrespondence, Profile, fixed_correspondence
 from palpate.uncertainty.sampling import sample_posterior
 
 __all__ = [
@@ -21,6 +21,7 @@ __all__ = [
     "Combination",
     "Covariance",
     "FittedState",
+    "FixedCorrespondence",
     "Information",
     "Interval",
     "ModulusInterval",

@@ -1,0 +1,265 @@
+"""Whether intervals hold: random pelves, noise on exact surfaces of another mesh, the same outer loop and intervals.
+
+    python benchmarks/coverage.py [--settings gauss-0.3-6,...] [--pelves N] [--draws N] [--laws linear,neo-hookean]
+                                  [--first-seed S] [--edge MM] [--output FILE] [--json]
+
+For each pelvis one estimate from the clean surfaces of a finer mesh. Then each draw moves both images' surfaces along
+their normals by a random field of its own, and weights and moduli are sought anew **with the closest points and the
+approximation of the clean estimate** (the fast path: a second a draw); intervals are the product's, without the part of
+the voxels' place. A line of JSON a pelvis, as soon as it is done; another run with the same file adds to it. The truths
+are known: simulated data.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from accuracy import true_ratios
+from accuracy_rows import ROWS, posed
+from numpy.typing import NDArray
+from scipy import stats
+
+from palpate.inversion import (
+    Bounds,
+    Evaluation,
+    Linearisation,
+    LinearisedObjective,
+    Minimum,
+    Objective,
+    gauss_newton,
+    invert,
+    reweighted,
+)
+from palpate.phantoms import smooth_field
+from palpate.uncertainty import FixedCorrespondence, fixed_correspondence, modulus_interval, sandwich_covariance
+
+Array = NDArray[np.float64]
+Shift = Callable[[Array, Array, np.random.Generator, bool], Array]  # of places and normals, in the later image or not
+
+PASSES = 10
+SETTLED = 0.02  # posterior standard deviations
+LEVELS = (0.50, 0.68, 0.80, 0.90, 0.95, 0.99)
+FAR = 3.0  # half-widths
+SLICE_MM, CUT_SHARE = 2.5, 0.15
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A kind of segmentation error: how far (n,) mm surfaces at places (n, 3) move along their normals (n, 3)."""
+
+    name: str
+    gaussian: bool
+    shift: Shift
+
+
+def gauss(sd_mm: float, correlation_mm: float) -> Setting:
+    """Both images' surfaces moved by fields of their own."""
+
+    def shift(places: Array, normals: Array, rng: np.random.Generator, later: bool) -> Array:
+        del later
+        field = smooth_field(rng, sd_mm=sd_mm, correlation_mm=correlation_mm)
+        return np.asarray(np.einsum("ni,ni->n", field.at(places), normals))
+
+    return Setting(f"gauss-{sd_mm}-{correlation_mm:g}", True, shift)
+
+
+def _one_sided(places: Array, normals: Array, rng: np.random.Generator, later: bool) -> Array:
+    """Over-segmentation: outwards only, by 0.3 mm times the absolute value of a normal field."""
+    del later
+    field = smooth_field(rng, sd_mm=0.3, correlation_mm=6.0)
+    return np.asarray(np.abs(np.einsum("ni,ni->n", field.at(places), normals)))
+
+
+def _missing_slice(places: Array, normals: Array, rng: np.random.Generator, later: bool) -> Array:
+    """The later image's uppermost slice of 2.5 mm is missing, beside a normal field of 0.2 mm."""
+    moved = gauss(0.2, 6.0).shift(places, normals, rng, later)
+    if not later:
+        return moved
+    top = places[:, 2].max() - SLICE_MM
+    return np.asarray(moved - np.maximum(places[:, 2] - top, 0.0) * np.maximum(normals[:, 2], 0.0))
+
+
+def _shrunk(places: Array, normals: Array, rng: np.random.Generator, later: bool) -> Array:
+    """Every organ of the later image is smaller by 0.2 mm all around, beside a normal field of 0.2 mm."""
+    return np.asarray(gauss(0.2, 6.0).shift(places, normals, rng, later) - (0.2 if later else 0.0))
+
+
+SETTINGS = {
+    setting.name: setting
+    for setting in (
+        *(gauss(sd, 6.0) for sd in (0.1, 0.2, 0.3, 0.5)),
+        gauss(0.3, 3.0),
+        gauss(0.3, 12.0),
+        Setting("one-sided", False, _one_sided),
+        Setting("missing-slice", False, _missing_slice),
+        Setting("shrunk", False, _shrunk),
+    )
+}
+
+
+@dataclass(frozen=True)
+class Clean:
+    """An estimate from clean surfaces, from which all draws of one pelvis begin; truth (n,): ln of the true ratios."""
+
+    objective: Objective
+    minimum: Minimum
+    bounds: Bounds
+    truth: Array
+
+
+def main() -> int:
+    """Run what was asked for and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--settings", default=",".join(SETTINGS))
+    parser.add_argument("--laws", default="linear,neo-hookean")
+    parser.add_argument("--pelves", type=int, default=10)
+    parser.add_argument("--draws", type=int, default=20)
+    parser.add_argument("--first-seed", type=int, default=501)
+    parser.add_argument("--edge", type=float, default=5.0, help="edge length (mm) of the estimate's mesh")
+    parser.add_argument("--output", type=Path, default=Path("coverage.jsonl"))
+    parser.add_argument("--json", action="store_true", help="print one JSON document")
+    asked = parser.parse_args()
+    rows = [json.loads(line) for line in asked.output.read_text().splitlines()] if asked.output.exists() else []
+    done = {(row["law"], row["seed"], row["setting"]) for row in rows}
+    for law in asked.laws.split(","):
+        for seed in range(asked.first_seed, asked.first_seed + asked.pelves):
+            open_ = [name for name in asked.settings.split(",") if (law, seed, name) not in done]
+            if not open_:
+                continue
+            clean = _clean(law, seed, asked.edge)
+            for name in open_:
+                found = [_drawn(clean, SETTINGS[name], seed, draw) for draw in range(asked.draws)]
+                rows.append({"law": law, "seed": seed, "setting": name, "draws": found})
+                with asked.output.open("a") as file:
+                    file.write(json.dumps(rows[-1]) + "\n")
+                print(f"{law} {seed} {name}: {_line(rows[-1:])}", file=sys.stderr, flush=True)
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {(row["law"], row["setting"]): [] for row in rows}
+    for row in rows:
+        groups[row["law"], row["setting"]].append(row)
+    table = {f"{law} {name}": _summary(of) for (law, name), of in groups.items()}
+    print(json.dumps(table, indent=1) if asked.json else "\n".join(f"{name}: {_line(of)}" for name, of in _by(groups)))
+    return 0
+
+
+def _by(groups: dict[tuple[str, str], list[dict[str, Any]]]) -> list[tuple[str, list[dict[str, Any]]]]:
+    return [(f"{law:12} {name:14}", rows) for (law, name), rows in groups.items()]
+
+
+def _clean(law: str, seed: int, edge_mm: float) -> Clean:
+    row = replace(ROWS["other-mesh"], law=law, edge_mm=edge_mm, truth_edge_mm=0.68 * edge_mm)
+    case = posed(row, seed, 0, {})
+    found = invert(case.problem, case.settings, progress=lambda _: None)
+    truth = np.log(true_ratios(found.objective, case.scene))
+    return Clean(found.objective, found.minimum, case.settings.bounds, truth)
+
+
+def _drawn(clean: Clean, setting: Setting, seed: int, draw: int) -> dict[str, Any]:
+    """Errors of ln E, standard deviations, interval ends and the root deviance at the truth, by organ."""
+    rng = np.random.default_rng([seed, draw, *setting.name.encode()])
+    lines = _moved(clean.minimum.evaluation.lines, setting, rng)
+    evaluation = replace(clean.minimum.evaluation, lines=lines)
+    objective, minimum, fixed = _settled(clean, evaluation)
+    n = objective.n_parameters
+    covariance = sandwich_covariance(objective, minimum.evaluation)
+    theta, found = minimum.unknowns[:n], []
+    for i in range(n):
+        variance = float(covariance[i, i])
+        interval = modulus_interval(fixed, minimum, i, variance=variance, bounds=clean.bounds)
+        low, high = (None if end is None else float(np.log(end)) for end in interval.ends)
+        found.append(
+            {
+                "error": float(theta[i] - clean.truth[i]),
+                "sd": float(np.sqrt(variance)),
+                "low": None if low is None else low - float(clean.truth[i]),
+                "high": None if high is None else high - float(clean.truth[i]),
+                "kind": interval.kind,
+                "root": _root(interval.profile.theta, interval.profile.root, float(clean.truth[i])),
+            }
+        )
+    return {"converged": minimum.converged, "organs": found}
+
+
+def _moved(lines: Sequence[Linearisation], setting: Setting, rng: np.random.Generator) -> tuple[Linearisation, ...]:
+    """The residuals with both images' surfaces moved; one field an image, across all organs."""
+    residuals = [line.residuals for line in lines]
+    normals = np.concatenate([r.normals for r in residuals])
+    after = setting.shift(np.concatenate([r.places for r in residuals]), normals, rng, True)
+    before = setting.shift(np.concatenate([r.material for r in residuals]), normals, rng, False)
+    ends = np.cumsum([len(r.values) for r in residuals])[:-1]
+    moved = [
+        replace(line, residuals=replace(r, values=r.values - error))
+        for line, r, error in zip(lines, residuals, np.split(after - before, ends), strict=True)
+    ]
+    return tuple(moved)
+
+
+def _settled(clean: Clean, evaluation: Evaluation) -> tuple[Objective, Minimum, FixedCorrespondence]:
+    """Weights and moduli that agree with each other on the moved surfaces."""
+    minimum = replace(clean.minimum, evaluation=evaluation)
+    objective, n = clean.objective, clean.objective.n_parameters
+    for _ in range(PASSES):
+        objective = reweighted(objective, minimum)
+        again = LinearisedObjective(objective, minimum.unknowns, minimum.evaluation)(minimum.unknowns)
+        fixed = fixed_correspondence(objective, minimum.unknowns, again)
+        before, minimum = minimum, gauss_newton(fixed, minimum.unknowns, bounds=clean.bounds, tolerance=1e-5)
+        sd = np.sqrt(np.diag(minimum.evaluation.covariance_columns(n)))
+        if np.all(np.abs(minimum.unknowns - before.unknowns)[:n] < SETTLED * sd):
+            break
+    return objective, minimum, fixed
+
+
+def _root(theta: Array, root: Array, truth: float) -> float:
+    """Signed root deviance at the truth, between the points of a profile and on their chords beyond them."""
+    if theta[0] <= truth <= theta[-1] or len(theta) < 2:
+        return float(np.interp(truth, theta, root))
+    (a, b), (c, d) = (theta[:2], root[:2]) if truth < theta[0] else (theta[-2:], root[-2:])
+    return float(c + (truth - a) * (d - c) / (b - a))
+
+
+def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Coverage of the 95 % intervals, calibration, and widths beside the spread of the estimates."""
+    organs = [organ for row in rows for draw in row["draws"] if draw["converged"] for organ in draw["organs"]]
+    lows = np.array([-np.inf if o["low"] is None else o["low"] for o in organs])
+    highs = np.array([np.inf if o["high"] is None else o["high"] for o in organs])
+    held, roots = (lows <= 0.0) & (highs >= 0.0), np.abs([o["root"] for o in organs])
+    spread = [
+        np.std([draw["organs"][i]["error"] for draw in row["draws"]], ddof=1)
+        / np.median([draw["organs"][i]["sd"] for draw in row["draws"]])
+        for row in rows
+        for i in range(len(row["draws"][0]["organs"]))
+    ]
+    interval = stats.binomtest(int(held.sum()), len(held)).proportion_ci()
+    half = np.array([1.96 * o["sd"] for o in organs])
+    return {
+        "intervals": len(organs),
+        "not_converged": sum(not draw["converged"] for row in rows for draw in row["draws"]),
+        "coverage95": float(held.mean()),
+        "coverage95_interval": [float(interval.low), float(interval.high)],
+        "calibration": {str(level): float(np.mean(roots <= stats.norm.ppf(0.5 + level / 2))) for level in LEVELS},
+        "sd_over_spread": float(1.0 / np.median(spread)),
+        "beyond_three_half_widths": int(np.sum(np.abs([o["error"] for o in organs]) > FAR * half)),
+        "profile_share": float(np.mean([o["kind"] == "profile" for o in organs])),
+        "median_error_percent": float(100.0 * np.median(np.abs(np.expm1([o["error"] for o in organs])))),
+    }
+
+
+def _line(rows: Sequence[dict[str, Any]]) -> str:
+    of = _summary(rows)
+    low, high = of["coverage95_interval"]
+    calibration = " ".join(f"{float(level):.0%}:{found:.0%}" for level, found in of["calibration"].items())
+    return (
+        f"{of['coverage95']:.1%} [{low:.1%}, {high:.1%}] of {of['intervals']} held; {calibration}; sd / spread"
+        f" {of['sd_over_spread']:.2f}; beyond 3 half-widths {of['beyond_three_half_widths']};"
+        f" profiles {of['profile_share']:.0%}; median error {of['median_error_percent']:.1f} %"
+    )
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
