@@ -266,6 +266,17 @@ def test_warnings_of_one_code_are_folded(case_result, tmp_path):
     assert all(f"warning number {i}" in page for i in range(5))
 
 
+def test_warnings_stand_under_what_they_cost(case_result, tmp_path):
+    found = [Finding(code, f"said by {code}") for code in ("earlier-files", "cut-by-border", "thin", "mirrored")]
+    estimation = dataclasses.replace(case_result.estimation, remarks=())
+    result = dataclasses.replace(case_result, estimation=estimation, remarks=tuple(found))
+    page = write_case_report(result, tmp_path).read_text()
+    order = ["more than its interval", "said by mirrored", "said by thin"]
+    order += ["narrower intervals", "said by cut-by-border", "as good as without", "said by earlier-files"]
+    places = [page.index(words) for words in order]
+    assert places == sorted(places)
+
+
 def test_what_did_not_converge_shows_no_number(case_result, tmp_path):
     estimation = dataclasses.replace(case_result.estimation, status="not converged", reason="it stopped early")
     page = write_case_report(dataclasses.replace(case_result, estimation=estimation), tmp_path).read_text()

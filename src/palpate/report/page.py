@@ -15,6 +15,7 @@ import jinja2
 import numpy as np
 from markupsafe import Markup, escape
 
+from palpate.findings import HARMLESS, WIDENING
 from palpate.report.charts import (
     START_COLOURS,
     angle_svg,
@@ -39,6 +40,14 @@ __all__ = ["Picture", "render"]
 T = TypeVar("T")
 LOGGER = logging.getLogger(__name__)
 SCRIPTS = ("three.min.js", "report.js", "slices.js", "alignment.js", "viewer.js", "organs.js", "mesh.js", "start.js")
+COSTS: tuple[tuple[str, Callable[[str], bool]], ...] = (  # a code that is not ours may cost as much as any
+    (
+        "The result stands, but each of these can move a modulus by more than its interval.",
+        lambda code: code not in (*WIDENING, *HARMLESS),
+    ),
+    ("Of the images: others would give narrower intervals, or values in kPa.", lambda code: code in WIDENING),
+    ("The numbers are as good as without these.", lambda code: code in HARMLESS),
+)
 POLICY = (
     "default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data:; base-uri 'none';"
     " form-action 'none'"
@@ -135,12 +144,16 @@ def _policy(scripts: tuple[Markup, ...]) -> Markup:
     return Markup(POLICY.format(hashes=hashes))  # noqa: S704 - our own words and base64
 
 
-def _warnings(data: ReportData) -> tuple[tuple[str, tuple[str, ...]], ...]:
-    """Code and messages of the warnings, those of one code together."""
+def _warnings(data: ReportData) -> tuple[tuple[str, tuple[tuple[str, tuple[str, ...]], ...]], ...]:
+    """A caption with the codes and messages of the warnings under it, those of one code together, for each cost."""
     groups: dict[str, list[str]] = {}
     for warning in data.document["warnings"]:
         groups.setdefault(str(warning["code"]), []).append(str(warning["message"]))
-    return tuple((code, tuple(messages)) for code, messages in groups.items())
+    said = {code: (code, tuple(messages)) for code, messages in groups.items()}
+    if data.document["status"] != "converged":
+        return (("There is no result; these were noticed on the way.", tuple(said.values())),)
+    costs = ((caption, tuple(said[code] for code in said if fits(code))) for caption, fits in COSTS)
+    return tuple((caption, codes) for caption, codes in costs if codes)
 
 
 def _later(data: ReportData, k: int, later: LaterImage) -> _Later:
