@@ -22,6 +22,7 @@ from palpate.uncertainty.profile import FixedCorrespondence, fixed_correspondenc
 __all__ = ["FastPath", "Shift", "fast_path", "modulus_errors", "poisson_errors", "surface_errors"]
 
 TOLERANCE = 1e-6  # decrement of a minimum
+STEPS = 120  # at the most: a modulus that runs away has far to go
 DROPPED = 1e10  # precision of a coefficient that is held at 0: its own is 1
 AT_BOUND = 1e-6
 
@@ -68,7 +69,7 @@ class FastPath:
             seen = [replace(o.residuals, values=o.residuals.values + e) for o, e in zip(lines, errors, strict=True)]
             lines = tuple(replace(line, residuals=own) for line, own in zip(lines, seen, strict=True))
         changed = replace(fixed, objective=objective, lines=lines)
-        found = gauss_newton(changed, start, bounds=self.bounds, tolerance=TOLERANCE)
+        found = gauss_newton(changed, start, bounds=self.bounds, tolerance=TOLERANCE, max_steps=STEPS)
         theta = found.unknowns[:n]
         room = np.minimum(theta - self.bounds.lower, self.bounds.upper - theta)
         return Shift(theta - self.least.unknowns[:n], room < AT_BOUND, found.converged)
