@@ -56,7 +56,8 @@ def boxes_svg(patients: Patients, tissue: str, unit: str, *, name: str) -> str:
         axes.set_xlim(min(stages) - 0.6, max(stages) + 0.6)
         _label(axes, unit)
 
-    return draw_svg(draw, size=SIZE, name=name)
+    says = f"{tissue}: quartiles of the scans' {_axis(unit)} at each stage, medians of patients as points"
+    return draw_svg(draw, size=SIZE, name=name, says=says)
 
 
 def scatter_svg(patients: Patients, tissue: str, unit: str, line: Mapping[str, Any], *, name: str) -> str:
@@ -86,7 +87,8 @@ def scatter_svg(patients: Patients, tissue: str, unit: str, line: Mapping[str, A
         axes.yaxis.set_minor_formatter(NullFormatter())
         _label(axes, unit)
 
-    return draw_svg(draw, size=SIZE, name=name)
+    says = f"{tissue}: each patient's {_axis(unit)} with its 95 % interval against the stage, and a line through them"
+    return draw_svg(draw, size=SIZE, name=name, says=says)
 
 
 def forest_svg(patients: Patients, tissue: str, unit: str, *, name: str) -> str:
@@ -118,7 +120,8 @@ def forest_svg(patients: Patients, tissue: str, unit: str, *, name: str) -> str:
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_xlabel(_axis(unit))
 
-    return draw_svg(draw, size=(SIZE[0], height), name=name)
+    says = f"{tissue}: each patient's {_axis(unit)} with its 95 % interval, by stage"
+    return draw_svg(draw, size=(SIZE[0], height), name=name, says=says)
 
 
 def _stages(patients: Patients, tissue: str) -> list[int]:
