@@ -51,7 +51,7 @@ class Supervisor:
                 for message in self._heard(process, LOOK_S):
                     watch.hear(message)
                 watch.look()
-        except (OSError, EOFError):
+        except (OSError, EOFError, ValueError):  # gone, closed from another thread, or no line of ours
             self._drop()
         return watch.verdict()
 
