@@ -10,8 +10,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from palpate.cli import cohorts, commands, studies, verification, written
+from palpate.cli import cohorts, commands, exports, studies, verification, written
 from palpate.cli.outcome import Outcome
+from palpate.export.formats import FORMATS
 
 __all__ = ["make_parser", "version"]
 
@@ -32,6 +33,10 @@ EXAMPLES = {
         "palpate estimate case/case.toml --output out",
         "palpate estimate out/case.toml --set mechanics.law=linear --output linear",
     ),
+    "export": (
+        "palpate export out --format abaqus --output abaqus",
+        "palpate export out --format dicom --source series/ --output dicom",
+    ),
     "report": ("palpate report out", "palpate report out --json"),
     "cohort": (
         "palpate cohort cohort.csv --template case.toml --output study",
@@ -40,6 +45,7 @@ EXAMPLES = {
     "status": ("palpate status study", "palpate status study --json"),
     "statistics": ("palpate statistics study", "palpate statistics study --json"),
     "reproduce": ("palpate reproduce table1", "palpate reproduce figure4 --output figure4"),
+    "view": ("palpate view out", "palpate view out --no-browser"),
     "verify": ("palpate verify --quick", "palpate verify --output verification"),
 }
 
@@ -95,6 +101,8 @@ def make_parser() -> argparse.ArgumentParser:
     simulate.set_defaults(targets=commands.SIMULATION_TARGETS)
     _add_estimate(subparsers)
     _add_report(subparsers)
+    _add_export(subparsers)
+    _add_view(subparsers)
     _add_cohort(subparsers)
     _add_reproduce(subparsers)
     _add_verify(subparsers)
@@ -143,6 +151,27 @@ def _add_report(subparsers: Any) -> None:
     command = _command(subparsers, "report", written.report, what=what, folder=None)
     command.add_argument("output", type=Path, metavar="DIR", help="the output folder of an estimate")
     command.set_defaults(makes_folder=False, targets=(written.DOCUMENT, written.PAGE))
+
+
+def _add_export(subparsers: Any) -> None:
+    what = "write an estimate for another program: simulators, viewers, hospital systems"
+    command = _command(subparsers, "export", exports.export, what=what, folder="palpate-export")
+    command.add_argument("result", type=Path, metavar="DIR", help="the output folder of an estimate")
+    command.add_argument("--format", required=True, choices=tuple(FORMATS), help="; ".join(_formats()))
+    command.add_argument("--linear", action="store_true", help="tetrahedra of four nodes in place of ten")
+    command.add_argument("--source", type=Path, metavar="SERIES", help="dicom: the first image's DICOM series")
+    command.set_defaults(logs=False)  # which would hold the command with its paths
+
+
+def _add_view(subparsers: Any) -> None:
+    what = "show the report of an estimate and its files in a browser, on this machine alone"
+    command = _command(subparsers, "view", exports.view, what=what, folder=None)
+    command.add_argument("result", type=Path, metavar="DIR", help="the output folder of an estimate")
+    command.add_argument("--no-browser", action="store_true", help="print the address, open nothing")
+
+
+def _formats() -> list[str]:
+    return [f"{name}: {form.description}" for name, form in FORMATS.items()]
 
 
 def _add_cohort(subparsers: Any) -> None:

@@ -122,6 +122,7 @@ def estimate_states(
             *estimate_warnings(estimation),
         ),
         further=_further(bodies, estimation),
+        alignments=states.alignments,
     )
 
 
@@ -171,7 +172,9 @@ def _further(bodies: tuple[Body, ...], estimation: Estimation) -> tuple[PairResu
     for body in bodies[1:]:
         states = body.states
         motions = estimation.displacements[first : first + len(states.after)]
-        found.append(PairResult(body.space, mesh_summary(body), states.before, states.after, motions))
+        found.append(
+            PairResult(body.space, mesh_summary(body), states.before, states.after, motions, states.alignments)
+        )
         first += len(states.after)
     return tuple(found)
 
