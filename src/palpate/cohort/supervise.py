@@ -169,11 +169,7 @@ class _Watch:
             return Outcome.failed(task, "resources", text, cause="memory")
         if self.ended is None:
             return Outcome.failed(task, "lost", "the process that computed it is gone", cause="lost")
-        if (
-            self.ended == -signal.SIGKILL
-            and self.expected_gb
-            and self.peak_gb > MUCH * min(limit, 2 * self.expected_gb)
-        ):
+        if self.ended == -signal.SIGKILL and self.peak_gb > MUCH * limit:
             text = f"the system ended it at {self.peak_gb:.1f} GB of memory, most likely for want of more"
             return Outcome.failed(task, "resources", text, cause="memory")
         name = {-int(number): number.name for number in signal.Signals}.get(self.ended, f"exit code {self.ended}")
