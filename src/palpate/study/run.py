@@ -48,7 +48,7 @@ def estimate(case: Case, *, progress: Progress = silent, truth: Mapping[str, flo
     """
     began = time.perf_counter()
     refuse_what_cannot_be_estimated(case)
-    during("reading", progress)("reading the images")
+    during("reading", progress)("reading and aligning the images")
     reading = during("reading", progress)
     states, further = read_states(case, progress=reading), read_pairs(case, progress=reading)
     if progress is not silent:
@@ -114,7 +114,7 @@ def estimate_states(
 def mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
     """Mesh the reference state of a case and pass it through the gate."""
     began = time.perf_counter()
-    progress("reading the images")
+    progress("reading and aligning the images")
     states = read_states(case, progress=progress)
     inputs = input_digests(case, states.inputs)
     body = make_body(states, case, progress=progress)
