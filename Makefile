@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo test lint check clean pardiso benchmark-setup schemas docs dist dist-test minimum report-check
+.PHONY: install demo test lint check clean pardiso benchmark-setup schemas docs dist dist-test minimum report-check export-check
 
 install: $(VENV)/.installed
 
@@ -82,6 +82,15 @@ minimum: install
 	$(BIN)/uv pip install --quiet --python build/minimum --resolution lowest-direct --editable ".[dev]"
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 build/minimum/bin/python -m pytest -n 2 \
 	  -W default::DeprecationWarning -W default::PendingDeprecationWarning $(addprefix tests/,$(MINIMUM))
+
+# What other programs make of our exports; CalculiX comes from Debian where that can be installed.
+export-check: install
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[export-check]"
+	command -v ccx > /dev/null || { [ "$$(id -u)" = 0 ] && command -v apt-get > /dev/null && \
+	  apt-get install --yes --no-install-recommends calculix-ccx; } || \
+	  echo "CalculiX is not installed: its lines will have no figure"
+	$(BIN)/python -m pytest tests/export/test_notebook.py
+	$(BIN)/python benchmarks/export_check.py
 
 clean:
 	rm -rf $(VENV) demo-output build dist .mypy_cache .pytest_cache .ruff_cache

@@ -29,8 +29,7 @@ from palpate import check, init, make_mesh
 from palpate.experiments.simulated_pelvis import DATA
 from palpate.images import Role, write_label_image
 from palpate.phantoms import PelvisOptions, Scene, SpheresOptions, pelvis, spheres
-from palpate.study import Case, estimate, expected_cost, read_case, read_states
-from palpate.study.cost import ExpectedCost
+from palpate.study import Case, ExpectedCost, estimate, expected_cost, read_case, read_states
 
 
 @dataclass(frozen=True)

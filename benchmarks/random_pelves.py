@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.images import LabelImage, VoxelGrid, write_label_image
-from palpate.phantoms import PelvisShapes, centred_grid, draw_pelvis, grid_box
-from palpate.phantoms.shapes import Ellipsoid, Tube, rotation_about
+from palpate.phantoms import Ellipsoid, PelvisShapes, Tube, centred_grid, draw_pelvis, grid_box, rotation_about
 
 __all__ = ["RandomPelvis", "random_pelvis", "write_images"]
 

@@ -61,6 +61,7 @@ FILES = {
         "report.html",
         "report-data.npz",
         "mesh.vtu",
+        "model.npz",
         "stiffness.nii.gz",
         "labels.csv",
         "labels.nii.gz",

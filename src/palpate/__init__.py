@@ -8,18 +8,20 @@ TYPE_CHECKING = False  # the module typing takes longer to import than all that 
 if TYPE_CHECKING:
     from typing import Any
 
+    from palpate.export.folder import export
     from palpate.steps.commands import check, estimate, init, make_mesh, simulate
     from palpate.steps.results import CaseResult
     from palpate.study.case import Case
     from palpate.study.case_file import read_case
 
-__all__ = ["Case", "CaseResult", "check", "estimate", "init", "make_mesh", "read_case", "simulate"]
+__all__ = ["Case", "CaseResult", "check", "estimate", "export", "init", "make_mesh", "read_case", "simulate"]
 
 _HOMES = {
     "Case": "palpate.study.case",
     "CaseResult": "palpate.steps.results",
     "check": "palpate.steps.commands",
     "estimate": "palpate.steps.commands",
+    "export": "palpate.export.folder",
     "init": "palpate.steps.commands",
     "make_mesh": "palpate.steps.commands",
     "read_case": "palpate.study.case_file",

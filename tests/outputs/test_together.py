@@ -23,6 +23,7 @@ FILES = {
     "report.html",
     "report-data.npz",
     "mesh.vtu",
+    "model.npz",
     "stiffness.nii.gz",
     "labels.csv",
     "labels.nii.gz",
@@ -83,9 +84,10 @@ def test_a_disk_that_is_full_after_the_page_costs_the_page_only(estimate, out, m
 
     monkeypatch.setattr("palpate.study.outputs.carry_out", full)
     assert estimate("bert", "--quiet") == 0
-    assert calls == [8, 6]
+    assert calls == [9, 7]
     assert not (out / "report.html").exists()
-    assert set(result(out)["files"]) == {"mesh.vtu", "stiffness.nii.gz", "labels.csv", "labels.nii.gz", "case.toml"}
+    files = {"mesh.vtu", "model.npz", "stiffness.nii.gz", "labels.csv", "labels.nii.gz", "case.toml"}
+    assert set(result(out)["files"]) == files
 
 
 def test_a_page_that_nobody_vouches_for_is_set_aside(estimate, out, monkeypatch):

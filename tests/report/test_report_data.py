@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from palpate.errors import InputDataError, NotConverged
-from palpate.report import archive
 from palpate.report.collect import collect, collect_failure
 from palpate.report.report_data import ReportData
+from palpate.study import archive
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ def test_a_file_of_something_else_is_refused(tmp_path, members):
     with zipfile.ZipFile(path, "w") as file:
         for name, content in members.items():
             file.writestr(name, content)
-    with pytest.raises(InputDataError, match="does not hold the data of a report"):
+    with pytest.raises(InputDataError, match="does not hold the data of a run"):
         ReportData.load(path)
 
 

@@ -21,7 +21,7 @@ Progress = Callable[[str], None]
 DOCUMENT, PAGE, DATA = "result.json", "report.html", "report-data.npz"
 ASIDE = tuple(f"{name}.earlier" for name in (PAGE, DATA))
 LABELS = ("labels.csv", "labels.nii.gz")
-TARGETS = (DOCUMENT, PAGE, DATA, *ASIDE, "mesh.vtu", "stiffness.nii.gz", *LABELS, "case.toml")
+TARGETS = (DOCUMENT, PAGE, DATA, *ASIDE, "mesh.vtu", "model.npz", "stiffness.nii.gz", *LABELS, "case.toml")
 
 
 def estimate(arguments: argparse.Namespace, case: Case | None, outputs: OutputFolder, progress: Progress) -> Outcome:

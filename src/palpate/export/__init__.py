@@ -1,1 +1,24 @@
-"""Files that other programs read."""
+"""Files that other programs read; the package itself can be called: `palpate.export(result, folder, format="stl")`."""
+
+from __future__ import annotations
+
+import sys
+from types import ModuleType
+
+TYPE_CHECKING = False  # the module typing takes longer to import than all that is needed here
+if TYPE_CHECKING:
+    from pathlib import Path
+    from typing import Any
+
+
+class _Callable(ModuleType):
+    """Python makes a package an attribute of the one around it: `palpate.export` is this, so it does what it says."""
+
+    def __call__(self, *arguments: Any, **options: Any) -> tuple[Path, ...]:
+        """Do what `palpate.export.folder.export` does."""
+        from palpate.export.folder import export  # noqa: PLC0415 - numpy is loaded when it is needed
+
+        return export(*arguments, **options)
+
+
+sys.modules[__name__].__class__ = _Callable

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.export.label_table import write_label_table
+from palpate.export.model_file import MODEL, write_model
 from palpate.export.rasterise import region_image
 from palpate.export.vtk_xml import write_pvd, write_vtp, write_vtu
 from palpate.images.label_image import LabelImage
@@ -30,8 +31,8 @@ MOST_BYTES = 60  # of a tissue's name in a file's: file systems count bytes, not
 def write_estimate_files(result: CaseResult, folder: Path) -> tuple[Path, ...]:
     """Write mesh.vtu (displacement of the last image), stiffness.nii.gz (`result.unit`), labels.nii.gz and labels.csv.
 
-    Each further pair has its own mesh_2.vtu, mesh_3.vtu ... Returns the paths written; raises `ResourceError` when the
-    disk refuses.
+    Each further pair has its own mesh_2.vtu, mesh_3.vtu ...; a converged result leaves model.npz for `palpate export`.
+    Returns the paths written; raises `ResourceError` when the disk refuses.
     """
     make_folder(folder)
     paths = [folder / "mesh.vtu", folder / "stiffness.nii.gz"]
@@ -43,6 +44,9 @@ def write_estimate_files(result: CaseResult, folder: Path) -> tuple[Path, ...]:
     for number, pair in enumerate(result.further, start=2):
         paths.append(folder / f"mesh_{number}.vtu")
         _write_fitted(paths[-1], result, pair.space, pair.displacements)
+    if result.estimation.status == "converged":
+        paths.append(folder / MODEL)
+        write_model(result, paths[-1])
     return tuple(paths)
 
 

@@ -9,7 +9,7 @@ from palpate.images.label_image import VoxelGrid
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.parallel import mapped
 
-__all__ = ["region_image"]
+__all__ = ["region_image", "tetrahedron_image"]
 
 CANDIDATES = 1_000_000  # voxel centres tested at once by a thread, which bounds the memory
 TOLERANCE = 1e-9  # in barycentric coordinates: a centre on a face belongs to both
@@ -17,7 +17,12 @@ TOLERANCE = 1e-9  # in barycentric coordinates: a centre on a face belongs to bo
 
 def region_image(mesh: TetMesh, grid: VoxelGrid) -> NDArray[np.int16]:
     """Region (n_x, n_y, n_z) of the tetrahedron at each voxel centre of `grid`: index into `mesh.tissues`; -1: none."""
-    image = np.full(grid.shape, -1, dtype=np.int16)
+    return np.append(mesh.region, -1).astype(np.int16)[tetrahedron_image(mesh, grid)]
+
+
+def tetrahedron_image(mesh: TetMesh, grid: VoxelGrid) -> NDArray[np.int32]:
+    """Number (n_x, n_y, n_z) of the tetrahedron at each voxel centre of `grid`; -1: none."""
+    image = np.full(grid.shape, -1, dtype=np.int32)
     corners = grid.index(mesh.nodes)[mesh.tets]
     low = np.maximum(np.ceil(corners.min(axis=1) - TOLERANCE), 0).astype(np.int64)
     high = np.minimum(np.floor(corners.max(axis=1) + TOLERANCE), np.array(grid.shape) - 1).astype(np.int64)
@@ -39,5 +44,5 @@ def region_image(mesh: TetMesh, grid: VoxelGrid) -> NDArray[np.int16]:
     ends = np.cumsum(count)
     parts = np.split(np.arange(len(count)), np.searchsorted(ends, np.arange(CANDIDATES, ends[-1], CANDIDATES)))
     for voxel, owner in mapped(centres_of, parts):
-        image[tuple(voxel.T)] = mesh.region[owner]
+        image[tuple(voxel.T)] = owner
     return image

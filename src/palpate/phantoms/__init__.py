@@ -6,18 +6,20 @@ from palpate.phantoms.motion import filling_of
 from palpate.phantoms.pelvis import PelvisOptions, pelvis, pelvis_anatomy, pelvis_grid
 from palpate.phantoms.pelvis_shapes import PelvisShapes, draw_pelvis
 from palpate.phantoms.scene import Noise, Scene, centred_grid, grid_box, imaged, reimaged, rescaled
-from palpate.phantoms.shapes import Complement, ball, rotation_about
+from palpate.phantoms.shapes import Complement, Ellipsoid, Tube, ball, rotation_about
 from palpate.phantoms.spheres import SpheresOptions, spheres
 from palpate.phantoms.wall_filling import wall_filling
 
 __all__ = [
     "Complement",
+    "Ellipsoid",
     "Noise",
     "PelvisOptions",
     "PelvisShapes",
     "Scene",
     "SmoothField",
     "SpheresOptions",
+    "Tube",
     "ball",
     "centred_grid",
     "draw_pelvis",

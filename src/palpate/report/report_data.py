@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.images.label_image import VoxelGrid
-from palpate.report.archive import read_archive, write_archive
+from palpate.study.archive import read_archive, write_archive
 
 __all__ = [
     "GREY_STEPS",
@@ -28,6 +28,7 @@ __all__ = [
     "Volume",
 ]
 
+FORMAT = "palpate.report-data/4"
 GREY_STEPS = 1023  # from the darkest to the brightest value that a volume keeps
 
 
@@ -210,7 +211,7 @@ class ReportData:
 
     def save(self, path: Path) -> None:
         """Write everything to `path` (.npz without pickles); `ResourceError` when the disk refuses."""
-        write_archive(self, path)
+        write_archive(self, path, version=FORMAT)
 
     @classmethod
     def load(cls, path: Path, *, sha256: str | None = None) -> ReportData:
@@ -218,4 +219,4 @@ class ReportData:
 
         Raises `InputDataError` when the file is missing, damaged, too large, another, or has not the SHA-256 given.
         """
-        return read_archive(cls, path, sha256=sha256)
+        return read_archive(cls, path, version=FORMAT, sha256=sha256)

@@ -6,9 +6,10 @@ import os
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from palpate.errors import ResourceError
+from palpate.export.notebook import notebook_viewer
 from palpate.images.tissue_colours import tissue_colours
 from palpate.report.cards import moduli_figure, result_cards, result_lines
 from palpate.steps.saving import save_estimate
@@ -79,6 +80,14 @@ class CaseResult(result.CaseResult):
         A figure of its own, which no display is needed for: `figure.savefig("moduli.png")`.
         """
         return moduli_figure(self.to_dict(), self._colours())
+
+    def view(self, background: str | os.PathLike[str] | None = None, *, opacity: float = 0.6) -> Any:
+        """A widget for notebooks: slices and volume of the first image, Young's modulus over it.
+
+        background: a grey image (NIfTI ...) in the place of the tissues in their colours; opacity: of the modulus, 0 to
+        1. Raises `ResourceError` without ipyniivue: pip install 'palpate[notebook]'.
+        """
+        return notebook_viewer(self, background=None if background is None else Path(background), opacity=opacity)
 
     def __str__(self) -> str:
         """A line a tissue: value, interval, verdict and why."""

@@ -9,12 +9,12 @@ if TYPE_CHECKING:
     from palpate.study.body import Body, ImagedStates, aligned, inverse_problem, make_body
     from palpate.study.case import Case, Domain, DriverMotion, Mechanics, MeshSettings, Phantom
     from palpate.study.case_file import read_case
-    from palpate.study.cost import expected_cost
+    from palpate.study.cost import ExpectedCost, expected_cost
     from palpate.study.earlier import strange_files
     from palpate.study.estimation import Observed, conclude, verdict
     from palpate.study.journal import recover
-    from palpate.study.lock import own_file
-    from palpate.study.outputs import make_folder, staged, write_json, write_text
+    from palpate.study.lock import held_folder, own_file
+    from palpate.study.outputs import make_folder, read_json, staged, write_json, write_text
     from palpate.study.provenance import software_versions
     from palpate.study.read import read_states
     from palpate.study.result import CaseResult, failure_document
@@ -27,6 +27,7 @@ __all__ = [
     "CaseResult",
     "Domain",
     "DriverMotion",
+    "ExpectedCost",
     "ImagedStates",
     "Mechanics",
     "MeshSettings",
@@ -40,6 +41,7 @@ __all__ = [
     "failure_document",
     "filled",
     "fitted_states",
+    "held_folder",
     "inverse_problem",
     "inversion_settings",
     "make_body",
@@ -47,6 +49,7 @@ __all__ = [
     "mesh",
     "own_file",
     "read_case",
+    "read_json",
     "read_states",
     "recover",
     "software_versions",
@@ -63,6 +66,7 @@ _HOMES = {
     "CaseResult": "palpate.study.result",
     "Domain": "palpate.study.case",
     "DriverMotion": "palpate.study.case",
+    "ExpectedCost": "palpate.study.cost",
     "ImagedStates": "palpate.study.body",
     "Mechanics": "palpate.study.case",
     "MeshSettings": "palpate.study.case",
@@ -76,6 +80,7 @@ _HOMES = {
     "failure_document": "palpate.study.result",
     "filled": "palpate.study.simulate",
     "fitted_states": "palpate.study.run",
+    "held_folder": "palpate.study.lock",
     "inverse_problem": "palpate.study.body",
     "inversion_settings": "palpate.study.run",
     "make_body": "palpate.study.body",
@@ -83,6 +88,7 @@ _HOMES = {
     "mesh": "palpate.study.run",
     "own_file": "palpate.study.lock",
     "read_case": "palpate.study.case_file",
+    "read_json": "palpate.study.outputs",
     "read_states": "palpate.study.read",
     "recover": "palpate.study.journal",
     "software_versions": "palpate.study.provenance",

@@ -51,7 +51,7 @@ class Background:
 def background_of(
     image: LabelImage, window: tuple[slice, ...], ct: tuple[NDArray[np.float32], VoxelGrid] | None
 ) -> Background | None:
-    """Label 0 of the part `window` of `image`; `ct`: HU (n_x, n_y, n_z) and their grid. None where there is no label 0.
+    """Label 0 of the part `window` of `image`; `ct`: HU (nx, ny, nz) and their grid. None where there is no label 0.
 
     A grey image without air, as of an MR, tells nothing.
     """

@@ -58,7 +58,8 @@ STATED = (
 class ImagedStates:
     """The reference state and the later states, brought to it; `bones`: each later state's motions by tissue index.
 
-    `inputs`: SHA-256 of each file that was read for them, by its key in `result.json`.
+    `inputs`: SHA-256 of each file that was read for them, by its key in `result.json`; `alignments`: each later
+    state's motion from the first image's world to its own, of all bones as one body; none where nothing was aligned.
     """
 
     before: Segmentation
@@ -66,6 +67,7 @@ class ImagedStates:
     bones: tuple[Mapping[int, RigidMotion], ...]
     findings: tuple[Finding, ...]
     inputs: Mapping[str, str] = field(default_factory=dict)
+    alignments: tuple[RigidMotion, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +119,7 @@ def brought(
     before: Segmentation, after: tuple[Segmentation, ...], *, method: str, progress: Progress = silent
 ) -> ImagedStates:
     """Bring the later images to the first as `aligned` does, but check nothing; raises `InputDataError` as `align`."""
-    images, bones, findings = [], [], list[Finding]()
+    images, bones, findings, alignments = [], [], list[Finding](), list[RigidMotion]()
     names = later_names(len(after))
     for name, image in zip(names, after, strict=True):
         if method == "none":
@@ -126,11 +128,12 @@ def brought(
             continue
         progress(f"aligning '{name}' on the rigid tissues")
         alignment = align(before, image)
+        alignments.append(alignment.overall.motion)
         images.append(moved(image, alignment.overall.motion.inverse()))
         rigid = {i: t.name for i, t in enumerate(before.tissues) if t.role is Role.RIGID}
         bones.append({i: alignment.remaining(bone) for i, bone in rigid.items()})
         findings += _alignment_findings(alignment, name)
-    return ImagedStates(before, tuple(images), tuple(bones), tuple(findings))
+    return ImagedStates(before, tuple(images), tuple(bones), tuple(findings), alignments=tuple(alignments))
 
 
 def _alignment_findings(alignment: Alignment, name: str) -> list[Finding]:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role
@@ -10,7 +13,7 @@ from palpate.mechanics.loads import Load, boundary_named, gravity, pressure, tra
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.case import Case, CaseLoad
 
-__all__ = ["case_loads"]
+__all__ = ["case_loads", "loads_on"]
 
 
 def case_loads(case: Case, space: LagrangeSpace, *, share: float = 1.0) -> tuple[Load, ...]:
@@ -18,15 +21,22 @@ def case_loads(case: Case, space: LagrangeSpace, *, share: float = 1.0) -> tuple
 
     Raises `ConfigurationError` for a surface that the mesh has not, or whose motion is prescribed.
     """
-    return tuple(_load(load, case, space, share) for load in case.loads)
+    density = {tissue.name: tissue.density_kg_m3 for tissue in case.tissues}
+    heavy = np.array([density.get(tissue.name, 1000.0) for tissue in space.mesh.tissues])
+    return loads_on(space, case.loads, densities=heavy, share=share)
 
 
-def _load(load: CaseLoad, case: Case, space: LagrangeSpace, share: float) -> Load:
+def loads_on(
+    space: LagrangeSpace, loads: Sequence[CaseLoad], *, densities: NDArray[np.float64], share: float = 1.0
+) -> tuple[Load, ...]:
+    """The same of `loads` alone; densities (n_tissues,) kg/m^3, one each of the mesh's tissues."""
+    return tuple(_load(load, densities, space, share) for load in loads)
+
+
+def _load(load: CaseLoad, densities: NDArray[np.float64], space: LagrangeSpace, share: float) -> Load:
     tissues = space.mesh.tissues
     if load.acceleration_m_s2 is not None:
-        density = {tissue.name: tissue.density_kg_m3 for tissue in case.tissues}
-        heavy = np.array([density.get(tissue.name, 1000.0) for tissue in tissues])
-        return gravity(space, heavy, share * np.array(load.acceleration_m_s2))
+        return gravity(space, densities, share * np.array(load.acceleration_m_s2))
     surface = load.surface or ""
     prescribed = [t.name for t in tissues if t.role in (Role.DRIVER, Role.RIGID)]
     if surface in prescribed:

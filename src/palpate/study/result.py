@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import NotConverged, PalpateError
 from palpate.findings import Finding, one_a_cause, warning_rows
+from palpate.images.alignment import RigidMotion
 from palpate.images.label_image import LabelImage
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
@@ -24,6 +25,7 @@ from palpate.study.together import ImagePairs
 from palpate.uncertainty import Information
 
 __all__ = [
+    "SCHEMA",
     "CaseResult",
     "MeshResult",
     "MeshSummary",
@@ -71,7 +73,7 @@ class Provenance:
 class PairResult:
     """A further pair of images, which shares the moduli: its own mesh, its segmentations, its displacements.
 
-    displacements: one (n_points, 3) mm on `space.points` a later image; before, after: as in `CaseResult`.
+    displacements: one (n_points, 3) mm on `space.points` a later image; before, after, alignments: as in `CaseResult`.
     """
 
     space: LagrangeSpace
@@ -79,6 +81,7 @@ class PairResult:
     before: Segmentation
     after: tuple[Segmentation, ...]
     displacements: tuple[NDArray[np.float64], ...]
+    alignments: tuple[RigidMotion, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +91,8 @@ class CaseResult:
     space: the displacements' points on the mesh of the reference state; before, after: segmentations, the later ones
     brought to the first (aligned), all in RAS mm; remarks: those of the study, beside the estimation's own;
     note: a sentence that must stand wherever the numbers are shown (of what a demo simulates, say);
-    further: the pairs after the first. The estimation's fits and displacements are those of `after`, then theirs.
+    further: the pairs after the first. The estimation's fits and displacements are those of `after`, then theirs;
+    alignments: the motion that takes each of `after` to where its own image has it; empty where nothing was aligned.
     """
 
     case: Case
@@ -101,6 +105,7 @@ class CaseResult:
     remarks: tuple[Finding, ...] = ()
     note: str = ""
     further: tuple[PairResult, ...] = ()
+    alignments: tuple[RigidMotion, ...] = ()
 
     @property
     def tissues(self) -> tuple[Tissue, ...]:

@@ -12,7 +12,7 @@ from palpate.images.readers import (
     table_slicer,
 )
 from palpate.images.readers.isolation import ReadLimits
-from palpate.images.readers.nifti import write_label_image, write_scalar_image
+from palpate.images.readers.nifti import write_displacement_field, write_label_image, write_scalar_image
 from palpate.images.readers.read import read_intensities, read_label_image
 
 __all__ = [
@@ -28,6 +28,7 @@ __all__ = [
     "table_itksnap",
     "table_json",
     "table_slicer",
+    "write_displacement_field",
     "write_label_image",
     "write_scalar_image",
 ]

@@ -27,7 +27,7 @@ from palpate.images.readers.nifti_extension import extension_names
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
 from palpate.images.readers.voxel_stream import MAX_OFFSET, VoxelBlock, check_end, check_size, damaged, read_exactly
 
-__all__ = ["read_nifti", "write_label_image", "write_scalar_image"]
+__all__ = ["read_nifti", "write_displacement_field", "write_label_image", "write_scalar_image"]
 
 MILLIMETRES = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}  # xyzt_units: unknown, metre, millimetre, micrometre
 HEADERS = {348: nibabel.Nifti1Header, 540: nibabel.Nifti2Header}
@@ -167,13 +167,26 @@ def write_scalar_image(path: Path | str, array: NDArray[np.floating[Any]], grid:
         _write(Path(path), np.asarray(array, dtype=np.float32), grid)
 
 
-def _write(path: Path, values: NDArray[Any], grid: VoxelGrid) -> None:
+def write_displacement_field(path: Path | str, field: NDArray[np.float64], grid: VoxelGrid) -> None:
+    """Write displacements (n_x, n_y, n_z, 3) RAS mm at the voxel centres of `grid` as ITK's transforms have them.
+
+    The file holds LPS mm, a vector image (NIfTI intent 1007): SimpleITK, ANTs and 3D Slicer read it as a displacement
+    field. Raises as `write_scalar_image` does.
+    """
+    if field.shape != (*grid.shape, 3):
+        raise InputDataError(f"a field of shape {field.shape} cannot be written on a grid of shape {grid.shape}")
+    lps = (field * [-1.0, -1.0, 1.0]).astype(np.float32)
+    _write(Path(path), lps[:, :, :, None, :], grid, intent="vector")
+
+
+def _write(path: Path, values: NDArray[Any], grid: VoxelGrid, *, intent: str = "none") -> None:
     if not path.name.lower().endswith((".nii", ".nii.gz")):
         raise ConfigurationError(f"'{path}' cannot be written: images are written as .nii or .nii.gz; choose one")
     image = nibabel.Nifti1Image(values, grid.affine)
     image.set_sform(grid.affine, code="scanner")
     image.set_qform(grid.affine, code="scanner")
     image.header.set_xyzt_units("mm")
+    image.header.set_intent(intent)
     content: bytes = image.to_bytes()
     if path.name.lower().endswith(".gz"):
         content = gzip.compress(content, compresslevel=6, mtime=0)  # no time stamp: equal images give equal files

@@ -11,6 +11,7 @@ import types
 import typing
 import zipfile
 from collections.abc import Mapping
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -25,27 +26,26 @@ __all__ = ["read_archive", "write_archive"]
 
 T = TypeVar("T")
 
-FORMAT = "palpate.report-data/4"
 LARGEST_FILE = 1 << 30  # bytes
 MOST_BYTES = 1 << 30  # of all arrays together, unpacked
 MOST_ARRAYS = 4096
 
 
-def write_archive(value: Any, path: Path) -> None:
-    """Write a dataclass instance to `path`.
+def write_archive(value: Any, path: Path, *, version: str) -> None:
+    """Write a dataclass instance to `path`; `version`: name and number of the format, "palpate.model/1" for example.
 
     Raises `ResourceError` when the disk refuses, `TypeError` for a value that JSON does not know.
     """
     arrays: dict[str, NDArray[Any]] = {}
-    plain = {"format": FORMAT, "value": _encode(value, arrays)}
+    plain = {"format": version, "value": _encode(value, arrays)}
     text = json.dumps(plain, ensure_ascii=False, allow_nan=False).encode()
     memory = io.BytesIO()
     np.savez_compressed(memory, allow_pickle=False, json=np.frombuffer(text, dtype=np.uint8), **arrays)
     write_bytes(path, memory.getvalue())
 
 
-def read_archive(kind: type[T], path: Path, *, sha256: str | None = None) -> T:
-    """The instance of dataclass `kind` in `path`.
+def read_archive(kind: type[T], path: Path, *, version: str, sha256: str | None = None) -> T:
+    """The instance of dataclass `kind` in `path`, as `write_archive` wrote it under the same `version`.
 
     Raises `InputDataError` when there is none to be had, or when the file has another SHA-256 than it should.
     """
@@ -53,19 +53,19 @@ def read_archive(kind: type[T], path: Path, *, sha256: str | None = None) -> T:
     if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
         raise InputDataError(
             f"{path} is not of the run that the result beside it tells of (its SHA-256 is another): run the estimate"
-            " again, or draw the report where its files came from"
+            " again, or work where its files came from"
         )
     try:
         arrays = _arrays(content)
         plain = json.loads(arrays["json"].tobytes())
-        if plain["format"] != FORMAT:
-            raise ValueError(f"its format is {str(plain['format'])[:40]!r}, not '{FORMAT}'")
+        if plain["format"] != version:
+            raise ValueError(f"its format is {str(plain['format'])[:40]!r}, not '{version}'")
         return typing.cast("T", _decode(kind, plain["value"], arrays))
     except MemoryError:
         raise
-    except Exception as error:  # whatever another's file makes of our reading: it is no report's data
+    except Exception as error:  # whatever another's file makes of our reading: it is no data of ours
         raise InputDataError(
-            f"{path} does not hold the data of a report ({type(error).__name__}: {printable(str(error)[:200])}); run"
+            f"{path} does not hold the data of a run ({type(error).__name__}: {printable(str(error)[:200])}); run"
             " the estimate again"
         ) from error
 
@@ -76,7 +76,7 @@ def _arrays(content: bytes) -> dict[str, NDArray[Any]]:
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         members = archive.infolist()
         if len(members) > MOST_ARRAYS or sum(member.file_size for member in members) > MOST_BYTES:
-            raise ValueError("it declares more data than a report has")
+            raise ValueError("it declares more data than a result has")
         for member in members:
             with archive.open(member) as file:
                 # its header must not ask for more memory than the file has bytes
@@ -134,6 +134,8 @@ def _decode(hint: Any, value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
 def _scalar(hint: Any, value: Any) -> Any:
     if hint is float:
         return math.nan if value is None else float(value)
+    if isinstance(hint, type) and issubclass(hint, StrEnum):
+        return hint(value)
     if hint in (str, int, bool) and not isinstance(value, hint):
         raise ValueError(f"{str(value)[:40]!r} is no {hint.__name__}")
     return value

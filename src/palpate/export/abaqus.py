@@ -1,0 +1,113 @@
+"""Abaqus and CalculiX: an input file whose steps move walls and bones as they were fitted.
+
+Keywords: Abaqus Analysis User's Guide; CalculiX CrunchiX User's Manual 2.20, chapter 7 (which takes the same file). The
+hyperelastic laws of both are decoupled, W = C10 (J^(-2/3) I1 - 3) + C01 (J^(-4/3) I2 - 3) + (J - 1)^2 / D1, ours are
+not: C10, C01 and D1 = 2 / K give the same moduli at small strain, mu and K, and docs/export/abaqus.md the difference.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from palpate.export.conditions import prescribed
+from palpate.export.fitted_model import FittedBody, FittedModel
+from palpate.export.formats import Options
+from palpate.export.groups import element_faces, face_groups, plain_names, tissue_groups
+from palpate.export.text_lines import rows, wrapped
+from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
+from palpate.mechanics.loads import FollowingPressure
+from palpate.mesh.space import LagrangeSpace
+from palpate.study.case_loads import loads_on
+from palpate.study.outputs import write_text
+
+__all__ = ["write"]
+
+FACE = np.array([3, 4, 2, 1])  # Abaqus' number of each row of FACES
+INCREMENT = 0.2  # of a step at finite strain, at first
+
+
+def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
+    """Write palpate.inp; where Palpate averages the volume change, too, palpate_hybrid.inp, C3D10H for Abaqus alone."""
+    del options  # the body has been made linear already
+    space = body.space
+    write_text(folder / "palpate.inp", _text(model, body, space, "C3D10" if space.order == 2 else "C3D4"))
+    if model.element in ("auto", "P2-P0") and space.order == 2:
+        write_text(folder / "palpate_hybrid.inp", _text(model, body, space, "C3D10H"))
+
+
+def _text(model: FittedModel, body: FittedBody, space: LagrangeSpace, element: str) -> str:
+    mesh, tissues = body.mesh, tissue_groups(body.mesh)
+    groups = face_groups(mesh)
+    names = plain_names([*tissues, *(group.name for group in groups)])
+    parts = [
+        "*HEADING\nFitted by Palpate. Units: mm, kPa, mN; RAS coordinates.\n",
+        f"** {model.units}\n** law: {model.law}; Palpate's element: {model.element}\n",
+        *(f"** {plain}: {name}\n" for name, plain in names.items() if name.isprintable()),
+        "*NODE, NSET=ALL_NODES\n",
+        rows("%d, %.12g, %.12g, %.12g", np.arange(1, len(space.points) + 1), space.points),
+    ]
+    pattern = ", ".join(["%d"] * (1 + space.cells.shape[1]))
+    for name, cells in tissues.items():
+        parts += [f"*ELEMENT, TYPE={element}, ELSET={names[name]}\n", rows(pattern, cells + 1, space.cells[cells] + 1)]
+    for group in groups:
+        points = np.unique(space.facets(group.triangles))
+        cells, faces = element_faces(mesh, group.triangles)
+        parts += [f"*NSET, NSET={names[group.name]}\n", wrapped(points + 1)]
+        parts += [f"*SURFACE, NAME={names[group.name]}_F, TYPE=ELEMENT\n", rows("%d, S%d", cells + 1, FACE[faces])]
+    for number, tissue in enumerate(body.tissues):
+        if tissue.name in tissues:
+            parts += [f"*MATERIAL, NAME={names[tissue.name]}\n", _material(model, number)]
+            parts += [f"*SOLID SECTION, ELSET={names[tissue.name]}, MATERIAL={names[tissue.name]}\n"]
+    return "".join([*parts, *_steps(model, body, space)])
+
+
+def _material(model: FittedModel, number: int) -> str:
+    """The law of a tissue (index) with its constants in kPa, D1 in 1/kPa."""
+    modulus, ratio, law = float(model.moduli[number]), model.tissues[number].poisson_ratio, model.material_law
+    if not law.finite:
+        return f"*ELASTIC\n{modulus:.12g}, {ratio:.12g}\n"
+    shear, compliance = modulus / (2.0 * (1.0 + ratio)), 6.0 * (1.0 - 2.0 * ratio) / modulus
+    if isinstance(law, MooneyRivlin):
+        first, second = law.coefficients
+        constants = f"{first * shear:.12g}, {second * shear:.12g}, {compliance:.12g}"
+        return f"*HYPERELASTIC, MOONEY-RIVLIN\n{constants}\n"
+    return f"*HYPERELASTIC, NEO HOOKE\n{0.5 * shear:.12g}, {compliance:.12g}\n"
+
+
+def _steps(model: FittedModel, body: FittedBody, space: LagrangeSpace) -> list[str]:
+    """A step a later image: walls, bones and the cut of the image where the fit has them, and the known loads."""
+    held = prescribed(body, space, outer=model.outer_boundary)
+    parts = []
+    if not held.along_world:
+        parts += ["*NSET, NSET=SLIDING\n", wrapped(held.sliding + 1), "*TRANSFORM, NSET=SLIDING, TYPE=R\n"]
+        parts += [", ".join(f"{x:.12g}" for x in held.axes[:2].ravel()) + "\n"]
+    finite = model.material_law.finite
+    for number, displacement in enumerate(body.displacements, start=1):
+        increments = f"{INCREMENT:g}, 1.\n" if finite else ""
+        parts += [f"** later image {number}\n*STEP{', NLGEOM, INC=1000' if finite else ''}\n*STATIC\n{increments}"]
+        parts += ["*BOUNDARY\n"]
+        for axis in range(3):
+            along = np.full(len(held.whole), axis + 1)
+            parts += [rows("%d, %d, %d, %.12g", held.whole + 1, along, along, displacement[held.whole, axis])]
+            still = held.sliding[held.held[:, axis]] + 1
+            parts += [rows("%d, %d, %d", still, np.full(len(still), axis + 1), np.full(len(still), axis + 1))]
+        parts += _loads(model, body, space)
+        parts += ["*NODE PRINT, NSET=ALL_NODES\nU\n*NODE FILE\nU\n*END STEP\n"]
+    return parts
+
+
+def _loads(model: FittedModel, body: FittedBody, space: LagrangeSpace) -> list[str]:
+    """A pressure that follows its surface on the elements' faces; other loads as their forces on the nodes, mN."""
+    parts = []
+    for load in loads_on(space, model.loads, densities=model.densities):
+        if isinstance(load, FollowingPressure):
+            cells, faces = element_faces(body.mesh, load.faces[:, :3])
+            pressures = np.full(len(cells), load.kilopascal)
+            parts += ["*DLOAD\n", rows("%d, P%d, %.12g", cells + 1, FACE[faces], pressures)]
+        else:
+            forces = load.forces(np.zeros_like(space.points)).reshape(-1, 3)
+            points, axes = np.nonzero(forces)
+            parts += ["*CLOAD\n", rows("%d, %d, %.12g", points + 1, axes + 1, forces[points, axes])]
+    return parts

@@ -1,0 +1,101 @@
+"""The surface of each tissue before and after as closed triangles, normals outwards, for STL, OBJ and PLY."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.export.case_files import file_name
+from palpate.export.fitted_model import FittedBody
+from palpate.images.tissue import Role
+from palpate.mesh.space import LagrangeSpace
+from palpate.mesh.surface import tissue_surface
+from palpate.observation.observed_surface import SUBTRIANGLES
+from palpate.study.outputs import write_bytes
+
+__all__ = ["ClosedSurface", "closed_surfaces", "write_surfaces"]
+
+
+@dataclass(frozen=True, slots=True)
+class ClosedSurface:
+    """Points (n, 3) RAS mm and triangles (m, 3) of a tissue in one state; the same triangles in all states.
+
+    stem: a name for its file; state: "before" or "after", numbered where there are several later images.
+    """
+
+    stem: str
+    name: str
+    state: str
+    points: NDArray[np.float64]
+    triangles: NDArray[np.int64]
+
+
+def closed_surfaces(body: FittedBody) -> Iterator[ClosedSurface]:
+    """Each tissue's surface before and after each later image, but for `void`; a quadratic face is four triangles.
+
+    Where a hollow tissue leaves the image its wall is closed by a fan of triangles about the middle of its rim.
+    """
+    space = body.space
+    several = len(body.displacements) > 1
+    states = {"before": space.points}
+    for number, displacement in enumerate(body.displacements, start=1):
+        states[f"after_{number}" if several else "after"] = space.points + displacement
+    for number, tissue in enumerate(body.tissues):
+        faces = tissue_surface(body.mesh, number).triangles
+        if not len(faces) or tissue.role is Role.VOID:  # the air around a body is no body
+            continue
+        used, local = np.unique(_split(space, faces), return_inverse=True)
+        triangles = local.reshape(-1, 3)
+        rims = _rims(triangles)
+        for state, points in states.items():
+            caps = [points[used][rim].mean(axis=0) for rim in rims]
+            stem = f"{number:02d}_{file_name(tissue.name)}_{state}"
+            own = np.concatenate([points[used], np.reshape(caps, (-1, 3))])
+            yield ClosedSurface(stem, tissue.name, state, own, _closed(triangles, rims, len(used)))
+
+
+def write_surfaces(body: FittedBody, folder: Path, ending: str, content: Callable[[ClosedSurface], bytes]) -> None:
+    """Write each closed surface to a file of its own; raises `ResourceError` when the disk refuses."""
+    for surface in closed_surfaces(body):
+        write_bytes(folder / f"{surface.stem}.{ending}", content(surface))
+
+
+def _split(space: LagrangeSpace, faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Flat triangles (n, 3) between the points of the space on faces (n_faces, 3)."""
+    facets = space.facets(faces)
+    return np.asarray(facets[:, SUBTRIANGLES].reshape(-1, 3)) if space.order == 2 else facets
+
+
+def _rims(triangles: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Points of each closed line of edges that only one triangle has, in the triangles' own direction."""
+    edges = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    both = {(a, b) for a, b in edges.tolist()}
+    following: dict[int, list[int]] = {}
+    for a, b in edges.tolist():
+        if (b, a) not in both:
+            following.setdefault(a, []).append(b)
+    rims = []
+    while following:
+        first = next(iter(following))
+        rim, point = list[int](), first
+        while not rim or point != first:
+            rim.append(point)
+            point_after = following[point].pop()
+            if not following[point]:
+                del following[point]
+            point = point_after
+        rims.append(np.array(rim))
+    return rims
+
+
+def _closed(triangles: NDArray[np.int64], rims: list[NDArray[np.int64]], n_points: int) -> NDArray[np.int64]:
+    """The triangles with a fan over each rim, about the points from number `n_points` on."""
+    fans = [
+        np.stack([np.roll(rim, -1), rim, np.full(len(rim), n_points + number)], axis=1)
+        for number, rim in enumerate(rims)
+    ]
+    return np.concatenate([triangles, *fans])

@@ -1,0 +1,74 @@
+"""Which points of a fitted body are prescribed, along what, and by how much."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from palpate.errors import ConfigurationError
+from palpate.export.fitted_model import FittedBody
+from palpate.mechanics.boundary import outer_constraint
+from palpate.mesh.space import LagrangeSpace
+from palpate.observation.prescribed_motion import prescribed_motion
+
+__all__ = ["Prescribed", "prescribed"]
+
+IN_FRAME = 1e-6  # by which a held direction may lie off an axis: the image's faces are planes along its own axes
+
+
+@dataclass(frozen=True, slots=True)
+class Prescribed:
+    """Points that are held or moved.
+
+    whole (n,): points whose displacement is that of the fit along all axes; sliding (m,): points that keep to a face,
+    an edge or a corner of the image, held (m, 3) marks along which rows of `axes` (3, 3), unit vectors, they do not
+    move.
+    """
+
+    whole: NDArray[np.int64]
+    sliding: NDArray[np.int64]
+    held: NDArray[np.bool_]
+    axes: NDArray[np.float64]
+
+    @property
+    def along_world(self) -> bool:
+        """Whether what slides does so along the axes of the world."""
+        return not len(self.sliding) or bool(np.array_equal(self.axes, np.eye(3)))
+
+
+def prescribed(body: FittedBody, space: LagrangeSpace, *, outer: str) -> Prescribed:
+    """The points that walls, bones and the image's cut (`outer`: "fixed", "sliding", "free") hold or move.
+
+    Raises `ConfigurationError` where a sliding face is not along the image's axes.
+    """
+    walls = prescribed_motion(space, {}, n_modes=0, kernel_mm=1.0, prior_mm=1.0)
+    n = 3 * len(space.points)
+    constraint = outer_constraint(
+        space, outer=outer, modes=np.zeros((n, 0)), offset=np.zeros(n), prescribed=walls.prescribed
+    )
+    # the part of each axis that is free at each point, 0 or 1
+    axes, rows = _axes(body), constraint.free.tocsr()
+    free = np.stack([_free_share(rows, axis) for axis in axes], axis=1)
+    counts = np.rint(free.sum(axis=1))
+    sliding = np.flatnonzero((counts > 0.0) & (counts < 3.0))
+    share = free[sliding]
+    if np.any(np.minimum(share, 1.0 - share) > IN_FRAME):
+        raise ConfigurationError("the sliding faces do not lie along the image's axes, which no export can state")
+    return Prescribed(np.flatnonzero(counts == 0.0), sliding, share < 0.5, axes)
+
+
+def _free_share(rows: sparse.csr_matrix[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Square (n_points,) of the part of a unit vector (3,) that lies among each point's free directions."""
+    n_points = rows.shape[0] // 3
+    blocks = sparse.kron(sparse.eye_array(n_points), axis[None]).tocsr() @ rows
+    return np.asarray(blocks.multiply(blocks).sum(axis=1)).ravel()
+
+
+def _axes(body: FittedBody) -> NDArray[np.float64]:
+    """Unit vectors (3, 3), in rows, along the image's axes; the world's where they are these, maybe reordered."""
+    axes = (body.grid.affine[:3, :3] / body.grid.spacing).T
+    sizes = np.abs(axes)
+    return np.eye(3) if np.all(np.minimum(sizes, 1.0 - sizes) < IN_FRAME) else np.asarray(axes)

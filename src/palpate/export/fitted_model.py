@@ -1,0 +1,139 @@
+"""The model that an estimate has fitted, as other programs get it: meshes, moduli, motions; no name of an input."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import EstimationError
+from palpate.images.label_image import VoxelGrid
+from palpate.images.tissue import Tissue
+from palpate.mechanics.laws.contract import Law
+from palpate.mechanics.laws.registry import law_from
+from palpate.mesh.space import LagrangeSpace, lagrange_space
+from palpate.mesh.tet_mesh import TetMesh
+from palpate.study.case import CaseLoad
+from palpate.study.estimation import ModulusEstimate
+from palpate.study.result import CaseResult, PairResult
+
+__all__ = ["FittedBody", "FittedModel", "fitted_model"]
+
+
+@dataclass(frozen=True, slots=True)
+class FittedBody:
+    """One reference state with the motion fitted to each of its later images.
+
+    order: 1 or 2, of the displacements (n_points, 3) mm on the points of `space`, one a later image; alignments: one
+    (4, 4) a later image, which takes points from the world of the first image, RAS mm, to where the later one has them;
+    index (n_x, n_y, n_z): the tissue of each voxel of the first image, on `grid`.
+    """
+
+    mesh: TetMesh
+    order: int
+    displacements: tuple[NDArray[np.float64], ...]
+    alignments: tuple[NDArray[np.float64], ...]
+    index: NDArray[np.int16]
+    grid: VoxelGrid
+
+    @property
+    def tissues(self) -> tuple[Tissue, ...]:
+        """The case's tissues, in the mesh's order."""
+        return self.mesh.tissues
+
+    @property
+    def space(self) -> LagrangeSpace:
+        """The displacements' points on the mesh."""
+        return lagrange_space(self.mesh, f"P{self.order}")
+
+    def with_linear_tetrahedra(self) -> FittedBody:
+        """The same with the displacements of the corners alone."""
+        n = len(self.mesh.nodes)  # which come first among the points
+        return replace(self, order=1, displacements=tuple(motion[:n] for motion in self.displacements))
+
+
+@dataclass(frozen=True, slots=True)
+class FittedModel:
+    """All bodies of a case with the moduli that they share.
+
+    moduli (n_tissues,) in `unit`, "kPa" or "ratio" to `relative_to`; NaN of hollow tissues; covariance (n, n) of the
+    natural logarithms of the `estimates`; law_parameters, element, outer_boundary, loads, densities (n_tissues,), in
+    kg/m^3: as the case has them; seal: SHA-256 of the numbers of the result.json beside it.
+    """
+
+    bodies: tuple[FittedBody, ...]
+    moduli: NDArray[np.float64]
+    unit: str
+    relative_to: str
+    estimates: tuple[ModulusEstimate, ...]
+    covariance: NDArray[np.float64]
+    law: str
+    law_parameters: Mapping[str, float]
+    element: str
+    outer_boundary: str
+    loads: tuple[CaseLoad, ...]
+    densities: NDArray[np.float64]
+    seal: str
+
+    @property
+    def material_law(self) -> Law:
+        """The law with its parameters."""
+        return law_from(self.law, self.law_parameters)
+
+    @property
+    def tissues(self) -> tuple[Tissue, ...]:
+        """The case's tissues; their order is that of every body's mesh."""
+        return self.bodies[0].tissues
+
+    @property
+    def units(self) -> str:
+        """The units of all numbers, as a file's heading says them."""
+        stress = "kPa" if self.unit == "kPa" else f"moduli are ratios to '{self.relative_to}'"
+        return f"mm, {stress}; RAS coordinates"
+
+
+def fitted_model(result: CaseResult, *, seal: str) -> FittedModel:
+    """The model of a result; raises `EstimationError` where the estimate did not converge, for there is none then."""
+    estimation, case = result.estimation, result.case
+    if estimation.status != "converged":
+        raise EstimationError(
+            f"the estimate ended with the status '{estimation.status}' ({estimation.reason}), so there is no model to"
+            " export: nothing that did not converge is passed on"
+        )
+    first = len(result.after)
+    bodies = [_body(result, estimation.displacements[:first])]
+    bodies += [_body(pair, pair.displacements) for pair in result.further]
+    density = {tissue.name: tissue.density_kg_m3 for tissue in case.tissues}
+    law = case.mechanics.material_law
+    return FittedModel(
+        tuple(bodies),
+        result.stiffness,
+        result.unit,
+        next((item.relative_to for item in estimation.estimates), ""),
+        estimation.estimates,
+        estimation.covariance.total,
+        law.name,
+        {parameter.name: getattr(law, parameter.name) for parameter in law.parameters},
+        case.mechanics.element,
+        case.domain.outer_boundary,
+        case.loads,
+        np.array([density.get(tissue.name, 1000.0) for tissue in result.tissues]),
+        seal,
+    )
+
+
+def _body(pair: CaseResult | PairResult, displacements: tuple[NDArray[np.float64], ...]) -> FittedBody:
+    mesh = pair.space.mesh
+    nameless = tuple(replace(tissue, called=()) for tissue in mesh.tissues)  # the labels' own names are the image's
+    alignments = tuple(motion.matrix for motion in pair.alignments) or tuple(np.eye(4) for _ in displacements)
+    motions = displacements or (np.zeros_like(pair.space.points),)
+    return FittedBody(
+        replace(mesh, tissues=nameless),
+        pair.space.order,
+        motions,
+        alignments or (np.eye(4),),
+        pair.before.index,
+        pair.before.grid,
+    )

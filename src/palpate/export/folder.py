@@ -1,0 +1,58 @@
+"""From a result, or the folder that it was written to, to files for another program."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from palpate.errors import ConfigurationError
+from palpate.export.fitted_model import FittedModel, fitted_model
+from palpate.export.formats import Options, format_named
+from palpate.export.model_file import read_model, seal_of
+from palpate.study.lock import held_folder
+from palpate.study.outputs import OutputFolder, make_folder
+from palpate.study.result import CaseResult
+
+__all__ = ["export", "export_into"]
+
+PathLike = str | os.PathLike[str]
+
+
+def export(
+    result: CaseResult | PathLike,
+    output: PathLike,
+    *,
+    format: str,  # noqa: A002 - the flag's own name
+    linear: bool = False,
+    source: PathLike | None = None,
+) -> tuple[Path, ...]:
+    """Write a result, or what an estimate wrote to the folder `result`, into `output` for another program.
+
+    format: one of `palpate.export.formats.FORMATS`; linear: tetrahedra of four nodes, displacements of corners alone;
+    source: a folder with the DICOM series of the first image, which "dicom" refers to. Gives the paths that were
+    written, all or none of them. Raises `InputDataError` for a folder that is incomplete, of another version or changed
+    since, `EstimationError` for an estimate that did not converge, `ConfigurationError` for an unknown format,
+    `ResourceError` where a library is missing or the disk refuses.
+    """
+    options = Options(linear, None if source is None else Path(source))
+    format_named(format)
+    if isinstance(result, CaseResult):
+        model = fitted_model(result, seal=seal_of(result.to_dict()))
+    else:
+        model = read_model(Path(result))
+        if Path(result).resolve() == Path(output).resolve():
+            raise ConfigurationError(f"{output} is the folder of the result itself: choose another one for the export")
+    outputs = OutputFolder(Path(output))
+    with held_folder(outputs.path):
+        export_into(outputs, model, format, options)
+    return tuple(outputs.path / name for name in outputs.written)
+
+
+def export_into(outputs: OutputFolder, model: FittedModel, name: str, options: Options) -> None:
+    """Put the files of the format `name` in place in a folder that is held; further pairs' in pair_2, pair_3 ..."""
+    form = format_named(name)
+    with outputs.staged() as staging:
+        for number, body in enumerate(model.bodies if form.every_pair else model.bodies[:1], start=1):
+            folder = staging.area if number == 1 else make_folder(staging.area / f"pair_{number}")
+            form.write(model, body.with_linear_tetrahedra() if options.linear else body, folder, options)
+        staging.commit()

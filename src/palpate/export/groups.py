@@ -1,0 +1,81 @@
+"""The named parts of a fitted body that every simulator's file has: tissues, walls, the cut of the image."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.images.tissue import Role
+from palpate.mesh.surface import tissue_surface
+from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh
+
+__all__ = ["FaceGroup", "element_faces", "face_groups", "plain_names", "tissue_groups"]
+
+
+@dataclass(frozen=True, slots=True)
+class FaceGroup:
+    """Faces of a mesh under a name: triangles (n, 3) node numbers, normals out of the tissue (into a hollow one's)."""
+
+    name: str
+    triangles: NDArray[np.int64]
+
+
+def tissue_groups(mesh: TetMesh) -> dict[str, NDArray[np.int64]]:
+    """Numbers (n,) of the tetrahedra of each meshed tissue by its name."""
+    return {
+        tissue.name: np.flatnonzero(mesh.region == number)
+        for number, tissue in enumerate(mesh.tissues)
+        if tissue.meshed
+    }
+
+
+def face_groups(mesh: TetMesh) -> tuple[FaceGroup, ...]:
+    """The surface of each meshed tissue, its observed part, each hollow tissue's wall, the cut of the image.
+
+    Their names are the tissue's with " surface", " observed" or " wall", and "outer boundary". Empty ones are left out.
+    """
+    prescribed = [i for i, tissue in enumerate(mesh.tissues) if tissue.role in (Role.DRIVER, Role.RIGID)]
+    found = []
+    for number, tissue in enumerate(mesh.tissues):
+        if not tissue.meshed:
+            found.append(FaceGroup(f"{tissue.name} wall", mesh.boundary[mesh.beyond == number]))
+            continue
+        surface = tissue_surface(mesh, number)
+        found.append(FaceGroup(f"{tissue.name} surface", surface.triangles))
+        if tissue.role is Role.ESTIMATE:
+            seen = ~np.isin(surface.other, [OUTER, *prescribed])
+            found.append(FaceGroup(f"{tissue.name} observed", surface.triangles[seen]))
+    found.append(FaceGroup("outer boundary", mesh.boundary[mesh.beyond == OUTER]))
+    return tuple(group for group in found if len(group.triangles))
+
+
+def element_faces(mesh: TetMesh, triangles: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Tetrahedron (n,) and its face (n,), a row of FACES, of triangles (n, 3) whose normals point out of it."""
+    every, wanted = _turned(mesh.tets[:, FACES].reshape(-1, 3), len(mesh.nodes)), _turned(triangles, len(mesh.nodes))
+    order = np.argsort(every)
+    place = order[np.searchsorted(every, wanted, sorter=order)]
+    return place // 4, place % 4
+
+
+def plain_names(names: Iterable[str], *, most: int = 80) -> dict[str, str]:
+    """Names of capital letters, digits and underscores, each its own, for programs that take no others."""
+    found: dict[str, str] = {}
+    for name in names:
+        letters = "".join(c.upper() if c.isascii() and c.isalnum() else "_" for c in name)
+        plain = (letters if letters[:1].isalpha() else f"T_{letters}")[: most - 6]
+        taken, number = set(found.values()), 2
+        unique = plain
+        while unique in taken:
+            unique, number = f"{plain}_{number}", number + 1
+        found[name] = unique
+    return found
+
+
+def _turned(triangles: NDArray[np.int64], n_nodes: int) -> NDArray[np.int64]:
+    """One number a triangle (n, 3), the same for its three turns, another for its mirror image; (n,)."""
+    first = np.argmin(triangles, axis=1)
+    turned = triangles[np.arange(len(triangles))[:, None], (first[:, None] + np.arange(3)) % 3]
+    return np.asarray((turned[:, 0] * n_nodes + turned[:, 1]) * n_nodes + turned[:, 2])

@@ -1,0 +1,84 @@
+"""model.npz, which every estimate leaves beside its result: what `palpate export` makes the files of others from."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from palpate.errors import EstimationError, InputDataError
+from palpate.export.fitted_model import FittedModel, fitted_model
+from palpate.images.named_labels import printable
+from palpate.study.archive import read_archive, write_archive
+from palpate.study.earlier import RESULT
+from palpate.study.outputs import read_json, sha256_of
+from palpate.study.result import SCHEMA, CaseResult
+
+__all__ = ["MODEL", "read_model", "seal_of", "write_model"]
+
+MODEL = "model.npz"
+FORMAT = "palpate.model/1"
+UNSEALED = ("files", "warnings")  # which are added when the files take their places
+
+
+def write_model(result: CaseResult, path: Path) -> None:
+    """Write the model of a converged result to `path`; raises `ResourceError` when the disk refuses."""
+    write_archive(fitted_model(result, seal=seal_of(result.to_dict())), path, version=FORMAT)
+
+
+def read_model(folder: Path) -> FittedModel:
+    """The model of the estimate that wrote `folder`.
+
+    Raises `InputDataError` where a file of that run is missing, or was changed since, or another version wrote it,
+    `EstimationError` where the estimate did not converge.
+    """
+    path = folder / RESULT
+    document = read_json(path)
+    if document.get("schema") != SCHEMA:
+        schema = printable(str(document.get("schema"))[:40])
+        raise InputDataError(
+            f"{path} has the schema '{schema}', this version of Palpate reads '{SCHEMA}': run the estimate again"
+        )
+    if document.get("status") != "converged":
+        raise EstimationError(
+            f"{path} tells of an estimate with the status '{printable(str(document.get('status'))[:40])}'; nothing that"
+            " did not converge is exported"
+        )
+    files = document.get("files", {})
+    if MODEL not in files:
+        raise InputDataError(
+            f"{path} tells of a run without {MODEL}, from which files for other programs are made; run the estimate"
+            " again with this version"
+        )
+    for name, entry in files.items():
+        _refuse_other(folder, name, entry["sha256"])
+    model = read_archive(FittedModel, folder / MODEL, version=FORMAT, sha256=files[MODEL]["sha256"])
+    if model.seal != seal_of(document):
+        raise InputDataError(
+            f"the numbers in {path} are not those of the run that wrote {MODEL}: one was changed since; run the"
+            " estimate again"
+        )
+    return model
+
+
+def seal_of(document: Mapping[str, Any]) -> str:
+    """SHA-256 (hexadecimal) of what a result.json says, whatever files and warnings stand beside it."""
+    sealed = {key: value for key, value in document.items() if key not in UNSEALED}
+    return hashlib.sha256(json.dumps(sealed, sort_keys=True, allow_nan=False).encode()).hexdigest()
+
+
+def _refuse_other(folder: Path, name: str, sha256: str) -> None:
+    """Raise `InputDataError` where the file `name` of the run is missing or has other bytes."""
+    path = folder / name
+    if Path(name).name != name or path.is_symlink() or not path.is_file():
+        raise InputDataError(
+            f"{folder} is incomplete: the file '{printable(name)}', which its {RESULT} lists, is not there; run the"
+            " estimate again"
+        )
+    if sha256_of(path) != sha256:
+        raise InputDataError(
+            f"{path} was changed after the estimate that {RESULT} tells of (its SHA-256 is another); run the estimate"
+            " again, into another folder"
+        )

@@ -1,0 +1,65 @@
+"""A result on its image in a notebook: slices and volume by NiiVue, through ipyniivue (extra `notebook`)."""
+
+from __future__ import annotations
+
+import tempfile
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate.errors import ResourceError
+from palpate.export.rasterise import region_image
+from palpate.images.label_image import LabelImage
+from palpate.images.readers import write_label_image, write_scalar_image
+from palpate.images.tissue import Role
+from palpate.images.tissue_colours import tissue_colours
+from palpate.study.result import CaseResult
+
+__all__ = ["notebook_viewer"]
+
+
+def notebook_viewer(result: CaseResult, *, background: Path | None = None, opacity: float = 0.6) -> Any:
+    """A widget of the first image: `background` (a grey image) or the tissues, the modulus over it from `stiffness`.
+
+    opacity: of the modulus, 0 to 1. Raises `ResourceError` without the extra `notebook`.
+    """
+    try:
+        ipyniivue = import_module("ipyniivue")
+    except ImportError as error:
+        raise ResourceError(
+            "the viewer for notebooks is ipyniivue, which is not installed: pip install 'palpate[notebook]'"
+        ) from error
+    moduli = np.nan_to_num(np.append(result.stiffness, 0.0))
+    with tempfile.TemporaryDirectory() as folder:
+        labels, stiffness = Path(folder) / "tissues.nii.gz", Path(folder) / "stiffness.nii.gz"
+        write_label_image(labels, LabelImage(result.before.index.astype(np.int32), result.before.grid))
+        write_scalar_image(stiffness, moduli[region_image(result.space.mesh, result.before.grid)], result.before.grid)
+        known = moduli[moduli > 0.0]
+        over = ipyniivue.Volume(
+            data=stiffness.read_bytes(),
+            name=stiffness.name,
+            colormap="viridis",
+            cal_min=0.5 * float(known.min()) if len(known) else 0.0,
+            cal_max=float(known.max()) if len(known) else 1.0,
+            opacity=opacity,
+        )
+        if background is None:
+            under = ipyniivue.Volume(
+                data=labels.read_bytes(), name=labels.name, colormap_label=_table(ipyniivue, result), opacity=1.0
+            )
+        else:
+            under = ipyniivue.Volume(path=background, colormap="gray", opacity=1.0)
+    viewer = ipyniivue.NiiVue(height=400)
+    viewer.load_volumes([under, over])
+    return viewer
+
+
+def _table(ipyniivue: Any, result: CaseResult) -> Any:
+    """Colour and name of each tissue in their order; what lies around the body is clear."""
+    colours = [bytes.fromhex(colour[1:]) for colour in tissue_colours(result.tissues)]
+    opaque = [0 if tissue.role is Role.VOID else 255 for tissue in result.tissues]
+    table = [part for colour, alpha in zip(colours, opaque, strict=True) for part in (*colour, alpha)]
+    names = [tissue.name for tissue in result.tissues]
+    return ipyniivue.LUT(lut=table, min=0.0, max=len(names) - 1.0, labels=names)

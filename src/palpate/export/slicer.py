@@ -1,0 +1,108 @@
+"""3D Slicer: labels with names and colours, the stiffness over them, surfaces and warp, and a script that loads all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from palpate.export import ply, warp
+from palpate.export.closed_surfaces import closed_surfaces
+from palpate.export.fitted_model import FittedBody, FittedModel
+from palpate.export.formats import Options
+from palpate.export.label_table import write_label_table
+from palpate.export.rasterise import region_image
+from palpate.images.label_image import LabelImage
+from palpate.images.readers import write_label_image, write_scalar_image
+from palpate.images.segmentation import first_labels
+from palpate.images.tissue_colours import tissue_colours
+from palpate.study.outputs import write_json, write_text
+
+__all__ = ["write"]
+
+SCRIPT = '''"""Load what Palpate exported into 3D Slicer: paste into its Python console
+
+    exec(open(r"/path/to/load_in_slicer.py").read(), {"__file__": r"/path/to/load_in_slicer.py"})
+
+or start Slicer with: Slicer --python-script load_in_slicer.py. Grey images named before.* and after.* (.nii.gz, .nrrd)
+that lie beside this script are loaded, too.
+"""
+
+import json
+from pathlib import Path
+
+import slicer
+
+HERE = Path(__file__).resolve().parent
+SCENE = json.loads((HERE / "scene.json").read_text(encoding="utf-8"))
+
+
+def load():
+    grey = {}
+    for state in ("before", "after"):
+        for path in [*HERE.glob(f"{state}.nii*"), *HERE.glob(f"{state}.nrrd")][:1]:
+            grey[state] = slicer.util.loadVolume(str(path))
+    colours = slicer.util.loadColorTable(str(HERE / "labels.csv"))
+    labels = slicer.util.loadLabelVolume(str(HERE / "labels.nii.gz"), {"colorNodeID": colours.GetID()})
+    segmentation = slicer.mrmlScene.AddNewNodeByClass("vtkMRMLSegmentationNode", "tissues")
+    slicer.modules.segmentations.logic().ImportLabelmapToSegmentationNode(labels, segmentation)
+    stiffness = slicer.util.loadVolume(str(HERE / "stiffness.nii.gz"))
+    stiffness.SetName(SCENE["stiffness"]["name"])
+    display = stiffness.GetDisplayNode()
+    display.SetAndObserveColorNodeID("vtkMRMLColorTableNodeFileViridis.txt")
+    low, high = SCENE["stiffness"]["range"]
+    display.AutoWindowLevelOff()
+    display.SetWindowLevelMinMax(low, high)
+    display.SetApplyThreshold(True)
+    display.SetLowerThreshold(SCENE["stiffness"]["least"])
+    for model in SCENE["models"]:
+        node = slicer.util.loadModel(str(HERE / model["file"]))
+        node.SetName(model["name"])
+        node.GetDisplayNode().SetColor(*model["colour"])
+        node.GetDisplayNode().SetOpacity(0.4)
+        node.GetDisplayNode().SetVisibility(model["visible"])
+    for name in SCENE["warps"]:
+        slicer.util.loadTransform(str(HERE / name))
+    background = grey.get("before", labels)
+    slicer.util.setSliceViewerLayers(background=background, foreground=stiffness, foregroundOpacity=0.5, fit=True)
+
+
+load()
+'''
+
+
+def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
+    """Write load_in_slicer.py, labels.nii.gz and .csv, stiffness.nii.gz, the surfaces (.ply), the warp, scene.json."""
+    numbers = first_labels(body.tissues)
+    write_label_image(folder / "labels.nii.gz", LabelImage(numbers[body.index], body.grid))
+    write_label_table(folder / "labels.csv", body.tissues)
+    moduli = np.nan_to_num(np.append(model.moduli, 0.0))  # 0 where nothing is meshed: Slicer shows NaN as anything
+    write_scalar_image(folder / "stiffness.nii.gz", moduli[region_image(body.mesh, body.grid)], body.grid)
+    ply.write(model, body, folder, options)
+    warp.write(model, body, folder, options)
+    shown = zip(body.tissues, tissue_colours(body.tissues), strict=True)
+    colours = {tissue.name: _rgb(colour) for tissue, colour in shown}
+    roles = {tissue.name: str(tissue.role) for tissue in body.tissues}
+    known = model.moduli[np.isfinite(model.moduli)]
+    name = "Young's modulus (kPa)" if model.unit == "kPa" else f"Young's modulus (ratio to {model.relative_to})"
+    scene = {
+        "schema": "palpate.slicer/1",
+        "stiffness": {"name": name, "range": [0.0, float(known.max())], "least": 0.5 * float(known.min())},
+        "models": [
+            {
+                "file": f"{surface.stem}.ply",
+                "name": f"{surface.name}, {surface.state.replace('_', ' ')}",
+                "colour": colours[surface.name],
+                "visible": surface.state == "before" and roles[surface.name] in ("estimate", "driver"),
+            }
+            for surface in closed_surfaces(body)
+        ],
+        "warps": sorted(path.name for path in folder.glob("*warp*.nii.gz")),
+    }
+    write_json(folder / "scene.json", scene)
+    write_text(folder / "load_in_slicer.py", SCRIPT)
+
+
+def _rgb(colour: str) -> list[float]:
+    """Red, green, blue (3,) from 0 to 1 of #rrggbb."""
+    return [int(colour[start : start + 2], 16) / 255.0 for start in (1, 3, 5)]

@@ -1,0 +1,58 @@
+"""VTK: the mesh in each state, a collection to animate them, and the groups as blocks with their names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.export.case_files import file_name
+from palpate.export.fitted_model import FittedBody, FittedModel
+from palpate.export.formats import Options
+from palpate.export.groups import face_groups
+from palpate.export.vtk_xml import write_pvd, write_vtp, write_vtu
+from palpate.images.segmentation import first_labels
+from palpate.mechanics.deformation import largest_strains
+from palpate.study.outputs import make_folder, write_text
+
+__all__ = ["write", "write_states"]
+
+
+def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
+    """Write mesh_0.vtu (at rest), mesh_1.vtu ... (each later image), mesh.pvd, and groups.vtm with groups/*.vtp."""
+    del options
+    blocks = [("mesh", write_states(model, body, folder)[-1])]
+    make_folder(folder / "groups")
+    moved = {"displacement_mm": body.displacements[-1][: len(body.mesh.nodes)]}
+    for number, group in enumerate(face_groups(body.mesh)):
+        name = f"groups/{number:02d}_{file_name(group.name)}.vtp"
+        write_vtp(folder / name, body.mesh.nodes, group.triangles, point_data=moved)
+        blocks.append((group.name, name))
+    sets = "".join(
+        f'<DataSet index="{index}" name={quoteattr(name)} file={quoteattr(file)}/>'
+        for index, (name, file) in enumerate(blocks)
+    )
+    heading = '<?xml version="1.0"?>\n<VTKFile type="vtkMultiBlockDataSet" version="1.0">'
+    write_text(folder / "groups.vtm", f"{heading}<vtkMultiBlockDataSet>{sets}</vtkMultiBlockDataSet></VTKFile>\n")
+
+
+def write_states(model: FittedModel, body: FittedBody, folder: Path) -> list[str]:
+    """Write the mesh at rest and as each later image has it, each with its displacement; gives the files' names."""
+    space, region = body.space, body.mesh.region
+    poisson = np.array([tissue.poisson_ratio for tissue in body.tissues])
+    modulus = "youngs_modulus_kpa" if model.unit == "kPa" else "youngs_modulus_ratio"
+    cells: dict[str, NDArray[Any]] = {
+        "label": first_labels(body.tissues)[region],
+        modulus: model.moduli[region],
+        "poisson_ratio": poisson[region],
+    }
+    names = []
+    for number, displacement in enumerate((np.zeros_like(space.points), *body.displacements)):
+        names.append(f"mesh_{number}.vtu")
+        strained = {**cells, "largest_strain": largest_strains(space, displacement)}
+        write_vtu(folder / names[-1], space, point_data={"displacement_mm": displacement}, cell_data=strained)
+    write_pvd(folder / "mesh.pvd", [(float(number), name) for number, name in enumerate(names)])
+    return names

@@ -1,0 +1,433 @@
+"""Every format of `palpate export` says the same of a body: volumes by tissue, groups, names, moduli, motion."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import re
+import runpy
+import sys
+import types
+from collections import Counter
+from xml.etree import ElementTree as ET
+
+import highdicom
+import meshio
+import numpy as np
+import pydicom
+import pytest
+import SimpleITK
+
+import palpate
+from dicom_files import PLANTED, ct_slices, save_series
+from palpate.errors import ConfigurationError, InputDataError
+from palpate.export.fitted_model import fitted_model
+from palpate.export.groups import element_faces, face_groups, plain_names
+from palpate.images.alignment import RigidMotion
+from palpate.images.label_image import VoxelGrid
+from palpate.mechanics.laws.contract import energy
+from palpate.mesh.space import lagrange_space
+from palpate.mesh.surface import triangle_normals
+from palpate.mesh.tet_mesh import FACES
+from palpate.study.case import CaseLoad
+
+VOLUME = 1e-4  # relative
+LPS = np.array([-1.0, -1.0, 1.0])
+MESHED = ("prostate", "bladder", "surroundings")
+GROUPS = {
+    "prostate surface",
+    "prostate observed",
+    "bladder surface",
+    "bladder observed",
+    "rectum wall",
+    "surroundings surface",
+    "outer boundary",
+}
+
+
+@pytest.fixture(scope="module")
+def model(case_result):
+    return fitted_model(case_result, seal="")
+
+
+@pytest.fixture(scope="module")
+def exported(case_result, tmp_path_factory):
+    """The folder of each format, written once when it is asked for."""
+    made = {}
+
+    def export(name, **options):
+        key = (name, *sorted(options))
+        if key not in made:
+            made[key] = tmp_path_factory.mktemp(name) / "out"
+            palpate.export(case_result, made[key], format=name, **options)
+        return made[key]
+
+    return export
+
+
+def volumes(points, tets):
+    corner = points[tets[:, :4]]
+    return np.linalg.det(corner[:, 1:] - corner[:, :1]) / 6.0
+
+
+def volume_of(model, name):
+    mesh = model.bodies[0].mesh
+    return mesh.volumes[mesh.region == mesh.tissue_index(name)].sum()
+
+
+def test_a_face_is_that_of_the_tetrahedron_whose_outside_it_shows(model):
+    mesh = model.bodies[0].mesh
+    for group in face_groups(mesh):
+        cells, faces = element_faces(mesh, group.triangles)
+        found = mesh.tets[cells[:, None], FACES[faces]]
+        assert np.array_equal(np.sort(found, axis=1), np.sort(group.triangles, axis=1))
+        away = mesh.nodes[group.triangles].mean(axis=1) - mesh.nodes[mesh.tets[cells]].mean(axis=1)
+        assert (np.einsum("ni,ni->n", away, triangle_normals(mesh.nodes, group.triangles)) > 0).all()
+
+
+def test_plain_names_stay_apart():
+    names = ["left hip", "left-hip", "Blase (ü)", "9", "x" * 200, "x" * 201]
+    plain = plain_names(names)
+    assert len(set(plain.values())) == len(names)
+    assert all(re.fullmatch("[A-Z][A-Z0-9_]{0,79}", name) for name in plain.values())
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_abaqus_has_each_tissue_with_its_volume_moduli_and_moved_wall(exported, model, linear):
+    folder = exported("abaqus", linear=True) if linear else exported("abaqus")
+    assert (folder / "palpate_hybrid.inp").exists() == (not linear)
+    text = (folder / "palpate.inp").read_text()
+    mesh = meshio.read(folder / "palpate.inp")
+    tets = np.concatenate([block.data for block in mesh.cells])
+    assert tets.shape[1] == (4 if linear else 10)
+    plain = plain_names([*MESHED, *GROUPS])
+    for name in MESHED:
+        own = [block.data[ids] for block, ids in zip(mesh.cells, mesh.cell_sets[plain[name]], strict=True)]
+        assert volumes(mesh.points, np.concatenate(own)).sum() == pytest.approx(volume_of(model, name), rel=VOLUME)
+    assert {plain[group] for group in GROUPS} <= set(mesh.point_sets)
+    constants = re.search(r"\*MATERIAL, NAME=PROSTATE\n\*HYPERELASTIC, NEO HOOKE\n(.*), (.*)\n", text)
+    modulus, ratio = 58.9, 0.45
+    shear, bulk = modulus / (2 * (1 + ratio)), modulus / (3 * (1 - 2 * ratio))
+    assert [float(c) for c in constants.groups()] == pytest.approx([shear / 2, 2 / bulk], rel=1e-9)
+    conditions = re.findall(r"^(\d+), ([123]), \2, (\S+)$", text.split("*BOUNDARY\n")[1], re.MULTILINE)
+    motion = model.bodies[0].displacements[0]
+    wall = mesh.point_sets[plain["rectum wall"]]
+    moved = {(int(node), int(axis)): float(value) for node, axis, value in conditions}
+    for node in wall[::7]:
+        assert [moved[node + 1, axis] for axis in (1, 2, 3)] == pytest.approx(motion[node], abs=1e-9)
+
+
+def test_the_elements_of_abaqus_are_ours_edge_by_edge(exported):
+    """Quadratic nodes lie in the middle of the edges 12, 23, 13, 14, 24, 34 of C3D10."""
+    mesh = meshio.read(exported("abaqus") / "palpate.inp")
+    tets = mesh.cells[0].data
+    for place, (a, b) in enumerate([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)], start=4):
+        np.testing.assert_allclose(mesh.points[tets[:, place]], mesh.points[tets[:, [a, b]]].mean(axis=1), atol=1e-9)
+
+
+def test_sliding_faces_are_held_along_their_normals(case_result, tmp_path):
+    """In Abaqus along the image's own axes; where these are askew, FEBio and SOFA say that they cannot."""
+    domain = dataclasses.replace(case_result.case.domain, outer_boundary="sliding")
+    result = dataclasses.replace(case_result, case=dataclasses.replace(case_result.case, domain=domain))
+    palpate.export(result, tmp_path / "straight", format="abaqus", linear=True)
+    text = (tmp_path / "straight" / "palpate.inp").read_text()
+    held = re.findall(r"^(\d+), ([123]), \2$", text, re.MULTILINE)
+    mesh = result.space.mesh
+    low = {(int(node) - 1, int(axis) - 1) for node, axis in held}
+    for node, axis in list(low)[::20]:
+        assert mesh.nodes[node, axis] in (0.0, 40.0)
+    assert "*TRANSFORM" not in text
+    turn = np.eye(4)
+    turn[:2, :2] = [[0.8, -0.6], [0.6, 0.8]]
+    mesh = dataclasses.replace(mesh, nodes=mesh.nodes @ turn[:3, :3].T)
+    grid = dataclasses.replace(result.before.grid, affine=turn @ result.before.grid.affine)
+    space = lagrange_space(mesh, "P2")
+    before = dataclasses.replace(result.before, grid=grid)
+    askew = dataclasses.replace(result, space=space, before=before)
+    palpate.export(askew, tmp_path / "askew", format="abaqus", linear=True)
+    lines = (tmp_path / "askew" / "palpate.inp").read_text().split("TYPE=R\n")[1].splitlines()
+    axes = np.array([float(x) for x in lines[0].split(",")]).reshape(2, 3)
+    np.testing.assert_allclose(np.abs(axes @ turn[:3, :3]), np.eye(3)[:2], atol=1e-9)
+    for name in ("febio", "sofa"):
+        with pytest.raises(ConfigurationError, match="askew"):
+            palpate.export(askew, tmp_path / name, format=name)
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_gmsh_has_volumes_and_surfaces_as_physical_groups(exported, model, linear):
+    folder = exported("gmsh", linear=True) if linear else exported("gmsh")
+    mesh = meshio.read(folder / "palpate.msh")
+    assert GROUPS | set(MESHED) == {re.sub(r"\W+$", "", name) for name in mesh.field_data}
+    for name in MESHED:
+        tag = mesh.field_data[name][0]
+        own = [
+            block.data[data == tag]
+            for block, data in zip(mesh.cells, mesh.cell_data["gmsh:physical"], strict=True)
+            if block.type.startswith("tetra")
+        ]
+        assert volumes(mesh.points, np.concatenate(own)).sum() == pytest.approx(volume_of(model, name), rel=VOLUME)
+    np.testing.assert_allclose(mesh.point_data["displacement_mm"], fitted_motion(model, linear=linear), atol=1e-8)
+
+
+def fitted_motion(model, *, linear=False):
+    body = model.bodies[0].with_linear_tetrahedra() if linear else model.bodies[0]
+    return body.displacements[0]
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_febio_has_domains_sets_and_maps_that_refer_to_each_other(exported, model, linear):
+    root = ET.parse((exported("febio", linear=True) if linear else exported("febio")) / "palpate.feb").getroot()
+    order = ["Module", "Material", "Mesh", "MeshDomains", "MeshData", "LoadData", "Step", "Output"]
+    assert [child.tag for child in root] == order
+    nodes = np.array([[float(x) for x in node.text.split(",")] for node in root.find("Mesh/Nodes")])
+    sizes = {}
+    for elements in root.iter("Elements"):
+        assert elements.get("type") == ("tet4" if linear else "tet10")
+        cells = np.array([[int(x) for x in e.text.split(",")] for e in elements]) - 1
+        sizes[elements.get("name")] = volumes(nodes, cells).sum()
+    assert sizes == {name: pytest.approx(volume_of(model, name), rel=VOLUME) for name in MESHED}
+    assert {surface.get("name") for surface in root.iter("Surface")} == GROUPS
+    assert {d.get("mat") for d in root.iter("SolidDomain")} == {m.get("name") for m in root.iter("material")}
+    sets = {s.get("name"): [int(n) for n in s.text.split(",")] for s in root.iter("NodeSet")}
+    maps = {data.get("name"): data for data in root.iter("NodeData")}
+    motion = fitted_motion(model, linear=linear)
+    conditions = [bc for bc in root.iter("bc") if bc.get("type") == "prescribed displacement"]
+    assert [bc.find("dof").text for bc in conditions] == ["x", "y", "z"]
+    for axis, condition in enumerate(conditions):
+        values = [float(node.text) for node in maps[condition.find("value").text]]
+        points = np.array(sets[condition.get("node_set")]) - 1
+        np.testing.assert_allclose(values, motion[points, axis], atol=1e-9)
+    prostate = next(m for m in root.iter("material") if m.get("name") == "prostate")
+    assert prostate.get("type") == "neo-Hookean"
+    assert [float(prostate.find(key).text) for key in ("E", "v")] == [58.9, 0.45]
+
+
+@pytest.mark.parametrize("name", ["stl", "obj", "ply"])
+def test_surfaces_are_closed_outward_and_hold_their_tissues_volume(exported, model, name):
+    for tissue in (*MESHED, "rectum"):
+        for state in ("before", "after"):
+            (path,) = exported(name).glob(f"*_{tissue}_{state}.{name}")
+            mesh = meshio.read(path)
+            points, triangles = merged(mesh.points, mesh.cells_dict["triangle"])
+            edges = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+            ways = Counter(map(tuple, edges.tolist()))  # where a body touches itself, an edge has four triangles
+            assert ways == Counter({(b, a): count for (a, b), count in ways.items()})
+            size = np.linalg.det(points[triangles]).sum() / 6.0
+            assert size > 0.0
+            if state == "before" and tissue != "rectum":
+                assert size == pytest.approx(volume_of(model, tissue), rel=VOLUME)
+    if name != "obj":  # whose comments meshio passes over
+        assert b"SPACE=RAS" in path.read_bytes()[:200]
+
+
+def merged(points, triangles):
+    """Points that lie on each other as one, as in the triangles of STL."""
+    _, first, inverse = np.unique(np.round(points, 4), axis=0, return_index=True, return_inverse=True)
+    return points[first].astype(float), inverse.ravel()[triangles]
+
+
+def test_vtk_has_each_state_and_each_group(exported, model):
+    folder = exported("vtu")
+    mesh = meshio.read(folder / "mesh_1.vtu")
+    np.testing.assert_allclose(mesh.point_data["displacement_mm"], fitted_motion(model), atol=1e-12)
+    assert not meshio.read(folder / "mesh_0.vtu").point_data["displacement_mm"].any()
+    label = mesh.cell_data["label"][0]
+    sizes = volumes(mesh.points, mesh.cells[0].data)
+    for number, name in ((1, "prostate"), (2, "bladder"), (4, "surroundings")):
+        assert sizes[label == number].sum() == pytest.approx(volume_of(model, name), rel=VOLUME)
+    blocks = ET.parse(folder / "groups.vtm").getroot().iter("DataSet")
+    files = {block.get("name"): folder / block.get("file") for block in blocks}
+    assert set(files) == GROUPS | {"mesh"}
+    assert all(path.is_file() for path in files.values())
+
+
+def test_the_warp_takes_points_to_where_the_model_has_them(case_result, tmp_path, model):
+    """Before's surfaces come to lie on after's, in the worlds of both images; the inverse takes them back."""
+    shift = RigidMotion([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], [5.0, -3.0, 2.0])
+    result = dataclasses.replace(case_result, alignments=(shift,))
+    palpate.export(result, tmp_path, format="warp")
+    body = model.bodies[0]
+    surface = np.unique(np.concatenate([body.space.facets(g.triangles) for g in face_groups(body.mesh)]))
+    before = body.space.points[surface]
+    after = shift.apply(before + fitted_motion(model)[surface])
+    grid = case_result.before.grid
+    there = VoxelGrid(grid.shape, shift.matrix @ grid.affine)
+    for name, start, goal, box in (("warp", before, after, grid), ("inverse_warp", after, before, there)):
+        image = SimpleITK.ReadImage(str(tmp_path / f"{name}.nii.gz"), SimpleITK.sitkVectorFloat64)
+        transform = SimpleITK.DisplacementFieldTransform(image)
+        near = (np.abs(box.index(start) / (np.array(grid.shape) - 1.0) - 0.5) < 0.5).all(axis=1)  # where the field is
+        assert near.sum() > 1000
+        found = np.array([transform.TransformPoint(p) for p in (start[near] * LPS).tolist()]) * LPS
+        assert np.sqrt(((found - goal[near]) ** 2).sum(axis=1).mean()) < 0.05
+
+
+def test_dicom_holds_stiffness_in_kilopascals_and_every_tissue(exported, case_result):
+    folder = exported("dicom")
+    stiffness = pydicom.dcmread(folder / "stiffness.dcm")
+    assert stiffness.ContentQualification == "RESEARCH"
+    mapping = stiffness.SharedFunctionalGroupsSequence[0].RealWorldValueMappingSequence[0]
+    assert mapping.MeasurementUnitsCodeSequence[0].CodeValue == "kPa"
+    assert mapping.MeasurementUnitsCodeSequence[0].CodingSchemeDesignator == "UCUM"
+    values = np.unique(np.frombuffer(stiffness.FloatPixelData, dtype="<f4"))
+    np.testing.assert_allclose(values, [0.0, 10.0, 31.2, 58.9], rtol=1e-6)
+    segmentation = highdicom.seg.segread(folder / "segmentation.dcm")
+    names = {str(item.SegmentLabel): int(item.SegmentNumber) for item in segmentation.SegmentSequence}
+    assert set(names) == {"prostate", "bladder", "rectum", "surroundings"}
+    prostate = segmentation.get_volume(segment_numbers=[names["prostate"]], combine_segments=True)
+    count = np.count_nonzero(case_result.before.index == 0)
+    assert np.count_nonzero(prostate.array) == count
+    world = prostate.affine
+    middle = np.argwhere(prostate.array).mean(axis=0) @ world[:3, :3].T + world[:3, 3]
+    expected = case_result.before.grid.world(np.argwhere(case_result.before.index == 0).mean(axis=0)[None])[0]
+    np.testing.assert_allclose(middle * [-1, -1, 1], expected, atol=1e-3)
+
+
+def test_dicom_belongs_to_the_series_that_is_named(case_result, tmp_path):
+    slices = ct_slices((28, 27, 26), (1.6, 1.6, 1.6), (-40.3, -41.2, -1.0))
+    save_series(tmp_path / "series", slices)
+    palpate.export(case_result, tmp_path / "out", format="dicom", source=tmp_path / "series")
+    for name in ("stiffness.dcm", "segmentation.dcm"):
+        found = pydicom.dcmread(tmp_path / "out" / name)
+        assert found.StudyInstanceUID == slices[0].StudyInstanceUID
+        assert found.FrameOfReferenceUID == slices[0].FrameOfReferenceUID
+        assert found.PatientName == PLANTED
+        assert found.ReferencedSeriesSequence[0].SeriesInstanceUID == slices[0].SeriesInstanceUID
+    save_series(tmp_path / "far", ct_slices((5, 27, 26), (1.6, 1.6, 1.6), (-40.3, -41.2, 500.0)))
+    with pytest.raises(InputDataError, match="does not lie where"):
+        palpate.export(case_result, tmp_path / "no", format="dicom", source=tmp_path / "far")
+    assert not (tmp_path / "no").exists()
+
+
+def test_netcdf_and_csv_hold_the_posterior_of_the_intervals(exported, case_result):
+    h5netcdf = pytest.importorskip("h5netcdf")
+    with h5netcdf.File(exported("netcdf") / "posterior.nc") as file:
+        values = np.array(file["posterior/youngs_modulus"][...])
+        assert file["posterior/youngs_modulus"].dimensions == ("chain", "draw", "tissue")
+        names = [str(name, "utf-8") if isinstance(name, bytes) else name for name in file["posterior/tissue"][...]]
+    assert names == ["prostate", "bladder"]
+    logarithms = np.log(values).reshape(-1, 2)
+    np.testing.assert_allclose(logarithms.mean(axis=0), np.log([58.9, 31.2]), atol=0.02)
+    np.testing.assert_allclose(np.cov(logarithms.T), case_result.estimation.covariance.total, rtol=0.1, atol=2e-3)
+    with (exported("csv") / "samples.csv").open() as table:
+        rows = list(csv.DictReader(table))
+    assert [float(row["youngs_modulus"]) for row in rows] == pytest.approx(values.ravel(), rel=1e-9)
+    with (exported("csv") / "tissues.csv").open() as table:
+        tissues = {row["tissue"]: row for row in csv.DictReader(table)}
+    assert float(tissues["prostate"]["interval95_low"]) == pytest.approx(0.8 * 58.9)
+    assert tissues["rectum"]["youngs_modulus"] == tissues["surroundings"]["verdict"] == ""
+
+
+class Node:
+    """Records what a scene adds to it, in place of SOFA's own."""
+
+    def __init__(self):
+        self.objects, self.children = [], {}
+
+    def addChild(self, name):
+        return self.children.setdefault(name, Node())
+
+    def addObject(self, kind, **options):
+        self.objects.append((kind, options))
+        return options
+
+
+def test_the_sofa_scene_builds_every_tissue(exported, model):
+    scene = runpy.run_path(str(exported("sofa") / "scene.py"))
+    root = scene["createScene"](Node())
+    body = root.children["body"]
+    nodes = np.array(dict(body.objects)["MechanicalObject"]["position"])
+    for name in MESHED:
+        parts = dict(body.children[name.upper()].objects)
+        tets = np.array(parts["TetrahedronSetTopologyContainer"]["tetrahedra"])
+        assert volumes(nodes, tets).sum() == pytest.approx(volume_of(model, name), rel=VOLUME)
+    shear, lame = map(float, body.children["PROSTATE"].objects[2][1]["ParameterSet"].split())
+    assert shear * (3 * lame + 2 * shear) / (lame + shear) == pytest.approx(58.9)
+    held = dict(body.objects)["FixedProjectiveConstraint"]["indices"]
+    np.testing.assert_allclose(scene["positions"](1.0), (nodes + fitted_motion(model, linear=True))[held], atol=1e-12)
+
+
+class Recorder(types.ModuleType):
+    """Takes every call of a viewer's script; `files`: paths that it was given."""
+
+    def __init__(self, name):
+        super().__init__(name)
+        self.files = []
+
+    def __getattr__(self, name):
+        return self
+
+    def __call__(self, *arguments, **options):
+        self.files += [a for a in (*arguments, *options.values()) if isinstance(a, str) and "/" in a]
+        return self
+
+
+@pytest.mark.parametrize(("name", "module"), [("slicer", "slicer"), ("paraview", "paraview")])
+def test_the_scripts_of_viewers_load_files_that_are_there(exported, monkeypatch, name, module):
+    folder, viewer = exported(name), Recorder(module)
+    monkeypatch.setitem(sys.modules, module, viewer)
+    monkeypatch.setattr(sys, "argv", ["script"])
+    runpy.run_path(str(folder / f"load_in_{name}.py"))
+    loaded = [path for path in viewer.files if path.startswith(str(folder))]
+    assert len(loaded) >= (12 if name == "slicer" else 1)
+    assert all((folder / path).is_file() for path in loaded)
+    assert json.loads((folder / "scene.json").read_text())["schema"] == f"palpate.{name}/1"
+
+
+def with_mechanics(result, law, loads=()):
+    mechanics = dataclasses.replace(result.case.mechanics, law=law)
+    return dataclasses.replace(result, case=dataclasses.replace(result.case, mechanics=mechanics, loads=loads))
+
+
+def test_febio_and_sofa_have_our_energies(case_result, tmp_path):
+    """The formulae of their manuals, with the constants of the files, give the energy that we compute."""
+    F = np.eye(3) + 0.15 * np.random.default_rng(2).standard_normal((4, 3, 3))
+    C = np.einsum("nki,nkj->nij", F, F)
+    first, log = np.einsum("nii->n", C), np.log(np.linalg.det(F))
+    second = 0.5 * (first**2 - np.einsum("nij,nij->n", C, C))
+    shear, lame = 58.9 / 2.9, 58.9 * 0.45 / (1.45 * 0.1)
+    result = with_mechanics(case_result, "mooney-rivlin")
+    palpate.export(result, tmp_path, format="febio", linear=True)
+    material = ET.parse(tmp_path / "palpate.feb").find("Material/material")
+    assert material.get("type") == "coupled Mooney-Rivlin"
+    c1, c2, k = (float(material.find(key).text) for key in ("c1", "c2", "k"))
+    theirs = c1 * (first - 3) + c2 * (second - 3) - 2 * (c1 + 2 * c2) * log + k / 2 * log**2
+    ours = energy(result.case.mechanics.material_law, F, mu=shear, lame=lame)
+    np.testing.assert_allclose(theirs, ours, rtol=1e-9)
+    palpate.export(case_result, tmp_path / "sofa", format="sofa")
+    tissue = json.loads((tmp_path / "sofa" / "model.json").read_text())["tissues"][0]
+    mu, lame_there = map(float, tissue["parameters"]["ParameterSet"].split())
+    theirs = mu / 2 * (first - 3) - mu * log + lame_there / 2 * log**2
+    np.testing.assert_allclose(
+        theirs, energy(case_result.case.mechanics.material_law, F, mu=shear, lame=lame), rtol=1e-9
+    )
+
+
+def test_the_linear_law_is_a_linear_step(case_result, tmp_path):
+    palpate.export(with_mechanics(case_result, "linear"), tmp_path, format="abaqus", linear=True)
+    text = (tmp_path / "palpate.inp").read_text()
+    assert "*MATERIAL, NAME=PROSTATE\n*ELASTIC\n58.9, 0.45\n" in text
+    assert "NLGEOM" not in text
+
+
+def test_known_loads_keep_their_sum(case_result, tmp_path, model):
+    """Weight as forces on nodes, a pressure on the faces of the outer boundary; SOFA's scene says that it has none."""
+    weight = CaseLoad("gravity", acceleration_m_s2=(0.0, -9.81, 0.0))
+    pressed = CaseLoad("pressure", surface="outer", pressure_kpa=2.0)
+    result = with_mechanics(case_result, "neo-hookean", (weight, pressed))
+    palpate.export(result, tmp_path / "abaqus", format="abaqus", linear=True)
+    text = (tmp_path / "abaqus" / "palpate.inp").read_text()
+    rows = text.split("*CLOAD\n")[1].split("*")[0].split("\n")[:-1]
+    forces = np.array([[float(x) for x in row.split(",")] for row in rows])
+    assert set(forces[:, 1]) == {2.0}
+    mass_kg = 1e-6 * model.bodies[0].mesh.volumes.sum()
+    assert forces[:, 2].sum() == pytest.approx(-9.81e3 * mass_kg, rel=1e-6)  # mN
+    faces = text.split("*DLOAD\n")[1].split("*")[0].split("\n")[:-1]
+    (outer,) = [group for group in face_groups(model.bodies[0].mesh) if group.name == "outer boundary"]
+    assert len(faces) == len(outer.triangles)
+    assert all(row.endswith(", 2") for row in faces)
+    palpate.export(result, tmp_path / "febio", format="febio", linear=True)
+    root = ET.parse(tmp_path / "febio" / "palpate.feb").getroot()
+    assert [load.get("type") for load in root.find("Loads")] == ["nodal_force", "pressure"]
+    with pytest.raises(ConfigurationError, match="neither known loads"):
+        palpate.export(result, tmp_path / "sofa", format="sofa")
