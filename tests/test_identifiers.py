@@ -177,3 +177,33 @@ def test_no_identifier_of_a_header_is_in_any_output(
     table = (output / "labels.csv").read_text()
     assert "1,core,128,64,32,255" in table
     assert "3,frame,64,96,255,255" in table
+
+
+def test_no_identifier_of_a_header_is_in_any_output_of_a_cohort(
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A row that is estimated, and one that fails over its image."""
+    table = folder / "cohort.csv"
+    broken = (folder / "before.seg.nrrd").read_bytes()[:600]
+    (folder / "broken.seg.nrrd").write_bytes(broken)
+    assert planted_in(folder / "broken.seg.nrrd")
+    rows = ("good,P,2,before.seg.nrrd,after.nii.gz", "bad,Q,1,broken.seg.nrrd,after.nii.gz")
+    table.write_text("\n".join(["id,patient,stage,before,after", *rows]) + "\n")
+    output = tmp_path / "study"
+    arguments = ["--template", str(folder / "case.toml"), "--output", str(output), "--workers", "1"]
+    assert main(["cohort", str(table), *arguments]) == 0
+    files = [path for path in output.rglob("*") if path.is_file()]
+    assert {path.parent.name for path in files} >= {"study", "good", "bad"}
+    assert [str(path) for path in files if planted_in(path)] == []
+    marks = [json.loads((output / f"cases/{row}/done.json").read_text()) for row in ("good", "bad")]
+    assert [(mark["state"], mark["failure_class"]) for mark in marks] == [("done", ""), ("failed", "input")]
+    assert (output / "cases/good/report.html").exists()
+    assert "cases/good/report.html" in (output / "cohort.html").read_text()
+    assert main(["status", str(output)]) == 0
+    spoken = capfd.readouterr()
+    assert "2 rows: 1 done, 1 failed (1 input), 0 running, 0 waiting" in spoken.out
+    assert "Meyer" not in spoken.out + spoken.err
+    assert main(["statistics", str(output), "--json"]) == 0
+    document = json.loads(capfd.readouterr().out)
+    assert document["rows"] == {"in": 2, "done": 1, "failed": 1, "waiting": 0}
+    assert main(["cohort", str(table), *arguments]) == 2

@@ -9,6 +9,7 @@ PalpateError
 │   ├── SolverError         5   a linear solve failed or did not reach its tolerance
 │   └── NotConverged        5   an iteration stopped before its tolerance
 └── ResourceError           6   memory, disk, a missing optional library
+    └── FolderInUse         6   another run works in the output folder
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from __future__ import annotations
 __all__ = [
     "ConfigurationError",
     "EstimationError",
+    "FolderInUse",
     "GeometryError",
     "InputDataError",
     "MeshQualityError",
@@ -72,3 +74,7 @@ class ResourceError(PalpateError):
     """The machine lacks memory, disk space or an optional library."""
 
     exit_code = 6
+
+
+class FolderInUse(ResourceError):  # noqa: N818 - it may pass by itself
+    """Another run of Palpate works in the output folder."""

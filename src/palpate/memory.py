@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
-__all__ = ["available_memory", "total_memory"]
+try:
+    import resource
+except ImportError:  # Windows
+    TOLD = False
+else:
+    TOLD = True
+
+__all__ = ["available_memory", "peak_memory_gb", "total_memory"]
 
 # Control groups, version 2 and 1, as a container sees its own: limit, use, and the line of its caches in memory.stat.
 CGROUPS = (
@@ -21,6 +29,14 @@ def available_memory() -> float | None:
     """Bytes that are free on this machine and under its control group's limit; None where the system does not tell."""
     found = [_of_machine(), *(_of_group(*paths) for paths in CGROUPS)]
     return min((amount for amount in found if amount is not None), default=None)
+
+
+def peak_memory_gb() -> float | None:
+    """The most memory (GB) that this process has held; None where the system does not tell."""
+    if not TOLD:
+        return None
+    unit = 1 if sys.platform == "darwin" else 1024
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9, 3)
 
 
 def total_memory() -> float | None:

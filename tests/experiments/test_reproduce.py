@@ -12,6 +12,7 @@ import pytest
 from scipy import stats
 
 from palpate.cli import main
+from palpate.cohort.statistics.association import association, pearson_p, points_behind
 from palpate.errors import ConfigurationError, GeometryError, ResourceError
 from palpate.experiments.reproduce.cohort import ORGANS, PatientResult
 from palpate.experiments.reproduce.figure4 import LAW, Figure4, Point
@@ -22,7 +23,6 @@ from palpate.experiments.reproduce.paper import PAPER_STAGING, PAPER_TABLE1, PAP
 from palpate.experiments.reproduce.real_pelvis import grid_within
 from palpate.experiments.reproduce.run import reproduce
 from palpate.experiments.reproduce.staging import Staging, paper_remark
-from palpate.experiments.reproduce.statistics import association, pearson_p, points_behind
 from palpate.experiments.reproduce.table import COLUMNS, Entry, Table, TableRow
 from palpate.mesh.anatomy import Box
 

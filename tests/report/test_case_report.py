@@ -281,7 +281,7 @@ def test_what_did_not_converge_shows_no_number(case_result, tmp_path):
     estimation = dataclasses.replace(case_result.estimation, status="not converged", reason="it stopped early")
     page = write_case_report(dataclasses.replace(case_result, estimation=estimation), tmp_path).read_text()
     table = page[page.index("How stiff") : page.index("Correlation of")]
-    assert "it stopped early" in page
+    assert "It stopped early." in page
     assert not any(number in table for number in ("58.9", "31.2", "5.89", "3.12"))
     assert "not identified" in table
     assert "There is no result; these were noticed" in page
@@ -290,7 +290,7 @@ def test_what_did_not_converge_shows_no_number(case_result, tmp_path):
 
 def test_an_estimate_that_failed_has_a_report_too(case_result, tmp_path):
     page = write_failure_report(case_result.case, NotConverged("stopped <here>"), tmp_path).read_text()
-    assert "stopped &lt;here&gt;" in page
+    assert "Stopped &lt;here&gt;." in page
     assert "Yang S, Lin MC" not in page
     assert "There is no result: the search for the stiffness did not come to an end." in page
 

@@ -43,7 +43,7 @@ def test_without_convergence_there_is_no_result(status):
     banner = headline(document("identified", status=status))
     assert banner.kind == "bad"
     assert banner.title.startswith("There is no result")
-    assert banner.sentences == ("the decrement fell under its tolerance",)
+    assert banner.sentences == ("The decrement fell under its tolerance.",)
 
 
 @pytest.mark.parametrize(("count", "words"), [(0, "No warnings."), (1, "1 warning"), (3, "3 warnings")])

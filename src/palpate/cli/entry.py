@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, TextIO
 from palpate.cli.console import LOGGER, close_log, interruptible, log_is_open, output_folder, tell
 from palpate.cli.outcome import Outcome, printable_lines
 from palpate.cli.parser import make_parser, version
-from palpate.cli.progress import progress_on_stderr
+from palpate.cli.progress import PATIENCE_S, progress_on_stderr
 from palpate.errors import ConfigurationError, InputDataError, PalpateError, ResourceError
 from palpate.study.outputs import OutputFolder
 
@@ -91,16 +91,16 @@ def _run(arguments: argparse.Namespace, written: list[str]) -> Outcome:
     """
     command: Callable[..., Outcome] = arguments.command
     case = _case(arguments)
-    if arguments.output is None:
+    if arguments.output is None or getattr(arguments, "task", None) is not None:  # a task's folder is another run's
         with progress_on_stderr(quiet=arguments.quiet) as progress:
             return command(arguments, case, None, progress)
     if not arguments.makes_folder and not arguments.output.is_dir():
-        raise InputDataError(f"there is no folder {arguments.output}; name the output folder of an estimate")
+        raise InputDataError(f"there is no folder {arguments.output}; name the output folder of an earlier run")
     heading = f"palpate {version()}: {' '.join(sys.argv[1:])}"
     outputs = OutputFolder(arguments.output, written)
     with (
         output_folder(outputs, heading, logs=arguments.logs),
-        progress_on_stderr(quiet=arguments.quiet) as progress,
+        progress_on_stderr(quiet=arguments.quiet, patience_s=getattr(arguments, "patience_s", PATIENCE_S)) as progress,
     ):
         outputs.require(arguments.targets)
         _spare_inputs(arguments, case, outputs)
@@ -119,7 +119,8 @@ def _case(arguments: argparse.Namespace) -> Case | None:
 def _spare_inputs(arguments: argparse.Namespace, case: Case | None, outputs: OutputFolder) -> None:
     """Refuse to write an output in the place of an input."""
     given = () if case is not None and not arguments.set else getattr(arguments, "inputs", ())  # a case stays as it is
-    inputs: list[Path | None] = [*given, getattr(arguments, "labels", None), *getattr(arguments, "ct", ())]
+    named = (getattr(arguments, name, None) for name in ("labels", "table", "template"))
+    inputs: list[Path | None] = [*given, *named, *getattr(arguments, "ct", ())]
     if case is not None and case.images is not None:
         images = case.images
         inputs += [images.before, *images.after, images.names, images.intensities_before, *images.intensities_after]

@@ -10,7 +10,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from palpate.cli import commands, exports, studies, verification, written
+from palpate.cli import cohorts, commands, exports, studies, verification, written
 from palpate.cli.outcome import Outcome
 from palpate.export.formats import FORMATS
 
@@ -38,6 +38,12 @@ EXAMPLES = {
         "palpate export out --format dicom --source series/ --output dicom",
     ),
     "report": ("palpate report out", "palpate report out --json"),
+    "cohort": (
+        "palpate cohort cohort.csv --template case.toml --output study",
+        "palpate cohort cohort.csv --output study --engine slurm --workers 20 --resume",
+    ),
+    "status": ("palpate status study", "palpate status study --json"),
+    "statistics": ("palpate statistics study", "palpate statistics study --json"),
     "reproduce": ("palpate reproduce table1", "palpate reproduce figure4 --output figure4"),
     "view": ("palpate view out", "palpate view out --no-browser"),
     "verify": ("palpate verify --quick", "palpate verify --output verification"),
@@ -97,6 +103,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_report(subparsers)
     _add_export(subparsers)
     _add_view(subparsers)
+    _add_cohort(subparsers)
     _add_reproduce(subparsers)
     _add_verify(subparsers)
     return parser
@@ -167,6 +174,39 @@ def _formats() -> list[str]:
     return [f"{name}: {form.description}" for name, form in FORMATS.items()]
 
 
+def _add_cohort(subparsers: Any) -> None:
+    what = "estimate many cases, and ask how their moduli go with the stage"
+    command = _command(subparsers, "cohort", cohorts.cohort, what=what, folder="palpate-cohort")
+    command.add_argument(
+        "table",
+        type=Path,
+        nargs="?",
+        metavar="COHORT",
+        help="CSV file: id, patient, session, stage, and case or before and after; or a folder of BIDS derivatives",
+    )
+    command.add_argument("--template", type=Path, metavar="CASE.TOML", help="the case that images are put into")
+    command.add_argument("--engine", choices=("local", "dask", "slurm"), default="local", help="default: %(default)s")
+    command.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask scheduler that runs, with --engine dask")
+    command.add_argument("--workers", type=_count, metavar="N", help="cases at a time; default: one a processor")
+    command.add_argument("--resume", action="store_true", help="go on with the cohort in the output folder")
+    command.add_argument("--only-failed", action="store_true", help="of that cohort, compute the failed rows again")
+    command.add_argument(
+        "--memory-limit", type=_positive, metavar="GB", help="of each case; default: by its prediction"
+    )
+    command.add_argument("--time-limit", type=_positive, metavar="S", help="of each case; default: by its prediction")
+    command.add_argument("--reference", metavar="SESSION", help="of BIDS derivatives; default: each patient's first")
+    command.add_argument("--task", type=int, metavar="N", help="what --engine slurm starts: part N of its job array")
+    command.set_defaults(targets=cohorts.TARGETS, patience_s=300.0)
+    _add_set(command)
+    what = "say where a cohort stands"
+    status = _command(subparsers, "status", cohorts.status, what=what, folder=None)
+    status.add_argument("folder", type=Path, metavar="DIR", help="the output folder of a cohort")
+    what = "compute the statistics of a cohort again, and draw its page"
+    statistics = _command(subparsers, "statistics", cohorts.statistics, what=what, folder=None)
+    statistics.add_argument("output", type=Path, metavar="DIR", help="the output folder of a cohort")
+    statistics.set_defaults(makes_folder=False, targets=cohorts.TARGETS)
+
+
 def _add_reproduce(subparsers: Any) -> None:
     what = "compute one of the paper's experiments, its numbers beside ours; goes on where it was interrupted"
     command = _command(subparsers, "reproduce", studies.reproduce, what=what, folder="palpate-reproduce")
@@ -213,3 +253,9 @@ def _count(text: str) -> int:
     if not re.fullmatch(r"[0-9]{1,4}", text) or not 1 <= int(text) <= 1000:
         raise argparse.ArgumentTypeError(f"{text[:20]!r} is no whole number from 1 to 1000")
     return int(text)
+
+
+def _positive(text: str) -> float:
+    if not re.fullmatch(r"[0-9]{1,9}(\.[0-9]{1,6})?", text) or not float(text) > 0.0:
+        raise argparse.ArgumentTypeError(f"{text[:20]!r} is no positive number")
+    return float(text)

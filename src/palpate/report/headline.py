@@ -33,7 +33,8 @@ def headline(document: Mapping[str, Any]) -> Headline:
     warnings = "No warnings." if not count else "1 warning" if count == 1 else f"{count} warnings"
     if document["status"] != "converged":
         why = "the search for the stiffness did not come to an end" if document["status"] == "not converged" else ""
-        return Headline("bad", f"There is no result{f': {why}' if why else ''}.", (reason,), warnings, "")
+        told = f"{reason[:1].upper()}{reason[1:].rstrip('.')}."
+        return Headline("bad", f"There is no result{f': {why}' if why else ''}.", (told,), warnings, "")
     verdicts: dict[str, list[str]] = {}
     for item in document["estimates"]:
         verdicts.setdefault(item["verdict"], []).append(item["tissue"])

@@ -71,7 +71,7 @@ def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tu
     rows = []
     for item in items:
         value, interval = main_numbers(item)
-        truth = item["truth"]
+        truth, shares = item["truth"], item.get("variance_shares") or {}
         row = EstimateRow(
             tissue=item["tissue"],
             colour=colours.get(item["tissue"], "#888888"),
@@ -86,7 +86,7 @@ def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tu
             truth=number(truth),
             error=f"{100.0 * (value / truth - 1.0):+.1f} %" if shown and value and truth else NONE,
             bar=_bar(value, interval, truth=truth, scale=scale) if scale and value else None,
-            shares=", ".join(f"{CAUSES[c]} {100 * s:.0f} %" for c, s in (item.get("variance_shares") or {}).items()),
+            shares=", ".join(f"{CAUSES[c]} {100 * s:.0f} %" for c, s in shares.items()) if shown else "",
         )
         rows.append(row)
     return tuple(rows)

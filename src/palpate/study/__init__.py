@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from palpate.study.earlier import strange_files
     from palpate.study.estimation import Observed, conclude, verdict
     from palpate.study.journal import recover
-    from palpate.study.lock import own_file
-    from palpate.study.outputs import make_folder, staged, write_json, write_text
+    from palpate.study.lock import held_folder, own_file
+    from palpate.study.outputs import make_folder, read_json, staged, write_json, write_text
     from palpate.study.provenance import software_versions
     from palpate.study.read import read_states
     from palpate.study.result import CaseResult, failure_document
@@ -41,6 +41,7 @@ __all__ = [
     "failure_document",
     "filled",
     "fitted_states",
+    "held_folder",
     "inverse_problem",
     "inversion_settings",
     "make_body",
@@ -48,6 +49,7 @@ __all__ = [
     "mesh",
     "own_file",
     "read_case",
+    "read_json",
     "read_states",
     "recover",
     "software_versions",
@@ -78,6 +80,7 @@ _HOMES = {
     "failure_document": "palpate.study.result",
     "filled": "palpate.study.simulate",
     "fitted_states": "palpate.study.run",
+    "held_folder": "palpate.study.lock",
     "inverse_problem": "palpate.study.body",
     "inversion_settings": "palpate.study.run",
     "make_body": "palpate.study.body",
@@ -85,6 +88,7 @@ _HOMES = {
     "mesh": "palpate.study.run",
     "own_file": "palpate.study.lock",
     "read_case": "palpate.study.case_file",
+    "read_json": "palpate.study.outputs",
     "read_states": "palpate.study.read",
     "recover": "palpate.study.journal",
     "software_versions": "palpate.study.provenance",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,14 +21,20 @@ LARGEST_FILE = 100_000  # bytes; a case is a page of text, and one of a hundred 
 MOST_DOTS = 100  # in a line: keys of thousands of parts would take the parser minutes
 
 
-def read_case(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Case:
+def read_case(
+    path: str | os.PathLike[str],
+    overrides: Sequence[str] = (),
+    *,
+    change: Callable[[dict[str, Any]], dict[str, Any]] = dict,
+) -> Case:
     """The case that the TOML file at `path` describes; paths in it are relative to the file.
 
     Each of `overrides` is `key.path=value` with a TOML value (text may go without quotes); it replaces the file's.
+    change: makes another table of the file's before that, as a cohort does with its template.
     Raises `ConfigurationError` when the file cannot be read or says something unknown or impossible.
     """
     path = Path(path)
-    table = _parse(_read_text(path), str(path))
+    table = change(_parse(_read_text(path), str(path)))
     for override in overrides:
         table = _merged(table, _parse_override(override))
     table.setdefault("id", path.stem)

@@ -10,14 +10,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from palpate.errors import ResourceError
+from palpate.errors import FolderInUse, ResourceError
 from palpate.study.journal import recover
 from palpate.study.outputs import make_folder
 
 if sys.platform != "win32":
     import fcntl
 
-__all__ = ["folder_lock", "held_folder", "own_file"]
+__all__ = ["folder_lock", "held_folder", "is_held", "own_file"]
 
 NAME = ".palpate.lock"
 FLAGS = ("O_CREAT", "O_APPEND", "O_NOFOLLOW", "O_NONBLOCK", "O_NOCTTY", "O_CLOEXEC")  # Windows lacks some
@@ -46,8 +46,9 @@ def held_folder(folder: Path) -> Iterator[bool]:
 def folder_lock(folder: Path) -> Iterator[bool]:
     """Hold `folder`, which exists, for this process; the lock dies with the process, however that ends.
 
-    Gives False where the file system knows no locks: another run would not be noticed. Raises `ResourceError` when
-    another run works in the folder, nothing can be written there, or the lock's name is taken by something else.
+    Gives False where the file system knows no locks: another run would not be noticed. Raises `FolderInUse` when
+    another run works in the folder, `ResourceError` when nothing can be written there, or the lock's name is taken by
+    something else.
     """
     if sys.platform == "win32":  # no POSIX locks: two runs in a folder are not noticed there
         yield False
@@ -60,6 +61,23 @@ def folder_lock(folder: Path) -> Iterator[bool]:
         with suppress(OSError):
             path.unlink()
         os.close(file)
+
+
+def is_held(folder: Path) -> bool:
+    """Whether a run works in `folder` at the moment; False where the file system knows no locks."""
+    if sys.platform == "win32":
+        return False
+    try:
+        file = os.open(folder / NAME, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError:  # no lock, or no folder
+        return False
+    try:
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError as error:
+        return error.errno == errno.EWOULDBLOCK
+    finally:
+        os.close(file)
+    return False
 
 
 def own_file(path: Path) -> int:
@@ -102,7 +120,7 @@ def _locked(path: Path) -> tuple[int, bool]:
                 return file, False
             owner = os.pread(file, 20, 0).decode("ascii", errors="replace").strip()
             os.close(file)
-            raise ResourceError(
+            raise FolderInUse(
                 f"another run of palpate{f' (process {owner})' if owner.isdigit() else ''} works in {path.parent}: wait"
                 " until it has ended, or choose another --output folder"
             ) from error

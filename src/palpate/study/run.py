@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -39,10 +39,22 @@ __all__ = [
 ]
 
 
-def estimate(case: Case, *, progress: Progress = silent, truth: Mapping[str, float] | None = None) -> CaseResult:
+def unconditional(cost: ExpectedCost) -> None:
+    """An estimate goes on once its images are read, whatever it costs."""
+    del cost
+
+
+def estimate(
+    case: Case,
+    *,
+    progress: Progress = silent,
+    truth: Mapping[str, float] | None = None,
+    condition: Callable[[ExpectedCost], None] = unconditional,
+) -> CaseResult:
     """Estimate the Young's modulus of every `estimate` tissue of a case, from its images or its phantom.
 
-    `truth`: true moduli (kPa) by tissue, to stand beside the estimates of a simulation; a phantom brings its own.
+    `truth`: true moduli (kPa) by tissue, to stand beside the estimates of a simulation; a phantom brings its own;
+    `condition`: is asked with what is expected to be taken, once the images are read, and may raise.
     Raises `PalpateError`s of reading, meshing and solving; an iteration that did not converge is no error but a
     result whose status says so, with no values.
     """
@@ -51,8 +63,10 @@ def estimate(case: Case, *, progress: Progress = silent, truth: Mapping[str, flo
     during("reading", progress)("reading the images")
     reading = during("reading", progress)
     states, further = read_states(case, progress=reading), read_pairs(case, progress=reading)
-    if progress is not silent:
-        progress(_forecast(expected_cost(case, states.before, states.after, n_pairs=1 + len(further))))
+    if progress is not silent or condition is not unconditional:
+        cost = expected_cost(case, states.before, states.after, n_pairs=1 + len(further))
+        condition(cost)
+        progress(_forecast(cost))
     truth = _truth(states) if case.phantom else truth
     inputs = input_digests(case, states.inputs, *(pair.inputs for pair in further))
     seconds = time.perf_counter() - began

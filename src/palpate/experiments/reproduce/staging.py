@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from palpate.cohort.statistics.association import Association, association, pearson_p, points_behind
 from palpate.experiments.reproduce.cohort import ORGANS, CohortSettings, PatientResult, estimate_patient
 from palpate.experiments.reproduce.jobs import Job, Progress, compute
 from palpate.experiments.reproduce.ledger import Ledger
 from palpate.experiments.reproduce.paper import PAPER_STAGING
-from palpate.experiments.reproduce.statistics import Association, association, pearson_p, points_behind
 
 __all__ = ["Staging", "paper_remark", "staging"]
 
@@ -90,5 +90,5 @@ def _part(settings: CohortSettings, number: int, key: str, progress: Progress) -
     return asdict(estimate_patient(settings, number, progress))
 
 
-def _range(interval: tuple[float, float]) -> str:
-    return f"{interval[0]:.2f} to {interval[1]:.2f}"
+def _range(interval: tuple[float, float] | None) -> str:
+    return "undefined" if interval is None else f"{interval[0]:.2f} to {interval[1]:.2f}"

@@ -1,0 +1,161 @@
+"""The sub-commands of many cases: cohort, status, statistics."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from palpate.cli.outcome import Outcome, columns
+from palpate.errors import ConfigurationError, ResourceError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from palpate.cohort.engines.contract import Engine
+    from palpate.cohort.records import Record
+    from palpate.cohort.task import Row
+    from palpate.study.outputs import OutputFolder
+
+__all__ = ["TARGETS", "cohort", "statistics", "status"]
+
+Progress = Callable[[str], None]
+
+INTERRUPTED = "the plan and the rows that are done, with which --resume goes on"
+MOST_TOLD = 20  # failed rows
+TARGETS = ("cohort.csv", "cohort.parquet", "cohort.html", "statistics.json", "plan.json")
+
+
+def cohort(arguments: argparse.Namespace, _: None, outputs: OutputFolder | None, progress: Progress) -> Outcome:
+    """Compute the rows of a table, or a part of them that SLURM asks for."""
+    from palpate.cohort.tables import require_tables
+
+    if arguments.task is not None:
+        return _task(arguments, progress)
+    require_tables()
+    from palpate.cohort.run import Options, run_cohort
+    from palpate.cohort.task import Limits
+
+    assert outputs is not None
+    rows = _rows(arguments)
+    engine = _engine(arguments, outputs.path)
+    options = Options(
+        overrides=tuple(arguments.set),
+        limits=Limits(arguments.memory_limit, arguments.time_limit),
+        resume=arguments.resume,
+        only_failed=arguments.only_failed,
+        workers=arguments.workers,
+    )
+    try:
+        records = run_cohort(rows, outputs.path, engine, options, progress=progress)
+    except KeyboardInterrupt:
+        outputs.written.append(INTERRUPTED)
+        raise
+    return _told(records, outputs.path)
+
+
+def status(arguments: argparse.Namespace, _: None, outputs: None, progress: Progress) -> Outcome:
+    """Say where a cohort stands, from its files."""
+    from palpate.cohort.progress import status_of
+
+    del outputs, progress
+    found = status_of(arguments.folder)
+    return Outcome(found.to_dict(), found.text())
+
+
+def statistics(_: argparse.Namespace, case: None, outputs: OutputFolder, progress: Progress) -> Outcome:
+    """Compute the statistics of a cohort from its files."""
+    from palpate.cohort.tables import require_tables
+
+    require_tables()
+    from palpate.cohort.closing import close_cohort
+    from palpate.cohort.plan import read_plan
+    from palpate.study.outputs import read_json
+
+    del case
+    plan = read_plan(outputs.path)
+    progress("computing the statistics")
+    close_cohort(plan, outputs.path)
+    document = read_json(outputs.path / "statistics.json")
+    return Outcome(document, f"{_associations(document)}\nwritten to {outputs.path}: {', '.join(TARGETS[:-1])}")
+
+
+def _rows(arguments: argparse.Namespace) -> Sequence[Row]:
+    from palpate.cohort.bids import read_derivatives
+    from palpate.cohort.table import read_table
+
+    table, template = arguments.table, arguments.template
+    if table is None:
+        raise ConfigurationError("name the cohort's table: palpate cohort cohort.csv --output DIR")
+    if template is not None and not template.is_file():
+        raise ConfigurationError(f"there is no template {template}; give the path of a case.toml")
+    if table.is_dir():
+        return read_derivatives(table, template, reference=arguments.reference)
+    if arguments.reference is not None:
+        raise ConfigurationError("--reference goes with BIDS derivatives; in a table, 'before' names the rest state")
+    return read_table(table, template)
+
+
+def _engine(arguments: argparse.Namespace, folder: Path) -> Engine:
+    if arguments.scheduler is not None and arguments.engine != "dask":
+        raise ConfigurationError("--scheduler goes with --engine dask")
+    if arguments.engine == "dask":
+        from palpate.cohort.engines.dask import DaskEngine
+
+        return DaskEngine(arguments.scheduler, arguments.workers)
+    if arguments.engine == "slurm":
+        from palpate.cohort.engines.slurm import SlurmEngine
+
+        return SlurmEngine(folder, arguments.workers)
+    from palpate.cohort.engines.local import LocalEngine
+
+    return LocalEngine(arguments.workers)
+
+
+def _task(arguments: argparse.Namespace, progress: Progress) -> Outcome:
+    from palpate.cohort.engines.slurm import run_part
+
+    outcomes = [outcome.to_dict() for outcome in run_part(arguments.output, arguments.task, progress)]
+    return Outcome({"schema": "palpate.task/1", "outcomes": outcomes}, f"{len(outcomes)} rows computed")
+
+
+def _told(records: Sequence[Record], folder: Path) -> Outcome:
+    """What came of the rows; an exit code above 0 when any of them is still waiting."""
+    from palpate.study.outputs import read_json
+
+    states = [record.state for record in records]
+    counts = {state: states.count(state) for state in ("done", "failed", "waiting")}
+    document: dict[str, Any] = {"schema": "palpate.cohort/1", "rows": len(records), **counts}
+    document["failures"] = [
+        {"id": record.row.id, "failure_class": record.failure_class, "message": record.message}
+        for record in records
+        if record.state == "failed"
+    ]
+    found = read_json(folder / "statistics.json")
+    document["statistics"] = found
+    failed = [record for record in records if record.failure_class]
+    lines = [f"{record.row.id} failed ({record.failure_class}): {record.message}" for record in failed[:MOST_TOLD]]
+    if len(failed) > MOST_TOLD:
+        lines.append(f"and {len(failed) - MOST_TOLD} more, which stand in cohort.csv")
+    summary = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
+    text = "\n".join([*lines, _associations(found), summary, f"written to {folder}: {', '.join(TARGETS[:-1])}, cases/"])
+    left = f"{counts['waiting']} rows are waiting: --resume goes on with them" if counts["waiting"] else ""
+    return Outcome(document, text, ResourceError.exit_code if left else 0, left)
+
+
+def _associations(document: dict[str, Any]) -> str:
+    """A line a tissue: what its modulus has to do with the stage, with the unit of analysis."""
+    rows = [["tissue", "unit", "n", "r", "95 % (patients drawn)", "p", "rank rho"]]
+    for tissue, found in document["organs"].items():
+        for name, unit in (("patient", found["per_patient"]), ("scan", found["per_scan"])):
+            rows.append([tissue, name, str(unit["n"]), *_cells(unit)])
+    return columns(rows)
+
+
+def _cells(unit: dict[str, Any]) -> list[str]:
+    if unit["r"] is None:
+        return [unit.get("undefined") or "undefined", "", "", ""]
+    interval = unit["interval95"]
+    text = f"{interval[0]:.2f} to {interval[1]:.2f}" if interval else "undefined"
+    rho = unit.get("rho")
+    return [f"{unit['r']:.3f}", text, f"{unit['p']:.2g}", "" if rho is None else f"{rho:.3f}"]

@@ -1,0 +1,151 @@
+"""Charts of a cohort: boxes by stage, patients against the stage, patients with their intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from palpate.report.svg import INK, draw_svg
+
+__all__ = ["MOST_IN_FOREST", "boxes_svg", "forest_svg", "scatter_svg"]
+
+SIZE = (4.4, 3.0)
+PLACE = (0.15, 0.2, 0.82, 0.74)
+ROW = 0.2  # inches of a patient in the forest
+MOST_IN_FOREST = 150
+COLOUR = "#0072b2"
+LINE = "#d55e00"
+SPREAD = 0.18  # of points beside each other at a stage
+
+Patients = Sequence[Mapping[str, Any]]
+
+
+def boxes_svg(patients: Patients, tissue: str, unit: str, *, name: str) -> str:
+    """Quartiles of all scans of each stage, and the medians of its patients as points, with both numbers, as SVG.
+
+    Raises `ValueError` when nobody has a stage.
+    """
+    stages = _stages(patients, tissue)
+
+    def draw(figure: Figure) -> None:
+        """A box and points a stage."""
+        axes = figure.add_axes(PLACE)
+        labels = []
+        for stage in stages:
+            own = [patient for patient in patients if patient["stage"] == stage and tissue in patient["summary"]]
+            scans = [value for patient in own for value in _values(patient, tissue)]
+            axes.boxplot(
+                scans,
+                positions=[stage],
+                widths=0.55,
+                showfliers=False,
+                boxprops={"color": INK},
+                medianprops={"color": LINE},
+                whiskerprops={"color": INK},
+                capprops={"color": INK},
+            )
+            medians = [patient["summary"][tissue]["median"] for patient in own]
+            axes.plot(stage + _beside(len(medians)), medians, "o", color=COLOUR, markersize=4.5, alpha=0.85)
+            labels.append(f"{stage}\n{len(own)} patients\n{len(scans)} scans")
+        axes.set_xticks(stages, labels)
+        axes.set_xlim(min(stages) - 0.6, max(stages) + 0.6)
+        _label(axes, unit)
+
+    says = f"Each patient's modulus of {tissue}, {len(patients)} patients, by stage, as boxes and points, in {unit}"
+    return draw_svg(draw, size=SIZE, name=name, says=says)
+
+
+def scatter_svg(patients: Patients, tissue: str, unit: str, line: Mapping[str, Any], *, name: str) -> str:
+    """Each patient's combined modulus with its 95 % interval against the stage, and the weighted line, as SVG.
+
+    line: `weighted` of statistics.json. Raises `ValueError` when nobody has a stage.
+    """
+    stages = _stages(patients, tissue)
+
+    def draw(figure: Figure) -> None:
+        """Points with bars, the line through their weighted middle."""
+        axes = figure.add_axes(PLACE)
+        axes.set_yscale("log")
+        for stage in stages:
+            own = [p["summary"][tissue]["combined"] for p in patients if p["stage"] == stage and tissue in p["summary"]]
+            for place, found in zip(stage + _beside(len(own)), own, strict=True):
+                axes.plot([place, place], [found["low95"], found["high95"]], color=COLOUR, linewidth=1.4, alpha=0.6)
+                axes.plot(place, found["value"], "o", color=COLOUR, markersize=4.5)
+        factor = line.get("factor_per_stage")
+        if factor is not None:
+            ends = np.array([min(stages), max(stages)], dtype=float)
+            axes.plot(ends, line["at_mean_stage"] * factor ** (ends - line["mean_stage"]), color=LINE, linewidth=1.4)
+        axes.set_xticks(stages)
+        axes.set_xlim(min(stages) - 0.6, max(stages) + 0.6)
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+        axes.yaxis.set_minor_formatter(NullFormatter())
+        _label(axes, unit)
+
+    says = (
+        f"Each patient's modulus of {tissue} with its 95 % interval against the stage, {unit}, with the weighted line"
+    )
+    return draw_svg(draw, size=SIZE, name=name, says=says)
+
+
+def forest_svg(patients: Patients, tissue: str, unit: str, *, name: str) -> str:
+    """Each patient's combined modulus with its 95 % interval, a line each, by stage, as SVG.
+
+    Raises `ValueError` when there are none, or too many to be drawn.
+    """
+    own = [patient for patient in patients if tissue in patient["summary"]]
+    if not 0 < len(own) <= MOST_IN_FOREST:
+        raise ValueError(f"{len(own)} patients have a modulus; 1 to {MOST_IN_FOREST} are drawn")
+    own.sort(key=lambda patient: (patient["stage"] is None, patient["stage"] or 0))
+    height = 0.7 + ROW * len(own)
+
+    def draw(figure: Figure) -> None:
+        """Bars from top to bottom."""
+        axes = figure.add_axes((0.32, 0.5 / height, 0.65, (height - 0.55) / height))
+        axes.set_xscale("log")
+        for number, patient in enumerate(own):
+            found = patient["summary"][tissue]["combined"]
+            axes.plot([found["low95"], found["high95"]], [number, number], color=COLOUR, linewidth=2.5, alpha=0.6)
+            axes.plot(found["value"], number, "s", color=COLOUR, markersize=4.0)
+        stages = ["" if p["stage"] is None else f", stage {p['stage']}" for p in own]
+        axes.set_yticks(
+            range(len(own)), [f"{p['patient'][:24]}{stage}" for p, stage in zip(own, stages, strict=True)], fontsize=7.5
+        )
+        axes.set_ylim(len(own) - 0.5, -0.5)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.set_xlabel(_axis(unit))
+
+    says = f"The modulus of {tissue} of {len(own)} patients with its 95 % interval, a line each, by stage, in {unit}"
+    return draw_svg(draw, size=(SIZE[0], height), name=name, says=says)
+
+
+def _stages(patients: Patients, tissue: str) -> list[int]:
+    found = sorted({p["stage"] for p in patients if p["stage"] is not None and tissue in p["summary"]})
+    if not found:
+        raise ValueError("no patient has a stage and a modulus that counts")
+    return found
+
+
+def _values(patient: Mapping[str, Any], tissue: str) -> list[float]:
+    found: list[float] = patient["kpa"].get(tissue) or patient["ratio"].get(tissue) or []
+    return found
+
+
+def _beside(count: int) -> Any:
+    return np.linspace(-SPREAD, SPREAD, count) if count > 1 else np.zeros(count)
+
+
+def _axis(unit: str) -> str:
+    return "Young's modulus (kPa)" if unit == "kPa" else "ratio of moduli"
+
+
+def _label(axes: Axes, unit: str) -> None:
+    axes.set_xlabel("stage")
+    axes.set_ylabel(_axis(unit))

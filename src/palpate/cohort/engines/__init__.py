@@ -1,0 +1,1 @@
+"""Who computes the rows of a cohort: this machine, a Dask cluster, SLURM."""

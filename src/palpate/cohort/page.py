@@ -1,0 +1,74 @@
+"""cohort.html: who came in, who failed and why, what the moduli have to do with the stage, every case's report."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jinja2
+from markupsafe import Markup
+
+from palpate.cohort.charts import boxes_svg, forest_svg, scatter_svg
+from palpate.cohort.records import Record
+from palpate.report.rows import interval_text, number
+
+__all__ = ["cohort_page"]
+
+LOGGER = logging.getLogger(__name__)
+POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
+MOST_ROWS = 2000  # of the table; cohort.csv has all
+
+
+@dataclass(frozen=True, slots=True)
+class _Chart:
+    """A chart of a tissue, or the reason why there is none."""
+
+    title: str
+    body: Markup | None
+    missing: str = ""
+
+
+def cohort_page(records: Sequence[Record], document: Mapping[str, Any], *, created: str, version: str) -> str:
+    """The page of a cohort: one file that loads nothing, every name in it escaped.
+
+    document: statistics.json; created: when the run began.
+    """
+    loader = jinja2.ChoiceLoader([jinja2.PackageLoader("palpate.cohort"), jinja2.PackageLoader("palpate.report")])
+    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
+    environment.filters["number"] = number
+    environment.filters["interval"] = lambda ends: interval_text(None if ends is None else tuple(ends))
+    charts = {tissue: _charts(document, tissue, place) for place, tissue in enumerate(document["organs"])}
+    shown = [record for record in records if record.state == "failed"] + [r for r in records if r.state != "failed"]
+    page: str = environment.get_template("cohort.html").render(
+        records=shown[:MOST_ROWS],
+        left_out=len(shown[MOST_ROWS:]),
+        document=document,
+        charts=charts,
+        created=created,
+        version=version,
+        policy=POLICY,
+    )
+    return page
+
+
+def _charts(document: Mapping[str, Any], tissue: str, place: int) -> tuple[_Chart, ...]:
+    organ, patients = document["organs"][tissue], document["patients"]
+    draw = {
+        "Scans by stage, patients as points": partial(boxes_svg, patients, tissue, organ["unit"]),
+        "Patients against the stage": partial(scatter_svg, patients, tissue, organ["unit"], organ["weighted"]),
+        "Patients": partial(forest_svg, patients, tissue, organ["unit"]),
+    }
+    return tuple(_chart(title, partial(one, name=f"c{place}-{i}")) for i, (title, one) in enumerate(draw.items()))
+
+
+def _chart(title: str, draw: Callable[[], str]) -> _Chart:
+    try:
+        return _Chart(title, Markup(draw()))  # noqa: S704 - drawn by us, names in it as paths
+    except ValueError as error:
+        return _Chart(title, None, str(error))
+    except Exception as error:
+        LOGGER.exception("a chart could not be drawn")
+        return _Chart(title, None, f"it could not be drawn ({error})")

@@ -1,0 +1,97 @@
+"""A cohort from its rows to its tables: what is done stays, what is not is computed, whoever computes."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+
+from palpate.cohort.closing import close_cohort
+from palpate.cohort.engines.contract import Engine
+from palpate.cohort.mark import MARK
+from palpate.cohort.plan import CASES, PLAN, Plan, make_plan, write_plan
+from palpate.cohort.progress import Tally
+from palpate.cohort.records import Record
+from palpate.cohort.tables import CSV, PARQUET
+from palpate.cohort.task import Limits, Outcome, Row
+from palpate.errors import ConfigurationError, PalpateError
+from palpate.progress import Progress
+from palpate.study.outputs import make_folder
+
+__all__ = ["Options", "run_cohort"]
+
+LOGGER = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How a cohort is computed: --set of all rows, limits of each, and which rows.
+
+    resume: go on in a folder that has a cohort: rows that are waiting, changed or lost; only_failed: of its rows those
+    that failed, and no others.
+    """
+
+    overrides: tuple[str, ...] = ()
+    limits: Limits = field(default_factory=Limits)
+    resume: bool = False
+    only_failed: bool = False
+    workers: int | None = None
+
+
+def run_cohort(
+    rows: Sequence[Row], folder: Path, engine: Engine, options: Options, *, progress: Progress
+) -> tuple[Record, ...]:
+    """Compute the rows into `folder`, which this process holds, and write the cohort's tables, statistics and page.
+
+    A row that fails is a row that failed. Raises `ConfigurationError` when the folder has a cohort and nobody asked to
+    go on with it, `ResourceError` when the engine is gone or the disk refuses: what is done stays done, and tables tell
+    of that.
+    """
+    if (folder / PLAN).exists() and not (options.resume or options.only_failed):
+        raise ConfigurationError(
+            f"{folder} has a cohort already: --resume goes on with it, --only-failed computes what failed there again;"
+            " or choose another --output folder"
+        )
+    foreign = [name for name in (CSV, PARQUET) if not (folder / PLAN).exists() and (folder / name).exists()]
+    if foreign:
+        raise ConfigurationError(f"{folder / foreign[0]} is of no cohort of Palpate's, and would be replaced: move it")
+    progress(f"{len(rows)} rows: reading what each depends on")
+    began = datetime.now(UTC).isoformat(timespec="seconds")
+    plan = make_plan(rows, options.overrides, engine=engine.name, workers=options.workers, began=began)
+    make_folder(folder / CASES)
+    marks = plan.marks(folder)
+    wanted = [number for number, mark in enumerate(marks) if _is_wanted(mark, options)]
+    for number in wanted:
+        (folder / CASES / rows[number].id / MARK).unlink(missing_ok=True)
+    write_plan(plan, folder)
+    kept = Counter(mark.state for mark in marks if mark is not None and not _is_wanted(mark, options))
+    if kept:
+        progress(f"{kept['done']} done and {kept['failed']} failed before; {len(wanted)} to compute")
+    tally = Tally(len(rows), len(wanted), kept)
+    with _tables_at_the_end(plan, folder):
+        for outcome in engine.outcomes([plan.task(folder, number, options.limits) for number in wanted]):
+            progress(tally.add(outcome))
+    progress("tables, statistics and page of the cohort")
+    return close_cohort(plan, folder)
+
+
+def _is_wanted(mark: Outcome | None, options: Options) -> bool:
+    """Whether a row is computed in this run: `mark` is what it came to before, of the same inputs and options."""
+    if mark is None:
+        return not options.only_failed or options.resume
+    return mark.state == "failed" and (options.only_failed or mark.failure_class == "lost")
+
+
+@contextmanager
+def _tables_at_the_end(plan: Plan, folder: Path) -> Iterator[None]:
+    """Should the block break off, the tables tell of what is done by then."""
+    try:
+        yield
+    except BaseException:
+        with suppress(PalpateError):
+            close_cohort(plan, folder, tables_only=True)
+        raise

@@ -1,0 +1,111 @@
+"""Dask as an engine: rows stay with their worker, a worker that is gone is a lost attempt, a scheduler ends the run."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import types
+
+import pytest
+
+from palpate.cohort.engines import dask
+from palpate.cohort.engines.dask import DaskEngine, attempt_on_worker
+from palpate.cohort.engines.packing import packed
+from palpate.cohort.task import Limits, Outcome, Row, Task
+from palpate.errors import ResourceError
+
+
+class Future:
+    """A future that is pending until the client says otherwise."""
+
+    def __init__(self, task, worker):
+        self.task, self.worker, self.status, self.cancelled = task, worker, "pending", False
+
+    def result(self):
+        return Outcome(self.task.row.id, "done", attempts=self.task.attempt).to_dict()
+
+    def exception(self):
+        return OSError("no such folder")
+
+    def cancel(self):
+        self.cancelled = True
+
+
+class Client:
+    """What the engine asks of Dask's client: workers that die when they get their first row, and one that lives."""
+
+    scheduler = None
+
+    def __init__(self, mortal, status="running"):
+        self.status, self.futures = status, []
+        worker = {"memory_limit": 4e9, "nthreads": 1, "status": "running"}
+        self.workers = {**{f"mortal-{i}": worker for i in range(mortal)}, "immortal": {**worker, "nthreads": 2}}
+
+    def scheduler_info(self, n_workers):
+        assert n_workers == -1
+        return {"workers": dict(self.workers)}
+
+    def submit(self, function, task, work, *, workers, allow_other_workers, pure):
+        assert function is attempt_on_worker
+        assert not allow_other_workers
+        assert not pure
+        assert ":" in work
+        future = Future(Task.from_json(task), workers[0])
+        self.futures.append(future)
+        if workers[0] == "immortal":
+            future.status = "error" if future.task.row.id == "bad" else "finished"
+        else:
+            del self.workers[workers[0]]
+        return future
+
+
+@pytest.fixture(autouse=True)
+def no_waiting(monkeypatch):
+    monkeypatch.setattr(dask, "MOMENT_S", 0.01)
+    monkeypatch.setattr(dask, "PATIENCE_S", 0.02)
+
+
+def tasks(folder, *names):
+    return [Task(Row(name, "P"), str(folder / name), "0" * 64, (), Limits()) for name in names]
+
+
+def test_rows_of_workers_that_are_gone_go_to_others(tmp_path):
+    client = Client(mortal=2)
+    names = [f"r{i}" for i in range(6)]
+    found = {o.id: o for o in packed(dask._Cluster(client, "a:b", None), tasks(tmp_path, *names))}
+    assert {outcome.state for outcome in found.values()} == {"done"}
+    assert sorted(found) == names
+    assert sorted(outcome.attempts for outcome in found.values()) == [1, 1, 1, 1, 2, 2]
+    assert all(future.cancelled == (future.worker != "immortal") for future in client.futures)
+
+
+def test_a_worker_that_fails_is_a_crash_of_its_row(tmp_path):
+    (found,) = packed(dask._Cluster(Client(mortal=0), "a:b", None), tasks(tmp_path, "bad"))
+    assert (found.failure_class, found.message) == ("crash", "the worker failed: OSError: no such folder.")
+
+
+def test_a_row_that_every_worker_dies_of_is_lost(tmp_path):
+    client = Client(mortal=4)
+    del client.workers["immortal"]
+    (found,) = packed(dask._Cluster(client, "a:b", None), tasks(tmp_path, "heavy"))
+    assert (found.failure_class, found.attempts) == ("lost", 3)
+    assert (tmp_path / "heavy/done.json").exists()
+
+
+def test_a_scheduler_that_is_gone_ends_the_run(tmp_path, monkeypatch):
+    distributed = types.SimpleNamespace(Client=lambda *_, **__: contextlib.nullcontext(client))
+    monkeypatch.setitem(sys.modules, "distributed", distributed)
+    client = Client(mortal=0, status="closed")
+    with pytest.raises(ResourceError, match="--resume"):
+        list(DaskEngine("tcp://here:1").outcomes(tasks(tmp_path, "a")))
+    client = Client(mortal=0)
+    monkeypatch.setattr(Future, "result", lambda _: (_ for _ in ()).throw(ConnectionResetError()))
+    with pytest.raises(ResourceError, match="tcp://here:1 is gone"):
+        list(DaskEngine("tcp://here:1").outcomes(tasks(tmp_path, "a")))
+
+
+def test_without_workers_rows_wait(tmp_path):
+    client = Client(mortal=0)
+    client.workers.clear()
+    with pytest.raises(ResourceError, match="no worker"):
+        list(packed(dask._Cluster(client, "a:b", None), tasks(tmp_path, "a")))

@@ -1,0 +1,50 @@
+"""Work for the tests of scheduling: it does what a row's column `does` says, in no time, and computes nothing."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+from palpate.cohort.mark import held_soon, read_mark, write_mark
+from palpate.cohort.task import Outcome, Task
+from palpate.errors import GeometryError
+from palpate.study.outputs import staged, write_json
+
+
+def work(task: Task, tell) -> Outcome:
+    folder, key = Path(task.folder), task.key
+    what, _, number = task.row.covariates.get("does", "").partition(" ")
+    (folder / f"attempt-{task.attempt}").touch()
+    need = float(number or 0.1) if what == "needs" else 0.1
+    if task.room_gb is not None and need > task.room_gb:
+        return Outcome(task.row.id, "failed", key, "resources", cause="room", expected_gb=need)
+    tell(need, 0.1)
+    if what == "abort":
+        os.abort()
+    if what == "hang":
+        time.sleep(1000.0)
+    if what == "fill" and task.coarser == 1.0:
+        held = bytearray(int(float(number) * 1e9))
+        held[::4096] = b"x" * len(held[::4096])
+        time.sleep(1000.0)
+    if what == "allocate" and task.coarser == 1.0:
+        return Outcome.failed(task, "resources", "memory was short.", cause="memory")
+    if what == "die" and task.attempt <= int(number):
+        os.kill(os.getpid(), signal.SIGKILL)
+    if what == "refuse":
+        return Outcome.failed(task, "geometry", str(GeometryError("an organ is too thin.")))
+    with held_soon(folder):
+        if (mark := read_mark(folder)) is not None and mark.key == key:
+            return mark
+        item = {
+            "tissue": "prostate",
+            "value": 30.0 + task.row.stage,
+            "verdict": "identified",
+            "interval95": [25.0, 44.0],
+        }
+        with staged(folder) as staging:
+            write_json(staging.area / "result.json", {"id": task.row.id, "estimates": [item]})
+            staging.commit()
+        return write_mark(folder, Outcome(task.row.id, "done", key, message=" ".join(task.remarks)))
