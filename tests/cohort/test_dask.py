@@ -81,7 +81,7 @@ def test_rows_of_workers_that_are_gone_go_to_others(tmp_path):
 
 def test_a_worker_that_fails_is_a_crash_of_its_row(tmp_path):
     (found,) = packed(dask._Cluster(Client(mortal=0), "a:b", None), tasks(tmp_path, "bad"))
-    assert (found.failure_class, found.message) == ("crash", "the worker failed: OSError: no such folder.")
+    assert (found.failure_class, found.message) == ("crash", "the worker failed: OSError: no such folder")
 
 
 def test_a_row_that_every_worker_dies_of_is_lost(tmp_path):

@@ -143,7 +143,7 @@ class _Cluster:
         if future.status == "error":
             error = future.exception()
             if type(error).__name__ not in ("KilledWorker", "CancelledError"):
-                return Outcome.failed(task, "crash", f"the worker failed: {type(error).__name__}: {error}.")
+                return Outcome.failed(task, "crash", f"the worker failed: {type(error).__name__}: {error}")
         return _lost(task)
 
 
@@ -152,7 +152,7 @@ def _status(future: Any) -> str:
 
 
 def _lost(task: Task) -> Outcome:
-    return Outcome.failed(task, "lost", "the Dask worker that computed it is gone.", cause="lost")
+    return Outcome.failed(task, "lost", "the Dask worker that computed it is gone", cause="lost")
 
 
 def _place(worker: Mapping[str, Any]) -> Place:
