@@ -9,12 +9,23 @@ if TYPE_CHECKING:
     from typing import Any
 
     from palpate.export.folder import export
-    from palpate.steps.commands import check, estimate, init, make_mesh, simulate
+    from palpate.steps.commands import check, estimate, init, make_mesh, sensitivity, simulate
     from palpate.steps.results import CaseResult
     from palpate.study.case import Case
     from palpate.study.case_file import read_case
 
-__all__ = ["Case", "CaseResult", "check", "estimate", "export", "init", "make_mesh", "read_case", "simulate"]
+__all__ = [
+    "Case",
+    "CaseResult",
+    "check",
+    "estimate",
+    "export",
+    "init",
+    "make_mesh",
+    "read_case",
+    "sensitivity",
+    "simulate",
+]
 
 _HOMES = {
     "Case": "palpate.study.case",
@@ -25,6 +36,7 @@ _HOMES = {
     "init": "palpate.steps.commands",
     "make_mesh": "palpate.steps.commands",
     "read_case": "palpate.study.case_file",
+    "sensitivity": "palpate.steps.commands",
     "simulate": "palpate.steps.commands",
 }
 

@@ -62,6 +62,9 @@ class PointMotion:
     def imaging_error(self, _residuals, _before, _after):
         return np.zeros(3)
 
+    def growth_error(self, residuals, _tissue, _peers):
+        return np.zeros(len(residuals.values))
+
     def fit(self, residuals, _modelled, _image):
         length = float(np.linalg.norm(residuals.values))
         return Fit(length, length, length, None)

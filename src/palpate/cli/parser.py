@@ -38,6 +38,10 @@ EXAMPLES = {
         "palpate export out --format dicom --source series/ --output dicom",
     ),
     "report": ("palpate report out", "palpate report out --json"),
+    "sensitivity": (
+        "palpate sensitivity case/case.toml --output out",
+        "palpate sensitivity case/case.toml --sobol 64 --output out",
+    ),
     "cohort": (
         "palpate cohort cohort.csv --template case.toml --output study",
         "palpate cohort cohort.csv --output study --engine slurm --workers 20 --resume",
@@ -100,6 +104,7 @@ def make_parser() -> argparse.ArgumentParser:
     simulate.add_argument("--steps", type=_count, default=1, metavar="N", help="write N steps to animate")
     simulate.set_defaults(targets=commands.SIMULATION_TARGETS)
     _add_estimate(subparsers)
+    _add_sensitivity(subparsers)
     _add_report(subparsers)
     _add_export(subparsers)
     _add_view(subparsers)
@@ -151,6 +156,15 @@ def _add_report(subparsers: Any) -> None:
     command = _command(subparsers, "report", written.report, what=what, folder=None)
     command.add_argument("output", type=Path, metavar="DIR", help="the output folder of an estimate")
     command.set_defaults(makes_folder=False, targets=(written.DOCUMENT, written.PAGE))
+
+
+def _add_sensitivity(subparsers: Any) -> None:
+    what = "estimate a case, and each modulus again under changed assumptions; goes on where it was interrupted"
+    command = _command(subparsers, "sensitivity", studies.sensitivity, what=what)
+    _add_case(command)
+    what = "also Sobol indices of N samples an input, a power of 2 (extra `sensitivity`)"
+    command.add_argument("--sobol", type=_power_of_two, default=0, metavar="N", help=what)
+    command.set_defaults(targets=studies.SENSITIVITY_TARGETS)
 
 
 def _add_export(subparsers: Any) -> None:
@@ -247,6 +261,12 @@ def _command(
     command.add_argument("--json", action="store_true", help="print one JSON document on stdout, and nothing else")
     command.add_argument("--quiet", action="store_true", help="no progress, no table")
     return command
+
+
+def _power_of_two(text: str) -> int:
+    if text not in (powers := [str(2**n) for n in range(3, 17)]):
+        raise argparse.ArgumentTypeError(f"{text[:20]!r} is no power of 2 from {powers[0]} to {powers[-1]}")
+    return int(text)
 
 
 def _count(text: str) -> int:

@@ -21,12 +21,20 @@ from palpate.mechanics.loads import Load
 from palpate.mechanics.rigid import rigid_modes
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mechanics.solvers.registry import factorise
-from palpate.mechanics.stiffness import stiffness_parts, tissue_stiffness
+from palpate.mechanics.stiffness import stiffness_by_poisson, stiffness_parts, tissue_stiffness
 from palpate.mesh.constraint import Constraint
 from palpate.mesh.space import LagrangeSpace
 from palpate.parallel import mapped
 
-__all__ = ["LinearEquilibrium", "LinearModel", "LinearSystem", "linear_model", "weighted_sum", "with_constraint"]
+__all__ = [
+    "LinearEquilibrium",
+    "LinearModel",
+    "LinearSystem",
+    "linear_model",
+    "poisson_tangents",
+    "weighted_sum",
+    "with_constraint",
+]
 
 FURTHER = 10  # right-hand sides a modulus, beside one for each mode: sensitivities, series
 
@@ -226,6 +234,24 @@ class LinearEquilibrium:
         result = np.asarray(self.system.tangent_loads(self.values).T @ adjoint)
         result[self.system.model.n_regions :] += constraint.modes.T @ gradient
         return result
+
+
+def poisson_tangents(equilibrium: LinearEquilibrium, dilatation: Dilatation) -> NDArray[np.float64]:
+    """Columns du / d nu_r = -F K_ff^-1 F^T E_r dK_r/dnu u (n_dof, n_regions) mm, one a tissue.
+
+    dilatation: that with which the model was made. The tissues' Poisson's ratios are closed.
+    """
+    system, model = equilibrium.system, equilibrium.system.model
+    tissues, free = model.space.mesh.tissues, model.constraint.free
+
+    def force(of: tuple[float, int]) -> NDArray[np.float64]:
+        """E_r F^T dK_r/dnu u (n_free,), mN, of one region."""
+        modulus, region = of
+        by_poisson = stiffness_by_poisson(model.space, region, tissues[region].poisson_ratio, dilatation=dilatation)
+        return np.asarray(free.T @ (modulus * (by_poisson @ equilibrium.values)))
+
+    forces = mapped(force, zip(system.moduli.tolist(), model.regions, strict=True))
+    return np.asarray(free @ system.factorisation.solve(-np.stack(forces, axis=1)))
 
 
 def linear_model(

@@ -18,6 +18,7 @@ __all__ = [
     "lame_parameters",
     "lame_parts",
     "lame_parts_by_poisson",
+    "stiffness_by_poisson",
     "stiffness_parts",
     "tissue_stiffness",
 ]
@@ -104,6 +105,13 @@ def _stiffness(space: LagrangeSpace, tissue: int, weights: tuple[float, float, f
         if in_mean:
             blocks[part] += mean @ _constant_gradient_blocks(gradients[part], volumes[part], (in_mean, 0.0))
     return block_pattern(cells, len(space.points)).assemble(blocks.reshape(-1, 9))
+
+
+def stiffness_by_poisson(
+    space: LagrangeSpace, tissue: int, poisson_ratio: float, *, dilatation: Dilatation = Dilatation.POINTWISE
+) -> sparse.csr_matrix[np.float64]:
+    """Derivative (n_dof, n_dof), mN/mm, of `tissue_stiffness` with respect to nu; raises as that does."""
+    return _stiffness(space, tissue, lame_parts_by_poisson(poisson_ratio, dilatation))
 
 
 def checked_gradients(

@@ -158,6 +158,13 @@ class Observation(Protocol):
         """Errors (n,) mm of the residuals when the model itself is imaged: `before` at rest, `after` deformed."""
         ...
 
+    def growth_error(self, residuals: Residuals, tissue: str, peers: Sequence[Observation]) -> NDArray[np.float64]:
+        """Change (n,) of the residuals, dimensionless, for each mm that `tissue` reaches further in the later image.
+
+        Along its normals, and into its neighbours; `peers`: all observations of the later image, itself among them.
+        """
+        ...
+
     def fit(self, residuals: Residuals, modelled: NDArray[np.int16], image: NDArray[np.int16]) -> Fit:
         """How well the model fits: by residuals, and by tissue indices (nx, ny, nz) of model and image on one grid."""
         ...

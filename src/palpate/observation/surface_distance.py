@@ -13,7 +13,7 @@ from palpate.images.distance import DistanceMap
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.images.tissue_distance import tissue_distance_map
-from palpate.observation.contract import Fit, ImagedBody, Residuals, Weighting
+from palpate.observation.contract import Fit, ImagedBody, Observation, Residuals, Weighting
 from palpate.observation.noise_model import EXACT_NOISE, SEGMENTATION_NOISE, NoiseModel, fit_noise_model
 from palpate.observation.observed_surface import ObservedSurface, observed_surface
 from palpate.observation.robust_loss import Tukey
@@ -190,6 +190,21 @@ class SurfaceDistance:
         ]
         errors, n = np.zeros(len(residuals.values)), len(rest)
         errors[:n] = 2.0 * (maps[1].at(residuals.places[:n]) - maps[0].at(rest) - excess)
+        return errors
+
+    def growth_error(self, residuals: Residuals, tissue: str, peers: Sequence[Observation]) -> NDArray[np.float64]:
+        """Change (n,) of the residuals: -1 on the tissue's own surface, 1 where it touches this one, and draws it in.
+
+        Both directions of the distance see the same: d_after falls by what the surface moves outwards, and so does the
+        signed distance of the model from it.
+        """
+        if tissue == self.name:
+            return np.full(len(residuals.values), -1.0)
+        errors = np.zeros(len(residuals.values))
+        for peer in peers:
+            if peer.name == tissue and isinstance(peer, SurfaceDistance) and peer.target.voxels is not None:
+                reach = 0.5 * float(np.sqrt(np.mean(peer.target.voxels[1].grid.spacing ** 2)))
+                errors[np.abs(peer.target.after.at(residuals.places)) < reach] = 1.0
         return errors
 
     def fit(self, residuals: Residuals, modelled: NDArray[np.int16], image: NDArray[np.int16]) -> Fit:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from palpate.progress import Progress, silent
 from palpate.steps.results import CaseResult
+from palpate.steps.saving import save_sensitivity
 from palpate.study import run
 from palpate.study.case import Case
 from palpate.study.check import CheckReport, check_case
@@ -16,8 +17,10 @@ from palpate.study.lock import held_folder
 from palpate.study.new_case import NewCase, write_new_case
 from palpate.study.outputs import OutputFolder
 from palpate.study.result import MeshResult, Simulation
+from palpate.study.sensitivity import Kept, Sensitivity
+from palpate.study.sensitivity import sensitivity as vary
 
-__all__ = ["check", "estimate", "init", "make_mesh", "simulate"]
+__all__ = ["check", "estimate", "init", "make_mesh", "sensitivity", "simulate"]
 
 PathLike = str | os.PathLike[str]
 
@@ -80,3 +83,21 @@ def estimate(case: Case, *, truth: Mapping[str, float] | None = None, progress: 
     """
     found = run.estimate(case, progress=progress, truth=truth)
     return CaseResult(**{field.name: getattr(found, field.name) for field in fields(found)})
+
+
+def sensitivity(
+    case: Case, *, sobol: int = 0, output: PathLike | None = None, progress: Progress = silent
+) -> Sensitivity:
+    """Each modulus of a case under changed assumptions: constants, segmentation, law, boundary, mesh, alignment, prior.
+
+    sobol: samples an input of the Sobol indices, a power of 2 (extra `sensitivity`); 0: none. output: a folder for
+    sensitivity.json and sensitivity.html, where an interrupted study goes on; None: nothing is written. Raises as
+    `estimate` does, and `NotConverged` where the case itself has no estimate.
+    """
+    if output is None:
+        return vary(case, sobol=sobol, progress=progress)
+    outputs = OutputFolder(Path(output))
+    with held_folder(outputs.path):
+        found = vary(case, kept=Kept(outputs), sobol=sobol, progress=progress)
+        save_sensitivity(found, outputs)
+    return found

@@ -12,13 +12,15 @@ from palpate.export.case_files import write_estimate_files
 from palpate.findings import Finding, warning_rows
 from palpate.progress import during, silent
 from palpate.report import case_report
+from palpate.report.sensitivity_page import sensitivity_page
 from palpate.study.case import Case
 from palpate.study.case_as_run import stage_case
 from palpate.study.earlier import RESULT, earlier_files
-from palpate.study.outputs import OutputFolder, Staging, write_json
+from palpate.study.outputs import OutputFolder, Staging, write_json, write_text
 from palpate.study.result import CaseResult, failure_document
+from palpate.study.sensitivity import Sensitivity
 
-__all__ = ["DATA", "PAGE", "save_document", "save_estimate", "save_failure"]
+__all__ = ["DATA", "PAGE", "save_document", "save_estimate", "save_failure", "save_sensitivity"]
 
 LOGGER = logging.getLogger(__name__)
 PAGE, DATA = "report.html", "report-data.npz"
@@ -50,6 +52,15 @@ def save_failure(case: Case, error: EstimationError, outputs: OutputFolder) -> d
     with outputs.staged() as staging:
         _draw(lambda: case_report.write_failure_report(case, error, staging.area), staging, document)
         _commit_estimate(staging, case, document)
+    return document
+
+
+def save_sensitivity(found: Sensitivity, outputs: OutputFolder) -> dict[str, Any]:
+    """Put sensitivity.json and sensitivity.html in place; gives the document. Raises `ResourceError`."""
+    document = found.to_dict()
+    with outputs.staged() as staging:
+        write_text(staging.area / "sensitivity.html", sensitivity_page(document))
+        save_document(staging, "sensitivity.json", document)
     return document
 
 

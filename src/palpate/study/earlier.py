@@ -15,7 +15,7 @@ from palpate.study.outputs import Digests, read_json, sha256_of
 __all__ = ["RESULT", "Earlier", "earlier_files", "strange_files", "vouched"]
 
 RESULT = "result.json"
-DOCUMENTS = (RESULT, "mesh.json", "simulation.json")  # each lists the files of its run
+DOCUMENTS = (RESULT, "mesh.json", "simulation.json", "sensitivity.json")  # each lists the files of its run
 PAGE_FILES = ("report-data.npz", "report.html")
 RESULT_FILES = (*PAGE_FILES, "labels.csv", "labels.nii.gz", "mesh.vtu", "model.npz", "stiffness.nii.gz")
 FURTHER_MESH = re.compile(r"mesh_\d+\.vtu")

@@ -18,7 +18,7 @@ from palpate.study.schema import MOST_LETTERS, Rule
 __all__ = ["DIALECT", "SCHEMAS", "case_schema"]
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
-SCHEMAS = resources.files("palpate.study") / "schemas"  # case.schema.json and result.schema.json, as they are shipped
+SCHEMAS = resources.files("palpate.study") / "schemas"  # case, result and sensitivity, as they are shipped
 LABEL = {
     "description": "an integer, a list of integers, a name of the label table, or 'remaining'",
     "oneOf": [

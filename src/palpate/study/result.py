@@ -32,6 +32,7 @@ __all__ = [
     "PairResult",
     "Provenance",
     "Simulation",
+    "closing",
     "distinct_names",
     "failure_document",
     "image_names",
@@ -150,7 +151,7 @@ class CaseResult:
         }
         if self.further:
             document |= {"pairs": [{"mesh": _plain(pair.mesh_summary)} for pair in self.further]}
-        return json_object(document | _closing(self.case, self.provenance, self.all_remarks) | {"note": self.note})
+        return json_object(document | closing(self.case, self.provenance, self.all_remarks) | {"note": self.note})
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +168,7 @@ class MeshResult:
     def to_dict(self) -> dict[str, Any]:
         """A JSON document, schema palpate.mesh/1."""
         document = {"schema": "palpate.mesh/1", "id": self.case.id, "mesh": _plain(self.mesh_summary)}
-        return json_object(document | _closing(self.case, self.provenance, self.remarks))
+        return json_object(document | closing(self.case, self.provenance, self.remarks))
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,7 +202,7 @@ class Simulation:
             "steps": len(self.displacements),
             "mesh": _plain(self.mesh_summary),
         }
-        return json_object(document | _closing(self.case, self.provenance, self.remarks))
+        return json_object(document | closing(self.case, self.provenance, self.remarks))
 
 
 def failure_document(case: Case, error: PalpateError) -> dict[str, Any]:
@@ -228,7 +229,7 @@ def failure_document(case: Case, error: PalpateError) -> dict[str, Any]:
         "mesh": None,
         "note": "",
     }
-    return json_object(_heading(case, status, str(error)) | empty | _closing(case, Provenance(), ()))
+    return json_object(_heading(case, status, str(error)) | empty | closing(case, Provenance(), ()))
 
 
 def stated_unit(case: Case) -> str:
@@ -277,7 +278,8 @@ def _heading(case: Case, status: str, reason: str) -> dict[str, Any]:
     }
 
 
-def _closing(case: Case, provenance: Provenance, remarks: tuple[Finding, ...]) -> dict[str, Any]:
+def closing(case: Case, provenance: Provenance, remarks: tuple[Finding, ...]) -> dict[str, Any]:
+    """How every document of a case ends: seconds, inputs, versions, the case as it was run, seed, warnings."""
     return {
         "seconds": dict(provenance.seconds),
         "inputs": {key: {"sha256": digest} for key, digest in provenance.inputs.items()},

@@ -1,4 +1,4 @@
-"""What is known of an estimate: covariance by its causes, profile likelihoods, intervals, samples of the posterior."""
+"""What is known of an estimate: covariance by cause, profiles, intervals, samples of the posterior, sensitivity."""
 
 from palpate.uncertainty.combinations import Combination, Information, information, known_pairs
 from palpate.uncertainty.covariance import (
@@ -14,12 +14,22 @@ from palpate.uncertainty.image_pairs import Agreement, PairEstimate, agreement, 
 from palpate.uncertainty.intervals import NORMAL_95, Interval, ModulusInterval, log_interval, modulus_interval
 from palpate.uncertainty.profile import FixedCorrespondence, Profile, fixed_correspondence
 from palpate.uncertainty.sampling import sample_posterior
+from palpate.uncertainty.sensitivity import (
+    FastPath,
+    Shift,
+    fast_path,
+    modulus_errors,
+    poisson_errors,
+    surface_errors,
+)
+from palpate.uncertainty.sobol import SobolIndices, require_salib, sobol_indices
 
 __all__ = [
     "NORMAL_95",
     "Agreement",
     "Combination",
     "Covariance",
+    "FastPath",
     "FittedState",
     "FixedCorrespondence",
     "Information",
@@ -27,8 +37,11 @@ __all__ = [
     "ModulusInterval",
     "PairEstimate",
     "Profile",
+    "Shift",
+    "SobolIndices",
     "agreement",
     "covariance_of",
+    "fast_path",
     "fixed_correspondence",
     "gain",
     "grid_position_shifts",
@@ -36,8 +49,13 @@ __all__ = [
     "information",
     "known_pairs",
     "log_interval",
+    "modulus_errors",
     "modulus_interval",
     "pair_estimates",
+    "poisson_errors",
+    "require_salib",
     "sample_posterior",
     "sandwich_covariance",
+    "sobol_indices",
+    "surface_errors",
 ]

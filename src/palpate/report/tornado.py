@@ -1,0 +1,153 @@
+"""What each assumption does to a modulus, largest effect first: as rows and as a tornado chart."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+from palpate.report.rows import interval_text, main_numbers, number
+from palpate.report.svg import INK, draw_svg
+
+__all__ = ["TornadoRow", "effect_text", "sensitivity_table", "tornado_rows", "tornado_svg"]
+
+NAMES = {
+    "known_modulus": "modulus of {}",
+    "poisson_ratio": "Poisson's ratio of {}",
+    "segmentation": "surface of {}",
+    "driver_prior": "prior of the drivers' motion",
+    "driver_modes": "modes of the drivers' motion",
+    "law": "material law",
+    "outer_boundary": "outer boundary",
+    "edge_length": "edge length of the mesh",
+    "alignment": "alignment",
+}
+COLOURS = ("#3b7dd8", "#d9822b")  # of what lowers the modulus, and of what raises it
+WIDEST = math.log(4.0)  # of ln E on the axis: what reaches further ends in an arrow
+LEAST = math.log(1.05)
+MARKS = (0.25, 0.5, 0.67, 0.8, 0.9, 0.95, 1.0, 1.05, 1.1, 1.25, 1.5, 2.0, 4.0)
+LETTERS = 34  # of a label
+
+
+@dataclass(frozen=True, slots=True)
+class TornadoRow:
+    """One assumption and what its settings do to one modulus: ln E' / E by setting, in their order.
+
+    method: how they were found; at_bound: settings at which the modulus runs to the bounds of the search; failed:
+    setting -> why there is no estimate.
+    """
+
+    label: str
+    method: str
+    effects: Mapping[str, float]
+    at_bound: tuple[str, ...]
+    failed: Mapping[str, str]
+
+    @property
+    def size(self) -> float:
+        """The largest effect, of |ln E' / E|; -1 where there is none."""
+        return max(map(abs, self.effects.values()), default=-1.0)
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Least and largest ln E' / E, the unchanged estimate among them."""
+        return min(0.0, *self.effects.values(), 0.0), max(0.0, *self.effects.values(), 0.0)
+
+
+def tornado_rows(document: Mapping[str, Any], tissue: str) -> tuple[TornadoRow, ...]:
+    """Those of one tissue of a document sensitivity.json, the largest effect first."""
+    groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
+    for variation in document["variations"]:
+        groups.setdefault((variation["cause"], variation["subject"]), []).append(variation)
+    rows = []
+    for (cause, subject), members in groups.items():
+        found = [m for m in members if m["changes"] is not None]
+        rows.append(
+            TornadoRow(
+                NAMES.get(cause, cause).format(subject),
+                members[0]["method"],
+                {m["setting"]: m["changes"][tissue] for m in found},
+                tuple(m["setting"] for m in found if tissue in m["at_bound"]),
+                {m["setting"]: m["reason"] for m in members if m["changes"] is None},
+            )
+        )
+    return tuple(sorted(rows, key=lambda row: -row.size))
+
+
+def effect_text(row: TornadoRow) -> str:
+    """What each setting does, in per cent of the modulus: "0.43: -3 %, 0.47: +4 %"."""
+    words = []
+    for setting, change in row.effects.items():
+        end = " (at the search's bound)" if setting in row.at_bound else ""
+        words.append(f"{setting}: {100.0 * math.expm1(change):+.3g} %{end}")
+    return ", ".join([*words, *(f"{setting}: no estimate" for setting in row.failed)])
+
+
+def sensitivity_table(document: Mapping[str, Any]) -> list[list[str]]:
+    """Rows of cells, a heading first: modulus of each tissue, then what changes it, the largest effect first."""
+    rows = [["tissue", "changed", "modulus", "method"]]
+    for item in document["estimates"]:
+        value, interval = main_numbers(item)
+        unit = "kPa" if item["unit"] == "kPa" else f"x {item['relative_to']}"
+        rows.append([item["tissue"], "-", f"{number(value)} {unit} (95 %: {interval_text(interval)})", ""])
+        rows += [["", row.label, effect_text(row), row.method] for row in tornado_rows(document, item["tissue"])]
+    return rows
+
+
+def tornado_svg(document: Mapping[str, Any], tissue: str, *, name: str) -> str:
+    """The tornado of one tissue's modulus as SVG, on a logarithmic axis of E' / E, its 95 % interval as a band.
+
+    Raises `ValueError` where nothing was varied.
+    """
+    rows = [row for row in tornado_rows(document, tissue) if row.effects]
+    if not rows:
+        raise ValueError("nothing was varied")
+    estimate = next(item for item in document["estimates"] if item["tissue"] == tissue)
+    reach = min(1.15 * max(rows[0].size, LEAST), WIDEST)
+    value, interval = main_numbers(estimate)
+    height = 0.8 + 0.3 * len(rows)
+
+    def draw(figure: Figure) -> None:
+        """A bar a row, blue to the left and orange to the right, a tick a setting."""
+        axes = figure.add_axes((0.36, 0.55 / height, 0.61, 1.0 - 0.65 / height))
+        if value and interval:
+            low, high = (math.log(e / value) if e else sign * reach for e, sign in zip(interval, (-1, 1), strict=True))
+            axes.axvspan(max(low, -reach), min(high, reach), color=INK, alpha=0.1, linewidth=0)
+        for place, row in enumerate(rows):
+            for end, colour in zip(row.ends, COLOURS, strict=True):
+                axes.barh(place, max(-reach, min(end, reach)), height=0.62, color=colour, alpha=0.85)
+                if abs(end) > reach:
+                    marker = ">" if end > 0.0 else "<"
+                    axes.plot(math.copysign(reach, end), place, marker=marker, color=INK, markersize=6, clip_on=False)
+            inside = [change for change in row.effects.values() if abs(change) <= reach]
+            axes.plot(inside, [place] * len(inside), "|", color=INK, markersize=7)
+        axes.axvline(0.0, color=INK, linewidth=0.9)
+        axes.set_yticks(range(len(rows)), [_label(row.label) for row in rows])
+        axes.set_ylim(len(rows) - 0.4, -0.6)
+        axes.set_xlim(-reach, reach)
+        axes.xaxis.set_major_locator(FixedLocator([math.log(m) for m in _marks(reach)]))
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{math.exp(x):.2g}"))
+        axes.set_xlabel("modulus, times the estimate")
+        axes.grid(visible=True, axis="x")
+
+    told = "; ".join(f"{row.label}: {effect_text(row)}" for row in rows)
+    return draw_svg(draw, size=(7.2, height), name=name, says=f"Tornado of {tissue}: {told}.")
+
+
+def _label(text: str) -> str:
+    return text if len(text) <= LETTERS else f"{text[: LETTERS - 3]}..."
+
+
+def _marks(reach: float) -> list[float]:
+    """Round ratios within the axis, not closer than a twelfth of it."""
+    marks = [1.0]
+    for mark in sorted(MARKS, key=lambda m: -abs(math.log(m))):
+        apart = min(abs(math.log(mark / other)) for other in marks)
+        if abs(math.log(mark)) <= reach and apart >= reach / 6.0:
+            marks.append(mark)
+    return marks

@@ -1,0 +1,269 @@
+"""How much of an estimate is assumption: the case estimated once, then again under other constants, laws and meshes.
+
+What a change of the residuals shows is found on the fast path; a change of the model's geometry, law or boundary is
+estimated anew from the estimate on. Each finished part is kept, so that an interrupted study goes on where it ended.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import EstimationError, GeometryError, InputDataError, NotConverged, PalpateError, ResourceError
+from palpate.images.tissue import Role
+from palpate.inversion import Inversion, InversionSettings, invert
+from palpate.mechanics.dilatation import choose_element
+from palpate.parallel import blas_on_one_thread
+from palpate.progress import Progress, silent
+from palpate.study.body import Body, ImagedStates, joint_problem, make_body
+from palpate.study.case import LAW_NAMES, Case
+from palpate.study.case_text import case_tables
+from palpate.study.estimation import Observed, conclude
+from palpate.study.outputs import OutputFolder, read_json, write_json
+from palpate.study.provenance import input_digests, software_versions
+from palpate.study.read import read_pairs, read_states
+from palpate.study.result import Provenance, closing, json_object
+from palpate.study.run import fitted_states, inversion_settings, refuse_what_cannot_be_estimated
+from palpate.study.variations import SobolResult, Variation, fast_variations, sobol_result
+from palpate.uncertainty import require_salib
+
+__all__ = ["KEPT", "Kept", "Sensitivity", "sensitivity"]
+
+KEPT = "variants"  # folder of the finished parts
+COARSER = 1.25  # times the mesh's edge length
+BASE = ("tissue", "unit", "value", "interval95", "relative_to", "ratio", "ratio_interval95", "verdict", "why")
+
+Bodies = tuple[Body, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """Where finished parts of a study are kept: in a folder that this process holds, or nowhere (None)."""
+
+    outputs: OutputFolder | None = None
+
+    def get(self, name: str, key: str) -> dict[str, Any] | None:
+        """The part of that name, if it is of the same case, inputs and version (`key`)."""
+        if self.outputs is None:
+            return None
+        try:
+            document = read_json(self.outputs.path / KEPT / f"{name}-{key[:16]}.json")
+        except InputDataError:
+            return None
+        return document if document.get("key") == key else None
+
+    def put(self, name: str, key: str, part: Mapping[str, Any]) -> None:
+        """Keep a part, whole or not at all; raises `ResourceError` where the disk refuses."""
+        if self.outputs is None:
+            return
+        with self.outputs.staged() as staging:
+            (staging.area / KEPT).mkdir()
+            write_json(staging.area / KEPT / f"{name}-{key[:16]}.json", json_object(part) | {"key": key})
+            staging.commit()
+
+
+@dataclass(frozen=True, slots=True)
+class Sensitivity:
+    """Every modulus under every changed assumption.
+
+    estimates: of the case as it is, an entry a tissue as in result.json; sobol: None where it was not asked for.
+    """
+
+    case: Case
+    estimates: tuple[Mapping[str, Any], ...]
+    variations: tuple[Variation, ...]
+    provenance: Provenance
+    sobol: SobolResult | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The document sensitivity.json, schema palpate.sensitivity/1, ready for strict JSON."""
+        document = {
+            "schema": "palpate.sensitivity/1",
+            "id": self.case.id,
+            "law": self.case.mechanics.law,
+            "element": self.case.mechanics.element,
+            "estimates": [dict(item) for item in self.estimates],
+            "variations": [asdict(variation) for variation in self.variations],
+            "sobol": None if self.sobol is None else asdict(self.sobol),
+        }
+        return json_object(document | closing(self.case, self.provenance, ()))
+
+
+@dataclass(frozen=True, slots=True)
+class _Variant:
+    """A case that is estimated anew: `name` of its file; makes: what differs, "model", "mesh" or "images"."""
+
+    name: str
+    cause: str
+    setting: str
+    case: Case
+    makes: str = "model"
+
+
+@dataclass(frozen=True, slots=True)
+class _Images:
+    """The first pair and the further ones of a case, and the digests of their files."""
+
+    first: ImagedStates
+    further: tuple[ImagedStates, ...]
+    inputs: Mapping[str, str] = field(default_factory=dict)
+
+    def bodies(self, case: Case, progress: Progress) -> Bodies:
+        """All of them meshed."""
+        return tuple(make_body(pair, case, progress=progress) for pair in (self.first, *self.further))
+
+
+@blas_on_one_thread()
+def sensitivity(case: Case, *, kept: Kept | None = None, sobol: int = 0, progress: Progress = silent) -> Sensitivity:
+    """Estimate a case, and say how each modulus depends on what it rests on.
+
+    kept: finished parts of an earlier study are taken from there, new ones left there; sobol: samples an input of the
+    Sobol indices, a power of 2; none with 0. A variant without an estimate says why. Raises as `estimate` does,
+    `NotConverged` where the case itself has no estimate, `ResourceError` where `sobol` asks for SALib and it is not
+    installed.
+    """
+    began, kept = time.perf_counter(), kept or Kept()
+    refuse_what_cannot_be_estimated(case)
+    if sobol:
+        require_salib()
+    progress("reading the images")
+    images = _read(case, progress)
+    key = _key(case, images.inputs)
+    bodies = cache(lambda: images.bodies(case, progress))
+    base = kept.get(f"estimate-sobol-{sobol}", key)
+    if base is None:
+        base = json_object(_estimated(case, bodies(), sobol, progress))
+        kept.put(f"estimate-sobol-{sobol}", key, base)
+    variations = [Variation(**each) for each in base["variations"]]
+    variants = list(_variants(case))
+    for number, variant in enumerate(variants, start=1):
+        part = kept.get(variant.name, key)
+        if part is None:
+            progress(f"variant {number} of {len(variants)}: {variant.cause.replace('_', ' ')} {variant.setting}")
+            found = _varied(variant, images, bodies, base, progress)
+            part = json_object(asdict(found))
+            kept.put(variant.name, key, part)
+        variations.append(Variation(**{name: value for name, value in part.items() if name != "key"}))
+    seconds = {"total": round(time.perf_counter() - began, 3)}
+    indices = base["sobol"]
+    return Sensitivity(
+        case,
+        tuple(base["estimates"]),
+        tuple(variations),
+        Provenance(seconds, images.inputs, software_versions()),
+        None if indices is None else SobolResult(**indices),
+    )
+
+
+def _read(case: Case, progress: Progress) -> _Images:
+    first, further = read_states(case, progress=progress), read_pairs(case, progress=progress)
+    return _Images(first, further, input_digests(case, first.inputs, *(pair.inputs for pair in further)))
+
+
+def _key(case: Case, inputs: Mapping[str, str]) -> str:
+    """What a finished part is of: the case without the places of its files, their contents, this version."""
+    parts = [case_tables(case, lambda path: path.name), dict(inputs), software_versions().get("palpate")]
+    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def _inverted(
+    bodies: Bodies, case: Case, progress: Progress, start: NDArray[np.float64] | None = None
+) -> tuple[Inversion, InversionSettings]:
+    """The inversion of a case, from its own starts or from one alone."""
+    problem = joint_problem(bodies, case, progress=progress)
+    settings = inversion_settings(case, problem.parameters)
+    if start is not None:
+        inside = np.clip(start, settings.bounds.lower, settings.bounds.upper)
+        settings = replace(settings, starts=(inside,))
+    return invert(problem, settings, progress=progress), settings
+
+
+def _estimated(case: Case, bodies: Bodies, sobol: int, progress: Progress) -> dict[str, Any]:
+    """The case as it is, and all that is found on the fast path around it."""
+    inversion, settings = _inverted(bodies, case, progress)
+    if not inversion.minimum.converged:
+        raise NotConverged(
+            f"the case itself has no estimate ({inversion.minimum.outcome.value}), so nothing can be said of what it"
+            " depends on; see what `palpate estimate` tells of it"
+        )
+    later = tuple(image for body in bodies for image in body.states.after)
+    observed = Observed(fitted_states(inversion, *bodies), tuple(image.index for image in later))
+    estimation = conclude(inversion, settings, observed, truth={}, seed=case.seed, progress=progress)
+    given: dict[str, Any] = {
+        "dilatation": choose_element(case.mechanics.element).dilatation,
+        "voxel_mm": float(np.mean([image.grid.voxel_volume ** (1.0 / 3.0) for image in later])),
+    }
+    tissues = bodies[0].space.mesh.tissues
+    progress("constants, surfaces, modes and prior changed on the fast path")
+    variations = fast_variations(inversion, settings, tissues, **given)
+    indices = None
+    if sobol:
+        progress(f"Sobol indices: {sobol} samples an input")
+        indices = asdict(sobol_result(inversion, settings, tissues, n=sobol, seed=case.seed, **given))
+    return {
+        "estimates": [{name: getattr(item, name) for name in BASE} for item in estimation.estimates],
+        "theta": inversion.minimum.unknowns[: inversion.objective.n_parameters],
+        "variations": [asdict(variation) for variation in variations],
+        "sobol": indices,
+    }
+
+
+def _variants(case: Case) -> Iterator[_Variant]:
+    """What is estimated anew, what costs least first."""
+    law, domain, mesh = case.mechanics, case.domain, case.mesh
+    laws = sorted((name for name in LAW_NAMES if name != law.law), key=lambda name: name != "linear")
+    boundaries = [name for name in ("sliding", "free", "fixed") if name != domain.outer_boundary]
+    edge = COARSER * mesh.edge_length_mm
+
+    def of_law(name: str) -> _Variant:
+        """Under another law."""
+        return _Variant(f"law-{name}", "law", name, replace(case, mechanics=replace(law, law=name)))
+
+    yield from (of_law(name) for name in laws if name == "linear")
+    coarser = replace(case, mesh=replace(mesh, edge_length_mm=edge))
+    yield _Variant("edge-length", "edge_length", f"{edge:g} mm", coarser, "mesh")
+    for name in boundaries:
+        other = replace(case, domain=replace(domain, outer_boundary=name))
+        yield _Variant(f"outer-boundary-{name}", "outer_boundary", name, other)
+    yield from (of_law(name) for name in laws if name != "linear")
+    if case.images is not None and any(tissue.role is Role.RIGID for tissue in case.tissues):
+        method = "none" if case.align != "none" else "rigid-tissues"
+        unaligned = replace(case, images=replace(case.images, align=method))
+        yield _Variant(f"alignment-{method}", "alignment", method, unaligned, "images")
+
+
+def _varied(
+    variant: _Variant, images: _Images, bodies: Callable[[], Bodies], base: Mapping[str, Any], progress: Progress
+) -> Variation:
+    """One variant estimated anew; one that has no estimate says why."""
+    began, case, changes, reason = time.perf_counter(), variant.case, None, ""
+    at_bound: tuple[str, ...] = ()
+    theta, names = np.array(base["theta"]), [item["tissue"] for item in base["estimates"]]
+    try:
+        if variant.makes == "model":
+            made = bodies()
+        else:
+            made = (_read(case, progress) if variant.makes == "images" else images).bodies(case, progress)
+        if variant.makes == "mesh" and made[0].edge_length_mm != case.mesh.edge_length_mm:
+            raise GeometryError(f"no mesh of {variant.setting} is fit to compute with")
+        inversion, settings = _inverted(made, case, progress, theta)
+        if not inversion.minimum.converged:
+            raise EstimationError(f"the estimate did not converge: {inversion.minimum.outcome.value}")
+        found = inversion.minimum.unknowns[: len(theta)]
+        changes = dict(zip(names, (found - theta).tolist(), strict=True))
+        room = np.minimum(found - settings.bounds.lower, settings.bounds.upper - found)
+        at_bound = tuple(name for name, left in zip(names, room, strict=True) if left < 1e-6)
+    except ResourceError:
+        raise
+    except PalpateError as error:
+        reason = str(error)
+    seconds = round(time.perf_counter() - began, 3)
+    return Variation(variant.cause, "", variant.setting, "re-estimated", changes, at_bound, reason, seconds)

@@ -1,0 +1,270 @@
+"""What an estimate rests on, changed on the fast path: constants, surfaces, the drivers' modes and their prior."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import EstimationError, SolverError
+from palpate.images.tissue import Role, Tissue
+from palpate.inversion import Inversion, InversionSettings
+from palpate.mechanics.dilatation import Dilatation
+from palpate.parallel import mapped
+from palpate.uncertainty import FastPath, fast_path, modulus_errors, poisson_errors, sobol_indices, surface_errors
+
+__all__ = ["Range", "SobolResult", "Variation", "fast_variations", "sobol_result"]
+
+POISSON_STEP = 0.02
+KNOWN_FACTOR = 1.2
+VOXELS = (-0.5, -0.25, 0.25, 0.5)
+PRIOR_WIDTHS = (0.5, 2.0)
+ALL = "all tissues"
+
+Errors = tuple[NDArray[np.float64], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Variation:
+    """One changed assumption: its cause, what it is about (`subject`, a tissue or nothing), its setting in words.
+
+    method: "exact", "linearised" or "re-estimated"; changes: ln E' / E of each tissue, None where there is no estimate,
+    for a `reason`; at_bound: tissues whose modulus runs to the bounds of the search; seconds: what it took.
+    """
+
+    cause: str
+    subject: str
+    setting: str
+    method: str
+    changes: Mapping[str, float] | None
+    at_bound: tuple[str, ...] = ()
+    reason: str = ""
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """An input of the Sobol indices: uniform between low and high, in `unit`."""
+
+    cause: str
+    subject: str
+    low: float
+    high: float
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class SobolResult:
+    """Shares of the variance of ln E of each tissue by each of the `inputs`, in their order.
+
+    sd: standard deviation of ln E over all inputs; first, total with the half widths of their 95 % intervals; failed:
+    share of the samples without an estimate, which count as the base estimate.
+    """
+
+    samples: int
+    inputs: tuple[Range, ...]
+    sd: Mapping[str, float]
+    first: Mapping[str, tuple[float, ...]]
+    first_half: Mapping[str, tuple[float, ...]]
+    total: Mapping[str, tuple[float, ...]]
+    total_half: Mapping[str, tuple[float, ...]]
+    failed: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Input:
+    """One thing that can be changed by an amount: errors of the residuals for a unit of it."""
+
+    cause: str
+    subject: str
+    unit: str
+    errors: Errors
+    amounts: tuple[tuple[float, str], ...]
+
+
+def fast_variations(
+    inversion: Inversion,
+    settings: InversionSettings,
+    tissues: tuple[Tissue, ...],
+    *,
+    dilatation: Dilatation,
+    voxel_mm: float,
+) -> tuple[Variation, ...]:
+    """All that is found without solving the model for another estimate.
+
+    tissues: the mesh's; dilatation: the element's; voxel_mm: edge of a voxel of the later images. Raises
+    `EstimationError`, `SolverError` where the estimate itself cannot be changed at all.
+    """
+    path = fast_path(inversion.objective, inversion.minimum, settings.bounds)
+    names = inversion.objective.parameters.tissues
+    jobs: list[tuple[_Input, float, str]] = [
+        (each, amount, words)
+        for each in _inputs(inversion, tissues, dilatation, voxel_mm)
+        for amount, words in each.amounts
+    ]
+
+    def vary(job: tuple[_Input, float, str]) -> Variation:
+        """One of them."""
+        each, amount, words = job
+        return _found(path, names, each.cause, each.subject, words, tuple(amount * error for error in each.errors))
+
+    found = [*_exact(inversion, tissues), *mapped(vary, jobs)]
+    if sum(inversion.objective.parameters.n_modes):
+        found += [
+            _found(path, names, "driver_prior", "", f"{width:g} times as wide", None, width=width)
+            for width in PRIOR_WIDTHS
+        ]
+        dropped = _finer_half(inversion)
+        found.append(_found(path, names, "driver_modes", "", "the smoother half alone", None, dropped=dropped))
+    return tuple(found)
+
+
+def sobol_result(
+    inversion: Inversion,
+    settings: InversionSettings,
+    tissues: tuple[Tissue, ...],
+    *,
+    dilatation: Dilatation,
+    voxel_mm: float,
+    n: int,
+    seed: int,
+) -> SobolResult:
+    """Sobol indices of ln E over the ranges of the fast variations, all changed at once; n: a power of 2.
+
+    Raises `ResourceError` where SALib is not installed.
+    """
+    path = fast_path(inversion.objective, inversion.minimum, settings.bounds)
+    mapping = inversion.objective.parameters
+    inputs = [each for each in _inputs(inversion, tissues, dilatation, voxel_mm) if each.subject != ALL]
+    ends = [[amount for amount, _ in each.amounts] for each in inputs]
+    ranges = [Range(i.cause, i.subject, min(of), max(of), i.unit) for i, of in zip(inputs, ends, strict=True)]
+    exact = bool(_exact(inversion, tissues))
+    scale = float(np.log(KNOWN_FACTOR))
+    if exact:
+        (known,) = (t.name for t in tissues if t.role is Role.KNOWN)
+        ranges.append(Range("known_modulus", known, -scale, scale, "ln E"))
+    if sum(mapping.n_modes):
+        low, high = np.log2(PRIOR_WIDTHS).tolist()
+        ranges.append(Range("driver_prior", "", low, high, "log2 of the width"))
+    failures = list[bool]()
+
+    def one(row: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The change of ln E (n_parameters,) of one sample (n_inputs,)."""
+        weighted = [tuple(x * e for e in each.errors) for x, each in zip(row, inputs, strict=False)]
+        errors = tuple(np.sum(of, axis=0) for of in zip(*weighted, strict=True))
+        width = float(2.0 ** row[-1]) if sum(mapping.n_modes) else 1.0
+        try:
+            theta = path.shift(errors, width=width).theta
+        except (SolverError, EstimationError):
+            failures.append(True)
+            theta = np.zeros(mapping.n_parameters)
+        return theta + (row[len(inputs)] if exact else 0.0)
+
+    def all_of(samples: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The same (n_samples, n_parameters) of samples (n_samples, n_inputs)."""
+        failures.append(False)
+        return np.stack(mapped(one, samples))
+
+    found = sobol_indices(all_of, [(r.low, r.high) for r in ranges], n=n, seed=seed)
+    samples = n * (len(ranges) + 2)
+
+    def by_tissue(shares: NDArray[np.float64]) -> dict[str, tuple[float, ...]]:
+        """Columns of (n_inputs, n_parameters) by tissue."""
+        return {name: tuple(column.tolist()) for name, column in zip(mapping.tissues, shares.T, strict=True)}
+
+    return SobolResult(
+        samples,
+        tuple(ranges),
+        dict(zip(mapping.tissues, np.sqrt(found.variance).tolist(), strict=True)),
+        by_tissue(found.first),
+        by_tissue(found.first_half),
+        by_tissue(found.total),
+        by_tissue(found.total_half),
+        sum(failures) / samples,
+    )
+
+
+def _inputs(
+    inversion: Inversion, tissues: tuple[Tissue, ...], dilatation: Dilatation, voxel_mm: float
+) -> tuple[_Input, ...]:
+    """Poisson's ratio of each tissue and of all, each observed surface, known moduli where several set the scale."""
+    objective, minimum = inversion.objective, inversion.minimum
+    regions = [tissues[region] for region in objective.states[0].model.regions]
+    by_poisson = poisson_errors(objective, minimum.unknowns, minimum.evaluation, dilatation)
+    found = []
+    for number, tissue in enumerate(regions):
+        steps = _poisson_steps(tissue.poisson_ratio)
+        words = tuple((step, f"{tissue.poisson_ratio + step:.3g}") for step in steps)
+        found.append(_Input("poisson_ratio", tissue.name, "", tuple(e[:, number] for e in by_poisson), words))
+    if len(regions) > 1:
+        steps = _poisson_steps(max(tissue.poisson_ratio for tissue in regions))
+        words = tuple((step, f"{step:+.3g}") for step in steps)
+        found.append(_Input("poisson_ratio", ALL, "", tuple(e.sum(axis=1) for e in by_poisson), words))
+    for name in dict.fromkeys(observation.name for observation in objective.observations):
+        amounts = tuple((voxel_mm * share, f"{share:+g} voxel") for share in VOXELS)
+        found.append(_Input("segmentation", name, "mm", surface_errors(minimum.evaluation, name), amounts))
+    if not _exact(inversion, tissues):
+        by_modulus = modulus_errors(objective, minimum.unknowns, minimum.evaluation)
+        step = float(np.log(KNOWN_FACTOR))
+        amounts = ((-step, f"/ {KNOWN_FACTOR:g}"), (step, f"x {KNOWN_FACTOR:g}"))
+        found += [
+            _Input("known_modulus", tissue.name, "ln E", tuple(e[:, number] for e in by_modulus), amounts)
+            for number, tissue in enumerate(regions)
+            if tissue.role is Role.KNOWN
+        ]
+    return tuple(found)
+
+
+def _poisson_steps(ratio: float) -> tuple[float, float]:
+    """Down and up, the latter at most half of the way to 0.5."""
+    return -POISSON_STEP, min(POISSON_STEP, 0.5 * (0.5 - ratio))
+
+
+def _exact(inversion: Inversion, tissues: tuple[Tissue, ...]) -> list[Variation]:
+    """The known modulus, where it alone sets the scale: every other one is proportional to it."""
+    mapping = inversion.objective.parameters
+    known = [tissue.name for tissue in tissues if tissue.role is Role.KNOWN]
+    loaded = any(state.model.load.any() for state in inversion.objective.states)
+    if len(known) != 1 or loaded or not mapping.absolute:
+        return []
+    step = float(np.log(KNOWN_FACTOR))
+    return [
+        Variation("known_modulus", known[0], words, "exact", dict.fromkeys(mapping.tissues, sign * step))
+        for sign, words in ((-1.0, f"/ {KNOWN_FACTOR:g}"), (1.0, f"x {KNOWN_FACTOR:g}"))
+    ]
+
+
+def _finer_half(inversion: Inversion) -> NDArray[np.bool_]:
+    """The finer half of the modes (n_coefficients,) of each driver's wall, which are sorted by their size."""
+    dropped = []
+    for state, n_modes in zip(inversion.objective.states, inversion.objective.parameters.n_modes, strict=True):
+        own = np.zeros(n_modes, dtype=bool)
+        for columns in [wall.columns for wall in state.walls] or [np.arange(n_modes)]:
+            own[columns[3 * (len(columns) // 6) :]] = True
+        dropped.append(own)
+    return np.concatenate(dropped)
+
+
+def _found(
+    path: FastPath,
+    names: tuple[str, ...],
+    cause: str,
+    subject: str,
+    setting: str,
+    errors: Errors | None,
+    *,
+    width: float = 1.0,
+    dropped: NDArray[np.bool_] | None = None,
+) -> Variation:
+    """One variation on the fast path; an estimate that is none says why."""
+    try:
+        shift = path.shift(errors, width=width, dropped=dropped)
+    except (SolverError, EstimationError) as error:
+        return Variation(cause, subject, setting, "linearised", None, reason=str(error))
+    if not shift.converged:
+        return Variation(cause, subject, setting, "linearised", None, reason="the estimate did not converge")
+    changes = dict(zip(names, shift.theta.tolist(), strict=True))
+    at_bound = tuple(name for name, ended in zip(names, shift.at_bound, strict=True) if ended)
+    return Variation(cause, subject, setting, "linearised", changes, at_bound)

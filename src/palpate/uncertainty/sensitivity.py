@@ -1,0 +1,128 @@
+"""How an estimate moves when what it rests on is changed, without another solution of the model.
+
+Residuals change to first order in the assumption, r + e, by the surfaces or by the displacement; then the objective is
+minimised anew with the closest points and robust weights held, on the approximation of the model, which bends: an organ
+that is drawn too large can run away to the bounds, which no gradient at the estimate foretells.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.inversion import Bounds, Evaluation, Minimum, Objective, gauss_newton
+from palpate.inversion.expansion import Expansion
+from palpate.mechanics.dilatation import Dilatation
+from palpate.mechanics.finite_strain import FiniteStrainEquilibrium
+from palpate.mechanics.linear_model import LinearEquilibrium, poisson_tangents, with_constraint
+from palpate.uncertainty.profile import FixedCorrespondence, fixed_correspondence
+
+__all__ = ["FastPath", "Shift", "fast_path", "modulus_errors", "poisson_errors", "surface_errors"]
+
+TOLERANCE = 1e-6  # decrement of a minimum
+STEPS = 120  # at the most: a modulus that runs away has far to go
+DROPPED = 1e10  # precision of a coefficient that is held at 0: its own is 1
+AT_BOUND = 1e-6
+
+Errors = tuple[NDArray[np.float64], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Shift:
+    """Change theta (n_parameters,) of the log-moduli; at_bound (n_parameters,): which of them end at a bound.
+
+    converged: whether there is a minimum.
+    """
+
+    theta: NDArray[np.float64]
+    at_bound: NDArray[np.bool_]
+    converged: bool
+
+
+@dataclass(frozen=True, slots=True)
+class FastPath:
+    """The objective with closest points and weights held, its minimum near the estimate, and the search's bounds."""
+
+    fixed: FixedCorrespondence
+    least: Minimum
+    bounds: Bounds
+
+    def shift(
+        self, errors: Errors | None = None, *, width: float = 1.0, dropped: NDArray[np.bool_] | None = None
+    ) -> Shift:
+        """Where the estimate goes under other residuals, another prior or fewer modes.
+
+        errors: e (n,) mm of the residuals of each observation; width: of the drivers' prior, times its own; dropped
+        (n_coefficients,): coefficients that are held at 0. Raises `SolverError`, `EstimationError` where an unknown is
+        left open.
+        """
+        fixed, start, n = self.fixed, self.least.unknowns.copy(), self.fixed.n_parameters
+        parameters = fixed.objective.parameters
+        precision = parameters.driver_precision / width**2
+        if dropped is not None:
+            precision, start[n:] = precision + DROPPED * np.diag(dropped), np.where(dropped, 0.0, start[n:])
+        objective = replace(fixed.objective, parameters=replace(parameters, driver_precision=precision))
+        lines = fixed.lines
+        if errors is not None:
+            seen = [replace(o.residuals, values=o.residuals.values + e) for o, e in zip(lines, errors, strict=True)]
+            lines = tuple(replace(line, residuals=own) for line, own in zip(lines, seen, strict=True))
+        changed = replace(fixed, objective=objective, lines=lines)
+        found = gauss_newton(changed, start, bounds=self.bounds, tolerance=TOLERANCE, max_steps=STEPS)
+        theta = found.unknowns[:n]
+        room = np.minimum(theta - self.bounds.lower, self.bounds.upper - theta)
+        return Shift(theta - self.least.unknowns[:n], room < AT_BOUND, found.converged)
+
+
+def fast_path(objective: Objective, minimum: Minimum, bounds: Bounds) -> FastPath:
+    """That of an estimate; raises as `gauss_newton` does."""
+    fixed = fixed_correspondence(objective, minimum.unknowns, minimum.evaluation)
+    return FastPath(fixed, gauss_newton(fixed, minimum.unknowns, bounds=bounds, tolerance=TOLERANCE), bounds)
+
+
+def poisson_errors(
+    objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation, dilatation: Dilatation
+) -> Errors:
+    """Derivatives (n, n_regions) mm of each observation's residuals by the Poisson's ratios of the regions.
+
+    At unknowns (n_unknowns,) and held moduli and coefficients; dilatation: that of the element. Raises `SolverError`.
+    """
+    tangents = []
+    places = objective.places(unknowns)
+    for state, approximation, place in zip(objective.states, objective.approximations, places, strict=True):
+        there: FiniteStrainEquilibrium | LinearEquilibrium
+        if isinstance(approximation, Expansion):
+            there = approximation.equilibrium
+            tangents.append(there.poisson_tangents())
+        else:
+            there = with_constraint(state.model, state.constraint).solve(place.moduli, place.coefficients)
+            tangents.append(poisson_tangents(there, dilatation))
+    return tuple(
+        np.asarray(line.residuals.smooth_jacobian @ tangents[line.state][line.observation.dofs])
+        for line in evaluation.lines
+    )
+
+
+def modulus_errors(objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation) -> Errors:
+    """Derivatives (n, n_regions) mm of each observation's residuals by ln E of the regions, known ones among them."""
+    found, lines = [], iter(evaluation.lines)
+    for state, place in zip(objective.states, objective.places(unknowns), strict=True):
+        assert state.observed is not None, "an objective is made of states with approximations"
+        tangent = state.observed.solve(place.moduli, place.coefficients).tangent()[:, : len(place.moduli)]
+        found += [np.asarray(next(lines).residuals.smooth_jacobian @ tangent[rows]) for rows in state.slices]
+    return tuple(found)
+
+
+def surface_errors(evaluation: Evaluation, tissue: str) -> Errors:
+    """Derivatives (n,), dimensionless, of each observation's residuals by how far `tissue` reaches in all later images.
+
+    By its growth along its normals, which takes from its neighbours (see `Observation.growth_error`). To first order
+    the same growth in the first image, the mesh held, has the opposite effect: residuals are differences.
+    """
+    return tuple(
+        line.observation.growth_error(
+            line.residuals, tissue, [other.observation for other in evaluation.lines if other.state == line.state]
+        )
+        for line in evaluation.lines
+    )

@@ -1,0 +1,244 @@
+"""A case under changed assumptions: what is varied, how, and that an interrupted study goes on where it ended."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import jsonschema
+import numpy as np
+import pytest
+import referencing
+
+import palpate
+from palpate.cli import main
+from palpate.errors import EstimationError
+from palpate.images.readers import write_label_image
+from palpate.report.sensitivity_page import sensitivity_page
+from palpate.report.tornado import effect_text, sensitivity_table, tornado_rows
+from palpate.study import sensitivity as study
+from palpate.study.case_file import read_case
+from palpate.study.json_schema import SCHEMAS
+
+CASE = """
+[images]
+before = "before.nii.gz"
+after = ["after.nii.gz"]
+
+[tissues."gland <b>"]
+label = 1
+role = "estimate"
+
+[tissues.tube]
+label = 3
+role = "driver"
+
+[tissues.rest]
+label = [2, 4]
+role = "known"
+youngs_modulus_kpa = 10.0
+
+[mechanics]
+law = "linear"
+element = "P1"
+
+[mesh]
+edge_length_mm = 7.0
+
+[driver]
+modes = 12
+
+[estimate]
+start_ratios = [3.0]
+"""
+GLAND = "gland <b>"
+
+
+@pytest.fixture(scope="module")
+def case_file(twin, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("case")
+    for name, image in (("before", twin.scene.before), ("after", twin.scene.after)):
+        write_label_image(folder / f"{name}.nii.gz", image)
+    (folder / "case.toml").write_text(CASE)
+    return folder / "case.toml"
+
+
+@pytest.fixture(scope="module")
+def interrupted(case_file, tmp_path_factory):
+    """Folder, document and progress of a study that was interrupted in its second variant, and was begun again.
+
+    Of the variants two are left; that under a law without equilibrium is refused.
+    """
+    folder, told, real = tmp_path_factory.mktemp("out"), [], study.invert
+    case = read_case(case_file)
+    calls = []
+
+    def until(problem, settings, *, progress):
+        calls.append(problem)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return real(problem, settings, progress=progress)
+
+    def again(problem, settings, *, progress):
+        if problem.finite_strain:
+            raise EstimationError("no equilibrium")
+        return until(problem, settings, progress=progress)
+
+    every = list(study._variants(case))
+    few = [
+        next(v for v in every if v.name == name)
+        for name in ("edge-length", "outer-boundary-sliding", "law-neo-hookean")
+    ]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(study, "_variants", lambda _case: iter(few))
+        patch.setattr(study, "invert", again)
+        with pytest.raises(KeyboardInterrupt):
+            palpate.sensitivity(case, sobol=8, output=folder)
+        before = len(calls)
+        found = palpate.sensitivity(case, sobol=8, output=folder, progress=told.append)
+        assert len(calls) == before + 1, "what was finished is not computed again"
+        assert main(["sensitivity", str(case_file), "--sobol", "8", "--output", str(folder), "--quiet"]) == 0
+        assert len(calls) == before + 1
+    return folder, found.to_dict(), told
+
+
+@pytest.fixture(scope="module")
+def document(interrupted):
+    return interrupted[1]
+
+
+def row_of(document, cause, subject="", setting=None):
+    return next(
+        v
+        for v in document["variations"]
+        if (v["cause"], v["subject"]) == (cause, subject) and setting in (None, v["setting"])
+    )
+
+
+def test_a_study_goes_on_where_it_was_interrupted(interrupted):
+    folder, document, told = interrupted
+    assert sorted(path.name.rsplit("-", 1)[0] for path in (folder / "variants").iterdir()) == [
+        "edge-length",
+        "estimate-sobol-8",
+        "law-neo-hookean",
+        "outer-boundary-sliding",
+    ]
+    assert [line for line in told if line.startswith("variant")] == [
+        "variant 2 of 3: outer boundary sliding",
+        "variant 3 of 3: law neo-hookean",
+    ]
+    written = json.loads((folder / "sensitivity.json").read_text())
+    assert set(written["files"]) == {"sensitivity.html"}
+    assert {k: v for k, v in written.items() if k not in ("files", "seconds")} == {
+        k: v for k, v in document.items() if k != "seconds"
+    }
+
+
+def test_another_case_takes_nothing_from_it(case_file):
+    case = read_case(case_file)
+    keys = {
+        study._key(case, {}),
+        study._key(case, {"before": "ab"}),
+        study._key(replace(case, driver=replace(case.driver, modes=15)), {}),
+    }
+    assert len(keys) == 3
+
+
+def test_the_document_meets_its_schema(document):
+    schemas = [json.loads(path.read_text()) for path in SCHEMAS.iterdir() if path.name.endswith(".json")]
+    registry = referencing.Registry().with_contents([(schema["$id"], schema) for schema in schemas])
+    (own,) = (schema for schema in schemas if schema["$id"] == "sensitivity.schema.json")
+    validator = jsonschema.Draft202012Validator(own, registry=registry)
+    assert [error.message for error in validator.iter_errors(document)] == []
+    assert list(validator.iter_errors(document | {"sobol": {}}))
+    assert list(validator.iter_errors(document | {"news": 1}))
+
+
+def test_every_assumption_is_varied_by_the_method_that_serves(document):
+    found = {(v["cause"], v["subject"]): v["method"] for v in document["variations"]}
+    assert found == {
+        ("known_modulus", "rest"): "exact",
+        **{("poisson_ratio", name): "linearised" for name in (GLAND, "rest", "all tissues")},
+        **{("segmentation", name): "linearised" for name in (GLAND, "tube")},
+        ("driver_prior", ""): "linearised",
+        ("driver_modes", ""): "linearised",
+        ("edge_length", ""): "re-estimated",
+        ("outer_boundary", ""): "re-estimated",
+        ("law", ""): "re-estimated",
+    }
+    assert row_of(document, "known_modulus", "rest", "x 1.2")["changes"] == {GLAND: pytest.approx(np.log(1.2))}
+    settings = [v["setting"] for v in document["variations"] if v["subject"] == "tube"]
+    assert settings == ["-0.5 voxel", "-0.25 voxel", "+0.25 voxel", "+0.5 voxel"]
+
+
+def test_what_has_no_estimate_says_why(document):
+    lost = row_of(document, "law", setting="neo-hookean")
+    assert lost["changes"] is None
+    assert lost["reason"] == "no equilibrium"
+
+
+def test_sobol_indices_say_what_the_ranges_say(document):
+    """The effects are nearly linear: the inputs alone account for the variance, as the square of half their range."""
+    sobol = document["sobol"]
+    first = dict(zip([(i["cause"], i["subject"]) for i in sobol["inputs"]], sobol["total"][GLAND], strict=True))
+    assert sobol["samples"] == 8 * (len(first) + 2)
+    assert ("poisson_ratio", "all tissues") not in first
+    widest = max(first, key=first.get)
+    spans = {
+        key: np.ptp([v["changes"][GLAND] for v in document["variations"] if (v["cause"], v["subject"]) == key])
+        for key in first
+    }
+    assert widest == max(spans, key=spans.get)
+
+
+def test_variants_begin_with_the_cheap_ones_and_leave_out_what_the_case_says(case_file):
+    case = read_case(case_file)
+    assert [v.name for v in study._variants(case)] == [
+        "edge-length",
+        "outer-boundary-sliding",
+        "outer-boundary-free",
+        "law-neo-hookean",
+        "law-mooney-rivlin",
+    ]
+    curved = replace(case, mechanics=replace(case.mechanics, law="neo-hookean"))
+    assert next(study._variants(curved)).case.mechanics.law == "linear"
+    assert next(study._variants(case)).case.mesh.edge_length_mm == pytest.approx(8.75)
+
+
+def test_the_largest_effect_comes_first_and_failures_last(document):
+    rows = tornado_rows(document, GLAND)
+    sizes = [row.size for row in rows]
+    assert sizes == sorted(sizes, reverse=True)
+    assert rows[-1].label == "material law"
+    assert effect_text(rows[-1]) == "neo-hookean: no estimate"
+    table = sensitivity_table(document)
+    assert table[1][0] == GLAND
+    assert len(table) == 2 + len(rows)
+
+
+def test_the_page_is_whole_escaped_and_without_scripts(document):
+    page = sensitivity_page(document)
+    assert "gland &lt;b&gt;" in page
+    assert GLAND not in page
+    assert "<script" not in page
+    assert page.count("<svg") == 1
+    assert "Sobol indices" in page
+    assert "Sobol indices" not in sensitivity_page(document | {"sobol": None})
+
+
+def test_a_runaway_ends_in_an_arrow_and_says_so(document):
+    changed = [
+        v | {"changes": {GLAND: -7.0}, "at_bound": [GLAND]} if v["cause"] == "edge_length" else v
+        for v in document["variations"]
+    ]
+    rows = tornado_rows(document | {"variations": changed}, GLAND)
+    assert rows[0].label == "edge length of the mesh"
+    assert effect_text(rows[0]) == "8.75 mm: -99.9 % (at the search's bound)"
+    assert "<svg" in sensitivity_page(document | {"variations": changed})
+
+
+@pytest.mark.parametrize("number", ["0", "7", "12", "131072", "x"])
+def test_samples_are_a_power_of_two(number):
+    with pytest.raises(SystemExit) as stop:
+        main(["sensitivity", "case.toml", "--sobol", number])
+    assert stop.value.code == 2
