@@ -30,11 +30,11 @@ def work(task: Task, tell) -> Outcome:
         held[::4096] = b"x" * len(held[::4096])
         time.sleep(1000.0)
     if what == "allocate" and task.coarser == 1.0:
-        return Outcome.failed(task, "resources", "memory was short.", cause="memory")
+        return Outcome.failed(task, "resources", "memory was short", cause="memory")
     if what == "die" and task.attempt <= int(number):
         os.kill(os.getpid(), signal.SIGKILL)
     if what == "refuse":
-        return Outcome.failed(task, "geometry", str(GeometryError("an organ is too thin.")))
+        return Outcome.failed(task, "geometry", str(GeometryError("an organ is too thin")))
     with held_soon(folder):
         if (mark := read_mark(folder)) is not None and mark.key == key:
             return mark
@@ -47,4 +47,4 @@ def work(task: Task, tell) -> Outcome:
         with staged(folder) as staging:
             write_json(staging.area / "result.json", {"id": task.row.id, "estimates": [item]})
             staging.commit()
-        return write_mark(folder, Outcome(task.row.id, "done", key, message=" ".join(task.remarks)))
+        return write_mark(folder, Outcome(task.row.id, "done", key, message="; ".join(task.remarks)))

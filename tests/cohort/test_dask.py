@@ -21,7 +21,9 @@ class Future:
     def __init__(self, task, worker):
         self.task, self.worker, self.status, self.cancelled = task, worker, "pending", False
 
-    def result(self):
+    def result(self, timeout):
+        if self.task.row.id == "gathered late" and self.task.attempt == 1:
+            raise TimeoutError(timeout)
         return Outcome(self.task.row.id, "done", attempts=self.task.attempt).to_dict()
 
     def exception(self):
@@ -79,9 +81,16 @@ def test_rows_of_workers_that_are_gone_go_to_others(tmp_path):
     assert all(future.cancelled == (future.worker != "immortal") for future in client.futures)
 
 
+def test_an_outcome_that_went_with_its_worker_is_asked_for_again(tmp_path):
+    client = Client(mortal=0)
+    (found,) = packed(dask._Cluster(client, "a:b", None), tasks(tmp_path, "gathered late"))
+    assert (found.state, found.attempts) == ("done", 2)
+    assert client.futures[0].cancelled
+
+
 def test_a_worker_that_fails_is_a_crash_of_its_row(tmp_path):
     (found,) = packed(dask._Cluster(Client(mortal=0), "a:b", None), tasks(tmp_path, "bad"))
-    assert (found.failure_class, found.message) == ("crash", "the worker failed: OSError: no such folder.")
+    assert (found.failure_class, found.message) == ("crash", "the worker failed: OSError: no such folder")
 
 
 def test_a_row_that_every_worker_dies_of_is_lost(tmp_path):
@@ -99,7 +108,7 @@ def test_a_scheduler_that_is_gone_ends_the_run(tmp_path, monkeypatch):
     with pytest.raises(ResourceError, match="--resume"):
         list(DaskEngine("tcp://here:1").outcomes(tasks(tmp_path, "a")))
     client = Client(mortal=0)
-    monkeypatch.setattr(Future, "result", lambda _: (_ for _ in ()).throw(ConnectionResetError()))
+    monkeypatch.setattr(Future, "result", lambda *_, **__: (_ for _ in ()).throw(ConnectionResetError()))
     with pytest.raises(ResourceError, match="tcp://here:1 is gone"):
         list(DaskEngine("tcp://here:1").outcomes(tasks(tmp_path, "a")))
 

@@ -17,7 +17,7 @@ from palpate.cohort.engines.packing import Place, packed
 from palpate.cohort.mark import read_mark
 from palpate.cohort.progress import status_of
 from palpate.cohort.run import Options, run_cohort
-from palpate.cohort.supervise import Supervisor
+from palpate.cohort.supervise import Supervisor, _Watch
 from palpate.cohort.task import FAILURE_CLASSES, Limits, Outcome, Row, Task, failure_class_of
 from palpate.errors import (
     ConfigurationError,
@@ -102,8 +102,10 @@ def test_a_result_that_was_changed_since_is_waiting(tmp_path):
     run(tmp_path, rows_that("", ""))
     path = tmp_path / "cases/r0/result.json"
     path.write_text(path.read_text().replace("30.0", "31.0"))
+    (tmp_path / "cases/r1/.writing-outputs/new").mkdir(parents=True)  # of one that was killed after its mark
     found, _ = run(tmp_path, rows_that("", ""), only_failed=True)
     assert [found[row].state for row in ("r0", "r1")] == ["waiting", "done"]
+    assert not (tmp_path / "cases/r1/.writing-outputs").exists()
     found, _ = run(tmp_path, rows_that("", ""), resume=True)
     assert [found[row].state for row in ("r0", "r1")] == ["done", "done"]
 
@@ -149,6 +151,14 @@ def test_a_child_dies_with_whoever_started_it_and_leaves_no_half_result(tmp_path
 def test_the_class_of_a_failure_is_that_of_its_exit_code(error, name):
     assert failure_class_of(error) == name
     assert name in FAILURE_CLASSES
+
+
+@pytest.mark.parametrize(("peak_gb", "name"), [(0.6, "lost"), (1.2, "memory")])
+def test_a_child_that_is_killed_is_taken_for_too_large_beyond_half_of_its_limit(tmp_path, peak_gb, name):
+    watch = _Watch(dataclasses.replace(task(tmp_path), limits=Limits()))
+    for message in ({"pid": 1}, {"expected": [0.5, 10.0]}, {"ended": -signal.SIGKILL, "peak_gb": peak_gb}):
+        watch.hear(message)
+    assert watch.verdict().cause == name
 
 
 def test_tasks_are_json(tmp_path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.mechanics.deformation import deformation_determinants, largest_strains
+from palpate.mechanics.deformation import deformation_determinants, largest_strains, volumes_after
 from palpate.mesh.space import lagrange_space
 
 TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])  # a proper rotation
@@ -57,3 +57,10 @@ def test_a_displacement_that_is_not_finite_has_no_strain(space):
 def test_a_stretch_changes_the_volume_by_its_factor(space):
     found = deformation_determinants(space, affine(space, np.diag([1.0, 1.3, 1.0])))
     np.testing.assert_allclose(found, 1.3, rtol=1e-12)
+
+
+def test_moved_volumes_add_up_to_that_of_the_moved_box(space):
+    bent = np.zeros_like(space.points)
+    bent[:, 0] = 0.05 * space.points[:, 0] ** 2  # the face at 10 mm moves by 5 mm
+    assert volumes_after(space, bent).sum() == pytest.approx(1500.0, rel=1e-12)
+    np.testing.assert_allclose(volumes_after(space, affine(space, 2.0 * TURN)), 8.0 * space.mesh.volumes, rtol=1e-12)

@@ -104,6 +104,7 @@ def test_an_image_of_one_label_is_refused():
 
 def test_the_case_is_read_by_its_reader_with_paths_that_lead_to_the_images(folder, capsys, monkeypatch):
     monkeypatch.setattr(check, "machine_memory_gb", lambda: 64.0)
+    monkeypatch.setattr(check, "make_body", lambda *_, **__: None)  # meshes are made by other tests
     command = ["init", str(folder / "b.nii.gz"), str(folder / "a.nii.gz"), "--labels", str(folder / "names.json")]
     assert main([*command, "--output", str(folder / "new" / "case 1"), "--json", "--quiet"]) == 0
     document = json.loads(capsys.readouterr().out)
@@ -116,7 +117,7 @@ def test_the_case_is_read_by_its_reader_with_paths_that_lead_to_the_images(folde
     assert case.images.before.resolve() == (folder / "b.nii.gz").resolve()
     assert str(folder) not in path.read_text()
     assert "'rectum' is hollow" in path.read_text()
-    assert main(["check", str(path), "--quiet", "--set", "mesh.edge_length_mm=6"]) == 0
+    assert main(["check", str(path), "--quiet"]) == 0
 
 
 def test_what_cannot_be_guessed_is_asked_for_and_then_refused_by_its_key(folder):

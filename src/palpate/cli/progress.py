@@ -7,6 +7,7 @@ backwards and is never full: its share is that of the stages that are over, and 
 from __future__ import annotations
 
 import math
+import os
 import signal
 import sys
 import threading
@@ -83,19 +84,29 @@ def progress_on_stderr(*, quiet: bool, patience_s: float = PATIENCE_S) -> Iterat
 
     def remind(over: threading.Event) -> None:
         """Say that the last thing still goes on."""
-        reminded = began
+        reminded, stream = began, _duplicate(sys.stderr)
         while not over.wait(0.1 * patience_s):
             sentence, since = said[-1] if said else ("starting", began)
             now = time.monotonic()
             if now - max(since, reminded) > patience_s and not bar.moves:
                 reminded = now
-                tell(f"[{now - began:6.1f} s] still, after {now - since:.0f} s: {printable(sentence)}", sys.stderr)
+                tell(f"[{now - began:6.1f} s] still, after {now - since:.0f} s: {printable(sentence)}", stream)
+        if stream is not sys.stderr and stream is not None:
+            stream.close()
 
     try:
         with nullcontext() if quiet else _beside(remind):
             yield progress
     finally:
         bar.close()
+
+
+def _duplicate(stream: TextIO | None) -> TextIO | None:
+    """A stream to the same place that stays open while a library's own words on standard error are sent nowhere."""
+    try:
+        return None if stream is None else os.fdopen(os.dup(stream.fileno()), "w", encoding=stream.encoding)
+    except (OSError, ValueError):  # closed, or no file
+        return stream
 
 
 @contextmanager

@@ -51,7 +51,7 @@ def _row(rest: Path, session: Path, root: Path, template: Path, person: Mapping[
     images = {"before": str(found[0][0].absolute()), "after": str(found[1][0].absolute())}
     row = row_of(cells | images, root, template)
     if any(len(paths) > 1 for paths in found):
-        return replace(row, problem=f"{rest.name} or {session.name} has several images {IMAGES}; leave one in each.")
+        return replace(row, problem=f"{rest.name} or {session.name} has several images {IMAGES}; leave one in each")
     return replace(row, names=_names(found[0][0], root))
 
 

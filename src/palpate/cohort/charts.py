@@ -56,7 +56,7 @@ def boxes_svg(patients: Patients, tissue: str, unit: str, *, name: str) -> str:
         axes.set_xlim(min(stages) - 0.6, max(stages) + 0.6)
         _label(axes, unit)
 
-    says = f"Each patient's modulus of {tissue}, {len(patients)} patients, by stage, as boxes and points, in {unit}"
+    says = f"{tissue}: quartiles of the scans' {_axis(unit)} at each stage, medians of patients as points"
     return draw_svg(draw, size=SIZE, name=name, says=says)
 
 
@@ -87,9 +87,7 @@ def scatter_svg(patients: Patients, tissue: str, unit: str, line: Mapping[str, A
         axes.yaxis.set_minor_formatter(NullFormatter())
         _label(axes, unit)
 
-    says = (
-        f"Each patient's modulus of {tissue} with its 95 % interval against the stage, {unit}, with the weighted line"
-    )
+    says = f"{tissue}: each patient's {_axis(unit)} with its 95 % interval against the stage, and a line through them"
     return draw_svg(draw, size=SIZE, name=name, says=says)
 
 
@@ -122,7 +120,7 @@ def forest_svg(patients: Patients, tissue: str, unit: str, *, name: str) -> str:
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_xlabel(_axis(unit))
 
-    says = f"The modulus of {tissue} of {len(own)} patients with its 95 % interval, a line each, by stage, in {unit}"
+    says = f"{tissue}: each patient's {_axis(unit)} with its 95 % interval, by stage"
     return draw_svg(draw, size=(SIZE[0], height), name=name, says=says)
 
 

@@ -12,14 +12,15 @@ from pathlib import Path
 
 from palpate.cohort.closing import close_cohort
 from palpate.cohort.engines.contract import Engine
-from palpate.cohort.mark import MARK
+from palpate.cohort.mark import MARK, held_soon
 from palpate.cohort.plan import CASES, PLAN, Plan, make_plan, write_plan
 from palpate.cohort.progress import Tally
 from palpate.cohort.records import Record
 from palpate.cohort.tables import CSV, PARQUET
 from palpate.cohort.task import Limits, Outcome, Row
-from palpate.errors import ConfigurationError, PalpateError
+from palpate.errors import ConfigurationError, FolderInUse, PalpateError
 from palpate.progress import Progress
+from palpate.study.journal import STAGING
 from palpate.study.outputs import make_folder
 
 __all__ = ["Options", "run_cohort"]
@@ -63,6 +64,10 @@ def run_cohort(
     began = datetime.now(UTC).isoformat(timespec="seconds")
     plan = make_plan(rows, options.overrides, engine=engine.name, workers=options.workers, began=began)
     make_folder(folder / CASES)
+    for place in [folder / CASES / row.id for row in rows]:
+        if (place / STAGING).exists():  # whoever wrote there was killed, perhaps after the mark
+            with suppress(FolderInUse), held_soon(place, 0.0):
+                pass  # what was begun is ended by whoever holds the folder
     marks = plan.marks(folder)
     wanted = [number for number, mark in enumerate(marks) if _is_wanted(mark, options)]
     for number in wanted:

@@ -51,7 +51,7 @@ class Supervisor:
                 for message in self._heard(process, LOOK_S):
                     watch.hear(message)
                 watch.look()
-        except (OSError, EOFError):
+        except (OSError, EOFError, ValueError):  # gone, closed from another thread, or no line of ours
             self._drop()
         return watch.verdict()
 
@@ -163,25 +163,19 @@ class _Watch:
     def _sudden_end(self) -> Outcome:
         task, limit = self.task, self.memory_gb
         if self.stopped == "time":
-            return Outcome.failed(task, "timeout", f"it took more than the {self.seconds:g} s that it was given.")
+            return Outcome.failed(task, "timeout", f"it took more than the {self.seconds:g} s that it was given")
         if self.stopped == "memory":
-            text = f"it took more than the {limit:.1f} GB of memory that it was given."
+            text = f"it took more than the {limit:.1f} GB of memory that it was given"
             return Outcome.failed(task, "resources", text, cause="memory")
         if self.ended is None:
-            return Outcome.failed(task, "lost", "the process that computed it is gone.", cause="lost")
-        if (
-            self.ended == -signal.SIGKILL
-            and self.expected_gb
-            and self.peak_gb > MUCH * min(limit, 2 * self.expected_gb)
-        ):
-            text = f"the system ended it at {self.peak_gb:.1f} GB of memory, most likely for want of more."
+            return Outcome.failed(task, "lost", "the process that computed it is gone", cause="lost")
+        if self.ended == -signal.SIGKILL and self.peak_gb > MUCH * limit:
+            text = f"the system ended it at {self.peak_gb:.1f} GB of memory, most likely for want of more"
             return Outcome.failed(task, "resources", text, cause="memory")
         name = {-int(number): number.name for number in signal.Signals}.get(self.ended, f"exit code {self.ended}")
         if self.ended in (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGHUP, -signal.SIGINT):
-            return Outcome.failed(task, "lost", f"something ended the process that computed it ({name}).", cause="lost")
-        return Outcome.failed(
-            task, "crash", f"the process that computed it crashed ({name}); its log.txt may tell why."
-        )
+            return Outcome.failed(task, "lost", f"something ended the process that computed it ({name})", cause="lost")
+        return Outcome.failed(task, "crash", f"the process that computed it crashed ({name}); its log.txt may tell why")
 
 
 def _start(work: str) -> subprocess.Popen[bytes]:

@@ -124,13 +124,13 @@ def row_of(cells: Mapping[str, str], folder: Path, template: Path | None) -> Row
     stage = cells.get("stage", "")
     problem = ""
     if stage and not (STAGE.fullmatch(stage) and int(stage) <= 1000):
-        problem = f"its stage is '{shortened(stage)}'; write a whole number from 0 to 1000, or nothing."
+        problem = f"its stage is '{shortened(stage)}'; write a whole number from 0 to 1000, or nothing"
     elif bool(case) == bool(before or after):
-        problem = "it must name either a case file (case) or images (before and after)."
+        problem = "it must name either a case file (case) or images (before and after)"
     elif not case and not (before and after):
-        problem = f"it has no image '{'after' if before else 'before'}'."
+        problem = f"it has no image '{'after' if before else 'before'}'"
     elif not case and template is None:
-        problem = "it names images, and there is no --template case.toml that says who is who in them."
+        problem = "it names images, and there is no --template case.toml that says who is who in them"
     later = [place for part in after.split(LATER) if (place := part.strip())]
     return Row(
         id=cells["id"],

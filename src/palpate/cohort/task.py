@@ -138,7 +138,7 @@ class Outcome:
     @classmethod
     def failed(cls, task: Task, failure_class: str, message: str, *, cause: str = "") -> Outcome:
         """A failure of a task's attempt."""
-        sentence = " ".join((*task.remarks, message))
+        sentence = "; ".join((*task.remarks, message))
         return cls(task.row.id, "failed", task.key, failure_class, sentence, cause, attempts=task.attempt)
 
     def took(self, seconds: float, *, expected_gb: float | None, peak_gb: float | None) -> Outcome:

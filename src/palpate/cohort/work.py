@@ -43,7 +43,7 @@ def estimate_row(task: Task, tell: Tell) -> Outcome:
         return replace(Outcome.failed(task, "resources", "", cause="room"), expected_gb=float(error.args[0]))
     except MemoryError:
         LOGGER.exception("memory is short")
-        return Outcome.failed(task, "resources", "memory was short for this case.", cause="memory")
+        return Outcome.failed(task, "resources", "memory was short for this case", cause="memory")
     except PalpateError as error:
         LOGGER.error("%s: %s", type(error).__name__, error)
         return Outcome.failed(task, failure_class_of(error), printable(str(error)))
@@ -90,7 +90,7 @@ def _estimated(task: Task, case: Case, key: str, outputs: OutputFolder, tell: Te
         raise InputDataError("an input was changed while it was used; run the cohort again, with --resume")
     if document["status"] != "converged":
         return Outcome.failed(task, "solver", f"{document['status']}: {printable(document['reason'])}")
-    outcome = Outcome(task.row.id, "done", key, message=" ".join(task.remarks), attempts=task.attempt)
+    outcome = Outcome(task.row.id, "done", key, message="; ".join(task.remarks), attempts=task.attempt)
     took = outcome.took(
         time.monotonic() - began, expected_gb=expected[0] if expected else None, peak_gb=peak_memory_gb()
     )

@@ -60,7 +60,7 @@ def estimate(
     """
     began = time.perf_counter()
     refuse_what_cannot_be_estimated(case)
-    during("reading", progress)("reading the images")
+    during("reading", progress)("reading and aligning the images")
     reading = during("reading", progress)
     states, further = read_states(case, progress=reading), read_pairs(case, progress=reading)
     if progress is not silent or condition is not unconditional:
@@ -129,7 +129,7 @@ def estimate_states(
 def mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
     """Mesh the reference state of a case and pass it through the gate."""
     began = time.perf_counter()
-    progress("reading the images")
+    progress("reading and aligning the images")
     states = read_states(case, progress=progress)
     inputs = input_digests(case, states.inputs)
     body = make_body(states, case, progress=progress)

@@ -52,7 +52,7 @@ def simulate(case: Case, *, progress: Progress, steps: int = 1) -> Simulation:
         before, after, summary, remarks = scene.before, scene.after, _plain_summary(space), tuple[Finding, ...]()
         displacements = tuple(scene.displacement * (step / steps) for step in range(1, steps + 1))
     else:
-        progress("reading the images")
+        progress("reading and aligning the images")
         states = read_states(case, progress=progress)
         inputs = input_digests(case, states.inputs)
         tissues = states.before.tissues

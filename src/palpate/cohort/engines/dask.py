@@ -24,6 +24,7 @@ __all__ = ["DaskEngine", "attempt_on_worker"]
 LOOPBACK = "127.0.0.1"
 PATIENCE_S = 600.0  # for a first worker, and for another when all are gone
 MOMENT_S = 1.0
+GATHER_S = 15.0  # for a few lines of JSON from a worker
 ADVICE = "--engine dask needs Dask distributed, which is not installed: pip install 'palpate[cluster]'"
 GONE = (
     "the Dask scheduler at {} is gone; what is done stays done: start another one, and run the cohort again with"
@@ -139,11 +140,15 @@ class _Cluster:
 
     def _outcome(self, future: Any, task: Task) -> Outcome:
         if future.status == "finished":
-            return Outcome(**future.result())
+            try:
+                return Outcome(**future.result(timeout=GATHER_S))
+            except TimeoutError:  # its worker is gone with it, and nobody else may compute it; its mark is on the disk
+                future.cancel()
+                return _lost(task)
         if future.status == "error":
             error = future.exception()
             if type(error).__name__ not in ("KilledWorker", "CancelledError"):
-                return Outcome.failed(task, "crash", f"the worker failed: {type(error).__name__}: {error}.")
+                return Outcome.failed(task, "crash", f"the worker failed: {type(error).__name__}: {error}")
         return _lost(task)
 
 
@@ -152,7 +157,7 @@ def _status(future: Any) -> str:
 
 
 def _lost(task: Task) -> Outcome:
-    return Outcome.failed(task, "lost", "the Dask worker that computed it is gone.", cause="lost")
+    return Outcome.failed(task, "lost", "the Dask worker that computed it is gone", cause="lost")
 
 
 def _place(worker: Mapping[str, Any]) -> Place:

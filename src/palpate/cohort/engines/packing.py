@@ -105,7 +105,7 @@ def again(task: Task, outcome: Outcome) -> Task | None:
     if outcome.cause == "lost" and task.attempt < LOST_ATTEMPTS:
         return replace(task, attempt=task.attempt + 1)
     if outcome.cause == "memory" and task.coarser == 1.0:
-        remark = f"{outcome.message} The mesh is {COARSER} times as coarse as asked for, for want of memory."
+        remark = f"{outcome.message}; so its mesh was made {COARSER} times as coarse as asked for"
         return replace(task, coarser=COARSER, expected_gb=None, attempt=task.attempt + 1, remarks=(remark,))
     return None
 

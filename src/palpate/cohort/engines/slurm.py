@@ -68,7 +68,7 @@ class SlurmEngine:
                 yield from self._watched(job, left)
             finally:
                 _run("scancel", job)
-            lost = [Outcome.failed(task, "lost", "its SLURM job is gone.", cause="lost") for task in left.values()]
+            lost = [Outcome.failed(task, "lost", "its SLURM job is gone", cause="lost") for task in left.values()]
             for outcome in lost:
                 task = left.pop(outcome.id)
                 if (next_one := again(task, outcome)) is not None:

@@ -15,6 +15,7 @@ from palpate.cohort.records import Record, tissues_of
 from palpate.cohort.statistics.association import association
 from palpate.cohort.statistics.models import combined, mixed_model, repeatability, weighted_regression
 from palpate.cohort.statistics.scans import RULE, Usable, inside_fences, usable_scans
+from palpate.cohort.task import Row
 from palpate.study.result import json_object
 
 __all__ = ["SCHEMA", "statistics_document"]
@@ -81,9 +82,10 @@ def _organ(usable: Usable, records: Sequence[Record]) -> dict[str, Any]:
 
 
 def _patients(records: Sequence[Record], tissues: Sequence[Usable]) -> list[dict[str, Any]]:
-    found = []
-    for patient in dict.fromkeys(record.row.patient for record in records):
-        rows = [record.row for record in records if record.row.patient == patient]
+    found, of_patients = [], dict[str, list[Row]]()
+    for record in records:
+        of_patients.setdefault(record.row.patient, []).append(record.row)
+    for patient, rows in of_patients.items():
         stages = {row.stage for row in rows}
         entry: dict[str, Any] = {"patient": patient, "stage": stages.pop() if len(stages) == 1 else None}
         entry |= {"sessions": [row.session for row in rows], "kpa": {}, "ratio": {}, "summary": {}}

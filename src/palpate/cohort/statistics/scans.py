@@ -41,21 +41,25 @@ class Scan:
 
 @dataclass(frozen=True, slots=True)
 class Usable:
-    """The scans of a tissue that count, in `unit` ("kPa" or "ratio"), and how many do not: why -> number."""
+    """The scans of a tissue that count, in `unit` ("kPa" or "ratio"), and how many do not: why -> number.
+
+    groups: the same scans by patient.
+    """
 
     tissue: str
     unit: str
     scans: tuple[Scan, ...]
     left_out: dict[str, int]
+    groups: dict[str, list[Scan]]
 
     @property
     def patients(self) -> tuple[str, ...]:
         """Patients with a scan that counts, in the table's order."""
-        return tuple(dict.fromkeys(scan.patient for scan in self.scans))
+        return tuple(self.groups)
 
     def of(self, patient: str) -> tuple[Scan, ...]:
         """The scans of a patient."""
-        return tuple(scan for scan in self.scans if scan.patient == patient)
+        return tuple(self.groups.get(patient, ()))
 
     def stage_of(self, patient: str) -> int | None:
         """The stage of a patient; None where its rows name none, or several."""
@@ -79,7 +83,10 @@ def usable_scans(records: Sequence[Record], tissue: str) -> Usable:
             sd = max(math.log(modulus.high95 / modulus.low95) / (2.0 * HALF_WIDTH), LEAST_SD)
             who = (row.id, row.patient, row.session, row.stage)
             scans.append(Scan(*who, modulus.value, modulus.low95, modulus.high95, sd, modulus.verdict))
-    return Usable(tissue, unit, tuple(scans), left_out)
+    groups: dict[str, list[Scan]] = {}
+    for scan in scans:
+        groups.setdefault(scan.patient, []).append(scan)
+    return Usable(tissue, unit, tuple(scans), left_out, groups)
 
 
 def inside_fences(values: Array) -> NDArray[np.bool_]:
