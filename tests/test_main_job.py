@@ -117,7 +117,7 @@ def test_the_case_beside_the_result_gives_the_same_numbers(outputs, result, tmp_
 
 def test_the_case_in_the_result_is_the_one_beside_it(outputs, result):
     beside = tomllib.loads((outputs / "case.toml").read_text())
-    named = {"before": "before.nii.gz", "after": ["after.nii.gz"], "align": "none"}
+    named = {"before": "before.nii.gz", "after": ["after.nii.gz"], "align": "none", "body_from_ct": False}
     assert result["case"] == beside | {"images": named}
     assert result["overrides"] == []
 

@@ -11,6 +11,7 @@ import pytest
 
 import palpate.mechanics
 from palpate.mechanics.boundary import outer_constraint
+from palpate.mechanics.curved import CurvedModel
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.first_order import expanded
@@ -81,7 +82,14 @@ def first_order(meshes):
     return expanded(equilibrium, names=model.names, moduli=moduli, coefficients=coefficients)
 
 
-FACTORIES = {"LinearModel": linear, "ReducedModel": reduced, "FirstOrderModel": first_order}
+def curved(meshes):
+    """A finite-strain expansion around another place, bent as the linear law is."""
+    law, moduli, coefficients = finite(LAWS["neo-hookean"])(meshes), np.array([2.0, 12.0]), np.array([0.5, 0.1])
+    there = law.solve(moduli, coefficients)
+    return CurvedModel.of(expanded(there, names=law.names, moduli=moduli, coefficients=coefficients), linear(meshes))
+
+
+FACTORIES = {"LinearModel": linear, "ReducedModel": reduced, "FirstOrderModel": first_order, "CurvedModel": curved}
 FACTORIES |= {f"FiniteStrainModel {name}": finite(law) for name, law in LAWS.items()}
 
 

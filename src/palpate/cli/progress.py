@@ -84,21 +84,22 @@ def progress_on_stderr(*, quiet: bool, patience_s: float = PATIENCE_S) -> Iterat
 
     def remind(over: threading.Event) -> None:
         """Say that the last thing still goes on."""
-        reminded, stream = began, _duplicate(sys.stderr)
+        reminded = began
         while not over.wait(0.1 * patience_s):
             sentence, since = said[-1] if said else ("starting", began)
             now = time.monotonic()
             if now - max(since, reminded) > patience_s and not bar.moves:
                 reminded = now
                 tell(f"[{now - began:6.1f} s] still, after {now - since:.0f} s: {printable(sentence)}", stream)
-        if stream is not sys.stderr and stream is not None:
-            stream.close()
 
+    stream = None if quiet else _duplicate(sys.stderr)  # before any library takes the place of standard error
     try:
         with nullcontext() if quiet else _beside(remind):
             yield progress
     finally:
         bar.close()
+        if stream is not sys.stderr and stream is not None:
+            stream.close()
 
 
 def _duplicate(stream: TextIO | None) -> TextIO | None:
