@@ -61,7 +61,7 @@ def test_of_two_pairs_none_is_called_an_outlier():
 
 
 def test_the_variation_within_a_patient_is_that_of_the_moduli(rng):
-    found = agreement(drawn(rng, 4000))
+    found = agreement(drawn(rng, 1000))
     assert found.within_cv == pytest.approx(np.expm1(np.sqrt(np.diag(COVARIANCE))), rel=0.05)
 
 
