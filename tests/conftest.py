@@ -20,6 +20,7 @@ from palpate.mesh.space import lagrange_space
 from palpate.mesh.tet_mesh import OUTER, TetMesh
 from palpate.mesh.tetrahedralise import boundary_of
 from palpate.observation.contract import Fit
+from palpate.report import render
 from palpate.study.case import Case, CaseTissue, Images
 from palpate.study.estimation import Estimation, Iteration, ModulusEstimate, Start, TissueFit
 from palpate.study.result import CaseResult, MeshSummary, Provenance
@@ -149,6 +150,14 @@ def case_result() -> CaseResult:
 
 
 TESTS = Path(__file__).parent
+
+
+@pytest.fixture(autouse=True, scope="session")
+def coarse_pictures():
+    """One sample a pixel where rendering is not what is tested: a page is drawn in half of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(render, "FINE", 1)
+        yield
 
 
 @pytest.fixture(scope="session")
