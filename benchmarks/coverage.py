@@ -5,7 +5,7 @@
 
 For each pelvis one estimate from the clean surfaces of a finer mesh. Then each draw moves both images' surfaces along
 their normals by a random field of its own, and weights and moduli are sought anew **with the closest points and the
-approximation of the clean estimate** (the fast path: a second a draw); intervals are the product's, without the part of
+approximation of the clean estimate** (the fast path); intervals are the product's, without the part of
 the voxels' place. A line of JSON a pelvis, as soon as it is done; another run with the same file adds to it. The truths
 are known: simulated data.
 """
@@ -26,25 +26,13 @@ from accuracy_rows import ROWS, posed
 from numpy.typing import NDArray
 from scipy import stats
 
-from palpate.inversion import (
-    Bounds,
-    Evaluation,
-    Linearisation,
-    LinearisedObjective,
-    Minimum,
-    Objective,
-    gauss_newton,
-    invert,
-    reweighted,
-)
+from palpate.inversion import Bounds, Linearisation, Minimum, Objective, invert
 from palpate.phantoms import smooth_field
-from palpate.uncertainty import FixedCorrespondence, fixed_correspondence, modulus_interval, sandwich_covariance
+from palpate.uncertainty import modulus_interval, refitted, sandwich_covariance
 
 Array = NDArray[np.float64]
 Shift = Callable[[Array, Array, np.random.Generator, bool], Array]  # of places and normals, in the later image or not
 
-PASSES = 10
-SETTLED = 0.02  # posterior standard deviations
 LEVELS = (0.50, 0.68, 0.80, 0.90, 0.95, 0.99)
 FAR = 3.0  # half-widths
 SLICE_MM, CUT_SHARE = 2.5, 0.15
@@ -165,7 +153,8 @@ def _drawn(clean: Clean, setting: Setting, seed: int, draw: int) -> dict[str, An
     rng = np.random.default_rng([seed, draw, *setting.name.encode()])
     lines = _moved(clean.minimum.evaluation.lines, setting, rng)
     evaluation = replace(clean.minimum.evaluation, lines=lines)
-    objective, minimum, fixed = _settled(clean, evaluation)
+    minimum, fixed = refitted(clean.objective, replace(clean.minimum, evaluation=evaluation), clean.bounds)
+    objective = fixed.objective
     n = objective.n_parameters
     covariance = sandwich_covariance(objective, minimum.evaluation)
     theta, found = minimum.unknowns[:n], []
@@ -198,21 +187,6 @@ def _moved(lines: Sequence[Linearisation], setting: Setting, rng: np.random.Gene
         for line, r, error in zip(lines, residuals, np.split(after - before, ends), strict=True)
     ]
     return tuple(moved)
-
-
-def _settled(clean: Clean, evaluation: Evaluation) -> tuple[Objective, Minimum, FixedCorrespondence]:
-    """Weights and moduli that agree with each other on the moved surfaces."""
-    minimum = replace(clean.minimum, evaluation=evaluation)
-    objective, n = clean.objective, clean.objective.n_parameters
-    for _ in range(PASSES):
-        objective = reweighted(objective, minimum)
-        again = LinearisedObjective(objective, minimum.unknowns, minimum.evaluation)(minimum.unknowns)
-        fixed = fixed_correspondence(objective, minimum.unknowns, again)
-        before, minimum = minimum, gauss_newton(fixed, minimum.unknowns, bounds=clean.bounds, tolerance=1e-5)
-        sd = np.sqrt(np.diag(minimum.evaluation.covariance_columns(n)))
-        if np.all(np.abs(minimum.unknowns - before.unknowns)[:n] < SETTLED * sd):
-            break
-    return objective, minimum, fixed
 
 
 def _root(theta: Array, root: Array, truth: float) -> float:

@@ -77,7 +77,7 @@ def test_both_laws_say_the_same_of_poissons_ratio_in_a_small_motion(twin):
 
 
 def test_what_is_not_changed_moves_nothing(path, found):
-    still = path.shift(tuple(np.zeros(len(line.residuals.values)) for line in found.minimum.evaluation.lines))
+    still = path.under(tuple(np.zeros(len(line.residuals.values)) for line in found.minimum.evaluation.lines))
     assert still.converged
     assert not still.at_bound.any()
     assert still.theta == pytest.approx(0.0, abs=1e-4)
@@ -86,7 +86,7 @@ def test_what_is_not_changed_moves_nothing(path, found):
 def test_another_poissons_ratio_of_all_moves_the_estimate_as_foretold(twins, twin, found, path):
     minimum = found.minimum
     errors = poisson_errors(found.objective, minimum.unknowns, minimum.evaluation, Dilatation.POINTWISE)
-    foretold = path.shift(tuple(0.01 * error.sum(axis=1) for error in errors)).theta
+    foretold = path.under(tuple(0.01 * error.sum(axis=1) for error in errors)).theta
     exact = moved(twins, found, model=with_poisson(twin, dict.fromkeys(("gland", "sac", "rest"), 0.46)))
     assert np.abs(exact).max() > 0.05
     assert foretold == pytest.approx(exact, abs=0.2 * np.abs(exact).max())
@@ -95,7 +95,7 @@ def test_another_poissons_ratio_of_all_moves_the_estimate_as_foretold(twins, twi
 def test_a_known_modulus_moves_all_others_in_proportion(found, path):
     """Nothing but displacements is prescribed: what is known sets the scale alone, and the fast path knows it."""
     errors = modulus_errors(found.objective, found.minimum.unknowns, found.minimum.evaluation)
-    shift = path.shift(tuple(np.log(1.1) * error[:, 2] for error in errors))
+    shift = path.under(tuple(np.log(1.1) * error[:, 2] for error in errors))
     assert shift.theta == pytest.approx(np.log([1.1, 1.1]), abs=0.01)
 
 
@@ -106,7 +106,7 @@ def test_a_surface_drawn_elsewhere_moves_the_estimate_as_foretold(twins, found, 
     A gland drawn larger by a quarter voxel is explained best by one as soft as can be: both end at the bound.
     """
     growth, minimum = VOXEL * voxels, found.minimum
-    foretold = path.shift(tuple(growth * error for error in surface_errors(minimum.evaluation, tissue)))
+    foretold = path.under(tuple(growth * error for error in surface_errors(minimum.evaluation, tissue)))
 
     def grown(observation):
         before, after = observation.target.voxels

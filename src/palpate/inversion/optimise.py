@@ -26,6 +26,7 @@ __all__ = [
     "same_minimum",
 ]
 
+AT_BOUND = 1e-6  # of ln E
 FIRST_RADIUS = 1.0  # of the log-moduli, per step: a factor e
 MAX_RADIUS = 2.0
 LEAST_DAMPING = 1e-2  # of the diagonal: less is nearly the step that was refused
@@ -74,6 +75,10 @@ class Bounds:
 
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
+
+    def reached(self, theta: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which of theta (n_parameters,) lie at a bound: what holds them there is the search, not the images."""
+        return np.asarray(np.minimum(theta - self.lower, self.upper - theta) < AT_BOUND)
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,8 +179,8 @@ def gauss_newton(
     -s.d / 2, the reduction that the quadratic model still promises in units of log-likelihood. It ends when that is
     under `tolerance` and the step to the model's minimum moves each log-modulus by less than `within` (one number, or
     (n_parameters,)), or where steps within the noise of closest points lower the decrement no more: then where that was
-    least; or where it has met one of the `known` minima. `held`: the log-moduli (n_parameters,), or all
-    of them, that keep their values.
+    least; or where it has met one of the `known` minima. `held`: which log-moduli (n_parameters,) keep their values, or
+    whether all do.
     """
     unknowns, region, history = start.copy(), _Region(), list[Iterate]()
     now, evaluations, outcome = objective(unknowns), 1, Outcome.STEPS

@@ -43,7 +43,6 @@ __all__ = [
 ]
 
 GRID_DRAWS = 8
-AT_BOUND = 1e-6
 IDENTIFIED, WEAK = 2.0, 10.0  # largest ratio of an interval's ends
 AS_GOOD = 0.05  # of the objective: another minimum that is worse by less cannot be excluded
 
@@ -271,7 +270,7 @@ def _estimates(
 ) -> tuple[ModulusEstimate, ...]:
     mapping, bounds = inversion.objective.parameters, settings.bounds
     theta, scale = inversion.minimum.unknowns[: mapping.n_parameters], mapping.scale_kpa
-    found, variances = [], np.diag(covariance.total)
+    found, variances, at_bound = [], np.diag(covariance.total), bounds.reached(theta)
     fixed = fixed_correspondence(inversion.objective, inversion.minimum.unknowns, inversion.minimum.evaluation)
     for i, name in enumerate(mapping.tissues):
         none = no_estimate(
@@ -289,8 +288,7 @@ def _estimates(
         own = modulus_interval(fixed, inversion.minimum, i, variance=float(variances[i]), bounds=bounds)
         others = [np.exp(t[i]) for t in _as_good(inversion)]
         interval = hull([own.ends, *(log_interval(float(e), float(np.sqrt(variances[i])), **limits) for e in others)])
-        at_bound = bool(np.min(np.abs([theta[i] - bounds.lower[i], theta[i] - bounds.upper[i]])) < AT_BOUND)
-        word, why = verdict(interval, at_bound=at_bound, absolute=mapping.absolute)
+        word, why = verdict(interval, at_bound=bool(at_bound[i]), absolute=mapping.absolute)
         low, high = interval
         unit = scale if mapping.absolute else 1.0
         points = zip(unit * np.exp(own.profile.theta), own.profile.root, strict=True)

@@ -259,8 +259,8 @@ def _varied(
             raise EstimationError(f"the estimate did not converge: {inversion.minimum.outcome.value}")
         found = inversion.minimum.unknowns[: len(theta)]
         changes = dict(zip(names, (found - theta).tolist(), strict=True))
-        room = np.minimum(found - settings.bounds.lower, settings.bounds.upper - found)
-        at_bound = tuple(name for name, left in zip(names, room, strict=True) if left < 1e-6)
+        ended = settings.bounds.reached(found)
+        at_bound = tuple(name for name, there in zip(names, ended, strict=True) if there)
     except ResourceError:
         raise
     except PalpateError as error:

@@ -49,7 +49,7 @@ def image_pairs_of(inversion: Inversion, bounds: Bounds) -> ImagePairs | None:
         return None
     pairs = pair_estimates(inversion.objective, inversion.minimum, bounds)
     found: Agreement = agreement(pairs)
-    scale = mapping.scale_kpa if mapping.absolute else 1.0
+    scale = mapping.scale_kpa
     names = mapping.tissues
 
     def stated(
@@ -76,6 +76,6 @@ def combinations_of(inversion: Inversion, covariance: NDArray[np.float64], *, wi
     if not inversion.minimum.converged:
         return ()
     theta = inversion.minimum.unknowns[: mapping.n_parameters]
-    scale = mapping.scale_kpa if mapping.absolute else 1.0
+    scale = mapping.scale_kpa
     found = known_pairs(mapping.tissues, theta, covariance, within=within)
     return tuple(pair.times(scale) if pair.kind == "geometric mean" else pair for pair in found)

@@ -260,7 +260,7 @@ def _found(
 ) -> Variation:
     """One variation on the fast path; an estimate that is none says why."""
     try:
-        shift = path.shift(errors, width=width, dropped=dropped)
+        shift = path.under(errors) if errors is not None else path.shift(width=width, dropped=dropped)
     except (SolverError, EstimationError) as error:
         return Variation(cause, subject, setting, "linearised", None, reason=str(error))
     if not shift.converged:

@@ -13,6 +13,7 @@ from palpate.uncertainty.covariance import (
 from palpate.uncertainty.image_pairs import Agreement, PairEstimate, agreement, pair_estimates
 from palpate.uncertainty.intervals import NORMAL_95, Interval, ModulusInterval, log_interval, modulus_interval
 from palpate.uncertainty.profile import FixedCorrespondence, Profile, fixed_correspondence
+from palpate.uncertainty.refit import refitted
 from palpate.uncertainty.sampling import sample_posterior
 from palpate.uncertainty.sensitivity import (
     FastPath,
@@ -53,6 +54,7 @@ __all__ = [
     "modulus_interval",
     "pair_estimates",
     "poisson_errors",
+    "refitted",
     "require_salib",
     "sample_posterior",
     "sandwich_covariance",

@@ -1,8 +1,9 @@
 """How an estimate moves when what it rests on is changed, without another solution of the model.
 
-Residuals change to first order in the assumption, r + e, by the surfaces or by the displacement; then the objective is
-minimised anew with the closest points and robust weights held, on the approximation of the model, which bends: an organ
-that is drawn too large can run away to the bounds, which no gradient at the estimate foretells.
+Residuals change to first order in the assumption, r + e, by the surfaces or by the displacement; then weights and
+estimate are brought into agreement with them, the closest points held (see `refitted`), on the approximation of the
+model, which bends: an organ that is drawn too large can run away to the bounds, which no gradient at the estimate
+foretells. The drivers' prior and their modes are changed under the estimate's own weights.
 """
 
 from __future__ import annotations
@@ -12,19 +13,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inversion import Bounds, Evaluation, Minimum, Objective, gauss_newton
+from palpate.inversion import Bounds, Evaluation, Linearisation, Minimum, Objective, gauss_newton
 from palpate.inversion.expansion import Expansion
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium
 from palpate.mechanics.linear_model import LinearEquilibrium, poisson_tangents, with_constraint
 from palpate.uncertainty.profile import FixedCorrespondence, fixed_correspondence
+from palpate.uncertainty.refit import refitted
 
 __all__ = ["FastPath", "Shift", "fast_path", "modulus_errors", "poisson_errors", "surface_errors"]
 
 TOLERANCE = 1e-6  # decrement of a minimum
 STEPS = 120  # at the most: a modulus that runs away has far to go
 DROPPED = 1e10  # precision of a coefficient that is held at 0: its own is 1
-AT_BOUND = 1e-6
 
 Errors = tuple[NDArray[np.float64], ...]
 
@@ -49,12 +50,18 @@ class FastPath:
     least: Minimum
     bounds: Bounds
 
-    def shift(
-        self, errors: Errors | None = None, *, width: float = 1.0, dropped: NDArray[np.bool_] | None = None
-    ) -> Shift:
-        """Where the estimate goes under other residuals, another prior or fewer modes.
+    def under(self, errors: Errors) -> Shift:
+        """Where the estimate goes when the residuals of each observation change by e (n,) mm, weights and all.
 
-        errors: e (n,) mm of the residuals of each observation; width: of the drivers' prior, times its own; dropped
+        Raises `EstimationError`, `SolverError` as `refitted`.
+        """
+        moved = replace(self.least, evaluation=replace(self.least.evaluation, lines=self._moved(errors)))
+        return self._shift(refitted(self.fixed.objective, moved, self.bounds, max_steps=STEPS)[0])
+
+    def shift(self, errors: Errors = (), *, width: float = 1.0, dropped: NDArray[np.bool_] | None = None) -> Shift:
+        """Where it goes under its own weights: with other residuals, another prior of the drivers, fewer modes.
+
+        errors: e (n,) mm of each observation, none for none; width: of the prior, times its own; dropped
         (n_coefficients,): coefficients that are held at 0. Raises `SolverError`, `EstimationError` where an unknown is
         left open.
         """
@@ -64,15 +71,18 @@ class FastPath:
         if dropped is not None:
             precision, start[n:] = precision + DROPPED * np.diag(dropped), np.where(dropped, 0.0, start[n:])
         objective = replace(fixed.objective, parameters=replace(parameters, driver_precision=precision))
-        lines = fixed.lines
-        if errors is not None:
-            seen = [replace(o.residuals, values=o.residuals.values + e) for o, e in zip(lines, errors, strict=True)]
-            lines = tuple(replace(line, residuals=own) for line, own in zip(lines, seen, strict=True))
+        lines = self._moved(errors, fixed.lines) if errors else fixed.lines
         changed = replace(fixed, objective=objective, lines=lines)
-        found = gauss_newton(changed, start, bounds=self.bounds, tolerance=TOLERANCE, max_steps=STEPS)
-        theta = found.unknowns[:n]
-        room = np.minimum(theta - self.bounds.lower, self.bounds.upper - theta)
-        return Shift(theta - self.least.unknowns[:n], room < AT_BOUND, found.converged)
+        return self._shift(gauss_newton(changed, start, bounds=self.bounds, tolerance=TOLERANCE, max_steps=STEPS))
+
+    def _moved(self, errors: Errors, lines: tuple[Linearisation, ...] = ()) -> tuple[Linearisation, ...]:
+        """Lines, by default those at the estimate, with their residuals changed."""
+        pairs = zip(lines or self.least.evaluation.lines, errors, strict=True)
+        return tuple(replace(o, residuals=replace(o.residuals, values=o.residuals.values + e)) for o, e in pairs)
+
+    def _shift(self, found: Minimum) -> Shift:
+        theta, least = (of.unknowns[: self.fixed.n_parameters] for of in (found, self.least))
+        return Shift(theta - least, self.bounds.reached(theta), found.converged)
 
 
 def fast_path(objective: Objective, minimum: Minimum, bounds: Bounds) -> FastPath:
