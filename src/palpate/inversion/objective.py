@@ -88,7 +88,7 @@ class Evaluation:
 class Objective:
     """J(x) = 1/2 sum_s precision_s sum_j w_j rho(r_j) + 1/2 (x - m)^T P (x - m) over all observations of all states.
 
-    The unknowns x, their prior mean m and precision P are those of `parameters`; rho: see `Tukey`.
+    The unknowns x, their prior mean m and precision P are those of `parameters`; rho: see `RobustLoss`.
     """
 
     states: tuple[LaterState, ...]

@@ -13,7 +13,7 @@ from scipy import sparse
 from palpate.images.segmentation import Segmentation
 from palpate.mesh.space import LagrangeSpace
 from palpate.observation.noise_model import NoiseModel
-from palpate.observation.robust_loss import Tukey
+from palpate.observation.robust_loss import RobustLoss
 
 __all__ = ["Fit", "ImagedBody", "Observation", "Residuals", "Weighting"]
 
@@ -57,7 +57,7 @@ class Weighting:
     """How residuals count in the objective: 1/2 precision sum_j w_j rho(r_j), `precision` in mm^-2, rho the `loss`."""
 
     precision: float
-    loss: Tukey
+    loss: RobustLoss
 
 
 @dataclass(frozen=True, slots=True)

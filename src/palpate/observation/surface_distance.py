@@ -16,7 +16,7 @@ from palpate.images.tissue_distance import tissue_distance_map
 from palpate.observation.contract import Fit, ImagedBody, Observation, Residuals, Weighting
 from palpate.observation.noise_model import EXACT_NOISE, SEGMENTATION_NOISE, NoiseModel, fit_noise_model
 from palpate.observation.observed_surface import ObservedSurface, observed_surface
-from palpate.observation.robust_loss import Tukey
+from palpate.observation.robust_loss import HUBER, Huber, RobustLoss, Tukey
 from palpate.observation.surface_residuals import Correspondence, correspondence, surface_residuals
 from palpate.observation.target import SurfaceTarget, surface_target
 from palpate.observation.wall_correction import wall_correction
@@ -122,8 +122,7 @@ class SurfaceDistance:
         square, so that its misfit is not forced into the other unknowns.
         """
         loss = robust_loss(residuals.values, self.target)
-        inside = ~loss.rejects(residuals.values)
-        mean_square = float(np.average(residuals.values[inside] ** 2, weights=residuals.weights[inside]))
+        mean_square = loss.mean_square(residuals.values, residuals.weights)
         share = min(1.0, self.noise_model.sd**2 / max(mean_square, 1e-12))
         return replace(self, weighting=Weighting(self._precision(self.noise_model) * share, loss))
 
@@ -254,16 +253,22 @@ def surface_distances(
     )
 
 
-def robust_loss(values: NDArray[np.float64], target: SurfaceTarget) -> Tukey:
-    """Tukey's biweight for residuals (n,) mm of one surface: its cutoff is 4.685 of their standard deviations.
+def robust_loss(values: NDArray[np.float64], target: SurfaceTarget) -> RobustLoss:
+    """The loss for residuals (n,) mm of one surface: Tukey's of an organ, Huber's of a driver.
 
-    Up to the edge of a voxel (half of each image's; root mean square of the three edges) all count fully: so far can
-    rounding move a surface that runs along the grids, and terraces that flip as a whole are no outliers. They are rare
-    and large and carry the motion of a surface that else seems to stand still: if they counted less than what is quiet,
-    every motion would be found too small.
+    A cutoff is 4.685 or 1.345 of their robust standard deviations. Up to the edge of a voxel (half of each image's;
+    root mean square of the three edges) all count fully: so far can rounding move a surface that runs along the grids,
+    and terraces that flip as a whole are no outliers. They are rare and large and carry the motion of a surface that
+    else seems to stand still: if they counted less than what is quiet, every motion would be found too small.
+
+    A driver's wall moves by modes that its own residuals hold, beside a prior that is learned from them. A part of it
+    that a biweight rejects is held by the prior alone, which then seems to say more, moves the wall further off, and
+    has more of it rejected: two estimates would agree with their own weights, and one of them is wrong.
     """
     spread = MAD * float(np.median(np.abs(values)))
     rounding = float(sum(0.5 * np.sqrt(np.mean(image.grid.spacing**2)) for image in target.voxels or ()))
+    if target.surface.driver:
+        return Huber(max(HUBER * spread, LEAST_CUTOFF, rounding))
     return Tukey(max(TUKEY * spread, LEAST_CUTOFF), rounding)
 
 

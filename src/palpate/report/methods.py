@@ -132,7 +132,8 @@ def _fit(data: ReportData, cite: _Citations) -> str:
     onwards = " The linear law gave the start; the fit then went on over expansions around finite-strain equilibria."
     observed = listed(list(data.document.get("observations", {}).values())) or "what the case's observations compare"
     return (
-        f"The misfit was {observed}. Outliers counted less by Tukey's biweight {cite('huber')}. It was minimised over"
-        f" the logarithms of the moduli from {starts} starts by {optimiser} {cite(source)}, on a reduced basis whose"
-        f" error was bounded at the estimate {cite('reduced')}.{onwards if finite else ''}"
+        f"The misfit was {observed}. Outliers counted less: by Tukey's biweight, on the drivers' walls by Huber's loss"
+        f" {cite('huber')}. It was minimised over the logarithms of the moduli from {starts} starts by {optimiser}"
+        f" {cite(source)}, on a reduced basis whose error was bounded at the estimate {cite('reduced')}."
+        f"{onwards if finite else ''}"
     )
