@@ -21,6 +21,7 @@ from palpate.inversion import (
     with_first_noise,
 )
 from palpate.inversion import outer_loop as loop
+from palpate.inversion.approximation import ModelError
 from palpate.inversion.optimise import posterior_sd
 from palpate.inversion.outer_loop import Convergence, Criterion, StopRule, minimised
 
@@ -141,6 +142,17 @@ def test_what_an_approximation_misses_is_told_by_how_far_it_sets_the_moduli_off(
     assert error > 1e-3
     assert true.max() > 1e-3
     assert off == pytest.approx(true, abs=0.1 * true.max())
+
+
+def test_an_approximation_that_cannot_say_what_it_misses_leaves_everything_open(twins, twin, voxels, monkeypatch):
+    basis = reduced_basis(twin.model, twin.moduli)
+    objective = twins.objective_of(voxels, twin.coefficients).under([basis]).rematched(twin.unknowns)
+    here = minimised(objective, twin.unknowns, twins.settings(1.0))
+    silent = ModelError(np.inf, np.zeros(0))
+    monkeypatch.setattr(type(basis), "error", lambda _self, _at: silent)
+    error, off, _ = loop._model_error(objective, here)
+    assert error == np.inf
+    assert off.tolist() == [np.inf, np.inf]
 
 
 def test_the_model_is_not_solved_where_its_error_is_small_enough(twins, twin, voxels):

@@ -407,15 +407,19 @@ def _model_error(objective: Objective, minimum: Minimum) -> tuple[float, NDArray
     """What the approximations miss at a minimum: the largest error in energy, and what it cost to know.
 
     Between them by how much it sets the log-moduli off (n_parameters,): |H^-1 J^T W S du|, with the displacement du
-    that is missing, the residuals' smooth derivatives S by it and the Gauss-Newton matrix H = J^T W J + P.
+    that is missing, the residuals' smooth derivatives S by it and the Gauss-Newton matrix H = J^T W J + P; infinite
+    where an approximation cannot say.
     """
     pairs = list(zip(objective.approximations, objective.places(minimum.unknowns), strict=True))
     cost = sum((approximation.error_counts for approximation, _ in pairs), SolveCounts())
     errors = [approximation.error(at) for approximation, at in pairs]
+    largest = max(error.relative for error in errors)
+    if not np.isfinite(largest):
+        return np.inf, np.full(objective.n_parameters, np.inf), cost
     pull = np.zeros(len(minimum.unknowns))
     for line in minimum.evaluation.lines:
         du = errors[line.state].missing[line.observation.dofs]
         missing = np.asarray(line.residuals.smooth_jacobian @ du)
         pull[line.columns] += line.jacobian.T @ (line.precision * line.weights * missing)
     off = np.abs(minimum.evaluation.covariance_columns(objective.n_parameters).T @ pull)
-    return max(error.relative for error in errors), np.asarray(off), cost
+    return largest, np.asarray(off), cost

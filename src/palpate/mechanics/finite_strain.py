@@ -228,11 +228,12 @@ class FiniteStrainEquilibrium:
         """Estimated relative error in energy of a displacement (n_dof,) mm at other moduli (n_regions,) kPa.
 
         It is that of one correction -K^-1 r (n_dof,) mm by the residual r, K the stiffness of this equilibrium, which
-        comes with it: one right-hand side. Infinite where no factorisation of K is kept.
+        comes with it: one right-hand side. Infinite where no factorisation of K is kept, and where an element is turned
+        inside out, which no law answers.
         """
-        if self.factorisation is None:
-            return np.inf, np.zeros_like(displacement)
         balance = self.model.balance(moduli)
+        if self.factorisation is None or balance.smallest_volume(displacement) <= 0.0:
+            return np.inf, np.zeros_like(displacement)
         residual = np.asarray(balance.free.T @ balance.residual(displacement)[0])
         correction = -self.factorisation.solve(residual[:, None])[:, 0]
         internal = balance.region_forces(displacement, balance.moduli).sum(axis=1)
