@@ -47,6 +47,14 @@ def test_a_square_fills_the_height_and_nothing_else():
     assert drawn[:, :8, 3].max() == 0.0
 
 
+def test_what_faces_away_is_not_drawn():
+    """Half of a closed surface faces away, and lies behind its front."""
+    faces, colours, normals = square(40.0, 0.0, (1, 1, 1))
+    drawn = picture(square(50.0, -5.0, (1, 0, 0)), (faces[:, ::-1], colours, normals))
+    assert drawn[40, 50, 0] > 0.8
+    assert drawn[40, 50, 1] < 0.1
+
+
 def test_edges_are_darker_than_faces():
     plain, edged = picture(square(40.0, 0.0, (1, 1, 1))), picture(square(40.0, 0.0, (1, 1, 1)), edges=True)
     diagonal = np.arange(15, 65)
@@ -70,6 +78,20 @@ def test_the_cut_mesh_is_bounded_by_closed_faces(case_result):
     assert len(edges)
     assert set(data.mesh.region[tets]) == {0, 1, 3}
     assert all(set(face) <= set(data.mesh.tets[tet]) for face, tet in zip(faces, tets, strict=True))
+    assert volume_within(data.mesh.nodes[faces]) > 0.0
+
+
+def test_surfaces_are_seen_from_outside(case_result):
+    """What faces away is not drawn: a surface turned inside out would show its far side."""
+    data = collect(case_result)
+    for later in data.later:
+        assert all(volume_within(model.rest[model.triangles]) > 0.0 for model in later.model)
+
+
+def volume_within(corners):
+    """Volume (mm^3) within triangles (n, 3 corners, 3) that run counter-clockwise seen from outside."""
+    a, b, c = (corners[:, k].astype(float) for k in range(3))
+    return float(np.einsum("na,na->", a, np.cross(b, c))) / 6.0
 
 
 def test_the_reports_pictures_are_drawn(case_result):

@@ -42,8 +42,9 @@ class Camera:
 
 @dataclass(frozen=True, slots=True)
 class Triangles:
-    """Triangles to be drawn, with their edges if `edges` is set.
+    """Triangles of closed surfaces, drawn with their edges if `edges` is set.
 
+    Seen from outside their corners run counter-clockwise; those that face away are hidden by others, and are not drawn.
     corners (n, 3, 3) mm; colours (n, 3, 3), 0 to 1, and normals (n, 3, 3), dimensionless, one a corner.
     """
 
@@ -60,13 +61,16 @@ def render_png(triangles: Triangles, camera: Camera, *, width: int, height: int,
     scale = fill * FINE * min(width / max(high[0] - low[0], 1e-9), height / max(high[1] - low[1], 1e-9))
     shape = (FINE * height, FINE * width)
     flat = (flat - 0.5 * (low + high)) * scale + [0.5 * shape[1], 0.5 * shape[0], 0.0]
-    # a lamp beside the viewer, both sides of a surface lit
+    # a lamp beside the viewer, normals to either side
     lamp = camera.back + 0.35 * camera.up - 0.3 * camera.right
     cosine = np.abs(triangles.normals @ (lamp / np.linalg.norm(lamp)))
     light = (0.5 + 0.55 * cosine)[..., None]
     depth = flat[..., 2]
     flat[..., 2] = (depth - depth.min()) / max(float(np.ptp(depth)), 1e-9)
     buffer = np.full(shape, -1, dtype=np.int64)
+    ahead = flat[:, 1:, :2] - flat[:, :1, :2]
+    facing = ahead[:, 0, 0] * ahead[:, 1, 1] > ahead[:, 0, 1] * ahead[:, 1, 0]
+    flat, shades = flat[facing], (triangles.colours * light)[facing]
     # by the number of samples along an edge, so that samples lie within a pixel
     edge = np.linalg.norm(flat[:, :, :2] - np.roll(flat[:, :, :2], 1, axis=1), axis=2).max(axis=1)
     wanted = DENSITIES[np.minimum(np.searchsorted(DENSITIES, 1.2 * edge), len(DENSITIES) - 1)]
@@ -74,7 +78,7 @@ def render_png(triangles: Triangles, camera: Camera, *, width: int, height: int,
         raise ValueError("the picture has too many triangles to be drawn")
     for density in np.unique(wanted):
         group = wanted == density
-        _splat(flat[group], (triangles.colours * light)[group], int(density), edges=triangles.edges, into=buffer)
+        _splat(flat[group], shades[group], int(density), edges=triangles.edges, into=buffer)
     # the mean over FINE x FINE samples, with straight alpha
     there = (buffer >= 0)[..., None]
     parts = np.stack([(buffer >> shift) & 255 for shift in (16, 8, 0)], axis=-1) * there
