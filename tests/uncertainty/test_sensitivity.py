@@ -161,3 +161,14 @@ def test_sobol_indices_of_ishigamis_function_are_the_known_ones():
     assert found.first[:, 0] == pytest.approx([0.3139, 0.4424, 0.0], abs=0.02)
     assert found.total[:, 0] == pytest.approx([0.5576, 0.4424, 0.2437], abs=0.02)
     assert found.variance[0] == pytest.approx(13.845, rel=0.02)
+    assert found.failed == 0.0
+
+
+def test_samples_without_an_output_count_as_nought_and_are_told():
+    def half(x):
+        return np.where(x[:, :1] > 0.0, 1.0, np.nan)
+
+    found = sobol_indices(half, [(-1.0, 1.0)] * 2, n=256, seed=1)
+    assert found.failed == pytest.approx(0.5, abs=0.01)
+    assert found.variance[0] == pytest.approx(0.25, abs=0.01)
+    assert found.first[0, 0] == pytest.approx(1.0, abs=0.05)

@@ -13,7 +13,15 @@ from palpate.images.tissue import Role, Tissue
 from palpate.inversion import Inversion, InversionSettings
 from palpate.mechanics.dilatation import Dilatation
 from palpate.parallel import mapped
-from palpate.uncertainty import FastPath, fast_path, modulus_errors, poisson_errors, sobol_indices, surface_errors
+from palpate.uncertainty import (
+    Errors,
+    FastPath,
+    fast_path,
+    modulus_errors,
+    poisson_errors,
+    sobol_indices,
+    surface_errors,
+)
 
 __all__ = ["Range", "SobolResult", "Variation", "fast_variations", "sobol_result"]
 
@@ -22,8 +30,6 @@ KNOWN_FACTOR = 1.2
 VOXELS = (-0.5, -0.25, 0.25, 0.5)
 PRIOR_WIDTHS = (0.5, 2.0)
 ALL = "all tissues"
-
-Errors = tuple[NDArray[np.float64], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +89,12 @@ class _Input:
     errors: Errors
     amounts: tuple[tuple[float, str], ...]
 
+    @property
+    def range(self) -> Range:
+        """From the least to the largest of its amounts."""
+        ends = [amount for amount, _ in self.amounts]
+        return Range(self.cause, self.subject, min(ends), max(ends), self.unit)
+
 
 def fast_variations(
     inversion: Inversion,
@@ -138,52 +150,51 @@ def sobol_result(
     path = fast_path(inversion.objective, inversion.minimum, settings.bounds)
     mapping = inversion.objective.parameters
     inputs = [each for each in _inputs(inversion, tissues, dilatation, voxel_mm) if each.subject != ALL]
-    ends = [[amount for amount, _ in each.amounts] for each in inputs]
-    ranges = [Range(i.cause, i.subject, min(of), max(of), i.unit) for i, of in zip(inputs, ends, strict=True)]
-    exact = bool(_exact(inversion, tissues))
-    scale = float(np.log(KNOWN_FACTOR))
-    if exact:
-        (known,) = (t.name for t in tissues if t.role is Role.KNOWN)
-        ranges.append(Range("known_modulus", known, -scale, scale, "ln E"))
-    if sum(mapping.n_modes):
-        low, high = np.log2(PRIOR_WIDTHS).tolist()
-        ranges.append(Range("driver_prior", "", low, high, "log2 of the width"))
-    failures = list[bool]()
+    ranges = [*(each.range for each in inputs), *_ranges(inversion, tissues)]
+    causes = [each.cause for each in ranges[len(inputs) :]]
 
-    def one(row: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The change of ln E (n_parameters,) of one sample (n_inputs,)."""
-        weighted = [tuple(x * e for e in each.errors) for x, each in zip(row, inputs, strict=False)]
+    def one(sample: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The change of ln E (n_parameters,) of one sample (n_inputs,); NaN where there is no estimate."""
+        weighted = [tuple(x * e for e in each.errors) for x, each in zip(sample, inputs, strict=False)]
         errors = tuple(np.sum(of, axis=0) for of in zip(*weighted, strict=True))
-        width = float(2.0 ** row[-1]) if sum(mapping.n_modes) else 1.0
+        others = dict(zip(causes, sample[len(inputs) :].tolist(), strict=True))
         try:
-            theta = path.shift(errors, width=width).theta
+            theta = path.shift(errors, width=2.0 ** others.get("driver_prior", 0.0)).theta
         except (SolverError, EstimationError):
-            failures.append(True)
-            theta = np.zeros(mapping.n_parameters)
-        return theta + (row[len(inputs)] if exact else 0.0)
+            return np.full(mapping.n_parameters, np.nan)
+        return np.asarray(theta + others.get("known_modulus", 0.0))
 
-    def all_of(samples: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The same (n_samples, n_parameters) of samples (n_samples, n_inputs)."""
-        failures.append(False)
-        return np.stack(mapped(one, samples))
-
-    found = sobol_indices(all_of, [(r.low, r.high) for r in ranges], n=n, seed=seed)
-    samples = n * (len(ranges) + 2)
+    found = sobol_indices(
+        lambda samples: np.stack(mapped(one, samples)), [(r.low, r.high) for r in ranges], n=n, seed=seed
+    )
 
     def by_tissue(shares: NDArray[np.float64]) -> dict[str, tuple[float, ...]]:
         """Columns of (n_inputs, n_parameters) by tissue."""
         return {name: tuple(column.tolist()) for name, column in zip(mapping.tissues, shares.T, strict=True)}
 
     return SobolResult(
-        samples,
+        n * (len(ranges) + 2),
         tuple(ranges),
         dict(zip(mapping.tissues, np.sqrt(found.variance).tolist(), strict=True)),
         by_tissue(found.first),
         by_tissue(found.first_half),
         by_tissue(found.total),
         by_tissue(found.total_half),
-        sum(failures) / samples,
+        found.failed,
     )
+
+
+def _ranges(inversion: Inversion, tissues: tuple[Tissue, ...]) -> list[Range]:
+    """Those of what changes no residual: a known modulus that alone sets the scale, and the drivers' prior."""
+    found = []
+    if _exact(inversion, tissues):
+        (known,) = (tissue.name for tissue in tissues if tissue.role is Role.KNOWN)
+        scale = float(np.log(KNOWN_FACTOR))
+        found.append(Range("known_modulus", known, -scale, scale, "ln E"))
+    if sum(inversion.objective.parameters.n_modes):
+        low, high = np.log2(PRIOR_WIDTHS).tolist()
+        found.append(Range("driver_prior", "", low, high, "log2 of the width"))
+    return found
 
 
 def _inputs(

@@ -16,6 +16,7 @@ from palpate.uncertainty.profile import FixedCorrespondence, Profile, fixed_corr
 from palpate.uncertainty.refit import refitted
 from palpate.uncertainty.sampling import sample_posterior
 from palpate.uncertainty.sensitivity import (
+    Errors,
     FastPath,
     Shift,
     fast_path,
@@ -30,6 +31,7 @@ __all__ = [
     "Agreement",
     "Combination",
     "Covariance",
+    "Errors",
     "FastPath",
     "FittedState",
     "FixedCorrespondence",

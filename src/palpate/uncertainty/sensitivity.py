@@ -21,13 +21,13 @@ from palpate.mechanics.linear_model import LinearEquilibrium, poisson_tangents, 
 from palpate.uncertainty.profile import FixedCorrespondence, fixed_correspondence
 from palpate.uncertainty.refit import refitted
 
-__all__ = ["FastPath", "Shift", "fast_path", "modulus_errors", "poisson_errors", "surface_errors"]
+__all__ = ["Errors", "FastPath", "Shift", "fast_path", "modulus_errors", "poisson_errors", "surface_errors"]
 
 TOLERANCE = 1e-6  # decrement of a minimum
 STEPS = 120  # at the most: a modulus that runs away has far to go
 DROPPED = 1e10  # precision of a coefficient that is held at 0: its own is 1
 
-Errors = tuple[NDArray[np.float64], ...]
+Errors = tuple[NDArray[np.float64], ...]  # changes (n,) mm of each observation's residuals
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ class SobolIndices:
     """Shares of the variance of each output (n_outputs,) by each input, (n_inputs, n_outputs) each, dimensionless.
 
     first: by the input alone; total: with all that it does together with others; *_half: half widths of their 95 %
-    intervals, by bootstrap; variance (n_outputs,): of the outputs.
+    intervals, by bootstrap; variance (n_outputs,): of the outputs; failed: share of the samples without an output.
     """
 
     first: NDArray[np.float64]
@@ -27,6 +27,7 @@ class SobolIndices:
     first_half: NDArray[np.float64]
     total_half: NDArray[np.float64]
     variance: NDArray[np.float64]
+    failed: float
 
 
 def require_salib() -> None:
@@ -49,9 +50,9 @@ def sobol_indices(
 ) -> SobolIndices:
     """Indices of the outputs of `function`, (n_samples, n_inputs) to (n_samples, n_outputs), over uniform inputs.
 
-    ranges: low and high of each input; n: a power of 2, the function is asked n (n_inputs + 2) times. Saltelli's
-    scheme on Sobol's sequence (Saltelli et al., Computer Physics Communications 181 (2010) 259-270), by SALib. Raises
-    `ResourceError` as `require_salib` does.
+    ranges: low and high of each input; n: a power of 2, the function is asked n (n_inputs + 2) times, and answers NaN
+    where it has no output, which then counts as 0. Saltelli's scheme on Sobol's sequence (Saltelli et al., Computer
+    Physics Communications 181 (2010) 259-270), by SALib. Raises `ResourceError` as `require_salib` does.
     """
     require_salib()
     sample, analyze = import_module("SALib.sample.sobol"), import_module("SALib.analyze.sobol")
@@ -61,8 +62,10 @@ def sobol_indices(
         "bounds": [list(r) for r in ranges],
     }
     outputs = function(np.asarray(sample.sample(problem, n, calc_second_order=False, seed=seed)))
+    failed = np.asarray(np.isnan(outputs).any(axis=1))
+    outputs = np.where(failed[:, None], 0.0, outputs)
     found = [analyze.analyze(problem, column, calc_second_order=False, seed=seed) for column in outputs.T]
     first, total, first_half, total_half = (
         np.stack([np.asarray(each[key]) for each in found], axis=1) for key in ("S1", "ST", "S1_conf", "ST_conf")
     )
-    return SobolIndices(first, total, first_half, total_half, np.var(outputs, axis=0))
+    return SobolIndices(first, total, first_half, total_half, np.var(outputs, axis=0), float(failed.mean()))
