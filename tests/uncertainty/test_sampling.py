@@ -110,11 +110,11 @@ def test_chains_made_in_blocks_have_every_draw_and_the_same_ones_with_a_seed(obj
     evaluation = objective(minimum)
     frozen = frozen_posterior(objective, minimum, evaluation)
     own = np.linalg.inv(evaluation.matrix)[:2, :2]
-    given = {"bounds": WIDE, "chains": 2, "draws": 300}
+    given = {"bounds": WIDE, "chains": 2, "draws": 150}
     first, second = (
         posterior_chains(frozen, minimum, evaluation, own, rng=np.random.default_rng(3), **given) for _ in range(2)
     )
-    assert first.theta.shape == (2, 300, 2)
+    assert first.theta.shape == (2, 150, 2)
     assert np.array_equal(first.theta, second.theta)
     assert np.std(first.theta, axis=(0, 1)) == pytest.approx(np.sqrt(np.diag(own)), rel=0.25)
 
