@@ -21,10 +21,11 @@ from palpate.mesh.tet_mesh import OUTER, TetMesh
 from palpate.mesh.tetrahedralise import boundary_of
 from palpate.observation.contract import Fit
 from palpate.report import render
-from palpate.study.case import Case, CaseTissue, Images
+from palpate.study.case import Case, CaseTissue, Estimate, Images
 from palpate.study.estimation import Estimation, Iteration, ModulusEstimate, Start, TissueFit
 from palpate.study.result import CaseResult, MeshSummary, Provenance
-from palpate.uncertainty import Covariance
+from palpate.study.samples import ModulusSamples
+from palpate.uncertainty import ChainDiagnostics, Covariance
 
 sys.path.insert(0, str(Path(__file__).parent))  # tests are no package; dicom_files.py lies here
 
@@ -147,6 +148,25 @@ def case_result() -> CaseResult:
         after=(make_segmentation(mesh, moved=True),),
         provenance=Provenance({"total": 1.5}, {"before": "ab" * 32}, {"palpate": "0.1.0"}),
     )
+
+
+@pytest.fixture(scope="session")
+def sampled_result(case_result) -> CaseResult:
+    """The same with chains of the moduli that stay together, and their diagnostics."""
+    normal = np.random.default_rng(5).standard_normal((4, 150, 2))
+    moduli = np.array([58.9, 31.2]) * np.exp(np.array([0.1, 0.245]) * normal)
+    samples = ModulusSamples(
+        ("prostate", "bladder"),
+        "kPa",
+        moduli,
+        -0.5 * (normal**2).sum(axis=2),
+        np.array([0.7, 0.72, 0.69, 0.71]),
+        np.array([[48.0, 71.0], [19.0, np.nan]]),
+        ChainDiagnostics(np.array([1.001, 1.002]), np.array([610.0, 580.0]), np.array([500.0, 490.0])),
+    )
+    case = dataclasses.replace(case_result.case, estimate=Estimate(samples=150))
+    estimation = dataclasses.replace(case_result.estimation, samples=samples)
+    return dataclasses.replace(case_result, case=case, estimation=estimation)
 
 
 TESTS = Path(__file__).parent

@@ -59,7 +59,15 @@ Widening = Literal[
     "touching",
 ]
 Harmless = Literal[
-    "finer-mesh", "front-exchanged", "sides-exchanged", "memory", "memory-now", "report", "case-file", "earlier-files"
+    "samples-not-mixed",
+    "finer-mesh",
+    "front-exchanged",
+    "sides-exchanged",
+    "memory",
+    "memory-now",
+    "report",
+    "case-file",
+    "earlier-files",
 ]
 Code = Misleading | Widening | Harmless
 

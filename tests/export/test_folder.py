@@ -149,6 +149,29 @@ def test_an_unknown_format_and_the_results_own_folder_are_refused(saved, tmp_pat
     assert "folder of the result itself" in capsys.readouterr().err
 
 
+def test_chains_are_a_file_of_their_run_and_go_on_from_the_folder(sampled_result, tmp_path):
+    folder = save(sampled_result, tmp_path / "out")
+    document = json.loads((folder / "result.json").read_text())
+    assert document["files"]["posterior.nc"]["sha256"] == sha256_of(folder / "posterior.nc")
+    assert_same(read_model(folder).samples, sampled_result.estimation.samples)
+    (path,) = palpate.export(folder, tmp_path / "nc", format="netcdf")
+    assert path.read_bytes() == (folder / "posterior.nc").read_bytes()
+    (folder / "posterior.nc").write_bytes(b"CDF")
+    with pytest.raises(InputDataError, match="was changed"):
+        palpate.export(folder, tmp_path / "changed", format="netcdf")
+
+
+@pytest.mark.parametrize("changes", [{"samples": None}, {"status": "not converged"}])
+def test_without_chains_there_is_no_file_of_them_and_an_earlier_one_goes(sampled_result, tmp_path, changes):
+    folder = save(sampled_result, tmp_path / "out")
+    save(
+        dataclasses.replace(sampled_result, estimation=dataclasses.replace(sampled_result.estimation, **changes)),
+        folder,
+    )
+    assert json.loads((folder / "result.json").read_text())["samples"] is None
+    assert not (folder / "posterior.nc").exists()
+
+
 def test_each_further_pair_has_a_folder_of_its_own(case_result, tmp_path):
     r = case_result
     pair = PairResult(r.space, r.mesh_summary, r.before, r.after, (0.5 * r.estimation.displacements[0],))

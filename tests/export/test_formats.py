@@ -318,6 +318,42 @@ def test_netcdf_and_csv_hold_the_posterior_of_the_intervals(exported, case_resul
     assert tissues["rectum"]["youngs_modulus"] == tissues["surroundings"]["verdict"] == ""
 
 
+def test_netcdf_and_csv_of_a_result_with_chains_hold_these(sampled_result, exported, tmp_path):
+    """Names, dims and units are ArviZ's; what they are, and the share of their intervals, is written beside them."""
+    h5netcdf = pytest.importorskip("h5netcdf")
+    samples = sampled_result.estimation.samples
+    (path,) = palpate.export(sampled_result, tmp_path / "nc", format="netcdf")
+    with h5netcdf.File(path) as file, h5netcdf.File(exported("netcdf") / "posterior.nc") as linearised:
+        posterior, stats, constant = (file[name] for name in ("posterior", "sample_stats", "constant_data"))
+        moduli = posterior["youngs_modulus"]
+        assert moduli.dimensions == ("chain", "draw", "tissue")
+        assert moduli.attrs["units"] == "kPa"
+        assert moduli.attrs["kind"].startswith("sampled")
+        assert linearised["posterior/youngs_modulus"].attrs["kind"].startswith("linearised")
+        np.testing.assert_array_equal(moduli[...], samples.moduli)
+        assert [len(posterior.dimensions[axis]) for axis in ("chain", "draw", "tissue")] == [4, 150, 2]
+        assert np.array_equal(posterior["draw"][...], np.arange(150))
+        assert stats["lp"].dimensions == ("chain", "draw")
+        np.testing.assert_array_equal(stats["lp"][...], samples.log_density)
+        np.testing.assert_array_equal(stats["acceptance_rate"][...], samples.accepted)
+        assert "r_hat" not in linearised["constant_data"].variables
+        for name in ("r_hat", "ess_bulk", "ess_tail"):
+            assert constant[name].dimensions == ("tissue",)
+            np.testing.assert_array_equal(constant[name][...], getattr(samples.diagnostics, name))
+        np.testing.assert_array_equal(constant["samples_interval95_high"][...], [71.0, np.nan])
+        np.testing.assert_allclose(constant["interval95_low"][...], [0.8 * 58.9, 0.8 * 31.2])
+        ends = [name for name in constant.variables if "interval95" in name]
+        assert len(ends) == 4
+        assert {(constant[name].attrs["units"], constant[name].attrs["interval_probability"]) for name in ends} == {
+            ("kPa", 0.95)
+        }
+    palpate.export(sampled_result, tmp_path / "csv", format="csv")
+    with (tmp_path / "csv" / "samples.csv").open() as table:
+        rows = list(csv.DictReader(table))
+    assert [float(row["youngs_modulus"]) for row in rows] == pytest.approx(samples.moduli.ravel(), rel=1e-9)
+    assert (rows[-1]["chain"], rows[-1]["draw"], rows[-1]["tissue"]) == ("3", "149", "bladder")
+
+
 class Node:
     """Records what a scene adds to it, in place of SOFA's own."""
 

@@ -22,6 +22,15 @@ def test_the_case_as_it_was_run_stands_beside_its_result(estimate, out):
     assert document(out)["case"]["mesh"] == {"edge_length_mm": 3.0}
 
 
+def test_how_many_samples_were_asked_is_a_setting_of_the_case(estimate, out):
+    assert estimate("anna", "--quiet", "--samples", "1000", "--set", "seed=3") == 0
+    assert tomllib.loads((out / "case.toml").read_text())["estimate"]["samples"] == 1000
+    assert document(out)["case"]["estimate"]["samples"] == 1000
+    assert document(out)["overrides"] == ["estimate.samples=1000", "seed=3"]
+    assert estimate("bert", "--quiet") == 0
+    assert tomllib.loads((out / "case.toml").read_text())["estimate"]["samples"] == 0
+
+
 def test_the_next_run_in_the_folder_replaces_it(estimate, out):
     assert estimate("anna", "--quiet") == 0
     assert estimate("bert", "--quiet") == 0

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +16,16 @@ from palpate.errors import ConfigurationError, ResourceError
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers import write_label_image
 from palpate.study import run
+from palpate.study.case import Estimate
 from palpate.study.lock import folder_lock
 
+CASE = """
+images = { before = "before.nii.gz", after = ["after.nii.gz"] }
+[tissues]
+prostate = { label = 1, role = "estimate" }
+rectum = { label = 2, role = "driver" }
+body = { label = "remaining", role = "known", youngs_modulus_kpa = 10.0 }
+"""
 NAMES = {"1": "prostate", "2": "rectum", "3": "body"}
 
 
@@ -62,6 +72,45 @@ def test_a_mesh_is_made_of_a_case_whatever_its_path_is(folder, kind):
     result = palpate.make_mesh(palpate.read_case(kind(case.path), ["mesh.edge_length_mm=8"]), progress=told.append)
     assert result.mesh_summary.tets == len(result.space.mesh.tets) > 100
     assert told[0] == "reading and aligning the images"
+
+
+@pytest.mark.parametrize(("module", "name"), [("arviz_stats.base", "arviz-stats"), ("h5netcdf", "h5netcdf")])
+def test_samples_without_their_libraries_are_refused_before_anything_is_read(
+    tmp_path, monkeypatch, capfd, module, name
+):
+    path = tmp_path / "case.toml"
+    path.write_text(CASE)
+    monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.setattr(run, "read_states", lambda *_, **__: pytest.fail("an image was read"))
+    with pytest.raises(ResourceError, match=rf"{name}, which is not installed: pip install 'palpate\[samples\]'"):
+        palpate.estimate(palpate.read_case(path), samples=1000)
+    assert main(["estimate", str(path), "--output", str(tmp_path / "out"), "--samples", "1000", "--quiet"]) == 6
+    assert "pip install 'palpate[samples]'" in capfd.readouterr().err
+    assert not (tmp_path / "out" / "result.json").exists()
+
+
+@pytest.mark.parametrize("samples", [-1, 1, 99, 100_001])
+def test_another_number_of_samples_than_can_be_drawn_is_refused(tmp_path, capfd, samples):
+    path = tmp_path / "case.toml"
+    path.write_text(CASE)
+    with pytest.raises(ConfigurationError, match=rf"samples is {samples}; ask for 100 to 100000"):
+        palpate.estimate(palpate.read_case(path), samples=samples)
+    assert main(["estimate", str(path), "--output", str(tmp_path), "--set", f"estimate.samples={samples}"]) == 2
+    assert f"is {samples}" in capfd.readouterr().err
+
+
+def test_what_is_no_number_of_samples_is_a_matter_of_usage(tmp_path, capfd):
+    with pytest.raises(SystemExit, match="2"):
+        main(["estimate", str(tmp_path / "case.toml"), "--samples", "many"])
+    assert "'many' is no whole number" in capfd.readouterr().err
+
+
+def test_samples_asked_in_python_are_those_of_the_case(monkeypatch, case_result):
+    monkeypatch.setattr(run, "estimate", lambda case, **__: dataclasses.replace(case_result, case=case))
+    assert palpate.estimate(case_result.case, samples=1000).case.estimate.samples == 1000
+    sampled = dataclasses.replace(case_result.case, estimate=Estimate(samples=1000))
+    assert palpate.estimate(sampled).case.estimate.samples == 1000
+    assert palpate.estimate(sampled, samples=0).case.estimate.samples == 0
 
 
 def test_an_estimate_can_be_saved_and_holds_its_folder(tmp_path, monkeypatch, case_result):

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 
 import pytest
 
 from palpate.cli import main
 from palpate.mechanics.solvers import registry
 from palpate.study import check, cost
+from palpate.study.case import Estimate
 from palpate.study.check import check_case
 from palpate.study.cost import expected_cost, expected_tets
 
@@ -18,23 +20,26 @@ def silent(_: str) -> None:
     """Nobody listens."""
 
 
-def test_every_problem_is_listed_and_the_worst_class_is_the_exit_code(tmp_path):
+def test_every_problem_is_listed_and_the_worst_class_is_the_exit_code(tmp_path, monkeypatch):
     for name in ("before.nii.gz", "after.nii.gz"):
         (tmp_path / name).write_bytes(b"")
     (tmp_path / "case.toml").write_text(
         '[images]\nbefore = "before.nii.gz"\nafter = ["after.nii.gz", "none.nii.gz"]\n[tissues.prostate]\nlabel = 1\n'
         'role = "estimate"\n[tissues.rest]\nlabel = "remaining"\nrole = "known"\nyoungs_modulus_kpa = 1e5\n'
+        "[estimate]\nsamples = 1000\n"
     )
+    monkeypatch.setitem(sys.modules, "arviz_stats.base", None)
     found = check_case(tmp_path / "case.toml", (), progress=silent)
     words = (
         "nothing moves this body",
+        "arviz-stats, which is not installed",
         "before.nii.gz' is empty",
         "after.nii.gz' is empty",
         "there is no file",
         "Pa, wr",
     )
-    assert [sum(word in problem.message for problem in found.problems) for word in words] == [1, 1, 1, 1, 1]
-    assert found.exit_code == 3
+    assert [sum(word in problem.message for problem in found.problems) for word in words] == [1] * 6
+    assert found.exit_code == 6
     assert found.text().splitlines()[-1].startswith("warning (units): tissue 'rest'")
 
 
@@ -61,6 +66,8 @@ def test_cost_grows_with_modes_images_and_pairs_and_shrinks_with_processors(case
     assert expected_cost(fewer, before, after, n_pairs=1).memory_gb < plain.memory_gb
     assert expected_cost(case, before, (*after, *after), n_pairs=1).seconds > plain.seconds
     assert expected_cost(case, before, after, n_pairs=2).unknowns == 2 * plain.unknowns
+    sampled = dataclasses.replace(case, estimate=Estimate(samples=10_000))
+    assert expected_cost(sampled, before, after, n_pairs=1).seconds > plain.seconds + 30.0
     monkeypatch.setattr(cost, "processors", lambda: 2 * plain.processors)
     assert expected_cost(case, before, after, n_pairs=1).seconds < plain.seconds
 

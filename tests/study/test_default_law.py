@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from palpate.images.readers import write_label_image
@@ -45,7 +46,7 @@ def case(request, tmp_path_factory):
 
 
 def test_the_default_law_finds_the_moduli_of_a_body_at_finite_strain(case):
-    result = estimate(read_case(case))
+    result = estimate(read_case(case, ["estimate.samples=200"]))
     assert (result.case.mechanics.law, result.case.mechanics.element) == ("neo-hookean", "auto")
     assert result.estimation.status == "converged"
     for found in result.estimation.estimates:
@@ -53,6 +54,11 @@ def test_the_default_law_finds_the_moduli_of_a_body_at_finite_strain(case):
         assert found.interval95[0] < truth < found.interval95[1]
         assert found.value == pytest.approx(truth, rel=0.15)
     assert "linear-strains" not in {remark.code for remark in result.remarks}
+    chains = np.log(result.estimation.samples.moduli)  # on the expansion with the linear law's curvature
+    sd = np.sqrt(np.diag(result.estimation.covariance.total))
+    best = np.log([found.value for found in result.estimation.estimates])
+    assert np.all(np.abs(chains.mean(axis=(0, 1)) - best) < 0.5 * sd)
+    assert chains.std(axis=(0, 1)) == pytest.approx(sd, rel=0.35)
 
 
 @pytest.mark.parametrize("case", [1], indirect=True)

@@ -13,6 +13,7 @@ from palpate.inversion.outer_loop import Convergence
 from palpate.mechanics.forward import SolveCounts
 from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimation import Observed, conclude, hull, verdict
+from palpate.study.samples import draw_moduli
 from palpate.uncertainty import FittedState, sandwich_covariance
 
 NOISE = NoiseModel(np.array([0.03**2]), np.array([3.0]))
@@ -179,8 +180,10 @@ def test_without_a_known_modulus_there_is_no_kpa(twins):
     twin = twins.make_twin(rest_kpa=None)
     settings = twins.settings(1.0)
     inversion = invert(twins.exact_problem(twin, noise=NOISE), settings, progress=twins.silent)
-    result = stated(inversion, settings, observed_of(twin))
+    result = conclude(inversion, settings, observed_of(twin), truth={}, seed=1, samples=100)
     assert [e.tissue for e in result.estimates] == ["sac", "rest"]
+    assert (result.samples.tissues, result.samples.unit) == (("sac", "rest"), "ratio")
+    assert np.median(result.samples.moduli, axis=(0, 1)) == pytest.approx([2.0 / 3.0, 1.0 / 3.0], rel=0.05)
     for estimate in result.estimates:
         assert (estimate.unit, estimate.relative_to) == ("ratio", "gland")
         assert (estimate.value, estimate.interval95) == (None, None)
@@ -224,6 +227,58 @@ def test_an_estimate_whose_outer_loop_ran_out_says_what_is_open(estimation, inve
 def test_the_same_seed_gives_the_same_statement(inversion, settings, observed, estimation):
     again = stated(inversion, settings, observed)
     assert np.array_equal(again.covariance.total, estimation.covariance.total)
+
+
+@pytest.fixture(scope="module")
+def sampled(inversion, settings, observed):
+    return conclude(inversion, settings, observed, truth={}, seed=1, samples=800)
+
+
+def test_samples_are_spread_as_the_interval_of_the_estimate(sampled, estimation):
+    samples, sd = sampled.samples, np.sqrt(np.diag(sampled.covariance.total))
+    assert (samples.tissues, samples.unit, samples.moduli.shape) == (("gland", "sac"), "kPa", (4, 800, 2))
+    logarithms = np.log(samples.moduli).reshape(-1, 2)
+    centre = np.log([estimate.value for estimate in estimation.estimates])
+    error = sd / np.sqrt(samples.diagnostics.ess_bulk)
+    assert np.all(np.abs(logarithms.mean(axis=0) - centre) < 4.0 * error)
+    assert logarithms.std(axis=0) == pytest.approx(sd, rel=0.1)
+    assert samples.diagnostics.mixed.all()
+    assert np.all((samples.diagnostics.r_hat > 0.99) & (samples.diagnostics.ess_bulk < 3200))
+    for estimate, interval, draws in zip(estimation.estimates, samples.interval95, samples.moduli.T, strict=True):
+        assert np.mean((draws >= interval[0]) & (draws <= interval[1])) == pytest.approx(0.95, abs=1e-3)
+        width = np.log(estimate.interval95[1] / estimate.interval95[0])
+        assert np.log(interval / estimate.interval95) == pytest.approx([0.0, 0.0], abs=0.1 * width)
+
+
+def test_the_estimates_do_not_rest_on_the_samples_which_repeat_with_the_seed(
+    sampled, estimation, inversion, settings, observed
+):
+    assert estimation.samples is None
+    assert [e.interval95 for e in sampled.estimates] == [e.interval95 for e in estimation.estimates]
+    first, second, other = (
+        conclude(inversion, settings, observed, truth={}, seed=seed, samples=100).samples.moduli for seed in (1, 1, 2)
+    )
+    assert np.array_equal(first, second)
+    assert not np.array_equal(first, other)
+
+
+def test_chains_that_are_too_short_are_remarked_with_what_to_do(sampled, inversion, settings, observed):
+    assert "samples-not-mixed" not in codes(sampled)
+    short = conclude(inversion, settings, observed, truth={}, seed=1, samples=100)
+    (remark,) = (remark for remark in short.remarks if remark.code == "samples-not-mixed")
+    assert "gland (R-hat 1." in remark.message
+    assert "--samples 400" in remark.message
+
+
+def test_what_did_not_converge_is_not_sampled(inversion, settings, observed):
+    ended = with_candidate(inversion, minimum=replace(inversion.minimum, outcome=Outcome.STEPS))
+    assert conclude(ended, settings, observed, truth={}, seed=1, samples=100).samples is None
+
+
+def test_an_interval_of_samples_is_open_where_that_of_the_estimate_is(inversion, settings):
+    given = {"bounds": settings.bounds, "draws": 100, "rng": np.random.default_rng(1)}
+    found = draw_moduli(inversion, 0.01 * np.eye(2), [(20.0, None), None], **given).interval95
+    assert np.array_equal(np.isnan(found), [[False, True], [True, True]])
 
 
 @pytest.mark.parametrize(("worse_by", "counts"), [(0.01, True), (0.5, False)])

@@ -64,8 +64,10 @@ def test_what_the_reader_refuses_at_sight_the_schema_refuses(change):
     assert errors(CASE, LEAST | change)
 
 
-def test_results_and_failures_meet_their_schema_key_by_key(case_result):
+def test_results_and_failures_meet_their_schema_key_by_key(case_result, sampled_result):
     document = case_result.to_dict()
+    assert errors(RESULT, sampled_result.to_dict()) == []
+    assert sampled_result.to_dict()["samples"]["moduli"][1]["interval95"] == [19.0, None]
     assert errors(RESULT, document) == []
     assert set(RESULT["properties"]) - set(document) == {"pairs", "files"}
     assert errors(RESULT, failure_document(case_result.case, NotConverged("it stopped"))) == []

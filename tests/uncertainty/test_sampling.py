@@ -91,13 +91,32 @@ def test_chains_have_the_covariance_that_is_asked_and_agree_with_each_other(obje
     evaluation, wanted = objective(minimum), np.array([[4e-4, 1e-4], [1e-4, 9e-4]])
     frozen = frozen_posterior(objective, minimum, evaluation)
     given = {"bounds": WIDE, "chains": 4, "draws": 500, "rng": rng}
-    theta = posterior_chains(frozen, minimum, evaluation, wanted, **given)
+    found = posterior_chains(frozen, minimum, evaluation, wanted, **given)
+    theta = found.theta
     assert theta.shape == (4, 500, 2)
     together = theta.reshape(-1, 2)
     assert together.mean(axis=0) == pytest.approx(minimum[:2], abs=0.004)
     assert np.cov(together.T) == pytest.approx(wanted, rel=0.3, abs=5e-5)
     within, between = theta.std(axis=1).mean(axis=0), theta.mean(axis=1).std(axis=0)
     assert np.all(between < 0.25 * within)
+    assert np.all((found.accepted > 0.5) & (found.accepted <= 1.0))
+    below = -objective.value(minimum) - found.log_density  # half of chi-squared with as many degrees as unknowns
+    assert below.shape == (4, 500)
+    assert below.mean() == pytest.approx(0.5 * len(minimum), rel=0.15)
+
+
+def test_chains_made_in_blocks_have_every_draw_and_the_same_ones_with_a_seed(objective, minimum, monkeypatch):
+    monkeypatch.setattr("palpate.uncertainty.sampling.BETWEEN_CHECKS", 300)
+    evaluation = objective(minimum)
+    frozen = frozen_posterior(objective, minimum, evaluation)
+    own = np.linalg.inv(evaluation.matrix)[:2, :2]
+    given = {"bounds": WIDE, "chains": 2, "draws": 150}
+    first, second = (
+        posterior_chains(frozen, minimum, evaluation, own, rng=np.random.default_rng(3), **given) for _ in range(2)
+    )
+    assert first.theta.shape == (2, 150, 2)
+    assert np.array_equal(first.theta, second.theta)
+    assert np.std(first.theta, axis=(0, 1)) == pytest.approx(np.sqrt(np.diag(own)), rel=0.25)
 
 
 def test_an_expansion_that_bends_is_frozen_with_its_own_value_far_away(twins, rng):

@@ -31,7 +31,7 @@ EXAMPLES = {
     ),
     "estimate": (
         "palpate estimate case/case.toml --output out",
-        "palpate estimate out/case.toml --set mechanics.law=linear --output linear",
+        "palpate estimate out/case.toml --set mechanics.law=linear --samples 1000 --output linear",
     ),
     "export": (
         "palpate export out --format abaqus --output abaqus",
@@ -144,6 +144,8 @@ def _add_estimate(subparsers: Any) -> None:
     _add_ct(command)
     command.set_defaults(targets=written.TARGETS)
     _add_set(command)
+    what = "keep N draws of the moduli's posterior in each of 4 chains, as posterior.nc (extra `samples`)"
+    command.add_argument("--samples", type=_samples, action="append", dest="set", default=[], metavar="N", help=what)
 
 
 def _add_ct(command: argparse.ArgumentParser) -> None:
@@ -267,6 +269,13 @@ def _power_of_two(text: str) -> int:
     if text not in (powers := [str(2**n) for n in range(3, 17)]):
         raise argparse.ArgumentTypeError(f"{text[:20]!r} is no power of 2 from {powers[0]} to {powers[-1]}")
     return int(text)
+
+
+def _samples(text: str) -> str:
+    """The value of the case that it replaces, as --set has it; which numbers it may be is the case's to say."""
+    if not re.fullmatch(r"[0-9]{1,9}", text):
+        raise argparse.ArgumentTypeError(f"{text[:20]!r} is no whole number")
+    return f"estimate.samples={text}"
 
 
 def _count(text: str) -> int:

@@ -21,7 +21,8 @@ Progress = Callable[[str], None]
 DOCUMENT, PAGE, DATA = "result.json", "report.html", "report-data.npz"
 ASIDE = tuple(f"{name}.earlier" for name in (PAGE, DATA))
 LABELS = ("labels.csv", "labels.nii.gz")
-TARGETS = (DOCUMENT, PAGE, DATA, *ASIDE, "mesh.vtu", "model.npz", "stiffness.nii.gz", *LABELS, "case.toml")
+NUMBERS = ("mesh.vtu", "model.npz", "posterior.nc", "stiffness.nii.gz")
+TARGETS = (DOCUMENT, PAGE, DATA, *ASIDE, *NUMBERS, *LABELS, "case.toml")
 
 
 def estimate(arguments: argparse.Namespace, case: Case | None, outputs: OutputFolder, progress: Progress) -> Outcome:

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.export.fitted_model import fitted_model
 from palpate.export.label_table import write_label_table
-from palpate.export.model_file import MODEL, write_model
+from palpate.export.model_file import MODEL, seal_of, write_model
+from palpate.export.netcdf import write_posterior
 from palpate.export.rasterise import region_image
 from palpate.export.vtk_xml import write_pvd, write_vtp, write_vtu
 from palpate.images.label_image import LabelImage
@@ -22,6 +24,7 @@ from palpate.mesh.surface import tissue_surface
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.study.outputs import make_folder
 from palpate.study.result import CaseResult, MeshResult, Simulation
+from palpate.study.samples import POSTERIOR
 
 __all__ = ["file_name", "write_estimate_files", "write_mesh_files", "write_simulation_files"]
 
@@ -31,8 +34,8 @@ MOST_BYTES = 60  # of a tissue's name in a file's: file systems count bytes, not
 def write_estimate_files(result: CaseResult, folder: Path) -> tuple[Path, ...]:
     """Write mesh.vtu (displacement of the last image), stiffness.nii.gz (`result.unit`), labels.nii.gz and labels.csv.
 
-    Each further pair has its own mesh_2.vtu, mesh_3.vtu ...; a converged result leaves model.npz for `palpate export`.
-    Returns the paths written; raises `ResourceError` when the disk refuses.
+    Each further pair has its own mesh_2.vtu, mesh_3.vtu ...; a converged result leaves model.npz for `palpate export`,
+    and posterior.nc where it has samples. Returns the paths written; raises `ResourceError` when the disk refuses.
     """
     make_folder(folder)
     paths = [folder / "mesh.vtu", folder / "stiffness.nii.gz"]
@@ -45,8 +48,12 @@ def write_estimate_files(result: CaseResult, folder: Path) -> tuple[Path, ...]:
         paths.append(folder / f"mesh_{number}.vtu")
         _write_fitted(paths[-1], result, pair.space, pair.displacements)
     if result.estimation.status == "converged":
+        model = fitted_model(result, seal=seal_of(result.to_dict()))
         paths.append(folder / MODEL)
-        write_model(result, paths[-1])
+        write_model(model, paths[-1])
+        if model.samples is not None:
+            paths.append(folder / POSTERIOR)
+            write_posterior(model, paths[-1])
     return tuple(paths)
 
 

@@ -18,6 +18,7 @@ from palpate.mesh.tet_mesh import TetMesh
 from palpate.study.case import CaseLoad
 from palpate.study.estimation import ModulusEstimate
 from palpate.study.result import CaseResult, PairResult
+from palpate.study.samples import ModulusSamples
 
 __all__ = ["FittedBody", "FittedModel", "fitted_model"]
 
@@ -60,7 +61,8 @@ class FittedModel:
 
     moduli (n_tissues,) in `unit`, "kPa" or "ratio" to `relative_to`; NaN of hollow tissues; covariance (n, n) of the
     natural logarithms of the `estimates`; law_parameters, element, outer_boundary, loads, densities (n_tissues,), in
-    kg/m^3: as the case has them; seal: SHA-256 of the numbers of the result.json beside it.
+    kg/m^3: as the case has them; seal: SHA-256 of the numbers of the result.json beside it; samples: chains of the
+    moduli's posterior, where the case asked for them.
     """
 
     bodies: tuple[FittedBody, ...]
@@ -76,6 +78,7 @@ class FittedModel:
     loads: tuple[CaseLoad, ...]
     densities: NDArray[np.float64]
     seal: str
+    samples: ModulusSamples | None = None
 
     @property
     def material_law(self) -> Law:
@@ -121,6 +124,7 @@ def fitted_model(result: CaseResult, *, seal: str) -> FittedModel:
         case.loads,
         np.array([density.get(tissue.name, 1000.0) for tissue in result.tissues]),
         seal,
+        estimation.samples,
     )
 
 

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from palpate.errors import EstimationError, InputDataError
-from palpate.export.fitted_model import FittedModel, fitted_model
+from palpate.export.fitted_model import FittedModel
 from palpate.images.named_labels import printable
 from palpate.study.archive import read_archive, write_archive
 from palpate.study.earlier import RESULT
 from palpate.study.outputs import read_json, sha256_of
-from palpate.study.result import SCHEMA, CaseResult
+from palpate.study.result import SCHEMA
 
 __all__ = ["MODEL", "read_model", "seal_of", "write_model"]
 
@@ -23,9 +23,9 @@ FORMAT = "palpate.model/1"
 UNSEALED = ("files", "warnings")  # which are added when the files take their places
 
 
-def write_model(result: CaseResult, path: Path) -> None:
-    """Write the model of a converged result to `path`; raises `ResourceError` when the disk refuses."""
-    write_archive(fitted_model(result, seal=seal_of(result.to_dict())), path, version=FORMAT)
+def write_model(model: FittedModel, path: Path) -> None:
+    """Write the model of a result to `path`; raises `ResourceError` when the disk refuses."""
+    write_archive(model, path, version=FORMAT)
 
 
 def read_model(folder: Path) -> FittedModel:

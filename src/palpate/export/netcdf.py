@@ -3,23 +3,33 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate.errors import ResourceError
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.formats import Options
-from palpate.export.samples import CHAINS, DRAWS, moduli_samples
+from palpate.export.samples import moduli_samples
 from palpate.study.outputs import write_bytes
+from palpate.study.samples import POSTERIOR
 
-__all__ = ["write"]
+__all__ = ["write", "write_posterior"]
+
+PROBABILITY = 0.95
 
 
 def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
     """Write posterior.nc: groups posterior, sample_stats, constant_data; `ResourceError` without the extra `netcdf`."""
     del body, options
+    write_posterior(model, folder / POSTERIOR)
+
+
+def write_posterior(model: FittedModel, path: Path) -> None:
+    """Write the samples of a model to `path`; raises as `write` does."""
     try:
         h5netcdf = import_module("h5netcdf")
     except ImportError as error:
@@ -28,23 +38,37 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
             " to csv holds the same samples"
         ) from error
     samples, unit = moduli_samples(model), "kPa" if model.unit == "kPa" else f"ratio to {model.relative_to}"
-    given = [item.interval95 if model.unit == "kPa" else item.ratio_interval95 for item in model.estimates]
-    ends = np.array([[np.nan if end is None else end for end in pair or (None, None)] for pair in given])
+    chains, draws, n = samples.moduli.shape
     memory = io.BytesIO()
     with h5netcdf.File(memory, "w") as file:
         file.attrs["created_by"] = "Palpate"
         for name in ("posterior", "sample_stats", "constant_data"):
             group = file.create_group(name)
-            axes = {} if name == "constant_data" else {"chain": CHAINS, "draw": DRAWS}
-            group.dimensions = {"tissue": len(samples.tissues), **axes}
+            axes = {} if name == "constant_data" else {"chain": chains, "draw": draws}
+            group.dimensions = {"tissue": n, **axes}
             tissue = group.create_variable("tissue", ("tissue",), h5netcdf.core.h5py.string_dtype())
             tissue[:] = np.array(samples.tissues, dtype=object)
             for axis, count in axes.items():
                 group.create_variable(axis, (axis,), data=np.arange(count))
         moduli = file["posterior"].create_variable("youngs_modulus", ("chain", "draw", "tissue"), data=samples.moduli)
-        moduli.attrs["units"], moduli.attrs["kind"] = unit, "linearised: log-normal about the estimate"
+        moduli.attrs["units"], moduli.attrs["kind"] = unit, samples.kind
         file["sample_stats"].create_variable("lp", ("chain", "draw"), data=samples.log_density)
-        for name, values in (("interval95_low", ends[:, 0]), ("interval95_high", ends[:, 1])):
+        if model.samples is not None:
+            accepted = model.samples.accepted
+            file["sample_stats"].create_variable("acceptance_rate", ("chain",), data=accepted)
+        for name, values in _constants(model):
             variable = file["constant_data"].create_variable(name, ("tissue",), data=values)
-            variable.attrs["units"], variable.attrs["interval_probability"] = unit, 0.95
-    write_bytes(folder / "posterior.nc", memory.getvalue())
+            if "interval95" in name:
+                variable.attrs["units"], variable.attrs["interval_probability"] = unit, PROBABILITY
+    write_bytes(path, memory.getvalue())
+
+
+def _constants(model: FittedModel) -> Iterator[tuple[str, NDArray[np.float64]]]:
+    """Numbers (n,) beside the draws: the intervals of the result; of chains also their own, and how they mixed."""
+    given = [item.interval95 if model.unit == "kPa" else item.ratio_interval95 for item in model.estimates]
+    ends = np.array([[np.nan if end is None else end for end in pair or (None, None)] for pair in given])
+    yield from (("interval95_low", ends[:, 0]), ("interval95_high", ends[:, 1]))
+    if model.samples is not None:
+        own, found = model.samples.interval95, model.samples.diagnostics
+        yield from (("samples_interval95_low", own[:, 0]), ("samples_interval95_high", own[:, 1]))
+        yield from (("r_hat", found.r_hat), ("ess_bulk", found.ess_bulk), ("ess_tail", found.ess_tail))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 from palpate.progress import Progress, silent
@@ -74,13 +74,24 @@ def simulate(case: Case, *, steps: int = 1, progress: Progress = silent) -> Simu
     return run.simulate(case, progress=progress, steps=steps)
 
 
-def estimate(case: Case, *, truth: Mapping[str, float] | None = None, progress: Progress = silent) -> CaseResult:
+def estimate(
+    case: Case,
+    *,
+    samples: int | None = None,
+    truth: Mapping[str, float] | None = None,
+    progress: Progress = silent,
+) -> CaseResult:
     """The Young's modulus of every `estimate` tissue of a case, with its interval and its verdict.
 
-    truth: true moduli (kPa) by tissue, to stand beside the estimates of a simulation; a phantom brings its own;
-    progress: is called with a sentence at each stage. Raises as `make_mesh` does, and `EstimationError` where there is
-    no result; an iteration that did not converge is a result whose status says so, without values.
+    samples: draws of the moduli's posterior in each of four chains, 100 to 100 000 (extra `samples`), in the place of
+    the case's own [estimate] samples; truth: true moduli (kPa) by tissue, to stand beside the estimates of a
+    simulation; a phantom brings its own; progress: is called with a sentence at each stage. Raises as `make_mesh` does,
+    `ConfigurationError` for another number of samples, `ResourceError` where the libraries for them are not installed,
+    and `EstimationError` where there is no result; an iteration that did not converge is a result whose status says so,
+    without values.
     """
+    if samples is not None:
+        case = replace(case, estimate=replace(case.estimate, samples=samples))
     found = run.estimate(case, progress=progress, truth=truth)
     return CaseResult(**{field.name: getattr(found, field.name) for field in fields(found)})
 

@@ -16,6 +16,7 @@ from palpate.study.schema import Rule, nearest, rule, shown
 
 __all__ = [
     "REMAINING",
+    "SAMPLES",
     "Case",
     "CaseLoad",
     "CaseTissue",
@@ -40,6 +41,7 @@ POSITIVE_NUMBERS = "a list of positive numbers"
 LOW_HIGH = "[low, high] with low < high"
 LARGEST_SEED = 2**53 - 1  # the largest whole number that JSON keeps everywhere
 RATIOS = (1e-6, 1e6)
+SAMPLES = (100, 100_000)  # draws of a chain: with fewer nothing is told of the tails, more take hours
 KILOPASCALS = (1e-3, 1e9)  # of a modulus: from the softest gels to diamond
 POISSON_RATIO = 0.45
 POISSON_RATIOS = (-0.99, 0.4999)  # beyond, a solid loses its shape or its volume's give, and equations their digits
@@ -263,7 +265,10 @@ class Noise:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """How the unknowns are found; starts and bounds to the `known` tissue, or in kPa where these are given."""
+    """How the unknowns are found; starts and bounds to the `known` tissue, or in kPa where these are given.
+
+    `samples`: draws of the moduli's posterior in each of four chains; 0: none.
+    """
 
     method: str = field(default="gauss-newton", metadata=rule(choices=("gauss-newton", "lbfgs")))
     parameters: tuple[str, ...] = field(
@@ -282,8 +287,14 @@ class Estimate:
     bounds_kpa: tuple[float, float] | None = field(
         default=None, metadata=rule(instead_of="bounds_ratio", between=KILOPASCALS, test=_ordered, wanted=LOW_HIGH)
     )
+    samples: int = field(default=0, metadata=rule(between=(0, SAMPLES[1])))
 
     def __post_init__(self) -> None:
+        if self.samples and not SAMPLES[0] <= self.samples <= SAMPLES[1]:
+            raise ConfigurationError(
+                f"[estimate] samples is {self.samples}; ask for {SAMPLES[0]} to {SAMPLES[1]} draws in each chain (1000"
+                " are usually enough), or for none with 0"
+            )
         for starts, bounds, name in (
             (self.start_ratios, self.bounds_ratio, "start_ratios"),
             (self.starts_kpa, self.bounds_kpa, "starts_kpa"),

@@ -38,6 +38,7 @@ from palpate.study.plausibility import unit_warnings
 from palpate.study.read import read_segmentation, read_states
 from palpate.study.refusals import refuse_lost, refuse_unmeshable
 from palpate.study.run import refuse_what_cannot_be_estimated
+from palpate.study.samples import require_samples
 
 __all__ = ["CheckReport", "Problem", "check_case", "memory_problems"]
 
@@ -176,6 +177,7 @@ def check_case(path: Path, overrides: Sequence[str], *, progress: Progress) -> C
     if case is None:
         return CheckReport(path.stem, problems.all())
     problems.attempt(lambda: refuse_what_cannot_be_estimated(case))
+    problems.attempt(lambda: require_samples(case))
     problems.warn(unit_warnings(case))
     progress("reading the images")
     phantom = problems.attempt(lambda: read_states(case)) if case.phantom else None

@@ -41,6 +41,7 @@ UNKNOWNS_A_TET = {"P1": 0.62, "P2": 4.4}
 FIXED_S: Mapping[Stage, float] = {"reading": 4.0, "linear law": 4.0, "intervals": 4.0, "report": 6.0}
 SECONDS_AN_UNKNOWN = 1.5e-4  # beside the solver, with 90 modes a driver, for each later image
 FINITE_STRAIN_S = 2.9e-4  # the same of equilibria and their derivatives at finite strain
+SECONDS_A_DRAW = 7.5e-3  # of the posterior, in four chains, with 90 modes, for each later image
 SECONDS_A_CUT = 1.65e-4  # of meshing, for each tetrahedron and each tissue that is cut out
 PARALLEL_SHARE = 0.3  # of the time, that more processors shorten
 FIXED_GB = 0.5
@@ -103,6 +104,7 @@ def cost_of_meshes(
         took["meshing"] += SECONDS_A_CUT * tets * (len(before.tissues) - 1) * shorter
         took["linear law"] += SECONDS_AN_UNKNOWN * work * shorter + solving.seconds
         took["finite strain"] += finite * FINITE_STRAIN_S * work * shorter
+        took["intervals"] += SECONDS_A_DRAW * case.estimate.samples * modes * max(n_after, 1)
         gigabytes += (GB_AN_UNKNOWN * work + solving.bytes / 1e9) * (FINITE_STRAIN_GB if finite else 1.0)
     return ExpectedCost(
         tets=sum(tets for tets, _ in meshes),

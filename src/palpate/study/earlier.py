@@ -17,7 +17,15 @@ __all__ = ["RESULT", "Earlier", "earlier_files", "strange_files", "vouched"]
 RESULT = "result.json"
 DOCUMENTS = (RESULT, "mesh.json", "simulation.json", "sensitivity.json")  # each lists the files of its run
 PAGE_FILES = ("report-data.npz", "report.html")
-RESULT_FILES = (*PAGE_FILES, "labels.csv", "labels.nii.gz", "mesh.vtu", "model.npz", "stiffness.nii.gz")
+RESULT_FILES = (
+    *PAGE_FILES,
+    "labels.csv",
+    "labels.nii.gz",
+    "mesh.vtu",
+    "model.npz",
+    "posterior.nc",
+    "stiffness.nii.gz",
+)
 FURTHER_MESH = re.compile(r"mesh_\d+\.vtu")
 
 

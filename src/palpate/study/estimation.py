@@ -15,6 +15,7 @@ from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit
 from palpate.progress import Progress, silent
 from palpate.study.estimate_findings import fold_findings, inversion_findings, pair_findings
+from palpate.study.samples import CHAINS, ModulusSamples, draw_moduli, sample_findings
 from palpate.study.together import ImagePairs, combinations_of, image_pairs_of
 from palpate.uncertainty import (
     Combination,
@@ -120,7 +121,8 @@ class Estimation:
     outer_loop: the steps from the best start's minimum to the estimate, which all starts of that minimum share;
     counts: of all starts and minima together; observations: what was compared, in words, by its kind; information: the
     directions of the log-moduli by how well they are known; combinations: what is known where single moduli are not;
-    image_pairs: what each of several later images says alone.
+    image_pairs: what each of several later images says alone; samples: of the moduli's posterior, where the case asks
+    for them and the estimate converged.
     """
 
     status: str
@@ -137,6 +139,7 @@ class Estimation:
     information: Information | None = None
     combinations: tuple[Combination, ...] = ()
     image_pairs: ImagePairs | None = None
+    samples: ModulusSamples | None = None
 
     @property
     def correlation(self) -> NDArray[np.float64]:
@@ -161,10 +164,12 @@ def conclude(
     *,
     truth: Mapping[str, float],
     seed: int,
+    samples: int = 0,
     progress: Progress = silent,
 ) -> Estimation:
     """State the result of an inversion; `truth`: true moduli (kPa) by tissue where they are known.
 
+    samples: draws in each chain of the moduli's posterior, where the estimate converged; 0: none.
     The covariance is the sandwich under the residuals' noise model plus the scatter over grid positions. Raises
     `ConfigurationError` where a Poisson's ratio was sought.
     """
@@ -176,15 +181,22 @@ def conclude(
     covariance = covariance_of(objective, minimum.evaluation, observed.states, draws=GRID_DRAWS, rng=rng)
     progress("intervals: profiles, and the fit of every surface before and after")
     pairs = image_pairs_of(inversion, settings.bounds)
+    estimates = _estimates(inversion, settings, covariance, truth)
+    drawn = None
+    if samples and minimum.converged:
+        progress(f"intervals: {samples} samples of the posterior in each of {CHAINS} chains")
+        stated = [e.interval95 if objective.parameters.absolute else e.ratio_interval95 for e in estimates]
+        drawn = draw_moduli(inversion, covariance.total, stated, bounds=settings.bounds, draws=samples, rng=rng)
     findings = (
         *inversion_findings(inversion, covariance.total),
         *pair_findings(pairs),
         *fold_findings(observed.states),
+        *sample_findings(drawn),
     )
     return Estimation(
         status="converged" if minimum.converged else "not converged",
         reason=_reason(inversion),
-        estimates=_estimates(inversion, settings, covariance, truth),
+        estimates=estimates,
         covariance=covariance,
         starts=tuple(_start(inversion, start) for start in inversion.starts),
         fits=_fits(inversion, observed),
@@ -202,6 +214,7 @@ def conclude(
         information=information(covariance.total),
         combinations=combinations_of(inversion, covariance.total, within=IDENTIFIED),
         image_pairs=pairs,
+        samples=drawn,
     )
 
 

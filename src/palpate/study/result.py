@@ -142,6 +142,7 @@ class CaseResult:
             "information": _information(estimation.information),
             "combinations": [_plain(pair) for pair in estimation.combinations],
             "image_pairs": _image_pairs(image_names(self.case), estimation.image_pairs),
+            "samples": _samples(estimation),
             "fit": [_fit(name, fits) for name, fits in zip(image_names(self.case), estimation.fits, strict=False)],
             "starts": [_start(start) for start in estimation.starts],
             "outer_loop": {"history_mm2": [step.objective_mm2 for step in estimation.outer_loop]},
@@ -221,6 +222,7 @@ def failure_document(case: Case, error: PalpateError) -> dict[str, Any]:
         "information": None,
         "combinations": [],
         "image_pairs": None,
+        "samples": None,
         "fit": [],
         "starts": [],
         "outer_loop": {"history_mm2": []},
@@ -311,6 +313,11 @@ def _image_pairs(names: Sequence[str], found: ImagePairs | None) -> dict[str, An
         return None
     alone = [{"after": name} | _plain(pair) for name, pair in zip(names, found.alone, strict=False)]
     return _plain(found) | {"alone": alone}
+
+
+def _samples(estimation: Estimation) -> dict[str, Any] | None:
+    found = estimation.samples if estimation.status == "converged" else None
+    return None if found is None else found.to_dict()
 
 
 def _fit(name: str, fits: tuple[TissueFit, ...]) -> dict[str, Any]:

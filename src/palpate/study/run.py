@@ -22,6 +22,7 @@ from palpate.study.plausibility import estimate_warnings, unit_warnings
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.read import read_pairs, read_states
 from palpate.study.result import CaseResult, MeshResult, PairResult, Provenance, image_names
+from palpate.study.samples import require_samples
 from palpate.study.simulate import simulate
 from palpate.study.strain_range import linear_strain_warnings
 from palpate.study.summary import mesh_summary
@@ -60,6 +61,7 @@ def estimate(
     """
     began = time.perf_counter()
     refuse_what_cannot_be_estimated(case)
+    require_samples(case)
     during("reading", progress)("reading and aligning the images")
     reading = during("reading", progress)
     states, further = read_states(case, progress=reading), read_pairs(case, progress=reading)
@@ -89,6 +91,7 @@ def estimate_states(
     `truth`: true moduli (kPa) by tissue, to stand beside the estimates of a simulation; `further`: pairs of the same
     body, each with its own reference state, which are meshed on their own and share the moduli.
     """
+    require_samples(case)
     clock = [time.perf_counter()]
     bodies = tuple(make_body(pair, case, progress=during("meshing", progress)) for pair in (states, *further))
     body = bodies[0]
@@ -103,7 +106,15 @@ def estimate_states(
     images = tuple(image.index for pair in bodies for image in pair.states.after)
     observed = Observed(fitted_states(inversion, *bodies), images)
     stating = during("intervals", progress)
-    estimation = conclude(inversion, settings, observed, truth=truth or {}, seed=case.seed, progress=stating)
+    estimation = conclude(
+        inversion,
+        settings,
+        observed,
+        truth=truth or {},
+        seed=case.seed,
+        samples=case.estimate.samples,
+        progress=stating,
+    )
     clock.append(time.perf_counter())
     stages = np.diff(clock)
     seconds = {"read": read_seconds, "mesh": stages[0], "assemble": stages[1], "estimate": stages[2]}

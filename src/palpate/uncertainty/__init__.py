@@ -10,11 +10,12 @@ from palpate.uncertainty.covariance import (
     imaging_errors,
     sandwich_covariance,
 )
+from palpate.uncertainty.diagnostics import ChainDiagnostics, chain_diagnostics, require_arviz
 from palpate.uncertainty.image_pairs import Agreement, PairEstimate, agreement, pair_estimates
 from palpate.uncertainty.intervals import NORMAL_95, Interval, ModulusInterval, log_interval, modulus_interval
 from palpate.uncertainty.profile import FixedCorrespondence, Profile, fixed_correspondence
 from palpate.uncertainty.refit import refitted
-from palpate.uncertainty.sampling import sample_posterior
+from palpate.uncertainty.sampling import PosteriorChains, frozen_posterior, posterior_chains, sample_posterior
 from palpate.uncertainty.sensitivity import (
     Errors,
     FastPath,
@@ -29,6 +30,7 @@ from palpate.uncertainty.sobol import SobolIndices, require_salib, sobol_indices
 __all__ = [
     "NORMAL_95",
     "Agreement",
+    "ChainDiagnostics",
     "Combination",
     "Covariance",
     "Errors",
@@ -39,13 +41,16 @@ __all__ = [
     "Interval",
     "ModulusInterval",
     "PairEstimate",
+    "PosteriorChains",
     "Profile",
     "Shift",
     "SobolIndices",
     "agreement",
+    "chain_diagnostics",
     "covariance_of",
     "fast_path",
     "fixed_correspondence",
+    "frozen_posterior",
     "gain",
     "grid_position_shifts",
     "imaging_errors",
@@ -56,7 +61,9 @@ __all__ = [
     "modulus_interval",
     "pair_estimates",
     "poisson_errors",
+    "posterior_chains",
     "refitted",
+    "require_arviz",
     "require_salib",
     "sample_posterior",
     "sandwich_covariance",

@@ -13,14 +13,21 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from palpate.errors import ConfigurationError, EstimationError
-from palpate.inversion.objective import Evaluation, Objective
+from palpate.inversion.objective import Evaluation, Objective, determined
 from palpate.inversion.optimise import Bounds
 from palpate.mechanics.curved import CurvedModel
 from palpate.mechanics.forward import ForwardModel
 from palpate.mechanics.reduced import ReducedModel
 from palpate.uncertainty.profile import fixed_correspondence
 
-__all__ = ["FrozenPosterior", "PosteriorSamples", "frozen_posterior", "posterior_chains", "sample_posterior"]
+__all__ = [
+    "FrozenPosterior",
+    "PosteriorChains",
+    "PosteriorSamples",
+    "frozen_posterior",
+    "posterior_chains",
+    "sample_posterior",
+]
 
 STEP = 0.35  # of a proposal, in standard deviations of the posterior
 THIN = 10  # steps of a draw that is kept
@@ -71,6 +78,19 @@ class PosteriorSamples:
         """Equal-tailed credible interval (n_parameters, 2) of the log-moduli that holds `share` of the samples."""
         tail = 0.5 * (1.0 - share)
         return np.asarray(np.quantile(self.theta, [tail, 1.0 - tail], axis=0).T)
+
+
+@dataclass(frozen=True, slots=True)
+class PosteriorChains:
+    """Markov chains side by side: log-moduli theta (chains, draws, n_parameters) that were kept.
+
+    log_density (chains, draws): of all unknowns at each draw, but for a constant; accepted (chains,): the share of its
+    proposals that each chain accepted.
+    """
+
+    theta: NDArray[np.float64]
+    log_density: NDArray[np.float64]
+    accepted: NDArray[np.float64]
 
 
 def frozen_posterior(
@@ -154,9 +174,10 @@ def sample_posterior(
     now, chain, counts, gap, refreshed = start, [], 0, 0.0, 0
     for done in range(0, evaluations, BETWEEN_CHECKS):
         steps = min(BETWEEN_CHECKS, evaluations - done)
-        theta, now, accepted = _chain(frozen, laplace, now, bounds=bounds, steps=steps, rng=rng)
-        chain.append(theta)
-        counts += accepted
+        stretch = _chain(frozen, laplace, now, bounds=bounds, steps=steps, rng=rng)
+        now = stretch.end
+        chain.append(stretch.theta)
+        counts += stretch.accepted
         off = abs(objective.value(now) - frozen(now) - anchor)
         gap = max(gap, off)
         if off > GAP:
@@ -175,8 +196,8 @@ def posterior_chains(
     chains: int,
     draws: int,
     rng: np.random.Generator,
-) -> NDArray[np.float64]:
-    """Log-moduli (chains, draws, n_parameters) of a frozen posterior, spread as all that is known of them is.
+) -> PosteriorChains:
+    """Chains of so many draws of a frozen posterior, the log-moduli spread as all that is known of them is.
 
     evaluation: of the objective at the minimum `start` (n,); covariance (n_parameters, n_parameters): of the log-moduli
     by correlated residuals, prior and grid, to which the samples are stretched about the minimum, as their own spread
@@ -186,16 +207,26 @@ def posterior_chains(
     """
     n = frozen.objective.n_parameters
     laplace = _laplace(start, evaluation)
-    own = np.linalg.cholesky(evaluation.covariance_columns(n)[:n])
-    stretch = np.linalg.cholesky(covariance) @ np.linalg.inv(own)
+    with determined():
+        own = np.linalg.cholesky(evaluation.covariance_columns(n)[:n])
+        stretch = np.linalg.cholesky(covariance) @ np.linalg.inv(own)
+    warm, steps = THIN * (draws // 10), THIN * draws
     found = []
     for generator in rng.spawn(chains):
-        away = start + SPREAD * laplace.draws(1, generator)[0]
-        away[:n] = np.clip(away[:n], bounds.lower, bounds.upper)
-        warm, steps = THIN * (draws // 10), THIN * draws
-        theta, _, _ = _chain(frozen, laplace, away, bounds=bounds, steps=warm + steps, rng=generator)
-        found.append(start[:n] + (theta[warm + THIN - 1 :: THIN] - start[:n]) @ stretch.T)
-    return np.stack(found)
+        now = start + SPREAD * laplace.draws(1, generator)[0]
+        now[:n] = np.clip(now[:n], bounds.lower, bounds.upper)
+        parts = []
+        for done in range(0, warm + steps, BETWEEN_CHECKS):  # proposals of all steps at once would take gigabytes
+            several = min(BETWEEN_CHECKS, warm + steps - done)
+            parts.append(_chain(frozen, laplace, now, bounds=bounds, steps=several, rng=generator))
+            now = parts[-1].end
+        kept = slice(warm + THIN - 1, None, THIN)
+        theta = np.concatenate([part.theta for part in parts])[kept]
+        density = -np.concatenate([part.energy for part in parts])[kept]
+        accepted = sum(part.accepted for part in parts) / (warm + steps)
+        found.append((start[:n] + (theta - start[:n]) @ stretch.T, density, accepted))
+    thetas, densities, shares = zip(*found, strict=True)
+    return PosteriorChains(np.stack(thetas), np.stack(densities), np.array(shares))
 
 
 def _laplace(start: NDArray[np.float64], evaluation: Evaluation) -> _Laplace:
@@ -226,6 +257,19 @@ class _Laplace:
         return np.asarray(linalg.solve_triangular(self.factor.T, normal, lower=False).T)
 
 
+@dataclass(frozen=True, slots=True)
+class _Stretch:
+    """Of a chain: its log-moduli (steps, n_parameters), the frozen posterior's values there (steps,), its end (n,).
+
+    accepted: how many proposals it took.
+    """
+
+    theta: NDArray[np.float64]
+    energy: NDArray[np.float64]
+    end: NDArray[np.float64]
+    accepted: int
+
+
 def _chain(
     frozen: FrozenPosterior,
     laplace: _Laplace,
@@ -234,17 +278,18 @@ def _chain(
     bounds: Bounds,
     steps: int,
     rng: np.random.Generator,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
-    """A stretch of the chain: its log-moduli (steps, n_parameters), its end (n,), how many proposals it accepted."""
+) -> _Stretch:
     n = frozen.objective.n_parameters
-    theta, accepted = np.empty((steps, n)), 0
-    now, level = start, frozen(start) - laplace.energy(start)
+    theta, energy, accepted = np.empty((steps, n)), np.empty(steps), 0
+    now, value = start, frozen(start)
+    level = value - laplace.energy(start)
     draws, thresholds = laplace.draws(steps, rng), np.log(rng.random(steps))
     for k in range(steps):
         trial = laplace.centre + np.sqrt(1.0 - STEP**2) * (now - laplace.centre) + STEP * draws[k]
         if np.all((trial[:n] >= bounds.lower) & (trial[:n] <= bounds.upper)):
-            there = frozen(trial) - laplace.energy(trial)
-            if thresholds[k] < level - there:
-                now, level, accepted = trial, there, accepted + 1
-        theta[k] = now[:n]
-    return theta, now, accepted
+            there = frozen(trial)
+            above = there - laplace.energy(trial)
+            if thresholds[k] < level - above:
+                now, value, level, accepted = trial, there, above, accepted + 1
+        theta[k], energy[k] = now[:n], value
+    return _Stretch(theta, energy, now, accepted)
