@@ -56,7 +56,7 @@ class Huber:
         return np.asarray(np.where(size < self.cutoff, size**2, self.cutoff * (2.0 * size - self.cutoff)))
 
     def mean_square(self, residuals: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
-        """Mean of w r^2 (mm^2), over what it is for normal residuals of variance 1 and the cutoff 1.345."""
+        """Mean of w r^2 (mm^2) of residuals r (n,) mm with weights (n,), over that of normal ones of variance 1."""
         return float(np.average(self.weight(residuals) * residuals**2, weights=weights)) / NORMAL
 
 
