@@ -20,7 +20,7 @@ import pytest
 import SimpleITK
 
 import palpate
-from dicom_files import PLANTED, ct_slices, save_series
+from dicom_files import PLANTED, TILTED, ct_slices, save_series
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.export.fitted_model import fitted_model
 from palpate.export.groups import element_faces, face_groups, plain_names
@@ -34,6 +34,7 @@ from palpate.study.case import CaseLoad
 
 VOLUME = 1e-4  # relative
 LPS = np.array([-1.0, -1.0, 1.0])
+PLACES = {"axial": (-40.3, -41.2, -1.0), "sagittal": (-0.3, -41.2, 42.2)}  # first voxel of a series, LPS mm
 MESHED = ("prostate", "bladder", "surroundings")
 GROUPS = {
     "prostate surface",
@@ -297,6 +298,29 @@ def test_dicom_belongs_to_the_series_that_is_named(case_result, tmp_path):
     with pytest.raises(InputDataError, match="does not lie where"):
         palpate.export(case_result, tmp_path / "no", format="dicom", source=tmp_path / "far")
     assert not (tmp_path / "no").exists()
+
+
+@pytest.mark.parametrize("plane", [None, "axial", "sagittal"])
+def test_frames_of_dicom_lie_as_the_slices_of_the_series_and_without_one_axial(case_result, tmp_path, plane):
+    """Viewers show frames as they are stored, whichever way the axes of the first image's file lead."""
+    source = None if plane is None else tmp_path / "series"
+    if plane is not None:
+        save_series(source, ct_slices((28, 27, 26), (1.6, 1.6, 1.6), PLACES[plane], plane))
+    palpate.export(case_result, tmp_path / "out", format="dicom", source=source)
+    grid, index = case_result.before.grid, case_result.before.index
+    expected = grid.world(np.argwhere(index == 0).mean(axis=0)[None])[0] * LPS
+    for name, least in (("stiffness.dcm", 58.0), ("segmentation.dcm", 0.5)):
+        found = highdicom.imread(tmp_path / "out" / name)
+        groups = found.SharedFunctionalGroupsSequence[0]
+        rows_and_columns = groups.PlaneOrientationSequence[0].ImageOrientationPatient
+        np.testing.assert_allclose(rows_and_columns, np.ravel(TILTED[plane or "axial"]), atol=1e-6)
+        volume = (
+            highdicom.seg.segread(tmp_path / "out" / name).get_volume(segment_numbers=[1], combine_segments=True)
+            if name == "segmentation.dcm"
+            else found.get_volume()
+        )
+        middle = volume.map_indices_to_reference(np.argwhere(volume.array > least).astype(float)).mean(axis=0)
+        np.testing.assert_allclose(middle, expected, atol=0.5)
 
 
 def test_netcdf_and_csv_hold_the_posterior_of_the_intervals(exported, case_result):

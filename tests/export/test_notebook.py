@@ -73,6 +73,8 @@ def test_the_widget_draws_the_organs_in_a_browser(case_result):
     if path is None:
         pytest.skip("no Chromium here")
     viewer = notebook_viewer(case_result)
+    assert viewer.opts.is_colorbar
+    assert [volume.colorbar_visible for volume in viewer.volumes] == [False, True]
     states = {widget.model_id: plain(widget.get_state()) for widget in (viewer, *viewer.volumes)}
     source = (Path(ipyniivue.__file__).parent / "static" / "widget.js").read_text()
     flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]

@@ -60,11 +60,14 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
     slices = [_placeholder()] if options.source is None else _series(options.source, body)
     frame = str(slices[0].FrameOfReferenceUID)
     affine = LPS @ body.grid.affine[:, [2, 1, 0, 3]]  # slices, rows, columns
+    across, down = np.reshape(np.array(slices[0].ImageOrientationPatient, dtype=float), (2, 3))
+    axes = highdicom.spatial.get_closest_patient_orientation(np.stack([np.cross(across, down), down, across], axis=1))
 
     def volume(array: NDArray[Any]) -> Any:
-        """An image (n_x, n_y, n_z) on the grid of the first image."""
+        """An image (n_x, n_y, n_z) on the grid of the first image, its frames as the series' slices lie."""
         turned = np.ascontiguousarray(array.transpose(2, 1, 0))
-        return highdicom.Volume(turned, affine, coordinate_system="PATIENT", frame_of_reference_uid=frame)
+        found = highdicom.Volume(turned, affine, coordinate_system="PATIENT", frame_of_reference_uid=frame)
+        return found.to_patient_orientation(axes)
 
     common = {
         "manufacturer": "Palpate",

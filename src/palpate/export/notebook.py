@@ -51,7 +51,8 @@ def notebook_viewer(result: CaseResult, *, background: Path | None = None, opaci
             )
         else:
             under = ipyniivue.Volume(path=background, colormap="gray", opacity=1.0)
-    viewer = ipyniivue.NiiVue(height=400)
+    under.colorbar_visible = False  # the bar is the modulus's
+    viewer = ipyniivue.NiiVue(height=400, is_colorbar=True)
     viewer.load_volumes([under, over])
     return viewer
 
