@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from palpate.inversion import gauss_newton, reweighted, with_first_noise
-from palpate.inversion.reweighting import fitted_noise
+from palpate.inversion.reweighting import _beyond_modes, fitted_noise
 from palpate.observation.noise_model import NoiseModel
 
 NOISE = NoiseModel(np.array([0.2**2]), np.array([4.0]))
@@ -62,3 +64,21 @@ def test_reweighting_again_at_the_same_place_changes_little(minimum):
     objective, found = minimum
     once, twice = reweighted(objective, found), reweighted(reweighted(objective, found), found)
     assert [o.weighting for o in twice.observations] == [o.weighting for o in once.observations]
+
+
+def test_a_driver_counts_no_less_for_what_its_modes_can_follow_and_do_not(minimum):
+    """Else it would follow its wall still less, and a prior that is learned from it would hold it there."""
+    objective, found = minimum
+    away = found.unknowns.copy()
+    away[objective.n_parameters : objective.n_parameters + 3] += 0.2  # the wall as a whole, off its image
+    there = replace(found, unknowns=away, evaluation=objective(away))
+    noise = fitted_noise(found.evaluation)["surface distance"]
+    (near,), (far,) = ([x for x in m.evaluation.lines if x.observation.of_driver] for m in (found, there))
+
+    def share(line, beyond):
+        seen = line.observation.with_noise(noise)
+        return seen.reweighted(line.residuals, beyond).weighting.precision / seen.weighting.precision
+
+    beyond = [_beyond_modes(line, objective.n_parameters) for line in (near, far)]
+    assert share(far, None) < 0.3 * share(near, None)
+    assert share(far, beyond[1]) == pytest.approx(share(near, beyond[0]), rel=0.05)

@@ -47,7 +47,7 @@ class PointMotion:
     def with_noise(self, noise):
         return replace(self, noise_model=noise, weighting=Weighting(3.0 / noise.sd**2, Tukey()))
 
-    def reweighted(self, _residuals):
+    def reweighted(self, _residuals, _beyond_modes=None):
         return self
 
     def first_noise(self, _peers):

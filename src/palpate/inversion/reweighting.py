@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+from numpy.typing import NDArray
+
 from palpate.inversion.driver import with_learned_prior
-from palpate.inversion.objective import Evaluation, Objective
+from palpate.inversion.objective import Evaluation, Linearisation, Objective
 from palpate.inversion.optimise import Minimum
 from palpate.observation.contract import Observation
 from palpate.observation.noise_model import NoiseModel
 
 __all__ = ["fitted_noise", "reweighted", "with_first_noise"]
+
+RIDGE = 1e-9  # of the mean diagonal: a mode that moves no observed point
 
 
 def with_first_noise(objective: Objective) -> Objective:
@@ -29,7 +34,8 @@ def reweighted(objective: Objective, minimum: Minimum) -> Objective:
     believed = with_learned_prior(objective, evaluation, minimum.unknowns)
     by_noise = _by_noise(believed, fitted_noise(evaluation))
     pairs = zip(by_noise.observations, evaluation.lines, strict=True)
-    return by_noise.with_observations([o.reweighted(line.residuals) for o, line in pairs])
+    n = objective.n_parameters
+    return by_noise.with_observations([o.reweighted(line.residuals, _beyond_modes(line, n)) for o, line in pairs])
 
 
 def fitted_noise(evaluation: Evaluation) -> dict[str, NoiseModel]:
@@ -49,3 +55,18 @@ def _by_kind(observations: list[Observation]) -> dict[str, list[Observation]]:
 
 def _by_noise(objective: Objective, noise: Mapping[str, NoiseModel]) -> Objective:
     return objective.with_observations([o.with_noise(noise[o.kind]) for o in objective.observations])
+
+
+def _beyond_modes(line: Linearisation, n_parameters: int) -> NDArray[np.float64] | None:
+    """What of a driver's residuals r (n,) mm no coefficients take away: (1 - J_q (J_q^T W J_q)^-1 J_q^T W) r.
+
+    J_q: their columns, of its modes. None where no driver is seen.
+    """
+    if not line.observation.of_driver:
+        return None
+    values, by_modes = line.residuals.values, line.jacobian[:, n_parameters:]
+    weighted = by_modes.T * line.weights
+    matrix = weighted @ by_modes
+    ridge = RIDGE * max(float(np.trace(matrix)) / max(len(matrix), 1), np.finfo(float).tiny)
+    step = np.linalg.solve(matrix + ridge * np.eye(len(matrix)), weighted @ values)
+    return np.asarray(values - by_modes @ step)

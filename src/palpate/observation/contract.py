@@ -132,8 +132,11 @@ class Observation(Protocol):
         """The same with all its residuals counting by a noise model."""
         ...
 
-    def reweighted(self, residuals: Residuals) -> Self:
-        """The same with a robust loss that its residuals tell, under its noise model."""
+    def reweighted(self, residuals: Residuals, beyond_modes: NDArray[np.float64] | None = None) -> Self:
+        """The same with a robust loss that its residuals tell, under its noise model.
+
+        beyond_modes (n,) mm: of a driver's residuals what no motion of its modes takes away; None: all of them.
+        """
         ...
 
     def first_noise(self, peers: Sequence[Self]) -> NoiseModel:

@@ -115,14 +115,16 @@ class SurfaceDistance:
             self, held=_everywhere(self.target), noise_model=noise, weighting=Weighting(self._precision(noise), Tukey())
         )
 
-    def reweighted(self, residuals: Residuals) -> SurfaceDistance:
+    def reweighted(self, residuals: Residuals, beyond_modes: NDArray[np.float64] | None = None) -> SurfaceDistance:
         """The same with a robust loss by its residuals.
 
         A surface that fits worse than the noise (a driver whose modes cannot follow its wall) counts by its own mean
-        square, so that its misfit is not forced into the other unknowns.
+        square, so that its misfit is not forced into the other unknowns. What its modes can follow and do not is no
+        such misfit: a driver that counted less for it would follow its wall still less.
         """
         loss = robust_loss(residuals.values, self.target)
-        mean_square = loss.mean_square(residuals.values, residuals.weights)
+        misfit = residuals.values if beyond_modes is None else beyond_modes
+        mean_square = loss.mean_square(misfit, residuals.weights)
         share = min(1.0, self.noise_model.sd**2 / max(mean_square, 1e-12))
         return replace(self, weighting=Weighting(self._precision(self.noise_model) * share, loss))
 
