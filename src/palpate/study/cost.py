@@ -38,15 +38,14 @@ LATTICE = 96  # points of the lattice along the longest side, on which edge leng
 # Fitted to the runs of benchmarks/cost.py (docs/command-line.md), on two cores of a 2.1 GHz server.
 TETS_A_CUBE = 19.4  # tetrahedra in a cube of the wanted edge length: 17 in smooth phantoms, 31 in a real pelvis
 UNKNOWNS_A_TET = {"P1": 0.62, "P2": 4.4}
-FIXED_S: Mapping[Stage, float] = {"reading": 4.0, "linear law": 4.0, "intervals": 4.0, "report": 6.0}
-SECONDS_AN_UNKNOWN = 1.5e-4  # beside the solver, with 90 modes a driver, for each later image
-FINITE_STRAIN_S = 2.9e-4  # the same of equilibria and their derivatives at finite strain
+FIXED_S: Mapping[Stage, float] = {"reading": 3.2, "linear law": 3.0, "intervals": 3.4, "report": 4.2}
+SECONDS_AN_UNKNOWN = 2.2e-4  # beside the solver, with 90 modes a driver, for each later image
+FINITE_STRAIN_S = 2.0e-4  # the same of equilibria and their derivatives at finite strain
 SECONDS_A_DRAW = 7.5e-3  # of the posterior, in four chains, with 90 modes, for each later image
-SECONDS_A_CUT = 1.65e-4  # of meshing, for each tetrahedron and each tissue that is cut out
+SECONDS_A_CUT = 2.0e-4  # of meshing, for each tetrahedron and each tissue that is cut out
 PARALLEL_SHARE = 0.3  # of the time, that more processors shorten
-FIXED_GB = 0.5
-GB_AN_UNKNOWN = 1.8e-5  # beside the factor, with 90 modes
-FINITE_STRAIN_GB = 1.2  # times the memory: an expansion and a tangent factorisation at once
+FIXED_GB = 0.48
+GB_AN_UNKNOWN = 1.07e-5  # beside the factor, with 90 modes
 USUAL_MODES = 90
 OVERHEAD_MODES = 10  # what an unknown costs without any mode, in modes
 SERIES = 30  # right-hand sides beside the modes
@@ -105,7 +104,7 @@ def cost_of_meshes(
         took["linear law"] += SECONDS_AN_UNKNOWN * work * shorter + solving.seconds
         took["finite strain"] += finite * FINITE_STRAIN_S * work * shorter
         took["intervals"] += SECONDS_A_DRAW * case.estimate.samples * modes * max(n_after, 1)
-        gigabytes += (GB_AN_UNKNOWN * work + solving.bytes / 1e9) * (FINITE_STRAIN_GB if finite else 1.0)
+        gigabytes += GB_AN_UNKNOWN * work + solving.bytes / 1e9
     return ExpectedCost(
         tets=sum(tets for tets, _ in meshes),
         unknowns=sum(unknowns for _, unknowns in meshes),
