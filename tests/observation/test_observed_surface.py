@@ -103,3 +103,11 @@ def test_the_rim_is_where_the_observed_part_ends(meshes, element):
     assert on_side.all()
     assert np.abs(at[..., 2] - 15.0).max() < 1e-9
     assert np.linalg.norm(at[:, 0] - at[:, 1], axis=1).sum() == pytest.approx(4 * SIZE)
+
+
+def test_an_organ_that_the_mesh_has_nothing_of_is_refused(meshes):
+    """As one of two voxels across is, which the smoothing of the images takes away."""
+    tissues = [meshes.known("fat"), meshes.unknown("organ"), meshes.unknown("sheet")]
+    mesh = meshes.box_mesh(4, size=SIZE, tissues=tissues, region=lambda c: (c[:, 2] > 15.0).astype(int))
+    with pytest.raises(GeometryError, match="nothing of 'sheet' is left in the mesh"):
+        observed_surface(lagrange_space(mesh, "P1"), 2)

@@ -51,10 +51,16 @@ class ObservedSurface:
 def observed_surface(space: LagrangeSpace, tissue: int) -> ObservedSurface:
     """Surface of an `estimate` tissue or a driver on `space`.
 
-    Raises `GeometryError` when under 10 % of an `estimate` tissue's surface is left to observe.
+    Raises `GeometryError` when the mesh has nothing of it, or under 10 % of an `estimate` tissue's surface is left to
+    observe.
     """
     mesh = space.mesh
-    surface = tissue_surface(mesh, tissue)
+    surface, name = tissue_surface(mesh, tissue), mesh.tissues[tissue].name
+    if not len(surface.triangles):
+        raise GeometryError(
+            f"nothing of '{name}' is left in the mesh: it is so thin that the smoothing of the images' voxels takes it"
+            " away; use finer images, or join it to its neighbour"
+        )
     driver = mesh.tissues[tissue].role is Role.DRIVER  # all of its wall is seen: it is itself an unknown
     prescribed = [i for i, other in enumerate(mesh.tissues) if other.role in (Role.DRIVER, Role.RIGID)]
     seen = ~np.isin(surface.other, [OUTER, *prescribed]) | driver
@@ -66,7 +72,6 @@ def observed_surface(space: LagrangeSpace, tissue: int) -> ObservedSurface:
     rest = space.points[points]
     area = np.linalg.norm(triangle_normals(rest, triangles), axis=1)
     share = float(area[observed].sum() / area.sum())
-    name = mesh.tissues[tissue].name
     if share < MIN_SHARE:
         raise GeometryError(
             f"'{name}': only {100 * share:.0f} % of its surface is free of drivers, bones and the image's border, so"
