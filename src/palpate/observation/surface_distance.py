@@ -119,8 +119,8 @@ class SurfaceDistance:
         """The same with a robust loss by its residuals.
 
         A surface that fits worse than the noise (a driver whose modes cannot follow its wall) counts by its own mean
-        square, so that its misfit is not forced into the other unknowns. What its modes can follow and do not is no
-        such misfit: a driver that counted less for it would follow its wall still less.
+        square, so that its misfit is not forced into the other unknowns; of a driver by the part beyond_modes (n,) mm,
+        as one that counted less for what it does not follow yet would follow its wall still less.
         """
         loss = robust_loss(residuals.values, self.target)
         misfit = residuals.values if beyond_modes is None else beyond_modes
