@@ -11,7 +11,7 @@ from scipy import sparse
 from palpate.mechanics.hyperelastic import Elements, Moduli
 from palpate.mechanics.linearised import LinearisedSystem, symmetric_part
 from palpate.mechanics.loads import Load
-from palpate.mechanics.pattern import BlockPattern, Restriction
+from palpate.mechanics.pattern import BlockPattern, Restriction, Stiffness
 from palpate.mechanics.rigid import rigid_modes
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mechanics.solvers.registry import factorise
@@ -59,13 +59,13 @@ class TissueBalance:
         regions = range(self.n_regions)
         return np.stack([self._sum(forces, self.element_region == r) for r in regions], axis=1)
 
-    def stiffness(self, displacement: Array, pressure: Array | None = None) -> sparse.csr_matrix[np.float64]:
+    def stiffness(self, displacement: Array, pressure: Array | None = None) -> Stiffness:
         """K = dR/du (n_dof, n_dof) mN/mm at u (n_dof,) mm; loads that follow the body make it unsymmetric.
 
         pressure (n_cells,) kPa takes the place of the mean pressures at u.
         """
         nodal = displacement.reshape(-1, 3)
-        matrix = self.pattern.assemble(self.elements.stiffness(nodal, self.moduli, pressure=pressure))
+        matrix: Stiffness = self.pattern.assemble(self.elements.stiffness(nodal, self.moduli, pressure=pressure))
         followers = [load.stiffness(nodal) for load in self.loads if load.follows]
         for follower in followers:
             matrix = sparse.csr_matrix(matrix - follower)
@@ -80,13 +80,13 @@ class TissueBalance:
         """Mean pressures (n_cells,) kPa at u + du by linear extrapolation from u (n_dof,) along du (n_dof,) mm."""
         return self.elements.pressure_ahead(displacement.reshape(-1, 3), change.reshape(-1, 3), self.moduli)
 
-    def restricted(self, stiffness: sparse.csr_matrix[np.float64]) -> sparse.csr_matrix[np.float64]:
+    def restricted(self, stiffness: Stiffness) -> sparse.csr_matrix[np.float64]:
         """F^T K F (n_free, n_free), mN/mm, of a stiffness K (n_dof, n_dof)."""
-        if self.symmetric:
+        if isinstance(stiffness, sparse.bsr_matrix):  # no load follows the body
             return self.restriction.of(stiffness)
         return sparse.csr_matrix(sparse.csr_matrix(self.free.T @ stiffness) @ self.free)
 
-    def factorise(self, stiffness: sparse.csr_matrix[np.float64]) -> Factorisation:
+    def factorise(self, stiffness: Stiffness) -> Factorisation:
         """Factorisation of F^T K F (n_free, n_free), of its symmetric part where loads follow; `SolverError`."""
         restricted = self.restricted(stiffness)
         symmetric = restricted if self.symmetric else symmetric_part(restricted)

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from palpate.errors import ConfigurationError, NotConverged
 from palpate.mechanics.balance import TissueBalance
@@ -22,7 +21,7 @@ from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.linearised import LinearisedSystem
 from palpate.mechanics.loads import Load
 from palpate.mechanics.newton import NewtonPath, NewtonSettings, follow
-from palpate.mechanics.pattern import BlockPattern, Restriction, block_pattern, restriction
+from palpate.mechanics.pattern import BlockPattern, Restriction, Stiffness, block_pattern, restriction
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mechanics.stiffness import lame_parts, lame_parts_by_poisson
 from palpate.mesh.constraint import Constraint
@@ -288,7 +287,7 @@ class FiniteStrainEquilibrium:
         """Products (n_regions,) of the columns du / d nu_r with g (n_dof,), by one adjoint solve; `NotConverged`."""
         return np.asarray(-self._poisson_forces().T @ self._dual(self._stiffness(), gradient))
 
-    def _stiffness(self) -> sparse.csr_matrix[np.float64]:
+    def _stiffness(self) -> Stiffness:
         if not self.converged:
             raise NotConverged(f"a state out of equilibrium has no derivatives: {self.reason}")
         return self.balance.stiffness(self.values)
@@ -299,7 +298,7 @@ class FiniteStrainEquilibrium:
             return True
         return not self.path.exact and n * (REFINEMENTS - 1) > FACTORISATION_IN_SOLVES
 
-    def _system(self, stiffness: sparse.csr_matrix[np.float64], n: int) -> LinearisedSystem:
+    def _system(self, stiffness: Stiffness, n: int) -> LinearisedSystem:
         """The linear system at this state, ready for n right-hand sides."""
         old = self.path.factorisation
         ready = self.balance.factorise(stiffness) if old is None or self._many(n) else old
@@ -307,12 +306,12 @@ class FiniteStrainEquilibrium:
             ready = ready.nearby
         return LinearisedSystem(self.balance.restricted(stiffness), ready, symmetric=self.balance.symmetric)
 
-    def _dual(self, stiffness: sparse.csr_matrix[np.float64], gradient: NDArray[np.float64]) -> Array:
+    def _dual(self, stiffness: Stiffness, gradient: NDArray[np.float64]) -> Array:
         """K_ff^-T F^T g (n_free,)."""
         load = np.asarray(self.balance.free.T @ gradient)
         return self._system(stiffness, 1).transposed().solve(load[:, None])[:, 0]
 
-    def _parameter_loads(self, stiffness: sparse.csr_matrix[np.float64]) -> Array:
+    def _parameter_loads(self, stiffness: Stiffness) -> Array:
         """-F^T [dR / d ln E_r, K M] (n_free, n_regions + n_modes), mN."""
         forces = self.balance.region_forces(self.values, self.balance.moduli)
         moved = np.asarray(stiffness @ self.model.constraint.modes)

@@ -18,6 +18,7 @@ from palpate.mechanics.element import quadrature, shape_derivatives
 from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.stiffness import checked_gradients
 from palpate.mesh.space import LagrangeSpace
+from palpate.parallel import mapped
 
 __all__ = ["Elements", "Moduli", "elements_of"]
 
@@ -78,7 +79,9 @@ class Elements:
     def forces(self, displacement: Array, moduli: Moduli) -> Array:
         """Internal forces (n_cells, n_a, 3), mN, of each element at u (n_points, 3) mm: derivatives of its energy."""
         result = np.empty((len(self.cells), self.cells.shape[1], 3))
-        for part in self._parts():
+
+        def fill(part: slice) -> None:
+            """Those of the elements `part`."""
             F = self.deformation(displacement, part)
             flat, (n, n_q) = F.reshape(-1, 3, 3), F.shape[:2]
             pressure = self._pressure(self.law.volume(flat).reshape(n, n_q), moduli.part(part))
@@ -86,6 +89,8 @@ class Elements:
             stress += pressure.reshape(-1, 1, 1) * self.law.volume_gradient(flat)
             weighted = stress.reshape(n, n_q, 3, 3) * (self.volumes[part, None] * self.weights)[:, :, None, None]
             result[part] = (self._stacked(part) @ np.swapaxes(weighted, 2, 3).reshape(n, -1, 3)).reshape(n, -1, 3)
+
+        mapped(fill, self._parts())
         return result
 
     def pressure_ahead(self, displacement: Array, change: Array, moduli: Moduli) -> Array:
@@ -105,9 +110,13 @@ class Elements:
         """
         n_a = self.cells.shape[1]
         result = np.empty((len(self.cells), n_a, n_a, 3, 3))
-        for part in self._parts():
+
+        def fill(part: slice) -> None:
+            """Those of the elements `part`."""
             foreseen = None if pressure is None else pressure[part]
             result[part] = self._stiffness(displacement, part, moduli.part(part), foreseen)
+
+        mapped(fill, self._parts())
         return result.reshape(-1, 9)
 
     def _parts(self) -> Iterator[slice]:

@@ -30,6 +30,7 @@ from scipy import sparse
 
 from palpate.errors import SolverError
 from palpate.mechanics.forward import SolveCounts
+from palpate.mechanics.pattern import Stiffness
 from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
 from palpate.mechanics.solvers.contract import Factorisation
 
@@ -56,7 +57,7 @@ class Balance(Protocol):
         """Internal less external forces R (n_dof,) mN, and the length of the internal ones, at u (n_dof,)."""
         ...
 
-    def stiffness(self, displacement: Array, pressure: Array | None = None) -> sparse.csr_matrix[np.float64]:
+    def stiffness(self, displacement: Array, pressure: Array | None = None) -> Stiffness:
         """K = dR/du (n_dof, n_dof) mN/mm at u (n_dof,), or with other pressures (n_cells,) kPa than those at u."""
         ...
 
@@ -69,11 +70,11 @@ class Balance(Protocol):
         """Whether the stiffness is symmetric."""
         ...
 
-    def restricted(self, stiffness: sparse.csr_matrix[np.float64]) -> sparse.csr_matrix[np.float64]:
+    def restricted(self, stiffness: Stiffness) -> sparse.csr_matrix[np.float64]:
         """F^T K F (n_free, n_free) mN/mm of K (n_dof, n_dof)."""
         ...
 
-    def factorise(self, stiffness: sparse.csr_matrix[np.float64]) -> Factorisation:
+    def factorise(self, stiffness: Stiffness) -> Factorisation:
         """Factorisation of F^T K F (n_free, n_free); raises `SolverError`."""
         ...
 
@@ -252,9 +253,7 @@ def _correct(way: _Way, path: NewtonPath) -> NewtonPath:
     )
 
 
-def _solved(
-    way: _Way, path: NewtonPath, stiffness: sparse.csr_matrix[np.float64], load: Array, forcing: float
-) -> tuple[Array, NewtonPath]:
+def _solved(way: _Way, path: NewtonPath, stiffness: Stiffness, load: Array, forcing: float) -> tuple[Array, NewtonPath]:
     """Free displacements (n_free,) under `load` (n_free,), by the old factorisation where it is near enough.
 
     `forcing` is the relative residual that is good enough.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,9 @@ from scipy import sparse
 
 from palpate.mesh.constraint import Constraint
 
-__all__ = ["BlockPattern", "Restriction", "block_pattern", "restriction"]
+__all__ = ["BlockPattern", "Restriction", "Stiffness", "block_pattern", "restriction"]
+
+Stiffness: TypeAlias = "sparse.bsr_matrix[np.float64] | sparse.csr_matrix[np.float64]"  # in blocks of points, or not
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,11 +28,11 @@ class BlockPattern:
     indices: NDArray[np.int64]
     indptr: NDArray[np.int64]
 
-    def assemble(self, blocks: NDArray[np.float64]) -> sparse.csr_matrix[np.float64]:
+    def assemble(self, blocks: NDArray[np.float64]) -> sparse.bsr_matrix[np.float64]:
         """Matrix (3 n_points, 3 n_points), mN/mm, of element blocks (n_cells * n_a * n_a, 9) mN/mm."""
         data = np.asarray(self.gather @ blocks).reshape(-1, 3, 3)
         size = 3 * (len(self.indptr) - 1)
-        return sparse.bsr_matrix((data, self.indices, self.indptr), shape=(size, size)).tocsr()
+        return sparse.bsr_matrix((data, self.indices, self.indptr), shape=(size, size))
 
 
 def block_pattern(cells: NDArray[np.int64], n_points: int) -> BlockPattern:
@@ -47,32 +50,32 @@ def block_pattern(cells: NDArray[np.int64], n_points: int) -> BlockPattern:
 
 @dataclass(frozen=True, slots=True)
 class Restriction:
-    """From a matrix K (n_dof, n_dof) to F^T K F: by `places` (nnz,) of its entries where F only selects."""
+    """From a matrix K (n_dof, n_dof) of blocks to F^T K F: by `places` (nnz,) of its entries where F only selects."""
 
     free: sparse.csr_matrix[np.float64]
     places: NDArray[np.int32] | None
     indices: NDArray[np.int32]
     indptr: NDArray[np.int32]
 
-    def of(self, matrix: sparse.csr_matrix[np.float64]) -> sparse.csr_matrix[np.float64]:
+    def of(self, matrix: sparse.bsr_matrix[np.float64]) -> sparse.csr_matrix[np.float64]:
         """F^T K F (n_free, n_free), mN/mm, of a matrix K (n_dof, n_dof) with the pattern that this was made for."""
         n = self.free.shape[1]
         if self.places is None:
             product = sparse.csr_matrix(sparse.csr_matrix(self.free.T @ matrix) @ self.free)
             product.sort_indices()
             return product
-        return sparse.csr_matrix((matrix.data[self.places], self.indices, self.indptr), shape=(n, n))
+        return sparse.csr_matrix((matrix.data.ravel()[self.places], self.indices, self.indptr), shape=(n, n))
 
 
-def restriction(constraint: Constraint, pattern: sparse.csr_matrix[np.float64]) -> Restriction:
-    """Restriction to the free displacements of `constraint`, for matrices with the entries of `pattern` (n, n)."""
+def restriction(constraint: Constraint, pattern: sparse.bsr_matrix[np.float64]) -> Restriction:
+    """Restriction to the free displacements of `constraint`, for matrices with the blocks of `pattern` (n, n)."""
     free = constraint.free
     columns = free.tocsc()
     empty = np.zeros(0, dtype=np.int32)
     if not (np.all(np.diff(columns.indptr) == 1) and np.all(columns.data == 1.0)):
         return Restriction(free, None, empty, empty)
-    numbers = np.arange(pattern.nnz, dtype=np.int32)
-    numbered = sparse.csr_matrix((numbers, pattern.indices, pattern.indptr), shape=pattern.shape)
+    numbers = np.arange(pattern.nnz, dtype=np.int32).reshape(pattern.data.shape)
+    numbered = sparse.bsr_matrix((numbers, pattern.indices, pattern.indptr), shape=pattern.shape).tocsr()
     chosen = sparse.csr_matrix(numbered[columns.indices][:, columns.indices])
     chosen.sort_indices()
     return Restriction(free, np.asarray(chosen.data), chosen.indices, chosen.indptr)

@@ -104,7 +104,7 @@ def _stiffness(space: LagrangeSpace, tissue: int, weights: tuple[float, float, f
         np.matmul(tensor, _constant_gradient_blocks(gradients[part], volumes[part], (pointwise, mu)), out=blocks[part])
         if in_mean:
             blocks[part] += mean @ _constant_gradient_blocks(gradients[part], volumes[part], (in_mean, 0.0))
-    return block_pattern(cells, len(space.points)).assemble(blocks.reshape(-1, 9))
+    return block_pattern(cells, len(space.points)).assemble(blocks.reshape(-1, 9)).tocsr()
 
 
 def stiffness_by_poisson(

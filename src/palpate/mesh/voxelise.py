@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -23,6 +25,7 @@ Warp = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 LATTICE = 2.0**16  # corners are rounded to voxel / LATTICE: products of their differences are then exact in float64
 TIE = 2.0**-14  # voxels: a face at a voxel's centre counts as just below it, whatever the rounding
+BRICK = 4  # voxels along each edge of what is decided at once
 BASE = 4  # region r is the digit r in base BASE: sums of crossings that do not belong together cannot pass for a region
 
 
@@ -62,9 +65,34 @@ def voxelise(
     behind = np.repeat(np.where(other == OUTER, inner, other), count)
     empty = np.argwhere(tissue < 0)
     if len(empty):
-        nearest = KDTree(pieces[hollow].mean(axis=1)).query(grid.world(empty.astype(float)), workers=-1)[1]
-        tissue[tuple(empty.T)] = behind[hollow][nearest]
+        tissue[tuple(empty.T)] = _behind(empty, grid, pieces[hollow].mean(axis=1), behind[hollow])
     return tissue
+
+
+def _behind(
+    voxels: NDArray[np.int64], grid: VoxelGrid, centres: NDArray[np.float64], regions: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Of each voxel (m, 3) the region of the nearest face; the faces' `centres` (n, 3) mm and `regions` (n,).
+
+    Bricks of voxels ask first: where a region is nearer to the brick's middle than every other one by more than the
+    brick's diameter, it is so for all of its voxels.
+    """
+    shape = tuple(-(-n // BRICK) for n in grid.shape)
+    brick = np.ravel_multi_index((voxels // BRICK).T, shape)
+    asked = np.flatnonzero(np.bincount(brick, minlength=math.prod(shape)))
+    middle = np.stack(np.unravel_index(asked, shape), axis=1) * BRICK + 0.5 * (BRICK - 1)
+    names = np.unique(regions)
+    apart = np.full((len(names) + 1, len(asked)), np.inf)  # the last: where there is no other region
+    for number, name in enumerate(names):
+        apart[number] = KDTree(centres[regions == name]).query(grid.world(middle), workers=-1)[0]
+    first, second = np.partition(apart, 1, axis=0)[:2]
+    half = (BRICK - 1) * np.array(list(itertools.product((-0.5, 0.5), repeat=3))) @ grid.affine[:3, :3].T
+    place = np.searchsorted(asked, brick)
+    found = names[apart.argmin(axis=0)][place]
+    open_ = ~(second - first > 2.0 * np.linalg.norm(half, axis=1).max())[place]
+    nearest = KDTree(centres).query(grid.world(voxels[open_].astype(float)), workers=-1)[1]
+    found[open_] = regions[nearest]
+    return found
 
 
 def _interfaces(mesh: TetMesh) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
