@@ -195,9 +195,9 @@ def test_what_its_error_costs_is_stated(made, there, monkeypatch):
     """Right-hand sides with the factorisation that is there; no approximation solves the model anew to be checked."""
     asked, solve = [], CheckedFactorisation.solve
 
-    def counted(self, rhs):
+    def counted(self, rhs, **kwargs):
         asked.append(rhs.shape[1])
-        return solve(self, rhs)
+        return solve(self, rhs, **kwargs)
 
     monkeypatch.setattr(CheckedFactorisation, "solve", counted)
     made.error(there)

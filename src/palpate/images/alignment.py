@@ -18,6 +18,7 @@ from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.images.tissue_distance import tissue_distance_map
+from palpate.parallel import mapped
 
 __all__ = ["Alignment", "RigidFit", "RigidMotion", "align", "fit_rigid_motion", "moved"]
 
@@ -187,22 +188,27 @@ def align(before: Segmentation, after: Segmentation) -> Alignment:
     if not rigid:
         raise InputDataError("no tissue is `rigid`, so nothing shows the motion between the images; set align = 'none'")
     width = smoothing_width(before.grid, after.grid)
-    pairs = [
-        (tissue_distance_map(before, i, smoothing_mm=width), tissue_distance_map(after, i, smoothing_mm=width))
-        for i in rigid
-    ]
-    overall = fit_rigid_motion(pairs)
-    names = [before.tissues[i].name for i in rigid]
-    each, loose = {}, {}
-    for i, name, pair in zip(rigid, names, pairs, strict=True):
+    images = product(rigid, (before, after))
+    maps = mapped(lambda of: tissue_distance_map(of[1], of[0], smoothing_mm=width), images)
+    pairs = dict(zip(rigid, zip(maps[::2], maps[1::2], strict=True), strict=True))
+    overall = fit_rigid_motion(list(pairs.values()))
+
+    def alone(tissue: int) -> tuple[RigidFit, float]:
+        """The fit of one tissue, and how far a piece of it lies off that, mm."""
         try:
-            each[name] = fit_rigid_motion([pair])
+            fit = fit_rigid_motion([pairs[tissue]]) if len(rigid) > 1 else overall
         except InputDataError:
-            each[name] = replace(overall, n_points=0)
-        off = _off_the_motion(before.mask(i), pair, each[name].motion)
-        if off > LOOSE_VOXELS * float(after.grid.spacing.max()):
-            loose[name] = off
-    return Alignment(overall, each, loose)
+            fit = replace(overall, n_points=0)
+        return fit, _off_the_motion(before.mask(tissue), pairs[tissue], fit.motion)
+
+    names = [before.tissues[i].name for i in rigid]
+    each = dict(zip(names, mapped(alone, rigid), strict=True))
+    limit = LOOSE_VOXELS * float(after.grid.spacing.max())
+    return Alignment(
+        overall,
+        {name: fit for name, (fit, _) in each.items()},
+        {name: off for name, (_, off) in each.items() if off > limit},
+    )
 
 
 def moved(segmentation: Segmentation, motion: RigidMotion) -> Segmentation:

@@ -28,6 +28,7 @@ __all__ = ["Expansion", "coarse_equilibrium", "expansion_around"]
 
 REACH = 0.8  # of ln E, within which it is trusted
 COARSE = 3e-2  # of the forces: for the equilibrium whose stiffness is factorised
+DERIVATIVES = 1e-5  # relative residual: those of a coarse equilibrium, which others replace where they decide
 FEW = 24  # moduli and modes, all of whose derivatives cost less than the iterations that they spare
 
 
@@ -148,5 +149,5 @@ def expansion_around(coarse: FiniteStrainEquilibrium, *, tolerance: float, progr
     full, moduli, coefficients = near.model.to_tolerance(tolerance), near.moduli, near.coefficients
     found = from_start(full, moduli, coefficients, start=near.displacement, nearby=near.factorisation)
     progress(f"finite strain: derivatives by {len(full.names)} moduli and {len(coefficients)} modes")
-    derivatives = FirstOrderModel(full.names, moduli, coefficients, found.values, near.tangent())
+    derivatives = FirstOrderModel(full.names, moduli, coefficients, found.values, near.tangent(tolerance=DERIVATIVES))
     return Expansion(derivatives, found, near.counts + near.tangent_counts + found.counts)

@@ -162,12 +162,10 @@ class Objective:
         prior = self.parameters.prior_matrix
         gradient, score, matrix = pull.copy(), pull.copy(), prior.copy()
         misfit = 0.0
-        for line in lines:
-            root = np.sqrt(line.precision * line.weights)
-            scaled = root[:, None] * line.jacobian
+        for line, (own_score, own_matrix) in zip(lines, mapped(_normal_equations, lines), strict=True):
             gradient[line.columns] += line.gradient
-            score[line.columns] += scaled.T @ (root * line.residuals.values)
-            matrix[np.ix_(line.columns, line.columns)] += scaled.T @ scaled  # of one array: half of a general product
+            score[line.columns] += own_score
+            matrix[np.ix_(line.columns, line.columns)] += own_matrix
             misfit += _mean_loss(line.observation, line.residuals) / len(lines)
             value += _misfit(line.observation, line.residuals)
         return Evaluation(value, misfit, gradient, score, matrix, tuple(lines), prior, pull)
@@ -271,6 +269,13 @@ def deciding_directions(evaluation: Evaluation, n_parameters: int) -> NDArray[np
     """
     unit = np.eye(len(evaluation.matrix))[:, :n_parameters]
     return np.concatenate([unit, evaluation.covariance_columns(n_parameters)], axis=1)
+
+
+def _normal_equations(line: Linearisation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """J^T W r (n_columns,) and J^T W J (n_columns, n_columns) of one observation."""
+    root = np.sqrt(line.precision * line.weights)
+    scaled = root[:, None] * line.jacobian
+    return scaled.T @ (root * line.residuals.values), scaled.T @ scaled  # of one array: half of a general product
 
 
 def _misfit(observation: Observation, residuals: Residuals) -> float:

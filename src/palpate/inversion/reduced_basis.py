@@ -20,6 +20,7 @@ __all__ = ["ReducedBasis", "reduced_basis"]
 
 SERIES = 40  # vectors at the most
 FAR = 30.0  # spread of the moduli's ratios to the factorised ones, beyond which a new factorisation costs less
+SNAPSHOT = 1e-5  # relative residual of basis vectors: what they miss is measured at each place and added there
 DISPLACEMENT, TANGENT = 1e-4, 1e-2  # of the reduced model's error, that a correction may leave
 MAX_ITERATIONS = 60
 
@@ -128,7 +129,7 @@ class ReducedBasis:
         level = self.model.solve(system.moduli, coefficients).values[:, None]
         vectors: list[NDArray[np.float64]] = []
         while level.shape[1] * n_parameters + sum(v.shape[1] for v in vectors) <= SERIES:
-            by_region = system.modulus_responses(level, regions=regions)
+            by_region = system.modulus_responses(level, regions=regions, tolerance=SNAPSHOT)
             level = np.concatenate([np.tensordot(column, by_region, axes=1) for column in by_theta[regions].T], axis=1)
             vectors.append(level)
         if not vectors:
@@ -154,7 +155,7 @@ class ReducedBasis:
 def reduced_basis(model: LinearModel, moduli: NDArray[np.float64]) -> ReducedBasis:
     """The model on its responses to every boundary mode at moduli (n_regions,) kPa; one factorisation."""
     system = model.system(moduli)
-    snapshots = np.asarray(model.constraint.free.T @ system.responses())
+    snapshots = np.asarray(model.constraint.free.T @ system.responses(tolerance=SNAPSHOT))
     return ReducedBasis(projection(model, snapshots), system, system.response_counts)
 
 

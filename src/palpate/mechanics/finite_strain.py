@@ -18,7 +18,7 @@ from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.forward import SolveCounts, checked_coefficients, checked_moduli
 from palpate.mechanics.hyperelastic import Elements, Moduli, elements_of
 from palpate.mechanics.laws.contract import Law
-from palpate.mechanics.linearised import LinearisedSystem
+from palpate.mechanics.linearised import TIGHT, LinearisedSystem
 from palpate.mechanics.loads import Load
 from palpate.mechanics.newton import NewtonPath, NewtonSettings, follow
 from palpate.mechanics.pattern import BlockPattern, Restriction, Stiffness, block_pattern, restriction
@@ -248,11 +248,15 @@ class FiniteStrainEquilibrium:
         path = self.path.with_factorisation(self.balance.factorise(self._stiffness()))
         return replace(self, path=replace(path, exact=True))
 
-    def tangent(self) -> NDArray[np.float64]:
-        """T (n_dof, n_regions + n_modes), mm: columns du / d ln E_r, then du / dq_k; raises `NotConverged`."""
+    def tangent(self, *, tolerance: float = TIGHT) -> NDArray[np.float64]:
+        """T (n_dof, n_regions + n_modes), mm: columns du / d ln E_r, then du / dq_k; raises `NotConverged`.
+
+        tolerance: of the relative residual of each.
+        """
         stiffness = self._stiffness()
         loads = self._parameter_loads(stiffness)
-        result = np.asarray(self.balance.free @ self._system(stiffness, loads.shape[1]).solve(loads))
+        system = self._system(stiffness, loads.shape[1])
+        result = np.asarray(self.balance.free @ system.solve(loads, tolerance=tolerance))
         result[:, self.model.n_regions :] += self.model.constraint.modes
         return result
 

@@ -19,7 +19,7 @@ from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.forward import SolveCounts, checked_coefficients, checked_moduli
 from palpate.mechanics.loads import Load
 from palpate.mechanics.rigid import rigid_modes
-from palpate.mechanics.solvers.contract import Factorisation
+from palpate.mechanics.solvers.contract import EXACT, Factorisation
 from palpate.mechanics.solvers.registry import factorise
 from palpate.mechanics.stiffness import stiffness_by_poisson, stiffness_parts, tissue_stiffness
 from palpate.mesh.constraint import Constraint
@@ -128,26 +128,33 @@ class LinearSystem:
         """What this system and one call of `responses` cost together."""
         return SolveCounts(forward=self.model.n_modes + 1, factorisations=1)
 
-    def responses(self) -> NDArray[np.float64]:
-        """Displacement (n_dof, n_modes + 1) mm for each unit mode alone and, last, for the offset and the loads."""
+    def responses(self, *, tolerance: float = EXACT) -> NDArray[np.float64]:
+        """Displacement (n_dof, n_modes + 1) mm for each unit mode alone and, last, for the offset and the loads.
+
+        tolerance: of the forces out of balance, relative.
+        """
         constraint = self.model.constraint
         loads = weighted_sum(self.moduli, self.model.coupling).toarray()
         loads[:, -1] -= self.model.free_load
         given = np.column_stack([constraint.modes, constraint.offset])
-        return np.asarray(given - constraint.free @ self.factorisation.solve(loads))
+        return np.asarray(given - constraint.free @ self.factorisation.solve(loads, tolerance=tolerance))
 
     def modulus_responses(
-        self, displacements: NDArray[np.float64], regions: NDArray[np.int64] | None = None
+        self,
+        displacements: NDArray[np.float64],
+        regions: NDArray[np.int64] | None = None,
+        *,
+        tolerance: float = EXACT,
     ) -> NDArray[np.float64]:
         """Derivatives dw / d ln E_r (n, n_dof, k), mm, of equilibria w (n_dof, k) mm at these moduli.
 
         F K_ff^-1 F^T (-E_r K_r w) for r in `regions` (n,), by default all; without loads they sum to zero over all of
-        them, for nothing sets a scale.
+        them, for nothing sets a scale. tolerance: of the relative residual.
         """
         free = self.model.constraint.free
         chosen = np.arange(self.model.n_regions) if regions is None else regions
         forces = [self.moduli[r] * np.asarray(free.T @ (self.model.stiffness[r] @ displacements)) for r in chosen]
-        solution = free @ self.factorisation.solve(-np.concatenate(forces, axis=1))
+        solution = free @ self.factorisation.solve(-np.concatenate(forces, axis=1), tolerance=tolerance)
         return np.stack(np.split(np.asarray(solution), len(chosen), axis=1))
 
     def solve(self, coefficients: NDArray[np.float64]) -> LinearEquilibrium:

@@ -13,9 +13,9 @@ from palpate.errors import SolverError
 from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
 from palpate.mechanics.solvers.contract import Factorisation
 
-__all__ = ["LinearisedSystem", "symmetric_part"]
+__all__ = ["TIGHT", "LinearisedSystem", "symmetric_part"]
 
-TOLERANCE = 1e-12  # of the residual, relative
+TIGHT = 1e-12  # of the residual, relative
 ACCEPTED = 1e-9  # where rounding stops it
 MAX_ITERATIONS = 100
 
@@ -32,7 +32,7 @@ class LinearisedSystem:
         """The system of A^T; the factorisation, of a symmetric matrix, serves both."""
         return self if self.symmetric else replace(self, matrix=sparse.csr_matrix(self.matrix.T))
 
-    def solve(self, rhs: NDArray[np.float64], *, tolerance: float = TOLERANCE) -> NDArray[np.float64]:
+    def solve(self, rhs: NDArray[np.float64], *, tolerance: float = TIGHT) -> NDArray[np.float64]:
         """Solution X (n, m) of A X = rhs (n, m) to a relative residual of `tolerance`; raises `SolverError`."""
         if not self.symmetric:
             return np.stack([self._unsymmetric(column, tolerance) for column in rhs.T], axis=1)

@@ -80,7 +80,7 @@ def _behind(
     shape = tuple(-(-n // BRICK) for n in grid.shape)
     brick = np.ravel_multi_index((voxels // BRICK).T, shape)
     asked = np.flatnonzero(np.bincount(brick, minlength=math.prod(shape)))
-    middle = np.stack(np.unravel_index(asked, shape), axis=1) * BRICK + 0.5 * (BRICK - 1)
+    middle = np.stack(np.unravel_index(asked, shape), axis=1).astype(float) * BRICK + 0.5 * (BRICK - 1)
     names = np.unique(regions)
     apart = np.full((len(names) + 1, len(asked)), np.inf)  # the last: where there is no other region
     for number, name in enumerate(names):
@@ -92,7 +92,7 @@ def _behind(
     open_ = ~(second - first > 2.0 * np.linalg.norm(half, axis=1).max())[place]
     nearest = KDTree(centres).query(grid.world(voxels[open_].astype(float)), workers=-1)[1]
     found[open_] = regions[nearest]
-    return found
+    return np.asarray(found)
 
 
 def _interfaces(mesh: TetMesh) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:

@@ -52,16 +52,21 @@ class NoiseModel:
 
         Residuals within half a correlation length are summed first.
         """
-        total = np.zeros((len(rows), len(rows)))
-        for variance, length in zip(self.variances, self.lengths, strict=True):
+
+        def term(of: tuple[float, float]) -> NDArray[np.float64]:
+            """That of one variance and its length."""
+            variance, length = of
             carried, centres = _gather(rows, places, normals, 0.5 * length)
             tree = cKDTree(centres)
             pairs = tree.sparse_distance_matrix(tree, 3.5 * length, output_type="coo_matrix").tocsr()
             pairs.data = np.exp(-(pairs.data**2) / (2.0 * length**2))
             pairs.setdiag(1.0)
+            total = np.zeros((len(rows), len(rows)))
             for axis in range(3):
                 total += variance * carried[:, :, axis] @ (pairs @ carried[:, :, axis].T)
-        return total
+            return total
+
+        return np.asarray(np.sum(mapped(term, zip(self.variances, self.lengths, strict=True)), axis=0))
 
 
 EXACT_NOISE = NoiseModel(np.array([0.03**2]), np.array([3.0]))  # of surfaces that no image has rounded

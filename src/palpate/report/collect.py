@@ -19,6 +19,7 @@ from palpate.images.tissue import Role, Tissue
 from palpate.images.tissue_colours import tissue_colours
 from palpate.mechanics.deformation import largest_strains
 from palpate.mesh.dihedral import tet_dihedrals
+from palpate.parallel import mapped
 from palpate.report.backgrounds import Grey, background, earlier_grey, later_grey, whole_box, whole_images
 from palpate.report.inputs import bone_distances, input_images
 from palpate.report.pairs import ImagePair, drawn_images, image_pairs
@@ -251,7 +252,9 @@ def _later(drawing: _Drawing, after: int, reference: Reference) -> LaterImage:
         surfaces=surfaces,
         model=attempt.part(
             f"distances of {name}",
-            lambda: tuple(model_surface(result, i, after) for i in _indices(result, MOVING)) if fitted else (),
+            lambda: tuple(
+                mapped(lambda i: model_surface(result, i, after), _indices(result, MOVING) if fitted else ())
+            ),
             (),
         ),
         background=attempt.part(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from importlib import resources
@@ -16,6 +16,7 @@ import numpy as np
 from markupsafe import Markup, escape
 
 from palpate.findings import HARMLESS, WIDENING
+from palpate.parallel import mapped
 from palpate.report.charts import (
     START_COLOURS,
     angle_svg,
@@ -171,9 +172,11 @@ def _later(data: ReportData, k: int, later: LaterImage) -> _Later:
             _picture(plane.view.name, partial(slice_svg, data, plane, later, name=f"s{k}{plane.view.name}"))
             for plane in planes
         ),
-        organs=(
-            _photograph(f"as in {reference.name}", partial(organs_png, data, later, fitted=False)),
-            _photograph(f"fitted to {later.name}", partial(organs_png, data, later, fitted=True)),
+        organs=_photographs(
+            {
+                f"as in {reference.name}": partial(organs_png, data, later, fitted=False),
+                f"fitted to {later.name}": partial(organs_png, data, later, fitted=True),
+            }
         ),
         residuals=tuple(
             _picture(
@@ -196,12 +199,13 @@ def _widths(box: SliceBox | None) -> str:
 def _mesh_pictures(data: ReportData) -> tuple[Picture, ...]:
     if data.mesh is None:
         return ()
-    strain = _photograph("coloured by the largest strain", partial(mesh_png, data, by="strain"))
-    return (
-        _photograph("coloured by tissue", partial(mesh_png, data, by="tissue")),
-        _photograph("coloured by Young's modulus", partial(mesh_png, data, by="modulus")),
-        *([strain] if len(data.mesh.strains) else []),
-    )
+    drawings = {
+        "coloured by tissue": partial(mesh_png, data, by="tissue"),
+        "coloured by Young's modulus": partial(mesh_png, data, by="modulus"),
+    }
+    if len(data.mesh.strains):
+        drawings["coloured by the largest strain"] = partial(mesh_png, data, by="strain")
+    return _photographs(drawings)
 
 
 def _curves(data: ReportData) -> tuple[Picture, ...]:
@@ -224,15 +228,15 @@ def _gradient(scale: Scale) -> str:
     return "linear-gradient(to right, " + ", ".join(f"rgb({r} {g} {b})" for r, g, b in shades.tolist()) + ")"
 
 
-def _photograph(title: str, draw: Callable[[], bytes]) -> Picture:
-    """The PNG that `draw` makes, as an image of the page."""
+def _photographs(drawings: Mapping[str, Callable[[], bytes]]) -> tuple[Picture, ...]:
+    """The PNG that each drawing makes, by its title, as images of the page; made side by side."""
 
-    def element() -> str:
+    def element(title: str) -> str:
         """The image as an HTML element that holds its own data."""
-        source = base64.b64encode(draw()).decode()
+        source = base64.b64encode(drawings[title]()).decode()
         return f'<img alt="{escape(title)}" src="data:image/png;base64,{source}">'
 
-    return _picture(title, element)
+    return tuple(mapped(lambda title: _picture(title, partial(element, title)), drawings))
 
 
 def _picture(title: str, draw: Callable[[], str]) -> Picture:

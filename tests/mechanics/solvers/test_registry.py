@@ -56,6 +56,15 @@ def test_every_solver_inverts_the_stiffness(problem, solver):
     assert np.linalg.norm(solution - loads) < 1e-7 * np.linalg.norm(loads)
 
 
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-6, 1e-9])
+@pytest.mark.parametrize("solver", AVAILABLE)
+def test_a_solution_is_as_exact_as_it_was_asked_for(problem, solver, tolerance):
+    matrix, motions, loads, _ = problem
+    solution = factorise(matrix, solver=solver, near_nullspace=motions).solve(loads, tolerance=tolerance)
+    missed = np.linalg.norm(matrix @ solution - loads, axis=0) / np.linalg.norm(loads, axis=0)
+    assert missed.max() < 1.01 * tolerance
+
+
 @pytest.mark.parametrize("solver", AVAILABLE)
 def test_a_zero_load_gives_a_zero_solution_and_leaves_its_neighbours_alone(solver):
     matrix, loads = laplacian(40), np.random.default_rng(0).standard_normal((40, 3))
@@ -95,7 +104,7 @@ def test_a_floating_body_is_refused(solver, element, meshes):
 
 def test_a_solver_that_misses_its_tolerance_is_found_out(monkeypatch):
     class Sloppy:
-        def solve(self, rhs):
+        def solve(self, rhs, *, tolerance):
             return 0.4 * rhs
 
     solver = Solver("sloppy", lambda *_: Sloppy(), False, lambda *_: Expectation(0.0, 0.0), SOLVERS["multigrid"].expect)

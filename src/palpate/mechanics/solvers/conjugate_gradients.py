@@ -13,6 +13,10 @@ from palpate.mechanics.solvers.products import times
 
 __all__ = ["conjugate_gradients"]
 
+ROOM = 2**28  # bytes of the vectors of columns that are iterated together
+VECTORS = 8  # that a column takes
+FEWEST = 32  # columns together, below which products with a factor are slow
+
 
 def conjugate_gradients(
     matrix: sparse.csr_matrix[np.float64],
@@ -25,9 +29,23 @@ def conjugate_gradients(
     """Solution X (n, m) of A X = rhs (n, m), one iteration for each column but all products at once; and how many.
 
     precondition maps residuals (n, k) to nearly A^-1 times them; tolerance is of the relative residual. Hestenes &
-    Stiefel, J. Res. NBS 49 (1952) 409-436. Raises `SolverError` for a direction of no positive energy and when the
-    tolerance is not met.
+    Stiefel, J. Res. NBS 49 (1952) 409-436. Columns are taken together as far as their vectors have room. Raises
+    `SolverError` for a direction of no positive energy and when the tolerance is not met.
     """
+    together = max(ROOM // (VECTORS * 8 * len(rhs)), FEWEST)
+    parts = np.array_split(rhs, max(-(-rhs.shape[1] // together), 1), axis=1)
+    found = [_iterated(matrix, part, precondition, tolerance, max_iterations) for part in parts]
+    return np.concatenate([solution for solution, _ in found], axis=1), max(number for _, number in found)
+
+
+def _iterated(
+    matrix: sparse.csr_matrix[np.float64],
+    rhs: NDArray[np.float64],
+    precondition: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    tolerance: float,
+    max_iterations: int,
+) -> tuple[NDArray[np.float64], int]:
+    """As `conjugate_gradients`, all columns together."""
     norms = np.linalg.norm(rhs, axis=0)
     solution = np.zeros_like(rhs)
     active = np.flatnonzero(norms > 0.0)
@@ -41,15 +59,21 @@ def conjugate_gradients(
         energy = np.einsum("ij,ij->j", direction, image)
         _refuse_no_energy(energy, len(rhs))
         alpha = product / energy
-        solution[:, active] += alpha * direction
-        residual -= alpha * image
+        image *= alpha
+        residual -= image
         running = np.linalg.norm(residual, axis=0) > tolerance * norms[active]
-        active, residual, direction = active[running], residual[:, running], direction[:, running]
-        if len(active) == 0:
+        if len(active) == len(norms):
+            solution += alpha * direction
+        else:
+            solution[:, active] += alpha * direction
+        if not running.any():
             return solution, number
+        if not running.all():
+            active, residual, direction = active[running], residual[:, running], direction[:, running]
         preconditioned = precondition(residual)
         following = np.einsum("ij,ij->j", residual, preconditioned)
-        direction = preconditioned + following / product[running] * direction
+        direction *= following / product[running]
+        direction += preconditioned
         product = following
     worst = float(np.max(np.linalg.norm(residual, axis=0) / norms[active]))
     raise SolverError(

@@ -10,14 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-__all__ = ["Coarser", "Expectation", "Factorisation", "Factoriser", "Hints", "Solver"]
+__all__ = ["EXACT", "Coarser", "Expectation", "Factorisation", "Factoriser", "Hints", "Solver"]
+
+EXACT = 1e-10  # relative residual of a solution of which nothing else is asked
 
 
 class Factorisation(Protocol):
     """A matrix A made ready to be solved with, again and again."""
 
-    def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Solution X (n, m) of A X = rhs (n, m); raises `SolverError` when it misses its tolerance."""
+    def solve(self, rhs: NDArray[np.float64], *, tolerance: float = EXACT) -> NDArray[np.float64]:
+        """Solution X (n, m) of A X = rhs (n, m) to a relative residual of `tolerance`, or raises `SolverError`.
+
+        What costs nothing more may be more exact than that.
+        """
         ...
 
     def nearly(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ from scipy import sparse
 
 from palpate.errors import ConfigurationError, SolverError
 from palpate.mechanics.solvers import multigrid
-from palpate.mechanics.solvers.contract import Coarser, Expectation, Factorisation, Hints
+from palpate.mechanics.solvers.contract import EXACT, Coarser, Expectation, Factorisation, Hints
 from palpate.mechanics.solvers.multifrontal import solver as multifrontal
 from palpate.mechanics.solvers.products import times
 from palpate.memory import available_memory, total_memory
@@ -18,7 +18,7 @@ from palpate.memory import available_memory, total_memory
 __all__ = ["SOLVERS", "expected_of_size", "factorise"]
 
 SOLVERS = {solver.name: solver for solver in (multifrontal.SOLVER, multifrontal.MIXED, multigrid.SOLVER)}
-TOLERANCE = 1e-8  # of a residual, relative to its right-hand side
+TOLERANCE = 1e-8  # of a residual, relative to its right-hand side, which rounding may leave
 LARGEST_CONDITION = 1e13  # beyond it a direct solution has lost three digits of four to rounding
 USABLE = 0.8  # of the memory that is free: the rest is for what comes with the solutions
 SHARE = 0.5  # of all memory, so that the choice is the same whatever else runs, unless memory is short
@@ -32,18 +32,22 @@ class CheckedFactorisation:
     inner: Factorisation
     solver: str
 
-    def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Solution X (n, m) of A X = rhs (n, m); raises `SolverError` above a relative residual of 1e-8."""
+    def solve(self, rhs: NDArray[np.float64], *, tolerance: float = EXACT) -> NDArray[np.float64]:
+        """Solution X (n, m) of A X = rhs (n, m); raises `SolverError` where its relative residual is too large.
+
+        That is above ten times the `tolerance`, and above 1e-8.
+        """
+        limit = max(TOLERANCE, 10.0 * tolerance)
         if not np.all(np.isfinite(rhs)):
             raise SolverError("a load of the linear system is not finite: check moduli and prescribed displacements")
-        solution = self.inner.solve(rhs)
+        solution = self.inner.solve(rhs, tolerance=tolerance)
         share, residual = self._residual(rhs, solution)
-        if share > TOLERANCE:
-            solution = solution + self.inner.solve(residual)
+        if share > limit:
+            solution = solution + self.inner.solve(residual, tolerance=tolerance)
             share, _ = self._residual(rhs, solution)
-        if share > TOLERANCE:
+        if share > limit:
             raise SolverError(
-                f"solver '{self.solver}' left a relative residual of {share:.2g} (tolerance {TOLERANCE:g}) in"
+                f"solver '{self.solver}' left a relative residual of {share:.2g} (limit {limit:g}) in"
                 f" {len(rhs)} unknowns: the moduli may differ too much, Poisson's ratio may be too close to 0.5, or"
                 " tetrahedra may be too flat; try another solver or a better mesh"
             )

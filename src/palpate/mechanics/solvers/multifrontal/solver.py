@@ -19,7 +19,7 @@ from scipy import sparse
 
 from palpate.errors import ResourceError, SolverError
 from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
-from palpate.mechanics.solvers.contract import Expectation, Factorisation, Factoriser, Hints, Solver
+from palpate.mechanics.solvers.contract import EXACT, Expectation, Factorisation, Factoriser, Hints, Solver
 from palpate.mechanics.solvers.multifrontal.dense import Matrix
 from palpate.mechanics.solvers.multifrontal.expectation import PRODUCT, expected, expected_of_size
 from palpate.mechanics.solvers.multifrontal.numeric import factorised
@@ -32,8 +32,6 @@ __all__ = ["MIXED", "SOLVER", "plan_of"]
 
 KEPT_PLANS = 2  # of a linear and a finite-strain model of one mesh
 HOPELESS = 4.0  # times the free memory; a pattern of such a size is not analysed to know more exactly
-TOLERANCE = 1e-10  # of the residual, relative, to which solutions by single-precision factors are refined
-AT_ONCE = 32  # right-hand sides refined together; each takes eight vectors
 MAX_REFINEMENTS = 8  # steps of conjugate gradients; where they do not suffice, double precision costs less
 
 
@@ -44,12 +42,15 @@ class MultifrontalFactorisation:
     plan: Plan
     factor: Matrix
 
-    def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Solution X (n, m) of A X = rhs (n, m)."""
+    def solve(self, rhs: NDArray[np.float64], *, tolerance: float = EXACT) -> NDArray[np.float64]:
+        """Solution X (n, m) of A X = rhs (n, m) to rounding, whatever the `tolerance`."""
+        del tolerance
+        return self.nearly(rhs)
+
+    def nearly(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A^-1 rhs (n, m) to rounding."""
         with blas_on_one_thread():
             return substituted(self.plan, self.factor, rhs, processors())
-
-    nearly = solve
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,14 +69,10 @@ class MixedFactorisation:
             rough = substituted(self.plan, self.factor, rhs / sizes, processors())
         return np.asarray(rough * (sizes / self.scale))
 
-    def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Solution X (n, m) of A X = rhs (n, m) to a relative residual of 1e-10; raises `SolverError`."""
-        parts = np.array_split(rhs, max(-(-rhs.shape[1] // AT_ONCE), 1), axis=1)
-        found = [
-            conjugate_gradients(self.matrix, part, self.nearly, tolerance=TOLERANCE, max_iterations=MAX_REFINEMENTS)[0]
-            for part in parts
-        ]
-        return np.concatenate(found, axis=1)
+    def solve(self, rhs: NDArray[np.float64], *, tolerance: float = EXACT) -> NDArray[np.float64]:
+        """Solution X (n, m) of A X = rhs (n, m) to a relative residual of `tolerance`; raises `SolverError`."""
+        steps = MAX_REFINEMENTS
+        return conjugate_gradients(self.matrix, rhs, self.nearly, tolerance=tolerance, max_iterations=steps)[0]
 
 
 class _Plans:
