@@ -16,6 +16,7 @@ from palpate.errors import ConfigurationError, SolverError
 from palpate.mechanics.dense_equilibrium import DenseEquilibrium
 from palpate.mechanics.forward import checked_coefficients, checked_moduli
 from palpate.mechanics.linear_model import LinearModel
+from palpate.mechanics.solvers.products import times
 
 __all__ = [
     "Projection",
@@ -307,7 +308,7 @@ def _products(
     results = [np.empty((side.shape[1], vectors.shape[1])) for side in sides]
     for start in range(0, vectors.shape[1], CHUNK):
         columns = slice(start, start + CHUNK)
-        image = np.asarray(inner @ np.ascontiguousarray(vectors[touched, columns]))
+        image = times(inner, vectors[touched, columns])
         for result, side in zip(results, own, strict=True):
             result[:, columns] = side.T @ image
     return results

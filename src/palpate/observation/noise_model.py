@@ -63,7 +63,7 @@ class NoiseModel:
             pairs.setdiag(1.0)
             total = np.zeros((len(rows), len(rows)))
             for axis in range(3):
-                total += variance * carried[:, :, axis] @ (pairs @ carried[:, :, axis].T)
+                total += variance * carried[:, :, axis] @ np.asarray(pairs @ carried[:, :, axis].T)
             return total
 
         return np.asarray(np.sum(mapped(term, zip(self.variances, self.lengths, strict=True)), axis=0))

@@ -1,4 +1,4 @@
-"""A product with a few vectors is the product, in whatever order the columns are taken."""
+"""A product with vectors is the product, in whatever order its columns are taken and by however many threads."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import sparse
 
+from palpate.mechanics.solvers import products
 from palpate.mechanics.solvers.products import FEW, times
 
 
@@ -18,3 +19,13 @@ def test_it_is_that_of_the_dense_matrix(n_columns, order):
     found = times(matrix, vectors)
     assert found.shape == (30, n_columns)
     assert np.allclose(found, matrix.toarray() @ vectors, atol=1e-13)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_threads_change_not_a_bit_of_it(threads, monkeypatch):
+    rng = np.random.default_rng(3)
+    matrix = sparse.csr_matrix(sparse.random_array((700, 600), density=0.2, rng=rng))
+    vectors = rng.standard_normal((600, FEW))
+    monkeypatch.setattr(products, "WORTH_THREADS", 1)
+    monkeypatch.setattr(products, "processors", lambda: threads)
+    assert np.array_equal(times(matrix, vectors), matrix @ vectors)

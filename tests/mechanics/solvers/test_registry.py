@@ -104,7 +104,7 @@ def test_a_floating_body_is_refused(solver, element, meshes):
 
 def test_a_solver_that_misses_its_tolerance_is_found_out(monkeypatch):
     class Sloppy:
-        def solve(self, rhs, *, tolerance):
+        def solve(self, rhs, **_):
             return 0.4 * rhs
 
     solver = Solver("sloppy", lambda *_: Sloppy(), False, lambda *_: Expectation(0.0, 0.0), SOLVERS["multigrid"].expect)
