@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
+from palpate.images.tissue_distance import cropped, window_of
 from palpate.inversion.objective import Evaluation, Linearisation, Objective
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
@@ -25,6 +27,8 @@ __all__ = [
     "imaging_errors",
     "sandwich_covariance",
 ]
+
+MARGIN_MM, MARGIN_VOXELS = 12.0, 8.0  # around the residuals' places, further than a distance map there is smoothed
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,19 +157,29 @@ def imaging_errors(
     states of one reference state have the same image of it.
     """
     errors, rest = list[NDArray[np.float64]](), dict[int, Segmentation]()
-    for s, (state, fitted) in enumerate(zip(objective.states, states, strict=True)):
-        if state.reference not in rest:
-            rest[state.reference] = _imaged(fitted.space, np.zeros_like(fitted.displacement), fitted.before, rng)
-        after = _imaged(fitted.space, fitted.displacement, fitted.after, rng)
+    references = [state.reference for state in objective.states]
+    for s, (reference, fitted) in enumerate(zip(references, states, strict=True)):
         lines: list[Linearisation] = [line for line in evaluation.lines if line.state == s]
-        errors += [line.observation.imaging_error(line.residuals, rest[state.reference], after) for line in lines]
+        if reference not in rest:
+            material = [line.residuals.material for line in evaluation.lines if references[line.state] == reference]
+            rest[reference] = _imaged(fitted.space, np.zeros_like(fitted.displacement), fitted.before, material, rng)
+        places = [line.residuals.places for line in lines]
+        after = _imaged(fitted.space, fitted.displacement, fitted.after, places, rng)
+        errors += [line.observation.imaging_error(line.residuals, rest[reference], after) for line in lines]
     return errors
 
 
 def _imaged(
-    space: LagrangeSpace, displacement: NDArray[np.float64], grid: VoxelGrid, rng: np.random.Generator
+    space: LagrangeSpace,
+    displacement: NDArray[np.float64],
+    grid: VoxelGrid,
+    places: Sequence[NDArray[np.float64]],
+    rng: np.random.Generator,
 ) -> Segmentation:
-    affine = np.array(grid.affine)
+    """The model's image around places (n, 3) mm; further away nobody looks at it."""
+    margin = max(MARGIN_MM, MARGIN_VOXELS * float(grid.spacing.max())) / float(grid.spacing.min())
+    near = cropped(grid, window_of(grid.index(np.concatenate(places)), grid, margin=math.ceil(margin)))
+    affine = np.array(near.affine)
     affine[:3, 3] += affine[:3, :3] @ rng.uniform(-0.5, 0.5, 3)
-    shifted = replace(grid, affine=affine)
+    shifted = replace(near, affine=affine)
     return Segmentation(voxelise(space, displacement, shifted, crossing=True), shifted, space.mesh.tissues)
