@@ -1,5 +1,8 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from palpate.errors import GeometryError, InputDataError
 from palpate.images.distance import distance_map
@@ -7,6 +10,7 @@ from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.mesh.anatomy import Anatomy, Box, anatomy_of, domain_box, margin_box, volume_preserving
+from palpate.mesh.tetrahedralise import tetrahedralise
 
 ORGAN = Tissue("organ", Role.ESTIMATE, (1,))
 DRIVER = Tissue("driver", Role.DRIVER, (2,))
@@ -39,13 +43,42 @@ def test_the_domain_is_what_the_images_have_in_common():
     assert np.allclose(box.lengths, [16.0, 24.0, 56.0])
 
 
-def test_flipped_axes_give_the_same_domain():
-    affine = np.diag([-1.0, -1.0, 2.0, 1.0])
-    affine[:3, 3] = [24.0, 20.0, 2.0]
-    box, plain = domain_box([VoxelGrid((20, 24, 28), affine)]), domain_box([_grid()])
-    corners = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
-    reach = [b.world(corners * b.lengths) for b in (box, plain)]
-    assert np.allclose(np.sort(reach[0], axis=0), np.sort(reach[1], axis=0))
+ORDERS = [((0, 1, 2), (True, True, False), 0.0), ((2, 0, 1), (False, True, True), 0.0), ((1, 2, 0), (True,) * 3, 20.0)]
+
+
+def _ball(radius):
+    """A ball in its surroundings, off the middle of a voxel."""
+    grid = _grid(shape=(20, 21, 11), origin=(-9.7, -10.2, -10.4))
+    places = grid.world(np.argwhere(np.ones(grid.shape, dtype=bool)).astype(float))
+    inside = (np.linalg.norm(places, axis=1) < radius).reshape(grid.shape)
+    return Segmentation(np.where(inside, 0, 1).astype(np.int16), grid, (ORGAN, REST))
+
+
+def _stored(segmentation, order, flipped):
+    """The same voxels at the same places in another order on disk."""
+    index, affine = segmentation.index.transpose(order), segmentation.grid.affine.copy()
+    affine[:3, :3] = affine[:3, order]
+    for axis in np.flatnonzero(flipped):
+        affine[:3, 3] += affine[:3, axis] * (index.shape[axis] - 1)
+        affine[:3, axis] *= -1.0
+        index = np.flip(index, axis)
+    return replace(segmentation, index=index, grid=VoxelGrid(index.shape, affine))
+
+
+@pytest.mark.parametrize(("order", "flipped", "turn_deg"), ORDERS)
+def test_the_order_of_the_voxels_on_disk_changes_neither_domain_nor_mesh(order, flipped, turn_deg):
+    plain = _ball(6.0)
+    affine = np.array(plain.grid.affine)
+    affine[:3, :3] = Rotation.from_euler("xyz", [turn_deg, 0.0, turn_deg], degrees=True).as_matrix() @ affine[:3, :3]
+    images = [replace(plain, grid=VoxelGrid(plain.grid.shape, affine))]
+    images.append(_stored(images[0], order, flipped))
+    boxes = [domain_box([image.grid]) for image in images]
+    for one, other in zip(*((box.origin, box.axes, box.lengths) for box in boxes), strict=True):
+        assert other == pytest.approx(one, abs=1e-9)
+    pairs = zip(images, boxes, strict=True)
+    meshes = [tetrahedralise(anatomy_of(i, box=b, smoothing_mm=1.0), edge_length_mm=4.0) for i, b in pairs]
+    assert np.array_equal(meshes[1].tets, meshes[0].tets)
+    assert meshes[1].nodes == pytest.approx(meshes[0].nodes, abs=1e-8)
 
 
 def test_images_without_a_common_part_are_refused():

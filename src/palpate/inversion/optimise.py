@@ -36,7 +36,7 @@ MET = 0.5  # decrement (log-likelihood) from which an iterate is where it is goi
 WORTH = 1e-2  # units of log-likelihood that a damped step must promise to be tried
 COEFFICIENTS = 0.1  # decrement of the drivers' coefficients at held moduli, which other unknowns are going to change
 CIRCLING = 4  # steps without a smaller decrement, after which those within the noise go round in circles
-STALLED = 1e-2  # decrement under which a refused step is the noise of re-chosen closest points, whatever it moves
+STALLED = 0.03  # decrement, a quarter of a posterior width, under which a refused step is the noise of closest points
 
 
 class LeastSquares(Protocol):
@@ -57,7 +57,7 @@ class Outcome(StrEnum):
 
     CONVERGED = "the decrement fell under its tolerance"
     JOINED = "it reached a minimum that another start had found"
-    STALLED = "no smaller value was found within a tenth of the posterior's width"
+    STALLED = "no smaller value was found within a quarter of the posterior's width"
     STEPS = "the iteration reached its largest number of steps; raise it, or start nearer"
     STUCK = "no step reduced the objective; look at the fit of the driver's surface and at the images"
     NOT_FINITE = "the objective is not a finite number; check the images and the moduli's bounds"

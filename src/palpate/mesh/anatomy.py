@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, optimize
 
 from palpate.errors import GeometryError, InputDataError
 from palpate.images.distance import DistanceMap, distance_map
@@ -158,13 +158,24 @@ def anatomy_of(segmentation: Segmentation, *, box: Box, smoothing_mm: float) -> 
 def domain_box(grids: Sequence[VoxelGrid]) -> Box:
     """The part common to the images, out to the outer faces of their voxels, along the first grid's axes.
 
+    The axes stand in the order and direction of right, anterior and superior, whatever that of the voxels on disk.
     Raises `GeometryError` when the images share no volume.
     """
     u, _, vt = np.linalg.svd((grids[0].affine[:3, :3] / grids[0].spacing).T)
     axes = u @ vt  # of the nearest rotation, for an oblique header may be slightly sheared
-    extents = [_extent(grid, axes) for grid in grids]
-    low = np.max([extent[0] for extent in extents], axis=0)
-    high = np.min([extent[1] for extent in extents], axis=0)
+    axes = axes[np.argsort(optimize.linear_sum_assignment(-np.abs(axes))[1])]
+    axes = axes * np.sign(np.diag(axes))[:, None]
+    lows, highs = [], []  # along the axes inside each grid: of one turned against them a box about its centre
+    for grid in grids:
+        shape = np.array(grid.shape, dtype=float)
+        centre = axes @ grid.world(((shape - 1.0) / 2.0)[None])[0]
+        own = 0.5 * shape * grid.spacing
+        turn = np.abs((grid.affine[:3, :3] / grid.spacing).T @ axes.T)  # grid axis by box axis
+        half = own[turn.argmax(axis=0)]
+        half = half * min(1.0, float((own / (turn @ half)).min()) + 1e-9)
+        lows.append(centre - half)
+        highs.append(centre + half)
+    low, high = np.max(lows, axis=0), np.min(highs, axis=0)
     return Box(low @ axes, axes, high - low)
 
 
@@ -197,14 +208,3 @@ def volume_preserving(distance: DistanceMap, mask: NDArray[np.bool_]) -> Distanc
         inside = float(np.clip(0.5 - (values + shift) / edge, 0.0, 1.0).sum())
         low, high = (low, shift) if inside < wanted else (shift, high)
     return distance.shifted(0.5 * (low + high))
-
-
-def _extent(grid: VoxelGrid, axes: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Range along `axes` inside the grid: all of it, or for a grid turned against them a box about its centre."""
-    shape = np.array(grid.shape, dtype=float)
-    centre = axes @ grid.world(((shape - 1.0) / 2.0)[None])[0]
-    own = 0.5 * shape * grid.spacing
-    turn = np.abs((grid.affine[:3, :3] / grid.spacing).T @ axes.T)  # grid axis by box axis
-    half = own[turn.argmax(axis=0)]
-    half = half * min(1.0, float((own / (turn @ half)).min()) + 1e-9)
-    return centre - half, centre + half
