@@ -103,7 +103,11 @@ def one_a_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
         if finding not in places:
             places.append(finding)
     ranked = sorted(causes.values(), key=lambda places: rank(places[0].code))
-    return tuple(_with_places(first, [other.place for other in others if other.place]) for first, *others in ranked)
+    found = []
+    for first, *others in ranked:
+        also = ", ".join(other.place for other in others if other.place)
+        found.append(replace(first, message=f"{first.message}; also {also}") if also else first)
+    return tuple(found)
 
 
 def known_code(code: str) -> Code:
@@ -133,7 +137,3 @@ def warning_rows(findings: Iterable[Finding], *, beside: Iterable[Mapping[str, s
 def rank(code: str) -> int:
     """The place of a code among all, from 0: what costs more in the answer is lower; an unknown one is last."""
     return CODES.index(code) if code in CODES else len(CODES)
-
-
-def _with_places(finding: Finding, places: list[str]) -> Finding:
-    return replace(finding, message=f"{finding.message}; also {', '.join(places)}") if places else finding

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 try:
@@ -27,7 +28,13 @@ CGROUPS = (
 
 def available_memory() -> float | None:
     """Bytes that are free on this machine and under its control group's limit; None where the system does not tell."""
-    found = [_of_machine(), *(_of_group(*paths) for paths in CGROUPS)]
+    found = [_of_machine()]
+    for limit, use, caches in CGROUPS:
+        with suppress(OSError, ValueError, IndexError):  # "max": no limit
+            lines = Path(limit).with_name("memory.stat").read_text(encoding="ascii").splitlines()
+            given_back = next((float(line.split()[1]) for line in lines if line.split()[0] == caches), 0.0)
+            left = float(Path(limit).read_text(encoding="ascii")) - float(Path(use).read_text(encoding="ascii"))
+            found.append(left + given_back)
     return min((amount for amount in found if amount is not None), default=None)
 
 
@@ -44,7 +51,10 @@ def total_memory() -> float | None:
 
     What is decided by it is the same from run to run.
     """
-    found = [_of_machine("MemTotal:"), *(_limit(limit) for limit, _, _ in CGROUPS)]
+    found = [_of_machine("MemTotal:")]
+    for limit, _, _ in CGROUPS:
+        with suppress(OSError, ValueError):  # "max": no limit
+            found.append(float(Path(limit).read_text(encoding="ascii")))
     return min((amount for amount in found if amount is not None), default=None)
 
 
@@ -53,22 +63,4 @@ def _of_machine(line: str = "MemAvailable:") -> float | None:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
         return next(float(found.split()[1]) for found in lines if found.startswith(line)) * 1024.0
     except (OSError, StopIteration, ValueError):
-        return None
-
-
-def _limit(path: str) -> float | None:
-    try:
-        return float(Path(path).read_text(encoding="ascii"))
-    except (OSError, ValueError):  # "max": no limit
-        return None
-
-
-def _of_group(limit: str, use: str, caches: str) -> float | None:
-    try:
-        lines = Path(limit).with_name("memory.stat").read_text(encoding="ascii").splitlines()
-        given_back = next((float(line.split()[1]) for line in lines if line.split()[0] == caches), 0.0)
-        return (
-            float(Path(limit).read_text(encoding="ascii")) - float(Path(use).read_text(encoding="ascii")) + given_back
-        )
-    except (OSError, ValueError, IndexError):  # "max": no limit
         return None

@@ -66,11 +66,7 @@ def blas_on_one_thread() -> Iterator[None]:
         _turn.release()
 
 
-def _limit_here() -> None:
-    """For a BLAS on OpenMP, whose limits are a thread's own; the thread ends before anybody else computes on it."""
-    _libraries().limit(limits=1, user_api="blas")
-
-
 def pool_of(threads: int) -> ThreadPoolExecutor:
     """Threads of ours, for calls inside `blas_on_one_thread`."""
-    return ThreadPoolExecutor(threads, initializer=_limit_here)
+    # A BLAS on OpenMP has limits of each thread's own; the thread ends before anybody else computes on it.
+    return ThreadPoolExecutor(threads, initializer=lambda: _libraries().limit(limits=1, user_api="blas"))

@@ -23,7 +23,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     held = signal.pthread_sigmask(signal.SIG_BLOCK, signals) if masks else ()  # until there is a sentence for them
     try:
         if argv is None:
-            _open_streams()
+            for file in range(3):  # one that is closed would lend its number to the next file: it leads nowhere instead
+                try:
+                    os.fstat(file)
+                except OSError:
+                    os.open(os.devnull, os.O_RDWR)
         from palpate.cli.entry import run
 
         return run(argv, signals, held)
@@ -36,12 +40,3 @@ def main(argv: Sequence[str] | None = None) -> int:
             close_streams()
         if masks:
             signal.pthread_sigmask(signal.SIG_SETMASK, held)
-
-
-def _open_streams() -> None:
-    """A standard stream that is closed would lend its number to the next file opened: it leads nowhere instead."""
-    for number in range(3):
-        try:
-            os.fstat(number)
-        except OSError:
-            os.open(os.devnull, os.O_RDWR)

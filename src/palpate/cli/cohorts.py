@@ -31,7 +31,10 @@ def cohort(arguments: argparse.Namespace, _: None, outputs: OutputFolder | None,
     from palpate.cohort.tables import require_tables
 
     if arguments.task is not None:
-        return _task(arguments, progress)
+        from palpate.cohort.engines.slurm import run_part
+
+        outcomes = [outcome.to_dict() for outcome in run_part(arguments.output, arguments.task, progress)]
+        return Outcome({"schema": "palpate.task/1", "outcomes": outcomes}, f"{len(outcomes)} rows computed")
     require_tables()
     from palpate.cohort.run import Options, run_cohort
     from palpate.cohort.task import Limits
@@ -112,13 +115,6 @@ def _engine(arguments: argparse.Namespace, folder: Path) -> Engine:
     return LocalEngine(arguments.workers)
 
 
-def _task(arguments: argparse.Namespace, progress: Progress) -> Outcome:
-    from palpate.cohort.engines.slurm import run_part
-
-    outcomes = [outcome.to_dict() for outcome in run_part(arguments.output, arguments.task, progress)]
-    return Outcome({"schema": "palpate.task/1", "outcomes": outcomes}, f"{len(outcomes)} rows computed")
-
-
 def _told(records: Sequence[Record], folder: Path) -> Outcome:
     """What came of the rows; an exit code above 0 when any of them is still waiting."""
     from palpate.study.outputs import read_json
@@ -148,14 +144,10 @@ def _associations(document: dict[str, Any]) -> str:
     rows = [["tissue", "unit", "n", "r", "95 % (patients drawn)", "p", "rank rho"]]
     for tissue, found in document["organs"].items():
         for name, unit in (("patient", found["per_patient"]), ("scan", found["per_scan"])):
-            rows.append([tissue, name, str(unit["n"]), *_cells(unit)])
+            cells = [unit.get("undefined") or "undefined", "", "", ""]
+            if unit["r"] is not None:
+                interval, rho = unit["interval95"], unit.get("rho")
+                text = f"{interval[0]:.2f} to {interval[1]:.2f}" if interval else "undefined"
+                cells = [f"{unit['r']:.3f}", text, f"{unit['p']:.2g}", "" if rho is None else f"{rho:.3f}"]
+            rows.append([tissue, name, str(unit["n"]), *cells])
     return columns(rows)
-
-
-def _cells(unit: dict[str, Any]) -> list[str]:
-    if unit["r"] is None:
-        return [unit.get("undefined") or "undefined", "", "", ""]
-    interval = unit["interval95"]
-    text = f"{interval[0]:.2f} to {interval[1]:.2f}" if interval else "undefined"
-    rho = unit.get("rho")
-    return [f"{unit['r']:.3f}", text, f"{unit['p']:.2g}", "" if rho is None else f"{rho:.3f}"]

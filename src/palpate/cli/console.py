@@ -15,6 +15,7 @@ import sys
 import threading
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
+from importlib import import_module
 from pathlib import Path
 from types import FrameType
 from typing import TextIO
@@ -79,14 +80,10 @@ def output_folder(outputs: OutputFolder, heading: str, *, logs: bool) -> Iterato
     """
     folder = outputs.path
     with held_folder(folder) as locked, _logged(folder / "log.txt", heading) if logs else nullcontext():
-        _warn_of(folder, locked=locked)
+        if not locked and sys.platform != "win32":
+            LOGGER.warning(UNLOCKED, folder)
+            tell(f"palpate: warning: {UNLOCKED % folder}", sys.stderr)
         yield
-
-
-def _warn_of(folder: Path, *, locked: bool) -> None:
-    if not locked and sys.platform != "win32":
-        LOGGER.warning(UNLOCKED, folder)
-        tell(f"palpate: warning: {UNLOCKED % folder}", sys.stderr)
 
 
 @contextmanager
@@ -113,7 +110,9 @@ def interruptible(signals: Sequence[signal.Signals], mask: Iterable[int]) -> Ite
         for number in ours:
             signal.signal(number, interrupt)
         if hasattr(signal, "pthread_sigmask"):
-            _start_threads()
+            # The linear algebra starts its threads while the signals are blocked, and so they are for ever for these:
+            # a signal reaches the main thread, or waits where that blocks it (`mesh.interrupts`).
+            import_module("scipy.linalg")
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         yield came
     finally:
@@ -121,16 +120,6 @@ def interruptible(signals: Sequence[signal.Signals], mask: Iterable[int]) -> Ite
             signal.pthread_sigmask(signal.SIG_BLOCK, signals)
         for number in ours:
             signal.signal(number, earlier[number])
-
-
-def _start_threads() -> None:
-    """Let the linear algebra start its threads while the signals are blocked: so they are for ever, for these threads.
-
-    A signal then reaches the main thread, or waits where that blocks it (`mesh.interrupts`).
-    """
-    import scipy.linalg
-
-    del scipy
 
 
 class _LogFile(logging.StreamHandler[TextIO]):

@@ -10,7 +10,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING
 
 from palpate.cli.console import LOGGER, close_log, interruptible, log_is_open, output_folder, tell
 from palpate.cli.outcome import Outcome, printable_lines
@@ -78,7 +78,7 @@ def _failed(error: Exception, arguments: argparse.Namespace) -> Outcome:
     if isinstance(error, MemoryError):
         advice = "memory is short; make mesh.edge_length_mm larger or the images smaller"
         return _failure("ResourceError", advice, ResourceError.exit_code)
-    hint = _log_hint(arguments)
+    hint = f" with {arguments.output / 'log.txt'}, which holds the details" if log_is_open() else ""
     LOGGER.error("unexpected error", exc_info=error)  # a bug: the traceback belongs into the log, not on the terminal
     sentence = f"unexpected {type(error).__name__}: {error}. This is a bug; please report it{hint}"
     return _failure(type(error).__name__, sentence, UNEXPECTED)
@@ -89,8 +89,12 @@ def _run(arguments: argparse.Namespace, written: list[str]) -> Outcome:
 
     `written` gets the names of the files that take their places.
     """
+    from palpate.study.case_file import read_case
+
     command: Callable[..., Outcome] = arguments.command
-    case = _case(arguments)
+    images = len(getattr(arguments, "inputs", ())) > 1  # in the place of a case
+    path: Path | None = None if images else getattr(arguments, "inputs", [getattr(arguments, "case", None)])[0]
+    case = None if path is None else read_case(path, arguments.set)
     if arguments.output is None or getattr(arguments, "task", None) is not None:  # a task's folder is another run's
         with progress_on_stderr(quiet=arguments.quiet) as progress:
             return command(arguments, case, None, progress)
@@ -105,15 +109,6 @@ def _run(arguments: argparse.Namespace, written: list[str]) -> Outcome:
         outputs.require(arguments.targets)
         _spare_inputs(arguments, case, outputs)
         return command(arguments, case, outputs, progress)
-
-
-def _case(arguments: argparse.Namespace) -> Case | None:
-    """The case that a command begins with; None where it has none, or images instead."""
-    from palpate.study.case_file import read_case
-
-    images = len(getattr(arguments, "inputs", ())) > 1
-    path: Path | None = None if images else getattr(arguments, "inputs", [getattr(arguments, "case", None)])[0]
-    return None if path is None else read_case(path, arguments.set)
 
 
 def _spare_inputs(arguments: argparse.Namespace, case: Case | None, outputs: OutputFolder) -> None:
@@ -153,24 +148,15 @@ def _speak(outcome: Outcome, arguments: argparse.Namespace) -> int:
         if outcome.text and not arguments.quiet:
             tell(printable_lines(outcome.text), sys.stdout)
         return outcome.exit_code
-    refused = tell(_json(outcome, sys.stdout), sys.stdout)
+    document = json.dumps(outcome.document, indent=1, ensure_ascii=False, allow_nan=False)
+    try:
+        document.encode(getattr(sys.stdout, "encoding", None) or "utf-8")
+    except ValueError:  # letters that the stream lacks are JSON's own escapes
+        document = json.dumps(outcome.document, indent=1, ensure_ascii=True, allow_nan=False)
+    refused = tell(document, sys.stdout)
     if refused is None or refused.errno == errno.EPIPE:  # a reader that has left wants no more
         return outcome.exit_code
     reason = refused.strerror or str(refused)
     where = f"; what the run had to write is whole in {arguments.output}" if arguments.output else ""
     tell(f"palpate: the document of --json could not be written to standard output ({reason}){where}", sys.stderr)
     return outcome.exit_code or ResourceError.exit_code
-
-
-def _json(outcome: Outcome, stream: TextIO | None) -> str:
-    """The document as text that the stream can hold: letters that it lacks as JSON's own escapes."""
-    text = json.dumps(outcome.document, indent=1, ensure_ascii=False, allow_nan=False)
-    try:
-        text.encode(getattr(stream, "encoding", None) or "utf-8")
-    except ValueError:
-        return json.dumps(outcome.document, indent=1, ensure_ascii=True, allow_nan=False)
-    return text
-
-
-def _log_hint(arguments: argparse.Namespace) -> str:
-    return f" with {arguments.output / 'log.txt'}, which holds the details" if log_is_open() else ""

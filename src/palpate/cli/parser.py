@@ -93,8 +93,26 @@ def make_parser() -> argparse.ArgumentParser:
     what = "the whole way on the pelvis that Palpate brings along"
     demo = _command(subparsers, "demo", written.demo, what=what, folder="palpate-demo")
     demo.set_defaults(targets=written.TARGETS)
-    _add_init(subparsers)
-    _add_check(subparsers)
+    _add_preparations(subparsers)
+    _add_estimates(subparsers)
+    _add_results(subparsers)
+    _add_cohort(subparsers)
+    _add_proofs(subparsers)
+    return parser
+
+
+def _add_preparations(subparsers: Any) -> None:
+    """What makes, checks and tries a case: init, check, mesh, simulate."""
+    what = "write a case.toml for images, roles guessed from names"
+    init = _command(subparsers, "init", commands.init, what=what)
+    init.add_argument("images", type=Path, nargs="+", metavar="IMAGE", help="label images: before, then after ...")
+    init.add_argument("--labels", type=Path, metavar="TABLE", help="label table: which number is which organ")
+    _add_ct(init)
+    init.set_defaults(logs=False, targets=("case.toml",))
+    what = "list every problem of a case without computing"
+    check = _command(subparsers, "check", commands.check, what=what, folder=None)
+    check.add_argument("case_file", type=Path, metavar="CASE.TOML", help=CASE_HELP)
+    _add_set(check)
     mesh = _command(subparsers, "mesh", commands.mesh, what="make the tetrahedra of a case and write them")
     _add_case(mesh)
     mesh.set_defaults(targets=commands.MESH_TARGETS)
@@ -103,49 +121,31 @@ def make_parser() -> argparse.ArgumentParser:
     _add_case(simulate)
     simulate.add_argument("--steps", type=_count, default=1, metavar="N", help="write N steps to animate")
     simulate.set_defaults(targets=commands.SIMULATION_TARGETS)
-    _add_estimate(subparsers)
-    _add_sensitivity(subparsers)
-    _add_report(subparsers)
-    _add_export(subparsers)
-    _add_view(subparsers)
-    _add_cohort(subparsers)
-    _add_reproduce(subparsers)
-    _add_verify(subparsers)
-    return parser
 
 
-def _add_init(subparsers: Any) -> None:
-    command = _command(subparsers, "init", commands.init, what="write a case.toml for images, roles guessed from names")
-    command.add_argument("images", type=Path, nargs="+", metavar="IMAGE", help="label images: before, then after ...")
-    command.add_argument("--labels", type=Path, metavar="TABLE", help="label table: which number is which organ")
-    _add_ct(command)
-    command.set_defaults(logs=False, targets=("case.toml",))
-
-
-def _add_check(subparsers: Any) -> None:
-    command = _command(
-        subparsers, "check", commands.check, what="list every problem of a case without computing", folder=None
-    )
-    command.add_argument("case_file", type=Path, metavar="CASE.TOML", help=CASE_HELP)
-    _add_set(command)
-
-
-def _add_estimate(subparsers: Any) -> None:
+def _add_estimates(subparsers: Any) -> None:
+    """What finds moduli: estimate, sensitivity."""
     what = "find the Young's modulus of each organ of a case, or of label images before and after"
-    command = _command(subparsers, "estimate", written.estimate, what=what)
-    command.add_argument(
+    estimate = _command(subparsers, "estimate", written.estimate, what=what)
+    estimate.add_argument(
         "inputs",
         type=Path,
         nargs="+",
         metavar="INPUT",
         help="CASE.TOML, or label images BEFORE AFTER ... for which a case is written first",
     )
-    command.add_argument("--labels", type=Path, metavar="TABLE", help="label table, with images")
-    _add_ct(command)
-    command.set_defaults(targets=written.TARGETS)
-    _add_set(command)
+    estimate.add_argument("--labels", type=Path, metavar="TABLE", help="label table, with images")
+    _add_ct(estimate)
+    estimate.set_defaults(targets=written.TARGETS)
+    _add_set(estimate)
     what = "keep N draws of the moduli's posterior in each of 4 chains, as posterior.nc (extra `samples`)"
-    command.add_argument("--samples", type=_samples, action="append", dest="set", default=[], metavar="N", help=what)
+    estimate.add_argument("--samples", type=_samples, action="append", dest="set", default=[], metavar="N", help=what)
+    what = "estimate a case, and each modulus again under changed assumptions; goes on where it was interrupted"
+    sensitivity = _command(subparsers, "sensitivity", studies.sensitivity, what=what)
+    _add_case(sensitivity)
+    what = "also Sobol indices of N samples an input, a power of 2 (extra `sensitivity`)"
+    sensitivity.add_argument("--sobol", type=_power_of_two, default=0, metavar="N", help=what)
+    sensitivity.set_defaults(targets=studies.SENSITIVITY_TARGETS)
 
 
 def _add_ct(command: argparse.ArgumentParser) -> None:
@@ -153,41 +153,24 @@ def _add_ct(command: argparse.ArgumentParser) -> None:
     command.add_argument("--ct", type=Path, nargs="+", default=[], metavar="CT", help=what)
 
 
-def _add_report(subparsers: Any) -> None:
+def _add_results(subparsers: Any) -> None:
+    """What hands on a result: report, export, view."""
     what = "draw report.html of an estimate again"
-    command = _command(subparsers, "report", written.report, what=what, folder=None)
-    command.add_argument("output", type=Path, metavar="DIR", help="the output folder of an estimate")
-    command.set_defaults(makes_folder=False, targets=(written.DOCUMENT, written.PAGE))
-
-
-def _add_sensitivity(subparsers: Any) -> None:
-    what = "estimate a case, and each modulus again under changed assumptions; goes on where it was interrupted"
-    command = _command(subparsers, "sensitivity", studies.sensitivity, what=what)
-    _add_case(command)
-    what = "also Sobol indices of N samples an input, a power of 2 (extra `sensitivity`)"
-    command.add_argument("--sobol", type=_power_of_two, default=0, metavar="N", help=what)
-    command.set_defaults(targets=studies.SENSITIVITY_TARGETS)
-
-
-def _add_export(subparsers: Any) -> None:
+    report = _command(subparsers, "report", written.report, what=what, folder=None)
+    report.add_argument("output", type=Path, metavar="DIR", help="the output folder of an estimate")
+    report.set_defaults(makes_folder=False, targets=(written.DOCUMENT, written.PAGE))
     what = "write an estimate for another program: simulators, viewers, hospital systems"
-    command = _command(subparsers, "export", exports.export, what=what, folder="palpate-export")
-    command.add_argument("result", type=Path, metavar="DIR", help="the output folder of an estimate")
-    command.add_argument("--format", required=True, choices=tuple(FORMATS), help="; ".join(_formats()))
-    command.add_argument("--linear", action="store_true", help="tetrahedra of four nodes in place of ten")
-    command.add_argument("--source", type=Path, metavar="SERIES", help="dicom: the first image's DICOM series")
-    command.set_defaults(logs=False)  # which would hold the command with its paths
-
-
-def _add_view(subparsers: Any) -> None:
+    export = _command(subparsers, "export", exports.export, what=what, folder="palpate-export")
+    export.add_argument("result", type=Path, metavar="DIR", help="the output folder of an estimate")
+    formats = "; ".join(f"{name}: {form.description}" for name, form in FORMATS.items())
+    export.add_argument("--format", required=True, choices=tuple(FORMATS), help=formats)
+    export.add_argument("--linear", action="store_true", help="tetrahedra of four nodes in place of ten")
+    export.add_argument("--source", type=Path, metavar="SERIES", help="dicom: the first image's DICOM series")
+    export.set_defaults(logs=False)  # which would hold the command with its paths
     what = "show the report of an estimate and its files in a browser, on this machine alone"
-    command = _command(subparsers, "view", exports.view, what=what, folder=None)
-    command.add_argument("result", type=Path, metavar="DIR", help="the output folder of an estimate")
-    command.add_argument("--no-browser", action="store_true", help="print the address, open nothing")
-
-
-def _formats() -> list[str]:
-    return [f"{name}: {form.description}" for name, form in FORMATS.items()]
+    view = _command(subparsers, "view", exports.view, what=what, folder=None)
+    view.add_argument("result", type=Path, metavar="DIR", help="the output folder of an estimate")
+    view.add_argument("--no-browser", action="store_true", help="print the address, open nothing")
 
 
 def _add_cohort(subparsers: Any) -> None:
@@ -223,16 +206,14 @@ def _add_cohort(subparsers: Any) -> None:
     statistics.set_defaults(makes_folder=False, targets=cohorts.TARGETS)
 
 
-def _add_reproduce(subparsers: Any) -> None:
+def _add_proofs(subparsers: Any) -> None:
+    """What holds our numbers beside known ones: reproduce, verify."""
     what = "compute one of the paper's experiments, its numbers beside ours; goes on where it was interrupted"
-    command = _command(subparsers, "reproduce", studies.reproduce, what=what, folder="palpate-reproduce")
-    command.add_argument("experiment", choices=("table1", "table2", "figure4", "staging"))
-
-
-def _add_verify(subparsers: Any) -> None:
+    reproduce = _command(subparsers, "reproduce", studies.reproduce, what=what, folder="palpate-reproduce")
+    reproduce.add_argument("experiment", choices=("table1", "table2", "figure4", "staging"))
     what = "compute the problems with known answers and hold our numbers beside them"
-    command = _command(subparsers, "verify", verification.verify, what=what, folder="palpate-verification")
-    command.add_argument("--quick", action="store_true", help="leave out the slow problems")
+    verify = _command(subparsers, "verify", verification.verify, what=what, folder="palpate-verification")
+    verify.add_argument("--quick", action="store_true", help="leave out the slow problems")
 
 
 def _add_case(command: argparse.ArgumentParser) -> None:

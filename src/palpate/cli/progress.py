@@ -55,14 +55,11 @@ def place(seconds: Mapping[Stage, float], begun: Mapping[Stage, float], now: flo
     trust = TRUST * total
     pace = (begun[stage] - first + trust) / (over + trust)
     slower = (now - first + trust) / (over + seconds[stage] + trust)  # at least, where the present one takes long
-    there = over + seconds[stage] * _creeping((now - begun[stage]) / max(pace * seconds[stage], 1e-9))
+    x, rest = (now - begun[stage]) / max(pace * seconds[stage], 1e-9), 1.0 - STEADY
+    # follows x up to STEADY, then goes ever slower towards 1; its slope is continuous
+    creeping = x if x <= STEADY else 1.0 - rest**2 / (rest + x - STEADY)
+    there = over + seconds[stage] * creeping
     return Place(stage, min(there / total, MOST), max(pace, slower) * (total - there))
-
-
-def _creeping(x: float) -> float:
-    """Follow x up to STEADY, then go ever slower towards 1; its slope is continuous."""
-    rest = 1.0 - STEADY
-    return x if x <= STEADY else 1.0 - rest**2 / (rest + x - STEADY)
 
 
 @contextmanager
@@ -174,7 +171,10 @@ class Bar:
 
 def _started(bar: Bar) -> Live | None:
     """The bar at work; None where stderr is no terminal that can be written over."""
-    if not _is_terminal(sys.stderr):
+    try:
+        if sys.stderr is None or not sys.stderr.isatty():
+            return None
+    except ValueError:  # closed
         return None
     from rich.console import Console
     from rich.live import Live
@@ -200,13 +200,6 @@ def _started(bar: Bar) -> Live | None:
         live.stop()
         raise
     return live
-
-
-def _is_terminal(stream: TextIO | None) -> bool:
-    try:
-        return stream is not None and stream.isatty()
-    except ValueError:  # closed
-        return False
 
 
 @contextmanager

@@ -30,12 +30,19 @@ def estimate(arguments: argparse.Namespace, case: Case | None, outputs: OutputFo
     from palpate.steps import commands
     from palpate.steps.saving import save_failure
     from palpate.study.case_as_run import refuse_other_case
+    from palpate.study.case_file import read_case
+    from palpate.study.new_case import write_new_case
 
     if case is not None and arguments.labels is not None:
         raise ConfigurationError("--labels goes with images; a case names its label table itself, as [images] names")
     if case is not None and arguments.ct:
         raise ConfigurationError("--ct goes with images; a case names its CTs itself, as [images] intensities_before")
-    case = case or _case_of_images(arguments, outputs, progress)
+    if case is None:
+        new = write_new_case(arguments.inputs, arguments.labels, outputs, cts=arguments.ct)
+        for tissue in new.tissues:
+            progress(f"{tissue.name}: {tissue.role or '?'}, for {tissue.reason}")
+        progress(f"the case is written to {new.path}")
+        case = read_case(new.path, arguments.set)
     refuse_other_case(case, outputs)
     outputs.require(f"mesh_{number}.vtu" for number in range(2, len(case.pairs) + 2))
     try:
@@ -76,18 +83,6 @@ def report(_: argparse.Namespace, case: None, outputs: OutputFolder, progress: P
     text = "".join(f"warning: {outputs.path / name} is not of the run that result.json tells of\n" for name in strange)
     document = {"schema": "palpate.report/1", "id": result.get("id"), "report": str(path), "strange_files": strange}
     return Outcome(document, f"{text}written to {path}")
-
-
-def _case_of_images(arguments: argparse.Namespace, outputs: OutputFolder, progress: Progress) -> Case:
-    """Write a case for images into the output folder, say who is taken for what, and read it."""
-    from palpate.study.case_file import read_case
-    from palpate.study.new_case import write_new_case
-
-    case = write_new_case(arguments.inputs, arguments.labels, outputs, cts=arguments.ct)
-    for tissue in case.tissues:
-        progress(f"{tissue.name}: {tissue.role or '?'}, for {tissue.reason}")
-    progress(f"the case is written to {case.path}")
-    return read_case(case.path, arguments.set)
 
 
 def _write_estimate(result: CaseResult, outputs: OutputFolder, progress: Progress) -> Outcome:

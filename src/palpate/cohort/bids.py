@@ -25,7 +25,11 @@ def read_derivatives(folder: Path, template: Path | None, *, reference: str | No
     """
     if template is None:
         raise ConfigurationError(f"{folder} is a folder of images: --template case.toml must say who is who in them")
-    people = _participants(folder)
+    people: dict[str, dict[str, str]] = {}  # patient -> the columns of participants.tsv; "n/a" is nothing
+    if (folder / PARTICIPANTS).is_file():
+        for cells in separated_cells(folder / PARTICIPANTS, delimiter="\t"):
+            plain = {name: "" if text == "n/a" else text for name, text in cells.items()}
+            people[plain.pop("participant_id", "")] = plain
     rows: list[Row] = []
     for patient in _sorted(folder, "sub-*"):
         sessions = [path for path in _sorted(patient, "ses-*") if any(path.rglob(IMAGES))]
@@ -52,26 +56,10 @@ def _row(rest: Path, session: Path, root: Path, template: Path, person: Mapping[
     row = row_of(cells | images, root, template)
     if any(len(paths) > 1 for paths in found):
         return replace(row, problem=f"{rest.name} or {session.name} has several images {IMAGES}; leave one in each")
-    return replace(row, names=_names(found[0][0], root))
-
-
-def _names(image: Path, root: Path) -> str:
-    """The label table of an image: of its own name, or dseg.tsv in its folder or one above."""
+    image = found[0][0]  # whose label table has its own name, or is dseg.tsv in its folder or one above
     own = image.with_name(image.name.removesuffix(".nii.gz") + ".tsv")
     above = [folder / TABLE for folder in image.parents if folder == root or root in folder.parents]
-    return str(next((path.absolute() for path in (own, *above) if path.is_file()), ""))
-
-
-def _participants(folder: Path) -> dict[str, dict[str, str]]:
-    """Patient -> the columns of participants.tsv; "n/a" is nothing."""
-    path = folder / PARTICIPANTS
-    if not path.is_file():
-        return {}
-    found = {}
-    for cells in separated_cells(path, delimiter="\t"):
-        plain = {name: "" if text == "n/a" else text for name, text in cells.items()}
-        found[plain.pop("participant_id", "")] = plain
-    return found
+    return replace(row, names=str(next((path.absolute() for path in (own, *above) if path.is_file()), "")))
 
 
 def _sorted(folder: Path, pattern: str) -> list[Path]:

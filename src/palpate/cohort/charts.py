@@ -38,7 +38,9 @@ def boxes_svg(patients: Patients, tissue: str, unit: str, *, name: str) -> str:
         labels = []
         for stage in stages:
             own = [patient for patient in patients if patient["stage"] == stage and tissue in patient["summary"]]
-            scans = [value for patient in own for value in _values(patient, tissue)]
+            scans = [
+                value for patient in own for value in patient["kpa"].get(tissue) or patient["ratio"].get(tissue) or []
+            ]
             axes.boxplot(
                 scans,
                 positions=[stage],
@@ -128,11 +130,6 @@ def _stages(patients: Patients, tissue: str) -> list[int]:
     found = sorted({p["stage"] for p in patients if p["stage"] is not None and tissue in p["summary"]})
     if not found:
         raise ValueError("no patient has a stage and a modulus that counts")
-    return found
-
-
-def _values(patient: Mapping[str, Any], tissue: str) -> list[float]:
-    found: list[float] = patient["kpa"].get(tissue) or patient["ratio"].get(tissue) or []
     return found
 
 

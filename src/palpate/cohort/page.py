@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -56,19 +56,19 @@ def cohort_page(records: Sequence[Record], document: Mapping[str, Any], *, creat
 
 def _charts(document: Mapping[str, Any], tissue: str, place: int) -> tuple[_Chart, ...]:
     organ, patients = document["organs"][tissue], document["patients"]
-    draw = {
+    drawings = {
         "Scans by stage, patients as points": partial(boxes_svg, patients, tissue, organ["unit"]),
         "Patients against the stage": partial(scatter_svg, patients, tissue, organ["unit"], organ["weighted"]),
         "Patients": partial(forest_svg, patients, tissue, organ["unit"]),
     }
-    return tuple(_chart(title, partial(one, name=f"c{place}-{i}")) for i, (title, one) in enumerate(draw.items()))
-
-
-def _chart(title: str, draw: Callable[[], str]) -> _Chart:
-    try:
-        return _Chart(title, Markup(draw()))  # noqa: S704 - drawn by us, names in it as paths
-    except ValueError as error:
-        return _Chart(title, None, str(error))
-    except Exception as error:
-        LOGGER.exception("a chart could not be drawn")
-        return _Chart(title, None, f"it could not be drawn ({error})")
+    charts = []
+    for i, (title, draw) in enumerate(drawings.items()):
+        try:
+            svg = draw(name=f"c{place}-{i}")
+            charts.append(_Chart(title, Markup(svg)))  # noqa: S704 - drawn by us, names in it as paths
+        except ValueError as error:
+            charts.append(_Chart(title, None, str(error)))
+        except Exception as error:
+            LOGGER.exception("a chart could not be drawn")
+            charts.append(_Chart(title, None, f"it could not be drawn ({error})"))
+    return tuple(charts)

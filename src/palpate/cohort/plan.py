@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from palpate.cohort.mark import read_mark
 from palpate.cohort.resolve import row_key
@@ -69,14 +68,10 @@ def read_plan(folder: Path) -> Plan:
     content = read_json(folder / PLAN)
     try:
         content.pop("schema")
-        rows = tuple(_row(row) for row in content.pop("rows"))
+        rows = tuple(Row(**{**row, "after": tuple(row["after"])}) for row in content.pop("rows"))
         keys, overrides = tuple(content.pop("keys")), tuple(content.pop("overrides"))
         if len(keys) != len(rows) or not all(KEY.fullmatch(key) for key in keys):
             raise ValueError("its keys are none")
         return Plan(rows, keys, overrides, **content)
     except (KeyError, TypeError, ValueError) as error:
         raise InputDataError(f"{folder / PLAN} is not what Palpate writes ({error}): run the cohort again") from error
-
-
-def _row(content: Mapping[str, Any]) -> Row:
-    return Row(**{**content, "after": tuple(content["after"])})

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from palpate.cohort.plan import CASES, Plan, read_plan
+from palpate.cohort.plan import CASES, read_plan
 from palpate.cohort.task import Outcome
 from palpate.progress import about
 from palpate.study.lock import is_held
@@ -60,21 +59,17 @@ def status_of(folder: Path) -> Status:
     running = [
         row.id for row, mark in zip(plan.rows, marks, strict=True) if mark is None and is_held(folder / CASES / row.id)
     ]
+    took = [mark.seconds for mark in marks if mark is not None and mark.state == "done"]
     waiting = sum(mark is None for mark in marks)
     return Status(
         rows=len(marks),
-        done=sum(mark is not None and mark.state == "done" for mark in marks),
+        done=len(took),
         failed=dict(Counter(mark.failure_class for mark in marks if mark is not None and mark.state == "failed")),
         running=len(running),
         waiting=waiting - len(running),
-        seconds_left=_seconds_left(plan, marks, waiting, len(running)),
+        seconds_left=sum(took) / len(took) * waiting / max(len(running), plan.workers or 1) if took else None,
         active=is_held(folder),
     )
-
-
-def _seconds_left(plan: Plan, marks: Sequence[Outcome | None], waiting: int, running: int) -> float | None:
-    took = [mark.seconds for mark in marks if mark is not None and mark.state == "done"]
-    return sum(took) / len(took) * waiting / max(running, plan.workers or 1) if took else None
 
 
 @dataclass(slots=True)

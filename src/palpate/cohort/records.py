@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from palpate.cohort.mark import document_of
 from palpate.cohort.plan import CASES, Plan
@@ -69,11 +68,10 @@ def _record(plan: Plan, folder: Path, marks: Sequence[Outcome | None], number: i
     document = document_of(place, mark)
     if document is None:
         return Record(row, "waiting")
-    return Record(row, "done", "", mark.message, tuple(map(_modulus, document["estimates"])), *took)
-
-
-def _modulus(item: dict[str, Any]) -> Modulus:
-    in_kpa = item["value"] is not None
-    low, high = (item["interval95"] if in_kpa else item["ratio_interval95"]) or (None, None)
-    value = item["value"] if in_kpa else item["ratio"]
-    return Modulus(item["tissue"], "kPa" if in_kpa else "ratio", value, low, high, item["verdict"])
+    moduli = []
+    for item in document["estimates"]:
+        in_kpa = item["value"] is not None
+        low, high = (item["interval95"] if in_kpa else item["ratio_interval95"]) or (None, None)
+        value = item["value"] if in_kpa else item["ratio"]
+        moduli.append(Modulus(item["tissue"], "kPa" if in_kpa else "ratio", value, low, high, item["verdict"]))
+    return Record(row, "done", "", mark.message, tuple(moduli), *took)

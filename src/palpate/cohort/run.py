@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,7 +13,7 @@ from pathlib import Path
 from palpate.cohort.closing import close_cohort
 from palpate.cohort.engines.contract import Engine
 from palpate.cohort.mark import MARK, held_soon
-from palpate.cohort.plan import CASES, PLAN, Plan, make_plan, write_plan
+from palpate.cohort.plan import CASES, PLAN, make_plan, write_plan
 from palpate.cohort.progress import Tally
 from palpate.cohort.records import Record
 from palpate.cohort.tables import CSV, PARQUET
@@ -77,9 +77,13 @@ def run_cohort(
     if kept:
         progress(f"{kept['done']} done and {kept['failed']} failed before; {len(wanted)} to compute")
     tally = Tally(len(rows), len(wanted), kept)
-    with _tables_at_the_end(plan, folder):
+    try:
         for outcome in engine.outcomes([plan.task(folder, number, options.limits) for number in wanted]):
             progress(tally.add(outcome))
+    except BaseException:  # the tables tell of what is done by then
+        with suppress(PalpateError):
+            close_cohort(plan, folder, tables_only=True)
+        raise
     progress("tables, statistics and page of the cohort")
     return close_cohort(plan, folder)
 
@@ -89,14 +93,3 @@ def _is_wanted(mark: Outcome | None, options: Options) -> bool:
     if mark is None:
         return not options.only_failed or options.resume
     return mark.state == "failed" and (options.only_failed or mark.failure_class == "lost")
-
-
-@contextmanager
-def _tables_at_the_end(plan: Plan, folder: Path) -> Iterator[None]:
-    """Should the block break off, the tables tell of what is done by then."""
-    try:
-        yield
-    except BaseException:
-        with suppress(PalpateError):
-            close_cohort(plan, folder, tables_only=True)
-        raise

@@ -71,9 +71,20 @@ class Supervisor:
     def _started(self) -> subprocess.Popen[bytes]:
         if self._closed:
             raise EOFError
-        if self._process is None or self._process.poll() is not None:
-            self._drop()
-            self._process = _start(self.work)
+        if self._process is not None and self._process.poll() is None:
+            return self._process
+        self._drop()
+        places = os.pathsep.join(str(Path(place).resolve()) for place in sys.path if place)
+        environment = {**os.environ, **dict.fromkeys(THREADS, "1"), "PYTHONPATH": places}
+        command = [sys.executable, "-P", "-W", "ignore", "-m", "palpate.cohort.warm", self.work]
+        try:
+            self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module, no shell
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment
+            )
+        except OSError as error:
+            raise ResourceError(
+                f"no process could be started ({error.strerror}): is memory left, and a process for this user?"
+            ) from error
         return self._process
 
     def _send(self, process: subprocess.Popen[bytes], task: Task) -> None:
@@ -176,17 +187,3 @@ class _Watch:
         if self.ended in (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGHUP, -signal.SIGINT):
             return Outcome.failed(task, "lost", f"something ended the process that computed it ({name})", cause="lost")
         return Outcome.failed(task, "crash", f"the process that computed it crashed ({name}); its log.txt may tell why")
-
-
-def _start(work: str) -> subprocess.Popen[bytes]:
-    places = os.pathsep.join(str(Path(place).resolve()) for place in sys.path if place)
-    environment = {**os.environ, **dict.fromkeys(THREADS, "1"), "PYTHONPATH": places}
-    command = [sys.executable, "-P", "-W", "ignore", "-m", "palpate.cohort.warm", work]
-    try:
-        return subprocess.Popen(  # noqa: S603 - our own interpreter and module, no shell
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment
-        )
-    except OSError as error:
-        raise ResourceError(
-            f"no process could be started ({error.strerror}): is memory left, and a process for this user?"
-        ) from error

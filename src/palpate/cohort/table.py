@@ -51,8 +51,13 @@ def separated_cells(path: Path, *, delimiter: str) -> list[dict[str, str]]:
         raise ConfigurationError(f"{path} is empty: its first line must name the columns: {', '.join(KNOWN)}")
     names = [name.strip() for name in lines[0]]
     _check_names(names, path)
-    if delimiter == ",":
-        _check_complete(names, path)
+    complete = "id" in names and {"case", "before"} & set(names) and ("before" in names) == ("after" in names)
+    if delimiter == "," and not complete:
+        missing = next(name for name in ("id", "before", "after") if name not in names)
+        raise ConfigurationError(
+            f"{path} lacks the column '{missing}': a table has id, and either case (a case file) or before and after"
+            f" (images, with --template); {nearest(missing, names)}"
+        )
     for number, line in enumerate(lines[1:], start=2):
         if any(cell.strip() for cell in line) and len(line) != len(names):
             raise ConfigurationError(
@@ -106,16 +111,6 @@ def _check_names(names: Sequence[str], path: Path) -> None:
             raise ConfigurationError(f"{path}: '{shortened(name)}' cannot be the name of a column; give it another")
         if name in COLUMNS:
             raise ConfigurationError(f"{path}: the column '{name}' is one of the outcome's; rename it")
-
-
-def _check_complete(names: Sequence[str], path: Path) -> None:
-    if "id" in names and {"case", "before"} & set(names) and ("before" in names) == ("after" in names):
-        return
-    missing = next(name for name in ("id", "before", "after") if name not in names)
-    raise ConfigurationError(
-        f"{path} lacks the column '{missing}': a table has id, and either case (a case file) or before and after"
-        f" (images, with --template); {nearest(missing, names)}"
-    )
 
 
 def row_of(cells: Mapping[str, str], folder: Path, template: Path | None) -> Row:

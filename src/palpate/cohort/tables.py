@@ -9,7 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from palpate.cohort.records import Modulus, Record, tissues_of
+from palpate.cohort.records import Record, tissues_of
 from palpate.errors import ResourceError
 from palpate.images.named_labels import computed_by_spreadsheets, printable
 from palpate.study.outputs import write_text
@@ -37,7 +37,7 @@ def columns_of(records: Sequence[Record]) -> dict[str, list[Any]]:
         moduli = [record.modulus(tissue) for record in records]
         for unit, name in UNITS.items():
             if any(modulus is not None and modulus.unit == unit for modulus in moduli):
-                columns[f"{tissue}_{name}"] = [_value(modulus, unit) for modulus in moduli]
+                columns[f"{tissue}_{name}"] = [m.value if m is not None and m.unit == unit else None for m in moduli]
         for end in ("low95", "high95", "verdict"):
             columns[f"{tissue}_{end}"] = [None if modulus is None else getattr(modulus, end) for modulus in moduli]
     for name in dict.fromkeys(name for record in records for name in record.row.covariates):
@@ -78,10 +78,6 @@ def write_parquet(records: Sequence[Record], path: Path) -> None:
         parquet.write_table(pyarrow.table(columns, schema=schema), path)
     except OSError as error:
         raise ResourceError(f"cannot write {path.name}: {error}; free some space") from error
-
-
-def _value(modulus: Modulus | None, unit: str) -> float | None:
-    return modulus.value if modulus is not None and modulus.unit == unit else None
 
 
 def _cell(value: Any) -> str:

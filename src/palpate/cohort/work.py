@@ -65,8 +65,10 @@ def _attempt(task: Task, tell: Tell) -> Outcome:
         if earlier is not None and earlier.key == key and earlier.state == "done":
             return earlier  # somebody else was quicker
         refuse_other_case(case, outputs)
-        if task.coarser > 1.0:
-            case = _coarser(case, task.coarser)
+        if task.coarser > 1.0:  # which the result tells as an override
+            edge = round(case.mesh.edge_length_mm * task.coarser, 3)
+            overrides = (*case.overrides, f"mesh.edge_length_mm={edge}")
+            case = replace(case, mesh=replace(case.mesh, edge_length_mm=edge), overrides=overrides)
         return _estimated(task, case, key, outputs, tell)
 
 
@@ -95,10 +97,3 @@ def _estimated(task: Task, case: Case, key: str, outputs: OutputFolder, tell: Te
         time.monotonic() - began, expected_gb=expected[0] if expected else None, peak_gb=peak_memory_gb()
     )
     return write_mark(outputs.path, took)
-
-
-def _coarser(case: Case, factor: float) -> Case:
-    """The case on a coarser mesh, which its result tells as an override."""
-    edge = round(case.mesh.edge_length_mm * factor, 3)
-    overrides = (*case.overrides, f"mesh.edge_length_mm={edge}")
-    return replace(case, mesh=replace(case.mesh, edge_length_mm=edge), overrides=overrides)

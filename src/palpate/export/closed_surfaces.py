@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from palpate.export.case_files import file_name
 from palpate.export.fitted_model import FittedBody
 from palpate.images.tissue import Role
-from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.surface import tissue_surface
 from palpate.observation.observed_surface import SUBTRIANGLES
 from palpate.study.outputs import write_bytes
@@ -48,26 +47,27 @@ def closed_surfaces(body: FittedBody) -> Iterator[ClosedSurface]:
         faces = tissue_surface(body.mesh, number).triangles
         if not len(faces) or tissue.role is Role.VOID:  # the air around a body is no body
             continue
-        used, local = np.unique(_split(space, faces), return_inverse=True)
+        facets = space.facets(faces)
+        flat = facets[:, SUBTRIANGLES] if space.order == 2 else facets
+        used, local = np.unique(flat, return_inverse=True)
         triangles = local.reshape(-1, 3)
         rims = _rims(triangles)
+        fans = [  # about the points that follow those of the mesh
+            np.stack([np.roll(rim, -1), rim, np.full(len(rim), len(used) + place)], axis=1)
+            for place, rim in enumerate(rims)
+        ]
+        closed = np.concatenate([triangles, *fans])
         for state, points in states.items():
             caps = [points[used][rim].mean(axis=0) for rim in rims]
             stem = f"{number:02d}_{file_name(tissue.name)}_{state}"
             own = np.concatenate([points[used], np.reshape(caps, (-1, 3))])
-            yield ClosedSurface(stem, tissue.name, state, own, _closed(triangles, rims, len(used)))
+            yield ClosedSurface(stem, tissue.name, state, own, closed)
 
 
 def write_surfaces(body: FittedBody, folder: Path, ending: str, content: Callable[[ClosedSurface], bytes]) -> None:
     """Write each closed surface to a file of its own; raises `ResourceError` when the disk refuses."""
     for surface in closed_surfaces(body):
         write_bytes(folder / f"{surface.stem}.{ending}", content(surface))
-
-
-def _split(space: LagrangeSpace, faces: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Flat triangles (n, 3) between the points of the space on faces (n_faces, 3)."""
-    facets = space.facets(faces)
-    return np.asarray(facets[:, SUBTRIANGLES].reshape(-1, 3)) if space.order == 2 else facets
 
 
 def _rims(triangles: NDArray[np.int64]) -> list[NDArray[np.int64]]:
@@ -90,12 +90,3 @@ def _rims(triangles: NDArray[np.int64]) -> list[NDArray[np.int64]]:
             point = point_after
         rims.append(np.array(rim))
     return rims
-
-
-def _closed(triangles: NDArray[np.int64], rims: list[NDArray[np.int64]], n_points: int) -> NDArray[np.int64]:
-    """The triangles with a fan over each rim, about the points from number `n_points` on."""
-    fans = [
-        np.stack([np.roll(rim, -1), rim, np.full(len(rim), n_points + number)], axis=1)
-        for number, rim in enumerate(rims)
-    ]
-    return np.concatenate([triangles, *fans])

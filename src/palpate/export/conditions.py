@@ -49,26 +49,17 @@ def prescribed(body: FittedBody, space: LagrangeSpace, *, outer: str) -> Prescri
     constraint = outer_constraint(
         space, outer=outer, modes=np.zeros((n, 0)), offset=np.zeros(n), prescribed=walls.prescribed
     )
-    # the part of each axis that is free at each point, 0 or 1
-    axes, rows = _axes(body), constraint.free.tocsr()
-    free = np.stack([_free_share(rows, axis) for axis in axes], axis=1)
+    axes = (body.grid.affine[:3, :3] / body.grid.spacing).T
+    sizes = np.abs(axes)
+    if np.all(np.minimum(sizes, 1.0 - sizes) < IN_FRAME):  # the world's axes, maybe reordered
+        axes = np.eye(3)
+    rows, free = constraint.free.tocsr(), np.empty((len(space.points), 3))
+    for place, axis in enumerate(axes):  # the square of what of it lies among each point's free directions, 0 or 1
+        blocks = sparse.kron(sparse.eye_array(len(space.points)), axis[None]).tocsr() @ rows
+        free[:, place] = np.asarray(blocks.multiply(blocks).sum(axis=1)).ravel()
     counts = np.rint(free.sum(axis=1))
     sliding = np.flatnonzero((counts > 0.0) & (counts < 3.0))
     share = free[sliding]
     if np.any(np.minimum(share, 1.0 - share) > IN_FRAME):
         raise ConfigurationError("the sliding faces do not lie along the image's axes, which no export can state")
     return Prescribed(np.flatnonzero(counts == 0.0), sliding, share < 0.5, axes)
-
-
-def _free_share(rows: sparse.csr_matrix[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Square (n_points,) of the part of a unit vector (3,) that lies among each point's free directions."""
-    n_points = rows.shape[0] // 3
-    blocks = sparse.kron(sparse.eye_array(n_points), axis[None]).tocsr() @ rows
-    return np.asarray(blocks.multiply(blocks).sum(axis=1)).ravel()
-
-
-def _axes(body: FittedBody) -> NDArray[np.float64]:
-    """Unit vectors (3, 3), in rows, along the image's axes; the world's where they are these, maybe reordered."""
-    axes = (body.grid.affine[:3, :3] / body.grid.spacing).T
-    sizes = np.abs(axes)
-    return np.eye(3) if np.all(np.minimum(sizes, 1.0 - sizes) < IN_FRAME) else np.asarray(axes)

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.formats import Options
@@ -43,10 +42,10 @@ TISSUES = (
 def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
     """Write tissues.csv, groups.csv and samples.csv (chain, draw, tissue, youngs_modulus); no value: empty."""
     del options
-    areas = [
-        (group.name, len(group.triangles), _number(_area(body.mesh.nodes, group.triangles)))
-        for group in face_groups(body.mesh)
-    ]
+    areas = []
+    for group in face_groups(body.mesh):
+        area = float(np.linalg.norm(triangle_normals(body.mesh.nodes, group.triangles), axis=1).sum())
+        areas.append((group.name, len(group.triangles), _number(area)))
     _table(folder / "tissues.csv", TISSUES, _tissues(model, body))
     _table(folder / "groups.csv", ("group", "faces", "area_before_mm2"), areas)
     samples = moduli_samples(model)
@@ -69,10 +68,6 @@ def _tissues(model: FittedModel, body: FittedBody) -> Iterable[Sequence[object]]
             *(_number(tissue.poisson_ratio) if tissue.meshed else "",),
             *(_number(volumes[region].sum()) if tissue.meshed else "" for volumes in (before, after)),
         )
-
-
-def _area(nodes: NDArray[np.float64], triangles: NDArray[np.int64]) -> float:
-    return float(np.linalg.norm(triangle_normals(nodes, triangles), axis=1).sum())
 
 
 def _number(value: float | None) -> str:

@@ -21,7 +21,6 @@ from palpate.export.formats import Options
 from palpate.export.rasterise import region_image
 from palpate.images.input_file import read_input
 from palpate.images.segmentation import first_labels
-from palpate.images.tissue import Tissue
 from palpate.images.tissue_colours import tissue_colours
 from palpate.study.outputs import write_bytes
 from palpate.study.provenance import software_versions
@@ -69,6 +68,8 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
         found = highdicom.Volume(turned, affine, coordinate_system="PATIENT", frame_of_reference_uid=frame)
         return found.to_patient_orientation(axes)
 
+    moduli = np.nan_to_num(np.append(model.moduli, 0.0)).astype(np.float32)  # 0 where nothing is meshed
+    stiffness = volume(moduli[region_image(body.mesh, body.grid)])
     common = {
         "manufacturer": "Palpate",
         "manufacturer_model_name": "Palpate",
@@ -78,7 +79,7 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
         "instance_number": 1,
     }
     made = {
-        "stiffness.dcm": _map(highdicom, slices, volume(_stiffness(model, body)), model, common),
+        "stiffness.dcm": _map(highdicom, slices, stiffness, model, common),
         "segmentation.dcm": _segmentation(highdicom, slices, volume, body, common),
     }
     for name, dataset in made.items():
@@ -87,12 +88,6 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
         content = io.BytesIO()
         dataset.save_as(content, enforce_file_format=True)
         write_bytes(folder / name, content.getvalue())
-
-
-def _stiffness(model: FittedModel, body: FittedBody) -> NDArray[np.float32]:
-    """Young's modulus (n_x, n_y, n_z) of the voxels, 0 where nothing is meshed."""
-    moduli = np.nan_to_num(np.append(model.moduli, 0.0)).astype(np.float32)
-    return np.asarray(moduli[region_image(body.mesh, body.grid)])
 
 
 def _map(highdicom: Any, slices: list[Dataset], volume: Any, model: FittedModel, common: dict[str, Any]) -> Dataset:
@@ -136,13 +131,17 @@ def _segmentation(
     )
     labels = first_labels(body.tissues)
     numbers = {number: place for place, number in enumerate(np.argsort(labels).tolist(), start=1)}
-    colours = tissue_colours(body.tissues)
+    colours, organs = tissue_colours(body.tissues), []
+    for tissue in body.tissues:
+        known = [code for word, code in ORGANS.items() if word in tissue.name.lower()]
+        code, meaning = known[0] if known else ("85756007", "Tissue")
+        organs.append(highdicom.sr.CodedConcept(code, "SCT", meaning))
     segments = [
         highdicom.seg.SegmentDescription(
             segment_number=place,
             segment_label=body.tissues[number].name[:64],
             segmented_property_category=highdicom.sr.CodedConcept("85756007", "SCT", "Tissue"),
-            segmented_property_type=highdicom.sr.CodedConcept(*_kind(body.tissues[number])),
+            segmented_property_type=organs[number],
             algorithm_type="SEMIAUTOMATIC",
             algorithm_identification=algorithm,
             display_color=highdicom.color.CIELabColor.from_string(colours[number]),
@@ -163,13 +162,6 @@ def _segmentation(
     )
     found.SeriesDescription = "Tissues, Palpate"
     return found
-
-
-def _kind(tissue: Tissue) -> tuple[str, str, str]:
-    """Code, scheme and meaning of a tissue."""
-    known = [code for word, code in ORGANS.items() if word in tissue.name.lower()]
-    code, meaning = known[0] if known else ("85756007", "Tissue")
-    return code, "SCT", meaning
 
 
 def _placeholder() -> Dataset:

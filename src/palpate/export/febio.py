@@ -60,7 +60,13 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
     steps = _add(root, "Step")
     for number in range(1, len(body.displacements) + 1):
         step = _add(steps, "step", id=number, name=f"later image {number}")
-        _control(step)
+        control = _add(step, "Control")  # a later image takes one unit of time
+        for key, value in {"analysis": "STATIC", "time_steps": STEPS, "step_size": 1.0 / STEPS}.items():
+            _add(control, key, value)
+        stepper = _add(control, "time_stepper", type="default")
+        for name, limit in {"max_retries": 10, "dtmin": 0.001, "dtmax": 1.0 / STEPS}.items():
+            _add(stepper, name, limit)
+        _add(control, "solver", type="solid")
         _boundary(step, data, body, held, number)
         _curve(curves, number)
     output = _add(_add(root, "Output"), "plotfile", type="febio")
@@ -106,7 +112,9 @@ def _mesh(mesh: Element, body: FittedBody, space: LagrangeSpace, held: Prescribe
     facets = {group.name: space.facets(group.triangles) for group in face_groups(body.mesh)}
     pressed = {f"load {n}": load.faces for n, load in enumerate(loads, start=1) if isinstance(load, FollowingPressure)}
     for name, faces in (facets | pressed).items():
-        _surface(mesh, name, faces)
+        surface = _add(mesh, "Surface", name=name)
+        for number, facet in enumerate(faces.tolist(), start=1):
+            _add(surface, f"tri{len(facet)}", ",".join(str(p + 1) for p in facet), id=number)
     for name, faces in facets.items():
         _node_set(mesh, f"{name} nodes", np.unique(faces))
     for number, load in enumerate(loads, start=1):
@@ -115,12 +123,6 @@ def _mesh(mesh: Element, body: FittedBody, space: LagrangeSpace, held: Prescribe
     _node_set(mesh, "prescribed", held.whole)
     for axis, points in _sliding(held):
         _node_set(mesh, f"sliding {AXES[axis]}", points)
-
-
-def _surface(mesh: Element, name: str, facets: NDArray[np.int64]) -> None:
-    surface = _add(mesh, "Surface", name=name)
-    for number, facet in enumerate(facets.tolist(), start=1):
-        _add(surface, f"tri{len(facet)}", ",".join(str(p + 1) for p in facet), id=number)
 
 
 def _node_set(mesh: Element, name: str, points: NDArray[np.int64]) -> None:
@@ -171,17 +173,6 @@ def _loads(data: Element, parent: Element, loads: tuple[Load, ...], n_points: in
             _add(values, "node", ",".join(f"{x:.12g}" for x in force), lid=place)
         nodal = _add(parent, "nodal_load", name=name, type="nodal_force", node_set=name)
         _add(nodal, "value", name, lc=curve, type="map")
-
-
-def _control(step: Element) -> None:
-    """The control of the step of a later image, which takes one unit of time."""
-    control = _add(step, "Control")
-    for key, value in {"analysis": "STATIC", "time_steps": STEPS, "step_size": 1.0 / STEPS}.items():
-        _add(control, key, value)
-    stepper = _add(control, "time_stepper", type="default")
-    for name, limit in {"max_retries": 10, "dtmin": 0.001, "dtmax": 1.0 / STEPS}.items():
-        _add(stepper, name, limit)
-    _add(control, "solver", type="solid")
 
 
 def _curve(parent: Element, number: int) -> None:

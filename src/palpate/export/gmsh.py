@@ -32,9 +32,15 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
     parts = ["$MeshFormat\n4.1 0 8\n$EndMeshFormat\n", "$PhysicalNames\n", f"{len(names) + len(volumes)}\n"]
     parts += [f'2 {tag} "{_quoted(name)}"\n' for tag, name in enumerate(names, start=1)]
     parts += [f'3 {tag} "{_quoted(name)}"\n' for tag, name in enumerate(volumes, start=1)]
-    parts += ["$EndPhysicalNames\n", *_entities(space, surfaces, list(volumes.values()))]
+    parts.append(f"$EndPhysicalNames\n$Entities\n0 0 {len(surfaces)} {len(volumes)}\n")
+    for tag, (groups, triangles) in enumerate(surfaces, start=1):
+        tags = " ".join(map(str, groups))
+        parts.append(f"{tag} {_box(space.points[triangles])} {len(groups)} {tags} 0\n")
+    for tag, cells in enumerate(volumes.values(), start=1):
+        parts.append(f"{tag} {_box(space.points[space.cells[cells]])} 1 {tag} 0\n")
     n = len(space.points)
     parts += [
+        "$EndEntities\n",
         f"$Nodes\n1 {n} 1 {n}\n3 1 0 {n}\n",
         rows("%d", np.arange(1, n + 1)),
         rows("%.16g %.16g %.16g", space.points),
@@ -72,20 +78,6 @@ def _surfaces(body: FittedBody) -> tuple[list[tuple[tuple[int, ...], NDArray[np.
         for number, row in enumerate(kinds)
     ]
     return found, [group.name for group in groups]
-
-
-def _entities(
-    space: LagrangeSpace,
-    surfaces: list[tuple[tuple[int, ...], NDArray[np.int64]]],
-    volumes: list[NDArray[np.int64]],
-) -> list[str]:
-    parts = [f"$Entities\n0 0 {len(surfaces)} {len(volumes)}\n"]
-    for tag, (groups, triangles) in enumerate(surfaces, start=1):
-        tags = " ".join(map(str, groups))
-        parts.append(f"{tag} {_box(space.points[triangles])} {len(groups)} {tags} 0\n")
-    for tag, cells in enumerate(volumes, start=1):
-        parts.append(f"{tag} {_box(space.points[space.cells[cells]])} 1 {tag} 0\n")
-    return [*parts, "$EndEntities\n"]
 
 
 def _elements(

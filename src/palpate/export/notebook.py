@@ -46,21 +46,15 @@ def notebook_viewer(result: CaseResult, *, background: Path | None = None, opaci
             opacity=opacity,
         )
         if background is None:
-            under = ipyniivue.Volume(
-                data=labels.read_bytes(), name=labels.name, colormap_label=_table(ipyniivue, result), opacity=1.0
-            )
+            colours = [bytes.fromhex(colour[1:]) for colour in tissue_colours(result.tissues)]
+            opaque = [0 if tissue.role is Role.VOID else 255 for tissue in result.tissues]
+            table = [part for colour, alpha in zip(colours, opaque, strict=True) for part in (*colour, alpha)]
+            names = [tissue.name for tissue in result.tissues]
+            shades = ipyniivue.LUT(lut=table, min=0.0, max=len(names) - 1.0, labels=names)
+            under = ipyniivue.Volume(data=labels.read_bytes(), name=labels.name, colormap_label=shades, opacity=1.0)
         else:
             under = ipyniivue.Volume(path=background, colormap="gray", opacity=1.0)
     under.colorbar_visible = False  # the bar is the modulus's
     viewer = ipyniivue.NiiVue(height=400, is_colorbar=True)
     viewer.load_volumes([under, over])
     return viewer
-
-
-def _table(ipyniivue: Any, result: CaseResult) -> Any:
-    """Colour and name of each tissue in their order; what lies around the body is clear."""
-    colours = [bytes.fromhex(colour[1:]) for colour in tissue_colours(result.tissues)]
-    opaque = [0 if tissue.role is Role.VOID else 255 for tissue in result.tissues]
-    table = [part for colour, alpha in zip(colours, opaque, strict=True) for part in (*colour, alpha)]
-    names = [tissue.name for tissue in result.tissues]
-    return ipyniivue.LUT(lut=table, min=0.0, max=len(names) - 1.0, labels=names)

@@ -81,7 +81,7 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
     ply.write(model, body, folder, options)
     warp.write(model, body, folder, options)
     shown = zip(body.tissues, tissue_colours(body.tissues), strict=True)
-    colours = {tissue.name: _rgb(colour) for tissue, colour in shown}
+    colours = {tissue.name: [part / 255.0 for part in bytes.fromhex(colour[1:])] for tissue, colour in shown}
     roles = {tissue.name: str(tissue.role) for tissue in body.tissues}
     known = model.moduli[np.isfinite(model.moduli)]
     name = "Young's modulus (kPa)" if model.unit == "kPa" else f"Young's modulus (ratio to {model.relative_to})"
@@ -101,8 +101,3 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
     }
     write_json(folder / "scene.json", scene)
     write_text(folder / "load_in_slicer.py", SCRIPT)
-
-
-def _rgb(colour: str) -> list[float]:
-    """Red, green, blue (3,) from 0 to 1 of #rrggbb."""
-    return [int(colour[start : start + 2], 16) / 255.0 for start in (1, 3, 5)]

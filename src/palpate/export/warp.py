@@ -37,15 +37,22 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
     """Write warp.nii.gz, inverse_warp.nii.gz (numbered where there are several later images) and warp.json."""
     del model, options
     space, grid = body.space, _field_grid(body.grid)
-    surface = np.unique(space.facets(_surface_triangles(body)))
+    meshed = [number for number, tissue in enumerate(body.tissues) if tissue.meshed]
+    borders = np.concatenate([tissue_surface(body.mesh, number).triangles for number in meshed])
+    surface = np.unique(space.facets(borders))
     numbers = [f"_{n}" for n in range(1, len(body.displacements) + 1)] if len(body.displacements) > 1 else [""]
     entries = []
     for ending, displacement, alignment in zip(numbers, body.displacements, body.alignments, strict=True):
         field = field_on_grid(space, displacement, grid)
-        back = _inverse(field, grid)
-        write_displacement_field(folder / f"warp{ending}.nii.gz", _aligned(field, grid, alignment), grid)
+        places = _centres(grid, np.ones(grid.shape, dtype=bool))
+        back = _inverse(field, grid, places)
+        # to where the later image itself has the points: x + d = A (x + u) at the voxel centres x
+        moved = _by(alignment, places + field.reshape(-1, 3)) - places
+        write_displacement_field(folder / f"warp{ending}.nii.gz", moved.reshape(field.shape), grid)
         there = VoxelGrid(grid.shape, alignment @ grid.affine)  # the same box in the later image's world
-        write_displacement_field(folder / f"inverse_warp{ending}.nii.gz", _unaligned(back, grid, alignment), there)
+        # from there: y + d = z + v(z), y = A z, at the voxel centres z
+        moved = places + back.reshape(-1, 3) - _by(alignment, places)
+        write_displacement_field(folder / f"inverse_warp{ending}.nii.gz", moved.reshape(back.shape), there)
         before, motion = space.points[surface], displacement[surface]
         off = _sampled(field, grid, before) - motion
         returned = _sampled(back, grid, before + motion) + motion
@@ -95,12 +102,6 @@ def _rms(vectors: NDArray[np.float64]) -> float:
     return float(np.sqrt((vectors**2).sum(axis=1).mean()))
 
 
-def _surface_triangles(body: FittedBody) -> NDArray[np.int64]:
-    """Faces (n, 3) of the mesh's border and of the tissues within it."""
-    meshed = [number for number, tissue in enumerate(body.tissues) if tissue.meshed]
-    return np.concatenate([tissue_surface(body.mesh, number).triangles for number in meshed])
-
-
 def _centres(grid: VoxelGrid, mask: NDArray[np.bool_]) -> NDArray[np.float64]:
     return grid.world(np.argwhere(mask).astype(float))
 
@@ -136,9 +137,12 @@ def _filled(field: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.
     else:
         start = np.broadcast_to(field[known].mean(axis=0), field.shape)
     found = np.where(known[..., None], field, start)
-    unknown = ~known
+    unknown, inner = ~known, slice(1, -1)
     for _ in range(SWEEPS):
-        found[unknown] = _neighbours_mean(found)[unknown]
+        padded = np.pad(found, [(1, 1)] * 3 + [(0, 0)], mode="edge")
+        total = padded[2:, inner, inner] + padded[:-2, inner, inner] + padded[inner, 2:, inner]
+        total += padded[inner, :-2, inner] + padded[inner, inner, 2:] + padded[inner, inner, :-2]
+        found[unknown] = (total / 6.0)[unknown]
     return found
 
 
@@ -149,14 +153,6 @@ def _halved(field: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(padded.reshape(x // 2, 2, y // 2, 2, z // 2, 2, m).sum(axis=(1, 3, 5)))
 
 
-def _neighbours_mean(field: NDArray[np.float64]) -> NDArray[np.float64]:
-    padded = np.pad(field, [(1, 1)] * 3 + [(0, 0)], mode="edge")
-    inner = slice(1, -1)
-    total = padded[2:, inner, inner] + padded[:-2, inner, inner] + padded[inner, 2:, inner]
-    total += padded[inner, :-2, inner] + padded[inner, inner, 2:] + padded[inner, inner, :-2]
-    return np.asarray(total / 6.0)
-
-
 def _sampled(field: NDArray[np.float64], grid: VoxelGrid, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """The field (n, 3) at points (n, 3) mm, interpolated linearly as ITK does; beyond the grid that of its border."""
     index = grid.index(points).T
@@ -165,9 +161,8 @@ def _sampled(field: NDArray[np.float64], grid: VoxelGrid, points: NDArray[np.flo
     )
 
 
-def _inverse(field: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.float64]:
-    """V (n_x, n_y, n_z, 3) mm with v(y) = -u(y + v(y)) at the voxel centres, by fixed-point iteration."""
-    places = _centres(grid, np.ones(grid.shape, dtype=bool))
+def _inverse(field: NDArray[np.float64], grid: VoxelGrid, places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """V (n_x, n_y, n_z, 3) mm with v(y) = -u(y + v(y)) at the voxel centres (n, 3) mm, by fixed-point iteration."""
     back = -field.reshape(-1, 3)
     active = np.arange(len(places))
     for number in range(INVERSIONS):
@@ -176,18 +171,6 @@ def _inverse(field: NDArray[np.float64], grid: VoxelGrid) -> NDArray[np.float64]
         back[active] += change if number < INVERSIONS // 2 else 0.5 * change  # where u is steep it would swing
         active = active[np.abs(change).max(axis=1) > SAME_MM]
     return back.reshape(field.shape)
-
-
-def _aligned(field: NDArray[np.float64], grid: VoxelGrid, alignment: NDArray[np.float64]) -> NDArray[np.float64]:
-    """D with x + d = A (x + u) at the voxel centres x of `grid`: to where the later image itself has the points."""
-    places = _centres(grid, np.ones(grid.shape, dtype=bool))
-    return np.asarray((_by(alignment, places + field.reshape(-1, 3)) - places).reshape(field.shape))
-
-
-def _unaligned(back: NDArray[np.float64], grid: VoxelGrid, alignment: NDArray[np.float64]) -> NDArray[np.float64]:
-    """D with y + d = z + v(z), y = A z, at the voxel centres z of `grid`: from where the later image has the points."""
-    places = _centres(grid, np.ones(grid.shape, dtype=bool))
-    return np.asarray((places + back.reshape(-1, 3) - _by(alignment, places)).reshape(back.shape))
 
 
 def _by(alignment: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:

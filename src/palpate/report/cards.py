@@ -55,7 +55,15 @@ def moduli_figure(document: Mapping[str, Any], colours: Mapping[str, str]) -> Fi
         figure = Figure(figsize=(6.4, 1.2 + 0.55 * max(len(items), 1)), layout="constrained")
         axes = figure.add_subplot()
         axes.set_xscale("log")
-        _set_scale(axes, items)
+        numbers = [item["truth"] for item in items]
+        for item in items:
+            value, interval = main_numbers(item)
+            numbers += [value, *(interval or ())]
+        known = [number for number in numbers if number]
+        axes.set_xlim(min(known, default=1.0) / ROOM, max(known, default=1.0) * ROOM)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
         for row, item in enumerate(items):
             _draw_item(axes, row, item, colours.get(item["tissue"], GREY))
         axes.set_yticks(range(len(items)), [f"{item['tissue']}\n{item['verdict']}" for item in items])
@@ -64,19 +72,6 @@ def moduli_figure(document: Mapping[str, Any], colours: Mapping[str, str]) -> Fi
         axes.set_xlabel("Young's modulus (kPa), 95 % interval" if in_kpa else "ratio of moduli, 95 % interval")
         axes.grid(visible=True, axis="x", alpha=0.3)
     return figure
-
-
-def _set_scale(axes: Axes, items: list[Mapping[str, Any]]) -> None:
-    """Limits around all numbers, with ticks that are written out."""
-    numbers = [item["truth"] for item in items]
-    for item in items:
-        value, interval = main_numbers(item)
-        numbers += [value, *(interval or ())]
-    known = [number for number in numbers if number]
-    axes.set_xlim(min(known, default=1.0) / ROOM, max(known, default=1.0) * ROOM)
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _draw_item(axes: Axes, row: int, item: Mapping[str, Any], colour: str) -> None:

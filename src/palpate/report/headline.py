@@ -38,20 +38,14 @@ def headline(document: Mapping[str, Any]) -> Headline:
     for item in document["estimates"]:
         verdicts.setdefault(item["verdict"], []).append(item["tissue"])
     sentences = [FOUND[verdict].format(listed(verdicts[verdict])) for verdict in FOUND if verdict in verdicts]
+    starts = document["starts"]
+    if len(starts) > 1:
+        answers = len({start["minimum"] for start in starts})
+        several = f"The search from {len(starts)} starts led to {answers} different answers; the best one is shown."
+        same = f"The search led to the same answer from all {len(starts)} starts."
+        sentences.append(several if answers > 1 else same)
     good = set(verdicts) <= {"identified", "ratio only"} and not count
-    return Headline(
-        "good" if good else "fair", "A result was found.", (*sentences, *_starts(document["starts"])), warnings, reason
-    )
-
-
-def _starts(starts: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
-    """Whether all starts of the search agree."""
-    if len(starts) < 2:
-        return ()
-    answers = len({start["minimum"] for start in starts})
-    if answers > 1:
-        return (f"The search from {len(starts)} starts led to {answers} different answers; the best one is shown.",)
-    return (f"The search led to the same answer from all {len(starts)} starts.",)
+    return Headline("good" if good else "fair", "A result was found.", tuple(sentences), warnings, reason)
 
 
 def listed(names: Sequence[str]) -> str:

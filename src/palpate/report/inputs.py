@@ -5,7 +5,6 @@ from __future__ import annotations
 import igl
 import numpy as np
 
-from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.report.pairs import ImagePair
 from palpate.report.report_data import BoneDistance, InputImage, TriangleSurface
@@ -25,15 +24,11 @@ def input_images(pairs: tuple[ImagePair, ...]) -> tuple[InputImage, ...]:
         images = (pair.result.before, *pair.result.after)
         digests = [pair.result.provenance.inputs.get(name, "") for name in keys]
         for later, (name, image, sha256) in enumerate(zip((pair.before, *pair.after), images, digests, strict=True)):
-            found.append(_described(name, number, image, later=later > 0, sha256=sha256))
+            counts = np.bincount(image.index.ravel(), minlength=len(image.tissues))
+            x, y, z = (float(edge) for edge in image.grid.spacing)
+            volumes = tuple((counts * (image.grid.voxel_volume / 1000.0)).tolist())
+            found.append(InputImage(name, number, later > 0, image.grid.shape, (x, y, z), volumes, sha256))
     return tuple(found)
-
-
-def _described(name: str, pair: int, image: Segmentation, *, later: bool, sha256: str) -> InputImage:
-    counts = np.bincount(image.index.ravel(), minlength=len(image.tissues))
-    x, y, z = (float(edge) for edge in image.grid.spacing)
-    volumes = tuple((counts * (image.grid.voxel_volume / 1000.0)).tolist())
-    return InputImage(name, pair, later, image.grid.shape, (x, y, z), volumes, sha256)
 
 
 def bone_distances(

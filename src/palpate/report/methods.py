@@ -46,13 +46,16 @@ class _Citations:
 def methods_text(data: ReportData) -> Methods:
     """What was done to the images of this case, in sentences that can be taken over."""
     cite = _Citations({})
+    leaning = listed([item["tissue"] for item in data.document["estimates"] if item.get("interval_kind") == "profile"])
+    if leaning:
+        leaning = f"; of {leaning}, whose profile likelihood leans to one side, its ends are those of the profile"
     paragraphs = (
         _aim(data, cite),
         _model(data, cite),
         _fit(data, cite),
         (
             "The 95 % intervals come from the sandwich covariance of the parameters under spatially correlated"
-            f" residuals {cite('white')}, with the scatter over the voxel grid's position added{_leaning(data)}. They"
+            f" residuals {cite('white')}, with the scatter over the voxel grid's position added{leaning}. They"
             " do not cover the errors of the mesh, of the material law, of Poisson's ratios, of the boundary condition"
             f" and of the given moduli. The seed of random numbers was {data.document['seed']}."
         ),
@@ -65,12 +68,6 @@ def methods_text(data: ReportData) -> Methods:
         tuple(reference_line(sources[key]) for key in cite.cited),
         "\n\n".join(bibtex(key, sources[key]) for key in cite.cited),
     )
-
-
-def _leaning(data: ReportData) -> str:
-    """What was done where the profile likelihood is not symmetric."""
-    own = listed([item["tissue"] for item in data.document["estimates"] if item.get("interval_kind") == "profile"])
-    return f"; of {own}, whose profile likelihood leans to one side, its ends are those of the profile" if own else ""
 
 
 def _aim(data: ReportData, cite: _Citations) -> str:

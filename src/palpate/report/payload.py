@@ -78,7 +78,16 @@ def payload(data: ReportData) -> Payload:
         "views": [
             {"name": v.name, "normal": v.normal, "across": v.across, "up": v.up, "letters": v.letters} for v in VIEWS
         ],
-        "references": [_reference(reference, packer) for reference in data.references],
+        "references": [
+            {
+                "name": reference.name,
+                "box": _box(reference.slices),
+                "whole": _box(reference.whole),
+                "background": _volume(reference.background, packer),
+                "surfaces": [_surface(surface, packer) for surface in reference.surfaces],
+            }
+            for reference in data.references
+        ],
         "later": [_later(data, later, packer) for later in data.later],
         "mesh": _mesh(data.mesh, packer),
         "angles": _scale(angle_scale()),
@@ -110,16 +119,6 @@ def _quantum(data: ReportData) -> tuple[NDArray[np.float64], float]:
     low = np.min([cloud.min(axis=0) for cloud in clouds], axis=0).astype(np.float64)
     high = np.max([cloud.max(axis=0) for cloud in clouds], axis=0).astype(np.float64)
     return low, max(float((high - low).max()) / LEVELS, 1e-9)
-
-
-def _reference(reference: Reference, packer: _Packer) -> dict[str, Any]:
-    return {
-        "name": reference.name,
-        "box": _box(reference.slices),
-        "whole": _box(reference.whole),
-        "background": _volume(reference.background, packer),
-        "surfaces": [_surface(surface, packer) for surface in reference.surfaces],
-    }
 
 
 def _box(box: SliceBox | None) -> dict[str, list[float]] | None:

@@ -22,26 +22,22 @@ def sensitivity_page(document: Mapping[str, Any]) -> str:
     tissues = []
     for place, item in enumerate(document["estimates"]):
         value, interval = main_numbers(item)
-        rows = tornado_rows(document, item["tissue"])
+        tissue, sobol = item["tissue"], document["sobol"]
+        indices = []  # name of each input with its first and total index, the largest total first
+        if sobol is not None:
+            parts = [sobol[key][tissue] for key in ("total", "total_half", "first", "first_half")]
+            named = zip([NAMES[of["cause"]].format(of["subject"]) for of in sobol["inputs"]], *parts, strict=True)
+            ranked = sorted(named, key=lambda row: -row[1])
+            indices = [(name, f"{a:.3f} ± {ah:.3f}", f"{b:.3f} ± {bh:.3f}") for name, b, bh, a, ah in ranked]
         tissues.append(
             {
-                "name": item["tissue"],
+                "name": tissue,
                 "value": number(value),
                 "unit": "kPa" if item["unit"] == "kPa" else f"× {item['relative_to']}",
                 "interval": interval_text(interval),
-                "chart": Markup(tornado_svg(document, item["tissue"], name=f"tornado{place}")),  # noqa: S704 - ours
-                "rows": [(row, effect_text(row)) for row in rows],
-                "sobol": _sobol_rows(document["sobol"], item["tissue"]),
+                "chart": Markup(tornado_svg(document, tissue, name=f"tornado{place}")),  # noqa: S704 - ours
+                "rows": [(row, effect_text(row)) for row in tornado_rows(document, tissue)],
+                "sobol": indices,
             }
         )
     return str(environment.get_template("sensitivity.html").render(document=document, tissues=tissues))
-
-
-def _sobol_rows(sobol: Mapping[str, Any] | None, tissue: str) -> list[tuple[str, str, str]]:
-    """Name of each input with its first and total index, the largest total first."""
-    if sobol is None:
-        return []
-    parts = [sobol[key][tissue] for key in ("total", "total_half", "first", "first_half")]
-    named = zip([NAMES[of["cause"]].format(of["subject"]) for of in sobol["inputs"]], *parts, strict=True)
-    ranked = sorted(named, key=lambda row: -row[1])
-    return [(name, f"{a:.3f} ± {ah:.3f}", f"{b:.3f} ± {bh:.3f}") for name, b, bh, a, ah in ranked]

@@ -110,6 +110,12 @@ def tornado_svg(document: Mapping[str, Any], tissue: str, *, name: str) -> str:
     reach = min(1.15 * max(rows[0].size, LEAST), WIDEST)
     value, interval = main_numbers(estimate)
     height = 0.8 + 0.3 * len(rows)
+    labels = [row.label if len(row.label) <= LETTERS else f"{row.label[: LETTERS - 3]}..." for row in rows]
+    marks = [1.0]  # round ratios within the axis, not closer than a twelfth of it
+    for mark in sorted(MARKS, key=lambda m: -abs(math.log(m))):
+        apart = min(abs(math.log(mark / other)) for other in marks)
+        if abs(math.log(mark)) <= reach and apart >= reach / 6.0:
+            marks.append(mark)
 
     def draw(figure: Figure) -> None:
         """A bar a row, blue to the left and orange to the right, a tick a setting."""
@@ -126,10 +132,10 @@ def tornado_svg(document: Mapping[str, Any], tissue: str, *, name: str) -> str:
             inside = [change for change in row.effects.values() if abs(change) <= reach]
             axes.plot(inside, [place] * len(inside), "|", color=INK, markersize=7)
         axes.axvline(0.0, color=INK, linewidth=0.9)
-        axes.set_yticks(range(len(rows)), [_label(row.label) for row in rows])
+        axes.set_yticks(range(len(rows)), labels)
         axes.set_ylim(len(rows) - 0.4, -0.6)
         axes.set_xlim(-reach, reach)
-        axes.xaxis.set_major_locator(FixedLocator([math.log(m) for m in _marks(reach)]))
+        axes.xaxis.set_major_locator(FixedLocator([math.log(m) for m in marks]))
         axes.xaxis.set_minor_locator(NullLocator())
         axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{math.exp(x):.2g}"))
         axes.set_xlabel("modulus, times the estimate")
@@ -137,17 +143,3 @@ def tornado_svg(document: Mapping[str, Any], tissue: str, *, name: str) -> str:
 
     told = "; ".join(f"{row.label}: {effect_text(row)}" for row in rows)
     return draw_svg(draw, size=(7.2, height), name=name, says=f"Tornado of {tissue}: {told}.")
-
-
-def _label(text: str) -> str:
-    return text if len(text) <= LETTERS else f"{text[: LETTERS - 3]}..."
-
-
-def _marks(reach: float) -> list[float]:
-    """Round ratios within the axis, not closer than a twelfth of it."""
-    marks = [1.0]
-    for mark in sorted(MARKS, key=lambda m: -abs(math.log(m))):
-        apart = min(abs(math.log(mark / other)) for other in marks)
-        if abs(math.log(mark)) <= reach and apart >= reach / 6.0:
-            marks.append(mark)
-    return marks

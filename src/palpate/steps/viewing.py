@@ -88,6 +88,8 @@ def viewing(folder: Path) -> Viewing:
 
 def _handler(folder: Path, title: str, files: Mapping[str, str], word: str) -> type[BaseHTTPRequestHandler]:
     """What answers: GET of the list and of the files that the result names, to this host alone."""
+    items = "".join(f'<li><a href="{quote(name)}">{html.escape(name)}</a></li>' for name in [RESULT, *sorted(files)])
+    page = PAGE.format(title=html.escape(title), items=items).encode()
 
     class Handler(BaseHTTPRequestHandler):
         """One request."""
@@ -103,7 +105,7 @@ def _handler(folder: Path, title: str, files: Mapping[str, str], word: str) -> t
             if not secrets.compare_digest(given.encode(), word.encode()):
                 return self._answer(HTTPStatus.NOT_FOUND, b"there is nothing here\n")
             if not name:
-                return self._answer(HTTPStatus.OK, _page(title, files), KINDS[".html"])
+                return self._answer(HTTPStatus.OK, page, KINDS[".html"])
             content = _content(folder, unquote(name), files)
             if content is None:
                 return self._answer(HTTPStatus.NOT_FOUND, b"the result lists no such file, or it was changed since\n")
@@ -120,12 +122,6 @@ def _handler(folder: Path, title: str, files: Mapping[str, str], word: str) -> t
             """Say nothing: a browser's requests are of no interest."""
 
     return Handler
-
-
-def _page(title: str, files: Mapping[str, str]) -> bytes:
-    names = [RESULT, *sorted(files)]
-    items = "".join(f'<li><a href="{quote(name)}">{html.escape(name)}</a></li>' for name in names)
-    return PAGE.format(title=html.escape(title), items=items).encode()
 
 
 def _content(folder: Path, name: str, files: Mapping[str, str]) -> bytes | None:

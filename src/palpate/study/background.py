@@ -62,11 +62,8 @@ def background_of(
     if ct is not None and shows_air(ct[0]):
         outside = outside_body(*ct, image.grid)[window]
         return Background(share, float(np.count_nonzero(outside & zero) / np.count_nonzero(zero)), seen=True)
-    return Background(share, _beyond_hull(np.argwhere(image.labels != 0), _places(zero, window)), seen=False)
-
-
-def _places(mask: NDArray[np.bool_], window: tuple[slice, ...]) -> NDArray[np.int64]:
-    return np.asarray(np.argwhere(mask) + np.array([s.start for s in window], dtype=np.int64))
+    places = np.argwhere(zero) + np.array([s.start for s in window], dtype=np.int64)
+    return Background(share, _beyond_hull(np.argwhere(image.labels != 0), places), seen=False)
 
 
 def _beyond_hull(labelled: NDArray[np.int64], places: NDArray[np.int64]) -> float:

@@ -19,7 +19,6 @@ from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_model
-from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.linear_model import LinearModel, linear_model, with_constraint
 from palpate.mechanics.newton import NewtonSettings
 from palpate.mesh.quality import MeshQuality
@@ -195,7 +194,11 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
     progress("assembling one stiffness matrix a tissue")
     pairs = [pair for body in bodies for pair in _models(body, case)]
     models = tuple(model for model, _ in pairs)
-    _refuse_rest(models, case)
+    if not case.loads and not any(model.n_modes or model.constraint.offset.any() for model in models):
+        raise ConfigurationError(  # at rest every modulus explains the images equally badly
+            'nothing moves this body: no tissue has role = "driver" and no `rigid` tissue moves between the images, so'
+            " no modulus can be estimated; give the role driver to the hollow organ whose wall deforms the others"
+        )
     finite = _finite_strain(models, case)
     states = tuple(
         LaterState(model, observations, law, walls if case.driver.learn_prior else (), reference)
@@ -246,30 +249,15 @@ def _finite_strain(models: tuple[LinearModel, ...], case: Case) -> Sequence[Fini
     law = case.mechanics.material_law
     if not law.finite:
         return [None] * len(models)
-    found: list[FiniteStrainModel] = []
-    for model in models:
-        like = next((other for other in found if other.space is model.space), None)
-        found.append(like.under(model.constraint) if like else _finite_strain_model(model, law, case))
-    return found
-
-
-def _finite_strain_model(model: LinearModel, law: Law, case: Case) -> FiniteStrainModel:
     dilatation = choose_element(case.mechanics.element).dilatation
     settings = NewtonSettings(tolerance=ACCURACY, solver=case.mechanics.solver)
-    return finite_strain_model(
-        model.space,
-        model.constraint,
-        law,
-        dilatation=dilatation,
-        loads=case_loads(case, model.space),
-        settings=settings,
-    )
-
-
-def _refuse_rest(models: tuple[LinearModel, ...], case: Case) -> None:
-    """Without a motion or a load, every modulus explains the images equally badly."""
-    if not case.loads and not any(model.n_modes or model.constraint.offset.any() for model in models):
-        raise ConfigurationError(
-            'nothing moves this body: no tissue has role = "driver" and no `rigid` tissue moves between the images, so'
-            " no modulus can be estimated; give the role driver to the hollow organ whose wall deforms the others"
-        )
+    found: list[FiniteStrainModel] = []
+    for model in models:
+        space, constraint = model.space, model.constraint
+        like = next((other for other in found if other.space is space), None)
+        if like:
+            found.append(like.under(constraint))
+            continue
+        loads = case_loads(case, space)
+        found.append(finite_strain_model(space, constraint, law, dilatation=dilatation, loads=loads, settings=settings))
+    return found

@@ -30,21 +30,21 @@ def loads_on(
     space: LagrangeSpace, loads: Sequence[CaseLoad], *, densities: NDArray[np.float64], share: float = 1.0
 ) -> tuple[Load, ...]:
     """The same of `loads` alone; densities (n_tissues,) kg/m^3, one each of the mesh's tissues."""
-    return tuple(_load(load, densities, space, share) for load in loads)
-
-
-def _load(load: CaseLoad, densities: NDArray[np.float64], space: LagrangeSpace, share: float) -> Load:
-    tissues = space.mesh.tissues
-    if load.acceleration_m_s2 is not None:
-        return gravity(space, densities, share * np.array(load.acceleration_m_s2))
-    surface = load.surface or ""
-    prescribed = [t.name for t in tissues if t.role in (Role.DRIVER, Role.RIGID)]
-    if surface in prescribed:
-        raise ConfigurationError(
-            f"[[loads]]: the motion of '{surface}' is prescribed, so a {load.kind} on it does nothing; give it the role"
-            " void if the load is to move it"
-        )
-    triangles = boundary_named(space.mesh, surface)
-    if load.traction_kpa is not None:
-        return traction(space, triangles, share * np.array(load.traction_kpa))
-    return pressure(space, triangles, share * (load.pressure_kpa or 0.0), following=load.following)
+    prescribed = [t.name for t in space.mesh.tissues if t.role in (Role.DRIVER, Role.RIGID)]
+    found: list[Load] = []
+    for load in loads:
+        if load.acceleration_m_s2 is not None:
+            found.append(gravity(space, densities, share * np.array(load.acceleration_m_s2)))
+            continue
+        surface = load.surface or ""
+        if surface in prescribed:
+            raise ConfigurationError(
+                f"[[loads]]: the motion of '{surface}' is prescribed, so a {load.kind} on it does nothing; give it the"
+                " role void if the load is to move it"
+            )
+        triangles = boundary_named(space.mesh, surface)
+        if load.traction_kpa is not None:
+            found.append(traction(space, triangles, share * np.array(load.traction_kpa)))
+        else:
+            found.append(pressure(space, triangles, share * (load.pressure_kpa or 0.0), following=load.following))
+    return tuple(found)

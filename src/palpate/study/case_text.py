@@ -24,7 +24,14 @@ def case_tables(case: Case, place: Callable[[Path], str]) -> dict[str, Any]:
     What follows from the whole case is stated, too: alignment, Poisson's ratios, the parameters of the material law.
     Only a phantom's own constants stay out, which its seed draws.
     """
-    return _table(_resolved(case), place)
+    law = case.mechanics.material_law
+    own = {parameter.name: getattr(law, parameter.name) for parameter in law.parameters}
+    case = replace(case, mechanics=replace(case.mechanics, law_parameters={**case.mechanics.law_parameters, **own}))
+    if case.images is not None:
+        ratios = [POISSON_RATIO if t.poisson_ratio is None else t.poisson_ratio for t in case.tissues]
+        tissues = tuple(replace(t, poisson_ratio=nu) for t, nu in zip(case.tissues, ratios, strict=True))
+        case = replace(case, images=replace(case.images, align=case.align), tissues=tissues)
+    return _table(case, place)
 
 
 def case_text(case: Case, folder: Path) -> str:
@@ -36,18 +43,6 @@ def case_text(case: Case, folder: Path) -> str:
     lines += [f"# --set {printable(override)}" for override in case.overrides]
     lines += ["", *_lines(case_tables(case, lambda path: relative_path(path, folder)), ())]
     return "\n".join(lines).rstrip() + "\n"
-
-
-def _resolved(case: Case) -> Case:
-    """The same case with what follows from the whole of it in its place."""
-    law = case.mechanics.material_law
-    own = {parameter.name: getattr(law, parameter.name) for parameter in law.parameters}
-    case = replace(case, mechanics=replace(case.mechanics, law_parameters={**case.mechanics.law_parameters, **own}))
-    if case.images is None:
-        return case
-    ratios = [POISSON_RATIO if t.poisson_ratio is None else t.poisson_ratio for t in case.tissues]
-    tissues = tuple(replace(t, poisson_ratio=nu) for t, nu in zip(case.tissues, ratios, strict=True))
-    return replace(case, images=replace(case.images, align=case.align), tissues=tissues)
 
 
 def _table(value: Any, place: Callable[[Path], str]) -> dict[str, Any]:

@@ -187,8 +187,13 @@ def check_case(path: Path, overrides: Sequence[str], *, progress: Progress) -> C
     if not pairs:
         return CheckReport(case.id, problems.all())
     cost = problems.attempt(lambda: _cost(problems, pairs, case, progress))
-    names = ("before", *(f"after[{i}]" for i in range(len(pairs[0].after))))
-    return CheckReport(case.id, problems.all(), names, _organs(pairs[0].before, pairs[0].after), cost)
+    before, after = pairs[0].before, pairs[0].after
+    names = ("before", *(f"after[{i}]" for i in range(len(after))))
+    organs = tuple(
+        OrganRow(t.name, str(t.role), tuple(round(image.volume(i) / 1000.0, 4) for image in (before, *after)))
+        for i, t in enumerate(before.tissues)
+    )
+    return CheckReport(case.id, problems.all(), names, organs, cost)
 
 
 def _cost(problems: _Problems, pairs: Sequence[ImagedStates], case: Case, progress: Progress) -> ExpectedCost:
@@ -312,10 +317,3 @@ def memory_problems(cost: ExpectedCost) -> list[Problem]:
         )
         return [Problem("memory-now", text)]
     return []
-
-
-def _organs(before: Segmentation, after: tuple[Segmentation, ...]) -> tuple[OrganRow, ...]:
-    return tuple(
-        OrganRow(t.name, str(t.role), tuple(round(image.volume(i) / 1000.0, 4) for image in (before, *after)))
-        for i, t in enumerate(before.tissues)
-    )

@@ -58,8 +58,10 @@ def inversion_findings(inversion: Inversion, covariance: NDArray[np.float64]) ->
                 " intervals reach over all that fit nearly as well",
             )
         )
-    alike = _alike(mapping.tissues, covariance)
-    if alike:
+    sd = np.sqrt(np.diag(covariance))
+    pairs = np.argwhere(np.tril(np.abs(covariance) > STRONG_CORRELATION * np.outer(sd, sd), -1)).tolist()
+    if pairs:
+        alike = [f"'{mapping.tissues[j]}' and '{mapping.tissues[i]}'" for i, j in pairs]
         text = f"the moduli of {', of '.join(alike)} cannot be told apart by these images"
         findings.append(Finding("correlated", f"{text}; add some that move them otherwise"))
     return tuple(findings)
@@ -82,13 +84,6 @@ def pair_findings(pairs: ImagePairs | None) -> tuple[Finding, ...]:
         advice = f"{text}: read the mean over them, `image_pairs` in result.json, whose interval holds the differences"
         findings.append(Finding("heterogeneous", advice))
     return tuple(findings)
-
-
-def _alike(tissues: Sequence[str], covariance: NDArray[np.float64]) -> list[str]:
-    """Pairs of tissues whose log-moduli depend on each other nearly wholly."""
-    sd = np.sqrt(np.diag(covariance))
-    pairs = np.argwhere(np.tril(np.abs(covariance) > STRONG_CORRELATION * np.outer(sd, sd), -1))
-    return [f"'{tissues[j]}' and '{tissues[i]}'" for i, j in pairs.tolist()]
 
 
 def fold_findings(states: Sequence[FittedState]) -> tuple[Finding, ...]:

@@ -285,6 +285,10 @@ def _estimates(
     theta, scale = inversion.minimum.unknowns[: mapping.n_parameters], mapping.scale_kpa
     found, variances, at_bound = [], np.diag(covariance.total), bounds.reached(theta)
     fixed = fixed_correspondence(inversion.objective, inversion.minimum.unknowns, inversion.minimum.evaluation)
+    # Voxels make the objective rough by some hundredths of it: its value alone cannot choose between such minima.
+    best = inversion.candidates[inversion.best]
+    others = [c for c in inversion.candidates if c is not best and c.minimum.converged]
+    good = [c.minimum.unknowns for c in others if c.value <= (1.0 + AS_GOOD) * best.value]
     for i, name in enumerate(mapping.tissues):
         none = no_estimate(
             name,
@@ -299,8 +303,8 @@ def _estimates(
         ratio = float(np.exp(theta[i]))
         limits = {"lower": float(np.exp(bounds.lower[i])), "upper": float(np.exp(bounds.upper[i]))}
         own = modulus_interval(fixed, inversion.minimum, i, variance=float(variances[i]), bounds=bounds)
-        others = [np.exp(t[i]) for t in _as_good(inversion)]
-        interval = hull([own.ends, *(log_interval(float(e), float(np.sqrt(variances[i])), **limits) for e in others)])
+        sd = float(np.sqrt(variances[i]))
+        interval = hull([own.ends, *(log_interval(float(np.exp(x[i])), sd, **limits) for x in good)])
         word, why = verdict(interval, at_bound=bool(at_bound[i]), absolute=mapping.absolute)
         low, high = interval
         unit = scale if mapping.absolute else 1.0
@@ -320,17 +324,6 @@ def _estimates(
             )
         )
     return tuple(found)
-
-
-def _as_good(inversion: Inversion) -> list[NDArray[np.float64]]:
-    """Log-moduli (n_parameters,) of every minimum beside the best one that explains the images nearly as well.
-
-    Voxels make the objective rough by some hundredths of it, so that its value alone cannot choose between them.
-    """
-    n, best = inversion.objective.n_parameters, inversion.candidates[inversion.best]
-    limit = (1.0 + AS_GOOD) * best.value
-    good = [c.minimum for c in inversion.candidates if c is not best and c.minimum.converged and c.value <= limit]
-    return [minimum.unknowns[:n] for minimum in good]
 
 
 def _start(inversion: Inversion, start: StartRun) -> Start:

@@ -131,11 +131,18 @@ def guess_tissues(before: LabelImage, after: Sequence[LabelImage] = ()) -> tuple
     at_border, n = np.unique(np.concatenate(layers), return_counts=True)
     border = {int(label): float(share) for label, share in zip(at_border, n / n.sum(), strict=True)}
     guesses = [_guess(label, before, after, border) for label in sizes]
-    guesses = _with_driver(_with_one_skeleton([_checked(guess, after) for guess in guesses]), before, after)
+    for i, guess in enumerate(guesses):
+        watched = guess.role in (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
+        if watched and any(not np.isin(image.labels, guess.labels).any() for image in after):
+            reason = f"'{guess.name}' is absent in a later image"
+            guesses[i] = replace(guess, name=SURROUNDINGS, role=Role.KNOWN, reason=reason)
+    guesses = _with_driver(_with_one_skeleton(guesses), before, after)
     outside = [g for g in guesses if g.role is Role.VOID]
     rest = [g for g in guesses if g.name == SURROUNDINGS]
     organs = [g for g in guesses if g.role is not Role.VOID and g.name != SURROUNDINGS]
-    organs.sort(key=lambda guess: (_order(guess), sum(sizes[label] for label in guess.labels)))
+    roles = (Role.ESTIMATE, Role.DRIVER, Role.RIGID, None, Role.KNOWN)
+    tumours = [g for g in organs if g.role is Role.ESTIMATE and "tumour" in g.reason]
+    organs.sort(key=lambda g: (g not in tumours, roles.index(g.role), sum(sizes[label] for label in g.labels)))
     return tuple(_renamed([*organs, *_surroundings(rest, before), *outside]))
 
 
@@ -213,8 +220,14 @@ def _by_place(label: int, before: LabelImage, after: Sequence[LabelImage], borde
     if label == 0 or label == max(bodies, key=lambda other: border[other], default=0):
         reason = f"label {label} covers {border.get(label, 0.0):.0%} of the image's border"
         return GuessedTissue(SURROUNDINGS, (label,), Role.KNOWN, reason)
-    name, change = f"label {label}", _volume_change(label, before, after)
-    if _still(label, before, after):
+    name, mask = f"label {label}", before.labels == label
+    start = np.count_nonzero(mask) * before.grid.voxel_volume
+    ends = [np.count_nonzero(image.labels == label) * image.grid.voxel_volume for image in after]
+    change = max((float(end / start - 1.0) for end in ends), key=abs, default=0.0)
+    alike = [image.labels for image in after if image.labels.shape == mask.shape]
+    changed = [int(np.count_nonzero((labels == label) != mask)) for labels in alike]
+    still = max(changed, default=np.inf) < STILL_SHARE * int(np.count_nonzero(mask))
+    if still and len(alike) == len(after):  # whether a voxel changes is not seen on another grid
         return GuessedTissue(name, (label,), Role.RIGID, "its voxels do not move at all, as only bone's do")
     if abs(change) > HOLLOW_CHANGE:
         return GuessedTissue(
@@ -237,15 +250,6 @@ def _with_one_skeleton(guesses: list[GuessedTissue]) -> list[GuessedTissue]:
     return [whole if guess is bones[0] else guess for guess in guesses if guess not in bones[1:]]
 
 
-def _checked(guess: GuessedTissue, after: Sequence[LabelImage]) -> GuessedTissue:
-    """An organ that a later image does not show goes to the surroundings."""
-    watched = guess.role in (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
-    if watched and any(not np.isin(image.labels, guess.labels).any() for image in after):
-        reason = f"'{guess.name}' is absent in a later image"
-        return replace(guess, name=SURROUNDINGS, role=Role.KNOWN, reason=reason)
-    return guess
-
-
 def _surroundings(rest: list[GuessedTissue], before: LabelImage) -> list[GuessedTissue]:
     """One tissue for all that is left, with a modulus between those of fat and muscle."""
     if not rest:
@@ -260,13 +264,6 @@ def _surroundings(rest: list[GuessedTissue], before: LabelImage) -> list[Guessed
         f" ({muscle.source})"
     )
     return [GuessedTissue(SURROUNDINGS, (), Role.KNOWN, reason, value)]
-
-
-def _order(guess: GuessedTissue) -> int:
-    if guess.role is Role.ESTIMATE and "tumour" in guess.reason:
-        return 0
-    roles = (Role.ESTIMATE, Role.DRIVER, Role.RIGID, None, Role.KNOWN)
-    return 1 + roles.index(guess.role)
 
 
 def _renamed(guesses: Sequence[GuessedTissue]) -> list[GuessedTissue]:
@@ -284,18 +281,3 @@ def _renamed(guesses: Sequence[GuessedTissue]) -> list[GuessedTissue]:
         taken.add(name)
         found.append(replace(guess, name=name))
     return found
-
-
-def _still(label: int, before: LabelImage, after: Sequence[LabelImage]) -> bool:
-    """Whether hardly a voxel of the label changes in any later image; False where grids differ."""
-    mask = before.labels == label
-    alike = [image for image in after if image.labels.shape == mask.shape]
-    changed = [int(np.count_nonzero((image.labels == label) != mask)) for image in alike]
-    return bool(alike) and len(alike) == len(after) and max(changed) < STILL_SHARE * int(np.count_nonzero(mask))
-
-
-def _volume_change(label: int, before: LabelImage, after: Sequence[LabelImage]) -> float:
-    """Largest relative change of a label's volume."""
-    start = np.count_nonzero(before.labels == label) * before.grid.voxel_volume
-    ends = [np.count_nonzero(image.labels == label) * image.grid.voxel_volume for image in after]
-    return max((float(end / start - 1.0) for end in ends), key=abs, default=0.0)

@@ -53,7 +53,10 @@ def _table(kind: Any) -> dict[str, Any]:
             properties[key] = {"type": "number", "minimum": least, "maximum": most}
         if bounds.collects or bounds.unwritten or (kind is CaseTissue and field.name == "name"):
             continue
-        properties[field.name] = _value(hints[field.name], bounds) | _default(field)
+        value, stated = _value(hints[field.name], bounds), field.default
+        default = list(stated) if isinstance(stated, tuple) else stated
+        written = isinstance(default, str | int | float | list) and default not in ("", [])
+        properties[field.name] = value | ({"default": default} if written else {})
         if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
             required.append(field.name)
         if bounds.instead_of:
@@ -91,8 +94,3 @@ def _list(arms: tuple[Any, ...], bounds: Rule) -> dict[str, Any]:
     if arms[-1] is not Ellipsis:
         return listed | {"minItems": len(arms), "maxItems": len(arms)}
     return listed | ({"minItems": 1} if bounds.test else {})
-
-
-def _default(field: dataclasses.Field[Any]) -> dict[str, Any]:
-    value = list(field.default) if isinstance(field.default, tuple) else field.default
-    return {"default": value} if isinstance(value, str | int | float | list) and value not in ("", []) else {}

@@ -30,7 +30,10 @@ def held_folder(folder: Path) -> Iterator[bool]:
 
     One that was made and is left empty vanishes again. Raises as `folder_lock` and `recover` do.
     """
-    made = _missing(folder)
+    try:
+        made = [path for path in (folder, *folder.parents) if not path.exists()]  # the deepest first
+    except OSError:  # a name too long, a folder that may not be searched: making it says so
+        made = []
     make_folder(folder)
     try:
         with folder_lock(folder) as locked:
@@ -101,14 +104,6 @@ def own_file(path: Path) -> int:
     return file
 
 
-def _missing(folder: Path) -> list[Path]:
-    """Those of `folder` and its parents that are not there yet, the deepest first."""
-    try:
-        return [path for path in (folder, *folder.parents) if not path.exists()]
-    except OSError:  # a name too long, a folder that may not be searched: making it says so
-        return []
-
-
 def _locked(path: Path) -> tuple[int, bool]:
     """The lock's file, and whether it is held; one that its last owner has removed meanwhile is left alone."""
     while True:
@@ -124,19 +119,16 @@ def _locked(path: Path) -> tuple[int, bool]:
                 f"another run of palpate{f' (process {owner})' if owner.isdigit() else ''} works in {path.parent}: wait"
                 " until it has ended, or choose another --output folder"
             ) from error
-        if _same(file, path):
+        try:
+            same = path.stat().st_ino == os.fstat(file).st_ino
+        except OSError:
+            same = False
+        if same:
             with suppress(OSError):  # who holds the lock is a courtesy; a full disk must not cost the run here
                 os.ftruncate(file, 0)
                 os.write(file, str(os.getpid()).encode())
             return file, True
         os.close(file)
-
-
-def _same(file: int, path: Path) -> bool:
-    try:
-        return path.stat().st_ino == os.fstat(file).st_ino
-    except OSError:
-        return False
 
 
 def _refused(path: Path, why: str) -> ResourceError:

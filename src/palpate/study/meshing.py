@@ -23,7 +23,7 @@ __all__ = ["ReferenceMesh", "mesh_reference", "refuse_edge"]
 
 FINER = 0.75  # times an edge length whose mesh is not fit: the next one's
 FINER_MESHES = 2  # at the most
-THIN_VOXELS = 4
+THIN_VOXELS = 4  # along some axis
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +63,15 @@ def mesh_reference(
             mesh, quality = _fit_mesh(before, anatomy, edge, progress)
         except GeometryError as error:
             failure = error
-        else:
-            return ReferenceMesh(mesh, quality, edge, _finer(asked, edge, failure))
+            continue
+        if failure is None:
+            return ReferenceMesh(mesh, quality, edge)
+        text = (
+            f"the mesh has edges of {edge:g} mm, for a coarser one was not fit to compute with: {failure}. With"
+            f" mesh.edge_length_mm = {edge:g} in place of {asked:g} the attempt is saved; a repair of the labels at"
+            " that place may allow coarser meshes"
+        )
+        return ReferenceMesh(mesh, quality, edge, (Finding("finer-mesh", text),))
     raise type(failure or GeometryError())(
         f"no mesh is fit to compute with, neither at mesh.edge_length_mm = {asked:g} nor at"
         f" {' and '.join(f'{edge:g}' for edge in edges[1:])} mm, where {failure}; repair the labels at that place, or"
@@ -82,17 +89,6 @@ def refuse_edge(case: Case, box: Box) -> None:
         )
 
 
-def _finer(asked: float, edge: float, failure: GeometryError | None) -> tuple[Finding, ...]:
-    if failure is None:
-        return ()
-    text = (
-        f"the mesh has edges of {edge:g} mm, for a coarser one was not fit to compute with: {failure}. With"
-        f" mesh.edge_length_mm = {edge:g} in place of {asked:g} the attempt is saved; a repair of the labels at that"
-        " place may allow coarser meshes"
-    )
-    return (Finding("finer-mesh", text),)
-
-
 def _fit_mesh(
     before: Segmentation, anatomy: Anatomy, edge_length_mm: float, progress: Progress
 ) -> tuple[TetMesh, MeshQuality]:
@@ -108,20 +104,12 @@ def _fit_mesh(
     index = np.argwhere(np.ones(before.grid.shape, dtype=bool))
     local = anatomy.box.local(before.grid.world(index.astype(float)))
     inside = np.all((local > 0.0) & (local < anatomy.box.lengths), axis=1).reshape(before.grid.shape)
-    volumes = {
-        tissue.name: float(np.count_nonzero(inside & before.mask(i))) * before.grid.voxel_volume
-        for i, tissue in enumerate(before.tissues)
-        if tissue.meshed
-    }
-    return mesh, check_mesh(mesh, anatomy, voxel_volumes=volumes, thin=_thin(before), image=before)
-
-
-def _thin(before: Segmentation) -> tuple[str, ...]:
-    """Names of meshed tissues that are under four voxels thick along some axis."""
-    thin = []
+    volumes, thin = dict[str, float](), list[str]()
     for i, tissue in enumerate(before.tissues):
-        mask = before.mask(i)
-        spans = [np.flatnonzero(mask.any(axis=tuple({0, 1, 2} - {a}))) for a in range(3)]
-        if tissue.meshed and min(span[-1] - span[0] + 1 for span in spans if len(span)) < THIN_VOXELS:
-            thin.append(tissue.name)
-    return tuple(thin)
+        if tissue.meshed:
+            mask = before.mask(i)
+            volumes[tissue.name] = float(np.count_nonzero(inside & mask)) * before.grid.voxel_volume
+            spans = [np.flatnonzero(mask.any(axis=tuple({0, 1, 2} - {a}))) for a in range(3)]
+            if min(span[-1] - span[0] + 1 for span in spans if len(span)) < THIN_VOXELS:
+                thin.append(tissue.name)
+    return mesh, check_mesh(mesh, anatomy, voxel_volumes=volumes, thin=tuple(thin), image=before)

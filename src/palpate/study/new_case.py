@@ -27,7 +27,7 @@ from palpate.study.toml_text import relative_path, toml_key, toml_text
 __all__ = ["CaseImages", "NewCase", "new_case", "write_new_case"]
 
 LARGEST_CASE = 1_000_000  # bytes
-WIDE_MM = 250.0  # of an image: more than the body of many
+WIDE_MM = 250.0  # of an image: more than the body of many, so that it must show what lies around, too
 ROLES = (
     "  estimate: its stiffness is wanted; its surface is looked at in all images",
     "  known:    its youngs_modulus_kpa is given; the first one sets the scale of all results",
@@ -90,23 +90,20 @@ def write_new_case(
         )
     outputs.require([CASE_NAME])
     case = new_case(CaseImages(images[0], tuple(images[1:]), table, tuple(cts)), outputs.path)
-    if case.path.exists() and _content(case.path) != case.text.encode("utf-8"):
-        raise ConfigurationError(
-            f"there is a case already, {case.path}, and it is not replaced: estimate it with 'palpate estimate"
-            f" {case.path}', or choose another --output"
-        )
+    if case.path.exists():
+        try:
+            content = read_regular(case.path, most_bytes=LARGEST_CASE)
+        except InputDataError:  # too large to be one, say
+            content = b""
+        if content != case.text.encode("utf-8"):
+            raise ConfigurationError(
+                f"there is a case already, {case.path}, and it is not replaced: estimate it with 'palpate estimate"
+                f" {case.path}', or choose another --output"
+            )
     with outputs.staged() as staging:
         write_text(staging.area / CASE_NAME, case.text)
         staging.commit()
     return case
-
-
-def _content(path: Path) -> bytes:
-    """The bytes of a case; nothing of what is too large to be one."""
-    try:
-        return read_regular(path, most_bytes=LARGEST_CASE)
-    except InputDataError:
-        return b""
 
 
 def new_case(images: CaseImages, folder: Path) -> NewCase:
@@ -130,7 +127,8 @@ def new_case(images: CaseImages, folder: Path) -> NewCase:
     background = _background(images, before, window, tissues)
     guessed = tissues
     if background is not None and background.has_air:
-        tissues = (*guessed, _air(background, guessed))
+        name = next(name for name in ("air", "air around", "label 0") if name not in {t.name for t in guessed})
+        tissues = (*guessed, GuessedTissue(name, (0,), Role.VOID, background.in_words))
     questions = _questions(tissues)
     named = zip((images.before, *images.after), (before, *after), strict=True)
     notes = [f"'{path.name}': {finding.message}" for path, image in named for finding in image.findings]
@@ -139,16 +137,21 @@ def new_case(images: CaseImages, folder: Path) -> NewCase:
             "the labels have no names; their numbers were taken for those of TotalSegmentator's task"
             f" '{known.task}', for {known.pairs} pairs of left and right lie as its names say"
         )
-    if background is not None and not background.seen and _shows_whole_slices(before):
+    width = (np.array(before.labels.shape) * before.grid.spacing)[:2].max()
+    if background is not None and not background.seen and width > WIDE_MM:
         questions = (*questions, background.in_words)
     elif background is not None:
         notes.append(background.in_words)
     from_ct = background is not None and background.has_air
-    blocks = [_heading(questions, notes), _images(images, folder, from_ct=from_ct), _domain(before, window)]
-    blocks += [_mesh(before, after, guessed, cropped=bool(blocks[-1]))]
+    blocks = [_heading(questions, notes), _images(images, folder, from_ct=from_ct)]
+    share = float(np.prod([s.stop - s.start for s in window]) / before.labels.size)
+    if share < 1.0:
+        blocks.append(f'[domain]\nextent = "margin"  # {MARGIN_MM:g} mm around the organs: {share:.0%} of the image')
+    proposed = proposed_edge(before, after, guessed, cropped=share < 1.0)
+    if proposed:
+        blocks.append(f"[mesh]\nedge_length_mm = {proposed[0]:g}  # {proposed[1]}")
     blocks += [_tissue(tissue, before) for tissue in tissues]
-    text = "\n\n".join(block for block in blocks if block) + "\n"
-    return NewCase(folder / CASE_NAME, text, tissues, questions)
+    return NewCase(folder / CASE_NAME, "\n\n".join(blocks) + "\n", tissues, questions)
 
 
 def _background(
@@ -158,16 +161,6 @@ def _background(
     if any(0 in tissue.labels for tissue in tissues) or not any(not tissue.labels for tissue in tissues):
         return None
     return background_of(before, window, read_intensities(images.cts[0]) if images.cts else None)
-
-
-def _air(background: Background, tissues: Sequence[GuessedTissue]) -> GuessedTissue:
-    name = next(name for name in ("air", "air around", "label 0") if name not in {t.name for t in tissues})
-    return GuessedTissue(name, (0,), Role.VOID, background.in_words)
-
-
-def _shows_whole_slices(before: LabelImage) -> bool:
-    """Whether an image is so wide that it must show what lies around the body, too."""
-    return bool((np.array(before.labels.shape) * before.grid.spacing)[:2].max() > WIDE_MM)
 
 
 def _questions(tissues: Sequence[GuessedTissue]) -> tuple[str, ...]:
@@ -240,19 +233,6 @@ def _tissue(tissue: GuessedTissue, before: LabelImage) -> str:
                 f"youngs_modulus_kpa = {value:g}  # every estimate in kPa scales with the first known tissue's"
             )
     return "\n".join(lines)
-
-
-def _domain(before: LabelImage, window: tuple[slice, ...]) -> str:
-    """A box around the organs where the image is much larger."""
-    share = float(np.prod([s.stop - s.start for s in window]) / before.labels.size)
-    return f'[domain]\nextent = "margin"  # {MARGIN_MM:g} mm around the organs: {share:.0%} of the image' * (
-        share < 1.0
-    )
-
-
-def _mesh(before: LabelImage, after: Sequence[LabelImage], tissues: Sequence[GuessedTissue], *, cropped: bool) -> str:
-    proposed = proposed_edge(before, after, tissues, cropped=cropped)
-    return f"[mesh]\nedge_length_mm = {proposed[0]:g}  # {proposed[1]}" if proposed else ""
 
 
 def _comment(text: str) -> str:

@@ -97,8 +97,9 @@ class Staging:
             renames.append((name, f"{name}{ASIDE}"))
         renames += [(f"{STAGING}/{NEW}/{name}", name) for name in names]
         try:
-            for name in names:
-                _flush(self.area / name)
+            for name in names:  # to the disk
+                with (self.area / name).open("rb+") as file:
+                    os.fsync(file.fileno())
             for _, target in renames:
                 (self.folder / target).parent.mkdir(parents=True, exist_ok=True)
             for place in (self.area, *(path for path in self.area.rglob("*") if path.is_dir())):
@@ -204,7 +205,10 @@ def read_json(path: Path) -> dict[str, Any]:
         raise InputDataError(f"{path} is no result of Palpate ({str(error)[:200]}); run the estimate again") from error
     if not isinstance(content, dict):
         raise InputDataError(f"{path} is no result of Palpate: it does not hold a JSON object")
-    if not _are_digests(content.get("files", {})):
+    files = content.get("files", {})
+    if not isinstance(files, dict) or not all(
+        isinstance(entry, dict) and isinstance(entry.get("sha256"), str) for entry in files.values()
+    ):
         raise InputDataError(f"{path} is no result of Palpate: its 'files' are not names with their SHA-256")
     return content
 
@@ -242,12 +246,6 @@ def _refuse_improper(folder: Path, names: Iterable[str]) -> None:
             raise _refused(path, error) from error
 
 
-def _are_digests(files: Any) -> bool:
-    return isinstance(files, dict) and all(
-        isinstance(entry, dict) and isinstance(entry.get("sha256"), str) for entry in files.values()
-    )
-
-
 def _no_constant(name: str) -> float:
     raise ValueError(f"it holds {name}")
 
@@ -263,12 +261,6 @@ def _refuse_target(path: Path) -> None:
     except PermissionError as error:
         if error.errno == errno.EPERM:  # protected by the file system; EACCES is no hindrance to replacing
             raise
-
-
-def _flush(path: Path) -> None:
-    """Bring the file to the disk, readable by whom the process's mask allows."""
-    with path.open("rb+") as file:
-        os.fsync(file.fileno())
 
 
 def _refused(path: Path, error: OSError) -> ResourceError:

@@ -53,7 +53,15 @@ def proposed_edge(
     wanted = round(2.0 * min(max(diameter / ORGAN_EDGES, EDGES_MM[0]), EDGES_MM[1])) / 2.0
     why = f"the smallest organ is as large as a ball of {diameter:.0f} mm"
     has, edge = machine_memory_gb(), wanted
-    case = _case(tissues, cropped=cropped)
+    case = Case(  # as far as its size depends on it; a tissue without a role is taken for a known one
+        id="proposed",
+        images=Images(Path("before"), (Path("after"),)),
+        tissues=tuple(
+            CaseTissue(t.name, t.labels or REMAINING, t.role or Role.KNOWN, youngs_modulus_kpa=SOME_KPA)
+            for t in tissues
+        ),
+        domain=Domain("margin" if cropped else "image", MARGIN_MM),
+    )
     first, *later = (segment(image, case.resolve_tissues({})) for image in (before, *after))
     tets = tets_by_edge(case, first, tuple(later))
 
@@ -66,16 +74,3 @@ def proposed_edge(
     if edge > wanted:
         why += f"; {wanted:g} mm would suit it, but this machine has {has:.0f} GB of memory"
     return edge, why
-
-
-def _case(tissues: Sequence[GuessedTissue], *, cropped: bool) -> Case:
-    """The case as far as its size depends on it; a tissue without a role is taken for a known one."""
-    return Case(
-        id="proposed",
-        images=Images(Path("before"), (Path("after"),)),
-        tissues=tuple(
-            CaseTissue(t.name, t.labels or REMAINING, t.role or Role.KNOWN, youngs_modulus_kpa=SOME_KPA)
-            for t in tissues
-        ),
-        domain=Domain("margin" if cropped else "image", MARGIN_MM),
-    )

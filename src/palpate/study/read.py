@@ -10,7 +10,7 @@ import numpy as np
 
 from palpate.errors import ConfigurationError
 from palpate.images.body_in_ct import outside_body
-from palpate.images.label_image import LabelImage, VoxelGrid
+from palpate.images.label_image import LabelImage
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_intensities, read_label_image
 from palpate.images.readers.registry import format_of
@@ -60,14 +60,10 @@ def read_segmentation(
     `names`: the label table (label -> name), if the case has one; an image that brings its own names is read by those.
     `tissues`: those of the reference image, for an image without names. Raises as `read_states` does.
     """
-    image = _with_body(read_label_image(path, names=names, grid=_given_grid(case, path)), case, path)
+    grey = _grey(case, path) if format_of(path).read_on is not None else None  # for files that may lack their grid
+    grid = read_intensities(grey)[1] if grey is not None else None
+    image = _with_body(read_label_image(path, names=names, grid=grid), case, path)
     return segment(image, case.resolve_tissues(image.names) if tissues is None or image.names else tissues)
-
-
-def _given_grid(case: Case, path: Path) -> VoxelGrid | None:
-    """The grid of the grey image of the same state, for files that may lack theirs; None where there is none."""
-    grey = _grey(case, path) if format_of(path).read_on is not None else None
-    return read_intensities(grey)[1] if grey is not None else None
 
 
 def _grey(case: Case, path: Path) -> Path | None:

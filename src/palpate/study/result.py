@@ -20,9 +20,7 @@ from palpate.images.tissue import Role, Tissue
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.case import Case, CaseTissue
 from palpate.study.case_text import case_tables
-from palpate.study.estimation import Estimation, ModulusEstimate, Start, TissueFit, no_estimate
-from palpate.study.together import ImagePairs
-from palpate.uncertainty import Information
+from palpate.study.estimation import Estimation, ModulusEstimate, TissueFit, no_estimate
 
 __all__ = [
     "SCHEMA",
@@ -126,25 +124,41 @@ class CaseResult:
     @property
     def stiffness(self) -> NDArray[np.float64]:
         """Young's modulus of each tissue in `unit`, (n_tissues,); NaN where none was found or the tissue is hollow."""
-        found = {e.tissue: e for e in self.estimation.estimates if e.parameter == "youngs_modulus"}
-        values = [_stiffness(tissue, found.get(tissue.name), self.unit) for tissue in self.tissues]
-        usable = self.estimation.status == "converged"
-        return np.array(
-            [v if usable or t.role is Role.KNOWN else math.nan for v, t in zip(values, self.tissues, strict=True)]
-        )
+        usable = self.estimation.estimates if self.estimation.status == "converged" else ()
+        moduli = [e for e in usable if e.parameter == "youngs_modulus"]
+        found = {e.tissue: e.value if self.unit == "kPa" else e.ratio for e in moduli}
+        values = [t.youngs_modulus_kpa if t.role is Role.KNOWN else found.get(t.name) for t in self.tissues]
+        meshed = [v if t.meshed else None for t, v in zip(self.tissues, values, strict=True)]
+        return np.array([math.nan if value is None else value for value in meshed])
 
     def to_dict(self) -> dict[str, Any]:
         """The document `result.json`, schema palpate.result/1, ready for strict JSON."""
-        estimation = self.estimation
+        estimation, names = self.estimation, image_names(self.case)
+        known, pairs = estimation.information, estimation.image_pairs
+        each = zip(names, pairs.alone if pairs else (), strict=False)
+        alone = [{"after": name} | _plain(pair) for name, pair in each]
+        drawn = estimation.samples if estimation.status == "converged" else None
         document = _heading(self.case, estimation.status, estimation.reason) | {
             "estimates": [_estimate(item, estimation.status) for item in estimation.estimates],
             "correlation": estimation.correlation.tolist(),
-            "information": _information(estimation.information),
+            "information": known and _plain(known),
             "combinations": [_plain(pair) for pair in estimation.combinations],
-            "image_pairs": _image_pairs(image_names(self.case), estimation.image_pairs),
-            "samples": _samples(estimation),
-            "fit": [_fit(name, fits) for name, fits in zip(image_names(self.case), estimation.fits, strict=False)],
-            "starts": [_start(start) for start in estimation.starts],
+            "image_pairs": pairs and _plain(pairs) | {"alone": alone},
+            "samples": drawn and drawn.to_dict(),
+            "fit": [_fit(name, fits) for name, fits in zip(names, estimation.fits, strict=False)],
+            "starts": [
+                {
+                    "start": dict(start.start),
+                    "end": dict(start.end),
+                    "objective_mm2": start.objective_mm2,
+                    "status": start.status,
+                    "reason": start.reason,
+                    "iterations": start.iterations,
+                    "minimum": start.minimum,
+                    "history_mm2": [step.objective_mm2 for step in start.history],
+                }
+                for start in estimation.starts
+            ],
             "outer_loop": {"history_mm2": [step.objective_mm2 for step in estimation.outer_loop]},
             "observations": dict(estimation.observations),
             "counts": dict(estimation.counts),
@@ -302,43 +316,12 @@ def _estimate(item: ModulusEstimate, status: str) -> dict[str, Any]:
     return document
 
 
-def _information(found: Information | None) -> dict[str, Any] | None:
-    if found is None:
-        return None
-    return {"singular_values": found.singular_values.tolist(), "directions": found.directions.tolist()}
-
-
-def _image_pairs(names: Sequence[str], found: ImagePairs | None) -> dict[str, Any] | None:
-    if found is None:
-        return None
-    alone = [{"after": name} | _plain(pair) for name, pair in zip(names, found.alone, strict=False)]
-    return _plain(found) | {"alone": alone}
-
-
-def _samples(estimation: Estimation) -> dict[str, Any] | None:
-    found = estimation.samples if estimation.status == "converged" else None
-    return None if found is None else found.to_dict()
-
-
 def _fit(name: str, fits: tuple[TissueFit, ...]) -> dict[str, Any]:
     entries = {
         fit.tissue: {"start": _plain(fit.start), "end": _plain(fit.end), "observed_share": fit.observed_share}
         for fit in fits
     }
     return {"after": name} | entries
-
-
-def _start(start: Start) -> dict[str, Any]:
-    return {
-        "start": dict(start.start),
-        "end": dict(start.end),
-        "objective_mm2": start.objective_mm2,
-        "status": start.status,
-        "reason": start.reason,
-        "iterations": start.iterations,
-        "minimum": start.minimum,
-        "history_mm2": [step.objective_mm2 for step in start.history],
-    }
 
 
 def image_names(case: Case) -> list[str]:
@@ -365,14 +348,3 @@ def distinct_names(paths: Sequence[Path]) -> list[str]:
             "/".join(path.parts[-depth:]) if name in alike else name for path, name in zip(paths, names, strict=True)
         ]
     return names
-
-
-def _stiffness(tissue: Tissue, estimate: ModulusEstimate | None, unit: str) -> float:
-    """Modulus of one tissue, kPa or ratio; NaN when nothing is known of it."""
-    if not tissue.meshed:
-        return math.nan
-    if tissue.role is Role.KNOWN:
-        value = tissue.youngs_modulus_kpa
-    else:
-        value = None if estimate is None else (estimate.value if unit == "kPa" else estimate.ratio)
-    return math.nan if value is None else value

@@ -69,7 +69,9 @@ def estimate(
         cost = expected_cost(case, states.before, states.after, n_pairs=1 + len(further))
         condition(cost)
         progress(_forecast(cost))
-    truth = _truth(states) if case.phantom else truth
+    if case.phantom:
+        stated = [(t.name, t.youngs_modulus_kpa) for t in states.before.tissues if t.role is Role.ESTIMATE]
+        truth = {name: value for name, value in stated if value is not None}
     inputs = input_digests(case, states.inputs, *(pair.inputs for pair in further))
     seconds = time.perf_counter() - began
     result = estimate_states(states, case, progress=progress, truth=truth, read_seconds=seconds, further=further)
@@ -209,15 +211,6 @@ def refuse_what_cannot_be_estimated(case: Case) -> None:
             'nothing moves this body: no tissue has role = "driver" (or "rigid", and moves between the images), so no'
             " modulus can be estimated; give the role driver to the hollow organ whose wall deforms the others"
         )
-
-
-def _truth(states: ImagedStates) -> Mapping[str, float]:
-    """True moduli (kPa) where a phantom or a simulation states them on its `estimate` tissues."""
-    return {
-        tissue.name: tissue.youngs_modulus_kpa
-        for tissue in states.before.tissues
-        if tissue.role is Role.ESTIMATE and tissue.youngs_modulus_kpa is not None
-    }
 
 
 def _remarks(case: Case, *bodies: Body) -> tuple[Finding, ...]:

@@ -28,7 +28,14 @@ def linear_strain_warnings(
     """
     if law.finite:
         return ()
-    strained = [_share_and_tail(space, motion) for space, motions in moved for motion in motions]
+    strained = []
+    for space, displacement in ((space, motion) for space, motions in moved for motion in motions):
+        strains, volumes = largest_strains(space, displacement), space.mesh.volumes
+        order = np.argsort(strains)
+        reached = np.cumsum(volumes[order]) / volumes.sum()
+        # the 99th percentile by volume
+        tail = strains[order[min(int(np.searchsorted(reached, 0.99)), len(order) - 1)]]
+        strained.append((float(volumes[strains > LINEAR_RANGE].sum() / volumes.sum()), float(tail)))
     names = [*images, *["a later image"] * len(strained)]  # states that come from no file may have none
     share, tail, image = max(((*s, name) for s, name in zip(strained, names, strict=False)), default=(0.0, 0.0, ""))
     if share <= MOST_BEYOND:
@@ -41,12 +48,3 @@ def linear_strain_warnings(
             ' tens of per cent; set [mechanics] law = "neo-hookean"',
         ),
     )
-
-
-def _share_and_tail(space: LagrangeSpace, displacement: NDArray[np.float64]) -> tuple[float, float]:
-    """Share of the volume beyond the linear range, and the 99th percentile of the strain by volume, dimensionless."""
-    strains, volumes = largest_strains(space, displacement), space.mesh.volumes
-    order = np.argsort(strains)
-    reached = np.cumsum(volumes[order]) / volumes.sum()
-    tail = strains[order[min(int(np.searchsorted(reached, 0.99)), len(order) - 1)]]
-    return float(volumes[strains > LINEAR_RANGE].sum() / volumes.sum()), float(tail)

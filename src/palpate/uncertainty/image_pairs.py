@@ -52,7 +52,24 @@ def pair_estimates(objective: Objective, minimum: Minimum, bounds: Bounds) -> tu
     Nothing is solved; the approximations of the joint estimate stand. Raises `EstimationError` where a state alone
     leaves a driver's motion open.
     """
-    return tuple(_alone(objective, minimum, bounds, s) for s in range(len(objective.states)))
+    n, estimates = objective.n_parameters, []
+    for s, state in enumerate(objective.states):
+        own = objective.parameters.unknowns_of(s)
+        coefficients = own[n:] - n
+        parameters = replace(
+            objective.parameters,
+            n_modes=(objective.parameters.n_modes[s],),
+            driver_precision=objective.parameters.driver_precision[np.ix_(coefficients, coefficients)],
+        )
+        alone = Objective((state,), parameters)
+        seen = [line for line in minimum.evaluation.lines if line.state == s]
+        lines = tuple(replace(line, state=0, columns=np.searchsorted(own, line.columns)) for line in seen)
+        start = minimum.unknowns[own]
+        fixed = fixed_correspondence(alone, start, replace(minimum.evaluation, lines=lines))
+        found = gauss_newton(fixed, start, bounds=bounds, tolerance=1e-4)
+        covariance = sandwich_covariance(alone, found.evaluation)
+        estimates.append(PairEstimate(found.unknowns[:n], covariance, found.converged))
+    return tuple(estimates)
 
 
 def agreement(pairs: Sequence[PairEstimate]) -> Agreement:
@@ -119,21 +136,3 @@ def _between(theta: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDA
     q = (weights * (theta - mean) ** 2).sum(axis=0)
     scale = total - (weights**2).sum(axis=0) / total
     return np.asarray(np.maximum((q - (len(theta) - 1)) / scale, 0.0))
-
-
-def _alone(objective: Objective, minimum: Minimum, bounds: Bounds, s: int) -> PairEstimate:
-    n, own = objective.n_parameters, objective.parameters.unknowns_of(s)
-    coefficients = own[n:] - n
-    parameters = replace(
-        objective.parameters,
-        n_modes=(objective.parameters.n_modes[s],),
-        driver_precision=objective.parameters.driver_precision[np.ix_(coefficients, coefficients)],
-    )
-    alone = Objective((objective.states[s],), parameters)
-    seen = [line for line in minimum.evaluation.lines if line.state == s]
-    lines = tuple(replace(line, state=0, columns=np.searchsorted(own, line.columns)) for line in seen)
-    start = minimum.unknowns[own]
-    fixed = fixed_correspondence(alone, start, replace(minimum.evaluation, lines=lines))
-    found = gauss_newton(fixed, start, bounds=bounds, tolerance=1e-4)
-    covariance = sandwich_covariance(alone, found.evaluation)
-    return PairEstimate(found.unknowns[:n], covariance, found.converged)

@@ -103,8 +103,11 @@ class _Cluster:
         end = time.monotonic() + PATIENCE_S
         while not (workers := self._workers()) and time.monotonic() < end:
             time.sleep(MOMENT_S)
-        chosen = list(workers.items())[: self._most]
-        return {address: _place(worker) for address, worker in chosen}
+        found = {}
+        for address, worker in list(workers.items())[: self._most]:
+            limit = float(worker["memory_limit"] or 0.0)
+            found[address] = Place(SHARE * limit / 1e9 if limit else UNKNOWN_GB, int(worker["nthreads"]))
+        return found
 
     def _workers(self) -> Mapping[str, Any]:
         if self._client.status != "running":
@@ -126,13 +129,14 @@ class _Cluster:
     def ended(self, running: Mapping[Hashable, Task]) -> Sequence[tuple[Hashable, Outcome]]:
         """Those that have ended, or whose worker is gone."""
         end = time.monotonic() + MOMENT_S
-        while not (done := [future for future in running if _status(future) != "pending"]) and time.monotonic() < end:
+        futures: list[Any] = list(running)
+        while not (done := [future for future in futures if future.status != "pending"]) and time.monotonic() < end:
             time.sleep(0.02)
         workers = self._workers()
         found = [(future, self._outcome(future, running[future])) for future in done]
-        for future in running:
+        for future in futures:
             if future not in done and self._where[future] not in workers:
-                future.cancel()  # type: ignore[attr-defined]
+                future.cancel()
                 found.append((future, _lost(running[future])))
         for future, _ in found:
             del self._where[future]
@@ -152,14 +156,5 @@ class _Cluster:
         return _lost(task)
 
 
-def _status(future: Any) -> str:
-    return str(future.status)
-
-
 def _lost(task: Task) -> Outcome:
     return Outcome.failed(task, "lost", "the Dask worker that computed it is gone", cause="lost")
-
-
-def _place(worker: Mapping[str, Any]) -> Place:
-    limit = float(worker["memory_limit"] or 0.0)
-    return Place(SHARE * limit / 1e9 if limit else UNKNOWN_GB, int(worker["nthreads"]))
