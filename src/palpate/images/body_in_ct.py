@@ -32,7 +32,8 @@ def outside_body(values: NDArray[np.float32], grid: VoxelGrid, on: VoxelGrid) ->
     affine = grid.affine @ np.diag([*step, 1.0])
     solid = values[:: step[0], :: step[1], :: step[2]] > AIR_HU
     reach = np.maximum(np.rint(THIN_MM / np.linalg.norm(affine[:3, :3], axis=0)), 1).astype(int)
-    ball = _ball(reach)
+    steps = np.meshgrid(*[np.arange(-r, r + 1) / (r + 0.5) for r in reach], indexing="ij")
+    ball = np.asarray(sum(step**2 for step in steps) <= 1.0)
     around = np.pad(solid, [(r, r) for r in reach], mode="edge")  # where the image ends, the body goes on
     parts, count = ndimage.label(ndimage.binary_opening(around, ball))
     core = parts == 1 + np.argmax(np.bincount(parts.ravel(), minlength=2)[1:]) if count else around
@@ -51,8 +52,3 @@ def outside_body(values: NDArray[np.float32], grid: VoxelGrid, on: VoxelGrid) ->
 def shows_air(values: NDArray[np.float32]) -> bool:
     """Whether a grey image (n_x, n_y, n_z) has values that only air has in a CT, HU."""
     return float(values.min(initial=0.0)) < CERTAINLY_AIR_HU
-
-
-def _ball(reach: NDArray[np.int64]) -> NDArray[np.bool_]:
-    steps = np.meshgrid(*[np.arange(-r, r + 1) / (r + 0.5) for r in reach], indexing="ij")
-    return np.asarray(sum(step**2 for step in steps) <= 1.0)

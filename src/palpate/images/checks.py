@@ -66,7 +66,15 @@ def check_segmentation(segmentation: Segmentation, name: str) -> tuple[Finding, 
         if not box:
             continue  # a tissue that is absent is refused by check_pair
         if tissue.role is not Role.RIGID:
-            findings += _cut_by_border(segmentation.mask(i), tissue, name)
+            mask = segmentation.mask(i)
+            if touching := _touching(mask):
+                surface = touching + sum(int(np.count_nonzero(np.diff(mask, axis=axis))) for axis in range(3))
+                share = f"{touching / surface:.1%}"
+                text = (
+                    f"'{tissue.name}' reaches the border of '{name}': {share} of its surface is a cut of the image,"
+                    " which says nothing about its stiffness; a larger field of view is better"
+                )
+                findings.append(Finding("cut-by-border", text, tissue.name, f"in '{name}' ({share})"))
             findings += _too_thin(segmentation.index == i, box[0], tissue, name)
             parts, count = ndimage.label(segmentation.index[box[0]] == i, structure=np.ones((3, 3, 3)))
             if count > 1:
@@ -102,7 +110,14 @@ def check_pair(before: Segmentation, after: Segmentation, *, name: str = "after"
             " estimated: check the two paths"
         )
     for segmentation, where in ((before, "before"), (after, name)):
-        _refuse_absent(segmentation, where)
+        present = set(np.unique(segmentation.index).tolist())
+        for i, tissue in enumerate(segmentation.tissues):
+            if tissue.role in OBSERVED and i not in present:
+                labels = ", ".join(map(str, tissue.labels)) or "remaining"
+                raise InputDataError(
+                    f"tissue '{tissue.name}' (label {labels}, role {tissue.role}) has no voxel in '{where}'; an organ"
+                    " must be seen in both states: check its label in the image, or take the tissue out of the case"
+                )
     findings = _common_part(before, after, name)
     observed = [i for i, tissue in enumerate(before.tissues) if tissue.role in OBSERVED]
     findings += _mirrored(before, after, observed, name)
@@ -110,30 +125,6 @@ def check_pair(before: Segmentation, after: Segmentation, *, name: str = "after"
     for i in observed:
         findings += _volume_change(before, after, i, name)
     return tuple(findings)
-
-
-def _refuse_absent(segmentation: Segmentation, where: str) -> None:
-    present = set(np.unique(segmentation.index).tolist())
-    for i, tissue in enumerate(segmentation.tissues):
-        if tissue.role in OBSERVED and i not in present:
-            labels = ", ".join(map(str, tissue.labels)) or "remaining"
-            raise InputDataError(
-                f"tissue '{tissue.name}' (label {labels}, role {tissue.role}) has no voxel in '{where}'; an organ must"
-                " be seen in both states: check its label in the image, or take the tissue out of the case"
-            )
-
-
-def _cut_by_border(mask: NDArray[np.bool_], tissue: Tissue, name: str) -> list[Finding]:
-    touching = _touching(mask)
-    if not touching:
-        return []
-    surface = touching + sum(int(np.count_nonzero(np.diff(mask, axis=axis))) for axis in range(3))
-    share = f"{touching / surface:.1%}"
-    text = (
-        f"'{tissue.name}' reaches the border of '{name}': {share} of its surface is a cut of the image, which says"
-        " nothing about its stiffness; a larger field of view is better"
-    )
-    return [Finding("cut-by-border", text, tissue.name, f"in '{name}' ({share})")]
 
 
 def _touching(mask: NDArray[np.bool_]) -> int:
@@ -193,7 +184,10 @@ def _mirrored(before: Segmentation, after: Segmentation, observed: Sequence[int]
     The agreement is the mean over the organs of the share of voxels that find their own organ; the organs' common
     centroids are laid on each other, so neither a shift nor the size of the field of view matters.
     """
-    points = [_sample(before, i) for i in observed]
+    points = []  # of each organ at most MIRROR_SAMPLES voxel centres (n, 3), evenly picked, RAS mm
+    for i in observed:
+        index = np.argwhere(before.mask(i))
+        points.append(before.grid.world(index[:: -(-len(index) // MIRROR_SAMPLES)].astype(np.float64)))
     middle = np.mean([p.mean(axis=0) for p in points], axis=0)
     target = np.mean([_centroid(after, i) for i in observed], axis=0)
     agreement = {}
@@ -216,12 +210,6 @@ def _mirrored(before: Segmentation, after: Segmentation, observed: Sequence[int]
     if best - plain >= MIRROR_CERTAIN:
         raise InputDataError(text)
     return [Finding("mirrored", text, place=f"'{name}'")]
-
-
-def _sample(segmentation: Segmentation, tissue: int) -> NDArray[np.float64]:
-    """At most MIRROR_SAMPLES voxel centres (n, 3) of a tissue, evenly picked, RAS mm."""
-    index = np.argwhere(segmentation.mask(tissue))
-    return segmentation.grid.world(index[:: -(-len(index) // MIRROR_SAMPLES)].astype(np.float64))
 
 
 def _centroid(segmentation: Segmentation, tissue: int) -> NDArray[np.float64]:

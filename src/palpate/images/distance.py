@@ -106,19 +106,20 @@ def distance_map(mask: NDArray[np.bool_], grid: VoxelGrid, *, smoothing_mm: floa
     near = -smoothing_mm * special.ndtri(np.clip(share, 1e-12, 1.0 - 1e-12))
     weight = np.clip(np.abs(near) / smoothing_mm - (PROBIT_LIMIT - 1.0), 0.0, 1.0)
     limit = PROBIT_LIMIT * smoothing_mm
-    values = (1.0 - weight) * near + weight * (_distance_transform(mask, grid) if far else np.clip(near, -limit, limit))
-    return DistanceMap(ndimage.spline_filter(values, order=3, mode="mirror"), grid, smoothing_mm)
-
-
-def _distance_transform(mask: NDArray[np.bool_], grid: VoxelGrid) -> NDArray[np.float64]:
-    """Exact distance between voxel centres, less half a voxel so that it is zero on the faces between them, mm."""
-    half = 0.5 * float(grid.spacing.mean())
-    if not mask.any() or mask.all():
+    if not far:
+        distance = np.clip(near, -limit, limit)
+    elif not mask.any() or mask.all():
         size = float(np.linalg.norm(grid.spacing * grid.shape))
-        return np.full(mask.shape, -size if mask.all() else size)
-    outside = ndimage.distance_transform_edt(~mask, sampling=grid.spacing)
-    inside = ndimage.distance_transform_edt(mask, sampling=grid.spacing)
-    return np.asarray(np.where(mask, half - inside, outside - half))
+        distance = np.full(mask.shape, -size if mask.all() else size)
+    else:  # between voxel centres, less half a voxel so that it is zero on the faces between them
+        half = 0.5 * float(grid.spacing.mean())
+        distance = np.where(
+            mask,
+            half - ndimage.distance_transform_edt(mask, sampling=grid.spacing),
+            ndimage.distance_transform_edt(~mask, sampling=grid.spacing) - half,
+        )
+    values = (1.0 - weight) * near + weight * distance
+    return DistanceMap(ndimage.spline_filter(values, order=3, mode="mirror"), grid, smoothing_mm)
 
 
 def _contract(block: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:

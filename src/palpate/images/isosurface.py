@@ -30,8 +30,16 @@ def isosurface_points(distance: DistanceMap, level: float = 0.0) -> IsosurfacePo
     h_b h_c |n_a| makes the sum over all three axes exact: sum_a n_a^2 = 1.
     """
     values = distance.node_values() - level
-    found = [_crossings(values, axis) for axis in range(3)]
-    axis = np.concatenate([np.full(len(index), a) for a, index in enumerate(found)])
+    found = []  # voxel indices (n, 3) where grid edges along each axis cross zero, by linear interpolation
+    for along in range(3):
+        moved = np.moveaxis(values, along, 0)
+        lower, upper = moved[:-1], moved[1:]
+        place = np.argwhere((lower < 0.0) != (upper < 0.0))
+        start, end = lower[tuple(place.T)], upper[tuple(place.T)]
+        crossings = place.astype(np.float64)
+        crossings[:, 0] += start / (start - end)
+        found.append(crossings[:, np.argsort([along, *[a for a in range(3) if a != along]])])
+    axis = np.concatenate([np.full(len(crossings), a) for a, crossings in enumerate(found)])
     index = np.concatenate(found)
     kept = np.all((index >= BORDER) & (index <= np.array(values.shape) - 1.0 - BORDER), axis=1)
     places = distance.grid.world(index[kept])
@@ -46,15 +54,3 @@ def isosurface_points(distance: DistanceMap, level: float = 0.0) -> IsosurfacePo
     normals = gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
     face = distance.grid.voxel_volume / distance.grid.spacing[axis[kept]]
     return IsosurfacePoints(places, normals, face * np.abs(np.einsum("na,na->n", normals, directions)))
-
-
-def _crossings(values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-    """Voxel indices (n, 3) where grid edges along `axis` cross zero, by linear interpolation."""
-    moved = np.moveaxis(values, axis, 0)
-    lower, upper = moved[:-1], moved[1:]
-    place = np.argwhere((lower < 0.0) != (upper < 0.0))
-    start, end = lower[tuple(place.T)], upper[tuple(place.T)]
-    index = place.astype(np.float64)
-    index[:, 0] += start / (start - end)
-    order = np.argsort([axis, *[a for a in range(3) if a != axis]])
-    return np.asarray(index[:, order])

@@ -206,7 +206,12 @@ def parameter_map(
     """
     meshed = [tissues[i] for i in regions]
     known = [tissue for tissue in meshed if tissue.role is Role.KNOWN]
-    groups = _groups([tissue.name for tissue in meshed if tissue.role is Role.ESTIMATE], tied)
+    estimated = [tissue.name for tissue in meshed if tissue.role is Role.ESTIMATE]
+    strange = sorted({name for group in tied for name in group} - set(estimated))
+    if strange:
+        raise ConfigurationError(f"tied tissues must have the role `estimate`: of {estimated}, not {strange}")
+    of = {name: tuple(group) for group in tied for name in group}
+    groups = list(dict.fromkeys(of.get(name, (name,)) for name in estimated))
     absolute = bool(known)
     sought = groups if absolute or loaded else groups[1:]
     if not sought:
@@ -232,12 +237,3 @@ def parameter_map(
     base = np.array([(t.youngs_modulus_kpa or unit) if t.role is Role.KNOWN else unit for t in meshed])
     scale = known[0].name if absolute else " and ".join(groups[0])
     return ParameterMap(base, selection, names, scale, absolute, modes, poisson=tuple(poisson))
-
-
-def _groups(names: Sequence[str], tied: Sequence[Sequence[str]]) -> list[tuple[str, ...]]:
-    """The names in groups that share a parameter, in the order of their first; raises `ConfigurationError`."""
-    strange = sorted({name for group in tied for name in group} - set(names))
-    if strange:
-        raise ConfigurationError(f"tied tissues must have the role `estimate`: of {list(names)}, not {strange}")
-    of = {name: tuple(group) for group in tied for name in group}
-    return list(dict.fromkeys(of.get(name, (name,)) for name in names))

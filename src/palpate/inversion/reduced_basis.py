@@ -93,7 +93,11 @@ class ReducedBasis:
             sharper = _extended(sharper, missing, SolveCounts(forward=1))
         if at.directions is None:
             return replace(sharper, place=at)
-        loads = _loads_along(at.directions, model, at.moduli, displacement)
+        # loads (n_free, k), mN, whose responses are the free part of the displacement's derivatives
+        by_modulus, by_mode = at.directions[: model.n_regions], at.directions[model.n_regions :]
+        loads = -np.asarray(weighted_sum(at.moduli, model.coupling)[:, :-1] @ by_mode)
+        for modulus, stiffness, share in zip(at.moduli, model.stiffness, by_modulus, strict=True):
+            loads -= np.outer(model.constraint.free.T @ (modulus * (stiffness @ displacement)), share)
         vectors = sharper.projection.vectors
         known = vectors @ sharper.model.system(at.moduli).backward(vectors.T @ loads)
         rest = solved(loads - matrix @ known, TANGENT)
@@ -161,14 +165,3 @@ def reduced_basis(model: LinearModel, moduli: NDArray[np.float64]) -> ReducedBas
 
 def _extended(basis: ReducedBasis, snapshots: NDArray[np.float64], cost: SolveCounts) -> ReducedBasis:
     return replace(basis, projection=basis.projection.extended(snapshots), counts=basis.counts + cost)
-
-
-def _loads_along(
-    directions: NDArray[np.float64], model: LinearModel, moduli: NDArray[np.float64], values: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Loads (n_free, k), mN, whose responses are the free part of the derivatives of u (n_dof,) along directions."""
-    by_modulus, by_mode = directions[: model.n_regions], directions[model.n_regions :]
-    loads = -np.asarray(weighted_sum(moduli, model.coupling)[:, :-1] @ by_mode)
-    for modulus, matrix, share in zip(moduli, model.stiffness, by_modulus, strict=True):
-        loads -= np.outer(model.constraint.free.T @ (modulus * (matrix @ values)), share)
-    return loads

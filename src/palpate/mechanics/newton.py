@@ -178,7 +178,12 @@ def follow(
         length, failure = 1.0, ""
         while path.fraction < 1.0:
             if length < settings.smallest_step or path.steps >= settings.max_steps:
-                return replace(path, reason=_ended(path, failure or f"{path.steps} steps were not enough"))
+                reason = (
+                    f"no equilibrium was found beyond {100.0 * path.fraction:.1f} % of the motion and load (step"
+                    f" {path.steps}): {failure or f'{path.steps} steps were not enough'}; move or load the body less,"
+                    " or use a finer mesh where it moves most"
+                )
+                return replace(path, reason=reason)
             before = path
             try:
                 path = _step(way, path, min(length, 1.0 - path.fraction))
@@ -190,13 +195,6 @@ def follow(
             taken = path.fraction - before.fraction
             length = 2.0 * taken if path.iterations - before.iterations <= EASY else taken
     return replace(path, converged=True, reason=f"in equilibrium after {path.iterations} iterations")
-
-
-def _ended(path: NewtonPath, failure: str) -> str:
-    return (
-        f"no equilibrium was found beyond {100.0 * path.fraction:.1f} % of the motion and load (step {path.steps}):"
-        f" {failure}; move or load the body less, or use a finer mesh where it moves most"
-    )
 
 
 def _step(way: _Way, path: NewtonPath, length: float) -> NewtonPath:

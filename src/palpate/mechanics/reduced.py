@@ -206,7 +206,12 @@ class Projection:
         model, old = self.model, self.reduced
         sides = [_products(matrix, (vectors, fresh), fresh) for matrix in model.free_stiffness]
         del vectors
-        stiffness = np.stack([_bordered(a, *side) for a, side in zip(old.stiffness, sides, strict=True)])
+        stiffness = np.stack(
+            [
+                np.block([[block, side], [side.T, 0.5 * (corner + corner.T)]])
+                for block, (side, corner) in zip(old.stiffness, sides, strict=True)
+            ]
+        )
         reduced = replace(
             old,
             stiffness=stiffness,
@@ -251,19 +256,15 @@ def orthonormal_basis(snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
     sizes = np.linalg.eigvalsh(scaled.T @ scaled)
     if sizes[0] > WELL_CONDITIONED * sizes[-1]:
         for _ in range(2):
-            _through_gram(scaled)
+            # V R^-1 in place of V, with V^T V = R^T R: a second copy would be among the largest there are
+            factor = linalg.cholesky(scaled.T @ scaled, check_finite=False)
+            inverse = linalg.solve_triangular(factor, np.eye(len(factor)), check_finite=False)
+            for start in range(0, len(scaled), ROWS):
+                scaled[start : start + ROWS] = scaled[start : start + ROWS] @ inverse
         return scaled
     q, r = np.linalg.qr(scaled)
     rotation, values, _ = np.linalg.svd(r)
     return np.asarray(q @ rotation[:, : int(np.sum(values > RANK_TOLERANCE * values[0]))])
-
-
-def _through_gram(vectors: NDArray[np.float64]) -> None:
-    """V R^-1 in place of V (n, k), with V^T V = R^T R: a second copy would be among the largest there are."""
-    factor = linalg.cholesky(vectors.T @ vectors, check_finite=False)
-    inverse = linalg.solve_triangular(factor, np.eye(len(factor)), check_finite=False)
-    for start in range(0, len(vectors), ROWS):
-        vectors[start : start + ROWS] = vectors[start : start + ROWS] @ inverse
 
 
 def _complement(vectors: NDArray[np.float64], snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -289,13 +290,6 @@ def _checked(model: LinearModel, snapshots: NDArray[np.float64]) -> NDArray[np.f
 def _coupling(model: LinearModel, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """V^T C_r (n_regions, m, n_modes + 1)."""
     return np.stack([np.asarray((matrix.T @ vectors).T) for matrix in model.coupling])
-
-
-def _bordered(
-    block: NDArray[np.float64], side: NDArray[np.float64], corner: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """The symmetric matrix [[block, side], [side^T, corner]]."""
-    return np.block([[block, side], [side.T, 0.5 * (corner + corner.T)]])
 
 
 def _products(

@@ -40,7 +40,10 @@ def largest_difference(mesh: TetMesh, image: Segmentation, tissue: int) -> NDArr
         shown = voxelise(space, np.zeros_like(space.points), image.grid, subdivisions=0, crossing=True)
     except GeometryError:
         return None
-    inside = [slice(low, high) for low, high in _extent(mesh, image.grid)]
+    index = image.grid.index(mesh.nodes)
+    first = np.clip(np.floor(index.min(axis=0) + 0.5).astype(np.int64), 0, image.grid.shape)
+    last = np.clip(np.ceil(index.max(axis=0) + 0.5).astype(np.int64), 0, image.grid.shape)
+    inside = [slice(low, high) for low, high in zip(first, last, strict=True)]
     differ = ((shown == tissue) != image.mask(tissue))[tuple(inside)]
     if not differ.any():
         return None
@@ -48,10 +51,3 @@ def largest_difference(mesh: TetMesh, image: Segmentation, tissue: int) -> NDArr
     density = np.where(differ, ndimage.uniform_filter(differ.astype(float), size.tolist(), mode="constant"), 0.0)
     voxel = np.array(np.unravel_index(int(density.argmax()), density.shape)) + [s.start for s in inside]
     return np.asarray(image.grid.world(voxel[None].astype(float))[0])
-
-
-def _extent(mesh: TetMesh, grid: VoxelGrid) -> NDArray[np.int64]:
-    """First voxel and the one after the last (3, 2) along each axis that the mesh's bounding box reaches."""
-    index = grid.index(mesh.nodes)
-    low, high = np.floor(index.min(axis=0) + 0.5), np.ceil(index.max(axis=0) + 0.5)
-    return np.asarray(np.clip(np.stack([low, high], axis=1), 0, np.array(grid.shape)[:, None]), dtype=np.int64)

@@ -35,7 +35,13 @@ def smoothed(
     reach = np.full(len(nodes), step_mm)
     worst = tet_dihedrals(nodes[grid.tets]).min(axis=1)
     for _ in range(sweeps):
-        chosen = _independent(grid.tets, worst < below_deg, rng.random(len(nodes)))
+        # of the nodes of bad tetrahedra those of the lowest priority around: no two in one tetrahedron
+        candidates = np.unique(grid.tets[worst < below_deg])
+        priority = np.full(len(nodes), np.inf)
+        priority[candidates] = rng.random(len(nodes))[candidates]
+        lowest = np.full(len(nodes), np.inf)
+        np.minimum.at(lowest, grid.tets, priority[grid.tets].min(axis=1)[:, None])
+        chosen = candidates[lowest[candidates] == priority[candidates]]
         if not len(chosen):
             break
         frames = np.linalg.qr(rng.normal(size=(TRIALS // 6, 3, 3)))[0].reshape(-1, 3)
@@ -48,16 +54,6 @@ def smoothed(
     return Grid(nodes, grid.tets, grid.region)
 
 
-def _independent(tets: NDArray[np.int64], bad: NDArray[np.bool_], priority: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Nodes of bad tetrahedra, no two of them in one tetrahedron: those of the lowest `priority` (n_nodes,) around."""
-    rank = np.full(len(priority), np.inf)
-    candidates = np.unique(tets[bad])
-    rank[candidates] = priority[candidates]
-    lowest = np.full(len(priority), np.inf)
-    np.minimum.at(lowest, tets, rank[tets].min(axis=1)[:, None])
-    return np.asarray(candidates[lowest[candidates] == rank[candidates]])
-
-
 def _search(
     nodes: NDArray[np.float64],
     tets: NDArray[np.int64],
@@ -67,7 +63,16 @@ def _search(
     steps: NDArray[np.float64],
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Best of the trial points (n, 3) of each chosen node, and whether it is better than where the node is."""
-    trials = _trial_points(nodes, contacts, chosen, steps)
+    n_trials = steps.shape[1]
+    start = np.repeat(nodes[chosen], n_trials, axis=0)
+    points = start + within_faces(steps.reshape(-1, 3), start, contacts.box)
+    index = np.repeat(chosen, n_trials)
+    surface = np.flatnonzero(contacts.on[index].any(axis=1))
+    limit = float(np.abs(steps).max()) * 1.5
+    for _ in range(2):
+        points[surface] += contacts.onto(points[surface], index[surface], limit_mm=limit)
+    local = np.clip(contacts.box.local(points), 0.0, contacts.box.lengths)
+    trials = contacts.box.world(local).reshape(len(chosen), n_trials, 3)
     trials = np.concatenate([nodes[chosen][:, None], trials], axis=1)
     owner = np.repeat(np.arange(len(chosen)), np.diff(star.indptr))
     around = tets[star.indices]
@@ -81,18 +86,3 @@ def _search(
     best = penalty.argmin(axis=1)
     rows = np.arange(len(chosen))
     return penalty[rows, best] < 0.999 * penalty[:, 0], trials[rows, best]
-
-
-def _trial_points(
-    nodes: NDArray[np.float64], contacts: Contacts, chosen: NDArray[np.int64], steps: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    n_trials = steps.shape[1]
-    start = np.repeat(nodes[chosen], n_trials, axis=0)
-    points = start + within_faces(steps.reshape(-1, 3), start, contacts.box)
-    index = np.repeat(chosen, n_trials)
-    surface = np.flatnonzero(contacts.on[index].any(axis=1))
-    limit = float(np.abs(steps).max()) * 1.5
-    for _ in range(2):
-        points[surface] += contacts.onto(points[surface], index[surface], limit_mm=limit)
-    local = np.clip(contacts.box.local(points), 0.0, contacts.box.lengths)
-    return contacts.box.world(local).reshape(len(chosen), n_trials, 3)

@@ -123,7 +123,16 @@ def snapped(grid: Grid, contacts: Contacts, *, limit_mm: float, sweeps: int = 3)
     for _ in range(sweeps):
         step = np.zeros(grid.nodes.shape)
         step[nodes] = contacts.onto(grid.nodes[nodes], nodes, limit_mm=limit_mm)
-        grid = Grid(_safely_moved(grid, step), grid.tets, grid.region)
+        before = signed_volumes(grid.nodes, grid.tets)
+        for _ in range(MAX_HALVINGS):  # around every tetrahedron that it would flatten
+            bad = signed_volumes(grid.nodes + step, grid.tets) < SHRINK_LIMIT * before
+            if not bad.any():
+                break
+            step[np.unique(grid.tets[bad])] *= 0.5
+        while bad.any():
+            step[np.unique(grid.tets[bad])] = 0.0
+            bad = signed_volumes(grid.nodes + step, grid.tets) < SHRINK_LIMIT * before
+        grid = Grid(grid.nodes + step, grid.tets, grid.region)
     return grid
 
 
@@ -171,36 +180,14 @@ def _sides(grid: Grid, anatomy: Anatomy) -> tuple[NDArray[np.int64], NDArray[np.
     border = order[first[count == 1]]
     hollow = [i for i in anatomy.priority if not anatomy.tissues[i].meshed] or [anatomy.filler]
     behind = np.where(np.any(anatomy.box.faces_of(grid.nodes[faces[border]]), axis=1), -1, hollow[0])
-    behind[(behind >= 0) & _faces_filler(anatomy, grid.nodes[faces[border]].mean(axis=1), region[border])] = (
-        anatomy.filler
-    )
+    if not anatomy.tissues[anatomy.filler].meshed:  # some look at the filler, not at another hollow tissue
+        others = [rank for rank, i in enumerate(anatomy.priority) if not anatomy.tissues[i].meshed]
+        values = np.abs(anatomy.values(grid.nodes[faces[border]].mean(axis=1)))
+        rank = np.array([anatomy.priority.index(int(i)) for i in region[border]], dtype=int)
+        nearer = values[others].min(axis=0, initial=np.inf) > values[rank, np.arange(len(border))]
+        behind[(behind >= 0) & nearer] = anatomy.filler
     inner = behind >= 0
     tissues = np.concatenate(
         [np.column_stack([region[a], region[b]])[differ], np.column_stack([region[border], behind])[inner]]
     )
     return np.concatenate([faces[a[differ]], faces[border[inner]]]), tissues
-
-
-def _faces_filler(anatomy: Anatomy, centres: NDArray[np.float64], region: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether border faces (n,) of tetrahedra of `region` (n,) look at a hollow filler, not another hollow tissue."""
-    if anatomy.tissues[anatomy.filler].meshed:
-        return np.zeros(len(centres), dtype=bool)
-    hollow = [rank for rank, i in enumerate(anatomy.priority) if not anatomy.tissues[i].meshed]
-    values = np.abs(anatomy.values(centres))
-    rank = np.array([anatomy.priority.index(int(i)) for i in region], dtype=int)
-    return np.asarray(values[hollow].min(axis=0, initial=np.inf) > values[rank, np.arange(len(centres))])
-
-
-def _safely_moved(grid: Grid, step: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Nodes after `step` (n_nodes, 3) mm, halved around every tetrahedron that it would flatten."""
-    before = signed_volumes(grid.nodes, grid.tets)
-    step = step.copy()
-    for _ in range(MAX_HALVINGS):
-        bad = signed_volumes(grid.nodes + step, grid.tets) < SHRINK_LIMIT * before
-        if not bad.any():
-            return np.asarray(grid.nodes + step)
-        step[np.unique(grid.tets[bad])] *= 0.5
-    while bad.any():
-        step[np.unique(grid.tets[bad])] = 0.0
-        bad = signed_volumes(grid.nodes + step, grid.tets) < SHRINK_LIMIT * before
-    return np.asarray(grid.nodes + step)

@@ -74,56 +74,7 @@ def tetrahedralise(anatomy: Anatomy, *, edge_length_mm: float, progress: Progres
 
 def _grid(anatomy: Anatomy, edge_length_mm: float, progress: Progress) -> Grid:
     progress("a graded grid, cut along every surface")
-    cut_grid = _cut_grid(anatomy, edge_length_mm)
-    keep = np.array([tissue.meshed for tissue in anatomy.tissues])[cut_grid.region]
-    if not keep.any():
-        raise GeometryError("no tetrahedron is left: the `estimate` and `known` tissues lie outside the domain")
-    tets, region = cut_grid.tets[keep], cut_grid.region[keep]
-    piece, _ = face_pieces(tets)  # small ones share no face with the rest, as between bones that touch
-    volume = np.bincount(piece, signed_volumes(cut_grid.nodes, tets))
-    keep = volume[piece] > CRUMB * volume.sum()
-    grid = compact(cut_grid.nodes, tets[keep], region[keep])
-    grid = _better(grid, anatomy, edge_length_mm, progress)
-    try:
-        return _better(grid, anatomy, edge_length_mm, progress)
-    except GeometryError:  # the second remeshing only saves tetrahedra; its input is a mesh already
-        return grid
 
-
-def _better(grid: Grid, anatomy: Anatomy, edge_length_mm: float, progress: Progress) -> Grid:
-    """The grid remeshed, its surfaces put back where they belong."""
-    progress(f"remeshing {len(grid.tets)} tetrahedra")
-    grid = _remeshed(grid, anatomy, edge_length_mm)
-    progress(f"fitting the surfaces of {len(grid.tets)} tetrahedra")
-    return _fitted(grid, anatomy, edge_length_mm)
-
-
-def _remeshed(grid: Grid, anatomy: Anatomy, edge_length_mm: float) -> Grid:
-    sizes = _sizes(anatomy, grid.nodes, edge_length_mm)
-    return remeshed(grid, sizes, box=anatomy.box, sag_mm=SAG * edge_length_mm)
-
-
-def boundary_of(tets: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Faces (n, 3) that belong to one of the tets (n_tets, 4) only, normals pointing out of it."""
-    faces = tets[:, FACES].reshape(-1, 3)
-    _, place, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    return np.asarray(faces[np.sort(place[count == 1])])
-
-
-def _fitted(grid: Grid, anatomy: Anatomy, edge_length_mm: float) -> Grid:
-    """The grid with its surface nodes where they belong and its bad tetrahedra opened."""
-    contacts = contacts_of(grid, anatomy)
-    grid = snapped(grid, contacts, limit_mm=edge_length_mm)
-    for sweeps in SMOOTHING_SWEEPS:
-        grid = smoothed(grid, contacts, step_mm=0.15 * edge_length_mm, sweeps=sweeps)
-        grid, contacts = debiased(grid, contacts)
-    grid = smoothed(grid, contacts, step_mm=0.05 * edge_length_mm, sweeps=SMOOTHING_SWEEPS[-1])
-    # where surfaces meet in too thin a wedge, a good element is worth more than a tenth of a millimetre of surface
-    step = 0.03 * edge_length_mm
-    return smoothed(grid, contacts.released(), step_mm=step, sweeps=RESCUE_SWEEPS, below_deg=RESCUE_DEG)
-
-
-def _cut_grid(anatomy: Anatomy, edge_length_mm: float) -> Grid:
     def longest_edge(points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Longest edge (n,) mm that the grid may have at points (n, 3) mm."""
         return GRID_FACTOR * _sizes(anatomy, points, edge_length_mm)
@@ -135,7 +86,43 @@ def _cut_grid(anatomy: Anatomy, edge_length_mm: float) -> Grid:
             touch = TOUCH * _sizes(anatomy, grid.nodes, edge_length_mm)
             free = grid.region == anatomy.filler
             grid = cut(grid, phi, inside=tissue, splittable=free, touch_mm=touch, box=anatomy.box)
-    return grid
+    keep = np.array([tissue.meshed for tissue in anatomy.tissues])[grid.region]
+    if not keep.any():
+        raise GeometryError("no tetrahedron is left: the `estimate` and `known` tissues lie outside the domain")
+    tets, region = grid.tets[keep], grid.region[keep]
+    piece, _ = face_pieces(tets)  # small ones share no face with the rest, as between bones that touch
+    volume = np.bincount(piece, signed_volumes(grid.nodes, tets))
+    keep = volume[piece] > CRUMB * volume.sum()
+    grid = compact(grid.nodes, tets[keep], region[keep])
+    grid = _better(grid, anatomy, edge_length_mm, progress)
+    try:
+        return _better(grid, anatomy, edge_length_mm, progress)
+    except GeometryError:  # the second remeshing only saves tetrahedra; its input is a mesh already
+        return grid
+
+
+def _better(grid: Grid, anatomy: Anatomy, edge_length_mm: float, progress: Progress) -> Grid:
+    """The grid remeshed, its surface nodes put back where they belong and its bad tetrahedra opened."""
+    progress(f"remeshing {len(grid.tets)} tetrahedra")
+    sizes = _sizes(anatomy, grid.nodes, edge_length_mm)
+    grid = remeshed(grid, sizes, box=anatomy.box, sag_mm=SAG * edge_length_mm)
+    progress(f"fitting the surfaces of {len(grid.tets)} tetrahedra")
+    contacts = contacts_of(grid, anatomy)
+    grid = snapped(grid, contacts, limit_mm=edge_length_mm)
+    for sweeps in SMOOTHING_SWEEPS:
+        grid = smoothed(grid, contacts, step_mm=0.15 * edge_length_mm, sweeps=sweeps)
+        grid, contacts = debiased(grid, contacts)
+    grid = smoothed(grid, contacts, step_mm=0.05 * edge_length_mm, sweeps=SMOOTHING_SWEEPS[-1])
+    # where surfaces meet in too thin a wedge, a good element is worth more than a tenth of a millimetre of surface
+    step = 0.03 * edge_length_mm
+    return smoothed(grid, contacts.released(), step_mm=step, sweeps=RESCUE_SWEEPS, below_deg=RESCUE_DEG)
+
+
+def boundary_of(tets: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Faces (n, 3) that belong to one of the tets (n_tets, 4) only, normals pointing out of it."""
+    faces = tets[:, FACES].reshape(-1, 3)
+    _, place, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    return np.asarray(faces[np.sort(place[count == 1])])
 
 
 def _sizes(anatomy: Anatomy, points: NDArray[np.float64], edge_length_mm: float) -> NDArray[np.float64]:

@@ -56,7 +56,13 @@ class NoiseModel:
         def term(of: tuple[float, float]) -> NDArray[np.float64]:
             """That of one variance and its length."""
             variance, length = of
-            carried, centres = _gather(rows, places, normals, 0.5 * length)
+            _, inverse = _cell_keys(places, 0.5 * length)
+            count = np.bincount(inverse)
+            centres = np.stack([np.bincount(inverse, places[:, a]) / count for a in range(3)], axis=1)
+            # sum of rows times normals in cells (n_rows, n_cells, 3)
+            carried = np.stack(
+                [np.stack([np.bincount(inverse, row * normals[:, a]) for a in range(3)], axis=1) for row in rows]
+            ).astype(np.float64)
             tree = cKDTree(centres)
             pairs = tree.sparse_distance_matrix(tree, 3.5 * length, output_type="coo_matrix").tocsr()
             pairs.data = np.exp(-(pairs.data**2) / (2.0 * length**2))
@@ -82,7 +88,7 @@ def fit_noise_model(
     (0.5 to 14 mm). Residuals below 0.001 mm tell no more: they are independent ones of that size.
     """
     sums = sum(
-        mapped(lambda of: _binned_products(*_cells(*of)), zip(values, places, normals, strict=True)),
+        mapped(lambda of: _binned_products(*of), zip(values, places, normals, strict=True)),
         np.zeros((4, BINS)),
     )
     products, cosines, distances, count = sums[:, sums[3] > 0]
@@ -97,9 +103,20 @@ def fit_noise_model(
 
 
 def _binned_products(
-    mean: NDArray[np.float64], centre: NDArray[np.float64], normal: NDArray[np.float64]
+    values: NDArray[np.float64], places: NDArray[np.float64], normals: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Sums (4, n_bins) over pairs of cells, those of a cell with itself first: r_i r_j n_i.n_j, (n_i.n_j)^2, mm, 1."""
+    """Sums (4, n_bins) over pairs of cells, those of a cell with itself first: r_i r_j n_i.n_j, (n_i.n_j)^2, mm, 1.
+
+    A cell (1 mm; at most 2500 of them) stands for the means of its residuals, places and normals.
+    """
+    keys, inverse = _cell_keys(places, CELL)
+    count = np.bincount(inverse)
+    mean = np.bincount(inverse, values) / count
+    centre = np.stack([np.bincount(inverse, places[:, a]) / count for a in range(3)], axis=1)
+    normal = np.stack([np.bincount(inverse, normals[:, a]) / count for a in range(3)], axis=1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    chosen = np.sort(np.argsort(_scattered(keys), kind="stable")[:MAX_CELLS])
+    mean, centre, normal = mean[chosen], centre[chosen], normal[chosen]
     sums = np.zeros((4, BINS))
     for start in range(0, len(mean), ROWS):
         rows, others = slice(start, start + ROWS), slice(start, None)
@@ -113,20 +130,6 @@ def _binned_products(
     return sums * np.where(np.arange(BINS) > 0, 2.0, 1.0)
 
 
-def _cells(
-    values: NDArray[np.float64], places: NDArray[np.float64], normals: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Means of residuals, places and normals in cells of 1 mm, at most 2500 of them."""
-    keys, inverse = _cell_keys(places, CELL)
-    count = np.bincount(inverse)
-    mean = np.bincount(inverse, values) / count
-    centre = np.stack([np.bincount(inverse, places[:, a]) / count for a in range(3)], axis=1)
-    normal = np.stack([np.bincount(inverse, normals[:, a]) / count for a in range(3)], axis=1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    chosen = np.sort(np.argsort(_scattered(keys), kind="stable")[:MAX_CELLS])
-    return mean[chosen], centre[chosen], normal[chosen]
-
-
 def _scattered(keys: NDArray[np.int64]) -> NDArray[np.uint64]:
     """Numbers (n,) that follow from the keys (n,) but without order (the finaliser of SplitMix64; Steele et al. 2014).
 
@@ -136,19 +139,6 @@ def _scattered(keys: NDArray[np.int64]) -> NDArray[np.uint64]:
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
         mixed = (mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)
     return np.asarray(mixed ^ (mixed >> np.uint64(31)))
-
-
-def _gather(
-    rows: NDArray[np.float64], places: NDArray[np.float64], normals: NDArray[np.float64], size: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Sum of rows times normals in cells, (n_rows, n_cells, 3), and the cells' centres (n_cells, 3)."""
-    _, inverse = _cell_keys(places, size)
-    count = np.bincount(inverse)
-    centre = np.stack([np.bincount(inverse, places[:, a]) / count for a in range(3)], axis=1)
-    carried = np.stack(
-        [np.stack([np.bincount(inverse, row * normals[:, a]) for a in range(3)], axis=1) for row in rows]
-    ).astype(np.float64)
-    return carried, centre
 
 
 def _cell_keys(places: NDArray[np.float64], size: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -78,14 +78,10 @@ def observed_surface(space: LagrangeSpace, tissue: int) -> ObservedSurface:
             " its modulus cannot be observed; enlarge the image, or make the tissue `known`"
         )
     faces = np.searchsorted(points, facets if space.order == 2 else np.zeros((0, 6), dtype=np.int64))
-    rim = _rim(triangles, observed)
-    return ObservedSurface(tissue, name, points, rest, triangles, observed, rim, share, faces, driver)
-
-
-def _rim(triangles: NDArray[np.int64], observed: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Edges (n_triangles, 3), each opposite its corner, that belong to a single observed triangle."""
+    # edges (n_triangles, 3), each opposite its corner, that belong to a single observed triangle
     edges = np.sort(triangles[:, [[1, 2], [0, 2], [0, 1]]], axis=2)
     keys = edges[..., 0] * (triangles.max() + 1) + edges[..., 1]
-    seen = np.sort(keys[observed].ravel())
-    count = np.searchsorted(seen, keys, side="right") - np.searchsorted(seen, keys, side="left")
-    return np.asarray((count == 1) & observed[:, None])
+    shown = np.sort(keys[observed].ravel())
+    count = np.searchsorted(shown, keys, side="right") - np.searchsorted(shown, keys, side="left")
+    rim = (count == 1) & observed[:, None]
+    return ObservedSurface(tissue, name, points, rest, triangles, observed, rim, share, faces, driver)

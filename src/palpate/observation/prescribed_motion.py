@@ -49,7 +49,13 @@ def prescribed_motion(
             offset[points] = bones[tissue].apply(space.points[points]) - space.points[points]
     held = prescribed.copy()
     for tissue in (i for i, role in enumerate(roles) if role is Role.DRIVER):
-        points, normals = _wall(space, tissue, held)
+        triangles = tissue_surface(space.mesh, tissue).triangles
+        facets = space.facets(triangles)
+        sums = np.zeros((n, 3))
+        np.add.at(sums, facets, triangle_normals(space.mesh.nodes, triangles)[:, None])
+        points = np.unique(facets)
+        points = points[~held[points]]
+        normals = sums[points] / np.maximum(np.linalg.norm(sums[points], axis=1, keepdims=True), np.finfo(float).tiny)
         local = wall_modes(space.points[points], n_modes=n_modes, kernel_mm=kernel_mm, prior_mm=prior_mm)
         block = np.zeros((n, 3, local.shape[1]))
         block[points] = local.reshape(len(points), 3, -1)
@@ -62,15 +68,3 @@ def prescribed_motion(
         prescribed[points] = True
     modes = np.concatenate(blocks, axis=1) if blocks else np.zeros((3 * n, 0))
     return PrescribedMotion(modes, offset.ravel(), prescribed, tuple(walls))
-
-
-def _wall(space: LagrangeSpace, tissue: int, held: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Points (n,) of a tissue's surface that are not held, and the surface's unit normals there (n, 3)."""
-    triangles = tissue_surface(space.mesh, tissue).triangles
-    facets = space.facets(triangles)
-    sums = np.zeros((len(space.points), 3))
-    np.add.at(sums, facets, triangle_normals(space.mesh.nodes, triangles)[:, None])
-    points = np.unique(facets)
-    points = points[~held[points]]
-    lengths = np.linalg.norm(sums[points], axis=1, keepdims=True)
-    return points, sums[points] / np.maximum(lengths, np.finfo(float).tiny)

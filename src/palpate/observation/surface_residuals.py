@@ -181,7 +181,15 @@ def _slide(
     Gram matrix G_ij = t_i . t_j and the closest-point condition (x - y) . t_i = 0:
     G_ij d xi_j = -(t_i . sum_a N_a du_a + (x - y) . d t_i), on an edge with its one tangent, at a corner not at all.
     """
-    along = _free_directions(closest.barycentric)
+    # directions (n, 2, 3) in barycentric coordinates along which the point may slide; zero where none
+    zero = closest.barycentric < ON_EDGE
+    count = zero.sum(axis=1)
+    along = np.zeros((len(zero), 2, 3))
+    along[count == 0] = [[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]]
+    for corner in range(3):
+        first, second = [c for c in range(3) if c != corner]
+        on_edge = (count == 1) & zero[:, corner]
+        along[on_edge, 0, first], along[on_edge, 0, second] = -1.0, 1.0
     tangent = along @ deformed  # (n, 2, 3 corners) x (n, 3 corners, 3 axes) -> (n, 2, 3 axes)
     gram = tangent @ tangent.transpose(0, 2, 1)
     still = ~np.any(along != 0.0, axis=2)
@@ -190,19 +198,6 @@ def _slide(
     rate = np.linalg.solve(gram, change).transpose(0, 2, 1)  # (n, 1, 2)
     rows = closest.barycentric[:, :, None] * (rate @ tangent)
     return np.asarray(rows + (rate @ along).transpose(0, 2, 1) * offset[:, None])
-
-
-def _free_directions(barycentric: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Directions (n, 2, 3) in barycentric coordinates along which a closest point may slide; zero where none."""
-    zero = barycentric < ON_EDGE
-    count = zero.sum(axis=1)
-    along = np.zeros((len(barycentric), 2, 3))
-    along[count == 0] = [[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]]
-    for corner in range(3):
-        first, second = [c for c in range(3) if c != corner]
-        on_edge = (count == 1) & zero[:, corner]
-        along[on_edge, 0, first], along[on_edge, 0, second] = -1.0, 1.0
-    return along
 
 
 def _closest(target: SurfaceTarget, displacement: NDArray[np.float64], image: NDArray[np.float64]) -> _Closest:

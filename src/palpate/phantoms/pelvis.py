@@ -60,7 +60,27 @@ def pelvis(options: PelvisOptions) -> Scene:
     """
     motion_rng = np.random.default_rng(options.seed).spawn(3)[2]
     grid = pelvis_grid(options)
-    motions = _motions(_body(options), options, motion_rng)
+    body = _body(options)
+    turn = rotation_about(motion_rng.normal(size=3), motion_rng.uniform(0.0, 30.0))
+    motions: dict[str, WallMotion] = {
+        "rectum": filling_of(
+            body.rectum,
+            filling_mm=options.filling_mm,
+            fullest_mm=float(motion_rng.uniform(-6.0, 6.0)),
+            length_mm=float(motion_rng.uniform(18.0, 24.0)),
+            towards=turn @ body.forwards,
+            lean=float(motion_rng.uniform(0.0, 0.2)),
+            stray=smooth_field(
+                motion_rng, sd_mm=STRAY * options.filling_mm, correlation_mm=STRAY_LENGTH_MM, features=300
+            ),
+        )
+    }
+    for name, bone in zip(("left bone", "right bone"), body.bones, strict=True):
+        axis, direction = motion_rng.normal(size=(2, 3))  # of a turn about the bone's centre, and of a shift
+        gradient = rotation_about(axis, options.bone_motion_mm) - np.eye(3)
+        motion = AffineMotion(gradient, bone.centre, options.bone_motion_mm * direction / np.linalg.norm(direction))
+        if options.bones and options.bone_motion_mm > 0.0:
+            motions[name] = motion
     anatomy = pelvis_anatomy(options)
     return make_scene(
         anatomy,
@@ -87,18 +107,8 @@ def pelvis_anatomy(options: PelvisOptions) -> Anatomy:
         parts |= {"left bone": body.bones[0], "right bone": body.bones[1]}
     parts |= {"surroundings": None}
     material_rng = np.random.default_rng(options.seed).spawn(3)[1]
-    tissues = _tissues(tuple(parts), options, material_rng)
-    return Anatomy(tissues, tuple(parts.values()), grid_box(pelvis_grid(options)))
-
-
-def _body(options: PelvisOptions) -> PelvisShapes:
-    shape_rng = np.random.default_rng(options.seed).spawn(3)[0]
-    return draw_pelvis(shape_rng, grid_box(pelvis_grid(options)), bones=options.bones)
-
-
-def _tissues(names: tuple[str, ...], options: PelvisOptions, rng: np.random.Generator) -> tuple[Tissue, ...]:
-    prostate, bladder = SURROUNDINGS_KPA * np.exp(rng.uniform(np.log(1.5), np.log(6.0), 2))
-    factor = rng.uniform(2.0, 3.0)
+    prostate, bladder = SURROUNDINGS_KPA * np.exp(material_rng.uniform(np.log(1.5), np.log(6.0), 2))
+    factor = material_rng.uniform(2.0, 3.0)
     moduli = {"surroundings": SURROUNDINGS_KPA, "prostate": prostate, "bladder": bladder}
     given = dict(options.moduli_kpa or {})
     unknown = sorted(set(given) - {*moduli, "tumour"})
@@ -106,37 +116,20 @@ def _tissues(names: tuple[str, ...], options: PelvisOptions, rng: np.random.Gene
         raise ConfigurationError(f"moduli_kpa names {unknown}; a pelvis has {[*moduli, 'tumour']}")
     moduli |= given
     moduli["tumour"] = given.get("tumour", factor * moduli["prostate"])
-    ratios = dict(zip(moduli, rng.uniform(0.40, 0.45, len(moduli)), strict=True))
+    ratios = dict(zip(moduli, material_rng.uniform(0.40, 0.45, len(moduli)), strict=True))
     stated = options.poisson_ratio or {}
     ratios |= stated if isinstance(stated, Mapping) else dict.fromkeys(ratios, stated)
     roles = {"rectum": Role.DRIVER, "left bone": Role.RIGID, "right bone": Role.RIGID, "surroundings": Role.KNOWN}
     tissues = []
-    for label, name in enumerate(names, start=1):
+    for label, name in enumerate(parts, start=1):
         role = roles.get(name, Role.ESTIMATE)
         if name not in moduli:
             tissues.append(Tissue(name, role, (label,)))
             continue
         tissues.append(Tissue(name, role, (label,), float(ratios[name]), float(moduli[name])))
-    return tuple(tissues)
+    return Anatomy(tuple(tissues), tuple(parts.values()), grid_box(pelvis_grid(options)))
 
 
-def _motions(body: PelvisShapes, options: PelvisOptions, rng: np.random.Generator) -> dict[str, WallMotion]:
-    turn = rotation_about(rng.normal(size=3), rng.uniform(0.0, 30.0))
-    motions: dict[str, WallMotion] = {
-        "rectum": filling_of(
-            body.rectum,
-            filling_mm=options.filling_mm,
-            fullest_mm=float(rng.uniform(-6.0, 6.0)),
-            length_mm=float(rng.uniform(18.0, 24.0)),
-            towards=turn @ body.forwards,
-            lean=float(rng.uniform(0.0, 0.2)),
-            stray=smooth_field(rng, sd_mm=STRAY * options.filling_mm, correlation_mm=STRAY_LENGTH_MM, features=300),
-        )
-    }
-    for name, bone in zip(("left bone", "right bone"), body.bones, strict=True):
-        axis, direction = rng.normal(size=(2, 3))  # of a turn about the bone's centre, and of a shift
-        gradient = rotation_about(axis, options.bone_motion_mm) - np.eye(3)
-        motion = AffineMotion(gradient, bone.centre, options.bone_motion_mm * direction / np.linalg.norm(direction))
-        if options.bones and options.bone_motion_mm > 0.0:
-            motions[name] = motion
-    return motions
+def _body(options: PelvisOptions) -> PelvisShapes:
+    shape_rng = np.random.default_rng(options.seed).spawn(3)[0]
+    return draw_pelvis(shape_rng, grid_box(pelvis_grid(options)), bones=options.bones)

@@ -63,9 +63,20 @@ def _upright(rng: np.random.Generator) -> PelvisShapes:
     reach = _reach(prostate.semi_axes, prostate.rotation, up) + _reach(semi_axes, turn, up)
     bladder = Ellipsoid((reach - rng.uniform(3.5, 6.0)) * up, semi_axes, turn)
     rectum = _rectum(rng, prostate, bladder)
-    return PelvisShapes(
-        prostate, bladder, rectum, _tumour(rng, prostate), _bones(rng, prostate), np.array([0.0, 1.0, 0.0])
-    )
+    # a tumour of at least 5 mL, off the prostate's centre, 2 mm or more (if there is room) under its surface
+    semi_axes, turn = rng.uniform(10.7, 11.8, 3), _turn(rng, 90.0)
+    away = 6.0 * _directions(1, rng)[0]
+    for share in np.linspace(1.0, 0.0, 11):
+        tumour = Ellipsoid(prostate.centre + share * away, semi_axes, turn)
+        if prostate.at(tumour.surface(_directions(400))).max() < -2.0:
+            break
+    bones = []
+    for side in (-1.0, 1.0):
+        semi_axes = rng.uniform([6.0, 12.0, 12.0], [8.0, 16.0, 16.0])
+        aside = _reach(prostate.semi_axes, prostate.rotation, np.array([1.0, 0.0, 0.0])) + semi_axes[0]
+        centre = np.array([side * (aside + rng.uniform(6.0, 9.0)), *rng.uniform([-4.0, -8.0], [4.0, 0.0])])
+        bones.append(Ellipsoid(centre, semi_axes, _turn(rng, 15.0)))
+    return PelvisShapes(prostate, bladder, rectum, tumour, (bones[0], bones[1]), np.array([0.0, 1.0, 0.0]))
 
 
 def _rectum(rng: np.random.Generator, prostate: Ellipsoid, bladder: Ellipsoid) -> Tube:
@@ -88,28 +99,6 @@ def _rectum(rng: np.random.Generator, prostate: Ellipsoid, bladder: Ellipsoid) -
             break
         knots = knots + np.array([0.0, excess, 0.0])
     return Tube(knots, radii)
-
-
-def _tumour(rng: np.random.Generator, prostate: Ellipsoid) -> Ellipsoid:
-    """An ellipsoid of at least 5 mL, off the prostate's centre, 2 mm or more (if there is room) under its surface."""
-    semi_axes, turn = rng.uniform(10.7, 11.8, 3), _turn(rng, 90.0)
-    away = 6.0 * _directions(1, rng)[0]
-    for share in np.linspace(1.0, 0.0, 11):
-        tumour = Ellipsoid(prostate.centre + share * away, semi_axes, turn)
-        if prostate.at(tumour.surface(_directions(400))).max() < -2.0:
-            return tumour
-    return tumour
-
-
-def _bones(rng: np.random.Generator, prostate: Ellipsoid) -> tuple[Ellipsoid, Ellipsoid]:
-    """Two ellipsoids beside the prostate."""
-    pair = []
-    for side in (-1.0, 1.0):
-        semi_axes = rng.uniform([6.0, 12.0, 12.0], [8.0, 16.0, 16.0])
-        aside = _reach(prostate.semi_axes, prostate.rotation, np.array([1.0, 0.0, 0.0])) + semi_axes[0]
-        centre = np.array([side * (aside + rng.uniform(6.0, 9.0)), *rng.uniform([-4.0, -8.0], [4.0, 0.0])])
-        pair.append(Ellipsoid(centre, semi_axes, _turn(rng, 15.0)))
-    return pair[0], pair[1]
 
 
 def _placed(body: PelvisShapes, rng: np.random.Generator, box: Box) -> PelvisShapes:

@@ -94,7 +94,16 @@ def make_scene(
     `seed` only draws the noise. Raises `GeometryError` where the truth folds over or cannot be meshed.
     """
     space = lagrange_space(tetrahedralise(anatomy, edge_length_mm=edge_length_mm), "P2")
-    walls, offset = _walls(space, motions)
+    # the points (n_points,) on walls of drivers and rigid tissues, and the displacement (n_points, 3) mm there
+    offset = np.zeros_like(space.points)
+    walls = np.zeros(len(space.points), dtype=np.bool_)
+    for index, tissue in enumerate(space.mesh.tissues):
+        if tissue.role not in (Role.DRIVER, Role.RIGID):
+            continue
+        points = np.unique(space.facets(space.mesh.boundary[space.mesh.beyond == index]))
+        walls[points] = True
+        if tissue.name in motions:
+            offset[points] = motions[tissue.name].at(space.points[points])
     no_modes = np.zeros((offset.size, 0))
     constraint = outer_constraint(space, outer="fixed", modes=no_modes, offset=offset.ravel(), prescribed=walls)
     moduli = [tissue.youngs_modulus_kpa or np.nan for tissue in space.mesh.tissues if tissue.meshed]
@@ -159,17 +168,3 @@ def grid_box(grid: VoxelGrid) -> Box:
     """The box of all voxels of an upright grid, out to their outer faces."""
     lengths = np.array(grid.shape) * grid.spacing
     return Box(grid.world(np.full((1, 3), -0.5))[0], np.eye(3), lengths)
-
-
-def _walls(space: LagrangeSpace, motions: Mapping[str, WallMotion]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Which points (n_points,) are on walls of drivers and rigid tissues; the displacement (n_points, 3) mm there."""
-    offset = np.zeros_like(space.points)
-    walls = np.zeros(len(space.points), dtype=np.bool_)
-    for index, tissue in enumerate(space.mesh.tissues):
-        if tissue.role not in (Role.DRIVER, Role.RIGID):
-            continue
-        points = np.unique(space.facets(space.mesh.boundary[space.mesh.beyond == index]))
-        walls[points] = True
-        if tissue.name in motions:
-            offset[points] = motions[tissue.name].at(space.points[points])
-    return walls, offset

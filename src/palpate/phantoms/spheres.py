@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError
 from palpate.images.label_image import VoxelGrid
@@ -85,7 +84,28 @@ def _body(options: SpheresOptions) -> tuple[Anatomy, dict[str, WallMotion]]:
     rng = np.random.default_rng(options.seed)
     grid = _grid(options)
     centre = rng.uniform(-0.5, 0.5, 3) * grid.spacing
-    parts, motions = (_pushed if options.kind == "pushed" else _squeezed)(options, centre, rng)
+    parts: dict[str, LevelSet | None]
+    motions: dict[str, WallMotion] = {}
+    if options.kind == "pushed":  # a cavity that grows, more to one side, in a ball in a box
+        parts = {"cavity": ball(centre, CORE), "shell": ball(centre, SHELL), "surroundings": None}
+        towards = rng.normal(size=3)
+        towards /= np.linalg.norm(towards)
+        stray = smooth_field(rng, sd_mm=STRAY * options.push_mm, correlation_mm=CORE, features=300)
+        motions["cavity"] = Swelling(centre, CORE, options.push_mm, towards, LEAN, stray)
+    else:  # balls in a frame that is stretched along one axis and squeezed along another, with a turn in it
+        inner, outer = ("tumour", "organ") if options.kind == "tumour" else ("core", "shell")
+        away = rng.normal(size=3)
+        off = 5.0 * away / np.linalg.norm(away) if options.kind == "tumour" else np.zeros(3)
+        parts = {
+            inner: ball(centre + off, CORE),
+            outer: ball(centre, SHELL),
+            "frame": Complement(ball(centre, OUTSIDE)),
+            "surroundings": None,
+        }
+        gradient = rng.normal(size=(3, 3))
+        gradient -= np.trace(gradient) / 3.0 * np.eye(3)
+        gradient *= options.push_mm / OUTSIDE / np.linalg.norm(gradient, ord=2)
+        motions["frame"] = AffineMotion(gradient, centre, np.zeros(3))
     names = tuple(parts)
     given = dict(options.moduli_kpa or {})
     unknown = sorted(set(given) - set(names))
@@ -100,37 +120,3 @@ def _body(options: SpheresOptions) -> tuple[Anatomy, dict[str, WallMotion]]:
         for label, name in enumerate(names, start=1)
     )
     return Anatomy(tissues, tuple(parts.values()), grid_box(grid)), motions
-
-
-Parts = dict[str, LevelSet | None]
-
-
-def _squeezed(
-    options: SpheresOptions, centre: NDArray[np.float64], rng: np.random.Generator
-) -> tuple[Parts, dict[str, WallMotion]]:
-    """Balls in a frame that is stretched along one axis and squeezed along another, with a turn in it."""
-    inner, outer = ("tumour", "organ") if options.kind == "tumour" else ("core", "shell")
-    away = rng.normal(size=3)
-    off = 5.0 * away / np.linalg.norm(away) if options.kind == "tumour" else np.zeros(3)
-    parts: Parts = {
-        inner: ball(centre + off, CORE),
-        outer: ball(centre, SHELL),
-        "frame": Complement(ball(centre, OUTSIDE)),
-        "surroundings": None,
-    }
-    gradient = rng.normal(size=(3, 3))
-    gradient -= np.trace(gradient) / 3.0 * np.eye(3)
-    gradient *= options.push_mm / OUTSIDE / np.linalg.norm(gradient, ord=2)
-    return parts, {"frame": AffineMotion(gradient, centre, np.zeros(3))}
-
-
-def _pushed(
-    options: SpheresOptions, centre: NDArray[np.float64], rng: np.random.Generator
-) -> tuple[Parts, dict[str, WallMotion]]:
-    """A cavity that grows, more to one side, in a ball in a box."""
-    parts: Parts = {"cavity": ball(centre, CORE), "shell": ball(centre, SHELL), "surroundings": None}
-    towards = rng.normal(size=3)
-    towards /= np.linalg.norm(towards)
-    stray = smooth_field(rng, sd_mm=STRAY * options.push_mm, correlation_mm=CORE, features=300)
-    filling = Swelling(centre, CORE, options.push_mm, towards, LEAN, stray)
-    return parts, {"cavity": filling}

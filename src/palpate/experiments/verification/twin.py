@@ -17,8 +17,6 @@ from palpate.mechanics import LinearModel, linear_model, triangle_quadrature
 from palpate.mesh import LevelSet, lagrange_space, triangle_normals
 from palpate.observation import (
     NoiseModel,
-    ObservedSurface,
-    SurfaceTarget,
     observed_surface,
     surface_distance,
     target_from,
@@ -91,36 +89,26 @@ def twin_problem(
 ) -> InverseProblem:
     """Core and middle are observed; `noise` moves their later surfaces; stated_noise: what the estimate is told."""
     shells = ((5.0, 10.0, 5.0 + PUSH, LATER[0]), (10.0, 20.0, LATER[0], LATER[1]))
+    places, weights = triangle_quadrature(7)
     observations = []
     for tissue, (inner, outer, later_inner, later_outer) in enumerate(shells):
+        points, areas = [], []
+        for rest, later in ((inner, later_inner), (outer, later_outer)):
+            faces = sphere_faces(model.space.mesh, rest)
+            spread = np.einsum("qk,fki->fqi", places, model.space.mesh.nodes[faces]).reshape(-1, 3)
+            points.append(later * spread / np.linalg.norm(spread, axis=1, keepdims=True))
+            size = np.linalg.norm(triangle_normals(model.space.mesh.nodes, faces), axis=1)
+            areas.append((size[:, None] * weights).ravel())
+        image = np.concatenate(points)
+        before, shell = SphericalShell(inner, outer), SphericalShell(later_inner, later_outer)
+        after: LevelSet = shell
+        if noise is not None:
+            after, image = Warped(shell, noise), noise.warp(image)
         surface = observed_surface(model.space, tissue)
-        later = SphericalShell(later_inner, later_outer)
-        target = _target(model, surface, SphericalShell(inner, outer), later, noise)
+        target = target_from(surface, before, after, level=0.0, image=(image, np.concatenate(areas)))
         observations.append(surface_distance(target, stated_noise=stated_noise))
     mapping = parameter_map(model.space.mesh.tissues, model.regions, [model.n_modes])
     return InverseProblem((LaterState(model, tuple(observations)),), mapping)
-
-
-def _target(
-    model: LinearModel,
-    surface: ObservedSurface,
-    before: SphericalShell,
-    after: SphericalShell,
-    noise: SmoothField | None,
-) -> SurfaceTarget:
-    places, weights = triangle_quadrature(7)
-    points, areas = [], []
-    for rest, later in ((before.inner, after.inner), (before.outer, after.outer)):
-        faces = sphere_faces(model.space.mesh, rest)
-        spread = np.einsum("qk,fki->fqi", places, model.space.mesh.nodes[faces]).reshape(-1, 3)
-        points.append(later * spread / np.linalg.norm(spread, axis=1, keepdims=True))
-        size = np.linalg.norm(triangle_normals(model.space.mesh.nodes, faces), axis=1)
-        areas.append((size[:, None] * weights).ravel())
-    image = np.concatenate(points)
-    shape: LevelSet = after
-    if noise is not None:
-        shape, image = Warped(after, noise), noise.warp(image)
-    return target_from(surface, before, shape, level=0.0, image=(image, np.concatenate(areas)))
 
 
 def settings_from(start: Array, *, lower: float = 0.01, upper: float = 10.0) -> InversionSettings:

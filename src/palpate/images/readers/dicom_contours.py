@@ -103,30 +103,27 @@ def _structures(dataset: Dataset, to_index: NDArray[np.float64], path: Path) -> 
     if not numbers:
         raise InputDataError(f"'{path}' has no structure with a contour; export the structures again")
     usable = len(set(numbers)) == len(numbers) and 1 <= min(numbers) <= max(numbers) <= MAX_LABEL
-    return [
-        _structure(item, NamedLabel(number if usable else place, names.get(number, "")), to_index, path)
-        for place, (item, number) in enumerate(zip(drawn, numbers, strict=True), start=1)
-    ]
-
-
-def _structure(item: Dataset, row: NamedLabel, to_index: NDArray[np.float64], path: Path) -> _Structure:
-    name = printable(row.name.strip())[:MAX_NAME] or f"structure {row.label}"
-    colour = None
-    if len(item.get("ROIDisplayColor") or ()) == 3:
-        red, green, blue = (float(part) for part in item.ROIDisplayColor)
-        colour = hex_colour(red, green, blue, top=255)
-    contours: list[NDArray[np.float64]] = []
-    n_open = n_short = 0
-    for contour in item.ContourSequence:
-        points = _points(contour)
-        if len(points) < 3:
-            n_short += 1
-        elif contour.get("ContourGeometricType") not in CLOSED:
-            n_open += 1
-        else:
-            contours.append(points @ to_index[:3, :3].T + to_index[:3, 3])
-    heights, areas = _planes(contours, name, path)
-    return _Structure(NamedLabel(row.label, name, colour), heights, areas, n_open, n_short)
+    structures = []
+    for place, (item, number) in enumerate(zip(drawn, numbers, strict=True), start=1):
+        label = number if usable else place
+        name = printable(names.get(number, "").strip())[:MAX_NAME] or f"structure {label}"
+        colour = None
+        if len(item.get("ROIDisplayColor") or ()) == 3:
+            red, green, blue = (float(part) for part in item.ROIDisplayColor)
+            colour = hex_colour(red, green, blue, top=255)
+        contours: list[NDArray[np.float64]] = []
+        n_open = n_short = 0
+        for contour in item.ContourSequence:
+            points = _points(contour)
+            if len(points) < 3:
+                n_short += 1
+            elif contour.get("ContourGeometricType") not in CLOSED:
+                n_open += 1
+            else:
+                contours.append(points @ to_index[:3, :3].T + to_index[:3, 3])
+        heights, areas = _planes(contours, name, path)
+        structures.append(_Structure(NamedLabel(label, name, colour), heights, areas, n_open, n_short))
+    return structures
 
 
 def _planes(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +10,6 @@ import numpy as np
 from highdicom.color import CIELabColor
 from highdicom.seg import Segmentation
 from numpy.typing import NDArray
-from pydicom.dataset import Dataset
 
 from palpate.errors import InputDataError
 from palpate.findings import Finding
@@ -50,27 +49,27 @@ def read(path: Path, grid: VoxelGrid | None) -> StoredImage:
                 f"the slices of '{path}' are not evenly spaced, so that no image can be made of them; resample it"
             )
         check_size(tuple(geometry.spatial_shape), 0, path, available=0, packed=False)
-        rows = tuple(_row(item) for item in segmentation.SegmentSequence if int(item.SegmentNumber) in numbers)
+        rows: list[NamedLabel] = []
+        for item in segmentation.SegmentSequence:
+            number, colour = int(item.SegmentNumber), None
+            if number not in numbers:
+                continue
+            if "RecommendedDisplayCIELabValue" in item:
+                lab = CIELabColor.from_dicom_value(item.RecommendedDisplayCIELabValue)
+                red, green, blue = lab.to_rgb(clip=True)
+                colour = hex_colour(red, green, blue, top=255)
+            name = printable(str(item.get("SegmentLabel", "")).strip())[:MAX_NAME] or f"segment {number}"
+            rows.append(NamedLabel(number, name, colour))
         labels, findings = _labels(segmentation, rows, tuple(geometry.spatial_shape))
         affine = LPS_TO_RAS @ geometry.affine
         referenced = dataset.get("ReferencedSeriesSequence") or ()
         series = series_beside(path, str(referenced[0].SeriesInstanceUID)) if referenced else None
         series = series or (Series(grid) if grid else None)
-        return _completed(StoredImage(labels, affine, rows, {"": sha256}, findings), series)
-
-
-def _row(item: Dataset) -> NamedLabel:
-    colour = None
-    if "RecommendedDisplayCIELabValue" in item:
-        red, green, blue = CIELabColor.from_dicom_value(item.RecommendedDisplayCIELabValue).to_rgb(clip=True)
-        colour = hex_colour(red, green, blue, top=255)
-    number = int(item.SegmentNumber)
-    name = printable(str(item.get("SegmentLabel", "")).strip())[:MAX_NAME] or f"segment {number}"
-    return NamedLabel(number, name, colour)
+        return _completed(StoredImage(labels, affine, tuple(rows), {"": sha256}, findings), series)
 
 
 def _labels(
-    segmentation: Segmentation, rows: tuple[NamedLabel, ...], shape: tuple[int, ...]
+    segmentation: Segmentation, rows: Sequence[NamedLabel], shape: tuple[int, ...]
 ) -> tuple[NDArray[np.uint16], tuple[Finding, ...]]:
     if segmentation.SegmentationType == "LABELMAP":
         return np.asarray(segmentation.get_volume(combine_segments=True, dtype=np.uint16).array), ()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -52,7 +52,16 @@ def read_mask_folder(folder: Path) -> StoredImage:
     def masks() -> Iterator[Mask]:
         for file in files:
             image = first if file is files[0] else _read(file)
-            _refuse_another_grid(first, image, (files[0].file, file.file), folder)
+            here, there = first.values.shape, image.values.shape
+            apart, voxel = corners_apart(here, first.affine, image.affine)
+            if here != there or not apart <= SAME_PLACE * voxel:  # what is not finite is not
+                how = f"{list(here)} and {list(there)} voxels"
+                if here == there:
+                    how = f"their corners lie up to {apart:.3g} mm apart"
+                raise InputDataError(
+                    f"the masks '{files[0].file}' and '{file.file}' in '{folder}' are not on one grid: {how}; resample"
+                    " them on the grid of one image, with nearest neighbour"
+                )
             for part, digest in image.digests.items():
                 digests[f"{file.file}.{part}" if part else file.file] = digest
             yield Mask(file.row, _inside(image.values, file.target))
@@ -86,7 +95,11 @@ def _mask_files(folder: Path) -> list[_MaskFile]:
             f" {len(names) if len(names) <= MOST_FILES else f'over {MOST_FILES}'} files; 1 to {MOST_MASKS} masks in a"
             " folder of their own are read, one file an organ (prostate.nii.gz), or name a single label image"
         )
-    numbers = _numbers(list(found))
+    # the labels of the task that knows most of the names; others follow after its last class
+    classes = max(CLASSES.values(), key=lambda known: len(set(found) & set(known)))
+    known = set(found) & set(classes)
+    others = enumerate((stem for stem in found if stem not in known), start=len(classes) + 1 if known else 1)
+    numbers = {stem: classes[stem] for stem in known} | {stem: number for number, stem in others}
     return [
         _MaskFile(NamedLabel(numbers[stem], printable(stem)), printable(name), _target(folder, name))
         for stem, name in found.items()
@@ -106,15 +119,6 @@ def _target(folder: Path, name: str) -> Path:
             " folder"
         )
     return target
-
-
-def _numbers(names: Sequence[str]) -> Mapping[str, int]:
-    """Labels of sorted names: those of the task that knows most of them; others follow after its last class."""
-    classes = max(CLASSES.values(), key=lambda known: len(set(names) & set(known)))
-    known = set(names) & set(classes)
-    last = len(classes) if known else 0
-    others = enumerate((name for name in names if name not in known), start=last + 1)
-    return {name: classes[name] for name in known} | {name: number for number, name in others}
 
 
 def _read(file: _MaskFile) -> StoredImage:
@@ -140,19 +144,6 @@ def _inside(values: NDArray[Any], path: Path) -> NDArray[np.bool_]:
             " folder of masks"
         )
     return inside
-
-
-def _refuse_another_grid(image: StoredImage, other: StoredImage, names: tuple[str, str], folder: Path) -> None:
-    here, there = image.values.shape, other.values.shape
-    alike = here == there
-    apart, voxel = corners_apart(here, image.affine, other.affine)
-    if alike and apart <= SAME_PLACE * voxel:  # what is not finite is not
-        return
-    how = f"their corners lie up to {apart:.3g} mm apart" if alike else f"{list(here)} and {list(there)} voxels"
-    raise InputDataError(
-        f"the masks '{names[0]}' and '{names[1]}' in '{folder}' are not on one grid: {how}; resample them on the"
-        " grid of one image, with nearest neighbour"
-    )
 
 
 register(ImageFormat("a folder of masks", (FOLDER,), read_mask_folder, patience=4))

@@ -10,7 +10,7 @@ import re
 import zlib
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
@@ -109,7 +109,20 @@ def read_nrrd(path: Path) -> StoredImage:
             digests = {part: each.sha256() for part, each in zip(("", "voxels"), files, strict=False)}
     except (OSError, EOFError, zlib.error) as error:
         raise damaged(path, error) from error
-    return replace(_image(values, header, place), digests=digests)
+    segments = segments_of(header.keys, path)
+    lists = [k for k in place.list_axes if values.shape[k] > 1]
+    if len(lists) > 1 or (lists and not segments):
+        raise InputDataError(
+            f"'{path}' has the sizes {list(values.shape)}, but an image of three axes is needed; extract one volume (a"
+            " time point, a channel)"
+        )
+    keep = lists[:1]
+    squeezed = np.squeeze(values, axis=tuple(k for k in place.list_axes if k not in keep))
+    if not segments:
+        return StoredImage(squeezed, place.affine, digests=digests)
+    layers = np.moveaxis(squeezed, keep[0], 0) if keep else squeezed[None]
+    labels, names = flattened(layers, segments, path)
+    return StoredImage(labels, place.affine, names, digests)
 
 
 def _header(file: BinaryIO, path: Path) -> _Header:
@@ -181,24 +194,6 @@ def _place(header: _Header) -> _Place:
 
 def _vector(text: str, header: _Header, field: str) -> NDArray[np.float64]:
     return numbers(text.replace(",", " "), 3, header.path, field=field)
-
-
-def _image(values: NDArray[np.generic], header: _Header, place: _Place) -> StoredImage:
-    path = header.path
-    segments = segments_of(header.keys, path)
-    lists = [k for k in place.list_axes if values.shape[k] > 1]
-    if len(lists) > 1 or (lists and not segments):
-        raise InputDataError(
-            f"'{path}' has the sizes {list(values.shape)}, but an image of three axes is needed; extract one volume (a"
-            " time point, a channel)"
-        )
-    keep = lists[:1]
-    squeezed = np.squeeze(values, axis=tuple(k for k in place.list_axes if k not in keep))
-    if not segments:
-        return StoredImage(squeezed, place.affine)
-    layers = np.moveaxis(squeezed, keep[0], 0) if keep else squeezed[None]
-    labels, names = flattened(layers, segments, path)
-    return StoredImage(labels, place.affine, names)
 
 
 register(ImageFormat("NRRD", (".nrrd", ".nhdr"), read_nrrd))

@@ -92,8 +92,21 @@ def flattened(
         return layers[0], names
     merged = np.zeros(layers.shape[1:], dtype=np.uint16)
     for k, layer in enumerate(layers):
-        ours = [(s, label) for s, label in zip(segments, labels, strict=True) if s.layer == k]
-        mapped = _relabelled(layer, ours, path)
+        if layer.dtype.kind not in "iu" or layer.min() < 0 or layer.max() > MAX_LABEL:
+            raise InputDataError(
+                f"the layers of '{path}' hold values that are no labels from 0 to {MAX_LABEL}; export it again"
+            )
+        table = np.zeros(MAX_LABEL + 1, dtype=np.uint16)
+        for s, label in zip(segments, labels, strict=True):
+            if s.layer == k:
+                table[s.label] = label
+        mapped = np.asarray(table[layer])
+        lost = (mapped == 0) & (layer > 0)
+        if lost.any():
+            raise InputDataError(
+                f"'{path}' has {np.count_nonzero(lost)} voxels that belong to no segment of their layer; export it"
+                " again"
+            )
         both = (merged > 0) & (mapped > 0)
         if both.any():
             where = tuple(np.argwhere(both)[0])
@@ -105,20 +118,3 @@ def flattened(
             )
         merged += mapped
     return merged, names
-
-
-def _relabelled(layer: NDArray[Any], segments: list[tuple[Segment, int]], path: Path) -> NDArray[np.uint16]:
-    if layer.dtype.kind not in "iu" or layer.min() < 0 or layer.max() > MAX_LABEL:
-        raise InputDataError(
-            f"the layers of '{path}' hold values that are no labels from 0 to {MAX_LABEL}; export it again"
-        )
-    table = np.zeros(MAX_LABEL + 1, dtype=np.uint16)
-    for segment, label in segments:
-        table[segment.label] = label
-    mapped = np.asarray(table[layer])
-    lost = (mapped == 0) & (layer > 0)
-    if lost.any():
-        raise InputDataError(
-            f"'{path}' has {np.count_nonzero(lost)} voxels that belong to no segment of their layer; export it again"
-        )
-    return mapped

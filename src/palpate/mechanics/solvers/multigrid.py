@@ -141,10 +141,6 @@ def _level(matrix: sparse.csr_matrix[np.float64], prolongation: sparse.csr_matri
     return Level(rows, inverse, largest, up, sparse.csr_matrix(up.T))
 
 
-def _expect(matrix: sparse.csr_matrix[np.float64], hints: Hints) -> Expectation:
-    return _expect_of_size(matrix.shape[0], hints.right_hand_sides, matrix.nnz)
-
-
 def _expect_of_size(unknowns: int, right_hand_sides: int, entries: float | None = None) -> Expectation:
     entries = ENTRIES * unknowns if entries is None else entries
     a_step = STEP_ALONE if right_hand_sides == 1 else STEP_OF_MANY
@@ -152,4 +148,10 @@ def _expect_of_size(unknowns: int, right_hand_sides: int, entries: float | None 
     return Expectation(seconds, entries * BYTES_AN_ENTRY + 40.0 * unknowns * right_hand_sides)
 
 
-SOLVER = Solver("multigrid", _factorise, False, _expect, _expect_of_size)
+SOLVER = Solver(
+    "multigrid",
+    _factorise,
+    False,
+    lambda matrix, hints: _expect_of_size(matrix.shape[0], hints.right_hand_sides, matrix.nnz),
+    _expect_of_size,
+)

@@ -96,7 +96,18 @@ def factorise(
     chosen = SOLVERS[solver]
     checked = CheckedFactorisation(matrix, chosen.factorise(matrix, hints), chosen.name)
     if chosen.direct:
-        _refuse_singular(checked)
+        # probe the condition: |A| |x| / |b| for a random b is a lower estimate; a floating body makes it 1e16
+        n = matrix.shape[0]
+        probe = np.random.default_rng(0).standard_normal((n, 1))
+        response = checked.inner.nearly(probe)
+        size = float(np.max(abs(matrix).sum(axis=1)))
+        condition = size * float(np.linalg.norm(response) / np.linalg.norm(probe))
+        if not condition < LARGEST_CONDITION:
+            raise SolverError(
+                f"the stiffness of {n} unknowns is singular (condition number at least {condition:.1g}): some part of"
+                " the body can move without resistance; hold it (outer boundary 'fixed', a rigid or driver tissue) or"
+                " join it to its neighbours"
+            )
     return checked
 
 
@@ -122,18 +133,3 @@ def _fastest(expected: dict[str, Expectation], room: float) -> str:
     if not fitting:
         return min(expected, key=lambda name: expected[name].bytes)
     return min(fitting, key=lambda name: expected[name].seconds)
-
-
-def _refuse_singular(checked: CheckedFactorisation) -> None:
-    """Probe the condition: |A| |x| / |b| for a random b is a lower estimate; a floating body makes it 1e16."""
-    n = checked.matrix.shape[0]
-    probe = np.random.default_rng(0).standard_normal((n, 1))
-    response = checked.inner.nearly(probe)
-    size = float(np.max(abs(checked.matrix).sum(axis=1)))
-    condition = size * float(np.linalg.norm(response) / np.linalg.norm(probe))
-    if not condition < LARGEST_CONDITION:
-        raise SolverError(
-            f"the stiffness of {n} unknowns is singular (condition number at least {condition:.1g}): some part of the"
-            " body can move without resistance; hold it (outer boundary 'fixed', a rigid or driver tissue) or join it"
-            " to its neighbours"
-        )
