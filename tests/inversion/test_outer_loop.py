@@ -110,6 +110,27 @@ def test_weights_that_never_agree_are_not_called_convergence(twins, voxels, monk
     assert found.minimum.outcome is Outcome.STEPS
 
 
+def test_weights_that_take_turns_within_the_noise_end_an_estimate(twins, voxels, monkeypatch):
+    """Two sets of weights, each of which asks for the other: an iteration of two passes ends where it began."""
+    passes, agreed = [], loop._agreed
+
+    def counted(*arguments):
+        passes.append(len(passes))
+        return agreed(*arguments)
+
+    def in_turn(objective, minimum):
+        first, *others = reweighted(objective, minimum).observations
+        times = 1.0 if len(passes) % 2 else 1.4
+        weighting = replace(first.weighting, precision=times * first.weighting.precision)
+        return objective.with_observations([replace(first, weighting=weighting), *others])
+
+    monkeypatch.setattr(loop, "_agreed", counted)
+    monkeypatch.setattr(loop, "reweighted", in_turn)
+    end = invert(voxels, twins.settings(0.5), progress=twins.silent, rule=StopRule(passes=2))
+    assert end.convergence.converged
+    assert len(passes) < 2 * StopRule().iterations
+
+
 def test_every_criterion_must_hold():
     met = Convergence(0.9, 0.9, 0.9)
     assert met.converged

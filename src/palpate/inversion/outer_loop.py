@@ -101,7 +101,8 @@ class StopRule:
     those that decide the moduli must be exact so near that they leave no more than a step; solve_above: error from
     which the full model is solved; passes: of weights and estimate in turn on one approximation; iterations;
     refinements of the drivers' walls: the largest numbers of each; far: tolerances by which an estimate may still move
-    at its largest number of iterations, where more has not converged.
+    at its largest number of iterations, where more has not converged, and by which a pass may move one that the passes
+    of an iteration lead round to where it began (weightings that explain the images as well take turns).
     """
 
     step_sd: float = 0.02
@@ -222,6 +223,8 @@ def _iteration(
     open_ = np.max(_linearisation(objective, found) / tolerance, initial=0.0) if rule.derivatives else step
     error, off, cost = _model_error(objective, found)
     missing = float(np.max(off / (rule.model_error * tolerance), initial=0.0))
+    if step < 1.0 and reweighting <= rule.far:  # its passes went round to where it began: more of them do the same
+        reweighting = min(reweighting, step)
     convergence = Convergence(reweighting, float(open_), missing)
     there = OuterIterate(objective, found, convergence, step, checks=now.checks + cost)
     if convergence.converged or error < rule.solve_above:
