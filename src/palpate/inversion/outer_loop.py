@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
 from palpate.inversion.approximation import Approximation
-from palpate.inversion.driver import refined_walls
+from palpate.inversion.driver import refined_walls, with_held_kernels
 from palpate.inversion.objective import Evaluation, LinearisedObjective, Objective
 from palpate.inversion.optimise import (
     Bounds,
@@ -152,31 +152,37 @@ def run_outer_loop(
     """Follow a minimum until reweighting it and updating its approximations change it no more.
 
     The approximations of `start` are exact there (see `updated`). Drivers' walls are refined where their surfaces ask
-    for it (see `refined_walls`). `title` begins each line of `progress`. The minimum's history is that of the loop
-    alone, its evaluations are added to those of `start`. Raises `NotConverged` when the full model has no equilibrium
-    where every part of a step leads.
+    for it (see `refined_walls`); the kernels of their motion are held from where the estimate is near. `title` begins
+    each line of `progress`. The minimum's history is that of the loop alone, its evaluations are added to those of
+    `start`. Raises `NotConverged` when the full model has no equilibrium where every part of a step leads.
     """
+    walls = [state.walls for state in start.objective.states]
     at, theta = start.minimum.evaluation, start.minimum.unknowns[: start.objective.n_parameters]
     first = Iterate(theta, at.value, at.misfit_mm2, newton_decrement(at))
-    now, refinements = replace(start, minimum=replace(start.minimum, history=(first,))), 0
+    now, refinements, held = replace(start, minimum=replace(start.minimum, history=(first,))), 0, False
     del start  # and with it its approximations, which are large, when others take their place
     for number in range(1, rule.iterations + 1):
         line = f"{title}, outer iteration {number}"
         progress(f"{line}: {now.objective.parameters.in_words(now.minimum.unknowns)}")
         now = _iteration(now, settings, rule, progress, line)
         if now.stayed:
-            return now
+            break
+        if not held and now.step * rule.step_sd < NEAR:
+            objective = with_held_kernels(now.objective, now.minimum.evaluation, now.minimum.unknowns)
+            now, held = replace(now, objective=objective), True
         if now.convergence.converged:
             finer = refined_walls(now.objective, now.minimum.evaluation)
             if all(of is None for of in finer) or refinements == rule.refinements or number == rule.iterations:
-                return now
+                break
             pairs = zip(now.objective.approximations, finer, strict=True)
             moved = [a if constraint is None else a.with_constraint(constraint) for a, constraint in pairs]
             now, refinements = _with_approximations(now, moved), refinements + 1
             now = replace(now, convergence=Convergence(), step=np.inf)
-    if max(now.convergence.reweighting, now.convergence.linearisation) > rule.far and now.minimum.converged:
-        now = replace(now, minimum=replace(now.minimum, outcome=Outcome.STEPS))
-    return now
+    else:
+        if max(now.convergence.reweighting, now.convergence.linearisation) > rule.far and now.minimum.converged:
+            now = replace(now, minimum=replace(now.minimum, outcome=Outcome.STEPS))
+    states = [replace(s, walls=own) for s, own in zip(now.objective.states, walls, strict=True)]  # for another law
+    return replace(now, objective=replace(now.objective, states=tuple(states)))
 
 
 def updated(objective: Objective, minimum: Minimum, rule: StopRule) -> OuterIterate:
