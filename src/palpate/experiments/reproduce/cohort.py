@@ -22,7 +22,7 @@ from palpate.inversion import (
     reduced_basis,
 )
 from palpate.mechanics import LinearModel, LinearSystem, linear_model, outer_constraint, with_constraint
-from palpate.mesh import Anatomy, lagrange_space, tetrahedralise
+from palpate.mesh import Anatomy, Box, lagrange_space, tetrahedralise
 from palpate.observation import NoiseModel, observed_surface, prescribed_motion, surface_distance
 from palpate.phantoms import (
     Noise,
@@ -99,16 +99,8 @@ def estimate_patient(settings: CohortSettings, patient: int, progress: Callable[
     """All pairs of a patient, with one mesh and one reduced model; raises `PalpateError`s of meshing and solving."""
     truth = true_moduli(settings, patient)
     seed = settings.seed + patient
-    box = grid_box(centred_grid(FIELD_MM, (1.0, 1.0, 1.0)))
-    shapes = draw_pelvis(np.random.default_rng(seed), box, bones=False)
-    tissues = (
-        Tissue("prostate", Role.ESTIMATE, (1,), POISSON_RATIO),
-        Tissue("bladder", Role.ESTIMATE, (2,), POISSON_RATIO),
-        Tissue("rectum", Role.DRIVER, (3,)),
-        Tissue("surroundings", Role.KNOWN, (4,), POISSON_RATIO, SURROUNDINGS_KPA),
-    )
-    anatomy = Anatomy(tissues, (shapes.prostate, shapes.bladder, shapes.rectum, None), box)
-    space = lagrange_space(tetrahedralise(anatomy, edge_length_mm=settings.edge_mm), "P2")
+    shapes = draw_pelvis(np.random.default_rng(seed), _box(), bones=False)
+    space = lagrange_space(tetrahedralise(_anatomy(shapes), edge_length_mm=settings.edge_mm), "P2")
     motion = prescribed_motion(
         space, {}, n_modes=settings.driver.modes, kernel_mm=settings.driver.kernel_mm, prior_mm=settings.driver.prior_mm
     )
@@ -117,13 +109,7 @@ def estimate_patient(settings: CohortSettings, patient: int, progress: Callable[
     )
     model = linear_model(space, constraint)
     progress(f"patient {patient + 1}: {3 * len(space.points)} unknowns")
-    # one reduced model for all pairs: responses at five places of the two moduli
-    middle = 2.5 * SURROUNDINGS_KPA
-    basis = reduced_basis(model, _moduli(model, dict.fromkeys(ORGANS, middle)))
-    none = np.zeros(model.n_modes)
-    for first in (middle / SPREAD, middle * SPREAD):
-        for second in (middle / SPREAD, middle * SPREAD):
-            basis = basis.with_responses(_moduli(model, dict(zip(ORGANS, (first, second), strict=True))), none)
+    basis = _basis(model)
     held = replace(model.constraint, modes=np.zeros((3 * len(space.points), 0)))
     system = with_constraint(model, held).system(_moduli(model, truth))
     pairs = [
@@ -206,6 +192,31 @@ class _Pair:
         offset[wall] = motion.at(model.space.points[wall])
         filled = with_constraint(model, replace(model.constraint, offset=offset.ravel()))
         return replace(self.system, model=filled).solve(np.zeros(0)).displacement
+
+
+def _box() -> Box:
+    return grid_box(centred_grid(FIELD_MM, (1.0, 1.0, 1.0)))
+
+
+def _anatomy(shapes: PelvisShapes) -> Anatomy:
+    tissues = (
+        Tissue("prostate", Role.ESTIMATE, (1,), POISSON_RATIO),
+        Tissue("bladder", Role.ESTIMATE, (2,), POISSON_RATIO),
+        Tissue("rectum", Role.DRIVER, (3,)),
+        Tissue("surroundings", Role.KNOWN, (4,), POISSON_RATIO, SURROUNDINGS_KPA),
+    )
+    return Anatomy(tissues, (shapes.prostate, shapes.bladder, shapes.rectum, None), _box())
+
+
+def _basis(model: LinearModel) -> ReducedBasis:
+    """One reduced model for all pairs: responses at five places of the two moduli."""
+    middle = 2.5 * SURROUNDINGS_KPA
+    basis = reduced_basis(model, _moduli(model, dict.fromkeys(ORGANS, middle)))
+    none = np.zeros(model.n_modes)
+    for first in (middle / SPREAD, middle * SPREAD):
+        for second in (middle / SPREAD, middle * SPREAD):
+            basis = basis.with_responses(_moduli(model, dict(zip(ORGANS, (first, second), strict=True))), none)
+    return basis
 
 
 def _moduli(model: LinearModel, organs: dict[str, float]) -> Array:
