@@ -88,15 +88,11 @@ def _learned(
                 found = list[tuple[float, float, NDArray[np.float64], Wall]]()
                 for (drift, swelling), (evidence, covariance) in zip(pairs, beliefs, strict=True):
                     if evidence > best - ALIKE:
-                        with_it = prior.copy()
+                        with_it, held = prior.copy(), Wall(wall.columns, (drift,), (swelling,))
                         with_it[np.ix_(places, places)] = np.linalg.inv(covariance)
-                        width, own_wall = (
-                            _width(data + with_it, n_parameters),
-                            Wall(wall.columns, (drift,), (swelling,)),
-                        )
-                        found.append((width, evidence, with_it, own_wall))
-                _, _, prior, of_wall = max(found, key=lambda each: each[:2])
-                chosen[s] = (*chosen[s], of_wall)
+                        found.append((_width(data + with_it, n_parameters), evidence, with_it, held))
+                _, _, prior, held = max(found, key=lambda each: each[:2])
+                chosen[s] = (*chosen[s], held)
     return prior[n_parameters:, n_parameters:], chosen
 
 
@@ -111,8 +107,9 @@ def with_learned_prior(objective: Objective, evaluation: Evaluation, unknowns: N
 def with_held_kernels(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> Objective:
     """The objective whose walls keep the kernels that are learned around unknowns (n_unknowns,).
 
-    Only their weights change from then on. Kernels are chosen from a few: where several explain the images as well, an
-    estimate that waits for the choice to settle may go from one to the other for ever.
+    Only their amplitudes change from then on. Kernels are chosen from a few: where several explain the images as well,
+    an estimate that waits for the choice to settle may go from one to the other for ever. Raises `EstimationError` as
+    `learned_precision` does.
     """
     held = _learned(objective, evaluation, unknowns)[1]
     states = tuple(replace(state, walls=walls) for state, walls in zip(objective.states, held, strict=True))

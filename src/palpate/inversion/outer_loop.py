@@ -49,7 +49,7 @@ FIRST = 10.0  # tolerances, to which they agree there at the least, however far 
 LINEARISED = 1e-4  # decrement of a minimum on them
 STRAIGHT = 0.4  # of ln E, within which linearised residuals are believed
 WITHIN_NOISE = 0.1  # of the posterior's width: a step that finds no smaller value
-NEAR = 0.5  # posterior standard deviations: a step that is shorter ends where derivatives are worth making exact
+NEAR = 0.5  # posterior standard deviations: a shorter step ends where exact derivatives and held kernels are worth it
 LEAST_SD = 0.03  # of ln E, see `_linearisation`
 HALVINGS = 3
 TRUSTED = 0.03  # error in energy of an approximation, below which the step on it needs no line search
@@ -101,8 +101,8 @@ class StopRule:
     those that decide the moduli must be exact so near that they leave no more than a step; solve_above: error from
     which the full model is solved; passes: of weights and estimate in turn on one approximation; iterations;
     refinements of the drivers' walls: the largest numbers of each; far: tolerances by which an estimate may still move
-    at its largest number of iterations, where more has not converged, and by which a pass may move one that the passes
-    of an iteration lead round to where it began (weightings that explain the images as well take turns).
+    where more iterations do no better: at the largest number of them, where more has not converged, and where the
+    passes of one lead back to where it began (weightings that explain the images as well take turns).
     """
 
     step_sd: float = 0.02
@@ -164,10 +164,11 @@ def run_outer_loop(
     for number in range(1, rule.iterations + 1):
         line = f"{title}, outer iteration {number}"
         progress(f"{line}: {now.objective.parameters.in_words(now.minimum.unknowns)}")
+        before = now.minimum.unknowns
         now = _iteration(now, settings, rule, progress, line)
         if now.stayed:
             break
-        if not held and now.step * rule.step_sd < NEAR:
+        if not held and _near(now.minimum, before, now.objective.n_parameters):
             objective = with_held_kernels(now.objective, now.minimum.evaluation, now.minimum.unknowns)
             now, held = replace(now, objective=objective), True
         if now.convergence.converged:
@@ -235,10 +236,16 @@ def _iteration(
     there = OuterIterate(objective, found, convergence, step, checks=now.checks + cost)
     if convergence.converged or error < rule.solve_above:
         return there
-    near = bool(np.all(moved < NEAR * posterior_sd(found, n)))
+    near = _near(found, now.minimum.unknowns, n)
     if error < TRUSTED:
         return _with_approximations(there, _solved(objective, found.unknowns, found.evaluation, near=near))
     return _line_search(now, there, near=near)
+
+
+def _near(found: Minimum, before: NDArray[np.float64], n_parameters: int) -> bool:
+    """Whether the step from unknowns (n_unknowns,) to a minimum is so short that the estimate lies near."""
+    moved = np.abs(found.unknowns - before)[:n_parameters]
+    return bool(np.all(moved < NEAR * posterior_sd(found, n_parameters)))
 
 
 def _reweighted_minimum(

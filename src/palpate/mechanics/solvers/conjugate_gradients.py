@@ -32,20 +32,14 @@ def conjugate_gradients(
     Stiefel, J. Res. NBS 49 (1952) 409-436. Columns are taken together as far as their vectors have room. Raises
     `SolverError` for a direction of no positive energy and when the tolerance is not met.
     """
-    together = max(ROOM // (VECTORS * 8 * len(rhs)), FEWEST)
-    parts = np.array_split(rhs, max(-(-rhs.shape[1] // together), 1), axis=1)
-    found = [_iterated(matrix, part, precondition, tolerance, max_iterations) for part in parts]
-    return np.concatenate([solution for solution, _ in found], axis=1), max(number for _, number in found)
-
-
-def _iterated(
-    matrix: sparse.csr_matrix[np.float64],
-    rhs: NDArray[np.float64],
-    precondition: Callable[[NDArray[np.float64]], NDArray[np.float64]],
-    tolerance: float,
-    max_iterations: int,
-) -> tuple[NDArray[np.float64], int]:
-    """As `conjugate_gradients`, all columns together."""
+    together = max(ROOM // (VECTORS * 8 * max(len(rhs), 1)), FEWEST)
+    if rhs.shape[1] > together:
+        parts = np.array_split(rhs, -(-rhs.shape[1] // together), axis=1)
+        found = [
+            conjugate_gradients(matrix, part, precondition, tolerance=tolerance, max_iterations=max_iterations)
+            for part in parts
+        ]
+        return np.concatenate([solution for solution, _ in found], axis=1), max(number for _, number in found)
     norms = np.linalg.norm(rhs, axis=0)
     solution = np.zeros_like(rhs)
     active = np.flatnonzero(norms > 0.0)
