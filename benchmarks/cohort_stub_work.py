@@ -23,7 +23,8 @@ def stub(task: Task, tell: Callable[[float, float], None]) -> Outcome:
             return mark
         time.sleep(float(task.row.covariates.get("seconds") or 0.0))
         value = 20.0 + len(task.row.id) + int(task.row.id[1:]) % 17
-        item = {"tissue": "organ", "value": value, "interval95": [0.8 * value, 1.25 * value], "verdict": "identified"}
+        item = {"tissue": "organ", "parameter": "youngs_modulus", "value": value, "verdict": "identified"}
+        item["interval95"] = [0.8 * value, 1.25 * value]
         empty: dict[str, Any] = {"correlation": [], "fit": [], "starts": [], "counts": {}, "mesh": None, "inputs": {}}
         document = {"status": "converged", "estimates": [item], "case": {"filler": "x" * SIZE}} | empty
         with staged(folder) as staging:

@@ -40,6 +40,7 @@ def work(task: Task, tell) -> Outcome:
             return mark
         item = {
             "tissue": "prostate",
+            "parameter": "youngs_modulus",
             "value": 30.0 + task.row.stage,
             "verdict": "identified",
             "interval95": [25.0, 44.0],

@@ -287,7 +287,7 @@ BAD_SETTINGS = {
     "tissues.surroundings.youngs_modulus_kpa=0": (2, ["[tissues.surroundings]", "a positive number in kPa"]),
     "mesh.edge_length_mm=500": (4, ["edge_length_mm is 500", "smallest side"]),
     "mechanics.law=neo-hooke": (2, ["'neo-hooke'", "did you mean 'neo-hookean'?"]),
-    "estimate.parameters=['poisson_ratio']": (2, ["'poisson_ratio'", "does not offer yet", "'youngs_modulus'"]),
+    "estimate.parameters=['poisson_ratio']": (2, ["[estimate] parameters", "always sought", "beside them"]),
 }
 
 

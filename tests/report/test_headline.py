@@ -11,7 +11,9 @@ def document(*verdicts, status="converged", warnings=0, minima=(0, 0)):
     return {
         "status": status,
         "reason": "the decrement fell under its tolerance",
-        "estimates": [{"tissue": f"organ {i}", "verdict": verdict} for i, verdict in enumerate(verdicts)],
+        "estimates": [
+            {"tissue": f"organ {i}", "parameter": "youngs_modulus", "verdict": v} for i, v in enumerate(verdicts)
+        ],
         "warnings": [{"code": "a", "message": "b"}] * warnings,
         "starts": [{"minimum": minimum} for minimum in minima],
     }

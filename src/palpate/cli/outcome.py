@@ -27,10 +27,10 @@ class Outcome:
 
 def estimates_table(document: Mapping[str, Any]) -> str:
     """The estimates of a result as aligned columns, with its note."""
-    from palpate.report.rows import interval_text, number
+    from palpate.report.rows import interval_text, moduli_in, number, ratio_rows
 
     rows = [["tissue", "Young's modulus", "95 % interval", "ratio", "verdict", "truth"]]
-    for item in document["estimates"]:
+    for item in moduli_in(document):
         interval, ratio = item["interval95"], number(item["ratio"])
         unit = " kPa"
         if interval is None and item["ratio_interval95"] is not None:
@@ -47,8 +47,10 @@ def estimates_table(document: Mapping[str, Any]) -> str:
         )
     if all(row[-1] == "–" for row in rows[1:]):
         rows = [row[:-1] for row in rows]
+    ratios = [[row.tissue, row.value, row.interval, row.verdict] for row in ratio_rows(document)]
+    more = [columns([["tissue", "Poisson's ratio", "95 % interval", "verdict"], *ratios])] if ratios else []
     note = [document["note"]] if document.get("note") else []
-    return "\n".join([columns(rows), *note])
+    return "\n".join([columns(rows), *more, *note])
 
 
 def listed(outputs: OutputFolder) -> str:

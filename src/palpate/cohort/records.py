@@ -70,6 +70,8 @@ def _record(plan: Plan, folder: Path, marks: Sequence[Outcome | None], number: i
         return Record(row, "waiting")
     moduli = []
     for item in document["estimates"]:
+        if item["parameter"] != "youngs_modulus":
+            continue
         in_kpa = item["value"] is not None
         low, high = (item["interval95"] if in_kpa else item["ratio_interval95"]) or (None, None)
         value = item["value"] if in_kpa else item["ratio"]

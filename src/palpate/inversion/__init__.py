@@ -15,7 +15,7 @@ from palpate.inversion.optimise import (
     posterior_sd,
 )
 from palpate.inversion.outer_loop import InversionSettings, OuterIterate, StopRule, run_outer_loop
-from palpate.inversion.parameters import ParameterMap, parameter_map
+from palpate.inversion.parameters import ParameterMap, eta_of_ratio, parameter_map, ratio_of_eta
 from palpate.inversion.reduced_basis import ReducedBasis, reduced_basis
 from palpate.inversion.reweighting import reweighted, with_first_noise
 
@@ -41,6 +41,7 @@ __all__ = [
     "StartRun",
     "StopRule",
     "continue_at_finite_strain",
+    "eta_of_ratio",
     "exact_approximation",
     "fit_coefficients",
     "fit_driver",
@@ -48,6 +49,7 @@ __all__ = [
     "invert",
     "parameter_map",
     "posterior_sd",
+    "ratio_of_eta",
     "reduced_basis",
     "reweighted",
     "run_outer_loop",

@@ -14,27 +14,39 @@ from palpate.images.tissue import Role, Tissue
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.stiffness import lame_parts, lame_parts_by_poisson
 
-__all__ = ["OpenPoisson", "ParameterMap", "parameter_map"]
+__all__ = ["OpenPoisson", "ParameterMap", "eta_of_ratio", "parameter_map", "ratio_of_eta"]
 
 LOADS = "the known loads"
+
+
+def eta_of_ratio(ratio: float) -> float:
+    """Eta = ln(lambda / mu) = ln(2 nu / (1 - 2 nu)) of a Poisson's ratio nu between 0 and 0.5."""
+    return float(np.log(2.0 * ratio / (1.0 - 2.0 * ratio)))
+
+
+def ratio_of_eta(eta: float) -> float:
+    """Poisson's ratio nu = 1/2 e^eta / (1 + e^eta) of eta = ln(lambda / mu)."""
+    return float(0.5 / (1.0 + np.exp(-eta)))
 
 
 @dataclass(frozen=True, slots=True)
 class OpenPoisson:
     """A tissue whose Poisson's ratio nu is sought, by eta = ln(lambda / mu), which no bound cuts short near nu = 0.5.
 
-    nu = 1/2 e^eta / (1 + e^eta), between 0 and 0.5; column: number of eta among the unknowns; regions: numbers of the
-    model's regions, one for each part of the tissue's stiffness that its dilatation has (see `stiffness_parts`).
+    given: that which the tissue states, where a search begins; column:
+    number of eta among the unknowns; regions: numbers of the model's regions, one for each part of the tissue's
+    stiffness that its dilatation has (see `stiffness_parts`).
     """
 
     tissue: str
+    given: float
     column: int
     regions: tuple[int, ...]
     dilatation: Dilatation
 
     def ratio(self, unknowns: NDArray[np.float64]) -> float:
         """Poisson's ratio, dimensionless, of unknowns (n_unknowns,)."""
-        return float(0.5 / (1.0 + np.exp(-unknowns[self.column])))
+        return ratio_of_eta(float(unknowns[self.column]))
 
     def weights(self, unknowns: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(n_parts,) dimensionless: the moduli of the parts over Young's, and the derivatives of their ln by eta."""
@@ -227,7 +239,8 @@ def parameter_map(
                 f"the Poisson's ratio of '{name}' is sought, but the model has {len(places)} moduli for it and not"
                 f" {parts}: make it with `linear_model(..., open_poisson=...)` and with the same dilatation"
             )
-        poisson.append(OpenPoisson(name, len(sought) + len(poisson), places, dilatation))
+        given = meshed[places[0]].poisson_ratio
+        poisson.append(OpenPoisson(name, given, len(sought) + len(poisson), places, dilatation))
     columns = [[float(tissue.name in group) for group in sought] for tissue in meshed]
     selection = np.pad(np.array(columns), ((0, 0), (0, len(poisson))))
     names, modes = tuple(" and ".join(group) for group in sought), tuple(n_modes)

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from palpate.report.rows import NONE, estimate_rows, interval_text, main_numbers
+from palpate.report.rows import NONE, estimate_rows, interval_text, main_numbers, moduli_in, ratio_rows
 
 __all__ = ["moduli_figure", "result_cards", "result_lines"]
 
@@ -42,7 +42,7 @@ def result_cards(document: Mapping[str, Any], colours: Mapping[str, str]) -> str
         loader=jinja2.PackageLoader("palpate.report"), autoescape=True, undefined=jinja2.StrictUndefined
     )
     template = environment.get_template("cards.html")
-    return str(template.render(document=document, rows=estimate_rows(document, colours)))
+    return str(template.render(document=document, rows=estimate_rows(document, colours), ratios=ratio_rows(document)))
 
 
 def moduli_figure(document: Mapping[str, Any], colours: Mapping[str, str]) -> Figure:
@@ -50,7 +50,7 @@ def moduli_figure(document: Mapping[str, Any], colours: Mapping[str, str]) -> Fi
 
     document, colours: as above. What did not converge is named without a number.
     """
-    items = [item for item in document["estimates"] if item["parameter"] == "youngs_modulus"]
+    items = moduli_in(document)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(6.4, 1.2 + 0.55 * max(len(items), 1)), layout="constrained")
         axes = figure.add_subplot()

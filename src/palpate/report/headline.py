@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from palpate.report.rows import moduli_in
+
 __all__ = ["Headline", "headline", "listed"]
 
 FOUND = {
@@ -35,7 +37,7 @@ def headline(document: Mapping[str, Any]) -> Headline:
         why = "the search for the stiffness did not come to an end" if document["status"] == "not converged" else ""
         return Headline("bad", f"There is no result{f': {why}' if why else ''}.", (reason,), warnings, "")
     verdicts: dict[str, list[str]] = {}
-    for item in document["estimates"]:
+    for item in moduli_in(document):
         verdicts.setdefault(item["verdict"], []).append(item["tissue"])
     sentences = [FOUND[verdict].format(listed(verdicts[verdict])) for verdict in FOUND if verdict in verdicts]
     starts = document["starts"]

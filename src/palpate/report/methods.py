@@ -10,6 +10,7 @@ from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.laws.registry import LAWS, law_from, law_parameters
 from palpate.report.headline import listed
 from palpate.report.report_data import ReportData
+from palpate.report.rows import moduli_in, ratio_rows
 from palpate.report.sources import SOURCES, bibtex, reference_line
 
 __all__ = ["Methods", "methods_text"]
@@ -46,7 +47,7 @@ class _Citations:
 def methods_text(data: ReportData) -> Methods:
     """What was done to the images of this case, in sentences that can be taken over."""
     cite = _Citations({})
-    leaning = listed([item["tissue"] for item in data.document["estimates"] if item.get("interval_kind") == "profile"])
+    leaning = listed([item["tissue"] for item in moduli_in(data.document) if item.get("interval_kind") == "profile"])
     if leaning:
         leaning = f"; of {leaning}, whose profile likelihood leans to one side, its ends are those of the profile"
     paragraphs = (
@@ -56,8 +57,8 @@ def methods_text(data: ReportData) -> Methods:
         (
             "The 95 % intervals come from the sandwich covariance of the parameters under spatially correlated"
             f" residuals {cite('white')}, with the scatter over the voxel grid's position added{leaning}. They"
-            " do not cover the errors of the mesh, of the material law, of Poisson's ratios, of the boundary condition"
-            f" and of the given moduli. The seed of random numbers was {data.document['seed']}."
+            " do not cover the errors of the mesh, of the material law, of given Poisson's ratios, of the boundary"
+            f" condition and of the given moduli. The seed of random numbers was {data.document['seed']}."
         ),
     )
     own = SOURCES["palpate"]
@@ -99,14 +100,18 @@ def _model(data: ReportData, cite: _Citations) -> str:
     loads = [words for key, words in data.settings if key == "known load"]
     acted = f" Known loads acted on the later states: {'; '.join(loads)}." if loads else ""
     settings, law = dict(data.settings), _law(data)
-    ratios = sorted({f"{t.poisson_ratio:g}" for t in data.tissues if t.role in ("estimate", "known")})
+    sought = [row.tissue for row in ratio_rows(document)]
+    given = [t for t in data.tissues if t.role in ("estimate", "known") and t.name not in sought]
+    ratios = sorted({f"{t.poisson_ratio:g}" for t in given})
+    told = [f"Poisson's ratios of {listed(ratios)}"] if ratios else []
+    told += [f"Poisson's ratios of {listed(sought)} as unknowns beside the moduli"] if sought else []
     return (
         "The label images were turned into signed distance maps by Gaussian smoothing and the probit of the smoothed"
         " share."
         f" A conforming mesh{size} (edge length {settings['edge length at the organs']} at the organs) was cut along"
         f" their zero levels and improved with Mmg {cite('mmg')}.{more} The tissues followed"
         f" {law.description if law else 'the law ' + document['law']} in"
-        f" {ELEMENTS.get(document['element'], str(document['element']))}, with Poisson's ratios of {listed(ratios)};"
+        f" {ELEMENTS.get(document['element'], str(document['element']))}, with {listed(told)};"
         " each was one solid, so that the modulus of an organ with a wall around a fluid, as a bladder, is an effective"
         f" one, not its wall's. The outer boundary: {settings['outer boundary']}. The motion of the drivers' walls was"
         f" a Gaussian process in its leading modes ({settings['driver motion']}) {cite('kernel')}, estimated together"

@@ -31,7 +31,7 @@ from palpate.report.methods import methods_text
 from palpate.report.payload import payload
 from palpate.report.pictures import mesh_png, organs_png
 from palpate.report.report_data import LaterImage, Reference, ReportData, SliceBox
-from palpate.report.rows import estimate_rows, number, scale_marks
+from palpate.report.rows import estimate_rows, moduli_in, number, ratio_rows, scale_marks
 from palpate.report.scales import Scale, angle_scale, distance_scale, modulus_scale, strain_scale
 from palpate.report.section import VIEWS
 from palpate.report.slices import alignment_svg, contour_names, first_planes, slice_svg
@@ -101,6 +101,7 @@ def render(data: ReportData) -> str:
         scripts=scripts,
         live=live if scripts else None,
         rows=estimate_rows(data.document, colours),
+        ratios=ratio_rows(data.document),
         marks=scale_marks(data.document),
         starts=tuple(
             {"colour": START_COLOURS[i % len(START_COLOURS)], **start}
@@ -114,7 +115,7 @@ def render(data: ReportData) -> str:
         curves=_curves(data),
         profiles=tuple(
             _picture(f"Profile of {item['tissue']}", partial(profile_svg, data, i, name=f"profile{i}"))
-            for i, item in enumerate(data.document["estimates"])
+            for i, item in enumerate(moduli_in(data.document))
             if data.document["status"] == "converged" and item.get("profile")
         ),
         angles=(
@@ -213,7 +214,7 @@ def _curves(data: ReportData) -> tuple[Picture, ...]:
         return ()
     moduli = [
         _picture(f"Stiffness of {item['tissue']}", partial(modulus_svg, data, i, name=f"modulus{i}"))
-        for i, item in enumerate(data.document["estimates"])
+        for i, item in enumerate(moduli_in(data.document))
     ]
     return (
         _picture("Misfit", partial(objective_svg, data, name="misfit")),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,6 +48,17 @@ class EstimateRow:
     shares: str
 
 
+@dataclass(frozen=True, slots=True)
+class RatioRow:
+    """A Poisson's ratio as a table shows it: value, 95 % interval, verdict and why, as texts."""
+
+    tissue: str
+    value: str
+    interval: str
+    verdict: str
+    why: str
+
+
 def number(value: float | None, *, digits: int = 3) -> str:
     """`value` with so many significant digits, without exponent where it can be read; a dash for nothing."""
     if value is None or not math.isfinite(value):
@@ -60,12 +71,33 @@ def number(value: float | None, *, digits: int = 3) -> str:
     return f"{round(value, digits - 1 - magnitude):.{max(digits - 1 - magnitude, 0)}f}"
 
 
+def moduli_in(document: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The entries of a result document's "estimates" that are Young's moduli; they come first."""
+    return [item for item in document["estimates"] if item["parameter"] == "youngs_modulus"]
+
+
+def ratio_rows(document: Mapping[str, Any]) -> tuple[RatioRow, ...]:
+    """A row for each Poisson's ratio that was sought; nothing that did not converge shows a number."""
+    shown = document["status"] == "converged"
+    return tuple(
+        RatioRow(
+            item["tissue"],
+            number(item["value"] if shown else None),
+            interval_text(item["interval95"] if shown else None),
+            item["verdict"] if shown else "not identified",
+            item["why"],
+        )
+        for item in document["estimates"]
+        if item["parameter"] == "poisson_ratio"
+    )
+
+
 def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tuple[EstimateRow, ...]:
-    """A row for each estimate of a result document; nothing that did not converge shows a number.
+    """A row for each modulus of a result document; nothing that did not converge shows a number.
 
     `colours`: tissue -> #rrggbb.
     """
-    items: Sequence[Mapping[str, Any]] = document["estimates"]
+    items = moduli_in(document)
     shown = document["status"] == "converged"
     scale = _scale(items) if shown else None
     rows = []
@@ -94,7 +126,7 @@ def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tu
 
 def scale_marks(document: Mapping[str, Any]) -> tuple[tuple[float, str], ...]:
     """Places (0 to BAR) and labels of round numbers on the common scale of the bars."""
-    scale = _scale(document["estimates"]) if document["status"] == "converged" else None
+    scale = _scale(moduli_in(document)) if document["status"] == "converged" else None
     if scale is None:
         return ()
     decades = range(math.floor(scale[0] / math.log(10.0)), math.ceil(scale[1] / math.log(10.0)) + 1)

@@ -12,6 +12,7 @@ from palpate.errors import ResourceError
 from palpate.export.notebook import notebook_viewer
 from palpate.images.tissue_colours import tissue_colours
 from palpate.report.cards import moduli_figure, result_cards, result_lines
+from palpate.report.rows import moduli_in
 from palpate.steps.saving import save_estimate
 from palpate.study import result
 from palpate.study.case_as_run import refuse_other_case
@@ -47,7 +48,7 @@ class CaseResult(result.CaseResult):
         return tuple(outputs.path / name for name in outputs.written)
 
     def to_dataframe(self) -> pd.DataFrame:
-        """A row a tissue: case, tissue, value and 95 % interval in kPa and as a ratio, verdict, truth.
+        """A row a modulus: case, tissue, value and 95 % interval in kPa and as a ratio, verdict, truth.
 
         An open end of an interval, and a value that was not found, is NaN. Raises `ResourceError` where pandas is not
         installed.
@@ -62,7 +63,7 @@ class CaseResult(result.CaseResult):
         document = self.to_dict()
         heading = {key: document[key] for key in COLUMNS}
         rows = []
-        for item in document["estimates"]:
+        for item in moduli_in(document):
             (low, high), (least, most) = (item[key] or (None, None) for key in ("interval95", "ratio_interval95"))
             rows.append(
                 heading

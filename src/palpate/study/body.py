@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -33,6 +34,7 @@ from palpate.study.case import Case
 from palpate.study.case_loads import case_loads
 from palpate.study.contacts import every_finding
 from palpate.study.meshing import mesh_reference
+from palpate.study.poisson_ratios import with_stated_priors
 from palpate.study.refusals import refuse_lost, refuse_unmeshable
 
 __all__ = [
@@ -204,8 +206,21 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
         LaterState(model, observations, law, walls if case.driver.learn_prior else (), reference)
         for (model, walls), law, (reference, observations) in zip(pairs, finite, seen, strict=True)
     )
-    tissues, n_modes = bodies[0].space.mesh.tissues, [model.n_modes for model in models]
-    return InverseProblem(states, parameter_map(tissues, models[0].regions, n_modes, loaded=bool(case.loads)))
+    parameters = parameter_map(
+        bodies[0].space.mesh.tissues,
+        models[0].regions,
+        [model.n_modes for model in models],
+        loaded=bool(case.loads),
+        open_poisson=_open_poisson(case, bodies[0]),
+        dilatation=choose_element(case.mechanics.element).dilatation,
+    )
+    return InverseProblem(states, with_stated_priors(parameters, case))
+
+
+def _open_poisson(case: Case, body: Body) -> tuple[str, ...]:
+    """The tissues whose Poisson's ratio the case seeks."""
+    estimated = [t.name for t in body.space.mesh.tissues if t.role is Role.ESTIMATE]
+    return tuple(estimated) if case.estimate.seeks_poisson_ratios else ()
 
 
 def stated_noise(case: Case) -> NoiseModel | None:
@@ -219,7 +234,12 @@ def stated_noise(case: Case) -> NoiseModel | None:
 def _models(body: Body, case: Case) -> list[tuple[LinearModel, tuple[Wall, ...]]]:
     """One model a later image, and its drivers' walls; they share the stiffness and differ in the bones' motion."""
     models: list[tuple[LinearModel, tuple[Wall, ...]]] = []
-    dilatation, loads = choose_element(case.mechanics.element).dilatation, case_loads(case, body.space)
+    given: dict[str, Any] = {
+        "dilatation": choose_element(case.mechanics.element).dilatation,
+        "open_poisson": _open_poisson(case, body),
+        "loads": case_loads(case, body.space),
+        "solver": case.mechanics.solver,
+    }
     for bones in body.states.bones:
         motion = prescribed_motion(
             body.space,
@@ -235,11 +255,7 @@ def _models(body: Body, case: Case) -> list[tuple[LinearModel, tuple[Wall, ...]]
             offset=motion.offset,
             prescribed=motion.prescribed,
         )
-        made = (
-            with_constraint(models[0][0], constraint)
-            if models
-            else linear_model(body.space, constraint, dilatation=dilatation, loads=loads, solver=case.mechanics.solver)
-        )
+        made = with_constraint(models[0][0], constraint) if models else linear_model(body.space, constraint, **given)
         models.append((made, motion.walls))
     return models
 

@@ -44,6 +44,8 @@ RATIOS = (1e-6, 1e6)
 SAMPLES = (100, 100_000)  # draws of a chain: with fewer nothing is told of the tails, more take hours
 KILOPASCALS = (1e-3, 1e9)  # of a modulus: from the softest gels to diamond
 POISSON_RATIO = 0.45
+SOUGHT_RATIOS = (0.02, 0.4995)  # between which a Poisson's ratio is searched
+RATIO_SD, RATIO_SDS = 0.03, (1e-4, 10.0)  # of what is believed of one: soft tissue is usually given 0.40 to 0.49
 POISSON_RATIOS = (-0.99, 0.4999)  # beyond, a solid loses its shape or its volume's give, and equations their digits
 STRESSES_KPA = (-1e4, 1e4)
 SEED = rule(between=(0, LARGEST_SEED))
@@ -122,7 +124,8 @@ class Domain:
 class CaseTissue:
     """A tissue as the case names it: `label` is a tuple of labels, a name of the label table, or "remaining".
 
-    `poisson_ratio` None: 0.45, or what a phantom draws.
+    `poisson_ratio` None: 0.45, or what a phantom draws; `poisson_ratio_sd`: standard deviation of what is believed of
+    it where it is sought, None: 0.03.
     """
 
     name: str
@@ -140,6 +143,7 @@ class CaseTissue:
         metadata=rule(between=KILOPASCALS, wanted="a positive number in kPa (soft tissue: 0.5 to 1000 kPa)"),
     )
     density_kg_m3: float = field(default=1000.0, metadata=rule(between=(0.1, 3e4)))
+    poisson_ratio_sd: float | None = field(default=None, metadata=rule(between=RATIO_SDS))
 
     def __post_init__(self) -> None:
         refuse_name(self.name, "the name of a tissue")
@@ -267,12 +271,13 @@ class Noise:
 class Estimate:
     """How the unknowns are found; starts and bounds to the `known` tissue, or in kPa where these are given.
 
-    `samples`: draws of the moduli's posterior in each of four chains; 0: none.
+    `parameters`: what is sought of every `estimate` tissue; `samples`: draws of the moduli's posterior in each of four
+    chains; 0: none.
     """
 
     method: str = field(default="gauss-newton", metadata=rule(choices=("gauss-newton", "lbfgs")))
     parameters: tuple[str, ...] = field(
-        default=("youngs_modulus",), metadata=rule(choices=("youngs_modulus",), later=("poisson_ratio",))
+        default=("youngs_modulus",), metadata=rule(choices=("youngs_modulus", "poisson_ratio"))
     )
     start_ratios: tuple[float, ...] = field(
         default=(0.5, 2.0, 8.0), metadata=rule(between=RATIOS, test=bool, wanted=POSITIVE_NUMBERS)
@@ -289,7 +294,17 @@ class Estimate:
     )
     samples: int = field(default=0, metadata=rule(between=(0, SAMPLES[1])))
 
+    @property
+    def seeks_poisson_ratios(self) -> bool:
+        """Whether Poisson's ratios are sought beside the moduli."""
+        return "poisson_ratio" in self.parameters
+
     def __post_init__(self) -> None:
+        if "youngs_modulus" not in self.parameters:
+            raise ConfigurationError(
+                f"[estimate] parameters is {shown(list(self.parameters))}; Young's moduli are always sought, Poisson's"
+                ' ratios beside them: ["youngs_modulus"] or ["youngs_modulus", "poisson_ratio"]'
+            )
         if self.samples and not SAMPLES[0] <= self.samples <= SAMPLES[1]:
             raise ConfigurationError(
                 f"[estimate] samples is {self.samples}; ask for {SAMPLES[0]} to {SAMPLES[1]} draws in each chain (1000"
@@ -374,6 +389,7 @@ class Case:
                 f"case '{self.id}' has [[loads]] on a [phantom], whose walls alone move it; take the loads out"
             )
         self._check_tissues()
+        self._check_ratios()
 
     @property
     def align(self) -> str:
@@ -409,6 +425,28 @@ class Case:
                 " one tissue label = 'remaining'"
             )
         _check_claims([(t.name, (t.label,) if isinstance(t.label, str) else t.label) for t in self.tissues])
+
+    def _check_ratios(self) -> None:
+        sought = [t for t in self.tissues if t.role is Role.ESTIMATE and self.estimate.seeks_poisson_ratios]
+        for tissue in self.tissues:
+            if tissue.poisson_ratio_sd is not None and tissue not in sought:
+                raise ConfigurationError(
+                    f"tissue '{tissue.name}' has a poisson_ratio_sd, which would not be used: its Poisson's ratio is"
+                    " not sought. Take it out, or seek those of the `estimate` tissues with [estimate] parameters ="
+                    ' ["youngs_modulus", "poisson_ratio"]'
+                )
+        low, high = SOUGHT_RATIOS
+        for tissue in sought:
+            if tissue.poisson_ratio is not None and not low < tissue.poisson_ratio < high:
+                raise ConfigurationError(
+                    f"the Poisson's ratio of '{tissue.name}' is sought between {low} and {high}, and its poisson_ratio"
+                    f" of {tissue.poisson_ratio}, where the search begins, does not lie there"
+                )
+        if self.estimate.seeks_poisson_ratios and self.mechanics.material_law.finite:
+            raise ConfigurationError(
+                f"Poisson's ratios are sought under the linear law only, and this case has '{self.mechanics.law}': set"
+                ' [mechanics] law = "linear", or leave [estimate] parameters at ["youngs_modulus"]'
+            )
 
 
 def _check_claims(claims: list[tuple[str, tuple[int, ...] | tuple[str, ...]]]) -> None:

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from palpate.images.named_labels import printable
-from palpate.study.case import POISSON_RATIO, Case, CaseTissue
+from palpate.images.tissue import Role
+from palpate.study.case import POISSON_RATIO, RATIO_SD, Case, CaseTissue
 from palpate.study.schema import Rule
 from palpate.study.toml_text import relative_path, toml_key, toml_value
 
@@ -30,6 +31,9 @@ def case_tables(case: Case, place: Callable[[Path], str]) -> dict[str, Any]:
     if case.images is not None:
         ratios = [POISSON_RATIO if t.poisson_ratio is None else t.poisson_ratio for t in case.tissues]
         tissues = tuple(replace(t, poisson_ratio=nu) for t, nu in zip(case.tissues, ratios, strict=True))
+        if case.estimate.seeks_poisson_ratios:
+            stated = {t.name: t.poisson_ratio_sd or RATIO_SD for t in case.tissues if t.role is Role.ESTIMATE}
+            tissues = tuple(replace(t, poisson_ratio_sd=stated.get(t.name)) for t in tissues)
         case = replace(case, images=replace(case.images, align=case.align), tissues=tissues)
     return _table(case, place)
 

@@ -21,7 +21,7 @@ HETEROGENEOUS = 0.01  # probability of such differences between image pairs that
 
 
 def inversion_findings(inversion: Inversion, covariance: NDArray[np.float64]) -> tuple[Finding, ...]:
-    """What the search itself tells of its result; covariance (n, n) of the log-moduli."""
+    """What the search itself tells of its result; covariance (n, n) of the parameters."""
     mapping = inversion.objective.parameters
     findings = []
     if not mapping.absolute:
@@ -61,8 +61,9 @@ def inversion_findings(inversion: Inversion, covariance: NDArray[np.float64]) ->
     sd = np.sqrt(np.diag(covariance))
     pairs = np.argwhere(np.tril(np.abs(covariance) > STRONG_CORRELATION * np.outer(sd, sd), -1)).tolist()
     if pairs:
-        alike = [f"'{mapping.tissues[j]}' and '{mapping.tissues[i]}'" for i, j in pairs]
-        text = f"the moduli of {', of '.join(alike)} cannot be told apart by these images"
+        alike = [f"'{mapping.names[j]}' and '{mapping.names[i]}'" for i, j in pairs]
+        what = "the moduli of" if np.max(pairs) < len(mapping.tissues) else "the parameters of"
+        text = f"{what} {', of '.join(alike)} cannot be told apart by these images"
         findings.append(Finding("correlated", f"{text}; add some that move them otherwise"))
     return tuple(findings)
 

@@ -8,13 +8,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.errors import ConfigurationError
 from palpate.findings import Finding
-from palpate.inversion import Inversion, InversionSettings, Iterate, Outcome, StartRun
+from palpate.inversion import Inversion, InversionSettings, Iterate, Outcome, StartRun, ratio_of_eta
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit
 from palpate.progress import Progress, silent
 from palpate.study.estimate_findings import fold_findings, inversion_findings, pair_findings
+from palpate.study.poisson_ratios import PoissonRatioEstimate, no_ratio, ratio_verdict
 from palpate.study.samples import CHAINS, ModulusSamples, draw_moduli, sample_findings
 from palpate.study.together import ImagePairs, combinations_of, image_pairs_of
 from palpate.uncertainty import (
@@ -23,6 +23,7 @@ from palpate.uncertainty import (
     FittedState,
     Information,
     Interval,
+    ModulusInterval,
     covariance_of,
     fixed_correspondence,
     information,
@@ -116,8 +117,9 @@ class TissueFit:
 class Estimation:
     """Result of one inversion.
 
-    correlation (n, n) of the log-moduli; fits: the tissues of each later image; displacements: (n_points, 3) mm of
-    each later image; covariance of the log-moduli by its causes;
+    estimates: of the moduli; poisson_ratios: of those that were sought beside them; covariance, correlation (n, n): of
+    the log-moduli, then of those ratios' eta = ln(lambda / mu); fits: the tissues of each later image; displacements:
+    (n_points, 3) mm of each later image;
     outer_loop: the steps from the best start's minimum to the estimate, which all starts of that minimum share;
     counts: of all starts and minima together; observations: what was compared, in words, by its kind; information: the
     directions of the log-moduli by how well they are known; combinations: what is known where single moduli are not;
@@ -140,10 +142,11 @@ class Estimation:
     combinations: tuple[Combination, ...] = ()
     image_pairs: ImagePairs | None = None
     samples: ModulusSamples | None = None
+    poisson_ratios: tuple[PoissonRatioEstimate, ...] = ()
 
     @property
     def correlation(self) -> NDArray[np.float64]:
-        """Correlation (n, n) of the log-moduli, dimensionless."""
+        """Correlation (n, n) of the parameters, dimensionless."""
         total = self.covariance.total
         sd = np.sqrt(np.diag(total))
         return np.asarray(total / np.outer(sd, sd))
@@ -170,18 +173,17 @@ def conclude(
     """State the result of an inversion; `truth`: true moduli (kPa) by tissue where they are known.
 
     samples: draws in each chain of the moduli's posterior, where the estimate converged; 0: none.
-    The covariance is the sandwich under the residuals' noise model plus the scatter over grid positions. Raises
-    `ConfigurationError` where a Poisson's ratio was sought.
+    The covariance is the sandwich under the residuals' noise model plus the scatter over grid positions.
     """
     objective, minimum = inversion.objective, inversion.minimum
-    if objective.parameters.poisson:
-        raise ConfigurationError("a result states Young's moduli only: a Poisson's ratio was sought beside them")
     rng = np.random.default_rng(seed)
     progress(f"intervals: correlation of the residuals, and the model as {GRID_DRAWS} random voxel grids show it")
     covariance = covariance_of(objective, minimum.evaluation, observed.states, draws=GRID_DRAWS, rng=rng)
     progress("intervals: profiles, and the fit of every surface before and after")
     pairs = image_pairs_of(inversion, settings.bounds)
-    estimates = _estimates(inversion, settings, covariance, truth)
+    known = _intervals(inversion, settings, covariance) if minimum.converged else ()
+    estimates = _estimates(inversion, known, covariance, truth)
+    of_moduli = covariance.total[: len(estimates), : len(estimates)]
     drawn = None
     if samples and minimum.converged:
         progress(f"intervals: {samples} samples of the posterior in each of {CHAINS} chains")
@@ -197,6 +199,7 @@ def conclude(
         status="converged" if minimum.converged else "not converged",
         reason=_reason(inversion),
         estimates=estimates,
+        poisson_ratios=_ratios(inversion, known, covariance),
         covariance=covariance,
         starts=tuple(_start(inversion, start) for start in inversion.starts),
         fits=_fits(inversion, observed),
@@ -211,8 +214,8 @@ def conclude(
         outer_loop=tuple(_iteration(inversion, iterate) for iterate in minimum.history),
         remarks=findings,
         observations={observation.kind: observation.description for observation in objective.observations},
-        information=information(covariance.total),
-        combinations=combinations_of(inversion, covariance.total, within=IDENTIFIED),
+        information=information(of_moduli),
+        combinations=combinations_of(inversion, of_moduli, within=IDENTIFIED),
         image_pairs=pairs,
         samples=drawn,
     )
@@ -278,52 +281,99 @@ def _reason(inversion: Inversion) -> str:
     )
 
 
-def _estimates(
-    inversion: Inversion, settings: InversionSettings, covariance: Covariance, truth: Mapping[str, float]
-) -> tuple[ModulusEstimate, ...]:
-    mapping, bounds = inversion.objective.parameters, settings.bounds
-    theta, scale = inversion.minimum.unknowns[: mapping.n_parameters], mapping.scale_kpa
-    found, variances, at_bound = [], np.diag(covariance.total), bounds.reached(theta)
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """Of one parameter: its own interval, one that holds all minima that fit as well, both of e^theta; at a bound."""
+
+    own: ModulusInterval
+    interval: Interval
+    at_bound: bool
+
+
+def _intervals(inversion: Inversion, settings: InversionSettings, covariance: Covariance) -> tuple[_Known, ...]:
+    n, bounds = inversion.objective.n_parameters, settings.bounds
+    found, variances, at_bound = [], np.diag(covariance.total), bounds.reached(inversion.minimum.unknowns[:n])
     fixed = fixed_correspondence(inversion.objective, inversion.minimum.unknowns, inversion.minimum.evaluation)
     # Voxels make the objective rough by some hundredths of it: its value alone cannot choose between such minima.
     best = inversion.candidates[inversion.best]
     others = [c for c in inversion.candidates if c is not best and c.minimum.converged]
     good = [c.minimum.unknowns for c in others if c.value <= (1.0 + AS_GOOD) * best.value]
-    for i, name in enumerate(mapping.tissues):
-        none = no_estimate(
-            name,
-            absolute=mapping.absolute,
-            relative_to=mapping.relative_to,
-            why=f"the estimation did not converge: {inversion.minimum.outcome.value}",
-            truth=truth.get(name),
-        )
-        if not inversion.minimum.converged:
-            found.append(none)
-            continue
-        ratio = float(np.exp(theta[i]))
+    for i in range(n):
         limits = {"lower": float(np.exp(bounds.lower[i])), "upper": float(np.exp(bounds.upper[i]))}
         own = modulus_interval(fixed, inversion.minimum, i, variance=float(variances[i]), bounds=bounds)
         sd = float(np.sqrt(variances[i]))
         interval = hull([own.ends, *(log_interval(float(np.exp(x[i])), sd, **limits) for x in good)])
-        word, why = verdict(interval, at_bound=bool(at_bound[i]), absolute=mapping.absolute)
-        low, high = interval
-        unit = scale if mapping.absolute else 1.0
-        points = zip(unit * np.exp(own.profile.theta), own.profile.root, strict=True)
+        found.append(_Known(own, interval, bool(at_bound[i])))
+    return tuple(found)
+
+
+def _estimates(
+    inversion: Inversion, known: Sequence[_Known], covariance: Covariance, truth: Mapping[str, float]
+) -> tuple[ModulusEstimate, ...]:
+    mapping, scale = inversion.objective.parameters, inversion.objective.parameters.scale_kpa
+    none = [
+        no_estimate(
+            name,
+            absolute=mapping.absolute,
+            relative_to=mapping.relative_to,
+            why=_not_converged(inversion),
+            truth=truth.get(name),
+        )
+        for name in mapping.tissues
+    ]
+    if not known:
+        return tuple(none)
+    found, unit = [], scale if mapping.absolute else 1.0
+    for i, (nothing, of) in enumerate(zip(none, known, strict=False)):
+        ratio, (low, high) = float(np.exp(inversion.minimum.unknowns[i])), of.interval
+        word, why = verdict(of.interval, at_bound=of.at_bound, absolute=mapping.absolute)
+        points = zip(unit * np.exp(of.own.profile.theta), of.own.profile.root, strict=True)
         found.append(
             replace(
-                none,
-                interval_kind=own.kind,
+                nothing,
+                interval_kind=of.own.kind,
                 variance_shares=covariance.shares(i),
                 profile=tuple((float(value), float(root)) for value, root in points),
                 value=ratio * scale if mapping.absolute else None,
                 interval95=(low and low * scale, high and high * scale) if mapping.absolute else None,
                 ratio=None if mapping.by_load else ratio,
-                ratio_interval95=None if mapping.by_load else interval,
+                ratio_interval95=None if mapping.by_load else of.interval,
                 verdict=word,
                 why=why,
             )
         )
     return tuple(found)
+
+
+def _ratios(inversion: Inversion, known: Sequence[_Known], covariance: Covariance) -> tuple[PoissonRatioEstimate, ...]:
+    mapping, found = inversion.objective.parameters, list[PoissonRatioEstimate]()
+    for open_ in mapping.poisson:
+        i, nothing = open_.column, no_ratio(open_.tissue, why=_not_converged(inversion))
+        if not known:
+            found.append(nothing)
+            continue
+        of = known[i]
+        low, high = (None if end is None else ratio_of_eta(np.log(end)) for end in of.interval)
+        of_prior = float(np.sqrt(covariance.total[i, i] * mapping.prior_precision[i, i]))
+        word, why = ratio_verdict((low, high), at_bound=of.at_bound, of_prior=of_prior)
+        points = zip(of.own.profile.theta, of.own.profile.root, strict=True)
+        found.append(
+            replace(
+                nothing,
+                value=open_.ratio(inversion.minimum.unknowns),
+                interval95=(low, high),
+                interval_kind=of.own.kind,
+                verdict=word,
+                why=why,
+                variance_shares=covariance.shares(i),
+                profile=tuple((ratio_of_eta(eta), float(root)) for eta, root in points),
+            )
+        )
+    return tuple(found)
+
+
+def _not_converged(inversion: Inversion) -> str:
+    return f"the estimation did not converge: {inversion.minimum.outcome.value}"
 
 
 def _start(inversion: Inversion, start: StartRun) -> Start:
@@ -346,7 +396,8 @@ def _iteration(inversion: Inversion, iterate: Iterate) -> Iteration:
 def _moduli(inversion: Inversion, theta: NDArray[np.float64]) -> dict[str, float]:
     """Moduli in kPa, or ratios when no modulus is known."""
     mapping = inversion.objective.parameters
-    return {name: float(mapping.scale_kpa * np.exp(value)) for name, value in zip(mapping.tissues, theta, strict=True)}
+    moduli = mapping.scale_kpa * np.exp(theta[: len(mapping.tissues)])
+    return dict(zip(mapping.tissues, moduli.tolist(), strict=True))
 
 
 def _fits(inversion: Inversion, observed: Observed) -> tuple[tuple[TissueFit, ...], ...]:

@@ -21,6 +21,7 @@ from palpate.mesh.space import LagrangeSpace
 from palpate.study.case import Case, CaseTissue
 from palpate.study.case_text import case_tables
 from palpate.study.estimation import Estimation, ModulusEstimate, TissueFit, no_estimate
+from palpate.study.poisson_ratios import PoissonRatioEstimate, no_ratio
 
 __all__ = [
     "SCHEMA",
@@ -125,8 +126,7 @@ class CaseResult:
     def stiffness(self) -> NDArray[np.float64]:
         """Young's modulus of each tissue in `unit`, (n_tissues,); NaN where none was found or the tissue is hollow."""
         usable = self.estimation.estimates if self.estimation.status == "converged" else ()
-        moduli = [e for e in usable if e.parameter == "youngs_modulus"]
-        found = {e.tissue: e.value if self.unit == "kPa" else e.ratio for e in moduli}
+        found = {e.tissue: e.value if self.unit == "kPa" else e.ratio for e in usable}
         values = [t.youngs_modulus_kpa if t.role is Role.KNOWN else found.get(t.name) for t in self.tissues]
         meshed = [v if t.meshed else None for t, v in zip(self.tissues, values, strict=True)]
         return np.array([math.nan if value is None else value for value in meshed])
@@ -139,7 +139,10 @@ class CaseResult:
         alone = [{"after": name} | _plain(pair) for name, pair in each]
         drawn = estimation.samples if estimation.status == "converged" else None
         document = _heading(self.case, estimation.status, estimation.reason) | {
-            "estimates": [_estimate(item, estimation.status) for item in estimation.estimates],
+            "estimates": [
+                *(_estimate(item, estimation.status) for item in estimation.estimates),
+                *(_ratio(item, estimation.status) for item in estimation.poisson_ratios),
+            ],
             "correlation": estimation.correlation.tolist(),
             "information": known and _plain(known),
             "combinations": [_plain(pair) for pair in estimation.combinations],
@@ -226,11 +229,12 @@ def failure_document(case: Case, error: PalpateError) -> dict[str, Any]:
     why = f"the estimation ended with the status '{status}'"
     unknown = [tissue.name for tissue in case.tissues if tissue.role is Role.ESTIMATE]
     known = [tissue.name for tissue in case.tissues if tissue.role is Role.KNOWN]
-    absolute = stated_unit(case) == "kPa"
+    absolute, sought = stated_unit(case) == "kPa", unknown if case.estimate.seeks_poisson_ratios else []
+    moduli = [no_estimate(name, absolute=absolute, relative_to=(known or unknown)[0], why=why) for name in unknown]
     empty: dict[str, Any] = {
         "estimates": [
-            _estimate(no_estimate(name, absolute=absolute, relative_to=(known or unknown)[0], why=why), status)
-            for name in unknown
+            *(_estimate(item, status) for item in moduli),
+            *(_ratio(no_ratio(name, why=why), status) for name in sought),
         ],
         "correlation": [],
         "information": None,
@@ -313,6 +317,15 @@ def _estimate(item: ModulusEstimate, status: str) -> dict[str, Any]:
     if status != "converged":
         document |= dict.fromkeys(("value", "interval95", "ratio", "ratio_interval95"))
         document["verdict"] = "not identified"
+    return document
+
+
+def _ratio(item: PoissonRatioEstimate, status: str) -> dict[str, Any]:
+    """One entry of "estimates" for a Poisson's ratio, under the keys of a modulus."""
+    document = _plain(item) | {"parameter": "poisson_ratio", "unit": "1", "relative_to": "", "truth": None}
+    document |= dict.fromkeys(("ratio", "ratio_interval95"))
+    if status != "converged":
+        document |= dict.fromkeys(("value", "interval95")) | {"verdict": "not identified"}
     return document
 
 

@@ -11,14 +11,15 @@ import numpy as np
 from palpate.errors import ConfigurationError
 from palpate.findings import Finding, of_pair
 from palpate.images.tissue import Role
-from palpate.inversion import Bounds, Inversion, InversionSettings, ParameterMap, invert
+from palpate.inversion import Bounds, Inversion, InversionSettings, ParameterMap, eta_of_ratio, invert
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Forecast, Progress, about, during, silent
 from palpate.study.body import Body, ImagedStates, joint_problem, make_body
-from palpate.study.case import Case
+from palpate.study.case import SOUGHT_RATIOS, Case
 from palpate.study.cost import ExpectedCost, cost_of_meshes, expected_cost
 from palpate.study.estimation import Estimation, Observed, conclude
 from palpate.study.plausibility import estimate_warnings, unit_warnings
+from palpate.study.poisson_ratios import with_found_ratios
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.read import read_pairs, read_states
 from palpate.study.result import CaseResult, MeshResult, PairResult, Provenance, image_names
@@ -124,7 +125,7 @@ def estimate_states(
     return CaseResult(
         case,
         estimation,
-        body.space,
+        with_found_ratios(body.space, estimation.poisson_ratios),
         mesh_summary(body),
         states.before,
         states.after,
@@ -157,14 +158,18 @@ def _forecast(cost: ExpectedCost) -> Forecast:
 
 
 def inversion_settings(case: Case, parameters: ParameterMap) -> InversionSettings:
-    """Starts and bounds as theta; those in kPa are divided by the scale's modulus."""
+    """Starts and bounds as theta; those in kPa are divided by the scale's modulus, Poisson's ratios begin as given."""
     scale = parameters.scale_kpa
     options = case.estimate
     starts = np.array(options.starts_kpa) / scale if options.starts_kpa else np.array(options.start_ratios)
     bounds = np.array(options.bounds_kpa) / scale if options.bounds_kpa else np.array(options.bounds_ratio)
-    n = parameters.n_parameters
-    limits = Bounds(np.full(n, np.log(bounds[0])), np.full(n, np.log(bounds[1])))
-    return InversionSettings(tuple(np.full(n, np.log(start)) for start in starts), limits, options.method)
+    n, given = len(parameters.tissues), [eta_of_ratio(open_.given) for open_ in parameters.poisson]
+    ends = [
+        np.concatenate([np.full(n, np.log(e)), np.full(len(given), eta_of_ratio(r))])
+        for e, r in zip(bounds, SOUGHT_RATIOS, strict=True)
+    ]
+    begin = tuple(np.concatenate([np.full(n, np.log(start)), given]) for start in starts)
+    return InversionSettings(begin, Bounds(*ends), options.method)
 
 
 def fitted_states(inversion: Inversion, *bodies: Body) -> tuple[FittedState, ...]:
@@ -186,7 +191,14 @@ def _further(bodies: tuple[Body, ...], estimation: Estimation) -> tuple[PairResu
         states = body.states
         motions = estimation.displacements[first : first + len(states.after)]
         found.append(
-            PairResult(body.space, mesh_summary(body), states.before, states.after, motions, states.alignments)
+            PairResult(
+                with_found_ratios(body.space, estimation.poisson_ratios),
+                mesh_summary(body),
+                states.before,
+                states.after,
+                motions,
+                states.alignments,
+            )
         )
         first += len(states.after)
     return tuple(found)

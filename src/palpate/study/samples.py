@@ -99,11 +99,12 @@ def draw_moduli(
 ) -> ModulusSamples:
     """So many draws in each chain around the estimate of an inversion that has converged.
 
-    covariance (n, n): of the log-moduli by noise, prior and grid, which the draws have (see `posterior_chains`);
+    covariance (n_parameters, n_parameters): by noise, prior and grid, which the draws have (see `posterior_chains`);
     intervals: of the estimates, whose ends may be open. Raises `EstimationError` where a modulus moves nothing,
     `ResourceError` as `require_arviz` does.
     """
     mapping, minimum = inversion.objective.parameters, inversion.minimum
+    n = len(mapping.tissues)  # Poisson's ratios are drawn with them, and not stated
     frozen = frozen_posterior(inversion.objective, minimum.unknowns, minimum.evaluation)
     chains = posterior_chains(
         frozen,
@@ -115,7 +116,7 @@ def draw_moduli(
         draws=draws,
         rng=rng,
     )
-    moduli = mapping.scale_kpa * np.exp(chains.theta)
+    moduli = mapping.scale_kpa * np.exp(chains.theta[..., :n])
     ends = np.quantile(moduli, [TAIL, 1.0 - TAIL], axis=(0, 1)).T
     is_open = np.array([[end is None for end in interval or (None, None)] for interval in intervals])
     return ModulusSamples(
@@ -125,7 +126,7 @@ def draw_moduli(
         chains.log_density,
         chains.accepted,
         np.where(is_open, np.nan, ends),
-        chain_diagnostics(chains.theta),
+        chain_diagnostics(chains.theta[..., :n]),
     )
 
 

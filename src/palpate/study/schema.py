@@ -32,15 +32,13 @@ T = TypeVar("T")
 class Rule:
     """What a key's value must be beyond its type.
 
-    choices: the values it may have; later: values of the schema that this version does not offer yet;
-    between: the least and the largest number, either of which it may be; test: a condition; wanted: what it must be,
-    in words, beside the numbers; instead_of: the key that may not stand beside this one; convert: reads a value whose
-    type alone does not say how; collects: keys of the same table, with their ranges, whose numbers the field holds;
-    unwritten: the field is no key of the table.
+    choices: the values it may have; between: the least and the largest number, either of which it may be; test: a
+    condition; wanted: what it must be, in words, beside the numbers; instead_of: the key that may not stand beside this
+    one; convert: reads a value whose type alone does not say how; collects: keys of the same table, with their ranges,
+    whose numbers the field holds; unwritten: the field is no key of the table.
     """
 
     choices: tuple[str, ...] = ()
-    later: tuple[str, ...] = ()
     between: tuple[float, float] | None = None
     test: Callable[[Any], bool] | None = None
     wanted: str = ""
@@ -53,7 +51,6 @@ class Rule:
 def rule(
     *,
     choices: tuple[str, ...] = (),
-    later: tuple[str, ...] = (),
     between: tuple[float, float] | None = None,
     test: Callable[[Any], bool] | None = None,
     wanted: str = "",
@@ -62,7 +59,7 @@ def rule(
     collects: Mapping[str, tuple[float, float]] | None = None,
 ) -> dict[str, Rule]:
     """The metadata of a dataclass field that carries a `Rule`; arguments as there."""
-    return {"rule": Rule(choices, later, between, test, wanted, instead_of, convert, collects or {})}
+    return {"rule": Rule(choices, between, test, wanted, instead_of, convert, collects or {})}
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
@@ -160,11 +157,6 @@ def _check_range(bounds: Rule, value: object, place: _Place) -> None:
 
 def _check_value(bounds: Rule, value: object, place: _Place) -> None:
     for item in value if isinstance(value, tuple) else (value,):
-        if item in bounds.later:
-            raise ConfigurationError(
-                f"{place} is '{item}', which this version of Palpate does not offer yet; use"
-                f" {' or '.join(map(repr, bounds.choices))}"
-            )
         if bounds.choices and item not in bounds.choices:
             raise ConfigurationError(f"{place} is {shown(item)}: {nearest(str(item), bounds.choices)}")
     if bounds.test is not None and value is not None and not bounds.test(value):

@@ -17,7 +17,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.errors import EstimationError, GeometryError, InputDataError, NotConverged, PalpateError, ResourceError
+from palpate.errors import (
+    ConfigurationError,
+    EstimationError,
+    GeometryError,
+    InputDataError,
+    NotConverged,
+    PalpateError,
+    ResourceError,
+)
 from palpate.images.tissue import Role
 from palpate.inversion import Inversion, InversionSettings, invert
 from palpate.mechanics.dilatation import choose_element
@@ -127,11 +135,16 @@ def sensitivity(case: Case, *, kept: Kept | None = None, sobol: int = 0, progres
 
     kept: finished parts of an earlier study are taken from there, new ones left there; sobol: samples an input of the
     Sobol indices, a power of 2; none with 0. A variant without an estimate says why. Raises as `estimate` does,
-    `NotConverged` where the case itself has no estimate, `ResourceError` where `sobol` asks for SALib and it is not
-    installed.
+    `ConfigurationError` for a case that seeks Poisson's ratios, which are varied here, `NotConverged` where the case
+    itself has no estimate, `ResourceError` where `sobol` asks for SALib and it is not installed.
     """
     began, kept = time.perf_counter(), kept or Kept()
     refuse_what_cannot_be_estimated(case)
+    if case.estimate.seeks_poisson_ratios:
+        raise ConfigurationError(
+            "how the moduli depend on Poisson's ratios is part of what is shown here, and this case seeks them as"
+            ' unknowns: leave [estimate] parameters at ["youngs_modulus"]'
+        )
     if sobol:
         require_salib()
     progress("reading the images")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,10 +47,10 @@ def image_pairs_of(inversion: Inversion, bounds: Bounds) -> ImagePairs | None:
     mapping = inversion.objective.parameters
     if len(inversion.objective.states) < 2 or not inversion.minimum.converged:
         return None
-    pairs = pair_estimates(inversion.objective, inversion.minimum, bounds)
+    scale, names = mapping.scale_kpa, mapping.tissues
+    every, n = pair_estimates(inversion.objective, inversion.minimum, bounds), len(names)
+    pairs = [replace(pair, theta=pair.theta[:n], covariance=pair.covariance[:n, :n]) for pair in every]
     found: Agreement = agreement(pairs)
-    scale = mapping.scale_kpa
-    names = mapping.tissues
 
     def stated(
         theta: NDArray[np.float64], covariance: NDArray[np.float64]
@@ -75,7 +75,7 @@ def combinations_of(inversion: Inversion, covariance: NDArray[np.float64], *, wi
     mapping = inversion.objective.parameters
     if not inversion.minimum.converged:
         return ()
-    theta = inversion.minimum.unknowns[: mapping.n_parameters]
+    theta = inversion.minimum.unknowns[: len(mapping.tissues)]
     scale = mapping.scale_kpa
     found = known_pairs(mapping.tissues, theta, covariance, within=within)
     return tuple(pair.times(scale) if pair.kind == "geometric mean" else pair for pair in found)
