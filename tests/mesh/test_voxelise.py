@@ -110,6 +110,20 @@ def test_touching_regions_leave_no_gap_and_no_overlap_even_on_voxel_centres():
     assert set(np.unique(inside)) == {0, 1, 2}
 
 
+@pytest.mark.parametrize("spacing", [0.5, 2.3])
+def test_what_bricks_decide_is_what_each_voxel_would_in_holes_and_outside_of_the_mesh(monkeypatch, spacing):
+    space = lagrange_space(ball_and_cavity(), "P2")
+    affine = np.array([[0.96, -0.28, 0.0], [0.28, 0.96, 0.0], [0.0, 0.0, 1.0]]) @ np.diag(
+        [spacing, spacing, 1.4 * spacing]
+    )
+    wide = VoxelGrid((47, 41, 29), np.block([[affine, np.full((3, 1), -12.0)], [np.zeros((1, 3)), 1.0]]))
+    bricks = voxelise(space, wave(space.points), wide)
+    monkeypatch.setattr("palpate.mesh.voxelise.BRICK", 1)
+    each = voxelise(space, wave(space.points), wide)
+    assert {1, 2} <= set(np.unique(each))
+    assert np.array_equal(bricks, each)
+
+
 def test_any_orientation_of_the_voxel_axes_gives_the_same_tissues():
     space = lagrange_space(ball_and_cavity(), "P2")
     straight = voxelise(space, wave(space.points), grid())

@@ -196,6 +196,19 @@ def test_finer_voxels_leave_less_to_the_place_of_the_grid(twins, twin, imaged):
     assert 0.0 < spread[1] < 0.7 * spread[0]
 
 
+def test_the_image_around_the_surfaces_errs_there_as_the_whole_one(twins, twin, imaged, monkeypatch):
+    objective, evaluation = imaged
+    states = (fitted(twins, twin, 1.5),)
+
+    def errors():
+        return np.concatenate(imaging_errors(objective, evaluation, states, rng=np.random.default_rng(4)))
+
+    near = errors()
+    monkeypatch.setattr("palpate.uncertainty.covariance.MARGIN_MM", 1e3)
+    assert near == pytest.approx(errors(), abs=1e-4)
+    assert np.std(near) > 0.01
+
+
 def test_later_states_of_one_rest_state_have_the_same_image_of_it(twins, twin, imaged):
     """Two states that are alike err alike in what their rest states show, where that is one, and else not."""
     objective, evaluation = imaged
