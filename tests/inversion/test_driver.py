@@ -201,30 +201,3 @@ def test_walls_that_ask_for_nothing_are_left(walls):
     rest, present = walls
     seen = [Wanting(np.arange(6), None), Wanting(np.arange(6, 12), None)]
     assert driver.refined_walls(*held_by(*seen, rest=rest, present=present)) == [None]
-
-
-def test_held_kernels_are_those_that_are_learned_there():
-    """The same prior where they were chosen; elsewhere no other kernels, whatever the motion asks for."""
-    here = ball()
-    smooth, rough = (drawn(here, sd_mm=2.0, kernel_mm=kernel, seed=2) for kernel in (60.0, 12.0))
-    modes, sd_mm = here.modes, 0.05
-    data, prior = modes.T @ modes / sd_mm**2, np.eye(here.modes.shape[1])
-    evaluations = [
-        SimpleNamespace(
-            matrix=data + prior,
-            prior=prior,
-            score=-modes.T @ motion.ravel() / sd_mm**2,
-            prior_score=np.zeros(len(data)),
-        )
-        for motion in (smooth, rough)
-    ]
-    free, still = moved_by(here.wall), np.zeros(len(data))
-    held = driver.with_held_kernels(free, evaluations[0], still)
-    (wall,) = held.states[0].walls
-    assert (len(wall.drifts), len(wall.swellings)) == (1, 1)
-    learned_there, learned_elsewhere = (
-        [driver.learned_precision(objective, evaluation, still) for objective in (free, held)]
-        for evaluation in evaluations
-    )
-    assert learned_there[1] == pytest.approx(learned_there[0], rel=1e-9, abs=1e-12)
-    assert np.abs(learned_elsewhere[1] - learned_elsewhere[0]).max() > 0.01 * np.abs(learned_elsewhere[0]).max()

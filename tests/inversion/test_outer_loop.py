@@ -24,6 +24,7 @@ from palpate.inversion import outer_loop as loop
 from palpate.inversion.approximation import ModelError
 from palpate.inversion.optimise import posterior_sd
 from palpate.inversion.outer_loop import Convergence, Criterion, StopRule, minimised
+from palpate.observation.wall_modes import Wall
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +91,42 @@ def test_where_the_reach_cuts_the_step_short_nothing_is_reweighted(twins, twin, 
     assert Criterion.REWEIGHTING in end.convergence.unmet
     end = loop.run_outer_loop(start, settings_from_far, StopRule(), progress=twins.silent, title="")
     assert end.minimum.unknowns[:2] == pytest.approx(twins.TRUTH, abs=1e-4)
+
+
+def test_a_prior_that_follows_the_estimate_is_held_from_where_that_is_near(twins, voxels, monkeypatch):
+    """Learned anew at every step it went on: the wall slid off along itself, and took the moduli with it."""
+    learned, asked = [], []
+
+    def wider(objective, *_):
+        asked.append(1)
+        if not any(state.walls for state in objective.states):
+            return objective
+        learned.append(0.7 * objective.parameters.driver_precision)
+        return replace(objective, parameters=replace(objective.parameters, driver_precision=learned[-1]))
+
+    wall = Wall(np.arange(0), (), ())
+    problem = replace(voxels, states=tuple(replace(state, walls=(wall,)) for state in voxels.states))
+    monkeypatch.setattr("palpate.inversion.estimate.with_learned_prior", lambda objective, *_: objective)
+    monkeypatch.setattr("palpate.inversion.reweighting.with_learned_prior", wider)
+    found = invert(problem, twins.settings(0.5), progress=twins.silent)
+    assert found.convergence.converged
+    assert 0 < len(learned) < len(asked)
+    assert np.array_equal(found.objective.parameters.driver_precision, learned[-1])
+    assert [state.walls for state in found.objective.states] == [(wall,)]
+
+
+def test_what_has_converged_is_not_given_up_for_a_finer_wall_in_the_last_iterations(twins, voxels, monkeypatch):
+    asked = []
+
+    def as_it_is(objective, _):
+        asked.append(1)
+        return [state.constraint for state in objective.states]
+
+    monkeypatch.setattr(loop, "refined_walls", as_it_is)
+    rule = StopRule(iterations=loop.AFTER_REFINEMENT)
+    found = invert(voxels, twins.settings(0.5), progress=twins.silent, rule=rule)
+    assert found.minimum.converged
+    assert len(asked) == 1
 
 
 def test_weights_that_never_agree_are_not_called_convergence(twins, voxels, monkeypatch):

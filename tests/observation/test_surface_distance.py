@@ -104,6 +104,19 @@ def test_no_part_of_a_drivers_wall_is_left_to_its_prior(sphere):
     assert pulls[1].tolist() == [0.0, 0.0]
 
 
+def test_a_driver_counts_by_how_well_its_modes_have_followed_at_best(sphere):
+    """One that is led away from its wall does not count less for it, and so is not led away further."""
+    seen = exact(sphere, later=9.3, driver=True).with_noise(NoiseModel(np.array([0.01**2]), np.array([4.0])))
+    here = still(seen)
+    beyond = [np.full(len(here.values), size) for size in (0.2, 0.4, 0.1)]
+    first = seen.reweighted(here, beyond[0])
+    away = first.with_noise(seen.noise_model).reweighted(here, beyond[1])
+    nearer = away.reweighted(here, beyond[2])
+    assert away.weighting.precision == pytest.approx(first.weighting.precision)
+    assert nearer.weighting.precision == pytest.approx(4.0 * first.weighting.precision)
+    assert seen.reweighted(here, beyond[1]).weighting.precision == pytest.approx(first.weighting.precision / 4.0)
+
+
 def test_terraces_count_the_less_the_finer_the_noise(seen):
     """Their own noise adds to what all residuals have; the sum of the weights stays."""
     coarse, fine = (still(seen.with_noise(NoiseModel(np.array([v]), np.array([3.0])))) for v in (1.0, 1e-4))

@@ -16,9 +16,8 @@ from scipy import linalg, optimize
 
 from palpate.inversion.objective import Evaluation, Objective, determined
 from palpate.mesh.constraint import Constraint
-from palpate.observation.wall_modes import Wall
 
-__all__ = ["learned_precision", "refined_walls", "with_held_kernels", "with_learned_prior"]
+__all__ = ["learned_precision", "refined_walls", "with_learned_prior"]
 
 AMPLITUDES = (0.005, 2.0)  # times the modes' own standard deviation
 FIRST_AMPLITUDES = ((0.3, 0.05), (0.05, 0.3))  # of drift and swelling; one may hide the other
@@ -65,35 +64,27 @@ def learned_precision(
     (MacKay 1992, Neural Computation 4, 415-447, section 4). Of kernels whose evidence is as good as equal, those that
     leave the log-moduli the widest posterior. Raises `EstimationError` where a wall's motion is left open.
     """
-    return _learned(objective, evaluation, unknowns)[0] if any(state.walls for state in objective.states) else None
-
-
-def _learned(
-    objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], list[tuple[Wall, ...]]]:
-    """That precision, and the walls of each state with the kernels that it was learned with alone."""
+    if not any(state.walls for state in objective.states):
+        return None
     data = evaluation.matrix - evaluation.prior
     pull = data @ unknowns - (evaluation.score - evaluation.prior_score)
     n_parameters, prior = objective.n_parameters, evaluation.prior.copy()
-    chosen: list[tuple[Wall, ...]] = [() for _ in objective.states]
     for s, state in enumerate(objective.states):
         own = objective.parameters.unknowns_of(s)[n_parameters:]
         for wall in state.walls:
             places = own[wall.columns]
             with determined():
                 seen = _seen(data + prior, data, pull, places)
-                pairs = list(product(wall.drifts, wall.swellings))
-                beliefs = [_most_evident(pair, seen) for pair in pairs]
+                beliefs = [_most_evident(pair, seen) for pair in product(wall.drifts, wall.swellings)]
                 best = max(evidence for evidence, _ in beliefs)
-                found = list[tuple[float, float, NDArray[np.float64], Wall]]()
-                for (drift, swelling), (evidence, covariance) in zip(pairs, beliefs, strict=True):
+                found = list[tuple[float, float, NDArray[np.float64]]]()
+                for evidence, covariance in beliefs:
                     if evidence > best - ALIKE:
-                        with_it, held = prior.copy(), Wall(wall.columns, (drift,), (swelling,))
+                        with_it = prior.copy()
                         with_it[np.ix_(places, places)] = np.linalg.inv(covariance)
-                        found.append((_width(data + with_it, n_parameters), evidence, with_it, held))
-                _, _, prior, held = max(found, key=lambda each: each[:2])
-                chosen[s] = (*chosen[s], held)
-    return prior[n_parameters:, n_parameters:], chosen
+                        found.append((_width(data + with_it, n_parameters), evidence, with_it))
+                _, _, prior = max(found, key=lambda each: each[:2])
+    return prior[n_parameters:, n_parameters:]
 
 
 def with_learned_prior(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> Objective:
@@ -102,18 +93,6 @@ def with_learned_prior(objective: Objective, evaluation: Evaluation, unknowns: N
     if precision is None:
         return objective
     return replace(objective, parameters=replace(objective.parameters, driver_precision=precision))
-
-
-def with_held_kernels(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> Objective:
-    """The objective whose walls keep the kernels that are learned around unknowns (n_unknowns,).
-
-    Only their amplitudes change from then on. Kernels are chosen from a few: where several explain the images as well,
-    an estimate that waits for the choice to settle may go from one to the other for ever. Raises `EstimationError` as
-    `learned_precision` does.
-    """
-    held = _learned(objective, evaluation, unknowns)[1]
-    states = tuple(replace(state, walls=walls) for state, walls in zip(objective.states, held, strict=True))
-    return replace(objective, states=states)
 
 
 def refined_walls(objective: Objective, evaluation: Evaluation) -> list[Constraint | None]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
 from palpate.inversion.approximation import Approximation
-from palpate.inversion.driver import refined_walls, with_held_kernels
+from palpate.inversion.driver import refined_walls
 from palpate.inversion.objective import Evaluation, LinearisedObjective, Objective
 from palpate.inversion.optimise import (
     Bounds,
@@ -28,6 +28,7 @@ from palpate.inversion.optimise import (
 )
 from palpate.inversion.reweighting import reweighted
 from palpate.mechanics.forward import SolveCounts
+from palpate.observation.wall_modes import Wall
 
 __all__ = [
     "Convergence",
@@ -49,8 +50,9 @@ FIRST = 10.0  # tolerances, to which they agree there at the least, however far 
 LINEARISED = 1e-4  # decrement of a minimum on them
 STRAIGHT = 0.4  # of ln E, within which linearised residuals are believed
 WITHIN_NOISE = 0.1  # of the posterior's width: a step that finds no smaller value
-NEAR = 0.5  # posterior standard deviations: a shorter step ends where exact derivatives and held kernels are worth it
+NEAR = 0.5  # posterior standard deviations: a shorter step ends where exact derivatives are worth it, and a held prior
 LEAST_SD = 0.03  # of ln E, see `_linearisation`
+AFTER_REFINEMENT = 4  # outer iterations that must be left where walls are refined: what has converged is not lost
 HALVINGS = 3
 TRUSTED = 0.03  # error in energy of an approximation, below which the step on it needs no line search
 ROUGHNESS = 0.5  # of the objective, in units of log-likelihood: the noise of re-chosen closest points
@@ -152,9 +154,9 @@ def run_outer_loop(
     """Follow a minimum until reweighting it and updating its approximations change it no more.
 
     The approximations of `start` are exact there (see `updated`). Drivers' walls are refined where their surfaces ask
-    for it (see `refined_walls`); the kernels of their motion are held from where the estimate is near. `title` begins
-    each line of `progress`. The minimum's history is that of the loop alone, its evaluations are added to those of
-    `start`. Raises `NotConverged` when the full model has no equilibrium where every part of a step leads.
+    for it (see `refined_walls`); what is believed of their motion is held from where the estimate is near. `title`
+    begins each line of `progress`. The minimum's history is that of the loop alone, its evaluations are added to those
+    of `start`. Raises `NotConverged` when the full model has no equilibrium where every part of a step leads.
     """
     walls = [state.walls for state in start.objective.states]
     at, theta = start.minimum.evaluation, start.minimum.unknowns[: start.objective.n_parameters]
@@ -169,11 +171,13 @@ def run_outer_loop(
         if now.stayed:
             break
         if not held and _near(now.minimum, before, now.objective.n_parameters):
-            objective = with_held_kernels(now.objective, now.minimum.evaluation, now.minimum.unknowns)
+            # Learned anew at every step it follows the estimate, which follows it: the wall slides off along itself.
+            objective = _with_walls(now.objective, [()] * len(walls))
             now, held = replace(now, objective=objective), True
         if now.convergence.converged:
             finer = refined_walls(now.objective, now.minimum.evaluation)
-            if all(of is None for of in finer) or refinements == rule.refinements or number == rule.iterations:
+            late = number > rule.iterations - AFTER_REFINEMENT
+            if all(of is None for of in finer) or refinements == rule.refinements or late:
                 break
             pairs = zip(now.objective.approximations, finer, strict=True)
             moved = [a if constraint is None else a.with_constraint(constraint) for a, constraint in pairs]
@@ -182,8 +186,13 @@ def run_outer_loop(
     else:
         if max(now.convergence.reweighting, now.convergence.linearisation) > rule.far and now.minimum.converged:
             now = replace(now, minimum=replace(now.minimum, outcome=Outcome.STEPS))
-    states = [replace(s, walls=own) for s, own in zip(now.objective.states, walls, strict=True)]  # for another law
-    return replace(now, objective=replace(now.objective, states=tuple(states)))
+    return replace(now, objective=_with_walls(now.objective, walls))  # from which another law learns
+
+
+def _with_walls(objective: Objective, walls: Sequence[tuple[Wall, ...]]) -> Objective:
+    """The objective whose drivers' prior is learned of these walls of each state; of none it stays as it is."""
+    states = (replace(state, walls=own) for state, own in zip(objective.states, walls, strict=True))
+    return replace(objective, states=tuple(states))
 
 
 def updated(objective: Objective, minimum: Minimum, rule: StopRule) -> OuterIterate:

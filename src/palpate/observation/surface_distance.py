@@ -41,7 +41,7 @@ class SurfaceDistance:
     point x = X + u(X) from the image point y, positive when the model lies outside; b is `held.excess`. Each direction
     has half of the weight, shared out by area and, where voxels' terraces add to the noise n (mm^4, its variance times
     its correlation area), as n / (n + terraces). stated_noise: that of the case, which holds whatever the residuals
-    say.
+    say; unfollowed: of a driver's residuals what no modes followed, the smallest mean square (mm^2) so far.
     """
 
     target: SurfaceTarget
@@ -49,6 +49,7 @@ class SurfaceDistance:
     noise_model: NoiseModel
     weighting: Weighting
     stated_noise: NoiseModel | None = None
+    unfollowed: float = np.inf
 
     @property
     def kind(self) -> str:
@@ -120,13 +121,17 @@ class SurfaceDistance:
 
         A surface that fits worse than the noise (a driver whose modes cannot follow its wall) counts by its own mean
         square, so that its misfit is not forced into the other unknowns; of a driver by the part beyond_modes (n,) mm,
-        as one that counted less for what it does not follow yet would follow its wall still less.
+        the smallest so far: one that counted less for what it does not follow yet, or for having been led away from its
+        wall, would follow it still less.
         """
         loss = robust_loss(residuals.values, self.target)
-        misfit = residuals.values if beyond_modes is None else beyond_modes
-        mean_square = loss.mean_square(misfit, residuals.weights)
+        if beyond_modes is None:
+            unfollowed, mean_square = self.unfollowed, loss.mean_square(residuals.values, residuals.weights)
+        else:
+            unfollowed = mean_square = min(self.unfollowed, loss.mean_square(beyond_modes, residuals.weights))
         share = min(1.0, self.noise_model.sd**2 / max(mean_square, 1e-12))
-        return replace(self, weighting=Weighting(self._precision(self.noise_model) * share, loss))
+        weighting = Weighting(self._precision(self.noise_model) * share, loss)
+        return replace(self, weighting=weighting, unfollowed=unfollowed)
 
     def first_noise(self, peers: Sequence[SurfaceDistance]) -> NoiseModel:
         """The rounding of both images' voxels; without any, `EXACT_NOISE`; what is stated, where it is.
