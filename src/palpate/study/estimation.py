@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -204,13 +204,7 @@ def conclude(
         starts=tuple(_start(inversion, start) for start in inversion.starts),
         fits=_fits(inversion, observed),
         displacements=tuple(state.displacement for state in observed.states),
-        counts={
-            "forward": inversion.counts.forward,
-            "adjoint": inversion.counts.adjoint,
-            "tangent": inversion.counts.tangent,
-            "factorisations": inversion.counts.factorisations,
-            "evaluations": inversion.evaluations,
-        },
+        counts=asdict(inversion.counts) | {"evaluations": inversion.evaluations},
         outer_loop=tuple(_iteration(inversion, iterate) for iterate in minimum.history),
         remarks=findings,
         observations={observation.kind: observation.description for observation in objective.observations},
