@@ -98,6 +98,9 @@ def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tu
     `colours`: tissue -> #rrggbb.
     """
     items = moduli_in(document)
+    causes = CAUSES | (
+        {"prior": "what is believed of walls and ratios"} if len(items) < len(document["estimates"]) else {}
+    )
     shown = document["status"] == "converged"
     scale = _scale(items) if shown else None
     rows = []
@@ -118,7 +121,7 @@ def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tu
             truth=number(truth),
             error=f"{100.0 * (value / truth - 1.0):+.1f} %" if shown and value and truth else NONE,
             bar=_bar(value, interval, truth=truth, scale=scale) if scale and value else None,
-            shares=", ".join(f"{CAUSES[c]} {100 * s:.0f} %" for c, s in shares.items()) if shown else "",
+            shares=", ".join(f"{causes[c]} {100 * s:.0f} %" for c, s in shares.items()) if shown else "",
         )
         rows.append(row)
     return tuple(rows)
