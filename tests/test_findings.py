@@ -70,7 +70,7 @@ def test_bones_in_pieces_unseen_or_round_are_one_warning_each_over_all_bones_and
 def test_moduli_that_depend_on_each_other_are_one_warning_with_every_pair():
     names = ("prostate", "bladder", "uterus")
     inversion = Stand(
-        objective=Stand(parameters=Stand(absolute=True, tissues=names)),
+        objective=Stand(parameters=Stand(absolute=True, tissues=names, names=names)),
         minimum=Stand(converged=True),
         convergence=Stand(unmet=()),
         candidates=[Stand(minimum=Stand(outcome=None))],

@@ -52,6 +52,9 @@ law = "linear"  # as the truth
 [mesh]
 edge_length_mm = 8.0
 
+[driver]
+modes = 30
+
 [estimate]
 start_ratios = [1.0, 4.0]
 """
