@@ -54,7 +54,7 @@ law = "linear"
 element = "P1"
 
 [mesh]
-edge_length_mm = 10.0
+edge_length_mm = 12.0
 
 [driver]
 modes = 8

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 __all__ = ["Complement", "Ellipsoid", "Shape", "Tube", "Union", "ball", "rotation_about"]
 
 NEWTON_STEPS = 40  # for the closest point of an ellipsoid; the iteration is monotone and rarely needs ten
+PLACES = 401  # along a tube, of which one is near every point's closest
 STEP_MM = 1e-4  # of the differences that give a tube's gradient
 
 
@@ -87,17 +88,30 @@ class Tube:
     """A tube with rounded ends about a curve through `knots` (n, 3) mm.
 
     `radii` (n,) mm at the knots; both vary as cubic splines. The distance is |p - c| - r at the closest point c of the
-    centre line: exact for a constant radius, to first order for a slowly varying one.
+    centre line: exact for a constant radius, to first order for a slowly varying one. `curve` and `radius`: the
+    splines, from 0 to 1; of so many `places` (n_places,) the closest, found by the `tree`, is where Newton's method
+    begins.
     """
 
     knots: NDArray[np.float64]
     radii: NDArray[np.float64]
+    curve: CubicSpline = field(init=False)
+    radius: CubicSpline = field(init=False)
+    places: NDArray[np.float64] = field(init=False)
+    tree: KDTree = field(init=False)
+
+    def __post_init__(self) -> None:
+        chords = np.linalg.norm(np.diff(self.knots, axis=0), axis=1)
+        parameters = np.concatenate([[0.0], np.cumsum(chords) / chords.sum()])
+        curve, places = CubicSpline(parameters, self.knots), np.linspace(0.0, 1.0, PLACES)
+        made = {"curve": curve, "radius": CubicSpline(parameters, self.radii), "places": places}
+        for name, value in (made | {"tree": KDTree(curve(places))}).items():
+            object.__setattr__(self, name, value)
 
     def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Signed distance (n,) mm."""
         place, spoke = self.coordinates(points)
-        radius = CubicSpline(self._parameters(), self.radii)(place)
-        return np.asarray(np.linalg.norm(spoke, axis=1) - radius)
+        return np.asarray(np.linalg.norm(spoke, axis=1) - self.radius(place))
 
     def gradient_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Gradient (n, 3), mm per mm, by central differences."""
@@ -106,9 +120,7 @@ class Tube:
 
     def coordinates(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Place (n,) of the closest point on the centre line, 0 to 1, and the vector (n, 3) mm from there."""
-        curve = CubicSpline(self._parameters(), self.knots)
-        samples = np.linspace(0.0, 1.0, 401)
-        place = samples[KDTree(curve(samples)).query(points)[1]]
+        curve, place = self.curve, self.places[self.tree.query(points)[1]]
         for _ in range(3):  # Newton on (p - c) . c' = 0, whose derivative is close to -|c'|^2
             slope = curve(place, 1)
             rest = ((points - curve(place)) * slope).sum(axis=1)
@@ -119,16 +131,10 @@ class Tube:
     def surface(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points (n, 3) mm of the surface, in unit `directions` (n, 3) from places all along the centre line."""
         place = np.linspace(0.0, 1.0, len(directions))
-        centre = CubicSpline(self._parameters(), self.knots)(place)
-        reach = CubicSpline(self._parameters(), self.radii)(place)[:, None] * directions
-        points = centre + reach
+        points = self.curve(place) + self.radius(place)[:, None] * directions
         for _ in range(2):
             points = points - self.at(points)[:, None] * self.gradient_at(points)
         return np.asarray(points)
-
-    def _parameters(self) -> NDArray[np.float64]:
-        chords = np.linalg.norm(np.diff(self.knots, axis=0), axis=1)
-        return np.concatenate([[0.0], np.cumsum(chords) / chords.sum()])
 
 
 @dataclass(frozen=True, slots=True)

@@ -194,7 +194,8 @@ def test_twin_rows_are_the_unknowns_of_one_node(problem, meshes):
 
 
 def test_nested_dissection_orders_every_unknown_once_and_spares_fill(problem):
-    matrix = problem[0]
+    part = problem[0].shape[0] // 2  # the natural order of all takes ten seconds
+    matrix = problem[0][:part][:, :part]
     order = nested_dissection(matrix)
     assert np.array_equal(np.sort(order), np.arange(matrix.shape[0]))
     options = {"permc_spec": "NATURAL", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
