@@ -33,9 +33,9 @@ def ratio_of_eta(eta: float) -> float:
 class OpenPoisson:
     """A tissue whose Poisson's ratio nu is sought, by eta = ln(lambda / mu), which no bound cuts short near nu = 0.5.
 
-    given: that which the tissue states, where a search begins; column:
-    number of eta among the unknowns; regions: numbers of the model's regions, one for each part of the tissue's
-    stiffness that its dilatation has (see `stiffness_parts`).
+    given: that which the tissue states, where a search begins; column: number of eta among the unknowns; regions:
+    numbers of the model's regions, one for each part of the tissue's stiffness that its dilatation has (see
+    `stiffness_parts`).
     """
 
     tissue: str
