@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo test lint check clean pardiso benchmark-setup schemas docs dist dist-test minimum report-check export-check
+.PHONY: install demo test style lint check clean pardiso benchmark-setup schemas docs dist dist-test minimum report-check export-check
 
 install: $(VENV)/.installed
 
@@ -26,14 +26,19 @@ benchmark-setup: install
 demo: install
 	$(BIN)/palpate demo --output demo-output
 
-lint: install
+style: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-cache
+
+lint: style
 	$(BIN)/mypy
 
-test: lint
-	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal
+# mypy has one thread: it runs beside the tests, and either of them fails the target.
+test: style
+	$(BIN)/mypy & types=$$!; \
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal; tests=$$?; \
+	wait $$types && exit $$tests
 
 check: test
 
