@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
@@ -234,12 +233,7 @@ def stated_noise(case: Case) -> NoiseModel | None:
 def _models(body: Body, case: Case) -> list[tuple[LinearModel, tuple[Wall, ...]]]:
     """One model a later image, and its drivers' walls; they share the stiffness and differ in the bones' motion."""
     models: list[tuple[LinearModel, tuple[Wall, ...]]] = []
-    given: dict[str, Any] = {
-        "dilatation": choose_element(case.mechanics.element).dilatation,
-        "open_poisson": _open_poisson(case, body),
-        "loads": case_loads(case, body.space),
-        "solver": case.mechanics.solver,
-    }
+    dilatation, loads = choose_element(case.mechanics.element).dilatation, case_loads(case, body.space)
     for bones in body.states.bones:
         motion = prescribed_motion(
             body.space,
@@ -255,7 +249,18 @@ def _models(body: Body, case: Case) -> list[tuple[LinearModel, tuple[Wall, ...]]
             offset=motion.offset,
             prescribed=motion.prescribed,
         )
-        made = with_constraint(models[0][0], constraint) if models else linear_model(body.space, constraint, **given)
+        made = (
+            with_constraint(models[0][0], constraint)
+            if models
+            else linear_model(
+                body.space,
+                constraint,
+                dilatation=dilatation,
+                loads=loads,
+                solver=case.mechanics.solver,
+                open_poisson=_open_poisson(case, body),
+            )
+        )
         models.append((made, motion.walls))
     return models
 

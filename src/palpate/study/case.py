@@ -440,7 +440,8 @@ class Case:
             if tissue.poisson_ratio is not None and not low < tissue.poisson_ratio < high:
                 raise ConfigurationError(
                     f"the Poisson's ratio of '{tissue.name}' is sought between {low} and {high}, and its poisson_ratio"
-                    f" of {tissue.poisson_ratio}, where the search begins, does not lie there"
+                    f" of {tissue.poisson_ratio}, where the search begins, does not lie there: give one that does, or"
+                    ' leave [estimate] parameters at ["youngs_modulus"]'
                 )
         if self.estimate.seeks_poisson_ratios and self.mechanics.material_law.finite:
             raise ConfigurationError(

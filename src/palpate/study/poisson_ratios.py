@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,7 +32,7 @@ class PoissonRatioEstimate:
     interval_kind: str
     verdict: str
     why: str
-    variance_shares: dict[str, float] | None = None
+    variance_shares: Mapping[str, float] | None = None
     profile: tuple[tuple[float, float], ...] = ()
 
 

@@ -52,10 +52,10 @@ def gain(evaluation: Evaluation, n_parameters: int) -> tuple[NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Covariance:
-    """Of the log-moduli, (n_parameters, n_parameters) each, by its independent causes.
+    """Of the parameters, (n_parameters, n_parameters) each, dimensionless, by its independent causes.
 
-    noise: of the residuals; prior: what is believed of the drivers' motion, and of the moduli; grid: the place of the
-    voxels.
+    Parameters are the log-moduli, then eta = ln(lambda / mu) of Poisson's ratios that are sought. noise: of the
+    residuals; prior: what is believed of the drivers' motion, and of parameters; grid: the place of the voxels.
     """
 
     noise: NDArray[np.float64]
