@@ -114,7 +114,8 @@ def test_an_extended_projection_is_that_on_all_vectors(model):
     whole, grown = projection(model, snapshots).reduced, projection(model, snapshots[:, :4])
     for start in range(4, snapshots.shape[1], 3):
         grown = grown.extended(snapshots[:, start : start + 3])
-    vectors = grown.vectors
+    vectors = grown.spanned(np.eye(grown.reduced.n_basis))
+    assert np.allclose(grown.components(vectors), np.eye(grown.reduced.n_basis), atol=1e-12)
     assert np.allclose(vectors.T @ vectors, np.eye(vectors.shape[1]), atol=1e-12)
     assert vectors.shape[1] == whole.n_basis
     moduli, q = np.array([1.0, 3.0]), np.array([0.4, -1.0])

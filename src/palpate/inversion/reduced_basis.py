@@ -98,8 +98,8 @@ class ReducedBasis:
         loads = -np.asarray(weighted_sum(at.moduli, model.coupling)[:, :-1] @ by_mode)
         for modulus, stiffness, share in zip(at.moduli, model.stiffness, by_modulus, strict=True):
             loads -= np.outer(model.constraint.free.T @ (modulus * (stiffness @ displacement)), share)
-        vectors = sharper.projection.vectors
-        known = vectors @ sharper.model.system(at.moduli).backward(vectors.T @ loads)
+        amplitudes = sharper.model.system(at.moduli).backward(sharper.projection.components(loads))
+        known = sharper.projection.spanned(amplitudes)
         rest = solved(loads - matrix @ known, TANGENT)
         return replace(_extended(sharper, rest, SolveCounts(tangent=rest.shape[1])), place=at)
 

@@ -323,8 +323,10 @@ def weighted_sum(
     weights: NDArray[np.float64], matrices: tuple[sparse.csr_matrix[np.float64], ...]
 ) -> sparse.csr_matrix[np.float64]:
     """Sum over r of weights[r] (n_regions,) times matrices[r], (n, k) each, in the unit of their products."""
-    total = weights[0] * matrices[0]
-    for weight, matrix in zip(weights[1:], matrices[1:], strict=True):
+    smallest_first = sorted(zip(weights, matrices, strict=True), key=lambda term: term[1].nnz)
+    (weight, matrix), *others = smallest_first  # every sum is copied whole into the next
+    total = weight * matrix
+    for weight, matrix in others:
         total = total + weight * matrix
     result = sparse.csr_matrix(total)
     result.sort_indices()

@@ -184,37 +184,36 @@ class ReducedEquilibrium(DenseEquilibrium):
 
 @dataclass(frozen=True, slots=True)
 class Projection:
-    """A linear model on the span of orthonormal vectors: the reduced model, and what extends it."""
+    """A linear model on the span of orthonormal vectors V (n_free, m): the reduced model, and what extends it."""
 
     model: LinearModel
     reduced: ReducedModel
 
-    @property
-    def vectors(self) -> NDArray[np.float64]:
-        """The orthonormal vectors V (n_free, m), from the outputs F V: kept twice they would be the largest of all."""
-        return np.asarray(self.model.constraint.free.T @ self.reduced.output_basis)
+    def spanned(self, amplitudes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """V a (n_free, k) for amplitudes a (m, k)."""
+        # V = F^T (F V) is not kept beside the outputs F V: twice they would be the largest of all
+        return np.asarray(self.model.constraint.free.T @ (self.reduced.output_basis @ amplitudes))
+
+    def components(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
+        """V^T f (m, k) of f (n_free, k)."""
+        return np.asarray(self.reduced.output_basis.T @ (self.model.constraint.free @ forces))
 
     def extended(self, snapshots: NDArray[np.float64]) -> Projection:
         """The projection on the span of the present vectors and of snapshots (n_free, k) mm.
 
         Only what the snapshots add is multiplied with the stiffness. Raises `ConfigurationError` for other rows.
         """
-        vectors = self.vectors
-        fresh = _complement(vectors, _checked(self.model, snapshots))
+        fresh = self._complement(_checked(self.model, snapshots))
         if not fresh.shape[1]:
             return self
-        model, old = self.model, self.reduced
-        sides = [_products(matrix, (vectors, fresh), fresh) for matrix in model.free_stiffness]
-        del vectors
-        stiffness = np.stack(
-            [
-                np.block([[block, side], [side.T, 0.5 * (corner + corner.T)]])
-                for block, (side, corner) in zip(old.stiffness, sides, strict=True)
-            ]
-        )
+        model, old, blocks = self.model, self.reduced, []
+        for matrix, block in zip(model.free_stiffness, old.stiffness, strict=True):
+            image = times(matrix, fresh)
+            side, corner = self.components(image), fresh.T @ image
+            blocks.append(np.block([[block, side], [side.T, 0.5 * (corner + corner.T)]]))
         reduced = replace(
             old,
-            stiffness=stiffness,
+            stiffness=np.stack(blocks),
             coupling=np.concatenate([old.coupling, _coupling(model, fresh)], axis=1),
             load=np.concatenate([old.load, fresh.T @ model.free_load]),
             output_basis=np.concatenate([old.output_basis, model.constraint.free @ fresh], axis=1),
@@ -223,9 +222,22 @@ class Projection:
 
     def under(self, model: LinearModel) -> Projection:
         """The same vectors for a `model` of the same body with other modes or another offset."""
-        constraint, coupling = model.constraint, _coupling(model, self.vectors)
+        constraint = model.constraint
+        coupling = np.stack([self.components(matrix.toarray()) for matrix in model.coupling])
         modes, offset = constraint.modes, constraint.offset
         return Projection(model, replace(self.reduced, coupling=coupling, output_modes=modes, output_offset=offset))
+
+    def _complement(self, snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Orthonormal columns (n_free, m) that span what the snapshots (n_free, k) add to the present vectors."""
+        lengths = np.linalg.norm(snapshots, axis=0)
+        rest = snapshots[:, lengths > 0.0] / lengths[lengths > 0.0]
+        for _ in range(2):  # once leaves the rounding of what it takes away
+            rest = rest - self.spanned(self.components(rest))
+        rest = rest[:, np.linalg.norm(rest, axis=0) > RANK_TOLERANCE]
+        if not rest.shape[1]:
+            return np.asarray(rest)
+        fresh = orthonormal_basis(rest)
+        return orthonormal_basis(fresh - self.spanned(self.components(fresh)))
 
 
 def projection(model: LinearModel, snapshots: NDArray[np.float64]) -> Projection:
@@ -234,8 +246,7 @@ def projection(model: LinearModel, snapshots: NDArray[np.float64]) -> Projection
     They are made orthonormal and their rank cut; raises `ConfigurationError` when their rows are not n_free.
     """
     vectors = orthonormal_basis(_checked(model, snapshots))
-    products = [_products(matrix, (vectors,), vectors)[0] for matrix in model.free_stiffness]
-    stiffness = np.stack([0.5 * (product + product.T) for product in products])
+    stiffness = np.stack([_products(matrix, vectors) for matrix in model.free_stiffness])
     load, coupling = np.asarray(vectors.T @ model.free_load), _coupling(model, vectors)
     outputs, constraint = np.asarray(model.constraint.free @ vectors), model.constraint
     reduced = ReducedModel(model.names, stiffness, coupling, load, outputs, constraint.modes, constraint.offset)
@@ -267,19 +278,6 @@ def orthonormal_basis(snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(q @ rotation[:, : int(np.sum(values > RANK_TOLERANCE * values[0]))])
 
 
-def _complement(vectors: NDArray[np.float64], snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Orthonormal columns (n, m) that span what the snapshots (n, k) add to orthonormal `vectors` (n, m_0)."""
-    lengths = np.linalg.norm(snapshots, axis=0)
-    rest = snapshots[:, lengths > 0.0] / lengths[lengths > 0.0]
-    for _ in range(2):  # once leaves the rounding of what it takes away
-        rest = rest - vectors @ (vectors.T @ rest)
-    rest = rest[:, np.linalg.norm(rest, axis=0) > RANK_TOLERANCE]
-    if not rest.shape[1]:
-        return np.asarray(rest)
-    fresh = orthonormal_basis(rest)
-    return orthonormal_basis(fresh - vectors @ (vectors.T @ fresh))
-
-
 def _checked(model: LinearModel, snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
     n_free = model.constraint.free.shape[1]
     if snapshots.ndim != 2 or len(snapshots) != n_free:
@@ -292,17 +290,11 @@ def _coupling(model: LinearModel, vectors: NDArray[np.float64]) -> NDArray[np.fl
     return np.stack([np.asarray((matrix.T @ vectors).T) for matrix in model.coupling])
 
 
-def _products(
-    matrix: sparse.csr_matrix[np.float64], sides: tuple[NDArray[np.float64], ...], vectors: NDArray[np.float64]
-) -> list[NDArray[np.float64]]:
-    """S^T A V (m, k) for each of `sides` S (n, m); a tissue's stiffness A is empty but for its own rows."""
+def _products(matrix: sparse.csr_matrix[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """V^T A V (m, m) for V (n, m); a tissue's stiffness A is empty but for its own rows."""
     touched = np.flatnonzero(np.diff(matrix.indptr))
-    inner = sparse.csr_matrix(matrix[touched][:, touched])
-    own = [side[touched] for side in sides]
-    results = [np.empty((side.shape[1], vectors.shape[1])) for side in sides]
+    own, result = vectors[touched], np.empty((vectors.shape[1],) * 2)
     for start in range(0, vectors.shape[1], CHUNK):
         columns = slice(start, start + CHUNK)
-        image = times(inner, vectors[touched, columns])
-        for result, side in zip(results, own, strict=True):
-            result[:, columns] = side.T @ image
-    return results
+        result[:, columns] = own.T @ times(matrix, vectors[:, columns])[touched]
+    return 0.5 * (result + result.T)

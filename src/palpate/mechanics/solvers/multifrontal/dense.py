@@ -7,6 +7,7 @@ Called so, they leave Python's lock while they compute; SciPy's own wrappers do 
 from __future__ import annotations
 
 import ctypes
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -50,24 +51,27 @@ _ROUTINES = {
         *((k, cython_blas) for k in ("trsm", "syrk", "gemm", "trsv", "gemv")),
     ]
 }
-_ONE = {np.dtype(t): np.array([1.0], dtype=t) for t in (np.float32, np.float64)}
-_CONSTANT = {(dtype, value): np.array([value], dtype=dtype) for dtype in _ONE for value in (-1.0, 0.0, 1.0)}
+_TYPES = (np.dtype(np.float32), np.dtype(np.float64))
+_CONSTANT = {(dtype, value): np.array([value], dtype=dtype) for dtype in _TYPES for value in (-1.0, 0.0, 1.0)}
+_PLACES = {key: constant.ctypes.data for key, constant in _CONSTANT.items()}
 
 
+# A factor has thousands of small fronts: what surrounds a call counts as much as the call.
 def _at(array: Matrix) -> int:
-    return int(array.__array_interface__["data"][0])
+    return array.ctypes.data
 
 
+@functools.lru_cache(maxsize=1 << 14)
 def _dimension(value: int) -> Any:
     return ctypes.byref(ctypes.c_int(value))
 
 
 def _leading(array: Matrix) -> Any:
-    return ctypes.byref(ctypes.c_int(max(array.strides[1] // array.itemsize, 1)))
+    return _dimension(max(array.strides[1] // array.itemsize, 1))
 
 
 def _scalar(dtype: np.dtype[Any], value: float) -> int:
-    return _at(_CONSTANT[dtype, value])
+    return _PLACES[dtype, value]
 
 
 def factor(a: Matrix) -> int:

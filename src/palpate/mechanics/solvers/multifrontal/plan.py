@@ -32,7 +32,7 @@ class Front:
 
     first: int
     width: int
-    rows: NDArray[np.int32]
+    rows: Integers
     panel: int
     contribution: int
     children: tuple[int, ...]
@@ -112,7 +112,7 @@ def make_plan(matrix: sparse.csr_matrix[np.float64], threads: int) -> Plan:
         Front(
             first=int(offset[nodes.start[s]]),
             width=int(width[s]),
-            rows=_spread(offset[nodes.rows[s]], own[nodes.rows[s]]).astype(np.int32),
+            rows=_spread(offset[nodes.rows[s]], own[nodes.rows[s]]),
             panel=int(panel[s]),
             contribution=places[s],
             children=tuple(children[s]),
