@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 __all__ = ["Huber", "RobustLoss", "Tukey"]
 
 HUBER = 1.345  # cutoff of `Huber` in standard deviations, 95 % efficient for normal errors
-NORMAL = float(2.0 * stats.norm.cdf(HUBER) - 1.0)  # mean of w r^2 of standard normal residuals r under that cutoff
+NORMAL = math.erf(HUBER / math.sqrt(2.0))  # mean of w r^2 of standard normal residuals r under that cutoff
 
 
 class RobustLoss(Protocol):

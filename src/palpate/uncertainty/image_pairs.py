@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from palpate.inversion import Bounds, Minimum, Objective, gauss_newton
 from palpate.uncertainty.covariance import sandwich_covariance
@@ -84,7 +84,7 @@ def agreement(pairs: Sequence[PairEstimate]) -> Agreement:
     """
     theta, covariance = np.stack([p.theta for p in pairs]), np.stack([p.covariance for p in pairs])
     kept = np.ones(len(pairs), dtype=bool)
-    limit = stats.chi2.ppf(1.0 - OUTLIER / len(pairs), theta.shape[1])
+    limit = special.chdtri(theta.shape[1], OUTLIER / len(pairs))
     while kept.sum() >= LEAST_PAIRS:
         distances = np.array([_distance(theta, covariance, kept, p) if kept[p] else 0.0 for p in range(len(pairs))])
         if distances.max() <= limit:
@@ -101,7 +101,7 @@ def agreement(pairs: Sequence[PairEstimate]) -> Agreement:
     return Agreement(
         outlier=~kept,
         influence=influence / np.sqrt(np.diag(spread)),
-        heterogeneity=float(stats.chi2.sf(q, max(good.size - good.shape[1], 1))),
+        heterogeneity=float(special.chdtrc(max(good.size - good.shape[1], 1), q)),
         within_cv=np.expm1(np.std(good, axis=0, ddof=1)),
         theta=robust,
         covariance=robust_covariance,
