@@ -70,6 +70,22 @@ def test_the_derivatives_that_decide_the_moduli_are_those_of_the_equilibrium(bod
     assert np.linalg.norm(stated - exact, axis=0) == pytest.approx(0.0, abs=0.02 * np.linalg.norm(exact))
 
 
+def test_all_derivatives_are_those_of_the_equilibrium_where_the_estimate_comes_near_slowly(body, linear, settings):
+    """By directions alone columns of elsewhere remain; a place that is slow has none of them left."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(expansion, "FEW", 0)
+        found = continue_at_finite_strain(linear, settings, progress=lambda _: None)
+        unknowns = found.minimum.unknowns + np.array([0.3, -0.2, *np.full(len(found.minimum.unknowns) - 2, 0.1)])
+        evaluation, missed = found.objective(unknowns), []
+        for slow in (False, True):
+            (place,) = found.objective.places(unknowns, evaluation, near=True, slow=slow)
+            there = found.objective.states[0].approximation.update(place)
+            exact = there.equilibrium.tangent()
+            missed.append(np.linalg.norm(there.model.derivatives - exact) / np.linalg.norm(exact))
+    assert missed[1] < 0.02  # of what they lack a hundredth is left, see `tangent_along`
+    assert missed[0] > 3.0 * missed[1]
+
+
 def test_the_displacement_reported_is_an_equilibrium(body, continued):
     moduli, q, _ = split(continued)
     stated = continued.objective.states[0].displacement(moduli, q)

@@ -33,7 +33,8 @@ class Place:
 
     directions (n_regions + n_modes, k) of (ln E, q): those along which derivatives are wanted, None where the
     displacement alone is; metric (n_regions + n_modes, n_regions + n_modes): the Gauss-Newton matrix there; near:
-    whether the estimate is so near that exact derivatives are worth their price.
+    whether the estimate is so near that exact derivatives are worth their price; slow: whether those of all moduli and
+    modes are, as it comes near while the model's error does not halve.
     """
 
     moduli: NDArray[np.float64]
@@ -41,6 +42,7 @@ class Place:
     directions: NDArray[np.float64] | None = None
     metric: NDArray[np.float64] | None = None
     near: bool = True
+    slow: bool = False
 
     def same_as(self, other: Place | None) -> bool:
         """Whether moduli and coefficients are those of another place."""

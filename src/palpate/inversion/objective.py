@@ -117,7 +117,12 @@ class Objective:
         return found
 
     def places(
-        self, unknowns: NDArray[np.float64], evaluation: Evaluation | None = None, *, near: bool = False
+        self,
+        unknowns: NDArray[np.float64],
+        evaluation: Evaluation | None = None,
+        *,
+        near: bool = False,
+        slow: bool = False,
     ) -> list[Place]:
         """What unknowns (n_unknowns,) mean for each state; by an `evaluation` with the directions that decide there."""
         mapping = self.parameters
@@ -128,7 +133,7 @@ class Objective:
         for s, q in enumerate(coefficients):
             own, chain = mapping.unknowns_of(s), mapping.chain(s, unknowns)
             metric = chain @ evaluation.matrix[np.ix_(own, own)] @ chain.T
-            places.append(Place(moduli, q, chain @ directions[own], metric, near))
+            places.append(Place(moduli, q, chain @ directions[own], metric, near, slow))
         return places
 
     def under(self, approximations: Sequence[Approximation]) -> Objective:

@@ -246,9 +246,10 @@ def _iteration(
     if convergence.converged or error < rule.solve_above:
         return there
     near = _near(found, now.minimum.unknowns, n)
+    slow = near and missing >= 1.0 and missing > 0.5 * now.convergence.model_error
     if error < TRUSTED:
-        return _with_approximations(there, _solved(objective, found.unknowns, found.evaluation, near=near))
-    return _line_search(now, there, near=near)
+        return _with_approximations(there, _solved(objective, found.unknowns, found.evaluation, near=near, slow=slow))
+    return _line_search(now, there, near=near, slow=slow)
 
 
 def _near(found: Minimum, before: NDArray[np.float64], n_parameters: int) -> bool:
@@ -360,7 +361,7 @@ def _advanced(
     return matched, found
 
 
-def _line_search(now: OuterIterate, there: OuterIterate, *, near: bool) -> OuterIterate:
+def _line_search(now: OuterIterate, there: OuterIterate, *, near: bool, slow: bool) -> OuterIterate:
     """The first of step, step / 2, step / 4 ... that lowers the objective on the full model, updated there.
 
     Where none does the iterate stays: `STALLED` when the step is within the tolerance, else `STUCK`. Raises
@@ -381,7 +382,9 @@ def _line_search(now: OuterIterate, there: OuterIterate, *, near: bool) -> Outer
             spent = there.minimum.evaluations + evaluations
             reached = replace(there.minimum, unknowns=unknowns, evaluation=evaluation, evaluations=spent)
             arrived = replace(there, objective=trial, minimum=reached)
-            return _with_approximations(arrived, _solved(trial, unknowns, there.minimum.evaluation, near=near))
+            return _with_approximations(
+                arrived, _solved(trial, unknowns, there.minimum.evaluation, near=near, slow=slow)
+            )
     if failure is not None:
         raise failure
     outcome = Outcome.STALLED if there.step < 1.0 else Outcome.STUCK
@@ -421,10 +424,15 @@ def _with_approximations(now: OuterIterate, approximations: list[Approximation])
 
 
 def _solved(
-    objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation | None = None, *, near: bool = False
+    objective: Objective,
+    unknowns: NDArray[np.float64],
+    evaluation: Evaluation | None = None,
+    *,
+    near: bool = False,
+    slow: bool = False,
 ) -> list[Approximation]:
     """The states' approximations updated at unknowns, with the derivatives that decide by an evaluation."""
-    places = objective.places(unknowns, evaluation, near=near)
+    places = objective.places(unknowns, evaluation, near=near, slow=slow)
     return [approximation.update(at) for approximation, at in zip(objective.approximations, places, strict=True)]
 
 
