@@ -70,7 +70,7 @@ def test_the_derivatives_that_decide_the_moduli_are_those_of_the_equilibrium(bod
     assert np.linalg.norm(stated - exact, axis=0) == pytest.approx(0.0, abs=0.02 * np.linalg.norm(exact))
 
 
-def test_all_derivatives_are_those_of_the_equilibrium_where_the_estimate_comes_near_slowly(body, linear, settings):
+def test_all_derivatives_are_those_of_the_equilibrium_where_the_estimate_comes_near_slowly(linear, settings):
     """By directions alone columns of elsewhere remain; a place that is slow has none of them left."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(expansion, "FEW", 0)

@@ -14,7 +14,7 @@ import palpate
 from palpate.cli import main
 from palpate.errors import EstimationError
 from palpate.images.readers import write_label_image
-from palpate.report.sensitivity_page import sensitivity_page
+from palpate.report.sensitivity_report import sensitivity_page
 from palpate.report.tornado import effect_text, sensitivity_table, tornado_rows
 from palpate.study import sensitivity as study
 from palpate.study.case_file import read_case

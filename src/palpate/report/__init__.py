@@ -6,15 +6,31 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from palpate.report.case_report import write_failure_report
+    from palpate.report.cards import moduli_figure, result_cards, result_lines
+    from palpate.report.case_report import write_case_report, write_failure_report
+    from palpate.report.sensitivity_report import sensitivity_page
 
-__all__ = ["write_failure_report"]
+__all__ = [
+    "moduli_figure",
+    "result_cards",
+    "result_lines",
+    "sensitivity_page",
+    "write_case_report",
+    "write_failure_report",
+]
 
-_HOMES = {"write_failure_report": "palpate.report.case_report"}
+_HOMES = {
+    "moduli_figure": "palpate.report.cards",
+    "result_cards": "palpate.report.cards",
+    "result_lines": "palpate.report.cards",
+    "sensitivity_page": "palpate.report.sensitivity_report",
+    "write_case_report": "palpate.report.case_report",
+    "write_failure_report": "palpate.report.case_report",
+}
 
 
 def __getattr__(name: str) -> Any:
-    """Import a name when it is first used: a part of this layer is often wanted alone, and quickly."""
+    """Import a name when it is first used: what draws takes half a second to import, and most commands draw nothing."""
     if name not in _HOMES:
         raise AttributeError(f"module 'palpate.report' has no attribute '{name}'")
     return getattr(import_module(_HOMES[name]), name)

@@ -8,10 +8,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from palpate import report
 from palpate.errors import ResourceError
 from palpate.export.notebook import notebook_viewer
 from palpate.images.tissue_colours import tissue_colours
-from palpate.report.cards import moduli_figure, result_cards, result_lines
 from palpate.report.rows import moduli_in
 from palpate.steps.saving import save_estimate
 from palpate.study import result
@@ -80,7 +80,7 @@ class CaseResult(result.CaseResult):
 
         A figure of its own, which no display is needed for: `figure.savefig("moduli.png")`.
         """
-        return moduli_figure(self.to_dict(), self._colours())
+        return report.moduli_figure(self.to_dict(), self._colours())
 
     def view(self, background: str | os.PathLike[str] | None = None, *, opacity: float = 0.6) -> Any:
         """A widget for notebooks: slices and volume of the first image, Young's modulus over it.
@@ -92,11 +92,11 @@ class CaseResult(result.CaseResult):
 
     def __str__(self) -> str:
         """A line a tissue: value, interval, verdict and why."""
-        return result_lines(self.to_dict())
+        return report.result_lines(self.to_dict())
 
     def _repr_html_(self) -> str:
         """The verdict of each tissue as a card, for notebooks."""
-        return result_cards(self.to_dict(), self._colours())
+        return report.result_cards(self.to_dict(), self._colours())
 
     def _colours(self) -> dict[str, str]:
         return {t.name: colour for t, colour in zip(self.tissues, tissue_colours(self.tissues), strict=True)}

@@ -7,12 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from palpate import report
 from palpate.errors import EstimationError, ResourceError
 from palpate.export.case_files import write_estimate_files
 from palpate.findings import Finding, warning_rows
 from palpate.progress import during, silent
-from palpate.report import case_report
-from palpate.report.sensitivity_page import sensitivity_page
 from palpate.study.case import Case
 from palpate.study.case_as_run import stage_case
 from palpate.study.earlier import RESULT, earlier_files
@@ -40,7 +39,7 @@ def save_estimate(
     with outputs.staged() as staging:
         write_estimate_files(result, staging.area)
         progress("drawing the report")
-        _draw(lambda: case_report.write_case_report(result, staging.area), staging, document)
+        _draw(lambda: report.write_case_report(result, staging.area), staging, document)
         _commit_estimate(staging, result.case, document)
     return document
 
@@ -50,7 +49,7 @@ def save_failure(case: Case, error: EstimationError, outputs: OutputFolder) -> d
     LOGGER.error("%s", error, exc_info=error)
     document = failure_document(case, error)
     with outputs.staged() as staging:
-        _draw(lambda: case_report.write_failure_report(case, error, staging.area), staging, document)
+        _draw(lambda: report.write_failure_report(case, error, staging.area), staging, document)
         _commit_estimate(staging, case, document)
     return document
 
@@ -59,7 +58,7 @@ def save_sensitivity(found: Sensitivity, outputs: OutputFolder) -> dict[str, Any
     """Put sensitivity.json and sensitivity.html in place; gives the document. Raises `ResourceError`."""
     document = found.to_dict()
     with outputs.staged() as staging:
-        write_text(staging.area / "sensitivity.html", sensitivity_page(document))
+        write_text(staging.area / "sensitivity.html", report.sensitivity_page(document))
         save_document(staging, "sensitivity.json", document)
     return document
 
