@@ -49,7 +49,7 @@ def _side_by_side(plan: Plan, factor: Matrix, x: Matrix, threads: int) -> None:
     def up(subtree: tuple[Front, ...]) -> tuple[NDArray[np.int64], Matrix]:
         """The subtree's own rows in their place; what it changes above (its root's rows), and by how much."""
         own, root = slice(subtree[0].first, subtree[-1].first + subtree[-1].width), subtree[-1]
-        alone = np.zeros_like(x)  # only the pages that are written are ever taken
+        alone = np.zeros(x.shape, x.dtype)  # only the pages that are written are ever taken
         alone[own] = x[own]
         _forward(subtree, factor, alone)
         x[own] = alone[own]
