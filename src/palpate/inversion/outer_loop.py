@@ -52,7 +52,11 @@ STRAIGHT = 0.4  # of ln E, within which linearised residuals are believed
 WITHIN_NOISE = 0.1  # of the posterior's width: a step that finds no smaller value
 NEAR = 0.5  # posterior standard deviations: a shorter step ends where exact derivatives are worth it, and a held prior
 LEAST_SD = 0.03  # of ln E, see `_linearisation`
-AFTER_REFINEMENT = 4  # outer iterations that must be left where walls are refined: what has converged is not lost
+LEARNED = 2  # times at the most that the drivers' prior is held
+PRIOR_HOLDS = 2.5  # tolerances, by which an estimate would move, or what is known of it, if it were learned anew there
+AFTER_CHANGE = (
+    4  # outer iterations that must be left for refined walls or another prior: what has converged is not lost
+)
 HALVINGS = 3
 TRUSTED = 0.03  # error in energy of an approximation, below which the step on it needs no line search
 ROUGHNESS = 0.5  # of the objective, in units of log-likelihood: the noise of re-chosen closest points
@@ -154,14 +158,16 @@ def run_outer_loop(
     """Follow a minimum until reweighting it and updating its approximations change it no more.
 
     The approximations of `start` are exact there (see `updated`). Drivers' walls are refined where their surfaces ask
-    for it (see `refined_walls`); what is believed of their motion is held from where the estimate is near. `title`
-    begins each line of `progress`. The minimum's history is that of the loop alone, its evaluations are added to those
-    of `start`. Raises `NotConverged` when the full model has no equilibrium where every part of a step leads.
+    for it (see `refined_walls`); what is believed of their motion is held from where the estimate is near, and learned
+    once more where, learned at the estimate, it would not leave that where it is. `title` begins each line of
+    `progress`. The minimum's history is that of the loop alone, its evaluations are added to those of `start`. Raises
+    `NotConverged` when the full model has no equilibrium where every part of a step leads.
     """
     walls = [state.walls for state in start.objective.states]
     at, theta = start.minimum.evaluation, start.minimum.unknowns[: start.objective.n_parameters]
     first = Iterate(theta, at.value, at.misfit_mm2, newton_decrement(at))
-    now, refinements, held = replace(start, minimum=replace(start.minimum, history=(first,))), 0, False
+    now, refinements = replace(start, minimum=replace(start.minimum, history=(first,))), 0
+    held, learned = False, 0
     del start  # and with it its approximations, which are large, when others take their place
     for number in range(1, rule.iterations + 1):
         line = f"{title}, outer iteration {number}"
@@ -173,12 +179,17 @@ def run_outer_loop(
         if not held and _near(now.minimum, before, now.objective.n_parameters):
             # Learned anew at every step it follows the estimate, which follows it: the wall slides off along itself.
             objective = _with_walls(now.objective, [()] * len(walls))
-            now, held = replace(now, objective=objective), True
+            now, held, learned = replace(now, objective=objective), True, learned + 1
         if now.convergence.converged:
-            finer = refined_walls(now.objective, now.minimum.evaluation)
-            late = number > rule.iterations - AFTER_REFINEMENT
-            if all(of is None for of in finer) or refinements == rule.refinements or late:
+            if number > rule.iterations - AFTER_CHANGE:
                 break
+            finer = refined_walls(now.objective, now.minimum.evaluation)
+            if all(of is None for of in finer) or refinements == rule.refinements:
+                free = replace(now, objective=_with_walls(now.objective, walls), convergence=Convergence())
+                if not held or learned == LEARNED or _prior_holds(free, settings, rule):
+                    break
+                now, held = free, False
+                continue
             pairs = zip(now.objective.approximations, finer, strict=True)
             moved = [a if constraint is None else a.with_constraint(constraint) for a, constraint in pairs]
             now, refinements = _with_approximations(now, moved), refinements + 1
@@ -187,6 +198,12 @@ def run_outer_loop(
         if max(now.convergence.reweighting, now.convergence.linearisation) > rule.far and now.minimum.converged:
             now = replace(now, minimum=replace(now.minimum, outcome=Outcome.STEPS))
     return replace(now, objective=_with_walls(now.objective, walls))  # from which another law learns
+
+
+def _prior_holds(free: OuterIterate, settings: InversionSettings, rule: StopRule) -> bool:
+    """Whether the drivers' prior, learned anew at an estimate that held it, would leave the estimate as it is."""
+    found = _agreed(free.objective, free.minimum, settings.bounds, settings.bounds, rule, 1.0)[1]
+    return _change(free.minimum, found, rule, free.objective.n_parameters) < PRIOR_HOLDS
 
 
 def _with_walls(objective: Objective, walls: Sequence[tuple[Wall, ...]]) -> Objective:
