@@ -34,6 +34,7 @@ __all__ = ["beside_each_other"]
 Matrix = sparse.csr_matrix
 Solve = Callable[[np.ndarray], np.ndarray]
 N_RHS = 91
+FEW_RHS = (1, 2, 4, 8, 16, 32)
 
 
 def _write_stiffness(path: Path, edge_mm: float, seed: int) -> None:
@@ -99,7 +100,8 @@ SOLVERS = {
     "superlu": _superlu,
 }
 CLOCKS = ("factor", "again", "solve")
-KEYS = ("unknowns", *(f"{name}{unit}" for name in CLOCKS for unit in ("_s", "_cpu_s")), "residual", "peak_mb")
+FEW = tuple(f"solve_{number}_s" for number in FEW_RHS)
+KEYS = ("unknowns", *(f"{name}{unit}" for name in CLOCKS for unit in ("_s", "_cpu_s")), "residual", "peak_mb", *FEW)
 
 
 def beside_each_other(edge_mm: float, seed: int, *, repeats: int, say: Callable[[str], None]) -> dict[str, Any]:
@@ -162,6 +164,7 @@ def _measured(name: str, path: Path) -> dict[str, float | None]:
     clocks.append(_clock())
     peak = peak_mb()
     residual = float(np.linalg.norm(matrix @ solution - rhs) / np.linalg.norm(rhs))
+    few = _few(solve, rhs)
     del solve, solution
     clocks.append(_clock())
     if name != "superlu":
@@ -178,7 +181,21 @@ def _measured(name: str, path: Path) -> dict[str, float | None]:
         "solve_cpu_s": steps[1, 1],
         "residual": residual,
         "peak_mb": peak,
+        **few,
     }
+
+
+def _few(solve: Solve, rhs: np.ndarray) -> dict[str, float]:
+    """The least of three times on the wall for each of a few right-hand sides, s."""
+    found = {}
+    for key, number in zip(FEW, FEW_RHS, strict=True):
+        ends = []
+        for _ in range(3):
+            began = time.perf_counter()
+            solve(rhs[:, :number])
+            ends.append(time.perf_counter() - began)
+        found[key] = min(ends)
+    return found
 
 
 def _clock() -> tuple[float, float]:

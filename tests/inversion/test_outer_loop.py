@@ -21,7 +21,7 @@ from palpate.inversion import (
     with_first_noise,
 )
 from palpate.inversion import outer_loop as loop
-from palpate.inversion.approximation import ModelError
+from palpate.inversion.approximation import Derivatives, ModelError
 from palpate.inversion.optimise import posterior_sd
 from palpate.inversion.outer_loop import Convergence, Criterion, StopRule, minimised
 from palpate.observation.wall_modes import Wall
@@ -281,7 +281,7 @@ def test_a_step_on_a_model_that_is_far_off_is_taken_only_as_far_as_it_lowers_the
     monkeypatch.setattr(loop, "_lowers", second_is_lower)
     there = step_of(twins, twin, voxels)
     before = replace(there, minimum=replace(there.minimum, unknowns=there.minimum.unknowns + 0.1))
-    reached = loop._line_search(before, there, near=False, slow=False)
+    reached = loop._line_search(before, there, Derivatives.KEPT)
     assert reached.minimum.unknowns == pytest.approx(before.minimum.unknowns - 0.05)
     assert not reached.stayed
     assert asked[0] == pytest.approx(2.0 * asked[1])
@@ -294,7 +294,7 @@ def test_where_no_part_of_a_step_lowers_the_objective_the_estimate_stays(
     monkeypatch.setattr(loop, "_lowers", lambda *_: False)
     there = replace(step_of(twins, twin, voxels), step=step)
     before = replace(there, minimum=replace(there.minimum, unknowns=there.minimum.unknowns + 0.1))
-    stayed = loop._line_search(before, there, near=False, slow=False)
+    stayed = loop._line_search(before, there, Derivatives.KEPT)
     assert np.array_equal(stayed.minimum.unknowns, before.minimum.unknowns)
     assert stayed.stayed
     assert stayed.minimum.outcome is outcome

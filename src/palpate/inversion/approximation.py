@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import Protocol, Self
 
 import numpy as np
@@ -16,7 +17,15 @@ from palpate.mechanics.linear_model import LinearEquilibrium, LinearModel, with_
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.constraint import Constraint
 
-__all__ = ["Approximation", "ExactApproximation", "LocalModel", "ModelError", "Place", "exact_approximation"]
+__all__ = [
+    "Approximation",
+    "Derivatives",
+    "ExactApproximation",
+    "LocalModel",
+    "ModelError",
+    "Place",
+    "exact_approximation",
+]
 
 
 class LocalModel(ForwardModel, Protocol):
@@ -27,22 +36,28 @@ class LocalModel(ForwardModel, Protocol):
         ...
 
 
+class Derivatives(Enum):
+    """Which derivatives are worth making exact at a place, where that has a price."""
+
+    KEPT = "none, those of elsewhere serve"
+    DECIDING = "those along the directions that decide the moduli"
+    ALL = "those by all moduli and modes"
+
+
 @dataclass(frozen=True, slots=True)
 class Place:
     """Moduli (n_regions,) kPa and driver coefficients (n_modes,) at which a model is approximated.
 
     directions (n_regions + n_modes, k) of (ln E, q): those along which derivatives are wanted, None where the
-    displacement alone is; metric (n_regions + n_modes, n_regions + n_modes): the Gauss-Newton matrix there; near:
-    whether the estimate is so near that exact derivatives are worth their price; slow: whether those of all moduli and
-    modes are, as it comes near while the model's error does not halve.
+    displacement alone is; metric (n_regions + n_modes, n_regions + n_modes): the Gauss-Newton matrix there; worth:
+    which exact derivatives are worth their price there.
     """
 
     moduli: NDArray[np.float64]
     coefficients: NDArray[np.float64]
     directions: NDArray[np.float64] | None = None
     metric: NDArray[np.float64] | None = None
-    near: bool = True
-    slow: bool = False
+    worth: Derivatives = Derivatives.DECIDING
 
     def same_as(self, other: Place | None) -> bool:
         """Whether moduli and coefficients are those of another place."""

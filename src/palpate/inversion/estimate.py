@@ -228,9 +228,8 @@ def _from_starts(
     minima: list[Minimum] = []
     for number, theta in enumerate(settings.starts, start=1):
         motion = minima[0].unknowns[len(theta) :] if minima else coefficients
-        bounds = settings.bounds
         begin = np.concatenate([theta, motion])
-        first = fit_coefficients(objective, begin, bounds=bounds, max_steps=FIRST_STEPS)
+        first = fit_coefficients(objective, begin, bounds=settings.bounds, max_steps=FIRST_STEPS)
         fresh = objective.rematched(first.unknowns)
         found = minimised(fresh, first.unknowns, settings, tolerance=START, known=minima)
         minima.append(replace(found, evaluations=found.evaluations + first.evaluations))
@@ -287,8 +286,7 @@ def _at_equilibrium(end: OuterIterate, before: tuple[Iterate, ...]) -> OuterIter
         exact.append(approximation.at_equilibrium(place, tolerance=ACCURACY))
     final = end.objective.under(exact)
     evaluation, spent = final(end.minimum.unknowns), end.minimum.evaluations + 1
-    history = before + end.minimum.history
-    minimum = replace(end.minimum, evaluation=evaluation, evaluations=spent, history=history)
+    minimum = replace(end.minimum, evaluation=evaluation, evaluations=spent, history=before + end.minimum.history)
     return replace(end, objective=final, minimum=minimum)
 
 
@@ -339,10 +337,7 @@ def _values(distinct: Sequence[OuterIterate], settings: InversionSettings) -> tu
 
 def _best(minima: Sequence[Minimum]) -> int:
     """Number of the converged minimum with the smallest value; of them all when none converged."""
-    values = [m.evaluation.value if m.converged else np.inf for m in minima]
-    if not np.isfinite(values).any():
-        values = [m.evaluation.value for m in minima]
-    return int(np.argmin(values))
+    return min(range(len(minima)), key=lambda i: (not minima[i].converged, minima[i].evaluation.value))
 
 
 def _groups(minima: Sequence[Minimum], n_parameters: int) -> list[int]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
-from palpate.inversion.approximation import Approximation, ModelError, Place
+from palpate.inversion.approximation import Approximation, Derivatives, ModelError, Place
 from palpate.inversion.objective import determined
 from palpate.mechanics.equilibrium import from_start
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
@@ -68,16 +68,16 @@ class Expansion:
     def update(self, at: Place) -> Expansion:
         """The expansion around the equilibrium at another place, its derivatives exact there where they are worth it.
 
-        They are worth their price near the estimate, all of them where they are few or the estimate comes near slowly,
-        as where drivers' walls slide along themselves by derivatives of elsewhere. With directions D, the exact C along
-        them and H the metric T becomes T + (C - T D) (D^T H D)^+ D^T H: of all T' with T' D = C the one that changes
-        least. The other columns stay as they were where T was made. Raises `NotConverged` when there is no equilibrium.
+        All of them where they are few. With directions D, the exact C along them and H the metric T becomes
+        T + (C - T D) (D^T H D)^+ D^T H: of all T' with T' D = C the one that changes least. The other columns stay as
+        they were where T was made. Raises `NotConverged` when there is no equilibrium.
         """
         there = self if at.same_as(self.place) else self._around(self._equilibrium(at))
-        whole = at.slow or there.model.n_regions + there.model.n_modes <= FEW
-        if at.directions is None or at.metric is None or not (at.near or whole):
+        few = there.model.n_regions + there.model.n_modes <= FEW
+        worth = Derivatives.ALL if few else at.worth
+        if at.directions is None or at.metric is None or worth is Derivatives.KEPT:
             return there
-        directions = np.eye(len(at.directions)) if whole else at.directions
+        directions = np.eye(len(at.directions)) if worth is Derivatives.ALL else at.directions
         before = there.model.derivatives @ directions
         change = there.equilibrium.tangent_along(directions, before) - before
         with determined():

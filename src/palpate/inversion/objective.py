@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import EstimationError
-from palpate.inversion.approximation import Approximation, Place
+from palpate.inversion.approximation import Approximation, Derivatives, Place
 from palpate.inversion.later_state import LaterState
 from palpate.inversion.parameters import ParameterMap
 from palpate.mechanics.forward import Equilibrium
@@ -117,12 +117,7 @@ class Objective:
         return found
 
     def places(
-        self,
-        unknowns: NDArray[np.float64],
-        evaluation: Evaluation | None = None,
-        *,
-        near: bool = False,
-        slow: bool = False,
+        self, unknowns: NDArray[np.float64], evaluation: Evaluation | None = None, worth: Derivatives = Derivatives.KEPT
     ) -> list[Place]:
         """What unknowns (n_unknowns,) mean for each state; by an `evaluation` with the directions that decide there."""
         mapping = self.parameters
@@ -133,7 +128,7 @@ class Objective:
         for s, q in enumerate(coefficients):
             own, chain = mapping.unknowns_of(s), mapping.chain(s, unknowns)
             metric = chain @ evaluation.matrix[np.ix_(own, own)] @ chain.T
-            places.append(Place(moduli, q, chain @ directions[own], metric, near, slow))
+            places.append(Place(moduli, q, chain @ directions[own], metric, worth))
         return places
 
     def under(self, approximations: Sequence[Approximation]) -> Objective:
@@ -157,9 +152,8 @@ class Objective:
 
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
         """J with gradient, Gauss-Newton matrix and residuals at `unknowns` (n_unknowns,)."""
-        return self.assembled(
-            unknowns, [line for s in range(len(self.states)) for line in self._linearised(s, unknowns)]
-        )
+        lines = [line for s in range(len(self.states)) for line in self._linearised(s, unknowns)]
+        return self.assembled(unknowns, lines)
 
     def assembled(self, unknowns: NDArray[np.float64], lines: Sequence[Linearisation]) -> Evaluation:
         """The evaluation at `unknowns` (n_unknowns,) from all observations' residuals there, with their derivatives."""

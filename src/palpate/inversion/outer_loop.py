@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
-from palpate.inversion.approximation import Approximation
+from palpate.inversion.approximation import Approximation, Derivatives
 from palpate.inversion.driver import refined_walls
 from palpate.inversion.objective import Evaluation, LinearisedObjective, Objective
 from palpate.inversion.optimise import (
@@ -54,9 +54,8 @@ NEAR = 0.5  # posterior standard deviations: a shorter step ends where exact der
 LEAST_SD = 0.03  # of ln E, see `_linearisation`
 LEARNED = 2  # times at the most that the drivers' prior is held
 PRIOR_HOLDS = 2.5  # tolerances, by which an estimate would move, or what is known of it, if it were learned anew there
-AFTER_CHANGE = (
-    4  # outer iterations that must be left for refined walls or another prior: what has converged is not lost
-)
+AFTER_CHANGE = 4  # outer iterations that must be left for finer walls or another prior: what converged is not lost
+SLOW = 0.5  # of the model's error an outer iteration before: where more is left all derivatives are made exact
 HALVINGS = 3
 TRUSTED = 0.03  # error in energy of an approximation, below which the step on it needs no line search
 ROUGHNESS = 0.5  # of the objective, in units of log-likelihood: the noise of re-chosen closest points
@@ -148,12 +147,7 @@ class OuterIterate:
 
 
 def run_outer_loop(
-    start: OuterIterate,
-    settings: InversionSettings,
-    rule: StopRule,
-    *,
-    progress: Callable[[str], None],
-    title: str,
+    start: OuterIterate, settings: InversionSettings, rule: StopRule, *, progress: Callable[[str], None], title: str
 ) -> OuterIterate:
     """Follow a minimum until reweighting it and updating its approximations change it no more.
 
@@ -262,11 +256,13 @@ def _iteration(
     there = OuterIterate(objective, found, convergence, step, checks=now.checks + cost)
     if convergence.converged or error < rule.solve_above:
         return there
-    near = _near(found, now.minimum.unknowns, n)
-    slow = near and missing >= 1.0 and missing > 0.5 * now.convergence.model_error
+    worth = Derivatives.KEPT
+    if _near(found, now.minimum.unknowns, n):  # walls that slide by derivatives of elsewhere leave an error that stays
+        slow = missing >= 1.0 and missing > SLOW * now.convergence.model_error
+        worth = Derivatives.ALL if slow else Derivatives.DECIDING
     if error < TRUSTED:
-        return _with_approximations(there, _solved(objective, found.unknowns, found.evaluation, near=near, slow=slow))
-    return _line_search(now, there, near=near, slow=slow)
+        return _with_approximations(there, _solved(objective, found.unknowns, found.evaluation, worth))
+    return _line_search(now, there, worth)
 
 
 def _near(found: Minimum, before: NDArray[np.float64], n_parameters: int) -> bool:
@@ -378,7 +374,7 @@ def _advanced(
     return matched, found
 
 
-def _line_search(now: OuterIterate, there: OuterIterate, *, near: bool, slow: bool) -> OuterIterate:
+def _line_search(now: OuterIterate, there: OuterIterate, worth: Derivatives) -> OuterIterate:
     """The first of step, step / 2, step / 4 ... that lowers the objective on the full model, updated there.
 
     Where none does the iterate stays: `STALLED` when the step is within the tolerance, else `STUCK`. Raises
@@ -399,9 +395,7 @@ def _line_search(now: OuterIterate, there: OuterIterate, *, near: bool, slow: bo
             spent = there.minimum.evaluations + evaluations
             reached = replace(there.minimum, unknowns=unknowns, evaluation=evaluation, evaluations=spent)
             arrived = replace(there, objective=trial, minimum=reached)
-            return _with_approximations(
-                arrived, _solved(trial, unknowns, there.minimum.evaluation, near=near, slow=slow)
-            )
+            return _with_approximations(arrived, _solved(trial, unknowns, there.minimum.evaluation, worth))
     if failure is not None:
         raise failure
     outcome = Outcome.STALLED if there.step < 1.0 else Outcome.STUCK
@@ -444,12 +438,10 @@ def _solved(
     objective: Objective,
     unknowns: NDArray[np.float64],
     evaluation: Evaluation | None = None,
-    *,
-    near: bool = False,
-    slow: bool = False,
+    worth: Derivatives = Derivatives.KEPT,
 ) -> list[Approximation]:
     """The states' approximations updated at unknowns, with the derivatives that decide by an evaluation."""
-    places = objective.places(unknowns, evaluation, near=near, slow=slow)
+    places = objective.places(unknowns, evaluation, worth)
     return [approximation.update(at) for approximation, at in zip(objective.approximations, places, strict=True)]
 
 

@@ -88,7 +88,7 @@ def with_threads(monkeypatch, threads):
     monkeypatch.setattr(solver, "processors", lambda: threads)
 
 
-@pytest.mark.parametrize(("threads", "columns"), [(1, 1), (2, 7), (5, 91)])
+@pytest.mark.parametrize(("threads", "columns"), [(1, 1), (2, 1), (2, 7), (5, 91)])
 def test_every_pattern_is_solved_to_rounding(matrix, threads, columns, monkeypatch):
     with_threads(monkeypatch, threads)
     rhs = np.random.default_rng(1).standard_normal((matrix.shape[0], columns))
