@@ -16,8 +16,8 @@ import referencing
 
 from palpate.cli import main
 from palpate.images.readers import write_label_image
-from palpate.phantoms.spheres import SpheresOptions, spheres
 from palpate.study.json_schema import SCHEMAS
+from scenes import balls
 
 TRUTH_KPA = {"core": 60.0, "shell": 30.0}
 VOXEL_MM = 1.5
@@ -86,9 +86,8 @@ KEYS = {
 def inputs(tmp_path_factory) -> Path:
     """A folder with both label images of two balls in one another that a frame squeezes, and the case."""
     folder = tmp_path_factory.mktemp("inputs")
-    scene = spheres(SpheresOptions(seed=2, spacing_mm=(VOXEL_MM,) * 3, truth_edge_mm=5.0))
-    write_label_image(folder / "before.nii.gz", scene.before)
-    write_label_image(folder / "after.nii.gz", scene.after)
+    write_label_image(folder / "before.nii.gz", balls().before)
+    write_label_image(folder / "after.nii.gz", balls().after)
     (folder / "case.toml").write_text(CASE)
     return folder
 

@@ -18,6 +18,8 @@ import tempfile
 import time
 
 # Whatever a command imports, so that a fork costs nothing.
+import nibabel  # noqa: F401
+
 import palpate.cli
 import palpate.experiments.demo
 import palpate.export.case_files

@@ -6,7 +6,8 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import Any, BinaryIO
+from types import ModuleType
+from typing import Any, BinaryIO, cast
 
 import numpy as np
 
@@ -44,7 +45,10 @@ def main(arguments: list[str]) -> None:
             if len(arguments) > 4:
                 (nx, ny, nz), affine = json.loads(arguments[4])
                 grid = VoxelGrid((int(nx), int(ny), int(nz)), np.array(affine, dtype=np.float64))
-            stored = format_of(path).stored(path, grid)
+            image_format = format_of(path)
+            if image_format.name == "NIfTI":  # nibabel would import pydicom, where that is: a quarter of all this takes
+                sys.modules["pydicom"] = cast("ModuleType", None)
+            stored = image_format.stored(path, grid)
             values = np.asfortranarray(REDUCED[kind](stored.values, path))
         except PalpateError as error:
             _send(pipe, {"error": type(error).__name__, "message": str(error)})

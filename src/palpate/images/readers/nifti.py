@@ -12,12 +12,11 @@ import io
 import math
 import os
 import zlib
+from importlib import import_module
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import nibabel
 import numpy as np
-from nibabel.spatialimages import HeaderDataError
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, InputDataError, ResourceError
@@ -30,7 +29,7 @@ from palpate.images.readers.voxel_stream import MAX_OFFSET, VoxelBlock, check_en
 __all__ = ["read_nifti", "write_displacement_field", "write_label_image", "write_scalar_image"]
 
 MILLIMETRES = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}  # xyzt_units: unknown, metre, millimetre, micrometre
-HEADERS = {348: nibabel.Nifti1Header, 540: nibabel.Nifti2Header}
+HEADERS = {348: "Nifti1Header", 540: "Nifti2Header"}  # by nibabel, which is imported when an image comes
 MAGIC = {348: b"n+1\0", 540: b"n+2\0\r\n\032\n"}
 
 
@@ -74,7 +73,8 @@ def _header(stream: BinaryIO, path: Path) -> tuple[Any, int]:
             block += read_exactly(stream, length - len(block), path).tobytes()
             magic = block[344:348] if length == 348 else block[4:12]
             if magic == MAGIC[length]:
-                return HEADERS[length](block, endianness=sign, check=False), length
+                decode = getattr(import_module("nibabel"), HEADERS[length])
+                return decode(block, endianness=sign, check=False), length
             raise InputDataError(
                 f"'{path}' has the mark {magic!r}, which is not that of a NIfTI file in one piece; convert Analyze and"
                 " .hdr/.img pairs to .nii.gz"
@@ -84,10 +84,11 @@ def _header(stream: BinaryIO, path: Path) -> tuple[Any, int]:
 
 def _block(header: Any, path: Path) -> tuple[VoxelBlock, float, float]:
     """What the header says of the voxels, and the slope and intercept of their scale."""
+    damage = import_module("nibabel.spatialimages").HeaderDataError
     try:
         dtype = np.dtype(header.get_data_dtype())
         slope, intercept = header.get_slope_inter()
-    except (HeaderDataError, KeyError, ValueError) as error:
+    except (damage, KeyError, ValueError) as error:
         raise InputDataError(f"the header of '{path}' is damaged: {error}; export the image again") from error
     if dtype.kind not in "iuf" or dtype.itemsize > 8:
         raise InputDataError(
@@ -116,11 +117,12 @@ def _block(header: Any, path: Path) -> tuple[VoxelBlock, float, float]:
 
 def _affine(header: Any, path: Path) -> NDArray[np.float64]:
     """Index -> RAS mm by the sform or the qform; where both are set, they must agree."""
+    damage = import_module("nibabel.spatialimages").HeaderDataError
     try:
         with np.errstate(all="ignore"):  # what is not finite is refused later, with its numbers
             affine = header.get_sform(coded=True)[0]
             qform = header.get_qform(coded=True)[0]
-    except (HeaderDataError, ValueError) as error:
+    except (damage, ValueError) as error:
         raise InputDataError(f"the qform in the header of '{path}' is damaged: {error}; set an sform") from error
     if affine is not None and qform is not None:
         # which of two places is right, nobody can tell here; half a voxel is more than rounding
@@ -182,7 +184,7 @@ def write_displacement_field(path: Path | str, field: NDArray[np.float64], grid:
 def _write(path: Path, values: NDArray[Any], grid: VoxelGrid, *, intent: str = "none") -> None:
     if not path.name.lower().endswith((".nii", ".nii.gz")):
         raise ConfigurationError(f"'{path}' cannot be written: images are written as .nii or .nii.gz; choose one")
-    image = nibabel.Nifti1Image(values, grid.affine)
+    image = import_module("nibabel").Nifti1Image(values, grid.affine)
     image.set_sform(grid.affine, code="scanner")
     image.set_qform(grid.affine, code="scanner")
     image.header.set_xyzt_units("mm")

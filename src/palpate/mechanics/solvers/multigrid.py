@@ -12,7 +12,6 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
-import pyamg
 from numpy.typing import NDArray
 from scipy import linalg, sparse
 
@@ -103,6 +102,8 @@ def _aggregated(
     matrix: sparse.csr_matrix[np.float64], near_nullspace: NDArray[np.float64] | None
 ) -> MultigridFactorisation:
     """The levels by smoothed aggregation."""
+    import pyamg  # noqa: PLC0415 - a tenth of a second that no other solver need spend
+
     n = matrix.shape[0]
     twins = np.bincount(twin_rows(matrix))
     whole_nodes = n % 3 == 0 and bool(np.all(twins == 3))
