@@ -34,8 +34,7 @@ from palpate.progress import Progress, during
 __all__ = ["Candidate", "Inversion", "StartRun", "continue_at_finite_strain", "invert"]
 
 FIRST_STEPS = 2  # of the drivers' coefficients at a start's moduli, before these move
-START = 1e-2  # decrement to which a start is followed under the first noise model
-OTHER = 1e-4  # decrement of the minima that are not the best one
+OTHER = 1e-2  # decrement of the minima that are not the best one
 LOWER = 0.5  # in units of log-likelihood: a minimum that is lower by less is as good
 REPORTED = StopRule()
 FIRST_GUESS = StopRule(
@@ -231,7 +230,7 @@ def _from_starts(
         begin = np.concatenate([theta, motion])
         first = fit_coefficients(objective, begin, bounds=settings.bounds, max_steps=FIRST_STEPS)
         fresh = objective.rematched(first.unknowns)
-        found = minimised(fresh, first.unknowns, settings, tolerance=START, known=minima)
+        found = minimised(fresh, first.unknowns, settings, tolerance=None, known=minima)
         minima.append(replace(found, evaluations=found.evaluations + first.evaluations))
         progress(f"start {number} of {len(settings.starts)}: {len(found.history)} steps, {found.outcome.value}")
     return minima
@@ -329,7 +328,7 @@ def _values(distinct: Sequence[OuterIterate], settings: InversionSettings) -> tu
     for iterate in distinct:
         unknowns = iterate.minimum.unknowns
         same = reference.objective.under(iterate.objective.approximations).rematched(unknowns)
-        there = minimised(same, unknowns, settings)
+        there = minimised(same, unknowns, settings, tolerance=OTHER)
         values.append(there.evaluation.value)
         evaluations += there.evaluations
     return values, evaluations

@@ -34,7 +34,8 @@ SEARCHES = 8  # trials of a step
 SAME_MINIMUM, SAME_SD = 0.02, 0.3  # of ln E, and of a posterior standard deviation: minima no further apart are one
 MET = 0.5  # decrement (log-likelihood) from which an iterate is where it is going to end
 WORTH = 1e-2  # units of log-likelihood that a damped step must promise to be tried
-COEFFICIENTS = 0.1  # decrement of the drivers' coefficients at held moduli, which other unknowns are going to change
+SLIDING = 0.02  # decrement a driver's coefficient, a fifth of its sd: below it walls slide from voxel to voxel
+SLIDING_SD = 0.1  # posterior standard deviations of a log-modulus, which are left while they do
 CIRCLING = 4  # steps without a smaller decrement, after which those within the noise go round in circles
 STALLED = 0.03  # decrement, a quarter of a posterior width, under which a refused step is the noise of closest points
 
@@ -150,13 +151,12 @@ def fit_coefficients(
     begin: NDArray[np.float64],
     *,
     bounds: Bounds,
-    tolerance: float = COEFFICIENTS,
+    tolerance: float | None = None,
     max_steps: int = 40,
 ) -> Minimum:
     """The best driver coefficients at the log-moduli of `begin` (n_unknowns,), sought from there.
 
-    To a decrement of `tolerance`, by default what serves where the moduli are going to change; they are left where they
-    are after `max_steps`.
+    To a decrement of `tolerance`, by default to where walls slide; they are left where they are after `max_steps`.
     """
     return gauss_newton(objective, begin, bounds=bounds, held=True, tolerance=tolerance, max_steps=max_steps)
 
@@ -167,7 +167,7 @@ def gauss_newton(
     *,
     bounds: Bounds,
     held: NDArray[np.bool_] | bool = False,
-    tolerance: float = 1e-3,
+    tolerance: float | None = 1e-3,
     within: NDArray[np.float64] | float = np.inf,
     known: Sequence[Minimum] = (),
     max_steps: int = 40,
@@ -180,9 +180,12 @@ def gauss_newton(
     under `tolerance` and the step to the model's minimum moves each log-modulus by less than `within` (one number, or
     (n_parameters,)), or where steps within the noise of closest points lower the decrement no more: then where that was
     least; or where it has met one of the `known` minima. `held`: which log-moduli (n_parameters,) keep their values, or
-    whether all do.
+    whether all do. A tolerance of None: to where drivers' walls slide from voxel to voxel and the log-moduli are within
+    a tenth of their posterior standard deviations, which serves where the objective is going to change.
     """
-    unknowns, region, history = start.copy(), _Region(), list[Iterate]()
+    unknowns, region, history, n = start.copy(), _Region(), list[Iterate](), objective.n_parameters
+    roughly = tolerance is None
+    tolerance = SLIDING * (len(start) - n) if tolerance is None else tolerance
     now, evaluations, outcome = objective(unknowns), 1, Outcome.STEPS
     nearest, least, since = (unknowns, now), np.inf, 0
     for _ in range(max_steps):
@@ -191,12 +194,14 @@ def gauss_newton(
             break
         free = _free(objective, unknowns, now, bounds, held)
         decrement = newton_decrement(now, free)
-        history.append(Iterate(unknowns[: objective.n_parameters], now.value, now.misfit_mm2, decrement))
-        whole = _step(now, free, objective.n_parameters, WHOLE)[: objective.n_parameters]
+        history.append(Iterate(unknowns[:n], now.value, now.misfit_mm2, decrement))
+        whole = _step(now, free, n, WHOLE)[:n]
+        if roughly and held is not True:
+            within = SLIDING_SD * np.sqrt(np.diag(now.covariance_columns(n)))
         if decrement < tolerance and np.all(np.abs(whole) < within):
             outcome = Outcome.CONVERGED
             break
-        if decrement < MET and any(same_minimum(unknowns, other, objective.n_parameters) for other in known):
+        if decrement < MET and any(same_minimum(unknowns, other, n) for other in known):
             outcome = Outcome.JOINED
             break
         since += 1

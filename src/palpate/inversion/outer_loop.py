@@ -43,7 +43,7 @@ __all__ = [
 
 FORCING = 0.1  # of the last outer iteration's step: to which the next one's weights and estimate agree
 INNER = 20.0  # a minimum is found to so small a part of what a reweighting may still change
-POLISH = 1e-5  # decrement of a minimum by a method that does not tell how far the log-moduli are from it
+POLISH, ROUGHLY = 1e-5, 1e-2  # decrements of a minimum by a method that does not tell how far the log-moduli are
 WIDTH = 0.05  # of a posterior standard deviation, by which a reweighting may still change it
 AGREED = 0.3  # of that tolerance, to which weights and estimate agree on linearised residuals
 FIRST = 10.0  # tolerances, to which they agree there at the least, however far the estimate still is
@@ -222,17 +222,17 @@ def minimised(
     start: NDArray[np.float64],
     settings: InversionSettings,
     *,
-    tolerance: float = 1e-3,
+    tolerance: float | None = 1e-3,
     within: NDArray[np.float64] | float = np.inf,
     known: Sequence[Minimum] = (),
 ) -> Minimum:
     """The minimum from `start` (n_unknowns,) by the method of the settings.
 
-    `tolerance` of the decrement; `within` (one, or (n_parameters,)): how far the log-moduli may yet be from it;
-    `known`: minima that may end Gauss-Newton where it meets one.
+    `tolerance` of the decrement, None: as `gauss_newton` has it; `within` (one, or (n_parameters,)): how far the
+    log-moduli may yet be from it; `known`: minima that may end Gauss-Newton where it meets one.
     """
     if settings.method == "lbfgs":
-        polish = min(tolerance, POLISH) if np.all(np.isfinite(within)) else tolerance
+        polish = POLISH if np.all(np.isfinite(within)) else ROUGHLY if tolerance is None else tolerance
         return lbfgs(objective, start, bounds=settings.bounds, tolerance=polish)
     return gauss_newton(objective, start, bounds=settings.bounds, tolerance=tolerance, within=within, known=known)
 
