@@ -33,7 +33,6 @@ from palpate.progress import Progress, during
 
 __all__ = ["Candidate", "Inversion", "StartRun", "continue_at_finite_strain", "invert"]
 
-FIRST_STEPS = 2  # of the drivers' coefficients at a start's moduli, before these move
 OTHER = 1e-2  # decrement of the minima that are not the best one
 LOWER = 0.5  # in units of log-likelihood: a minimum that is lower by less is as good
 REPORTED = StopRule()
@@ -226,12 +225,9 @@ def _from_starts(
     """A minimum from every start, the first with given coefficients (n_coefficients,), the others with its result."""
     minima: list[Minimum] = []
     for number, theta in enumerate(settings.starts, start=1):
-        motion = minima[0].unknowns[len(theta) :] if minima else coefficients
-        begin = np.concatenate([theta, motion])
-        first = fit_coefficients(objective, begin, bounds=settings.bounds, max_steps=FIRST_STEPS)
-        fresh = objective.rematched(first.unknowns)
-        found = minimised(fresh, first.unknowns, settings, tolerance=None, known=minima)
-        minima.append(replace(found, evaluations=found.evaluations + first.evaluations))
+        begin = np.concatenate([theta, minima[0].unknowns[len(theta) :] if minima else coefficients])
+        found = minimised(objective.rematched(begin), begin, settings, tolerance=None, known=minima)
+        minima.append(found)
         progress(f"start {number} of {len(settings.starts)}: {len(found.history)} steps, {found.outcome.value}")
     return minima
 
