@@ -13,7 +13,7 @@ __all__ = ["Camera", "Triangles", "render_png"]
 
 FINE = 2  # samples a pixel edge; the picture is averaged down by it
 DENSITIES = np.array([2, 3, 4, 6, 8, 11, 15, 20, 28, 40, 56, 80, 112, 160, 224, 320, 448, 640, 1280])
-DEPTH_STEPS = float(2**38)  # a depth and a colour of 24 bits share an integer, whose largest is the nearest
+DEPTHS, SAMPLES = 2**24 - 1, 2**38  # a depth and a sample's number share an integer, whose largest is the nearest
 EDGE_WIDTH = 1.1  # of drawn edges, in pixels of the finished picture
 MOST_SAMPLES = 60_000_000
 
@@ -67,7 +67,6 @@ def render_png(triangles: Triangles, camera: Camera, *, width: int, height: int,
     light = (0.5 + 0.55 * cosine)[..., None]
     depth = flat[..., 2]
     flat[..., 2] = (depth - depth.min()) / max(float(np.ptp(depth)), 1e-9)
-    buffer = np.full(shape, -1, dtype=np.int64)
     ahead = flat[:, 1:, :2] - flat[:, :1, :2]
     facing = ahead[:, 0, 0] * ahead[:, 1, 1] > ahead[:, 0, 1] * ahead[:, 1, 0]
     flat, shades = flat[facing], (triangles.colours * light)[facing]
@@ -76,53 +75,68 @@ def render_png(triangles: Triangles, camera: Camera, *, width: int, height: int,
     wanted = DENSITIES[np.minimum(np.searchsorted(DENSITIES, 1.2 * edge), len(DENSITIES) - 1)]
     if float((wanted.astype(float) ** 2).sum()) > 2.0 * MOST_SAMPLES:
         raise ValueError("the picture has too many triangles to be drawn")
+    buffer = np.full(shape[0] * shape[1], -1, dtype=np.int64)
+    fine, first, groups = np.zeros((len(buffer), 4)), 0, []
     for density in np.unique(wanted):
-        group = wanted == density
-        _splat(flat[group], shades[group], int(density), edges=triangles.edges, into=buffer)
+        group, weights = np.flatnonzero(wanted == density), _samples(int(density))
+        _keep_nearest(flat[group], weights, first, shape, buffer)
+        groups.append((first, group, weights))
+        first += len(group) * len(weights)
+    seen = np.flatnonzero(buffer >= 0)
+    number = buffer[seen] & (SAMPLES - 1)
+    for first, group, weights in groups:  # colours of the nearest samples alone
+        own = (number >= first) & (number < first + len(group) * len(weights))
+        triangle, sample = np.divmod(number[own] - first, len(weights))
+        triangle, weight = group[triangle], weights[sample]
+        shade = np.clip(np.einsum("ns,nsc->nc", weight, shades[triangle]), 0.0, 1.0)
+        if triangles.edges:
+            shade *= _edge_shade(flat, triangle, weight)[:, None]
+        fine[seen[own], :3] = shade
+    fine[seen, 3] = 1.0
     # the mean over FINE x FINE samples, with straight alpha
-    there = (buffer >= 0)[..., None]
-    parts = np.stack([(buffer >> shift) & 255 for shift in (16, 8, 0)], axis=-1) * there
-    fine = np.concatenate([parts / 255.0, there], axis=-1)
-    mean = fine.reshape(buffer.shape[0] // FINE, FINE, buffer.shape[1] // FINE, FINE, 4).mean(axis=(1, 3))
+    mean = fine.reshape(height, FINE, width, FINE, 4).mean(axis=(1, 3))
     mean[..., :3] /= np.maximum(mean[..., 3:], 1e-9)
     memory = io.BytesIO()
     mpimg.imsave(memory, np.rint(255.0 * mean).astype(np.uint8), format="png")
     return memory.getvalue()
 
 
-def _splat(
-    flat: NDArray[np.float64], colours: NDArray[np.float64], density: int, *, edges: bool, into: NDArray[np.int64]
-) -> None:
-    """Put `density` samples along each edge of the triangles into the picture, where they are nearer than others."""
+def _samples(density: int) -> NDArray[np.float64]:
+    """Barycentric coordinates (n_samples, 3) of samples, `density` along each edge of a triangle."""
     i, j = np.meshgrid(np.arange(density + 1), np.arange(density + 1))
     inside = i + j <= density
-    weights = np.stack([i[inside], j[inside], (density - i - j)[inside]], axis=1) / density  # (n_samples, 3)
+    return np.asarray(np.stack([i[inside], j[inside], (density - i - j)[inside]], axis=1) / density)
+
+
+def _keep_nearest(
+    flat: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    first: int,
+    shape: tuple[int, int],
+    buffer: NDArray[np.int64],
+) -> None:
+    """Put the samples of triangles (n, 3, 3), pixels and depth from 0 to 1, into the buffer of depths and numbers.
+
+    weights (n_samples, 3): where in each triangle; first: number of the first sample; shape: rows and columns.
+    """
+    rows, columns = shape
+    corners, narrow = flat.astype(np.float32), weights.astype(np.float32)
     batch = max(1_000_000 // len(weights), 1)
     for start in range(0, len(flat), batch):
-        part = slice(start, start + batch)
-        places = weights @ flat[part]
-        shade = np.clip(weights @ colours[part], 0.0, 1.0)
-        if edges:
-            shade *= _edge_shade(flat[part], weights)[..., None]
-        _keep_nearest(places.reshape(-1, 3), shade.reshape(-1, 3), into)
+        x, y, depth = (narrow @ corners[start : start + batch]).reshape(-1, 3).T
+        down, across = np.maximum(rows - 1 - y.astype(np.int64), 0), np.minimum(x.astype(np.int64), columns - 1)
+        near = (depth * np.float32(DEPTHS)).astype(np.int64) * SAMPLES
+        number = first + start * len(weights)
+        np.maximum.at(buffer, down * columns + across, near + np.arange(number, number + len(near)))
 
 
-def _edge_shade(flat: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Darkness (n_triangles, n_samples) of samples that lie on an edge."""
+def _edge_shade(
+    flat: NDArray[np.float64], triangle: NDArray[np.int64], weights: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Darkness (n,) of samples at barycentric weights (n, 3) of triangles (n,) that lie on an edge."""
     a, b = flat[:, 1, :2] - flat[:, 0, :2], flat[:, 2, :2] - flat[:, 0, :2]
     double_area = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
     opposite = np.linalg.norm(flat[:, [2, 0, 1], :2] - flat[:, [1, 2, 0], :2], axis=2)
     heights = double_area[:, None] / np.maximum(opposite, 1e-9)  # (n_triangles, 3)
-    distance = (weights[None] * heights[:, None]).min(axis=2)
+    distance = (weights * heights[triangle]).min(axis=1)
     return np.asarray(np.where(distance < 0.5 * EDGE_WIDTH * FINE, 0.45, 1.0))
-
-
-def _keep_nearest(places: NDArray[np.float64], shade: NDArray[np.float64], buffer: NDArray[np.int64]) -> None:
-    """Put samples at places (n, 3), pixels and depth from 0 to 1, into the buffer of depths and colours."""
-    rows, columns = buffer.shape
-    x, y = np.floor(places[:, 0]).astype(np.int64), rows - 1 - np.floor(places[:, 1]).astype(np.int64)
-    seen = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
-    red, green, blue = np.rint(255.0 * shade[seen]).astype(np.int64).T
-    colour = (red << 16) | (green << 8) | blue
-    near = (places[seen, 2] * DEPTH_STEPS).astype(np.int64)
-    np.maximum.at(buffer.reshape(-1), (y * columns + x)[seen], (near << 24) | colour)
