@@ -34,7 +34,7 @@ __all__ = [
 
 MEMORY_FACTOR = 1.5  # how far the predicted memory may be off
 
-LATTICE = 96  # points of the lattice along the longest side, on which edge lengths are summed
+LATTICE = 64  # points of the lattice along the longest side, on which edge lengths are summed
 # Fitted to the runs of benchmarks/cost.py (docs/command-line.md), on two cores of a 2.1 GHz server.
 TETS_A_CUBE = 19.4  # tetrahedra in a cube of the wanted edge length: 17 in smooth phantoms, 31 in a real pelvis
 UNKNOWNS_A_TET = {"P1": 0.62, "P2": 4.4}
