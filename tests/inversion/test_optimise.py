@@ -88,6 +88,19 @@ def test_steps_that_circle_in_the_noise_end_where_the_decrement_was_least(toys):
     assert found.evaluation.score[2] == 0.09
 
 
+def test_a_rough_minimum_leaves_walls_sliding_but_no_log_modulus_off(toys):
+    objective = toys.Sliding(np.array([0.3, -0.5]))
+    start = np.concatenate([[2.0, -3.0], np.zeros(objective.slides)])
+    rough = gauss_newton(objective, start, bounds=WIDE, tolerance=None)
+    exact = gauss_newton(objective, start, bounds=WIDE)
+    assert rough.outcome is exact.outcome is Outcome.CONVERGED
+    assert rough.evaluations < 0.5 * exact.evaluations
+    assert rough.history[-1].decrement < 0.02 * objective.slides < rough.history[-2].decrement
+    assert rough.unknowns[:2] == pytest.approx(objective.centre, abs=0.1)  # of a standard deviation of 1
+    near_only = np.concatenate([objective.centre + 0.15, np.full(objective.slides, 1.5)])
+    assert gauss_newton(objective, near_only, bounds=WIDE, tolerance=None).evaluations > 1
+
+
 def test_a_start_ends_where_it_meets_the_minimum_of_another_but_not_on_its_way_past_one(toys):
     objective = toys.Saturating(np.array([0.3, -0.5]))
     first = gauss_newton(objective, np.full(2, -3.0), bounds=WIDE, tolerance=1e-12)

@@ -71,6 +71,21 @@ class Circling:
         return Evaluation(value, value, score, score, matrix, (), 0.0 * matrix, 0.0 * score)
 
 
+@dataclass
+class Sliding:
+    """Two log-moduli as their model says, and coefficients that answer a fifth of what it says: walls that slide."""
+
+    centre: np.ndarray
+    slides: int = 40
+    n_parameters: int = 2
+
+    def __call__(self, unknowns):
+        away, apart = unknowns[:2] - self.centre, unknowns[2:] - 1.5
+        value, score = 0.5 * away @ away + 0.1 * apart @ apart, np.concatenate([away, 0.2 * apart])
+        matrix = np.eye(2 + self.slides)
+        return Evaluation(value, value, score, score, matrix, (), 0.0 * matrix, 0.0 * score)
+
+
 def coupled(rng, n=5, centre=None):
     root = rng.standard_normal((n, n))
     return Quadratic(root @ root.T + 0.5 * np.eye(n), rng.standard_normal(n) * 0.3 if centre is None else centre)
