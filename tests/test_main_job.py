@@ -17,10 +17,9 @@ import referencing
 from palpate.cli import main
 from palpate.images.readers import write_label_image
 from palpate.study.json_schema import SCHEMAS
-from scenes import balls
+from scenes import VOXEL_MM, balls
 
 TRUTH_KPA = {"core": 60.0, "shell": 30.0}
-VOXEL_MM = 1.5
 CASE = """
 id = "balls-1"
 seed = 3

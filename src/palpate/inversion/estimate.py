@@ -33,7 +33,7 @@ from palpate.progress import Progress, during
 
 __all__ = ["Candidate", "Inversion", "StartRun", "continue_at_finite_strain", "invert"]
 
-OTHER = 1e-2  # decrement of the minima that are not the best one
+OTHER = 1e-2  # decrement of minima that are compared: a fiftieth of what makes one lower
 LOWER = 0.5  # in units of log-likelihood: a minimum that is lower by less is as good
 REPORTED = StopRule()
 FIRST_GUESS = StopRule(

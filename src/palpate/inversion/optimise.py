@@ -196,7 +196,7 @@ def gauss_newton(
         decrement = newton_decrement(now, free)
         history.append(Iterate(unknowns[:n], now.value, now.misfit_mm2, decrement))
         whole = _step(now, free, n, WHOLE)[:n]
-        if roughly and held is not True:
+        if roughly and decrement < tolerance and held is not True:
             within = SLIDING_SD * np.sqrt(np.diag(now.covariance_columns(n)))
         if decrement < tolerance and np.all(np.abs(whole) < within):
             outcome = Outcome.CONVERGED

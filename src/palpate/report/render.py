@@ -87,10 +87,9 @@ def render_png(triangles: Triangles, camera: Camera, *, width: int, height: int,
     for first, group, weights in groups:  # colours of the nearest samples alone
         own = (number >= first) & (number < first + len(group) * len(weights))
         triangle, sample = np.divmod(number[own] - first, len(weights))
-        triangle, weight = group[triangle], weights[sample]
-        shade = np.clip(np.einsum("ns,nsc->nc", weight, shades[triangle]), 0.0, 1.0)
+        shade = np.clip(np.einsum("ns,nsc->nc", weights[sample], shades[group[triangle]]), 0.0, 1.0)
         if triangles.edges:
-            shade *= _edge_shade(flat, triangle, weight)[:, None]
+            shade *= _edge_shade(flat[group], triangle, weights[sample])[:, None]
         fine[seen[own], :3] = shade
     fine[seen, 3] = 1.0
     # the mean over FINE x FINE samples, with straight alpha

@@ -46,8 +46,8 @@ def main(arguments: list[str]) -> None:
                 (nx, ny, nz), affine = json.loads(arguments[4])
                 grid = VoxelGrid((int(nx), int(ny), int(nz)), np.array(affine, dtype=np.float64))
             image_format = format_of(path)
-            if image_format.name == "NIfTI":  # nibabel would import pydicom, where that is: a quarter of all this takes
-                sys.modules["pydicom"] = cast("ModuleType", None)
+            for module in image_format.needless:
+                sys.modules[module] = cast("ModuleType", None)  # whoever imports it is told that it is not installed
             stored = image_format.stored(path, grid)
             values = np.asfortranarray(REDUCED[kind](stored.values, path))
         except PalpateError as error:

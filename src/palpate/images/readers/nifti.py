@@ -84,11 +84,11 @@ def _header(stream: BinaryIO, path: Path) -> tuple[Any, int]:
 
 def _block(header: Any, path: Path) -> tuple[VoxelBlock, float, float]:
     """What the header says of the voxels, and the slope and intercept of their scale."""
-    damage = import_module("nibabel.spatialimages").HeaderDataError
+    header_error = import_module("nibabel.spatialimages").HeaderDataError
     try:
         dtype = np.dtype(header.get_data_dtype())
         slope, intercept = header.get_slope_inter()
-    except (damage, KeyError, ValueError) as error:
+    except (header_error, KeyError, ValueError) as error:
         raise InputDataError(f"the header of '{path}' is damaged: {error}; export the image again") from error
     if dtype.kind not in "iuf" or dtype.itemsize > 8:
         raise InputDataError(
@@ -117,12 +117,12 @@ def _block(header: Any, path: Path) -> tuple[VoxelBlock, float, float]:
 
 def _affine(header: Any, path: Path) -> NDArray[np.float64]:
     """Index -> RAS mm by the sform or the qform; where both are set, they must agree."""
-    damage = import_module("nibabel.spatialimages").HeaderDataError
+    header_error = import_module("nibabel.spatialimages").HeaderDataError
     try:
         with np.errstate(all="ignore"):  # what is not finite is refused later, with its numbers
             affine = header.get_sform(coded=True)[0]
             qform = header.get_qform(coded=True)[0]
-    except (damage, ValueError) as error:
+    except (header_error, ValueError) as error:
         raise InputDataError(f"the qform in the header of '{path}' is damaged: {error}; set an sform") from error
     if affine is not None and qform is not None:
         # which of two places is right, nobody can tell here; half a voxel is more than rounding
@@ -208,4 +208,4 @@ def _write(path: Path, values: NDArray[Any], grid: VoxelGrid, *, intent: str = "
         ) from error
 
 
-register(ImageFormat("NIfTI", (".nii", ".nii.gz"), read_nifti))
+register(ImageFormat("NIfTI", (".nii", ".nii.gz"), read_nifti, needless=("pydicom",)))  # half of nibabel's import

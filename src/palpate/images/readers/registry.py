@@ -44,8 +44,8 @@ class ImageFormat:
 
     `read` takes the path of an existing, non-empty file; it raises `InputDataError` and lets nothing else out. A folder
     has the ending `FOLDER`. `patience`: how many times the processor time of one file reading may take;
-    `mark`: what stands at byte 128 of its files, which then need no ending; `read_on`: reads a
-    file that may lack its grid (contours).
+    `mark`: what stands at byte 128 of its files, which then need no ending; `read_on`: reads a file that may lack its
+    grid (contours); `needless`: modules that its library imports where they are installed, and which no file needs.
     """
 
     name: str
@@ -54,6 +54,7 @@ class ImageFormat:
     patience: int = 1
     mark: bytes = b""
     read_on: Callable[[Path, VoxelGrid], StoredImage] | None = None
+    needless: tuple[str, ...] = ()
 
     def stored(self, path: Path, grid: VoxelGrid | None) -> StoredImage:
         """What `path` holds, on `grid` where the format may need one; raises as `read` does."""
