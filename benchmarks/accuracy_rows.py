@@ -129,7 +129,7 @@ def posed(row: Row, seed: int, draw: int, truths: Truths) -> Posed:
         problem, body = from_voxels(scene, case)
         space, bodies = body.space, (body,)
     else:
-        space, problem = _from_surfaces(scene, case, options, same_mesh=row.data == "same mesh")
+        space, problem = _from_surfaces(scene, case, options, row)
     return Posed(scene, options.filling_mm, space, problem, inversion_settings(case, problem.parameters), bodies)
 
 
@@ -140,14 +140,13 @@ def from_voxels(scene: Scene, case: Case) -> tuple[InverseProblem, Body]:
     return inverse_problem(body, case, progress=lambda _: None), body
 
 
-def _from_surfaces(
-    scene: Scene, case: Case, options: PelvisOptions, *, same_mesh: bool
-) -> tuple[LagrangeSpace, InverseProblem]:
+def _from_surfaces(scene: Scene, case: Case, options: PelvisOptions, row: Row) -> tuple[LagrangeSpace, InverseProblem]:
     """The truth's surfaces as targets; on the same mesh also a wall motion that the modes can make."""
+    same_mesh = row.data == "same mesh"
     if same_mesh:
         space = lagrange_space(scene.mesh, "P2")
     else:
-        space = lagrange_space(tetrahedralise(pelvis_anatomy(options), edge_length_mm=case.mesh.edge_length_mm), "P2")
+        space = lagrange_space(tetrahedralise(pelvis_anatomy(options), edge_length_mm=row.edge_mm), "P2")
     driver = case.driver
     motion = prescribed_motion(space, {}, n_modes=driver.modes, kernel_mm=driver.kernel_mm, prior_mm=driver.prior_mm)
     constraint = outer_constraint(

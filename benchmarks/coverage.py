@@ -35,7 +35,8 @@ Shift = Callable[[Array, Array, np.random.Generator, bool], Array]  # of places 
 
 LEVELS = (0.50, 0.68, 0.80, 0.90, 0.95, 0.99)
 FAR = 3.0  # half-widths
-SLICE_MM, CUT_SHARE = 2.5, 0.15
+SLICE_MM = 2.5
+FEATURES = 400  # waves of a random field, which are drawn anew for each
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ def gauss(sd_mm: float, correlation_mm: float) -> Setting:
 
     def shift(places: Array, normals: Array, rng: np.random.Generator, later: bool) -> Array:
         del later
-        field = smooth_field(rng, sd_mm=sd_mm, correlation_mm=correlation_mm)
+        field = smooth_field(rng, sd_mm=sd_mm, correlation_mm=correlation_mm, features=FEATURES)
         return np.asarray(np.einsum("ni,ni->n", field.at(places), normals))
 
     return Setting(f"gauss-{sd_mm}-{correlation_mm:g}", True, shift)
@@ -61,7 +62,7 @@ def gauss(sd_mm: float, correlation_mm: float) -> Setting:
 def _one_sided(places: Array, normals: Array, rng: np.random.Generator, later: bool) -> Array:
     """Over-segmentation: outwards only, by 0.3 mm times the absolute value of a normal field."""
     del later
-    field = smooth_field(rng, sd_mm=0.3, correlation_mm=6.0)
+    field = smooth_field(rng, sd_mm=0.3, correlation_mm=6.0, features=FEATURES)
     return np.asarray(np.abs(np.einsum("ni,ni->n", field.at(places), normals)))
 
 
@@ -110,7 +111,7 @@ def main() -> int:
     parser.add_argument("--pelves", type=int, default=10)
     parser.add_argument("--draws", type=int, default=20)
     parser.add_argument("--first-seed", type=int, default=501)
-    parser.add_argument("--edge", type=float, default=5.0, help="edge length (mm) of the estimate's mesh")
+    parser.add_argument("--edge", type=float, default=8.0, help="edge length (mm) of the estimate's mesh")
     parser.add_argument("--output", type=Path, default=Path("coverage.jsonl"))
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     asked = parser.parse_args()

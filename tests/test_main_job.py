@@ -160,7 +160,8 @@ def test_the_result_has_every_key_of_its_schema(result):
     assert len(result["starts"]) == 2
     assert {"start", "end", "objective_mm2", "status", "iterations"} <= set(result["starts"][0])
     assert {"forward", "adjoint", "tangent", "factorisations", "evaluations"} == set(result["counts"])
-    figures = {"nodes", "tets", "dofs", "min_dihedral_deg", "p5_dihedral_deg", "volume_error", "edge_length_mm"}
+    figures = {"nodes", "tets", "dofs", "min_dihedral_deg", "p5_dihedral_deg", "volume_error"}
+    figures |= {"edge_length_mm", "edge_length_reason"}
     assert figures == set(result["mesh"])
     assert {"read", "mesh", "assemble", "estimate", "total"} == set(result["seconds"])
     assert {"before", "after[0]"} == set(result["inputs"])

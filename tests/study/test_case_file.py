@@ -45,7 +45,8 @@ def test_defaults_are_those_of_the_schema(case_file):
     assert (case.mechanics.law, case.mechanics.element) == ("neo-hookean", "auto")
     assert (case.domain.extent, case.domain.margin_mm, case.domain.outer_boundary) == ("image", 40.0, "fixed")
     assert (case.driver.modes, case.driver.kernel_mm, case.driver.prior_mm) == (90, 20.0, 5.0)
-    assert case.mesh.edge_length_mm == 4.0
+    assert case.mesh.edge_length_mm is None
+    assert read_case(case_file, ["mesh.edge_length_mm='auto'"]).mesh == case.mesh
     assert case.estimate.start_ratios == (0.5, 2.0, 8.0)
     assert case.estimate.bounds_ratio == (0.02, 200.0)
     assert (case.noise.surface_sd_mm, case.noise.correlation_length_mm) == (None, None)

@@ -14,6 +14,7 @@ from palpate.study import cost, meshing
 from palpate.study.body import ImagedStates, make_body
 from palpate.study.case_text import case_text
 from palpate.study.check import check_case
+from palpate.study.edge_length import EdgeLength
 from palpate.study.meshing import mesh_reference
 
 
@@ -50,14 +51,14 @@ def mesh_of(result, edge, progress=silent):
 
 def test_a_mesh_that_is_fit_is_made_once_and_nothing_is_said(case_result, tried):
     found = mesh_of(case_result, 2.0)
-    assert (tried, found.edge_length_mm, found.findings) == ([2.0], 2.0, ())
+    assert (tried, found.edge_length.mm, found.findings) == ([2.0], 2.0, ())
 
 
 def test_a_mesh_that_is_not_fit_is_followed_by_finer_ones_which_the_result_tells(case_result, tried):
     told = []
     found = mesh_of(case_result, 4.0, told.append)
     assert tried == [4.0, 3.0, 2.25]
-    assert found.edge_length_mm == 2.25
+    assert found.edge_length == EdgeLength(2.25, "a mesh of 4 mm was not fit")
     (finding,) = found.findings
     assert finding.code == "finer-mesh"
     assert "mesh.edge_length_mm = 2.25 in place of 4" in finding.message

@@ -73,28 +73,30 @@ def interrupted(case_file, tmp_path_factory):
     case = read_case(case_file)
     calls = []
 
-    def until(problem, settings, *, progress):
-        calls.append(problem)
+    def until(problem, settings, *, progress, **rule):
+        calls.append((len(settings.starts), rule))
         if len(calls) == 3:
             raise KeyboardInterrupt
-        return real(problem, settings, progress=progress)
+        return real(problem, settings, progress=progress, **rule)
 
-    def again(problem, settings, *, progress):
+    def again(problem, settings, *, progress, **rule):
         if problem.finite_strain:
             raise EstimationError("no equilibrium")
-        return until(problem, settings, progress=progress)
+        return until(problem, settings, progress=progress, **rule)
 
-    every = list(study._variants(case))
+    every = list(study._variants(case, case.mesh.edge_length_mm))
     few = [
         next(v for v in every if v.name == name)
         for name in ("edge-length", "outer-boundary-sliding", "law-neo-hookean")
     ]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(study, "_variants", lambda _case: iter(few))
+        patch.setattr(study, "_variants", lambda *_: iter(few))
         patch.setattr(study, "invert", again)
         with pytest.raises(KeyboardInterrupt):
             palpate.sensitivity(case, sobol=8, output=folder)
         before = len(calls)
+        assert calls[0] == (len(case.estimate.start_ratios), {}), "the case itself, from every start to full accuracy"
+        assert calls[1:] == [(1, {"rule": study.NEAR})] * (before - 1)
         found = palpate.sensitivity(case, sobol=8, output=folder, progress=told.append)
         assert len(calls) == before + 1, "what was finished is not computed again"
         assert main(["sensitivity", str(case_file), "--sobol", "8", "--output", str(folder), "--quiet"]) == 0
@@ -193,7 +195,7 @@ def test_sobol_indices_say_what_the_ranges_say(document):
 
 def test_variants_begin_with_the_cheap_ones_and_leave_out_what_the_case_says(case_file):
     case = read_case(case_file)
-    assert [v.name for v in study._variants(case)] == [
+    assert [v.name for v in study._variants(case, 7.0)] == [
         "edge-length",
         "outer-boundary-sliding",
         "outer-boundary-free",
@@ -201,8 +203,8 @@ def test_variants_begin_with_the_cheap_ones_and_leave_out_what_the_case_says(cas
         "law-mooney-rivlin",
     ]
     curved = replace(case, mechanics=replace(case.mechanics, law="neo-hookean"))
-    assert next(study._variants(curved)).case.mechanics.law == "linear"
-    assert next(study._variants(case)).case.mesh.edge_length_mm == pytest.approx(8.75)
+    assert next(study._variants(curved, 7.0)).case.mechanics.law == "linear"
+    assert next(study._variants(case, 7.0)).case.mesh.edge_length_mm == pytest.approx(8.75)
 
 
 def test_the_largest_effect_comes_first_and_failures_last(document):

@@ -19,7 +19,9 @@ from palpate.study import run
 from palpate.study.case import Case
 from palpate.study.case_as_run import refuse_other_case
 from palpate.study.cost import ExpectedCost
+from palpate.study.edge_length import edge_length
 from palpate.study.outputs import OutputFolder
+from palpate.study.read import read_states
 
 __all__ = ["RoomError", "Tell", "estimate_row"]
 
@@ -66,10 +68,18 @@ def _attempt(task: Task, tell: Tell) -> Outcome:
             return earlier  # somebody else was quicker
         refuse_other_case(case, outputs)
         if task.coarser > 1.0:  # which the result tells as an override
-            edge = round(case.mesh.edge_length_mm * task.coarser, 3)
+            edge = round(_edge_length_mm(case) * task.coarser, 3)
             overrides = (*case.overrides, f"mesh.edge_length_mm={edge}")
             case = replace(case, mesh=replace(case.mesh, edge_length_mm=edge), overrides=overrides)
         return _estimated(task, case, key, outputs, tell)
+
+
+def _edge_length_mm(case: Case) -> float:
+    """That of the case, or what its images choose, which are read for it."""
+    if case.mesh.edge_length_mm is not None:
+        return case.mesh.edge_length_mm
+    states = read_states(case)
+    return edge_length(case, states.before, states.after).mm
 
 
 def _estimated(task: Task, case: Case, key: str, outputs: OutputFolder, tell: Tell) -> Outcome:

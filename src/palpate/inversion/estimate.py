@@ -37,14 +37,7 @@ OTHER = 1e-2  # decrement of minima that are compared: a fiftieth of what makes 
 LOWER = 0.5  # in units of log-likelihood: a minimum that is lower by less is as good
 REPORTED = StopRule()
 FIRST_GUESS = StopRule(
-    step_sd=0.5,
-    model_error=np.inf,
-    derivatives=False,
-    solve_above=0.1,
-    passes=1,
-    iterations=1,
-    refinements=0,
-    far=np.inf,
+    step_sd=0.5, model_error=np.inf, derivatives=False, solve_above=0.1, passes=1, iterations=1, far=np.inf
 )
 EQUILIBRIUM = 1e-5  # of the forces, while the estimate moves
 
@@ -106,14 +99,14 @@ class Inversion:
 
 @blas_on_one_thread()
 def invert(
-    problem: InverseProblem, settings: InversionSettings, *, progress: Progress, rule: StopRule | None = None
+    problem: InverseProblem, settings: InversionSettings, *, progress: Progress, rule: StopRule = REPORTED
 ) -> Inversion:
     """Estimate log-moduli and drivers' motion together, from all starts, with the linear law first.
 
     States that bring an approximation are estimated on it; for the others a reduced basis is made at the middle start
-    and extended where the estimate goes. rule: when the linear estimate ends; None: at its full accuracy, or when it is
-    near where another law follows. Raises `ConfigurationError` for an open Poisson's ratio with another law,
-    `EstimationError`s of solving; an estimate that did not converge says so in its minimum's outcome.
+    and extended where the estimate goes. rule: when the estimate ends; a linear one that another law follows ends near.
+    Raises `ConfigurationError` for an open Poisson's ratio with another law, `EstimationError`s of solving; an estimate
+    that did not converge says so in its minimum's outcome.
     """
     if problem.finite_strain and problem.parameters.poisson:
         raise ConfigurationError(
@@ -122,23 +115,24 @@ def invert(
         )
     middle = np.asarray(np.median(np.stack(settings.starts), axis=0))
     begin = np.concatenate([middle, np.zeros(sum(problem.parameters.n_modes))])
-    rule = rule or (FIRST_GUESS if problem.finite_strain else REPORTED)
+    first = FIRST_GUESS if problem.finite_strain else rule
     if any(state.approximation is None for state in problem.states):
-        linear = [_linear(*_with_reduced_bases(problem, settings, begin, progress), settings, rule, progress)]
+        linear = [_linear(*_with_reduced_bases(problem, settings, begin, progress), settings, first, progress)]
     else:
-        linear = [_linear(Objective(problem.states, problem.parameters), begin, 0, settings, rule, progress)]
+        linear = [_linear(Objective(problem.states, problem.parameters), begin, 0, settings, first, progress)]
     if not problem.finite_strain:
         return linear[0]
-    at_finite_strain = during("finite strain", progress)
-    return continue_at_finite_strain(linear.pop(), settings, progress=at_finite_strain)  # which lets go of its bases
+    there = during("finite strain", progress)
+    return continue_at_finite_strain(linear.pop(), settings, progress=there, rule=rule)  # which lets go of its bases
 
 
-def continue_at_finite_strain(linear: Inversion, settings: InversionSettings, *, progress: Progress) -> Inversion:
+def continue_at_finite_strain(
+    linear: Inversion, settings: InversionSettings, *, progress: Progress, rule: StopRule = REPORTED
+) -> Inversion:
     """The estimate under the law of the states' `finite_strain` models, from the candidates of the `linear` one.
 
-    The best one is continued always, the others where they are minima; one of these without equilibrium is left out of
-    the comparison. Raises `NotConverged` when the best one's equilibrium is not found, with the element and the share
-    of the motion where it ended.
+    The best one is continued always, the others where they are minima; of these one without equilibrium is left out.
+    Raises `NotConverged` when the best one's is not found, with the element and the share of the motion.
     """
     waiting = {number: candidate.iterate for number, candidate in enumerate(linear.candidates)}
     linear = replace(linear, candidates=())  # and with them their reduced bases, which are large, one by one
@@ -151,7 +145,7 @@ def continue_at_finite_strain(linear: Inversion, settings: InversionSettings, *,
         try:
             progress("finite strain: the equilibrium at the linear estimate")
             start = [_expanded(*_coarse(waiting.pop(number)), minimum, progress)]
-            end = run_outer_loop(start.pop(), settings, REPORTED, progress=progress, title="finite strain")
+            end = run_outer_loop(start.pop(), settings, rule, progress=progress, title="finite strain")
             progress("finite strain: the exact equilibrium at the estimate")
             ends[number] = end = _at_equilibrium(end, minimum.history)
             spent, evaluations = spent + end.counts, evaluations + end.minimum.evaluations

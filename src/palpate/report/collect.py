@@ -34,7 +34,7 @@ from palpate.report.report_data import (
 )
 from palpate.report.surfaces import MOST_TRIANGLES, carried_outline, contour_width, image_surface, model_surface
 from palpate.study.case import Case, CaseLoad
-from palpate.study.result import CaseResult, failure_document, stated_unit
+from palpate.study.result import CaseResult, MeshSummary, failure_document, stated_unit
 
 __all__ = ["collect", "collect_failure"]
 
@@ -101,7 +101,7 @@ def collect(result: CaseResult) -> ReportData:
     return ReportData(
         document=result.to_dict(),
         created=_now(),
-        settings=_settings(result.case),
+        settings=_settings(result.case, result.mesh_summary),
         tissues=_tissues(result.tissues, result.stiffness),
         unit=result.unit,
         images=images,
@@ -132,8 +132,17 @@ def _now() -> str:
     return datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
 
 
-def _settings(case: Case) -> tuple[tuple[str, str], ...]:
-    """What the case asked for, in words."""
+def _edge_length(case: Case, mesh: MeshSummary | None) -> str:
+    """That of the case, or of its mesh with the reason."""
+    if case.mesh.edge_length_mm is not None:
+        return f"{case.mesh.edge_length_mm:g} mm"
+    if mesh is None or mesh.edge_length_mm is None:
+        return "chosen by the organs"
+    return f"{mesh.edge_length_mm:g} mm, chosen: {mesh.edge_length_reason}"
+
+
+def _settings(case: Case, mesh: MeshSummary | None = None) -> tuple[tuple[str, str], ...]:
+    """What the case asked for, in words, and what it was given where it left the choice."""
     mechanics, domain, driver, options = case.mechanics, case.domain, case.driver, case.estimate
     margin = f", {domain.margin_mm:g} mm around the organs" if domain.extent == "margin" else ""
     by_load = bool(case.loads) and not any(tissue.role is Role.KNOWN for tissue in case.tissues)
@@ -146,7 +155,7 @@ def _settings(case: Case) -> tuple[tuple[str, str], ...]:
         ("material law", mechanics.law),
         *((p.name, f"{mechanics.law_parameters.get(p.name, p.default):g}") for p in mechanics.material_law.parameters),
         ("element", mechanics.element),
-        ("edge length at the organs", f"{case.mesh.edge_length_mm:g} mm"),
+        ("edge length at the organs", _edge_length(case, mesh)),
         ("outer boundary", f"{domain.outer_boundary}; domain: {domain.extent}{margin}"),
         ("alignment", case.align),
         (

@@ -32,6 +32,7 @@ from palpate.progress import Progress, silent
 from palpate.study.case import Case
 from palpate.study.case_loads import case_loads
 from palpate.study.contacts import every_finding
+from palpate.study.edge_length import EdgeLength
 from palpate.study.meshing import mesh_reference
 from palpate.study.poisson_ratios import with_stated_priors
 from palpate.study.refusals import refuse_lost, refuse_unmeshable
@@ -74,15 +75,15 @@ class ImagedStates:
 class Body:
     """A meshed reference state with its images.
 
-    `smoothing_mm`: the width of every distance map that is compared; `edge_length_mm`: the mesh's at the organs, None
-    where it was made otherwise; `findings`: of the mesh.
+    `smoothing_mm`: the width of every distance map that is compared; `edge_length`: the mesh's at the organs with its
+    reason, None where it was made otherwise; `findings`: of the mesh.
     """
 
     states: ImagedStates
     space: LagrangeSpace
     quality: MeshQuality
     smoothing_mm: float
-    edge_length_mm: float | None = None
+    edge_length: EdgeLength | None = None
     findings: tuple[Finding, ...] = ()
 
     def imaged(self, stated_noise: NoiseModel | None = None) -> ImagedBody:
@@ -176,7 +177,7 @@ def make_body(states: ImagedStates, case: Case, *, progress: Progress) -> Body:
         f" {found.quality.min_dihedral_deg:.1f} degrees"
     )
     grids = (states.before.grid, *(image.grid for image in states.after))
-    return Body(states, space, found.quality, observation_width(*grids), found.edge_length_mm, found.findings)
+    return Body(states, space, found.quality, observation_width(*grids), found.edge_length, found.findings)
 
 
 def inverse_problem(body: Body, case: Case, *, progress: Progress) -> InverseProblem:

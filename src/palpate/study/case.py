@@ -34,6 +34,7 @@ __all__ = [
 ]
 
 REMAINING = "remaining"
+AUTO = "auto"
 LAW_NAMES = tuple(LAWS)
 SOLVER_NAMES = ("auto", *SOLVERS)
 
@@ -234,9 +235,9 @@ class CaseLoad:
 
 @dataclass(frozen=True, slots=True)
 class MeshSettings:
-    """Edge length (mm) of the tetrahedra at the organs."""
+    """Edge length (mm) of the tetrahedra at the organs; None: "auto", chosen by the organs (see `chosen_edge`)."""
 
-    edge_length_mm: float = field(default=4.0, metadata=rule(between=(0.01, 1e3)))
+    edge_length_mm: float | None = field(default=None, metadata=rule(between=(0.01, 1e3), chosen=AUTO))
 
 
 @dataclass(frozen=True, slots=True)

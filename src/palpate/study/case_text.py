@@ -56,6 +56,8 @@ def _table(value: Any, place: Callable[[Path], str]) -> dict[str, Any]:
         bounds, item = field.metadata.get("rule", Rule()), getattr(value, field.name)
         if bounds.collects:
             table |= item
+        elif item is None and bounds.chosen:
+            table[field.name] = bounds.chosen
         elif item is not None and not bounds.unwritten and (plain := _plain(item, place)) not in ([], {}):
             table[field.name] = plain
             table.pop(bounds.instead_of, None)  # which stands before it

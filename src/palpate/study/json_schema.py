@@ -54,7 +54,7 @@ def _table(kind: Any) -> dict[str, Any]:
         if bounds.collects or bounds.unwritten or (kind is CaseTissue and field.name == "name"):
             continue
         value, stated = _value(hints[field.name], bounds), field.default
-        default = list(stated) if isinstance(stated, tuple) else stated
+        default = bounds.chosen if bounds.chosen else list(stated) if isinstance(stated, tuple) else stated
         written = isinstance(default, str | int | float | list) and default not in ("", [])
         properties[field.name] = value | ({"default": default} if written else {})
         if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
@@ -70,7 +70,8 @@ def _value(hint: Any, bounds: Rule) -> dict[str, Any]:
     if isinstance(hint, types.UnionType):  # X | None: None is the key left out
         if bounds.convert:
             return LABEL
-        return _value(next(arm for arm in typing.get_args(hint) if arm is not types.NoneType), bounds)
+        stated = _value(next(arm for arm in typing.get_args(hint) if arm is not types.NoneType), bounds)
+        return {"oneOf": [{"const": bounds.chosen}, stated]} if bounds.chosen else stated
     if typing.get_origin(hint) is tuple:
         return _list(typing.get_args(hint), bounds)
     if dataclasses.is_dataclass(hint):

@@ -18,6 +18,7 @@ from palpate.progress import Progress
 from palpate.study.case import Case
 from palpate.study.cost import expected_cost, lack_of_memory
 from palpate.study.domain import case_domain
+from palpate.study.edge_length import EdgeLength, edge_length
 
 __all__ = ["ReferenceMesh", "mesh_reference", "refuse_edge"]
 
@@ -28,29 +29,30 @@ THIN_VOXELS = 4  # along some axis
 
 @dataclass(frozen=True, slots=True)
 class ReferenceMesh:
-    """A mesh that has passed its gate, its edge length at the organs, and what the user should know of it."""
+    """A mesh that has passed its gate, its edge length at the organs with its reason, and what is found of it."""
 
     mesh: TetMesh
     quality: MeshQuality
-    edge_length_mm: float
+    edge_length: EdgeLength
     findings: tuple[Finding, ...] = ()
 
 
 def mesh_reference(
     before: Segmentation, after: tuple[Segmentation, ...], case: Case, *, progress: Progress
 ) -> ReferenceMesh:
-    """Mesh `before` inside the domain that it shares with the later images.
+    """Mesh `before` inside the domain that it shares with the later images, with the edge length of `edge_length`.
 
     A mesh that fails its gate, or that Mmg gives up, is followed by one of 0.75 times the edge length, at most twice
     and where this machine has the memory for an estimate on it; the finding "finer-mesh" tells of it. Raises
     `GeometryError` when none is fit, `ResourceError` where the mesher stops for want of memory.
     """
     box = case_domain(before, after, case)
-    refuse_edge(case, box)
+    chosen = edge_length(case, before, after)
+    asked = chosen.mm
+    refuse_edge(asked, box)
     progress(f"surfaces of {len(before.tissues)} tissues in {np.round(box.lengths).astype(int).tolist()} mm")
     width = smoothing_width(before.grid, *(image.grid for image in after))
     anatomy = anatomy_of(before, box=box, smoothing_mm=width)
-    asked = case.mesh.edge_length_mm
     edges = [round(asked * FINER**number, 3) for number in range(FINER_MESHES + 1)]
     failure: GeometryError | None = None
     for edge in edges:
@@ -58,20 +60,22 @@ def mesh_reference(
         lack = lack_of_memory(expected_cost(finer, before, after, n_pairs=1)) if failure else ""
         if lack:
             raise GeometryError(f"{failure}; a mesh of {edge:g} mm was not tried: {lack}") from failure
-        progress(f"meshing at {edge:g} mm" + (f", for the mesh before was not fit: {failure}" if failure else ""))
+        why = f"for the mesh before was not fit: {failure}" if failure else chosen.reason
+        progress(f"meshing at {edge:g} mm, {why}")
         try:
             mesh, quality = _fit_mesh(before, anatomy, edge, progress)
         except GeometryError as error:
             failure = error
             continue
         if failure is None:
-            return ReferenceMesh(mesh, quality, edge)
+            return ReferenceMesh(mesh, quality, chosen)
         text = (
             f"the mesh has edges of {edge:g} mm, for a coarser one was not fit to compute with: {failure}. With"
             f" mesh.edge_length_mm = {edge:g} in place of {asked:g} the attempt is saved; a repair of the labels at"
             " that place may allow coarser meshes"
         )
-        return ReferenceMesh(mesh, quality, edge, (Finding("finer-mesh", text),))
+        finer_edge = EdgeLength(edge, f"a mesh of {asked:g} mm was not fit")
+        return ReferenceMesh(mesh, quality, finer_edge, (Finding("finer-mesh", text),))
     raise type(failure or GeometryError())(
         f"no mesh is fit to compute with, neither at mesh.edge_length_mm = {asked:g} nor at"
         f" {' and '.join(f'{edge:g}' for edge in edges[1:])} mm, where {failure}; repair the labels at that place, or"
@@ -79,12 +83,11 @@ def mesh_reference(
     ) from failure
 
 
-def refuse_edge(case: Case, box: Box) -> None:
+def refuse_edge(edge_mm: float, box: Box) -> None:
     """Raise `GeometryError` for an edge length that the domain has no room for."""
-    edge = case.mesh.edge_length_mm
-    if edge >= float(box.lengths.min()):
+    if edge_mm >= float(box.lengths.min()):
         raise GeometryError(
-            f"mesh.edge_length_mm is {edge}; it must be positive and less than the smallest side of the domain,"
+            f"mesh.edge_length_mm is {edge_mm}; it must be positive and less than the smallest side of the domain,"
             f" {box.lengths.min():.1f} mm"
         )
 

@@ -1,4 +1,4 @@
-"""What a case to be should mesh: a box around the organs, and an edge length that suits them and the memory."""
+"""What a case to be should mesh: a box around the organs, and an edge length for which there is the memory."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ from palpate.images.segmentation import segment
 from palpate.images.tissue import Role
 from palpate.study.case import REMAINING, Case, CaseTissue, Domain, Images
 from palpate.study.cost import MEMORY_FACTOR, cost_of_meshes, expected_size, machine_memory_gb, tets_by_edge
+from palpate.study.edge_length import edge_length
 from palpate.study.guess import GuessedTissue
 
 __all__ = ["MARGIN_MM", "proposed_edge", "proposed_window"]
 
 MARGIN_MM = 40.0
 CROP_BELOW = 0.6  # a domain of the margin's box is proposed when it saves so much of the image
-EDGES_MM = (3.0, 8.0)
-ORGAN_EDGES = 6.0  # edges of tetrahedra across the smallest organ
 STEP_MM, LONGEST_MM = 0.5, 12.0  # in which edges grow until the memory does, and where that ends
 SOME_KPA = 1.0  # a modulus, on which no size depends
 
@@ -42,17 +41,12 @@ def proposed_window(before: LabelImage, tissues: Sequence[GuessedTissue]) -> tup
 def proposed_edge(
     before: LabelImage, after: Sequence[LabelImage], tissues: Sequence[GuessedTissue], *, cropped: bool
 ) -> tuple[float, str] | None:
-    """An edge length, mm, by the smallest organ, or a longer one for which this machine has the memory; and why.
+    """The edge length (mm) of a case that states none, or a longer one for which this machine has the memory; and why.
 
     `cropped`: whether only the margin around the organs is meshed. None where there is no organ.
     """
-    voxels = [np.count_nonzero(np.isin(before.labels, t.labels)) for t in tissues if t.role is Role.ESTIMATE]
-    if not voxels:
+    if not any(t.role is Role.ESTIMATE for t in tissues):
         return None
-    diameter = float((6.0 * min(voxels) * before.grid.voxel_volume / np.pi) ** (1.0 / 3.0))
-    wanted = round(2.0 * min(max(diameter / ORGAN_EDGES, EDGES_MM[0]), EDGES_MM[1])) / 2.0
-    why = f"the smallest organ is as large as a ball of {diameter:.0f} mm"
-    has, edge = machine_memory_gb(), wanted
     case = Case(  # as far as its size depends on it; a tissue without a role is taken for a known one
         id="proposed",
         images=Images(Path("before"), (Path("after"),)),
@@ -63,6 +57,8 @@ def proposed_edge(
         domain=Domain("margin" if cropped else "image", MARGIN_MM),
     )
     first, *later = (segment(image, case.resolve_tissues({})) for image in (before, *after))
+    suited, has = edge_length(case, first, later), machine_memory_gb()
+    edge, why = suited.mm, suited.reason
     tets = tets_by_edge(case, first, tuple(later))
 
     def memory_gb(edge_mm: float) -> float:
@@ -71,6 +67,6 @@ def proposed_edge(
 
     while has is not None and edge < LONGEST_MM and MEMORY_FACTOR * memory_gb(edge) > has:
         edge += STEP_MM
-    if edge > wanted:
-        why += f"; {wanted:g} mm would suit it, but this machine has {has:.0f} GB of memory"
+    if edge > suited.mm:
+        why = f"{suited.mm:g} mm would suit the organs ({why}), but this machine has {has:.0f} GB of memory"
     return edge, why

@@ -47,8 +47,8 @@ SCHEMA = "palpate.result/1"
 class MeshSummary:
     """Size and quality of a mesh; angles in degrees; volume_error: tissue -> (mesh - image) / image, dimensionless.
 
-    edge_length_mm: that at the organs, which may be shorter than the case's (finding "finer-mesh"); None where the mesh
-    is a phantom's own.
+    edge_length_mm: that at the organs, which may be shorter than the case's (finding "finer-mesh"), and the reason for
+    it; None where the mesh is a phantom's own.
     """
 
     nodes: int
@@ -58,6 +58,7 @@ class MeshSummary:
     p5_dihedral_deg: float
     volume_error: Mapping[str, float]
     edge_length_mm: float | None = None
+    edge_length_reason: str = ""
 
 
 @dataclass(frozen=True, slots=True)

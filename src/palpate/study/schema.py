@@ -35,7 +35,8 @@ class Rule:
     choices: the values it may have; between: the least and the largest number, either of which it may be; test: a
     condition; wanted: what it must be, in words, beside the numbers; instead_of: the key that may not stand beside this
     one; convert: reads a value whose type alone does not say how; collects: keys of the same table, with their ranges,
-    whose numbers the field holds; unwritten: the field is no key of the table.
+    whose numbers the field holds; unwritten: the field is no key of the table; chosen: a word that may stand for the
+    number, which is then chosen for the case: the field is None.
     """
 
     choices: tuple[str, ...] = ()
@@ -46,6 +47,7 @@ class Rule:
     convert: Callable[[object], object] | None = None
     collects: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
     unwritten: bool = False
+    chosen: str = ""
 
 
 def rule(
@@ -57,9 +59,10 @@ def rule(
     instead_of: str = "",
     convert: Callable[[object], object] | None = None,
     collects: Mapping[str, tuple[float, float]] | None = None,
+    chosen: str = "",
 ) -> dict[str, Rule]:
     """The metadata of a dataclass field that carries a `Rule`; arguments as there."""
-    return {"rule": Rule(choices, between, test, wanted, instead_of, convert, collects or {})}
+    return {"rule": Rule(choices, between, test, wanted, instead_of, convert, collects or {}, chosen=chosen)}
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
@@ -104,6 +107,9 @@ def read_table(kind: type[T], table: Mapping[str, object], *, where: str, folder
             values.setdefault(collected[key], {})[key] = _convert(float, value, place)
             continue
         bounds = rules[key]
+        if bounds.chosen and value == bounds.chosen:
+            values[key] = None
+            continue
         _check_range(bounds, value, place)
         converted = bounds.convert(value) if bounds.convert else _convert(hints[key], value, place)
         _check_value(bounds, converted, place)

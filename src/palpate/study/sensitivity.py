@@ -27,13 +27,14 @@ from palpate.errors import (
     ResourceError,
 )
 from palpate.images.tissue import Role
-from palpate.inversion import Inversion, InversionSettings, invert
+from palpate.inversion import Inversion, InversionSettings, StopRule, invert
 from palpate.mechanics.dilatation import choose_element
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Progress, silent
 from palpate.study.body import Body, ImagedStates, joint_problem, make_body
 from palpate.study.case import LAW_NAMES, Case
 from palpate.study.case_text import case_tables
+from palpate.study.edge_length import edge_length
 from palpate.study.estimation import Observed, conclude
 from palpate.study.outputs import OutputFolder, read_json, write_json
 from palpate.study.provenance import input_digests, software_versions
@@ -47,6 +48,7 @@ __all__ = ["KEPT", "Kept", "Sensitivity", "sensitivity"]
 
 KEPT = "variants"  # folder of the finished parts
 COARSER = 1.25  # times the mesh's edge length
+NEAR = StopRule(step_sd=0.1)  # a change that is less than a tenth of the estimate's own interval says no more
 BASE = ("tissue", "unit", "value", "interval95", "relative_to", "ratio", "ratio_interval95", "verdict", "why")
 
 Bodies = tuple[Body, ...]
@@ -156,7 +158,8 @@ def sensitivity(case: Case, *, kept: Kept | None = None, sobol: int = 0, progres
         base = json_object(_estimated(case, bodies(), sobol, progress))
         kept.put(f"estimate-sobol-{sobol}", key, base)
     variations = [Variation(**each) for each in base["variations"]]
-    variants = list(_variants(case))
+    edge_mm = edge_length(case, images.first.before, images.first.after).mm
+    variants = list(_variants(case, edge_mm))
     for number, variant in enumerate(variants, start=1):
         part = kept.get(variant.name, key)
         if part is None:
@@ -190,12 +193,13 @@ def _key(case: Case, inputs: Mapping[str, str]) -> str:
 def _inverted(
     bodies: Bodies, case: Case, progress: Progress, start: NDArray[np.float64] | None = None
 ) -> tuple[Inversion, InversionSettings]:
-    """The inversion of a case, from its own starts or from one alone."""
+    """The inversion of a case from its own starts, or from one alone to a tenth of its standard deviations."""
     problem = joint_problem(bodies, case, progress=progress)
     settings = inversion_settings(case, problem.parameters)
     if start is not None:
         inside = np.clip(start, settings.bounds.lower, settings.bounds.upper)
         settings = replace(settings, starts=(inside,))
+        return invert(problem, settings, progress=progress, rule=NEAR), settings
     return invert(problem, settings, progress=progress), settings
 
 
@@ -229,20 +233,20 @@ def _estimated(case: Case, bodies: Bodies, sobol: int, progress: Progress) -> di
     }
 
 
-def _variants(case: Case) -> Iterator[_Variant]:
-    """What is estimated anew, what costs least first."""
-    law, domain, mesh = case.mechanics, case.domain, case.mesh
+def _variants(case: Case, edge_mm: float) -> Iterator[_Variant]:
+    """What is estimated anew, what costs least first; edge_mm: the edge length of the case as it is."""
+    law, domain = case.mechanics, case.domain
     laws = sorted((name for name in LAW_NAMES if name != law.law), key=lambda name: name != "linear")
     boundaries = [name for name in ("sliding", "free", "fixed") if name != domain.outer_boundary]
-    edge = COARSER * mesh.edge_length_mm
+    coarser_mm = COARSER * edge_mm
 
     def of_law(name: str) -> _Variant:
         """Under another law."""
         return _Variant(f"law-{name}", "law", name, replace(case, mechanics=replace(law, law=name)))
 
     yield from (of_law(name) for name in laws if name == "linear")
-    coarser = replace(case, mesh=replace(mesh, edge_length_mm=edge))
-    yield _Variant("edge-length", "edge_length", f"{edge:g} mm", coarser, "mesh")
+    coarser = replace(case, mesh=replace(case.mesh, edge_length_mm=coarser_mm))
+    yield _Variant("edge-length", "edge_length", f"{coarser_mm:g} mm", coarser, "mesh")
     for name in boundaries:
         other = replace(case, domain=replace(domain, outer_boundary=name))
         yield _Variant(f"outer-boundary-{name}", "outer_boundary", name, other)
@@ -265,7 +269,8 @@ def _varied(
             made = bodies()
         else:
             made = (_read(case, progress) if variant.makes == "images" else images).bodies(case, progress)
-        if variant.makes == "mesh" and made[0].edge_length_mm != case.mesh.edge_length_mm:
+        edge = made[0].edge_length
+        if variant.makes == "mesh" and edge and edge.mm != case.mesh.edge_length_mm:
             raise GeometryError(f"no mesh of {variant.setting} is fit to compute with")
         inversion, settings = _inverted(made, case, progress, theta)
         if not inversion.minimum.converged:

@@ -18,5 +18,6 @@ def mesh_summary(body: Body) -> MeshSummary:
         quality.min_dihedral_deg,
         quality.p5_dihedral_deg,
         quality.volume_error,
-        body.edge_length_mm,
+        body.edge_length.mm if body.edge_length else None,
+        body.edge_length.reason if body.edge_length else "",
     )

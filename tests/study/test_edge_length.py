@@ -1,0 +1,72 @@
+"""The edge length that a case leaves to its organs: it follows their size, and how well their surfaces are known."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from palpate.images.label_image import VoxelGrid
+from palpate.images.segmentation import Segmentation
+from palpate.images.tissue import Role, Tissue
+from palpate.study.case import Case, MeshSettings, Noise, Phantom
+from palpate.study.edge_length import EdgeLength, edge_length
+
+TISSUES = (
+    Tissue("gland", Role.ESTIMATE, (1,)),
+    Tissue("bowel", Role.DRIVER, (2,)),
+    Tissue("rest", Role.KNOWN, (), 0.45, 10.0),
+)
+CASE = Case("balls", phantom=Phantom("spheres", 1))
+
+
+def image(radius_mm=15.0, *, bowel_mm=16.0, inner_mm=0.0, scale=1.0):
+    """A ball, or a shell around `inner_mm`, above a round bowel, on voxels of `scale` mm; lengths grow with them."""
+    places = np.stack(np.meshgrid(*[np.arange(80.0)] * 3, indexing="ij"), axis=-1) - 39.5
+    far = np.linalg.norm(places - np.array([0, 0, 8]), axis=-1)
+    index = np.full(far.shape, 2)
+    index[(far < radius_mm) & (far >= inner_mm)] = 0
+    index[np.linalg.norm(places + np.array([0, 0, 22]), axis=-1) < bowel_mm] = 1
+    return Segmentation(index, VoxelGrid((80, 80, 80), np.diag([scale, scale, scale, 1.0])), TISSUES)
+
+
+def chosen(picture, case=CASE):
+    return edge_length(case, picture, (picture,))
+
+
+def test_a_stated_edge_length_holds_whatever_the_organs_are():
+    stated = dataclasses.replace(CASE, mesh=MeshSettings(2.6))
+    assert chosen(image(), stated) == EdgeLength(2.6, "stated by the case")
+
+
+@pytest.mark.parametrize(("radius_mm", "expected"), [(10.0, 4.0), (15.0, 6.0), (18.0, 7.25)])
+def test_five_edges_cross_an_organ_on_voxels_of_one_millimetre(radius_mm, expected):
+    found = chosen(image(radius_mm))
+    assert found.mm == pytest.approx(expected, abs=0.25)
+    assert found.reason == f"5.0 edges across 'gland', as large as a ball of {2 * radius_mm:.0f} mm"
+
+
+def test_an_edge_is_no_longer_than_shows_a_surface_and_no_shorter_than_pays():
+    assert chosen(image(25.0, bowel_mm=17.0, scale=1.2)).mm == 8.0
+    speck = chosen(image(4.0))
+    assert speck.mm == 3.0
+    assert (
+        "shortest that is chosen, for 5.0 edges across 'gland', as large as a ball of 8 mm would be 1.6" in speck.reason
+    )
+
+
+def test_a_thin_shell_and_a_narrow_bowel_ask_for_shorter_edges_than_balls_of_their_volume():
+    shell = chosen(image(18.0, inner_mm=8.0))
+    assert shell.mm == pytest.approx(4.0, abs=0.5)
+    assert "2.5 edges across 'gland', 10 mm thick" in shell.reason
+    assert "'bowel'" in chosen(image(18.0, bowel_mm=9.0)).reason
+
+
+def test_the_edge_grows_with_the_root_of_the_surfaces_error_within_its_bounds():
+    """Of organs of the same size: on larger voxels, and under a noise that the case states."""
+    length = chosen(image(10.0)).mm
+    noisy = dataclasses.replace(CASE, noise=Noise(surface_sd_mm=np.sqrt(15.0 / 12.0)))  # four times the error
+    assert chosen(image(10.0), noisy).mm == pytest.approx(1.5 * length, abs=0.25)
+    finer = image(20.0, bowel_mm=17.0, scale=0.5)
+    assert chosen(finer).mm == pytest.approx(0.75 * length, abs=0.25)
