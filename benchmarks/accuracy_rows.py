@@ -29,6 +29,7 @@ from palpate.study import (
     MeshSettings,
     Phantom,
     aligned,
+    edge_length_of,
     inverse_problem,
     inversion_settings,
     make_body,
@@ -49,26 +50,24 @@ class Row:
     noise: Noise | None = None
     tumour: bool = False
     data: str = "voxels"
-    edge_mm: float = 4.0
-    truth_edge_mm: float = 2.7
+    edge_mm: float | None = None  # None: the program's own choice
+    truth_edge_mm: float = 3.4
     draws: int = 1  # of the noise, for each pelvis
     law: str = "linear"  # of the truth and of the estimate
     poisson_ratio: float | None = None  # None: 0.40 to 0.45 at random
 
 
 ROWS = {
-    "same-mesh": Row(2, data="same mesh", truth_edge_mm=4.0),
+    "same-mesh": Row(2, data="same mesh", truth_edge_mm=5.0),
     "other-mesh": Row(4, data="surfaces"),
     "clean": Row(8),
     "clean-3mm": Row(4, filling_mm=3.0),
-    "noise": Row(8, spacing_mm=(1.0, 1.0, 2.5), noise=NOISE, edge_mm=6.0, draws=3),
+    "noise": Row(8, spacing_mm=(1.0, 1.0, 2.5), noise=NOISE, draws=3),
     "tumour": Row(3, tumour=True),
     "nu-0.49": Row(4, poisson_ratio=0.49),
-    "finite-clean": Row(6, law="neo-hookean", edge_mm=5.0, truth_edge_mm=3.4),
-    "finite-clean-3mm": Row(3, law="neo-hookean", edge_mm=5.0, truth_edge_mm=3.4, filling_mm=3.0),
-    "finite-noise": Row(
-        6, law="neo-hookean", edge_mm=6.0, truth_edge_mm=3.4, spacing_mm=(1.0, 1.0, 2.5), noise=NOISE, draws=2
-    ),
+    "finite-clean": Row(6, law="neo-hookean"),
+    "finite-clean-3mm": Row(3, law="neo-hookean", filling_mm=3.0),
+    "finite-noise": Row(6, law="neo-hookean", spacing_mm=(1.0, 1.0, 2.5), noise=NOISE, draws=2),
 }
 
 
@@ -146,7 +145,9 @@ def _from_surfaces(scene: Scene, case: Case, options: PelvisOptions, row: Row) -
     if same_mesh:
         space = lagrange_space(scene.mesh, "P2")
     else:
-        space = lagrange_space(tetrahedralise(pelvis_anatomy(options), edge_length_mm=row.edge_mm), "P2")
+        before, after = (segment(image, scene.tissues) for image in (scene.before, scene.after))
+        edge_mm = edge_length_of(case, before, (after,)).mm
+        space = lagrange_space(tetrahedralise(pelvis_anatomy(options), edge_length_mm=edge_mm), "P2")
     driver = case.driver
     motion = prescribed_motion(space, {}, n_modes=driver.modes, kernel_mm=driver.kernel_mm, prior_mm=driver.prior_mm)
     constraint = outer_constraint(

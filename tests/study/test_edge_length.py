@@ -11,7 +11,7 @@ from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.study.case import Case, MeshSettings, Noise, Phantom
-from palpate.study.edge_length import EdgeLength, edge_length
+from palpate.study.edge_length import EdgeLength, edge_length_of
 
 TISSUES = (
     Tissue("gland", Role.ESTIMATE, (1,)),
@@ -32,7 +32,7 @@ def image(radius_mm=15.0, *, bowel_mm=16.0, inner_mm=0.0, scale=1.0):
 
 
 def chosen(picture, case=CASE):
-    return edge_length(case, picture, (picture,))
+    return edge_length_of(case, picture, (picture,))
 
 
 def test_a_stated_edge_length_holds_whatever_the_organs_are():

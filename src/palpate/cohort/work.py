@@ -19,7 +19,7 @@ from palpate.study import run
 from palpate.study.case import Case
 from palpate.study.case_as_run import refuse_other_case
 from palpate.study.cost import ExpectedCost
-from palpate.study.edge_length import edge_length
+from palpate.study.edge_length import edge_length_of
 from palpate.study.outputs import OutputFolder
 from palpate.study.read import read_states
 
@@ -79,7 +79,7 @@ def _edge_length_mm(case: Case) -> float:
     if case.mesh.edge_length_mm is not None:
         return case.mesh.edge_length_mm
     states = read_states(case)
-    return edge_length(case, states.before, states.after).mm
+    return edge_length_of(case, states.before, states.after).mm
 
 
 def _estimated(task: Task, case: Case, key: str, outputs: OutputFolder, tell: Tell) -> Outcome:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,7 +165,8 @@ class ParameterMap:
 
     def coefficients(self, unknowns: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         """Driver coefficients (n_modes,) of each state."""
-        return np.split(unknowns[self.n_parameters :], np.cumsum(self.n_modes)[:-1])
+        ends = np.add.accumulate([self.n_parameters, *self.n_modes]).tolist()
+        return [unknowns[start:end] for start, end in pairwise(ends)]
 
     def unknowns_of(self, state: int) -> NDArray[np.int64]:
         """Numbers (n_parameters + n_modes,) of the unknowns that move a state: theta, then its own coefficients."""

@@ -100,7 +100,9 @@ class ReducedModel:
         Nothing is checked: it is the fast way of those who ask ten thousands of times.
         """
         force = moduli @ (self.coupling @ given) - self.load
-        _, solution, failed = linalg.lapack.dposv(np.tensordot(moduli, self.stiffness, axes=1), force, lower=1)
+        stiffness = (moduli @ self.stiffness.reshape(len(moduli), -1)).reshape(self.n_basis, -1)
+        # a symmetric matrix is its own transpose, which LAPACK takes without a copy
+        _, solution, failed = linalg.lapack.dposv(stiffness.T, force, overwrite_a=1, overwrite_b=1)
         if failed:
             raise self._indefinite(moduli)
         return np.asarray(-solution)

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from palpate.study.case_file import read_case
     from palpate.study.cost import ExpectedCost, expected_cost
     from palpate.study.earlier import strange_files
+    from palpate.study.edge_length import EdgeLength, edge_length_of
     from palpate.study.estimation import Observed, conclude, verdict
     from palpate.study.journal import recover
     from palpate.study.lock import held_folder, own_file
@@ -27,6 +28,7 @@ __all__ = [
     "CaseResult",
     "Domain",
     "DriverMotion",
+    "EdgeLength",
     "ExpectedCost",
     "ImagedStates",
     "Mechanics",
@@ -35,6 +37,7 @@ __all__ = [
     "Phantom",
     "aligned",
     "conclude",
+    "edge_length_of",
     "estimate",
     "estimate_states",
     "expected_cost",
@@ -66,6 +69,7 @@ _HOMES = {
     "CaseResult": "palpate.study.result",
     "Domain": "palpate.study.case",
     "DriverMotion": "palpate.study.case",
+    "EdgeLength": "palpate.study.edge_length",
     "ExpectedCost": "palpate.study.cost",
     "ImagedStates": "palpate.study.body",
     "Mechanics": "palpate.study.case",
@@ -74,6 +78,7 @@ _HOMES = {
     "Phantom": "palpate.study.case",
     "aligned": "palpate.study.body",
     "conclude": "palpate.study.estimation",
+    "edge_length_of": "palpate.study.edge_length",
     "estimate": "palpate.study.run",
     "estimate_states": "palpate.study.run",
     "expected_cost": "palpate.study.cost",

@@ -235,7 +235,7 @@ class CaseLoad:
 
 @dataclass(frozen=True, slots=True)
 class MeshSettings:
-    """Edge length (mm) of the tetrahedra at the organs; None: "auto", chosen by the organs (see `chosen_edge`)."""
+    """Edge length (mm) of the tetrahedra at the organs; None: "auto", chosen by the organs (see `edge_length_of`)."""
 
     edge_length_mm: float | None = field(default=None, metadata=rule(between=(0.01, 1e3), chosen=AUTO))
 

@@ -33,7 +33,7 @@ from palpate.study.cost import (
     machine_memory_gb,
 )
 from palpate.study.domain import case_domain
-from palpate.study.edge_length import edge_length
+from palpate.study.edge_length import edge_length_of
 from palpate.study.meshing import refuse_edge
 from palpate.study.plausibility import unit_warnings
 from palpate.study.read import read_segmentation, read_states
@@ -201,7 +201,7 @@ def _cost(problems: _Problems, pairs: Sequence[ImagedStates], case: Case, progre
     """What an estimate would cost on its very meshes; on meshes of a guessed size where something is refused."""
     first = pairs[0]
     cost = expected_cost(case, first.before, first.after, n_pairs=len(pairs))
-    edge = edge_length(case, first.before, first.after).mm
+    edge = edge_length_of(case, first.before, first.after).mm
     problems.attempt(lambda: refuse_edge(edge, case_domain(first.before, first.after, case)))
     if any(problem.exit_code for problem in problems.all()):
         return cost

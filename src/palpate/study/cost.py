@@ -18,7 +18,7 @@ from palpate.parallel import processors
 from palpate.progress import STAGES, Stage
 from palpate.study.case import Case
 from palpate.study.domain import case_domain
-from palpate.study.edge_length import edge_length
+from palpate.study.edge_length import edge_length_of
 
 __all__ = [
     "MEMORY_FACTOR",
@@ -119,7 +119,7 @@ def cost_of_meshes(
 
 def expected_tets(case: Case, before: Segmentation, after: tuple[Segmentation, ...]) -> int:
     """Number of tetrahedra in the mesh of a reference state."""
-    return tets_by_edge(case, before, after)(edge_length(case, before, after).mm)
+    return tets_by_edge(case, before, after)(edge_length_of(case, before, after).mm)
 
 
 def tets_by_edge(case: Case, before: Segmentation, after: tuple[Segmentation, ...]) -> Callable[[float], int]:

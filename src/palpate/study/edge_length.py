@@ -15,7 +15,7 @@ from palpate.images.tissue import Role
 from palpate.images.tissue_distance import window_around
 from palpate.study.case import Case
 
-__all__ = ["EdgeLength", "edge_length"]
+__all__ = ["EdgeLength", "edge_length_of"]
 
 ACROSS_BALL = {Role.ESTIMATE: 5.0, Role.DRIVER: 4.0}  # edges across a ball of the tissue's volume
 ACROSS_THIN = 2.5  # edges across its thickness
@@ -34,7 +34,7 @@ class EdgeLength:
     reason: str
 
 
-def edge_length(case: Case, before: Segmentation, after: Sequence[Segmentation]) -> EdgeLength:
+def edge_length_of(case: Case, before: Segmentation, after: Sequence[Segmentation]) -> EdgeLength:
     """The edge length of `case`; where it leaves the choice, what keeps the mesh's error below a fifth of the interval.
 
     h = min_i min(d_i / n_i, t_i / 2.5) sqrt(s / s_1) over the `estimate` tissues (n = 5) and drivers (n = 4) of the

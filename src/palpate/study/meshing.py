@@ -18,7 +18,7 @@ from palpate.progress import Progress
 from palpate.study.case import Case
 from palpate.study.cost import expected_cost, lack_of_memory
 from palpate.study.domain import case_domain
-from palpate.study.edge_length import EdgeLength, edge_length
+from palpate.study.edge_length import EdgeLength, edge_length_of
 
 __all__ = ["ReferenceMesh", "mesh_reference", "refuse_edge"]
 
@@ -40,14 +40,14 @@ class ReferenceMesh:
 def mesh_reference(
     before: Segmentation, after: tuple[Segmentation, ...], case: Case, *, progress: Progress
 ) -> ReferenceMesh:
-    """Mesh `before` inside the domain that it shares with the later images, with the edge length of `edge_length`.
+    """Mesh `before` inside the domain that it shares with the later images, with the edge length of `edge_length_of`.
 
     A mesh that fails its gate, or that Mmg gives up, is followed by one of 0.75 times the edge length, at most twice
     and where this machine has the memory for an estimate on it; the finding "finer-mesh" tells of it. Raises
     `GeometryError` when none is fit, `ResourceError` where the mesher stops for want of memory.
     """
     box = case_domain(before, after, case)
-    chosen = edge_length(case, before, after)
+    chosen = edge_length_of(case, before, after)
     asked = chosen.mm
     refuse_edge(asked, box)
     progress(f"surfaces of {len(before.tissues)} tissues in {np.round(box.lengths).astype(int).tolist()} mm")

@@ -12,7 +12,7 @@ from palpate.images.segmentation import segment
 from palpate.images.tissue import Role
 from palpate.study.case import REMAINING, Case, CaseTissue, Domain, Images
 from palpate.study.cost import MEMORY_FACTOR, cost_of_meshes, expected_size, machine_memory_gb, tets_by_edge
-from palpate.study.edge_length import edge_length
+from palpate.study.edge_length import edge_length_of
 from palpate.study.guess import GuessedTissue
 
 __all__ = ["MARGIN_MM", "proposed_edge", "proposed_window"]
@@ -57,7 +57,7 @@ def proposed_edge(
         domain=Domain("margin" if cropped else "image", MARGIN_MM),
     )
     first, *later = (segment(image, case.resolve_tissues({})) for image in (before, *after))
-    suited, has = edge_length(case, first, later), machine_memory_gb()
+    suited, has = edge_length_of(case, first, later), machine_memory_gb()
     edge, why = suited.mm, suited.reason
     tets = tets_by_edge(case, first, tuple(later))
 

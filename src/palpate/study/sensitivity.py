@@ -34,7 +34,7 @@ from palpate.progress import Progress, silent
 from palpate.study.body import Body, ImagedStates, joint_problem, make_body
 from palpate.study.case import LAW_NAMES, Case
 from palpate.study.case_text import case_tables
-from palpate.study.edge_length import edge_length
+from palpate.study.edge_length import edge_length_of
 from palpate.study.estimation import Observed, conclude
 from palpate.study.outputs import OutputFolder, read_json, write_json
 from palpate.study.provenance import input_digests, software_versions
@@ -158,7 +158,7 @@ def sensitivity(case: Case, *, kept: Kept | None = None, sobol: int = 0, progres
         base = json_object(_estimated(case, bodies(), sobol, progress))
         kept.put(f"estimate-sobol-{sobol}", key, base)
     variations = [Variation(**each) for each in base["variations"]]
-    edge_mm = edge_length(case, images.first.before, images.first.after).mm
+    edge_mm = edge_length_of(case, images.first.before, images.first.after).mm
     variants = list(_variants(case, edge_mm))
     for number, variant in enumerate(variants, start=1):
         part = kept.get(variant.name, key)

@@ -18,6 +18,7 @@ from palpate.inversion.optimise import Bounds
 from palpate.mechanics.curved import CurvedModel
 from palpate.mechanics.forward import ForwardModel
 from palpate.mechanics.reduced import ReducedModel
+from palpate.parallel import blas_on_one_thread
 from palpate.uncertainty.profile import fixed_correspondence
 
 __all__ = [
@@ -33,6 +34,7 @@ STEP = 0.35  # of a proposal, in standard deviations of the posterior
 THIN = 10  # steps of a draw that is kept
 SPREAD = 1.5  # standard deviations, by which chains start apart
 BETWEEN_CHECKS = 4000  # evaluations
+ONE = np.ones(1)
 GAP = 1.0  # of log-likelihood, that the frozen posterior may be off; re-chosen closest points alone make some tenths
 
 
@@ -56,8 +58,8 @@ class FrozenPosterior:
         total = 0.5 * float(away @ self.prior @ away)
         parts = zip(self.models, self.forms, parameters.coefficients(unknowns), strict=True)
         for model, form, coefficients in parts:
-            state = np.append(_coordinates(model, moduli, coefficients), 1.0)
-            total += 0.5 * float(state @ form @ state)
+            state = np.concatenate([_coordinates(model, moduli, coefficients), ONE])
+            total += 0.5 * float(state @ (form @ state))
         return total
 
 
@@ -135,7 +137,7 @@ def _coordinates(
     """[a, q], and [a, q, ln E - ln E_0] of a model that an expansion adds to."""
     reduced = _reduced(model)
     assert isinstance(reduced, ReducedModel)
-    found = [reduced.amplitude(moduli, np.append(coefficients, 1.0)), coefficients]
+    found = [reduced.amplitude(moduli, np.concatenate([coefficients, ONE])), coefficients]
     if isinstance(model, CurvedModel):
         found.append(np.log(moduli / model.expansion.moduli))
     return np.concatenate(found)
@@ -152,6 +154,7 @@ def _answer(model: ReducedModel | CurvedModel) -> NDArray[np.float64]:
     return np.concatenate([reduced.output_basis, reduced.output_modes + by_mode, by_modulus], axis=1)
 
 
+@blas_on_one_thread()
 def sample_posterior(
     objective: Objective,
     start: NDArray[np.float64],
