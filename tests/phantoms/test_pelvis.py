@@ -105,3 +105,14 @@ def test_wall_motion_does_not_depend_on_what_else_is_asked_for():
     plain = pelvis(PelvisOptions(seed=3, filling_mm=3.0, truth_edge_mm=9.0, spacing_mm=(2, 2, 2.5)))
     assert plain.motions["rectum"].at(points) == pytest.approx(scene().motions["rectum"].at(points))
     assert plain.moduli_kpa["prostate"] == scene().moduli_kpa["prostate"]
+
+
+def test_another_motion_moves_the_same_body():
+    options = PelvisOptions(seed=3, filling_mm=3.0, truth_edge_mm=9.0, spacing_mm=(2, 2, 2.5), motion_seed=1)
+    other = pelvis(options)
+    assert other.moduli_kpa == {name: scene().moduli_kpa[name] for name in other.moduli_kpa}
+    wall = other.mesh.boundary[other.mesh.beyond == other.mesh.tissue_index("rectum")]
+    points = other.space.points[np.unique(other.space.facets(wall))]
+    moved, before = other.motions["rectum"].at(points), scene().motions["rectum"].at(points)
+    assert np.linalg.norm(moved - before, axis=1).max() > 0.5
+    assert np.linalg.norm(moved, axis=1).max() == pytest.approx(3.0, rel=0.3)

@@ -32,7 +32,8 @@ class PelvisOptions:
     `filling_mm`: the rectum's wall moves so far where it moves most; `moduli_kpa` by tissue (default: prostate and
     bladder 15 to 60 kPa, a tumour 2 to 3 times its gland; the surroundings have 10 kPa); `poisson_ratio` of all
     tissues or by tissue (default 0.40 to 0.45 each); `bone_motion_mm` and as many degrees move each bone as a rigid
-    body; `law` and `law_parameters`: the tissues' (see `make_scene`).
+    body; `law` and `law_parameters`: the tissues' (see `make_scene`); `motion_seed` draws another motion of the same
+    body.
     """
 
     seed: int
@@ -48,6 +49,7 @@ class PelvisOptions:
     tumour: bool = False
     law: str = "linear"
     law_parameters: Mapping[str, float] = field(default_factory=dict)
+    motion_seed: int | None = None
 
 
 def pelvis(options: PelvisOptions) -> Scene:
@@ -59,6 +61,8 @@ def pelvis(options: PelvisOptions) -> Scene:
     over, `ConfigurationError` for a field that is too small or a modulus for an unknown tissue.
     """
     motion_rng = np.random.default_rng(options.seed).spawn(3)[2]
+    if options.motion_seed is not None:
+        motion_rng = np.random.default_rng([options.seed, options.motion_seed])
     grid = pelvis_grid(options)
     body = _body(options)
     turn = rotation_about(motion_rng.normal(size=3), motion_rng.uniform(0.0, 30.0))

@@ -1,0 +1,138 @@
+"""What further image pairs of a patient are worth, and what one spoilt pair costs.
+
+    python benchmarks/pairs.py [--patients 20] [--first-seed 701] [--law linear] [--output FILE] [--json]
+
+Simulated pelves: a patient has one body and four pairs of label images, each with a motion and a noise of its own (0.3
+mm over 6 mm, voxels of 1 x 1 x 2.5 mm). Estimated are the first pair alone, all four together, and the same with the
+prostate of the fourth pair's later image shifted by 3 mm. The robust estimate is the random-effects mean of the pairs
+that are no outliers (`image_pairs` of a result). A line of JSON a patient; another run with the same file adds to it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate.images import LabelImage, segment
+from palpate.phantoms import Noise, PelvisOptions, Scene, pelvis, pelvis_grid, reimaged
+from palpate.study import Case, ImagedStates, Mechanics, Phantom, aligned, estimate_states
+
+PAIRS = 4
+NOISE = Noise(surface_sd_mm=0.3, correlation_length_mm=6.0)
+SHIFT_MM, SHIFTED = 3.0, "prostate"
+
+
+def main() -> int:
+    """Run what was asked for and print the summary."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--patients", type=int, default=20)
+    parser.add_argument("--first-seed", type=int, default=701)
+    parser.add_argument("--law", default="linear")
+    parser.add_argument("--output", type=Path, default=Path("pairs.jsonl"))
+    parser.add_argument("--json", action="store_true", help="print one JSON document")
+    asked = parser.parse_args()
+    rows = [json.loads(line) for line in asked.output.read_text().splitlines()] if asked.output.exists() else []
+    done = {(row["law"], row["seed"]) for row in rows}
+    for seed in range(asked.first_seed, asked.first_seed + asked.patients):
+        if (asked.law, seed) in done:
+            continue
+        rows.append({"law": asked.law, "seed": seed, **_patient(seed, asked.law)})
+        with asked.output.open("a") as file:
+            file.write(json.dumps(rows[-1]) + "\n")
+        print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
+    summary = _summary([row for row in rows if row["law"] == asked.law])
+    print(json.dumps(summary, indent=1) if asked.json else "\n".join(f"{k}: {v}" for k, v in summary.items()))
+    return 0
+
+
+def _patient(seed: int, law: str) -> dict[str, Any]:
+    """Errors of ln E: of the first pair, of all four, and of all with a spoilt one."""
+    rng = np.random.default_rng([seed, 5])
+    scenes = [_scene(seed, number, law, float(rng.uniform(6.0, 8.0))) for number in range(PAIRS)]
+    states = [_states(scene, scene.after) for scene in scenes]
+    last = scenes[-1]
+    spoilt = [*states[:-1], _states(last, _shifted(last, rng))]
+    case = Case(f"patient-{seed}", phantom=Phantom("pelvis", seed), mechanics=Mechanics(law))
+    tried = {"one": states[:1], "four": states, "spoilt": spoilt}
+    return {name: _estimated(case, pairs, scenes[0].moduli_kpa) for name, pairs in tried.items()}
+
+
+def _scene(seed: int, number: int, law: str, filling_mm: float) -> Scene:
+    """One pair of images of a patient, with a noise of its own."""
+    options = PelvisOptions(seed, filling_mm, (1.0, 1.0, 2.5), truth_edge_mm=5.0, law=law, motion_seed=number)
+    return reimaged(replace(pelvis(options), seed=seed + 1000 * number), pelvis_grid(options), noise=NOISE)
+
+
+def _states(scene: Scene, after: LabelImage) -> ImagedStates:
+    return aligned(segment(scene.before, scene.tissues), (segment(after, scene.tissues),), method="none")
+
+
+def _shifted(scene: Scene, rng: np.random.Generator) -> LabelImage:
+    """The later image with one organ drawn 3 mm beside its place, along a direction in the slice."""
+    label = scene.mesh.tissue_index(SHIFTED) + 1
+    rest = scene.mesh.tissue_index("surroundings") + 1
+    axis, sign = int(rng.integers(2)), int(rng.choice([-1, 1]))
+    steps = sign * round(SHIFT_MM / float(scene.after.grid.spacing[axis]))
+    organ = scene.after.labels == label
+    labels = np.where(organ, rest, scene.after.labels)
+    return replace(scene.after, labels=np.where(np.roll(organ, steps, axis), label, labels))
+
+
+def _estimated(case: Case, pairs: Sequence[ImagedStates], truth: Mapping[str, float]) -> dict[str, Any]:
+    """Errors of ln E by organ, of the joint estimate, of every pair alone in it, and of the robust mean."""
+    began = time.perf_counter()
+    estimation = estimate_states(pairs[0], case, further=tuple(pairs[1:]), truth=truth).estimation
+    found: dict[str, Any] = {"status": estimation.status, "seconds": round(time.perf_counter() - began, 1)}
+    found["joint"] = [
+        None if e.value is None else float(np.log(e.value / truth[e.tissue])) for e in estimation.estimates
+    ]
+    together = estimation.image_pairs
+    if together is not None:
+        names = [e.tissue for e in estimation.estimates]
+
+        def errors(moduli: Mapping[str, float]) -> list[float]:
+            """Of ln E by organ."""
+            return [float(np.log(moduli[name] / truth[name])) for name in names]
+
+        found |= {"alone": [errors(pair.moduli) for pair in together.alone], "robust": errors(together.mean)}
+        found |= {"outlier": [pair.outlier for pair in together.alone], "p": together.heterogeneity_p}
+    return found
+
+
+def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Root mean squares over patients whose three estimates all converged, and how often the spoilt pair was named."""
+    whole = [row for row in rows if all(row[name]["status"] == "converged" for name in ("one", "four", "spoilt"))]
+
+    def rms(name: str, kind: str) -> float:
+        """Of one estimate."""
+        return float(np.sqrt(np.mean([np.square(row[name][kind]) for row in whole])))
+
+    one, four, robust, spoilt = (rms(*which) for which in (("one", "joint"), ("four", "joint"), ("four", "robust"),
+                                                           ("spoilt", "robust")))  # fmt: skip
+    return {
+        "patients": len(rows),
+        "converged": len(whole),
+        "one pair": one,
+        "every pair alone": rms("four", "alone"),
+        "four pairs": four,
+        "four pairs over one": four / one,
+        "robust mean of four": robust,
+        "robust mean over one": robust / one,
+        "robust mean, one of four spoilt": spoilt,
+        "spoilt over good": spoilt / robust,
+        "joint, one of four spoilt": rms("spoilt", "joint"),
+        "spoilt pair named": float(np.mean([row["spoilt"]["outlier"][-1] for row in whole])),
+        "good pair named": float(np.mean([row["four"]["outlier"] for row in whole])),
+    }
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
