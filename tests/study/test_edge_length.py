@@ -10,6 +10,7 @@ import pytest
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
+from palpate.study import edge_length
 from palpate.study.case import Case, MeshSettings, Noise, Phantom
 from palpate.study.edge_length import EdgeLength, edge_length_of
 
@@ -70,3 +71,10 @@ def test_the_edge_grows_with_the_root_of_the_surfaces_error_within_its_bounds():
     assert chosen(image(10.0), noisy).mm == pytest.approx(1.5 * length, abs=0.25)
     finer = image(20.0, bowel_mm=17.0, scale=0.5)
     assert chosen(finer).mm == pytest.approx(0.75 * length, abs=0.25)
+
+
+def test_a_large_organ_is_measured_on_every_second_voxel(monkeypatch):
+    shell = image(18.0, inner_mm=8.0)
+    whole = chosen(shell).mm
+    monkeypatch.setattr(edge_length, "MOST_VOXELS", 24)
+    assert chosen(shell).mm == pytest.approx(whole, abs=0.8)

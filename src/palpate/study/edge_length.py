@@ -24,6 +24,7 @@ FINEST, COARSEST = 0.75, 1.5  # times that edge length, for better and worse sur
 LEAST_MM, LEAST_VOXELS = 3.0, 2.0  # shorter edges cost more than they show
 LONGEST_MM = 8.0  # a quadratic element has a point of the surface every 4 mm
 STEP_MM = 0.25  # to which the edge length is rounded down
+MOST_VOXELS = 128  # along each axis, in which a thickness is measured
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +67,8 @@ def edge_length_of(case: Case, before: Segmentation, after: Sequence[Segmentatio
 
 
 def _thickness(mask: NDArray[np.bool_], grid: VoxelGrid) -> float:
-    """Diameter (mm) of the largest ball inside `mask` (n_x, n_y, n_z)."""
-    part = np.pad(mask[window_around(mask, grid, reach_mm=0.0)], 1)
-    return 2.0 * float(ndimage.distance_transform_edt(part, sampling=grid.spacing).max())
+    """Diameter (mm) of the largest ball inside `mask` (n_x, n_y, n_z); of a large tissue on every second, ... voxel."""
+    part = mask[window_around(mask, grid, reach_mm=0.0)]
+    steps = [-(-n // MOST_VOXELS) for n in part.shape]
+    part = np.pad(part[:: steps[0], :: steps[1], :: steps[2]], 1)
+    return 2.0 * float(ndimage.distance_transform_edt(part, sampling=steps * grid.spacing).max())
