@@ -59,7 +59,7 @@ class Row:
 
 ROWS = {
     "same-mesh": Row(2, data="same mesh", truth_edge_mm=5.0),
-    "other-mesh": Row(4, data="surfaces"),
+    "other-mesh": Row(4, data="surfaces", edge_mm=4.0, truth_edge_mm=2.7),  # what exact surfaces show
     "clean": Row(8),
     "clean-3mm": Row(4, filling_mm=3.0),
     "noise": Row(8, spacing_mm=(1.0, 1.0, 2.5), noise=NOISE, draws=3),

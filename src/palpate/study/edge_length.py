@@ -42,7 +42,7 @@ def edge_length_of(case: Case, before: Segmentation, after: Sequence[Segmentatio
     reference state, d_i the diameter of a ball of the tissue's volume and t_i that of the largest ball inside it; s the
     standard deviation of the surfaces, by voxels v and the case's own noise, s^2 = v^2 / 12 + sd^2, and s_1 that of
     voxels of 1 mm: the mesh's error grows with (h / d)^2, the interval with s. The root is held between 0.75 and 1.5, h
-    between 3 mm, or two voxels, and 8 mm. docs/method.md, section 3, has the measurements.
+    between 3 mm, or two voxels, and 8 mm. docs/method.md, section 2, has the measurements.
     """
     stated = case.mesh.edge_length_mm
     if stated is not None:
