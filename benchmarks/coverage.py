@@ -107,7 +107,7 @@ def main() -> int:
     """Run what was asked for and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--settings", default=",".join(SETTINGS))
-    parser.add_argument("--laws", default="linear,neo-hookean")
+    parser.add_argument("--laws", default="linear", help="with commas; others reach noise of 0.1 mm only")
     parser.add_argument("--pelves", type=int, default=10)
     parser.add_argument("--draws", type=int, default=20)
     parser.add_argument("--first-seed", type=int, default=501)
