@@ -140,6 +140,7 @@ BAD = {
     "images=3": "must be a table",
     "mesh.edge_length_mm=0": "must be a number from 0.01 to 1000",
     "mesh.edge_length_mm=nan": "is nan, but it must be a number",
+    "mesh.edge_length_mm='atuo'": "is 'atuo', but it must be a number or 'auto'",
     "seed=true": "whole number",
     "seed=1.5": "whole number",
     "mechanics.law=hooke": "did you mean",

@@ -107,7 +107,9 @@ def read_table(kind: type[T], table: Mapping[str, object], *, where: str, folder
             values.setdefault(collected[key], {})[key] = _convert(float, value, place)
             continue
         bounds = rules[key]
-        if bounds.chosen and value == bounds.chosen:
+        if bounds.chosen and isinstance(value, str):
+            if value != bounds.chosen:
+                raise ConfigurationError(f"{place} is {shown(value)}, but it must be a number or '{bounds.chosen}'")
             values[key] = None
             continue
         _check_range(bounds, value, place)
