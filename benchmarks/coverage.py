@@ -219,6 +219,7 @@ def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "coverage95_interval": [float(interval.low), float(interval.high)],
         "calibration": {str(level): float(np.mean(roots <= stats.norm.ppf(0.5 + level / 2))) for level in LEVELS},
         "sd_over_spread": float(1.0 / np.median(spread)),
+        "mean_error_over_sd": float(np.mean([o["error"] / o["sd"] for o in organs])),
         "beyond_three_half_widths": int(np.sum(np.abs([o["error"] for o in organs]) > FAR * half)),
         "profile_share": float(np.mean([o["kind"] == "profile" for o in organs])),
         "median_error_percent": float(100.0 * np.median(np.abs(np.expm1([o["error"] for o in organs])))),

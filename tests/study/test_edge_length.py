@@ -11,7 +11,7 @@ from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.study import edge_length
-from palpate.study.case import Case, MeshSettings, Noise, Phantom
+from palpate.study.case import Case, Mechanics, MeshSettings, Noise, Phantom
 from palpate.study.edge_length import EdgeLength, edge_length_of
 
 TISSUES = (
@@ -67,8 +67,9 @@ def test_a_thin_shell_and_a_narrow_bowel_ask_for_shorter_edges_than_balls_of_the
 def test_the_edge_grows_with_the_root_of_the_surfaces_error_within_its_bounds():
     """Of organs of the same size: on larger voxels, and under a noise that the case states."""
     length = chosen(image(10.0)).mm
-    noisy = dataclasses.replace(CASE, noise=Noise(surface_sd_mm=np.sqrt(15.0 / 12.0)))  # four times the error
-    assert chosen(image(10.0), noisy).mm == pytest.approx(1.5 * length, abs=0.25)
+    for error, factor in ((2.0, np.sqrt(2.0)), (4.0, 1.5)):  # times that of the voxels alone
+        noisy = dataclasses.replace(CASE, noise=Noise(surface_sd_mm=np.sqrt((error**2 - 1.0) / 12.0)))
+        assert chosen(image(10.0), noisy).mm == pytest.approx(factor * length, abs=0.25)
     finer = image(20.0, bowel_mm=17.0, scale=0.5)
     assert chosen(finer).mm == pytest.approx(0.75 * length, abs=0.25)
 
@@ -78,3 +79,14 @@ def test_a_large_organ_is_measured_on_every_second_voxel(monkeypatch):
     whole = chosen(shell).mm
     monkeypatch.setattr(edge_length, "MOST_VOXELS", 24)
     assert chosen(shell).mm == pytest.approx(whole, abs=0.8)
+
+
+def test_linear_elements_get_half_the_edge_length_and_so_the_same_points():
+    linear = dataclasses.replace(CASE, mechanics=Mechanics("linear", "P1"))
+    assert chosen(image(18.0), linear).mm == pytest.approx(0.5 * chosen(image(18.0)).mm, abs=0.25)
+    assert chosen(image(25.0, bowel_mm=17.0, scale=1.2), linear).mm == 4.0
+
+
+def test_the_shortest_edge_is_not_rounded_below_two_voxels():
+    coarse = chosen(image(3.0, bowel_mm=17.0, scale=2.05))
+    assert coarse.mm == 4.25

@@ -96,7 +96,7 @@ def interrupted(case_file, tmp_path_factory):
             palpate.sensitivity(case, sobol=8, output=folder)
         before = len(calls)
         assert calls[0] == (len(case.estimate.start_ratios), {}), "the case itself, from every start to full accuracy"
-        assert calls[1:] == [(1, {"rule": study.NEAR})] * (before - 1)
+        assert calls[1:] == [(1, {"rule": study.VARIED})] * (before - 1)
         found = palpate.sensitivity(case, sobol=8, output=folder, progress=told.append)
         assert len(calls) == before + 1, "what was finished is not computed again"
         assert main(["sensitivity", str(case_file), "--sobol", "8", "--output", str(folder), "--quiet"]) == 0

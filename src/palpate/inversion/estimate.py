@@ -131,8 +131,9 @@ def continue_at_finite_strain(
 ) -> Inversion:
     """The estimate under the law of the states' `finite_strain` models, from the candidates of the `linear` one.
 
-    The best one is continued always, the others where they are minima; of these one without equilibrium is left out.
-    Raises `NotConverged` when the best one's is not found, with the element and the share of the motion.
+    The best one is continued always, the others where they are minima; of these one without equilibrium is left out of
+    the comparison. rule: when each ends. Raises `NotConverged` when the best one's equilibrium is not found, with the
+    element and the share of the motion where it ended.
     """
     waiting = {number: candidate.iterate for number, candidate in enumerate(linear.candidates)}
     linear = replace(linear, candidates=())  # and with them their reduced bases, which are large, one by one

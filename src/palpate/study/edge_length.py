@@ -13,6 +13,7 @@ from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.images.tissue_distance import window_around
+from palpate.mechanics.dilatation import choose_element
 from palpate.study.case import Case
 
 __all__ = ["EdgeLength", "edge_length_of"]
@@ -20,10 +21,11 @@ __all__ = ["EdgeLength", "edge_length_of"]
 ACROSS_BALL = {Role.ESTIMATE: 5.0, Role.DRIVER: 4.0}  # edges across a ball of the tissue's volume
 ACROSS_THIN = 2.5  # edges across its thickness
 SURFACE_MM = 12.0**-0.5  # standard deviation of a place in a voxel of 1 mm, for which these numbers hold
-FINEST, COARSEST = 0.75, 1.5  # times that edge length, for better and worse surfaces
+FACTORS = (0.75, 1.5)  # least and most, times that edge length, for better and worse surfaces
 LEAST_MM, LEAST_VOXELS = 3.0, 2.0  # shorter edges cost more than they show
-LONGEST_MM = 8.0  # a quadratic element has a point of the surface every 4 mm
-STEP_MM = 0.25  # to which the edge length is rounded down
+LONGEST_MM = 8.0  # of a quadratic element, which has a point of the surface every 4 mm
+LINEAR = 0.5  # times the edge length of quadratic elements: the same points
+STEP_MM = 0.25  # to which the edge length is rounded
 MOST_VOXELS = 128  # along each axis, in which a thickness is measured
 
 
@@ -36,21 +38,22 @@ class EdgeLength:
 
 
 def edge_length_of(case: Case, before: Segmentation, after: Sequence[Segmentation]) -> EdgeLength:
-    """The edge length of `case`; where it leaves the choice, what keeps the mesh's error below a fifth of the interval.
+    """The edge length of `case`; where it leaves the choice, one whose error is about a fifth of the interval at most.
 
     h = min_i min(d_i / n_i, t_i / 2.5) sqrt(s / s_1) over the `estimate` tissues (n = 5) and drivers (n = 4) of the
     reference state, d_i the diameter of a ball of the tissue's volume and t_i that of the largest ball inside it; s the
     standard deviation of the surfaces, by voxels v and the case's own noise, s^2 = v^2 / 12 + sd^2, and s_1 that of
-    voxels of 1 mm: the mesh's error grows with (h / d)^2, the interval with s. The root is held between 0.75 and 1.5, h
-    between 3 mm, or two voxels, and 8 mm. docs/method.md, section 2, has the measurements.
+    voxels of 1 mm. The root is held between 0.75 and 1.5, h between 3 mm, or two voxels, and 8 mm; linear elements get
+    half of all but the former. docs/method.md, section 2, has the measurements.
     """
     stated = case.mesh.edge_length_mm
     if stated is not None:
         return EdgeLength(stated, "stated by the case")
     voxel = max(image.grid.voxel_volume ** (1.0 / 3.0) for image in (before, *after))
     surface = float(np.hypot(voxel * SURFACE_MM, case.noise.surface_sd_mm or 0.0))
-    factor = float(np.clip(np.sqrt(surface / SURFACE_MM), FINEST, COARSEST))
-    wanted = [(LONGEST_MM, "the longest that shows the surface of an organ")]
+    order = 1.0 if choose_element(case.mechanics.element).space == "P2" else LINEAR
+    factor = order * float(np.clip(np.sqrt(surface / SURFACE_MM), *FACTORS))
+    wanted = [(order * LONGEST_MM, "the longest that shows the surface of an organ")]
     for i, tissue in enumerate(before.tissues):
         if tissue.role in ACROSS_BALL and (mask := before.mask(i)).any():
             ball, thickness = (6.0 * before.volume(i) / np.pi) ** (1.0 / 3.0), _thickness(mask, before.grid)
@@ -62,7 +65,8 @@ def edge_length_of(case: Case, before: Segmentation, after: Sequence[Segmentatio
     mm, reason = min(wanted)
     least = max(LEAST_MM, LEAST_VOXELS * voxel)
     if mm < least:
-        mm, reason = least, f"the shortest that is chosen, for {reason} would be {mm:.1f} mm"
+        reason = f"the shortest that is chosen, for {reason} would be {mm:.1f} mm"
+        return EdgeLength(STEP_MM * float(np.ceil(least / STEP_MM - 1e-9)), reason)
     return EdgeLength(STEP_MM * float(np.floor(mm / STEP_MM + 1e-9)), reason)
 
 

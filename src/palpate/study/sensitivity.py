@@ -48,7 +48,7 @@ __all__ = ["KEPT", "Kept", "Sensitivity", "sensitivity"]
 
 KEPT = "variants"  # folder of the finished parts
 COARSER = 1.25  # times the mesh's edge length
-NEAR = StopRule(step_sd=0.1)  # a change that is less than a tenth of the estimate's own interval says no more
+VARIED = StopRule(step_sd=0.1)  # of a variant: a change by less of its standard deviations says nothing
 BASE = ("tissue", "unit", "value", "interval95", "relative_to", "ratio", "ratio_interval95", "verdict", "why")
 
 Bodies = tuple[Body, ...]
@@ -199,7 +199,7 @@ def _inverted(
     if start is not None:
         inside = np.clip(start, settings.bounds.lower, settings.bounds.upper)
         settings = replace(settings, starts=(inside,))
-        return invert(problem, settings, progress=progress, rule=NEAR), settings
+        return invert(problem, settings, progress=progress, rule=VARIED), settings
     return invert(problem, settings, progress=progress), settings
 
 

@@ -34,7 +34,7 @@ STEP = 0.35  # of a proposal, in standard deviations of the posterior
 THIN = 10  # steps of a draw that is kept
 SPREAD = 1.5  # standard deviations, by which chains start apart
 BETWEEN_CHECKS = 4000  # evaluations
-ONE = np.ones(1)
+ONE = np.ones(1)  # the coordinate of what no unknown moves
 GAP = 1.0  # of log-likelihood, that the frozen posterior may be off; re-chosen closest points alone make some tenths
 
 
