@@ -25,6 +25,7 @@ from palpate.study.json_schema import SCHEMAS
 from palpate.study.poisson_ratios import PoissonRatioEstimate, ratio_verdict, with_found_ratios, with_stated_priors
 from palpate.study.result import failure_document
 from palpate.study.sensitivity import sensitivity
+from palpate.uncertainty import Covariance
 
 CASE = """
 [images]
@@ -93,7 +94,7 @@ def with_ratio(case_result):
         "prostate", 0.47, (0.44, None), "profile", "not identified", "it is open", {"noise": 1}
     )
     noise = np.diag([0.01, 0.06, 0.3])
-    covariance = replace(estimation.covariance, noise=noise, prior=0 * noise, grid=0 * noise)
+    covariance = Covariance(noise, *np.zeros((3, *noise.shape)))
     estimation = replace(estimation, poisson_ratios=(found,), covariance=covariance)
     space = with_found_ratios(case_result.space, estimation.poisson_ratios)
     return replace(case_result, case=seeking(case_result.case), estimation=estimation, space=space)

@@ -13,7 +13,12 @@ __all__ = ["NONE", "Bar", "EstimateRow", "estimate_rows", "interval_text", "main
 
 NONE = "–"
 BAR = 200.0  # width of a bar, in its own units
-CAUSES = {"noise": "the surfaces' noise", "prior": "the drivers' motion", "grid": "the voxels' place"}
+CAUSES = {
+    "noise": "the surfaces' noise",
+    "prior": "the drivers' motion",
+    "grid": "the voxels' place",
+    "mesh": "the mesh",
+}
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from palpate.uncertainty.covariance import (
     sandwich_covariance,
 )
 from palpate.uncertainty.diagnostics import ChainDiagnostics, chain_diagnostics, require_arviz
+from palpate.uncertainty.discretisation import discretisation_sd
 from palpate.uncertainty.image_pairs import Agreement, PairEstimate, agreement, pair_estimates
 from palpate.uncertainty.intervals import NORMAL_95, Interval, ModulusInterval, log_interval, modulus_interval
 from palpate.uncertainty.profile import FixedCorrespondence, Profile, fixed_correspondence
@@ -48,6 +49,7 @@ __all__ = [
     "agreement",
     "chain_diagnostics",
     "covariance_of",
+    "discretisation_sd",
     "fast_path",
     "fixed_correspondence",
     "frozen_posterior",

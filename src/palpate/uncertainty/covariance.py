@@ -1,10 +1,10 @@
-"""How uncertain the estimate is: covariance under correlated residuals, the drivers' prior, the voxels' place."""
+"""How uncertain the estimate is: correlated residuals, the drivers' prior, the voxels' place, the mesh."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.noise_model import NoiseModel
 from palpate.parallel import mapped
+from palpate.uncertainty.discretisation import discretisation_sd
 
 __all__ = [
     "Covariance",
@@ -25,6 +26,7 @@ __all__ = [
     "gain",
     "grid_position_shifts",
     "imaging_errors",
+    "mesh_covariance",
     "sandwich_covariance",
 ]
 
@@ -55,22 +57,26 @@ class Covariance:
     """Of the parameters, (n_parameters, n_parameters) each, dimensionless, by its independent causes.
 
     Parameters are the log-moduli, then eta = ln(lambda / mu) of Poisson's ratios that are sought. noise: of the
-    residuals; prior: what is believed of the drivers' motion, and of parameters; grid: the place of the voxels.
+    residuals; prior: what is believed of the drivers' motion, and of parameters; grid: the place of the voxels; mesh:
+    what another mesh would make of it (of Young's moduli).
     """
 
     noise: NDArray[np.float64]
     prior: NDArray[np.float64]
     grid: NDArray[np.float64]
+    mesh: NDArray[np.float64]
 
     @property
     def total(self) -> NDArray[np.float64]:
         """Their sum."""
-        return self.noise + self.prior + self.grid
+        return self.noise + self.prior + self.grid + self.mesh
 
     def shares(self, number: int) -> dict[str, float]:
         """Share of each cause, 0 to 1, in the variance of the log-modulus with a `number`."""
-        parts = {"noise": self.noise, "prior": self.prior, "grid": self.grid}
-        return {name: float(part[number, number] / self.total[number, number]) for name, part in parts.items()}
+        return {
+            part.name: float(getattr(self, part.name)[number, number] / self.total[number, number])
+            for part in fields(self)
+        }
 
 
 def covariance_of(
@@ -81,10 +87,26 @@ def covariance_of(
     draws: int,
     rng: np.random.Generator,
 ) -> Covariance:
-    """All that is known of the log-moduli's errors: the sandwich, and the scatter over so many grid positions."""
+    """All that is known of the log-moduli's errors: the sandwich, the scatter over so many grid positions, the mesh."""
     noise, prior = _sandwich(objective, evaluation)
     shifts = grid_position_shifts(objective, evaluation, states, draws=draws, rng=rng)
-    return Covariance(noise, prior, shifts.T @ shifts / len(shifts))
+    return Covariance(noise, prior, shifts.T @ shifts / len(shifts), mesh_covariance(objective))
+
+
+def mesh_covariance(objective: Objective) -> NDArray[np.float64]:
+    """Covariance (n_parameters, n_parameters) of the log-moduli by their meshes: diagonal, s^2 of each tissue.
+
+    s is `discretisation_sd` in the mesh of a reference state; the meshes of R reference states err independently, which
+    leaves the mean of their s^2 over R. Nothing is said of Poisson's ratios.
+    """
+    references = {state.reference: state.model for state in objective.states}
+    variances = np.zeros(objective.n_parameters)
+    for model in references.values():
+        for i, scaled in enumerate(objective.parameters.selection.T > 0.0):
+            tissues = sorted({model.regions[r] for r in np.flatnonzero(scaled)})
+            if tissues:
+                variances[i] += discretisation_sd(model.space, tissues) ** 2 / len(references) ** 2
+    return np.diag(variances)
 
 
 def sandwich_covariance(objective: Objective, evaluation: Evaluation) -> NDArray[np.float64]:
