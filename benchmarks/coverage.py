@@ -28,7 +28,7 @@ from scipy import stats
 
 from palpate.inversion import Bounds, Linearisation, Minimum, Objective, invert
 from palpate.phantoms import smooth_field
-from palpate.uncertainty import modulus_interval, refitted, sandwich_covariance
+from palpate.uncertainty import mesh_covariance, modulus_interval, refitted, sandwich_covariance
 
 Array = NDArray[np.float64]
 Shift = Callable[[Array, Array, np.random.Generator, bool], Array]  # of places and normals, in the later image or not
@@ -157,7 +157,7 @@ def _drawn(clean: Clean, setting: Setting, seed: int, draw: int) -> dict[str, An
     minimum, fixed = refitted(clean.objective, replace(clean.minimum, evaluation=evaluation), clean.bounds)
     objective = fixed.objective
     n = objective.n_parameters
-    covariance = sandwich_covariance(objective, minimum.evaluation)
+    covariance = sandwich_covariance(objective, minimum.evaluation) + mesh_covariance(objective)
     theta, found = minimum.unknowns[:n], []
     for i in range(n):
         variance = float(covariance[i, i])

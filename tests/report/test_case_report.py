@@ -22,6 +22,7 @@ from palpate.report.case_report import redrawn_page, write_case_report, write_fa
 from palpate.report.pairs import drawn_images
 from palpate.report.rows import number
 from palpate.study.case import Mechanics
+from palpate.study.together import ImagePairs, ModulusRegion, PairAlone
 
 EVIL = '</script><img src=x onerror=alert(1)>$\\frac{"&'
 
@@ -394,3 +395,33 @@ def test_the_profile_and_the_causes_of_the_variance_are_shown_where_they_are_kno
     assert "the drivers&#39; motion 10 %" in page
     assert "the mesh 10 %" in page
     assert "could not be drawn" not in page[: page.index("<script")]
+
+
+def test_two_moduli_together_and_what_each_image_says_alone_are_shown_where_they_are_known(case_result, tmp_path):
+    turn = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
+    places = np.column_stack([58.9 * np.exp(0.2 * np.cos(turn)), 31.2 * np.exp(0.1 * np.sin(turn))])
+    edge = tuple((float(a), float(b)) for a, b in places)
+    region = ModulusRegion(("prostate", "bladder"), edge, edge, open=True)
+    alone = [
+        PairAlone({"prostate": value, "bladder": 31.0}, {"prostate": (40.0, 80.0), "bladder": (29.0, 33.0)}, out, {})
+        for value, out in ((55.0, False), (20.0, True))
+    ]
+    mean = {"prostate": 56.0, "bladder": 31.0}
+    spans = {"prostate": (50.0, 63.0), "bladder": (30.0, 32.0)}
+    pairs = ImagePairs(tuple(alone), 0.021, {"prostate": 0.1, "bladder": 0.02}, mean, spans)
+    estimation = dataclasses.replace(case_result.estimation, regions=(region,), image_pairs=pairs)
+    images = dataclasses.replace(case_result.case.images, after=(Path("after.nii.gz"), Path("later.nii.gz")))
+    case = dataclasses.replace(case_result.case, images=images)
+    result = dataclasses.replace(case_result, case=case, estimation=estimation)
+    page = write_case_report(result, tmp_path).read_text()
+    low, high = 58.9 * np.exp(-0.2), 58.9 * np.exp(0.2)
+    spans = f"prostate {low:.1f} to {high:.1f} and bladder 28.2 to 34.5"
+    assert page.count(f"Joint 95 % region: {spans}, cut by the bounds of the search.") == 1
+    assert page.count("prostate by each later image alone: 1 55.0, 2 20.0 (an outlier); all together 58.9.") == 1
+    assert "would have a probability of 0.021" in page.lower()
+    assert "prostate 10 %" in page
+    assert "could not be drawn" not in page[: page.index("<script")]
+
+
+def test_a_result_of_one_image_says_nothing_of_repeats(page):
+    assert "says alone" not in page

@@ -14,7 +14,7 @@ from palpate.mechanics.forward import SolveCounts
 from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimation import Observed, conclude, hull, verdict
 from palpate.study.samples import draw_moduli
-from palpate.uncertainty import FittedState, sandwich_covariance
+from palpate.uncertainty import FittedState, mesh_covariance, sandwich_covariance
 
 NOISE = NoiseModel(np.array([0.03**2]), np.array([3.0]))
 
@@ -94,7 +94,7 @@ def test_the_place_of_the_grid_adds_to_what_the_noise_leaves(twins, twin, voxels
     found = Inversion((Candidate(OuterIterate(objective, minimum), 0.0),), 0, (), minimum.evaluation, 0, SolveCounts())
     estimation = stated(found, settings, observed)
     residuals = sandwich_covariance(objective, minimum.evaluation)
-    grid = estimation.covariance.total - residuals
+    grid = estimation.covariance.total - residuals - mesh_covariance(objective)
     assert grid == pytest.approx(estimation.covariance.grid)
     assert np.all(np.diag(grid) > 1e-3 * np.diag(residuals))
     assert np.linalg.eigvalsh(grid).min() > -1e-12
@@ -103,7 +103,7 @@ def test_the_place_of_the_grid_adds_to_what_the_noise_leaves(twins, twin, voxels
 def test_surfaces_without_voxels_leave_nothing_to_the_place_of_the_grid(estimation, inversion):
     assert not estimation.covariance.grid.any()
     residuals = sandwich_covariance(inversion.objective, inversion.minimum.evaluation)
-    assert np.array_equal(estimation.covariance.total, residuals)
+    assert np.array_equal(estimation.covariance.total, residuals + mesh_covariance(inversion.objective))
 
 
 def test_every_start_is_told(estimation):

@@ -8,7 +8,8 @@ import pytest
 from palpate.inversion import invert
 from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimate_findings import pair_findings
-from palpate.study.together import ImagePairs, PairAlone, combinations_of, image_pairs_of
+from palpate.study.together import ImagePairs, PairAlone, combinations_of, image_pairs_of, regions_of
+from palpate.uncertainty import fixed_correspondence, sandwich_covariance
 
 NOISE = NoiseModel(np.array([0.1**2]), np.array([3.0]))
 
@@ -61,3 +62,18 @@ def test_an_image_that_contradicts_the_others_is_named_with_what_they_say():
     assert (first.code, second.code) == ("pair-outlier", "heterogeneous")
     assert "'after[2]' contradicts" in first.message
     assert "p 31" in first.message
+
+
+def test_a_region_is_stated_in_kpa_around_the_estimate_of_both(single, settings):
+    objective, minimum = single.objective, single.minimum
+    fixed = fixed_correspondence(objective, minimum.unknowns, minimum.evaluation)
+    covariance = sandwich_covariance(objective, minimum.evaluation)
+    (region,) = regions_of(single, fixed, covariance, settings.bounds)
+    assert region.tissues == objective.parameters.tissues
+    assert not region.open
+    estimate = objective.parameters.scale_kpa * np.exp(minimum.unknowns[:2])
+    half = np.exp(2.4477 * np.sqrt(np.diag(covariance)))
+    for edge in (region.boundary, region.ellipse):
+        low, high = np.min(edge, axis=0), np.max(edge, axis=0)
+        assert np.all((low < estimate) & (estimate < high))
+        assert high / estimate == pytest.approx(half, rel=0.15)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -41,18 +39,7 @@ def profiled(objective, minimum, number, variance, bounds=WIDE):
     return profile(fixed, minimum, number, variance=variance, bounds=bounds, level=NORMAL_95)
 
 
-def straight(objective, minimum):
-    """The objective with every state's model to first order around the minimum."""
-    mapping, states = objective.parameters, []
-    moduli = mapping.moduli(minimum.unknowns)
-    for state, q in zip(objective.states, mapping.coefficients(minimum.unknowns), strict=True):
-        names = state.model.names
-        there = expanded(state.observed.solve(moduli, q), names=names, moduli=moduli, coefficients=q)
-        states.append(replace(state, observed=there))
-    return replace(objective, states=tuple(states))
-
-
-def test_where_the_model_is_straight_the_ends_are_those_of_the_ellipse(objective, minimum, variance):
+def test_where_the_model_is_straight_the_ends_are_those_of_the_ellipse(objective, minimum, variance, straight):
     for number in range(2):
         found = profiled(straight(objective, minimum), minimum, number, variance[number])
         half = NORMAL_95 * np.sqrt(variance[number])

@@ -6,10 +6,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
 
 from palpate.report.report_data import ModelSurface, ReportData
-from palpate.report.rows import interval_text, main_numbers, number
+from palpate.report.rows import number
 from palpate.report.svg import INK, draw_svg
 
 __all__ = [
@@ -17,7 +16,6 @@ __all__ = [
     "angle_svg",
     "modulus_svg",
     "objective_svg",
-    "profile_svg",
     "residual_svg",
     "waterfall_svg",
 ]
@@ -25,7 +23,6 @@ __all__ = [
 SIZE = (3.9, 2.5)
 DASHED = (0, (4, 3))
 BINS = 41
-LIMIT = 1.96**2  # deviance at the ends of a 95 % interval
 START_COLOURS = ("#3b7dd8", "#d9822b", "#3a9d5d", "#b0559b", "#8a6d3b", "#4aa3a3", "#c0504d", "#7f7fd0")
 
 
@@ -88,44 +85,6 @@ def modulus_svg(data: ReportData, estimate: int, *, name: str) -> str:
             figure.axes[0].axhline(item["truth"], color=INK, linewidth=1.0, linestyle=DASHED)
 
     return draw_svg(draw, size=SIZE, name=name, says=says)
-
-
-def profile_svg(data: ReportData, estimate: int, *, name: str) -> str:
-    """Deviance of one estimate (its number) at each value of its modulus, all else at its best, as SVG.
-
-    Between the points that were computed its signed root is monotone in ln E; the interval is a band, and the dashed
-    line the deviance 1.96^2 at the ends of a profile's.
-    """
-    item = data.document["estimates"][estimate]
-    in_kpa, colour = item["unit"] == "kPa", next(t.colour for t in data.tissues if t.name == item["tissue"])
-    value, interval = main_numbers(item)
-    at, root = np.array(sorted(item["profile"]), dtype=np.float64).T
-    fine = np.linspace(np.log(at[0]), np.log(at[-1]), 201)
-    between = PchipInterpolator(np.log(at), root)(fine)
-
-    def draw(figure: Figure) -> None:
-        """The profile with its points, the interval and the estimate."""
-        axes = figure.add_axes((0.14, 0.2, 0.83, 0.74))
-        room = (at[-1] / at[0]) ** 0.12
-        ends = (at[0] / room, at[-1] * room)
-        low, high = interval or (None, None)
-        axes.axvspan(low or ends[0], high or ends[1], color=INK, alpha=0.1, linewidth=0)
-        axes.plot(np.exp(fine), between**2, color=colour, linewidth=1.6)
-        axes.plot(at, root**2, "o", color=colour, markersize=3.2)
-        axes.axhline(LIMIT, color=INK, linewidth=0.9, linestyle=DASHED)
-        axes.plot([np.nan if value is None else value], [0.0], "o", color=colour, markeredgecolor=INK, clip_on=False)
-        axes.set_xscale("log")
-        axes.set_xlim(*ends)
-        axes.set_ylim(0.0, 1.6 * LIMIT)
-        axes.xaxis.set_major_locator(MaxNLocator(6))
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda tick, _: f"{tick:.3g}"))
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.set_xlabel("E (kPa)" if in_kpa else f"E / {item['relative_to'][:24]}")
-        axes.set_ylabel("deviance")
-        axes.yaxis.set_major_locator(MaxNLocator(4))
-
-    told = f"lowest at {number(value)}, 95 % interval {interval_text(interval)}"
-    return draw_svg(draw, size=SIZE, name=name, says=f"Profile likelihood of {item['tissue']}: {told}.")
 
 
 def waterfall_svg(data: ReportData, *, name: str) -> str:

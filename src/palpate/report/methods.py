@@ -56,9 +56,10 @@ def methods_text(data: ReportData) -> Methods:
         _fit(data, cite),
         (
             "The 95 % intervals come from the sandwich covariance of the parameters under spatially correlated"
-            f" residuals {cite('white')}, with the scatter over the voxel grid's position added{leaning}. They"
-            " do not cover the errors of the mesh, of the material law, of given Poisson's ratios, of the boundary"
-            f" condition and of the given moduli. The seed of random numbers was {data.document['seed']}."
+            f" residuals {cite('white')}, with the scatter over the voxel grid's position and a term for the mesh"
+            f" added{leaning}. They do not cover the errors of the material law, of given Poisson's ratios, of the"
+            " boundary condition and of the given moduli. The seed of random numbers was"
+            f" {data.document['seed']}."
         ),
     )
     own = SOURCES["palpate"]

@@ -22,11 +22,11 @@ from palpate.report.charts import (
     angle_svg,
     modulus_svg,
     objective_svg,
-    profile_svg,
     residual_svg,
     waterfall_svg,
 )
 from palpate.report.headline import headline
+from palpate.report.interval_charts import profile_svg, region_svg, repeats_svg
 from palpate.report.methods import methods_text
 from palpate.report.payload import payload
 from palpate.report.pictures import mesh_png, organs_png
@@ -117,6 +117,16 @@ def render(data: ReportData) -> str:
             _picture(f"Profile of {item['tissue']}", partial(profile_svg, data, i, name=f"profile{i}"))
             for i, item in enumerate(moduli_in(data.document))
             if data.document["status"] == "converged" and item.get("profile")
+        ),
+        regions=tuple(
+            _picture(" and ".join(region["tissues"]), partial(region_svg, data, i, name=f"region{i}"))
+            for i, region in enumerate(data.document.get("regions", ()))
+            if data.document["status"] == "converged"
+        ),
+        repeats=tuple(
+            _picture(f"Repeats of {item['tissue']}", partial(repeats_svg, data, i, name=f"repeats{i}"))
+            for i, item in enumerate(moduli_in(data.document))
+            if data.document["status"] == "converged" and data.document["image_pairs"]
         ),
         angles=(
             _picture("Dihedral angles of the mesh", partial(angle_svg, data.mesh.angles, name="angles"))

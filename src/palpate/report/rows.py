@@ -19,6 +19,7 @@ CAUSES = {
     "grid": "the voxels' place",
     "mesh": "the mesh",
 }
+OPACITIES = (0.95, 0.65, 0.4, 0.2)  # of the causes' parts, in their order
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,8 +35,19 @@ class Bar:
 
 
 @dataclass(frozen=True, slots=True)
+class Share:
+    """A cause's part of a variance, as text, and its place and width on a bar from 0 to BAR, with an opacity."""
+
+    cause: str
+    percent: str
+    place: float
+    width: float
+    opacity: float
+
+
+@dataclass(frozen=True, slots=True)
 class EstimateRow:
-    """One tissue of the result table, all texts; shares: of each cause in the variance."""
+    """One tissue of the result table, all texts; shares: of each cause in the variance of ln E."""
 
     tissue: str
     colour: str
@@ -50,7 +62,7 @@ class EstimateRow:
     truth: str
     error: str
     bar: Bar | None
-    shares: str
+    shares: tuple[Share, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +138,7 @@ def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tu
             truth=number(truth),
             error=f"{100.0 * (value / truth - 1.0):+.1f} %" if shown and value and truth else NONE,
             bar=_bar(value, interval, truth=truth, scale=scale) if scale and value else None,
-            shares=", ".join(f"{causes[c]} {100 * s:.0f} %" for c, s in shares.items()) if shown else "",
+            shares=_shares({causes[cause]: share for cause, share in shares.items()}) if shown else (),
         )
         rows.append(row)
     return tuple(rows)
@@ -174,6 +186,15 @@ def _scale(items: Iterable[Mapping[str, Any]]) -> tuple[float, float] | None:
     low, high = math.log(min(numbers)), math.log(max(numbers))
     room = 0.08 * (high - low) + 0.1
     return low - room, high + room
+
+
+def _shares(parts: Mapping[str, float]) -> tuple[Share, ...]:
+    """Parts of 1 by their names, one after the other along a bar."""
+    found, place = list[Share](), 0.0
+    for (name, part), opacity in zip(parts.items(), OPACITIES, strict=False):
+        found.append(Share(name, f"{100 * part:.0f} %", place, BAR * part, opacity))
+        place += BAR * part
+    return tuple(found)
 
 
 def _bar(value: float, interval: Interval | None, *, truth: float | None, scale: tuple[float, float]) -> Bar:

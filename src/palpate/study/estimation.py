@@ -9,18 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.findings import Finding
-from palpate.inversion import Inversion, InversionSettings, Iterate, Outcome, StartRun, ratio_of_eta
+from palpate.inversion import Bounds, Inversion, InversionSettings, Iterate, Outcome, StartRun, ratio_of_eta
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit
 from palpate.progress import Progress, silent
 from palpate.study.estimate_findings import fold_findings, inversion_findings, pair_findings
 from palpate.study.poisson_ratios import PoissonRatioEstimate, no_ratio, ratio_verdict
 from palpate.study.samples import CHAINS, ModulusSamples, draw_moduli, sample_findings
-from palpate.study.together import ImagePairs, combinations_of, image_pairs_of
+from palpate.study.together import ImagePairs, ModulusRegion, combinations_of, image_pairs_of, regions_of
 from palpate.uncertainty import (
     Combination,
     Covariance,
     FittedState,
+    FixedCorrespondence,
     Information,
     Interval,
     ModulusInterval,
@@ -123,6 +124,7 @@ class Estimation:
     outer_loop: the steps from the best start's minimum to the estimate, which all starts of that minimum share;
     counts: of all starts and minima together; observations: what was compared, in words, by its kind; information: the
     directions of the log-moduli by how well they are known; combinations: what is known where single moduli are not;
+    regions: joint ones of two moduli;
     image_pairs: what each of several later images says alone; samples: of the moduli's posterior, where the case asks
     for them and the estimate converged.
     """
@@ -140,6 +142,7 @@ class Estimation:
     observations: Mapping[str, str] = field(default_factory=dict)
     information: Information | None = None
     combinations: tuple[Combination, ...] = ()
+    regions: tuple[ModulusRegion, ...] = ()
     image_pairs: ImagePairs | None = None
     samples: ModulusSamples | None = None
     poisson_ratios: tuple[PoissonRatioEstimate, ...] = ()
@@ -181,9 +184,11 @@ def conclude(
     covariance = covariance_of(objective, minimum.evaluation, observed.states, draws=GRID_DRAWS, rng=rng)
     progress("intervals: profiles, and the fit of every surface before and after")
     pairs = image_pairs_of(inversion, settings.bounds)
-    known = _intervals(inversion, settings, covariance) if minimum.converged else ()
+    fixed = fixed_correspondence(objective, minimum.unknowns, minimum.evaluation)
+    known = _intervals(inversion, fixed, settings.bounds, covariance) if minimum.converged else ()
     estimates = _estimates(inversion, known, covariance, truth)
     of_moduli = covariance.total[: len(estimates), : len(estimates)]
+    regions = regions_of(inversion, fixed, of_moduli, settings.bounds) if minimum.converged else ()
     drawn = None
     if samples and minimum.converged:
         progress(f"intervals: {samples} samples of the posterior in each of {CHAINS} chains")
@@ -210,6 +215,7 @@ def conclude(
         observations={observation.kind: observation.description for observation in objective.observations},
         information=information(of_moduli),
         combinations=combinations_of(inversion, of_moduli, within=IDENTIFIED),
+        regions=regions,
         image_pairs=pairs,
         samples=drawn,
     )
@@ -284,10 +290,11 @@ class _Known:
     at_bound: bool
 
 
-def _intervals(inversion: Inversion, settings: InversionSettings, covariance: Covariance) -> tuple[_Known, ...]:
-    n, bounds = inversion.objective.n_parameters, settings.bounds
+def _intervals(
+    inversion: Inversion, fixed: FixedCorrespondence, bounds: Bounds, covariance: Covariance
+) -> tuple[_Known, ...]:
+    n = inversion.objective.n_parameters
     found, variances, at_bound = [], np.diag(covariance.total), bounds.reached(inversion.minimum.unknowns[:n])
-    fixed = fixed_correspondence(inversion.objective, inversion.minimum.unknowns, inversion.minimum.evaluation)
     # Voxels make the objective rough by some hundredths of it: its value alone cannot choose between such minima.
     best = inversion.candidates[inversion.best]
     others = [c for c in inversion.candidates if c is not best and c.minimum.converged]

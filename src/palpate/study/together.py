@@ -4,14 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.inversion import Bounds, Inversion
-from palpate.uncertainty import NORMAL_95, Agreement, Combination, agreement, known_pairs, pair_estimates
+from palpate.uncertainty import (
+    NORMAL_95,
+    Agreement,
+    Combination,
+    FixedCorrespondence,
+    agreement,
+    joint_region,
+    known_pairs,
+    pair_estimates,
+)
 
-__all__ = ["ImagePairs", "PairAlone", "combinations_of", "image_pairs_of"]
+__all__ = ["ImagePairs", "ModulusRegion", "PairAlone", "combinations_of", "image_pairs_of", "regions_of"]
+
+MOST_REGIONS = 3  # of the pairs of moduli that are correlated most
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +52,20 @@ class ImagePairs:
     within_cv: Mapping[str, float]
     mean: Mapping[str, float]
     mean_interval95: Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True, slots=True)
+class ModulusRegion:
+    """The joint 95 % region of two tissues' moduli (kPa, or ratios): places once around the estimate.
+
+    boundary: by the profile likelihood of both; ellipse: of ln E by their covariance; open: whether the bounds of the
+    search cut the boundary.
+    """
+
+    tissues: tuple[str, str]
+    boundary: tuple[tuple[float, float], ...]
+    ellipse: tuple[tuple[float, float], ...]
+    open: bool
 
 
 def image_pairs_of(inversion: Inversion, bounds: Bounds) -> ImagePairs | None:
@@ -79,3 +105,22 @@ def combinations_of(inversion: Inversion, covariance: NDArray[np.float64], *, wi
     scale = mapping.scale_kpa
     found = known_pairs(mapping.tissues, theta, covariance, within=within)
     return tuple(pair.times(scale) if pair.kind == "geometric mean" else pair for pair in found)
+
+
+def regions_of(
+    inversion: Inversion, fixed: FixedCorrespondence, covariance: NDArray[np.float64], bounds: Bounds
+) -> tuple[ModulusRegion, ...]:
+    """Of the pairs of moduli that are correlated most, `MOST_REGIONS` at the most; covariance (n, n) of ln E."""
+    mapping, sd = inversion.objective.parameters, np.sqrt(np.diag(covariance))
+    correlated = -np.abs(covariance / np.outer(sd, sd))
+    pairs = sorted(combinations(range(len(mapping.tissues)), 2), key=lambda pair: float(correlated[pair]))
+    found = []
+    for pair in pairs[:MOST_REGIONS]:
+        within = covariance[np.ix_(pair, pair)]
+        region = joint_region(fixed, inversion.minimum, pair, covariance=within, bounds=bounds)
+        edges = [mapping.scale_kpa * np.exp(edge) for edge in (region.boundary, region.ellipse)]
+        boundary, ellipse = (tuple((float(a), float(b)) for a, b in edge) for edge in edges)
+        found.append(
+            ModulusRegion((mapping.tissues[pair[0]], mapping.tissues[pair[1]]), boundary, ellipse, region.open)
+        )
+    return tuple(found)

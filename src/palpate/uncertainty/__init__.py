@@ -8,12 +8,14 @@ from palpate.uncertainty.covariance import (
     gain,
     grid_position_shifts,
     imaging_errors,
+    mesh_covariance,
     sandwich_covariance,
 )
 from palpate.uncertainty.diagnostics import ChainDiagnostics, chain_diagnostics, require_arviz
 from palpate.uncertainty.discretisation import discretisation_sd
 from palpate.uncertainty.image_pairs import Agreement, PairEstimate, agreement, pair_estimates
 from palpate.uncertainty.intervals import NORMAL_95, Interval, ModulusInterval, log_interval, modulus_interval
+from palpate.uncertainty.joint_region import JointRegion, joint_region
 from palpate.uncertainty.profile import FixedCorrespondence, Profile, fixed_correspondence
 from palpate.uncertainty.refit import refitted
 from palpate.uncertainty.sampling import PosteriorChains, frozen_posterior, posterior_chains, sample_posterior
@@ -40,6 +42,7 @@ __all__ = [
     "FixedCorrespondence",
     "Information",
     "Interval",
+    "JointRegion",
     "ModulusInterval",
     "PairEstimate",
     "PosteriorChains",
@@ -57,8 +60,10 @@ __all__ = [
     "grid_position_shifts",
     "imaging_errors",
     "information",
+    "joint_region",
     "known_pairs",
     "log_interval",
+    "mesh_covariance",
     "modulus_errors",
     "modulus_interval",
     "pair_estimates",

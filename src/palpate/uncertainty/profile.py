@@ -17,9 +17,9 @@ from palpate.mechanics.curved import CurvedModel
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import ForwardModel
 
-__all__ = ["FixedCorrespondence", "Profile", "fixed_correspondence", "profile"]
+__all__ = ["FixedCorrespondence", "Profile", "Way", "fixed_correspondence", "profile"]
 
-TRIALS = 12  # points on each side of the estimate
+TRIALS = 12  # points on a way from the estimate
 NEAR = 0.05  # of the level, to which an end is found before a line to the estimate corrects it
 FURTHEST = 2.0  # times the distance of the last point: more is not extrapolated
 
@@ -106,64 +106,77 @@ def profile(
     """The profile of the log-modulus with a `number`, as far as |r| = `level` or its bound, on both sides.
 
     `variance` of the log-modulus by all that is known (see `sandwich_covariance`). The deviance is scaled so that its
-    curvature is one over that (Chandler & Bate, Biometrika 94 (2007) 167-183, section 3, vertically). A value at which
-    the model cannot be solved ends the search as a bound does.
+    curvature is one over that (Chandler & Bate, Biometrika 94 (2007) 167-183, section 3, vertically).
     """
     least = gauss_newton(fixed, minimum.unknowns, bounds=bounds, tolerance=1e-6)
     scale = float(least.evaluation.covariance_columns(number + 1)[number, number]) / variance
-    sides = [
-        _side(fixed, least, number, bounds=bounds, scale=scale, level=level, first=sign * level * np.sqrt(variance))
-        for sign in (-1.0, 1.0)
-    ]
-    (low_points, low), (high_points, high) = sides
-    points = np.array(sorted([*low_points, (float(least.unknowns[number]), 0.0), *high_points]))
-    return Profile(points[:, 0], points[:, 1], low, high)
+    held, centre = np.arange(fixed.n_parameters) == number, float(least.unknowns[number])
+    points, ends = [(centre, 0.0)], list[float | None]()
+    for sign in (-1.0, 1.0):
+        way = Way(fixed, least, sign * held, held, bounds, scale)
+        found, end = way.to_level(level, first=level * float(np.sqrt(variance)))
+        points += [(centre + sign * distance, sign * root) for distance, root in found]
+        ends.append(None if end is None else centre + sign * end)
+    ordered = np.array(sorted(points))
+    return Profile(ordered[:, 0], ordered[:, 1], ends[0], ends[1])
 
 
-def _side(
-    fixed: FixedCorrespondence,
-    least: Minimum,
-    number: int,
-    *,
-    bounds: Bounds,
-    scale: float,
-    level: float,
-    first: float,
-) -> tuple[list[tuple[float, float]], float | None]:
-    """Points (theta, r) on one side of the minimum, and where |r| is the level; None at the bound.
+@dataclass(frozen=True, slots=True)
+class Way:
+    """A straight way of the log-moduli from a minimum, along which all unknowns that are not held are at their best.
 
-    The root deviance is nearly straight: the next point is where a line through the minimum and the last one, or
-    through the last two around the level, meets it.
+    direction (n_parameters,): change of the log-moduli for a distance of 1; held (n_parameters,): which of them the way
+    holds; scale: that of the deviance 2 (min J - least J), whose root is r.
     """
-    sign, centre = float(np.sign(first)), float(least.unknowns[number])
-    bound = float((bounds.lower if sign < 0.0 else bounds.upper)[number])
-    held = np.arange(fixed.n_parameters) == number
-    unknowns, points, inside, outside = least.unknowns, list[tuple[float, float]](), (0.0, 0.0), None
-    distance = abs(first)
-    if bound == centre:
-        return [], None
-    for _ in range(TRIALS):
-        at_bound = distance >= abs(bound - centre)
-        distance = min(distance, abs(bound - centre))
-        start = unknowns.copy()
-        start[number] = centre + sign * distance
-        try:
-            found = gauss_newton(fixed, start, bounds=bounds, held=held, tolerance=1e-4)
-        except SolverError:
-            return points, None
-        root = float(np.sqrt(max(2.0 * scale * (found.evaluation.value - least.evaluation.value), 0.0)))
-        points.append((centre + sign * distance, sign * root))
-        if abs(root - level) < NEAR * level:
-            return points, centre + sign * distance * level / root
-        if root < level:
-            if at_bound:
+
+    fixed: FixedCorrespondence
+    least: Minimum
+    direction: NDArray[np.float64]
+    held: NDArray[np.bool_]
+    bounds: Bounds
+    scale: float
+
+    @property
+    def bound(self) -> float:
+        """The distance at which the search's bounds end it."""
+        theta, along = self.least.unknowns[: len(self.direction)], self.direction != 0.0
+        limits = np.where(self.direction > 0.0, self.bounds.upper, self.bounds.lower)
+        return float(np.min((limits - theta)[along] / self.direction[along]))
+
+    def to_level(self, level: float, *, first: float) -> tuple[list[tuple[float, float]], float | None]:
+        """Points (distance, r) on the way, from the `first` distance on, and where r is the level; None at the bound.
+
+        The root deviance is nearly straight: the next point is where a line through the minimum and the last one, or
+        through the last two around the level, meets it. A place at which the model cannot be solved ends the search as
+        a bound does.
+        """
+        bound, n = self.bound, len(self.direction)
+        unknowns, points, inside, outside = self.least.unknowns, list[tuple[float, float]](), (0.0, 0.0), None
+        distance = first
+        if bound <= 0.0:
+            return [], None
+        for _ in range(TRIALS):
+            at_bound, distance = distance >= bound, min(distance, bound)
+            start, there = unknowns.copy(), self.least.unknowns[:n] + distance * self.direction
+            start[:n][self.held] = there[self.held]
+            try:
+                found = gauss_newton(self.fixed, start, bounds=self.bounds, held=self.held, tolerance=1e-4)
+            except SolverError:
                 return points, None
-            inside, unknowns = (distance, root), found.unknowns
-        else:
-            outside = (distance, root)
-        if outside is None:
-            distance *= min(level / max(root, 1e-3), FURTHEST)
-        else:
-            (near, low), (far, high) = inside, outside
-            distance = near + (far - near) * float(np.clip((level - low) / (high - low), 0.1, 0.9))
-    return points, centre + sign * distance
+            deviance = 2.0 * self.scale * (found.evaluation.value - self.least.evaluation.value)
+            root = float(np.sqrt(max(deviance, 0.0)))
+            points.append((distance, root))
+            if abs(root - level) < NEAR * level:
+                return points, distance * level / root
+            if root < level:
+                if at_bound:
+                    return points, None
+                inside, unknowns = (distance, root), found.unknowns
+            else:
+                outside = (distance, root)
+            if outside is None:
+                distance *= min(level / max(root, 1e-3), FURTHEST)
+            else:
+                (near, low), (far, high) = inside, outside
+                distance = near + (far - near) * float(np.clip((level - low) / (high - low), 0.1, 0.9))
+        return points, distance

@@ -1,0 +1,77 @@
+"""The joint region of two moduli: an ellipse where the model is straight, else with the profiles for its shadows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from palpate.inversion import Bounds, gauss_newton
+from palpate.observation.noise_model import NoiseModel
+from palpate.uncertainty.joint_region import DIRECTIONS, LEVEL, joint_region
+from palpate.uncertainty.profile import fixed_correspondence, profile
+
+WIDE = Bounds(np.full(2, np.log(0.02)), np.full(2, np.log(200.0)))
+WEAK = NoiseModel(np.array([0.18**2]), np.array([3.0]))
+
+
+@pytest.fixture(scope="module")
+def objective(twins, twin):
+    """With so much noise that the moduli are known to a factor of two at the most."""
+    return twins.objective_of(twins.exact_problem(twin, noise=WEAK), twin.coefficients).rematched(twin.unknowns)
+
+
+@pytest.fixture(scope="module")
+def minimum(objective, twin):
+    return gauss_newton(objective, twin.unknowns, bounds=WIDE, tolerance=1e-8)
+
+
+@pytest.fixture(scope="module")
+def fixed(objective, minimum):
+    return fixed_correspondence(objective, minimum.unknowns, minimum.evaluation)
+
+
+@pytest.fixture(scope="module")
+def covariance(minimum):
+    return minimum.evaluation.covariance_columns(2)[:2]
+
+
+@pytest.fixture(scope="module")
+def region(fixed, minimum, covariance):
+    return joint_region(fixed, minimum, (0, 1), covariance=covariance, bounds=WIDE)
+
+
+def test_the_ellipse_is_that_of_the_covariance(region, minimum, covariance):
+    away = region.ellipse - minimum.unknowns[:2]
+    assert np.einsum("na,ab,nb->n", away, np.linalg.inv(covariance), away) == pytest.approx([LEVEL**2] * DIRECTIONS)
+    assert pytest.approx(5.991, abs=1e-3) == LEVEL**2
+
+
+def test_where_the_model_is_straight_the_region_is_the_ellipse(objective, minimum, covariance, straight):
+    fixed = fixed_correspondence(straight(objective, minimum), minimum.unknowns, minimum.evaluation)
+    found = joint_region(fixed, minimum, (0, 1), covariance=covariance, bounds=WIDE)
+    assert np.abs((found.boundary - found.ellipse) / np.sqrt(np.diag(covariance))).max() < 0.02 * LEVEL
+    assert not found.open
+
+
+def test_the_shadow_of_the_region_is_the_profile_at_its_level(region, fixed, minimum, covariance):
+    """The largest value of a modulus in the region is where its own profile has the same deviance."""
+    for i in range(2):
+        alone = profile(fixed, minimum, i, variance=covariance[i, i], bounds=WIDE, level=LEVEL)
+        half = LEVEL * np.sqrt(covariance[i, i])
+        assert region.boundary[:, i].max() == pytest.approx(alone.high, abs=0.12 * half)
+        assert region.boundary[:, i].min() == pytest.approx(alone.low, abs=0.12 * half)
+        assert abs(alone.high + alone.low - 2.0 * minimum.unknowns[i]) > 0.03 * half  # it leans
+
+
+def test_bounds_cut_the_region_and_it_says_so(fixed, minimum, covariance, region):
+    upper = minimum.unknowns[:2] + 0.5 * LEVEL * np.sqrt(np.diag(covariance))
+    cut = joint_region(fixed, minimum, (0, 1), covariance=covariance, bounds=Bounds(WIDE.lower, upper))
+    assert cut.open
+    assert not region.open
+    assert np.all(cut.boundary <= upper + 1e-9)
+    assert cut.boundary[:, 0].min() == pytest.approx(region.boundary[:, 0].min(), abs=0.05)
+
+
+def test_the_order_of_the_two_is_that_of_the_columns(fixed, minimum, covariance, region):
+    other = joint_region(fixed, minimum, (1, 0), covariance=covariance[::-1, ::-1], bounds=WIDE)
+    assert other.boundary.max(axis=0) == pytest.approx(region.boundary.max(axis=0)[::-1], abs=0.08)
