@@ -71,7 +71,8 @@ class ReducedBasis:
         """Add what the reduced model misses at a place: of the displacement there, and of its derivatives.
 
         Both are corrections by conjugate gradients with the factorisation that is there, from the reduced answers on;
-        where it is none, or the moduli are far from its own, with a new one. Raises `SolverError`.
+        where it is none, or the moduli are far from its own, with a new one. The derivatives are those of the reduced
+        displacement: what it misses of the exact one changes them by as small a share. Raises `SolverError`.
         """
         model, near, sharper = self.full_model, self.system, self
         direct = isinstance(near.factorisation, CheckedFactorisation) and SOLVERS[near.factorisation.solver].direct
@@ -81,27 +82,40 @@ class ReducedBasis:
             sharper = replace(self, system=near, counts=self.counts + SolveCounts(factorisations=1))
         matrix = weighted_sum(at.moduli, model.free_stiffness)
         displacement = self.model.solve(at.moduli, at.coefficients).values
-
-        def solved(rhs: NDArray[np.float64], tolerance: float) -> NDArray[np.float64]:
-            """Solution (n_free, k) mm at the place to a relative residual."""
-            nearly = near.factorisation.nearly
-            return conjugate_gradients(matrix, rhs, nearly, tolerance=tolerance, max_iterations=MAX_ITERATIONS)[0]
-
+        loads, tolerances, cost = list[NDArray[np.float64]](), list[float](), SolveCounts()
         if not at.same_as(self.place):
-            missing = -solved(model.residual(at.moduli, displacement[:, None]), DISPLACEMENT)
-            displacement = displacement + np.asarray(model.constraint.free @ missing)[:, 0]
-            sharper = _extended(sharper, missing, SolveCounts(forward=1))
-        if at.directions is None:
+            loads.append(-model.residual(at.moduli, displacement[:, None]))
+            tolerances, cost = [DISPLACEMENT], SolveCounts(forward=1)
+        if at.directions is not None:
+            derivatives = self._tangent_loads(at, at.directions, displacement)
+            amplitudes = self.model.system(at.moduli).backward(self.projection.components(derivatives))
+            loads.append(derivatives - matrix @ self.projection.spanned(amplitudes))
+            tolerances += [TANGENT] * derivatives.shape[1]
+            cost += SolveCounts(tangent=derivatives.shape[1])
+        if not loads:
             return replace(sharper, place=at)
-        # loads (n_free, k), mN, whose responses are the free part of the displacement's derivatives
-        by_modulus, by_mode = at.directions[: model.n_regions], at.directions[model.n_regions :]
+        missing, _ = conjugate_gradients(
+            matrix,
+            np.concatenate(loads, axis=1),
+            near.factorisation.nearly,
+            tolerance=np.array(tolerances),
+            max_iterations=MAX_ITERATIONS,
+        )
+        return replace(_extended(sharper, missing, cost), place=at)
+
+    def _tangent_loads(
+        self, at: Place, directions: NDArray[np.float64], displacement: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Loads (n_free, k), mN, whose responses are the free part of the displacement's derivatives at a place.
+
+        directions (n_regions + n_modes, k) of (ln E, q); displacement (n_dof,) mm there.
+        """
+        model = self.full_model
+        by_modulus, by_mode = directions[: model.n_regions], directions[model.n_regions :]
         loads = -np.asarray(weighted_sum(at.moduli, model.coupling)[:, :-1] @ by_mode)
         for modulus, stiffness, share in zip(at.moduli, model.stiffness, by_modulus, strict=True):
             loads -= np.outer(model.constraint.free.T @ (modulus * (stiffness @ displacement)), share)
-        amplitudes = sharper.model.system(at.moduli).backward(sharper.projection.components(loads))
-        known = sharper.projection.spanned(amplitudes)
-        rest = solved(loads - matrix @ known, TANGENT)
-        return replace(_extended(sharper, rest, SolveCounts(tangent=rest.shape[1])), place=at)
+        return loads
 
     @property
     def error_counts(self) -> SolveCounts:

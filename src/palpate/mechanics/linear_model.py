@@ -36,6 +36,7 @@ __all__ = [
     "with_constraint",
 ]
 
+OF_ERROR = 1e-4  # relative residual of the solution that an error is made of
 FURTHER = 10  # right-hand sides a modulus, beside one for each mode: sensitivities, series
 
 
@@ -178,7 +179,7 @@ class LinearSystem:
         Source: Patera & Rozza, Reduced Basis Approximation (2007), section 4.2 (min-theta approach).
         """
         residual = self.model.residual(moduli, displacement[:, None])
-        missing = -self.factorisation.solve(residual)
+        missing = -self.factorisation.solve(residual, tolerance=OF_ERROR)
         energy = float(displacement @ self.model.forces(moduli, displacement[:, None])[:, 0])
         least = float(np.min(np.asarray(moduli) / self.moduli))
         squared = float(-residual[:, 0] @ missing[:, 0]) / least / max(energy, np.finfo(float).tiny)

@@ -23,24 +23,29 @@ def conjugate_gradients(
     rhs: NDArray[np.float64],
     precondition: Callable[[NDArray[np.float64]], NDArray[np.float64]],
     *,
-    tolerance: float,
+    tolerance: float | NDArray[np.float64],
     max_iterations: int,
 ) -> tuple[NDArray[np.float64], int]:
     """Solution X (n, m) of A X = rhs (n, m), one iteration for each column but all products at once; and how many.
 
-    precondition maps residuals (n, k) to nearly A^-1 times them; tolerance is of the relative residual. Hestenes &
-    Stiefel, J. Res. NBS 49 (1952) 409-436. Columns are taken together as far as their vectors have room. Raises
-    `SolverError` for a direction of no positive energy and when the tolerance is not met.
+    precondition maps residuals (n, k) to nearly A^-1 times them; tolerance, one or (m,), is of the relative residual.
+    Hestenes & Stiefel, J. Res. NBS 49 (1952) 409-436. Columns are taken together as far as their vectors have room.
+    Raises `SolverError` for a direction of no positive energy and when the tolerance is not met.
     """
+    tolerances = np.broadcast_to(np.asarray(tolerance, dtype=np.float64), rhs.shape[1:])
     together = max(ROOM // (VECTORS * 8 * max(len(rhs), 1)), FEWEST)
     if rhs.shape[1] > together:
-        parts = np.array_split(rhs, -(-rhs.shape[1] // together), axis=1)
+        number_of_parts = -(-rhs.shape[1] // together)
+        parts = zip(
+            np.array_split(rhs, number_of_parts, axis=1), np.array_split(tolerances, number_of_parts), strict=True
+        )
         found = [
-            conjugate_gradients(matrix, part, precondition, tolerance=tolerance, max_iterations=max_iterations)
-            for part in parts
+            conjugate_gradients(matrix, part, precondition, tolerance=own, max_iterations=max_iterations)
+            for part, own in parts
         ]
         return np.concatenate([solution for solution, _ in found], axis=1), max(number for _, number in found)
     norms = np.linalg.norm(rhs, axis=0)
+    limits = tolerances * norms
     solution = np.zeros_like(rhs)
     active = np.flatnonzero(norms > 0.0)
     if len(active) == 0:
@@ -55,7 +60,7 @@ def conjugate_gradients(
         alpha = product / energy
         image *= alpha
         residual -= image
-        running = np.linalg.norm(residual, axis=0) > tolerance * norms[active]
+        running = np.linalg.norm(residual, axis=0) > limits[active]
         if len(active) == len(norms):
             solution += alpha * direction
         else:
@@ -71,7 +76,7 @@ def conjugate_gradients(
         product = following
     worst = float(np.max(np.linalg.norm(residual, axis=0) / norms[active]))
     raise SolverError(
-        f"conjugate gradients stopped at a relative residual of {worst:.2g} (tolerance {tolerance:g}) after"
+        f"conjugate gradients stopped at a relative residual of {worst:.2g} (tolerance {tolerances.min():g}) after"
         f" {max_iterations} steps for {len(rhs)} unknowns: use the direct solver ('multifrontal') or a Poisson's"
         " ratio further from 0.5"
     )
