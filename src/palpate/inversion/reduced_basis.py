@@ -22,6 +22,7 @@ SERIES = 40  # vectors at the most
 FAR = 30.0  # spread of the moduli's ratios to the factorised ones, beyond which a new factorisation costs less
 SNAPSHOT = 1e-5  # relative residual of basis vectors: what they miss is measured at each place and added there
 DISPLACEMENT, TANGENT = 1e-4, 1e-2  # of the reduced model's error, that a correction may leave
+FAR_OFF = 3e-3  # of the displacement, missing: derivatives are off by as small a share
 MAX_ITERATIONS = 60
 
 
@@ -72,7 +73,7 @@ class ReducedBasis:
 
         Both are corrections by conjugate gradients with the factorisation that is there, from the reduced answers on;
         where it is none, or the moduli are far from its own, with a new one. The derivatives are those of the reduced
-        displacement: what it misses of the exact one changes them by as small a share. Raises `SolverError`.
+        displacement, and of what it missed where that is no small share. Raises `SolverError`.
         """
         model, near, sharper = self.full_model, self.system, self
         direct = isinstance(near.factorisation, CheckedFactorisation) and SOLVERS[near.factorisation.solver].direct
@@ -82,40 +83,30 @@ class ReducedBasis:
             sharper = replace(self, system=near, counts=self.counts + SolveCounts(factorisations=1))
         matrix = weighted_sum(at.moduli, model.free_stiffness)
         displacement = self.model.solve(at.moduli, at.coefficients).values
-        loads, tolerances, cost = list[NDArray[np.float64]](), list[float](), SolveCounts()
+
+        def solved(rhs: NDArray[np.float64], tolerance: float | NDArray[np.float64]) -> NDArray[np.float64]:
+            """Solution (n_free, k) mm at the place to a relative residual, one or (k,)."""
+            nearly = near.factorisation.nearly
+            return conjugate_gradients(matrix, rhs, nearly, tolerance=tolerance, max_iterations=MAX_ITERATIONS)[0]
+
+        loads, directions = np.zeros((matrix.shape[0], 0)), at.directions
         if not at.same_as(self.place):
-            loads.append(-model.residual(at.moduli, displacement[:, None]))
-            tolerances, cost = [DISPLACEMENT], SolveCounts(forward=1)
-        if at.directions is not None:
-            derivatives = self._tangent_loads(at, at.directions, displacement)
+            loads = -model.residual(at.moduli, displacement[:, None])
+        new = loads.shape[1]  # whether the displacement is among what is sought
+        if directions is not None:
+            derivatives = model.tangent_loads(at.moduli, displacement, directions)
             amplitudes = self.model.system(at.moduli).backward(self.projection.components(derivatives))
-            loads.append(derivatives - matrix @ self.projection.spanned(amplitudes))
-            tolerances += [TANGENT] * derivatives.shape[1]
-            cost += SolveCounts(tangent=derivatives.shape[1])
-        if not loads:
-            return replace(sharper, place=at)
-        missing, _ = conjugate_gradients(
-            matrix,
-            np.concatenate(loads, axis=1),
-            near.factorisation.nearly,
-            tolerance=np.array(tolerances),
-            max_iterations=MAX_ITERATIONS,
-        )
+            loads = np.concatenate([loads, derivatives - matrix @ self.projection.spanned(amplitudes)], axis=1)
+        if not loads.shape[1]:
+            return sharper
+        missing = solved(loads, np.array([DISPLACEMENT] * new + [TANGENT] * (loads.shape[1] - new)))
+        cost = SolveCounts(forward=new, tangent=loads.shape[1] - new)
+        late = np.asarray(model.constraint.free @ missing[:, :new])
+        if directions is not None and np.linalg.norm(late) > FAR_OFF * np.linalg.norm(displacement):
+            by_modulus = np.where(np.arange(len(directions))[:, None] < model.n_regions, directions, 0.0)
+            missing[:, new:] += solved(model.tangent_loads(at.moduli, late[:, 0], by_modulus), TANGENT)
+            cost += SolveCounts(tangent=directions.shape[1])
         return replace(_extended(sharper, missing, cost), place=at)
-
-    def _tangent_loads(
-        self, at: Place, directions: NDArray[np.float64], displacement: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Loads (n_free, k), mN, whose responses are the free part of the displacement's derivatives at a place.
-
-        directions (n_regions + n_modes, k) of (ln E, q); displacement (n_dof,) mm there.
-        """
-        model = self.full_model
-        by_modulus, by_mode = directions[: model.n_regions], directions[model.n_regions :]
-        loads = -np.asarray(weighted_sum(at.moduli, model.coupling)[:, :-1] @ by_mode)
-        for modulus, stiffness, share in zip(at.moduli, model.stiffness, by_modulus, strict=True):
-            loads -= np.outer(model.constraint.free.T @ (modulus * (stiffness @ displacement)), share)
-        return loads
 
     @property
     def error_counts(self) -> SolveCounts:

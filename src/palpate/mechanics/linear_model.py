@@ -115,6 +115,22 @@ class LinearModel:
             total += modulus * (matrix @ displacements)
         return total
 
+    def tangent_loads(
+        self, moduli: NDArray[np.float64], values: NDArray[np.float64], directions: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """Loads (n_free, k), mN, whose responses are the free part of the tangent at an equilibrium u (n_dof,) mm.
+
+        directions (n_regions + n_modes, k) of (ln E, q), by default each of them alone; moduli (n_regions,) kPa.
+        """
+        pairs = zip(moduli, self.stiffness, strict=True)
+        forces = [
+            modulus * np.asarray(self.constraint.free.T @ np.asarray(matrix @ values)) for modulus, matrix in pairs
+        ]
+        by_modulus, by_mode = np.stack(forces, axis=1), weighted_sum(moduli, self.coupling)[:, :-1]
+        if directions is None:
+            return -np.concatenate([by_modulus, by_mode.toarray()], axis=1)
+        return -np.asarray(by_modulus @ directions[: self.n_regions] + by_mode @ directions[self.n_regions :])
+
 
 @dataclass(frozen=True, slots=True)
 class LinearSystem:
@@ -185,18 +201,6 @@ class LinearSystem:
         squared = float(-residual[:, 0] @ missing[:, 0]) / least / max(energy, np.finfo(float).tiny)
         return float(np.sqrt(max(squared, 0.0))), np.asarray(self.model.constraint.free @ missing)[:, 0]
 
-    def _modulus_forces(self, displacements: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """E_r F^T K_r u, one (n_free, k) mN for each region."""
-        free = self.model.constraint.free
-        pairs = zip(self.moduli, self.model.stiffness, strict=True)
-        return [modulus * np.asarray(free.T @ np.asarray(matrix @ displacements)) for modulus, matrix in pairs]
-
-    def tangent_loads(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Loads (n_free, n_regions + n_modes), mN, whose responses are the free part of the tangent at u (n_dof,)."""
-        by_modulus = np.stack(self._modulus_forces(values), axis=1)
-        by_mode = weighted_sum(self.moduli, self.model.coupling)[:, :-1].toarray()
-        return -np.concatenate([by_modulus, by_mode], axis=1)
-
 
 @dataclass(frozen=True, slots=True)
 class LinearEquilibrium:
@@ -229,7 +233,7 @@ class LinearEquilibrium:
     def tangent(self) -> NDArray[np.float64]:
         """T (n_dof, n_regions + n_modes), mm: columns du / d ln E_r = -F K_ff^-1 F^T E_r K_r u, then du / dq_k."""
         constraint = self.system.model.constraint
-        solution = self.system.factorisation.solve(self.system.tangent_loads(self.values))
+        solution = self.system.factorisation.solve(self.system.model.tangent_loads(self.system.moduli, self.values))
         tangent = np.asarray(constraint.free @ solution)
         tangent[:, self.system.model.n_regions :] += constraint.modes
         return tangent
@@ -239,7 +243,7 @@ class LinearEquilibrium:
         constraint = self.system.model.constraint
         load = np.asarray(constraint.free.T @ gradient)
         adjoint = self.system.factorisation.solve(load[:, None])[:, 0]
-        result = np.asarray(self.system.tangent_loads(self.values).T @ adjoint)
+        result = np.asarray(self.system.model.tangent_loads(self.system.moduli, self.values).T @ adjoint)
         result[self.system.model.n_regions :] += constraint.modes.T @ gradient
         return result
 
