@@ -143,7 +143,7 @@ def _from_far_off(problem: InverseProblem, linear: Inversion, settings: Inversio
 
 
 def _errors(inversion: Inversion, scene: Scene) -> Result:
-    mapping, noise = inversion.objective.parameters, inversion.objective.noise["surface distance"]
+    mapping, noise = inversion.objective.parameters, inversion.objective.states[0].noise["surface distance"]
     theta = inversion.minimum.unknowns[: mapping.n_parameters]
     truth = true_ratios(inversion.objective, scene)
     return {
@@ -194,7 +194,7 @@ def at_truth(inversion: Inversion, problem: InverseProblem, scene: Scene) -> Inv
     A limit taken at the estimate would depend on the noise that moved it. All residuals count, by the inversion's noise
     model; what is known before is the prior that the case states.
     """
-    state, mapping, noise = problem.states[0], problem.parameters, inversion.objective.noise
+    state, mapping, noise = problem.states[0], problem.parameters, inversion.objective.states[0].noise
     wall = next(observation for observation in state.observations if observation.of_driver)
     rest, modes = state.model.space.points.ravel()[wall.dofs].reshape(-1, 3), state.constraint.modes[wall.dofs]
     motion = scene.motions[wall.name].at(rest).ravel() - state.constraint.offset[wall.dofs]

@@ -94,7 +94,9 @@ def _both(case: Posed) -> Result:
         "same": same.tolist(),
         "plainly_on_sd": None if moved is None else moved.tolist(),
         "sd": sd.tolist(),
-        "law_sd_mm": [objective.noise["surface distance"].sd for objective in (product.objective, plain.objective)],
+        "law_sd_mm": [
+            objective.states[0].noise["surface distance"].sd for objective in (product.objective, plain.objective)
+        ],
         "outcomes": [product.minimum.outcome.name, plain.minimum.outcome.name],
         "unmet": [[criterion.name for criterion in end.convergence.unmet] for end in (product, plain)],
         "seconds": [ended - began, time.perf_counter() - ended],

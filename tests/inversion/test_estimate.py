@@ -72,7 +72,7 @@ def test_a_bias_of_both_distance_maps_leaves_the_moduli_alone(twins, twin, voxel
         for problem in (voxels, twins.voxel_problem(twin, bias=0.4))
     )
     assert np.abs(np.expm1(biased.minimum.unknowns[:2] - plain.minimum.unknowns[:2])).max() < 1e-3
-    sds = [found.objective.noise["surface distance"].sd for found in (plain, biased)]
+    sds = [found.objective.states[0].noise["surface distance"].sd for found in (plain, biased)]
     assert sds[1] == pytest.approx(sds[0], rel=1e-3)
 
 
@@ -150,7 +150,7 @@ def test_a_second_kind_of_observation_is_estimated_from_together_with_the_surfac
     surfaces, together = with_and_without
     assert together.minimum.converged
     assert np.all(np.abs(together.minimum.unknowns[:2] - twins.TRUTH) < 0.05 * posterior_sd(together.minimum, 2))
-    assert set(together.objective.noise) == {"surface distance", "point motion"}
+    assert set(together.objective.states[0].noise) == {"surface distance", "point motion"}
     sds = [posterior_sd(found.minimum, 2) for found in (surfaces, together)]
     assert np.all(sds[1] < 0.999 * sds[0])
     spreads = [np.sqrt(np.diag(sandwich_covariance(f.objective, f.minimum.evaluation))) for f in (surfaces, together)]
@@ -175,7 +175,7 @@ def imaged(twins, twin, voxels):
 
 def believing(objective, factor):
     """The objective with noise of `factor` times the size."""
-    noise = objective.noise["surface distance"]
+    noise = objective.states[0].noise["surface distance"]
     larger = replace(noise, variances=factor**2 * noise.variances)
     return objective.with_observations([o.with_noise(larger) for o in objective.observations])
 
@@ -220,7 +220,7 @@ def test_no_kind_of_observation_decides_alone_under_which_noise_minima_are_compa
     compared = []
 
     def under(objective, start, settings, **_):
-        compared.append({kind: noise.sd for kind, noise in objective.noise.items()})
+        compared.append({kind: noise.sd for kind, noise in objective.states[0].noise.items()})
         return gauss_newton(objective, start, bounds=settings.bounds, max_steps=1)
 
     monkeypatch.setattr(estimate, "minimised", under)

@@ -87,7 +87,7 @@ def test_where_the_reach_cuts_the_step_short_nothing_is_reweighted(twins, twin, 
     one = StopRule(iterations=1)
     end = loop.run_outer_loop(start, settings_from_far, one, progress=twins.silent, title="")
     assert np.abs(end.minimum.unknowns - unknowns)[:2].max() == pytest.approx(exact.reach)
-    assert end.objective.noise == objective.noise
+    assert end.objective.states[0].noise == objective.states[0].noise
     assert Criterion.REWEIGHTING in end.convergence.unmet
     end = loop.run_outer_loop(start, settings_from_far, StopRule(), progress=twins.silent, title="")
     assert end.minimum.unknowns[:2] == pytest.approx(twins.TRUTH, abs=1e-4)

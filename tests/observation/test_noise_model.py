@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.observation.noise_model import NoiseModel, fit_noise_model
+from palpate.observation.noise_model import NoiseModel, fit_noise_model, mean_noise
 from palpate.phantoms.boundary_noise import smooth_field
 
 RADIUS = 20.0
@@ -112,3 +112,13 @@ def test_distant_residuals_are_independent_and_opposite_normals_count_negative()
 
 def test_the_correlation_area_of_one_gaussian():
     assert NoiseModel(np.array([0.5]), np.array([3.0])).correlation_area == pytest.approx(2.0 * np.pi * 9.0)
+
+
+def test_the_mean_of_several_has_the_mean_covariance_and_equal_ones_are_one(rng):
+    places, normals = sphere(60)
+    rows = rng.standard_normal((2, len(places)))
+    a, b = NoiseModel(np.array([0.04, 0.01]), np.array([3.0, 6.0])), NoiseModel(np.array([0.25]), np.array([9.0]))
+    expected = (2.0 * dense(a, rows, places, normals) + dense(b, rows, places, normals)) / 3.0
+    assert dense(mean_noise([a, b, a]), rows, places, normals) == pytest.approx(expected)
+    assert len(mean_noise([a, b, a]).variances) == 3
+    assert mean_noise([a, a]).key == a.key

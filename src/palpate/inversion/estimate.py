@@ -308,8 +308,8 @@ def _values(distinct: Sequence[OuterIterate], settings: InversionSettings) -> tu
     Each iterate has noise models, weights and a prior of its own, and a worse fit is a smaller value where the noise is
     believed to be larger: all are compared under the objective of the one with the least noise, on their own
     approximations. Least is the geometric mean of the observations' standard deviations: each of them counts as a
-    ratio, so that no kind decides by its unit or size. The evidence of each iterate under its own objective is no way
-    out: a robust loss with a cutoff of its own is the logarithm of no density that could be normalised.
+    ratio, so that no kind decides by its unit or size. The evidence of each under its own objective is no way out: a
+    robust loss with its own cutoff is the logarithm of no density.
     """
     if len(distinct) == 1:
         return [distinct[0].minimum.evaluation.value], 0

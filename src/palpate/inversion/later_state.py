@@ -16,6 +16,7 @@ from palpate.mechanics.forward import ForwardModel
 from palpate.mechanics.linear_model import LinearModel
 from palpate.mesh.constraint import Constraint
 from palpate.observation.contract import Observation
+from palpate.observation.noise_model import NoiseModel
 from palpate.observation.wall_modes import Wall
 
 __all__ = ["InverseProblem", "LaterState"]
@@ -45,6 +46,11 @@ class LaterState:
     def constraint(self) -> Constraint:
         """What is prescribed: the approximation's, where a wall has been refined there."""
         return self.model.constraint if self.approximation is None else self.approximation.constraint
+
+    @property
+    def noise(self) -> dict[str, NoiseModel]:
+        """The noise model of each kind of observation."""
+        return {observation.kind: observation.noise_model for observation in self.observations}
 
     @property
     def slices(self) -> list[slice]:

@@ -15,7 +15,6 @@ from palpate.inversion.later_state import LaterState
 from palpate.inversion.parameters import ParameterMap
 from palpate.mechanics.forward import Equilibrium
 from palpate.observation.contract import Observation, Residuals
-from palpate.observation.noise_model import NoiseModel
 from palpate.parallel import mapped
 
 __all__ = ["Evaluation", "Linearisation", "LinearisedObjective", "Objective", "deciding_directions", "determined"]
@@ -103,11 +102,6 @@ class Objective:
     def observations(self) -> list[Observation]:
         """Those of all states, one state after the other."""
         return [observation for state in self.states for observation in state.observations]
-
-    @property
-    def noise(self) -> dict[str, NoiseModel]:
-        """The noise model of each kind of observation."""
-        return {observation.kind: observation.noise_model for observation in self.observations}
 
     @property
     def approximations(self) -> list[Approximation]:

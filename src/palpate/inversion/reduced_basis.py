@@ -89,10 +89,8 @@ class ReducedBasis:
             nearly = near.factorisation.nearly
             return conjugate_gradients(matrix, rhs, nearly, tolerance=tolerance, max_iterations=MAX_ITERATIONS)[0]
 
-        loads, directions = np.zeros((matrix.shape[0], 0)), at.directions
-        if not at.same_as(self.place):
-            loads = -model.residual(at.moduli, displacement[:, None])
-        new = loads.shape[1]  # whether the displacement is among what is sought
+        new, directions = int(not at.same_as(self.place)), at.directions  # whether the displacement is sought, too
+        loads = -model.residual(at.moduli, displacement[:, None])[:, :new]
         if directions is not None:
             derivatives = model.tangent_loads(at.moduli, displacement, directions)
             amplitudes = self.model.system(at.moduli).backward(self.projection.components(derivatives))

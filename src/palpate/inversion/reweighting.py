@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from palpate.inversion.driver import with_learned_prior
 from palpate.inversion.objective import Evaluation, Linearisation, Objective
 from palpate.inversion.optimise import Minimum
-from palpate.observation.contract import Observation
 from palpate.observation.noise_model import NoiseModel
 
 __all__ = ["fitted_noise", "reweighted", "with_first_noise"]
@@ -19,9 +18,10 @@ RIDGE = 1e-9  # of the mean diagonal: a mode that moves no observed point
 
 
 def with_first_noise(objective: Objective) -> Objective:
-    """The objective before any residual is seen: all count by the noise that each kind of observation starts with."""
-    kinds = {kind: peers[0].first_noise(peers) for kind, peers in _by_kind(objective.observations).items()}
-    return _by_noise(objective, kinds)
+    """The objective before any residual is seen: all count by the noise that each kind begins with in its image."""
+    seen = [(s, o, state.observations) for s, state in enumerate(objective.states) for o in state.observations]
+    noise = {(s, o.kind): o.first_noise([p for p in peers if p.kind == o.kind]) for s, o, peers in seen}
+    return _by_noise(objective, noise)
 
 
 def reweighted(objective: Objective, minimum: Minimum) -> Objective:
@@ -38,23 +38,24 @@ def reweighted(objective: Objective, minimum: Minimum) -> Objective:
     return by_noise.with_observations([o.reweighted(line.residuals, _beyond_modes(line, n)) for o, line in pairs])
 
 
-def fitted_noise(evaluation: Evaluation) -> dict[str, NoiseModel]:
-    """Noise model of each kind of observation, by the residuals that tell: a driver's are flattened by its modes."""
+def fitted_noise(evaluation: Evaluation) -> dict[tuple[int, str], NoiseModel]:
+    """Noise model by later state and kind of observation, of the residuals that tell: modes flatten a driver's.
+
+    Each later image has its own: one that was drawn badly would else take from what the others are believed.
+    """
     found = {}
-    for kind, peers in _by_kind([line.observation for line in evaluation.lines]).items():
-        of_kind = [line for line in evaluation.lines if line.observation.kind == kind]
-        telling = [line.residuals for line in of_kind if not line.observation.of_driver]
-        found[kind] = peers[0].fitted_noise(telling or [line.residuals for line in of_kind])
+    for key in dict.fromkeys((line.state, line.observation.kind) for line in evaluation.lines):
+        own = [line for line in evaluation.lines if (line.state, line.observation.kind) == key]
+        telling = [line.residuals for line in own if not line.observation.of_driver]
+        found[key] = own[0].observation.fitted_noise(telling or [line.residuals for line in own])
     return found
 
 
-def _by_kind(observations: list[Observation]) -> dict[str, list[Observation]]:
-    kinds = dict.fromkeys(observation.kind for observation in observations)
-    return {kind: [o for o in observations if o.kind == kind] for kind in kinds}
-
-
-def _by_noise(objective: Objective, noise: Mapping[str, NoiseModel]) -> Objective:
-    return objective.with_observations([o.with_noise(noise[o.kind]) for o in objective.observations])
+def _by_noise(objective: Objective, noise: Mapping[tuple[int, str], NoiseModel]) -> Objective:
+    states = enumerate(objective.states)
+    return objective.with_observations(
+        [o.with_noise(noise[s, o.kind]) for s, state in states for o in state.observations]
+    )
 
 
 def _beyond_modes(line: Linearisation, n_parameters: int) -> NDArray[np.float64] | None:

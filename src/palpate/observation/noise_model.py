@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,7 +14,7 @@ from scipy.spatial.distance import cdist
 
 from palpate.parallel import mapped
 
-__all__ = ["EXACT_NOISE", "SEGMENTATION_NOISE", "NoiseModel", "fit_noise_model"]
+__all__ = ["EXACT_NOISE", "SEGMENTATION_NOISE", "NoiseModel", "fit_noise_model", "mean_noise"]
 
 LENGTHS = (0.5, 0.8, 1.2, 2.0, 3.0, 4.5, 6.5, 9.5, 14.0)  # mm
 CELL = 1.0  # mm: residuals nearer than that are averaged before they are compared
@@ -45,6 +46,11 @@ class NoiseModel:
         """Area that one independent residual stands for, mm^2: integral of C over a plane, by C(0)."""
         return float(2.0 * np.pi * (self.variances @ self.lengths**2) / self.variances.sum())
 
+    @property
+    def key(self) -> tuple[float, ...]:
+        """Its numbers, by which two are the same."""
+        return (*self.variances.tolist(), *self.lengths.tolist())
+
     def covariance(
         self, rows: NDArray[np.float64], places: NDArray[np.float64], normals: NDArray[np.float64]
     ) -> NDArray[np.float64]:
@@ -73,6 +79,15 @@ class NoiseModel:
             return total
 
         return np.asarray(np.sum(mapped(term, zip(self.variances, self.lengths, strict=True)), axis=0))
+
+
+def mean_noise(models: Sequence[NoiseModel]) -> NoiseModel:
+    """The noise whose covariance is the mean of those of several models; equal ones count, and cost, as one."""
+    distinct = {model.key: model for model in models}
+    counts = Counter(model.key for model in models)
+    shares = [counts[key] / len(models) for key in distinct]
+    variances = [share * model.variances for share, model in zip(shares, distinct.values(), strict=True)]
+    return NoiseModel(np.concatenate(variances), np.concatenate([model.lengths for model in distinct.values()]))
 
 
 EXACT_NOISE = NoiseModel(np.array([0.03**2]), np.array([3.0]))  # of surfaces that no image has rounded

@@ -15,7 +15,7 @@ from palpate.images.tissue_distance import cropped, window_of
 from palpate.inversion.objective import Evaluation, Linearisation, Objective
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
-from palpate.observation.noise_model import NoiseModel
+from palpate.observation.noise_model import NoiseModel, mean_noise
 from palpate.parallel import mapped
 from palpate.uncertainty.discretisation import discretisation_sd
 
@@ -112,11 +112,11 @@ def mesh_covariance(objective: Objective) -> NDArray[np.float64]:
 def sandwich_covariance(objective: Objective, evaluation: Evaluation) -> NDArray[np.float64]:
     """Covariance (n_parameters, n_parameters) of the log-moduli: H^-1 (J^T W C W J + P) H^-1.
 
-    C is the covariance of the residuals under each kind's noise model, across all observations of the kind; P the
+    C is the covariance of the residuals under the noise model of their image, across all observations of a kind; P the
     prior, whose uncertainty is thereby included (White 1980; Aitken's theorem read for correlated errors). A residual
     is the error of a later image less that of its rest state's image, each with half of the noise: the later ones are
-    independent, that of the rest state is the same for all states that have it, at the material place. Later states
-    that move alike do not average it away, opposite ones do.
+    independent, that of the rest state is the same for all states that have it, at the material place, by the mean of
+    their noise models. Later states that move alike do not average it away, opposite ones do.
     """
     return sum(_sandwich(objective, evaluation), np.zeros((objective.n_parameters,) * 2))
 
@@ -127,12 +127,13 @@ def _sandwich(objective: Objective, evaluation: Evaluation) -> tuple[NDArray[np.
     inverse = evaluation.covariance_columns(n)
     data = np.zeros((n, n))
     pairs = list(zip(evaluation.lines, gain(evaluation, n), strict=True))
-    for kind, noise in objective.noise.items():
+    for kind in dict.fromkeys(line.observation.kind for line in evaluation.lines):
         of_kind = [(line, row) for line, row in pairs if line.observation.kind == kind]
         later = [line.state for line, _ in of_kind]
         for groups, at_rest in ((later, False), ([objective.states[s].reference for s in later], True)):
             for key in dict.fromkeys(groups):
                 group = [pair for pair, own in zip(of_kind, groups, strict=True) if own == key]
+                noise = mean_noise([objective.states[line.state].noise[kind] for line, _ in group])
                 data += 0.5 * _propagated(noise, group, at_rest=at_rest)
     return data, np.asarray(inverse.T @ evaluation.prior @ inverse)
 
