@@ -30,6 +30,7 @@ Misleading = Literal[
     "volume-implausible",
     "fold-over",
     "pair-outlier",
+    "pair-noise",
     "implausible-stiffness",
     "units",
     "linear-strains",

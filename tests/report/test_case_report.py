@@ -403,7 +403,9 @@ def test_two_moduli_together_and_what_each_image_says_alone_are_shown_where_they
     edge = tuple((float(a), float(b)) for a, b in places)
     region = ModulusRegion(("prostate", "bladder"), edge, edge, open=True)
     alone = [
-        PairAlone({"prostate": value, "bladder": 31.0}, {"prostate": (40.0, 80.0), "bladder": (29.0, 33.0)}, out, {})
+        PairAlone(
+            {"prostate": value, "bladder": 31.0}, {"prostate": (40.0, 80.0), "bladder": (29.0, 33.0)}, out, {}, {}
+        )
         for value, out in ((55.0, False), (20.0, True))
     ]
     mean = {"prostate": 56.0, "bladder": 31.0}

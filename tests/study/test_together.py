@@ -34,6 +34,7 @@ def single(twins, twin, settings):
 def test_later_images_are_stated_in_kpa_each_alone(both, settings):
     found = image_pairs_of(both, settings.bounds)
     assert len(found.alone) == 2
+    assert [set(pair.noise_mm) for pair in found.alone] == [{"surface distance"}] * 2
     for pair in found.alone:
         low, high = pair.interval95["gland"]
         assert low < 30.0 < high
@@ -57,11 +58,24 @@ def test_a_mean_is_in_kpa_and_a_ratio_has_no_unit(single):
 
 
 def test_an_image_that_contradicts_the_others_is_named_with_what_they_say():
-    alone = [PairAlone({"p": 30.0}, {"p": (27.0, 33.0)}, number == 1, {"p": 4.0 * number}) for number in range(3)]
+    noise = {"surface distance": 0.3}
+    alone = [
+        PairAlone({"p": 30.0}, {"p": (27.0, 33.0)}, number == 1, {"p": 4.0 * number}, noise) for number in range(3)
+    ]
     first, second = pair_findings(ImagePairs(tuple(alone), 1e-4, {"p": 0.1}, {"p": 31.0}, {"p": (29.0, 33.0)}))
     assert (first.code, second.code) == ("pair-outlier", "heterogeneous")
     assert "'after[2]' contradicts" in first.message
     assert "p 31" in first.message
+
+
+@pytest.mark.parametrize(("noises", "named"), [((0.3, 0.4, 0.9), 1), ((0.3, 0.4, 0.45), 0), ((0.3, 0.9), 0)])
+def test_an_image_whose_surfaces_fit_far_worse_is_named(noises, named):
+    """One of three at the least: of two that differ nobody can say which is the usual one."""
+    alone = [PairAlone({"p": 30.0}, {"p": (27.0, 33.0)}, False, {"p": 0.1}, {"surface distance": sd}) for sd in noises]
+    found = pair_findings(ImagePairs(tuple(alone), 0.5, {"p": 0.1}, {"p": 31.0}, {"p": (29.0, 33.0)}))
+    assert [finding.code for finding in found] == ["pair-noise"] * named
+    assert all("'after[3]' fits worse" in finding.message for finding in found)
+    assert all("0.9 mm beside 0.35 mm" in finding.message for finding in found)
 
 
 def test_a_region_is_stated_in_kpa_around_the_estimate_of_both(single, settings):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ __all__ = ["fold_findings", "inversion_findings", "pair_findings"]
 
 STRONG_CORRELATION = 0.99
 HETEROGENEOUS = 0.01  # probability of such differences between image pairs that have the same moduli
+NOISIER, LEAST_IMAGES = 1.6, 3  # times the usual noise of so many later images: one is drawn badly
 
 
 def inversion_findings(inversion: Inversion, covariance: NDArray[np.float64]) -> tuple[Finding, ...]:
@@ -69,10 +70,10 @@ def inversion_findings(inversion: Inversion, covariance: NDArray[np.float64]) ->
 
 
 def pair_findings(pairs: ImagePairs | None) -> tuple[Finding, ...]:
-    """A finding for each later image that the others contradict, and one where the rest differs by more than noise."""
+    """What is told of later images: which the others contradict, which fit worse, whether the rest differ by more."""
     if pairs is None:
         return ()
-    findings = []
+    findings = list(_noisy_pairs(pairs))
     for name, pair in zip(later_names(len(pairs.alone)), pairs.alone, strict=True):
         if pair.outlier:
             moved = ", ".join(f"{tissue} by {by:+.1f}" for tissue, by in pair.influence.items())
@@ -85,6 +86,19 @@ def pair_findings(pairs: ImagePairs | None) -> tuple[Finding, ...]:
         advice = f"{text}: read the mean over them, `image_pairs` in result.json, whose interval holds the differences"
         findings.append(Finding("heterogeneous", advice))
     return tuple(findings)
+
+
+def _noisy_pairs(pairs: ImagePairs) -> Iterable[Finding]:
+    """A finding for each of three or more later images whose residuals have far more noise than those of the others."""
+    if len(pairs.alone) < LEAST_IMAGES:
+        return
+    for name, pair in zip(later_names(len(pairs.alone)), pairs.alone, strict=True):
+        for kind, noise in pair.noise_mm.items():
+            usual = float(np.median([other.noise_mm[kind] for other in pairs.alone if other is not pair]))
+            if noise > NOISIER * usual:
+                text = f"'{name}' fits worse than the other later images: noise of {noise:.2g} mm beside {usual:.2g} mm"
+                advice = f"{text}, so that it counts for less. Look at its labels; it may be left out"
+                yield Finding("pair-noise", advice, place=f"in '{name}'")
 
 
 def fold_findings(states: Sequence[FittedState]) -> tuple[Finding, ...]:

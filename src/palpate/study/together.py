@@ -30,13 +30,15 @@ MOST_REGIONS = 3  # of the pairs of moduli that are correlated most
 class PairAlone:
     """What one later image says alone: moduli (kPa, or ratios) with their 95 % intervals.
 
-    outlier: whether the others contradict it; influence: by how many standard deviations it moves the mean of all.
+    outlier: whether the others contradict it; influence: by how many standard deviations it moves the mean of all;
+    noise_mm: standard deviation of its residuals' noise, by the kind of observation.
     """
 
     moduli: Mapping[str, float]
     interval95: Mapping[str, tuple[float, float]]
     outlier: bool
     influence: Mapping[str, float]
+    noise_mm: Mapping[str, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,9 +90,11 @@ def image_pairs_of(inversion: Inversion, bounds: Bounds) -> ImagePairs | None:
         return middle, {name: (low[name], high[name]) for name in names}
 
     alone = []
-    for pair, outlier, influence in zip(pairs, found.outlier.tolist(), found.influence, strict=True):
+    every_one = zip(pairs, inversion.objective.states, found.outlier.tolist(), found.influence, strict=True)
+    for pair, state, outlier, influence in every_one:
         values, intervals = stated(pair.theta, pair.covariance)
-        alone.append(PairAlone(values, intervals, outlier, dict(zip(names, influence.tolist(), strict=True))))
+        noise = {kind: noise.sd for kind, noise in state.noise.items()}
+        alone.append(PairAlone(values, intervals, outlier, dict(zip(names, influence.tolist(), strict=True)), noise))
     mean, mean_interval = stated(found.theta, found.covariance)
     within = dict(zip(names, found.within_cv.tolist(), strict=True))
     return ImagePairs(tuple(alone), found.heterogeneity, within, mean, mean_interval)
