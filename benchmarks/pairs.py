@@ -5,7 +5,8 @@
 Simulated pelves: a patient has one body and four pairs of label images, each with a motion and a noise of its own (0.3
 mm over 6 mm, voxels of 1 x 1 x 2.5 mm). Estimated are the first pair alone, all four together, and the same with the
 prostate of the fourth pair's later image shifted by 3 mm. The robust estimate is the random-effects mean of the pairs
-that are no outliers (`image_pairs` of a result). A line of JSON a patient; another run with the same file adds to it.
+that are no outliers (`image_pairs` of a result); a pair is named by the warnings `pair-outlier` and `pair-noise`. A
+line of JSON a patient; another run with the same file adds to it.
 """
 
 from __future__ import annotations
@@ -103,7 +104,9 @@ def _estimated(case: Case, pairs: Sequence[ImagedStates], truth: Mapping[str, fl
             return [float(np.log(moduli[name] / truth[name])) for name in names]
 
         found |= {"alone": [errors(pair.moduli) for pair in together.alone], "robust": errors(together.mean)}
-        found |= {"outlier": [pair.outlier for pair in together.alone], "p": together.heterogeneity_p}
+        found |= {"p": together.heterogeneity_p, "noise_mm": [dict(pair.noise_mm) for pair in together.alone]}
+        said = [finding.message for finding in estimation.remarks if finding.code in ("pair-outlier", "pair-noise")]
+        found["named"] = [any(f"'after[{k}]'" in message for message in said) for k in range(1, len(pairs) + 1)]
     return found
 
 
@@ -129,8 +132,8 @@ def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "robust mean, one of four spoilt": spoilt,
         "spoilt over good": spoilt / robust,
         "joint, one of four spoilt": rms("spoilt", "joint"),
-        "spoilt pair named": float(np.mean([row["spoilt"]["outlier"][-1] for row in whole])),
-        "good pair named": float(np.mean([row["four"]["outlier"] for row in whole])),
+        "spoilt pair named": float(np.mean([row["spoilt"]["named"][-1] for row in whole])),
+        "good pair named": float(np.mean([row["four"]["named"] for row in whole])),
     }
 
 
