@@ -124,9 +124,8 @@ class Estimation:
     outer_loop: the steps from the best start's minimum to the estimate, which all starts of that minimum share;
     counts: of all starts and minima together; observations: what was compared, in words, by its kind; information: the
     directions of the log-moduli by how well they are known; combinations: what is known where single moduli are not;
-    regions: joint ones of two moduli;
-    image_pairs: what each of several later images says alone; samples: of the moduli's posterior, where the case asks
-    for them and the estimate converged.
+    regions: joint ones of two moduli; image_pairs: what each of several later images says alone; samples: of the
+    moduli's posterior, where the case asks for them and the estimate converged.
     """
 
     status: str

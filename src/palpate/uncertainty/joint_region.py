@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from palpate.inversion import Bounds, Minimum, gauss_newton
-from palpate.uncertainty.profile import FixedCorrespondence, Way
+from palpate.uncertainty.profile import FixedCorrespondence, Ray
 
 __all__ = ["JointRegion", "joint_region"]
 
@@ -51,13 +51,13 @@ def joint_region(
     held = np.isin(np.arange(fixed.n_parameters), pair)
     centre, edge, cut = least.unknowns[pair], list[NDArray[np.float64]](), False
     angles = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
-    spokes = np.stack([np.cos(angles), np.sin(angles)], axis=1) @ np.linalg.cholesky(covariance).T  # V^-1 norm 1
-    for spoke in spokes:
+    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1) @ np.linalg.cholesky(covariance).T  # V^-1 norm 1
+    for along in directions:
         direction = np.zeros(fixed.n_parameters)
-        direction[pair] = spoke
-        way = Way(fixed, least, direction, held, bounds, 1.0 / float(spoke @ np.linalg.solve(own, spoke)))
-        points, end = way.to_level(LEVEL, first=LEVEL)
+        direction[pair] = along
+        ray = Ray(fixed, least, direction, held, bounds, 1.0 / float(along @ np.linalg.solve(own, along)))
+        points, end = ray.to_level(LEVEL, first=LEVEL)
         reached = end if end is not None else max((distance for distance, _ in points), default=0.0)
         cut = cut or end is None
-        edge.append(centre + reached * spoke)
-    return JointRegion(numbers, np.array(edge), centre + LEVEL * spokes, cut)
+        edge.append(centre + reached * along)
+    return JointRegion(numbers, np.array(edge), centre + LEVEL * directions, cut)

@@ -17,9 +17,9 @@ from palpate.mechanics.curved import CurvedModel
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import ForwardModel
 
-__all__ = ["FixedCorrespondence", "Profile", "Way", "fixed_correspondence", "profile"]
+__all__ = ["FixedCorrespondence", "Profile", "Ray", "fixed_correspondence", "profile"]
 
-TRIALS = 12  # points on a way from the estimate
+TRIALS = 12  # points on a ray from the estimate
 NEAR = 0.05  # of the level, to which an end is found before a line to the estimate corrects it
 FURTHEST = 2.0  # times the distance of the last point: more is not extrapolated
 
@@ -113,8 +113,8 @@ def profile(
     held, centre = np.arange(fixed.n_parameters) == number, float(least.unknowns[number])
     points, ends = [(centre, 0.0)], list[float | None]()
     for sign in (-1.0, 1.0):
-        way = Way(fixed, least, sign * held, held, bounds, scale)
-        found, end = way.to_level(level, first=level * float(np.sqrt(variance)))
+        ray = Ray(fixed, least, sign * held, held, bounds, scale)
+        found, end = ray.to_level(level, first=level * float(np.sqrt(variance)))
         points += [(centre + sign * distance, sign * root) for distance, root in found]
         ends.append(None if end is None else centre + sign * end)
     ordered = np.array(sorted(points))
@@ -122,10 +122,10 @@ def profile(
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
-    """A straight way of the log-moduli from a minimum, along which all unknowns that are not held are at their best.
+class Ray:
+    """A straight line of the log-moduli from a minimum, along which all unknowns that are not held are at their best.
 
-    direction (n_parameters,): change of the log-moduli for a distance of 1; held (n_parameters,): which of them the way
+    direction (n_parameters,): change of the log-moduli for a distance of 1; held (n_parameters,): which of them the ray
     holds; scale: that of the deviance 2 (min J - least J), whose root is r.
     """
 
@@ -144,7 +144,7 @@ class Way:
         return float(np.min((limits - theta)[along] / self.direction[along]))
 
     def to_level(self, level: float, *, first: float) -> tuple[list[tuple[float, float]], float | None]:
-        """Points (distance, r) on the way, from the `first` distance on, and where r is the level; None at the bound.
+        """Points (distance, r) on the ray, from the `first` distance on, and where r is the level; None at the bound.
 
         The root deviance is nearly straight: the next point is where a line through the minimum and the last one, or
         through the last two around the level, meets it. A place at which the model cannot be solved ends the search as
