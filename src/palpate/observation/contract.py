@@ -140,11 +140,11 @@ class Observation(Protocol):
         ...
 
     def first_noise(self, peers: Sequence[Self]) -> NoiseModel:
-        """Noise of all observations of the kind, itself among its `peers`, before residuals tell."""
+        """Noise of the kind's observations in one later image, itself among its `peers`, before residuals tell."""
         ...
 
     def fitted_noise(self, residuals: Sequence[Residuals]) -> NoiseModel:
-        """Noise that residuals of observations of the kind tell."""
+        """Noise that the residuals of the kind's observations in one later image tell."""
         ...
 
     def wall_motion(
