@@ -12,7 +12,7 @@ from scipy import sparse
 from palpate.mesh.surface import mean_curvature, triangle_normals, vertex_normals
 from palpate.observation.contract import Residuals
 from palpate.observation.observed_surface import ObservedSurface
-from palpate.observation.target import SurfaceTarget, places_within
+from palpate.observation.target import SurfaceTarget, places_within, values_and_gradients
 
 __all__ = ["Correspondence", "correspondence", "surface_residuals"]
 
@@ -117,9 +117,9 @@ def _model_to_image(target: SurfaceTarget, displacement: NDArray[np.float64], he
     material, places = (
         places_within(vertices[corners], target.barycentric) for vertices in (surface.rest, surface.rest + displacement)
     )
-    gradient = target.after.gradient_at(places)
+    distance, gradient = values_and_gradients(target.after, places)
     excess = np.einsum("qk,qk->q", target.barycentric, held.excess[corners])
-    values = target.after.at(places) - target.rest_distance - excess
+    values = distance - target.rest_distance - excess
     rows = target.barycentric[:, :, None] * gradient[:, None]
     normals = _smooth_normals(surface.rest + displacement, surface.triangles, corners, target.barycentric)
     slope = np.einsum("qa,qa->q", gradient, normals)
@@ -146,9 +146,10 @@ def _image_to_model(target: SurfaceTarget, displacement: NDArray[np.float64], he
     material = (closest.barycentric[:, None] @ rest)[:, 0]
     at_vertices = held.excess[corners]
     excess = np.einsum("nk,nk->n", closest.barycentric, at_vertices)
-    values = side * length - (target.before.at(material) - target.level) - excess
+    at_rest, gradient = values_and_gradients(target.before, material)
+    values = side * length - (at_rest - target.level) - excess
     rows = closest.barycentric[:, :, None] * direction[:, None]
-    at_corners = (rest @ target.before.gradient_at(material)[:, :, None])[:, :, 0] + at_vertices
+    at_corners = (rest @ gradient[:, :, None])[:, :, 0] + at_vertices
     rows += _slide(closest, deformed, offset, at_corners)
     normals = _smooth_normals(surface.rest + displacement, surface.triangles, corners, closest.barycentric)
     smooth = closest.barycentric[:, :, None] * normals[:, None]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from palpate.mesh.anatomy import LevelSet
 from palpate.mesh.surface import triangle_normals
 from palpate.observation.observed_surface import ObservedSurface
 
-__all__ = ["SurfaceTarget", "places_within", "surface_target", "target_from"]
+__all__ = ["OneLookUp", "SurfaceTarget", "places_within", "surface_target", "target_from", "values_and_gradients"]
 
 # Strang & Fix 1973: three interior points, exact for quadratics; one point where triangles are as small as voxels
 THREE_POINTS = np.array([[4.0, 1.0, 1.0], [1.0, 4.0, 1.0], [1.0, 1.0, 4.0]]) / 6.0
@@ -77,6 +78,24 @@ def surface_target(surface: ObservedSurface, before: DistanceMap, after: Distanc
     )
 
 
+@runtime_checkable
+class OneLookUp(Protocol):
+    """A distance that tells its value and its gradient together for little more than one of them."""
+
+    def values_and_gradients(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Signed distances (n,) mm and gradients (n, 3), mm per mm, at points (n, 3) in RAS mm."""
+        ...
+
+
+def values_and_gradients(
+    distance: LevelSet, points: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Signed distances (n,) mm and gradients (n, 3), mm per mm, at points (n, 3) in RAS mm."""
+    if isinstance(distance, OneLookUp):
+        return distance.values_and_gradients(points)
+    return distance.at(points), distance.gradient_at(points)
+
+
 def places_within(corners: NDArray[np.float64], barycentric: NDArray[np.float64]) -> NDArray[np.float64]:
     """Places (n, 3) mm at barycentric coordinates (n, 3) of triangles with corners (n, 3, 3) mm.
 
@@ -104,5 +123,5 @@ def target_from(
     barycentric = np.tile(rule, (len(seen), 1))
     area = np.repeat(size / len(rule), len(rule))
     places = places_within(surface.rest[surface.triangles[triangle]], barycentric)
-    quiet = np.zeros(len(area))
-    return SurfaceTarget(surface, before, after, triangle, barycentric, area, before.at(places), level, *image, quiet)
+    rest, quiet = values_and_gradients(before, places)[0], np.zeros(len(area))
+    return SurfaceTarget(surface, before, after, triangle, barycentric, area, rest, level, *image, quiet)

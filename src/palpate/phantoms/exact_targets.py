@@ -31,10 +31,14 @@ class TriangulatedDistance:
 
     def gradient_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Gradient (n, 3) at points (n, 3) in RAS mm: away from the closest point, on the surface its normal."""
+        return self.values_and_gradients(points)[1]
+
+    def values_and_gradients(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Both by one query: signed distance (n,) mm and gradient (n, 3) at points (n, 3) in RAS mm."""
         distance, closest, normal = self._query(points)
         apart = np.abs(distance) > 1e-7
         scale = np.where(apart, distance, 1.0)[:, None]
-        return np.asarray(np.where(apart[:, None], (points - closest) / scale, normal))
+        return distance, np.asarray(np.where(apart[:, None], (points - closest) / scale, normal))
 
     def _query(
         self, points: NDArray[np.float64]
