@@ -5,8 +5,8 @@
 
 For each pelvis one estimate from the clean surfaces of a finer mesh. Then each draw moves both images' surfaces along
 their normals by a random field of its own, and weights and moduli are sought anew **with the closest points and the
-approximation of the clean estimate** (the fast path); intervals are the product's, without the part of
-the voxels' place. A line of JSON a pelvis, as soon as it is done; another run with the same file adds to it. The truths
+approximation of the clean estimate** (the fast path); intervals are the product's, without the parts of
+the voxels' place and of the mesh. A line of JSON a pelvis, as soon as it is done; another run with the same file adds to it. The truths
 are known: simulated data.
 """
 
@@ -28,7 +28,7 @@ from scipy import stats
 
 from palpate.inversion import Bounds, Linearisation, Minimum, Objective, invert
 from palpate.phantoms import smooth_field
-from palpate.uncertainty import mesh_covariance, modulus_interval, refitted, sandwich_covariance
+from palpate.uncertainty import modulus_interval, refitted, sandwich_covariance
 
 Array = NDArray[np.float64]
 Shift = Callable[[Array, Array, np.random.Generator, bool], Array]  # of places and normals, in the later image or not
@@ -157,7 +157,7 @@ def _drawn(clean: Clean, setting: Setting, seed: int, draw: int) -> dict[str, An
     minimum, fixed = refitted(clean.objective, replace(clean.minimum, evaluation=evaluation), clean.bounds)
     objective = fixed.objective
     n = objective.n_parameters
-    covariance = sandwich_covariance(objective, minimum.evaluation) + mesh_covariance(objective)
+    covariance = sandwich_covariance(objective, minimum.evaluation)
     theta, found = minimum.unknowns[:n], []
     for i in range(n):
         variance = float(covariance[i, i])
