@@ -5,9 +5,9 @@
 
 For each pelvis one estimate from the clean surfaces of a finer mesh. Then each draw moves both images' surfaces along
 their normals by a random field of its own, and weights and moduli are sought anew **with the closest points and the
-approximation of the clean estimate** (the fast path); intervals are the product's, without the parts of
-the voxels' place and of the mesh. A line of JSON a pelvis, as soon as it is done; another run with the same file adds to it. The truths
-are known: simulated data.
+approximation of the clean estimate** (the fast path); intervals are the product's, without the parts of the voxels'
+place and of the mesh. A line of JSON a pelvis, as soon as it is done; another run with the same file adds to it. The
+truths are known: simulated data.
 """
 
 from __future__ import annotations
