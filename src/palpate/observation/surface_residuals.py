@@ -17,6 +17,11 @@ from palpate.observation.target import SurfaceTarget, places_within, values_and_
 __all__ = ["Correspondence", "correspondence", "surface_residuals"]
 
 ON_EDGE = 1e-9
+# Directions (8, 2, 3) in barycentric coordinates along which a closest point may slide, zero where none: by which
+# corners have no share in it (1, 2, 4 added up). Inside there are two, on an edge one, at a corner none.
+SLIDES = np.zeros((8, 2, 3))
+SLIDES[0] = [[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]]
+SLIDES[1, 0], SLIDES[2, 0], SLIDES[4, 0] = [0.0, -1.0, 1.0], [-1.0, 0.0, 1.0], [-1.0, 1.0, 0.0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,31 +46,54 @@ class _Closest:
     places: NDArray[np.float64]
 
 
+@dataclass(frozen=True, slots=True)
+class _Direction:
+    """Residuals (n,) of one direction of the distance, as `Residuals` has them.
+
+    corners (n, 3): vertices of the triangle of each; exact, smooth (n, 3 corners, 3 axes): derivatives by their motion.
+    """
+
+    values: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    places: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    material: NDArray[np.float64]
+    corners: NDArray[np.int64]
+    exact: NDArray[np.float64]
+    smooth: NDArray[np.float64]
+
+
 def surface_residuals(target: SurfaceTarget, displacement: NDArray[np.float64], held: Correspondence) -> Residuals:
     """Residuals and their exact derivative at a displacement (n_vertices, 3) mm of the surface's points.
 
     model -> image first, then image -> model (see `SurfaceDistance`), each with half of the weight, shared out by area.
     """
-    forward = _model_to_image(target, displacement, held)
-    backward = _image_to_model(target, displacement, held)
+    vertices = target.surface.rest + displacement
+    normals = vertex_normals(vertices, target.surface.triangles)
+    both = (_model_to_image(target, vertices, normals, held), _image_to_model(target, vertices, normals, held))
+    corners = np.concatenate([d.corners for d in both])
+    columns = (3 * corners[:, :, None] + np.arange(3)).ravel()
+    starts, shape = 9 * np.arange(len(corners) + 1), (len(corners), 3 * len(vertices))
+    rows = (np.concatenate([d.exact for d in both]), np.concatenate([d.smooth for d in both]))
+    exact, smooth = (sparse.csr_matrix((of.ravel(), columns, starts), shape=shape) for of in rows)
     return Residuals(
-        np.concatenate([forward.values, backward.values]),
-        np.concatenate([forward.weights, backward.weights]),
-        np.concatenate([forward.places, backward.places]),
-        np.concatenate([forward.normals, backward.normals]),
-        np.concatenate([forward.material, backward.material]),
-        sparse.vstack([forward.jacobian, backward.jacobian], format="csr"),
-        sparse.vstack([forward.smooth_jacobian, backward.smooth_jacobian], format="csr"),
+        np.concatenate([d.values for d in both]),
+        np.concatenate([d.weights for d in both]),
+        np.concatenate([d.places for d in both]),
+        np.concatenate([d.normals for d in both]),
+        np.concatenate([d.material for d in both]),
+        exact,
+        smooth,
     )
 
 
 def correspondence(target: SurfaceTarget, displacement: NDArray[np.float64]) -> Correspondence:
     """Of a displacement (n_vertices, 3) mm: the image points that face the observed part, not its rim; the excess."""
-    closest = _closest(target, displacement, target.image_points)
-    surface = target.surface
+    surface, vertices = target.surface, target.surface.rest + displacement
+    closest = _closest(surface, vertices, target.image_points)
     at_rim = np.any((closest.barycentric < ON_EDGE) & surface.rim[closest.triangle], axis=1)
     corners = surface.triangles[closest.triangle]
-    normals = _smooth_normals(surface.rest + displacement, surface.triangles, corners, closest.barycentric)
+    normals = _within(vertex_normals(vertices, surface.triangles), corners, closest.barycentric)
     kept = surface.observed[closest.triangle] & ~at_rim
     if target.voxels is None:  # exact maps: nothing is smoothed, and they are made of plane pieces themselves
         excess = np.zeros(len(surface.rest))
@@ -111,63 +139,61 @@ def _bulge(surface: ObservedSurface, displacement: NDArray[np.float64]) -> NDArr
     return np.asarray(volumes / np.bincount(triangles.ravel(), np.repeat(areas, 3), len(vertices)))
 
 
-def _model_to_image(target: SurfaceTarget, displacement: NDArray[np.float64], held: Correspondence) -> Residuals:
-    surface = target.surface
-    corners = surface.triangles[target.triangle]
-    material, places = (
-        places_within(vertices[corners], target.barycentric) for vertices in (surface.rest, surface.rest + displacement)
-    )
+def _model_to_image(
+    target: SurfaceTarget, vertices: NDArray[np.float64], normals: NDArray[np.float64], held: Correspondence
+) -> _Direction:
+    """Of the deformed vertices (n_vertices, 3) mm with unit normals (n_vertices, 3)."""
+    corners = target.surface.triangles[target.triangle]
+    material, places = (places_within(of[corners], target.barycentric) for of in (target.surface.rest, vertices))
     distance, gradient = values_and_gradients(target.after, places)
     excess = np.einsum("qk,qk->q", target.barycentric, held.excess[corners])
-    values = distance - target.rest_distance - excess
-    rows = target.barycentric[:, :, None] * gradient[:, None]
-    normals = _smooth_normals(surface.rest + displacement, surface.triangles, corners, target.barycentric)
-    slope = np.einsum("qa,qa->q", gradient, normals)
-    smooth = target.barycentric[:, :, None] * (slope[:, None] * normals)[:, None]
-    weights = 0.5 * target.area / target.area.sum()
-    n = len(surface.rest)
-    exact, normal = _sparse_rows(rows, corners, n), _sparse_rows(smooth, corners, n)
-    return Residuals(values, weights, places, normals, material, exact, normal)
+    exact = target.barycentric[:, :, None] * gradient[:, None]
+    normal = _within(normals, corners, target.barycentric)
+    slope = np.einsum("qa,qa->q", gradient, normal)
+    smooth = target.barycentric[:, :, None] * (slope[:, None] * normal)[:, None]
+    values, weights = distance - target.rest_distance - excess, 0.5 * target.area / target.area.sum()
+    return _Direction(values, weights, places, normal, material, corners, exact, smooth)
 
 
-def _image_to_model(target: SurfaceTarget, displacement: NDArray[np.float64], held: Correspondence) -> Residuals:
+def _image_to_model(
+    target: SurfaceTarget, vertices: NDArray[np.float64], normals: NDArray[np.float64], held: Correspondence
+) -> _Direction:
+    """Of the deformed vertices (n_vertices, 3) mm with unit normals (n_vertices, 3)."""
     surface, kept = target.surface, held.kept
     image = target.image_points[kept]
-    closest = _closest(target, displacement, image)
+    closest = _closest(surface, vertices, image)
     corners = surface.triangles[closest.triangle]
-    deformed = (surface.rest + displacement)[corners]
+    deformed, rest = vertices[corners], surface.rest[corners]
     offset = closest.places - image
-    normal = np.cross(deformed[:, 1] - deformed[:, 0], deformed[:, 2] - deformed[:, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-    length = np.linalg.norm(offset, axis=1)
-    side = np.where(np.einsum("na,na->n", offset, normal) < 0.0, -1.0, 1.0)
-    direction = np.where(length[:, None] > 1e-9, side[:, None] * offset / np.maximum(length, 1e-30)[:, None], normal)
-    rest = surface.rest[corners]
-    material = (closest.barycentric[:, None] @ rest)[:, 0]
+    plane = triangle_normals(vertices, surface.triangles)
+    plane = (plane / np.maximum(_length(plane), 1e-30)[:, None])[closest.triangle]
+    length = _length(offset)
+    side = np.where(np.einsum("na,na->n", offset, plane) < 0.0, -1.0, 1.0)
+    direction = np.where(length[:, None] > 1e-9, (side / np.maximum(length, 1e-30))[:, None] * offset, plane)
+    material = places_within(rest, closest.barycentric)
     at_vertices = held.excess[corners]
     excess = np.einsum("nk,nk->n", closest.barycentric, at_vertices)
     at_rest, gradient = values_and_gradients(target.before, material)
-    values = side * length - (at_rest - target.level) - excess
-    rows = closest.barycentric[:, :, None] * direction[:, None]
-    at_corners = (rest @ gradient[:, :, None])[:, :, 0] + at_vertices
-    rows += _slide(closest, deformed, offset, at_corners)
-    normals = _smooth_normals(surface.rest + displacement, surface.triangles, corners, closest.barycentric)
-    smooth = closest.barycentric[:, :, None] * normals[:, None]
+    at_corners = np.einsum("nka,na->nk", rest, gradient) + at_vertices
+    exact = closest.barycentric[:, :, None] * direction[:, None] + _slide(closest, deformed, offset, at_corners)
+    normal = _within(normals, corners, closest.barycentric)
+    smooth = closest.barycentric[:, :, None] * normal[:, None]
     weights = 0.5 * target.image_area[kept] / max(target.image_area[kept].sum(), 1e-30)
-    n = len(surface.rest)
-    exact, plane = _sparse_rows(rows, corners, n), _sparse_rows(smooth, corners, n)
-    return Residuals(values, weights, closest.places, normals, material, exact, plane)
+    values = side * length - (at_rest - target.level) - excess
+    return _Direction(values, weights, closest.places, normal, material, corners, exact, smooth)
 
 
-def _smooth_normals(
-    vertices: NDArray[np.float64],
-    triangles: NDArray[np.int64],
-    corners: NDArray[np.int64],
-    barycentric: NDArray[np.float64],
+def _within(
+    normals: NDArray[np.float64], corners: NDArray[np.int64], barycentric: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Unit normals (n, 3) interpolated from area-weighted ones at the corners (n, 3) of the places' triangles."""
-    normals = (barycentric[:, None] @ vertex_normals(vertices, triangles)[corners])[:, 0]
-    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30))
+    """Unit normals (n, 3) interpolated from those (n_vertices, 3) at the corners (n, 3) of the places' triangles."""
+    within = np.einsum("nk,nka->na", barycentric, normals[corners])
+    return np.asarray(within / np.maximum(_length(within), 1e-30)[:, None])
+
+
+def _length(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lengths (n,) of vectors (n, 3)."""
+    return np.asarray(np.sqrt(np.einsum("na,na->n", vectors, vectors)))
 
 
 def _slide(
@@ -182,28 +208,22 @@ def _slide(
     Gram matrix G_ij = t_i . t_j and the closest-point condition (x - y) . t_i = 0:
     G_ij d xi_j = -(t_i . sum_a N_a du_a + (x - y) . d t_i), on an edge with its one tangent, at a corner not at all.
     """
-    # directions (n, 2, 3) in barycentric coordinates along which the point may slide; zero where none
-    zero = closest.barycentric < ON_EDGE
-    count = zero.sum(axis=1)
-    along = np.zeros((len(zero), 2, 3))
-    along[count == 0] = [[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]]
-    for corner in range(3):
-        first, second = [c for c in range(3) if c != corner]
-        on_edge = (count == 1) & zero[:, corner]
-        along[on_edge, 0, first], along[on_edge, 0, second] = -1.0, 1.0
-    tangent = along @ deformed  # (n, 2, 3 corners) x (n, 3 corners, 3 axes) -> (n, 2, 3 axes)
-    gram = tangent @ tangent.transpose(0, 2, 1)
-    still = ~np.any(along != 0.0, axis=2)
-    gram[:, [0, 1], [0, 1]] += still
-    change = along @ at_corners[:, :, None]
-    rate = np.linalg.solve(gram, change).transpose(0, 2, 1)  # (n, 1, 2)
-    rows = closest.barycentric[:, :, None] * (rate @ tangent)
-    return np.asarray(rows + (rate @ along).transpose(0, 2, 1) * offset[:, None])
+    along = SLIDES[(closest.barycentric < ON_EDGE) @ np.array([1, 2, 4])]  # (n, 2, 3 corners)
+    first, second = (np.einsum("nk,nka->na", along[:, i], deformed) for i in range(2))
+    change = np.einsum("nik,nk->ni", along, at_corners)
+    still = ~along.any(axis=2)
+    g11, g22 = (np.einsum("na,na->n", t, t) + still[:, i] for i, t in enumerate((first, second)))
+    g12 = np.einsum("na,na->n", first, second)
+    determinant = g11 * g22 - g12 * g12
+    rate = np.stack([g22 * change[:, 0] - g12 * change[:, 1], g11 * change[:, 1] - g12 * change[:, 0]], axis=1)
+    rate /= determinant[:, None]
+    slid = rate[:, :1] * first + rate[:, 1:] * second
+    by_corner = np.einsum("ni,nik->nk", rate, along)
+    return np.asarray(closest.barycentric[:, :, None] * slid[:, None] + by_corner[:, :, None] * offset[:, None])
 
 
-def _closest(target: SurfaceTarget, displacement: NDArray[np.float64], image: NDArray[np.float64]) -> _Closest:
-    vertices = np.ascontiguousarray(target.surface.rest + displacement)
-    triangles = np.ascontiguousarray(target.surface.triangles)
+def _closest(surface: ObservedSurface, vertices: NDArray[np.float64], image: NDArray[np.float64]) -> _Closest:
+    triangles = np.ascontiguousarray(surface.triangles)
     _, triangle, places = igl.point_mesh_squared_distance(np.ascontiguousarray(image), vertices, triangles)[:3]
     corner = vertices[triangles[triangle]]
     barycentric = igl.barycentric_coordinates(
@@ -216,13 +236,3 @@ def _closest(target: SurfaceTarget, displacement: NDArray[np.float64], image: ND
     barycentric[barycentric < ON_EDGE] = 0.0
     barycentric /= barycentric.sum(axis=1, keepdims=True)
     return _Closest(np.asarray(triangle, dtype=np.int64), barycentric, np.asarray(places))
-
-
-def _sparse_rows(
-    rows: NDArray[np.float64], corners: NDArray[np.int64], n_vertices: int
-) -> sparse.csr_matrix[np.float64]:
-    """Rows (n, 3 corners, 3 axes) as a sparse matrix (n, 3 n_vertices)."""
-    columns = (3 * corners[:, :, None] + np.arange(3)).reshape(len(rows), 9)
-    start = 9 * np.arange(len(rows) + 1)
-    shape = (len(rows), 3 * n_vertices)
-    return sparse.csr_matrix((rows.reshape(-1), columns.ravel(), start), shape=shape)
