@@ -5,24 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.inversion import Bounds, gauss_newton
-from palpate.observation.noise_model import NoiseModel
+from palpate.inversion import Bounds
 from palpate.uncertainty.joint_region import DIRECTIONS, LEVEL, joint_region
 from palpate.uncertainty.profile import fixed_correspondence, profile
 
 WIDE = Bounds(np.full(2, np.log(0.02)), np.full(2, np.log(200.0)))
-WEAK = NoiseModel(np.array([0.18**2]), np.array([3.0]))
-
-
-@pytest.fixture(scope="module")
-def objective(twins, twin):
-    """With so much noise that the moduli are known to a factor of two at the most."""
-    return twins.objective_of(twins.exact_problem(twin, noise=WEAK), twin.coefficients).rematched(twin.unknowns)
-
-
-@pytest.fixture(scope="module")
-def minimum(objective, twin):
-    return gauss_newton(objective, twin.unknowns, bounds=WIDE, tolerance=1e-8)
 
 
 @pytest.fixture(scope="module")

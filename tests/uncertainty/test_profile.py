@@ -10,23 +10,10 @@ from palpate.mechanics.curved import CurvedModel
 from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.first_order import expanded
 from palpate.mechanics.laws.registry import law_named
-from palpate.observation.noise_model import NoiseModel
 from palpate.uncertainty import NORMAL_95, sample_posterior
 from palpate.uncertainty.profile import fixed_correspondence, profile
 
 WIDE = Bounds(np.full(2, np.log(0.02)), np.full(2, np.log(200.0)))
-WEAK = NoiseModel(np.array([0.18**2]), np.array([3.0]))
-
-
-@pytest.fixture(scope="module")
-def objective(twins, twin):
-    """With so much noise that the moduli are known to a factor of two at the most."""
-    return twins.objective_of(twins.exact_problem(twin, noise=WEAK), twin.coefficients).rematched(twin.unknowns)
-
-
-@pytest.fixture(scope="module")
-def minimum(objective, twin):
-    return gauss_newton(objective, twin.unknowns, bounds=WIDE, tolerance=1e-8)
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +37,10 @@ def test_where_the_model_is_straight_the_ends_are_those_of_the_ellipse(objective
 
 
 def test_at_the_ends_the_objective_is_higher_by_the_level_at_its_best(objective, minimum, variance):
-    fixed, least = fixed_correspondence(objective, minimum.unknowns, minimum.evaluation), minimum.evaluation.value
+    fixed, least = (
+        fixed_correspondence(objective, minimum.unknowns, minimum.evaluation),
+        minimum.evaluation.value,
+    )
     found = profiled(objective, minimum, 0, variance[0])
     for end in (found.low, found.high):
         start = minimum.unknowns.copy()

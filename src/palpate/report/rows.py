@@ -19,7 +19,7 @@ CAUSES = {
     "grid": "the voxels' place",
     "mesh": "the mesh",
 }
-OPACITIES = (0.95, 0.65, 0.4, 0.2)  # of the causes' parts, in their order
+FADING = 0.6  # of a cause's opacity, that of the next one on the bar
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,8 +191,8 @@ def _scale(items: Iterable[Mapping[str, Any]]) -> tuple[float, float] | None:
 def _shares(parts: Mapping[str, float]) -> tuple[Share, ...]:
     """Parts of 1 by their names, one after the other along a bar."""
     found, place = list[Share](), 0.0
-    for (name, part), opacity in zip(parts.items(), OPACITIES, strict=False):
-        found.append(Share(name, f"{100 * part:.0f} %", place, BAR * part, opacity))
+    for number, (name, part) in enumerate(parts.items()):
+        found.append(Share(name, f"{100 * part:.0f} %", place, BAR * part, round(FADING**number, 2)))
         place += BAR * part
     return tuple(found)
 

@@ -187,6 +187,17 @@ def test_a_rough_solution_preconditions_conjugate_gradients(problem, solver):
     assert steps <= 3
 
 
+def test_each_column_of_conjugate_gradients_has_its_tolerance(problem):
+    matrix, _, loads, _ = problem
+    two = np.column_stack([loads[:, 0], loads[:, 0]])
+    nearly = 1.0 / matrix.diagonal()[:, None]
+    tolerances = np.array([1e-2, 1e-8])
+    found, _ = conjugate_gradients(matrix, two, lambda r: nearly * r, tolerance=tolerances, max_iterations=4000)
+    left = np.linalg.norm(two - matrix @ found, axis=0) / np.linalg.norm(two, axis=0)
+    assert np.all(left < 1.01 * tolerances)
+    assert left[0] > 1e-5  # it stopped where it was asked to
+
+
 def test_twin_rows_are_the_unknowns_of_one_node(problem, meshes):
     space = lagrange_space(meshes.box_mesh(2), "P2")
     assert np.array_equal(twin_rows(tissue_stiffness(space, 0, 0.3)), np.repeat(np.arange(len(space.points)), 3))
