@@ -1,8 +1,10 @@
 # Everything runs inside .venv, which each target makes when it is missing or older than pyproject.toml. Modules are
-# compiled when they are imported: compiling all that comes along takes two fifths of the installation.
+# compiled when they are imported: compiling all that comes along takes two fifths of the installation. What has been
+# compiled is kept in .venv, also where the shell says otherwise: else every process would compile it anew.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: install demo test style lint check clean pardiso benchmark-setup schemas docs dist dist-test minimum report-check export-check
 

@@ -4,7 +4,7 @@ from palpate.mesh.anatomy import Anatomy, Box, LevelSet, anatomy_of, domain_box,
 from palpate.mesh.constraint import Constraint
 from palpate.mesh.quality import check_mesh
 from palpate.mesh.space import LagrangeSpace, lagrange_space, triangle_shape
-from palpate.mesh.surface import tissue_surface, triangle_normals
+from palpate.mesh.surface import tissue_surface, triangle_normals, vertex_normals
 from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh
 from palpate.mesh.tetrahedralise import COARSER, COARSEST, GRADING, boundary_of, tetrahedralise
 
@@ -30,4 +30,5 @@ __all__ = [
     "tissue_surface",
     "triangle_normals",
     "triangle_shape",
+    "vertex_normals",
 ]
