@@ -42,10 +42,11 @@ def test_a_case_is_made_of_the_demos_images_from_the_wheel(unpacked, tmp_path):
 
 
 def test_every_file_of_the_package_is_in_the_wheel(unpacked):
-    package = ROOT / "src" / "palpate"
-    wanted = {path.relative_to(package) for path in package.rglob("*") if path.is_file() and path.suffix != ".pyc"}
-    assert {path.relative_to(unpacked / "palpate") for path in (unpacked / "palpate").rglob("*") if path.is_file()} == (
-        wanted
-    )
+    def files(package: Path) -> set[Path]:
+        """Those of a package, but for what Python keeps of the modules that it compiled."""
+        found = (path for path in package.rglob("*") if path.is_file() and path.parent.name != "__pycache__")
+        return {path.relative_to(package) for path in found}
+
+    assert files(unpacked / "palpate") == files(ROOT / "src" / "palpate")
     licences = {path.name for path in next(unpacked.glob("*.dist-info/licenses")).rglob("*") if path.is_file()}
     assert {"LICENSE", "NOTICE", "three.LICENSE.txt"} <= licences
