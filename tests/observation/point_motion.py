@@ -53,7 +53,7 @@ class PointMotion:
     def first_noise(self, _peers):
         return self.stated_noise
 
-    def fitted_noise(self, _residuals):
+    def fitted_noise(self, _residuals, _response=None):
         return self.stated_noise
 
     def wall_motion(self, _residuals, *, present, kernel_mm):  # noqa: ARG002

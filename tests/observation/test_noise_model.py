@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.observation.noise_model import NoiseModel, fit_noise_model, mean_noise
+from palpate.observation.noise_model import FitResponse, NoiseModel, fit_noise_model, mean_noise
 from palpate.phantoms.boundary_noise import smooth_field
 
 RADIUS = 20.0
@@ -44,6 +44,48 @@ def test_a_smooth_field_is_recognised(rng, sd, length, radius, count):
     noise = fit_noise_model(*residuals(rng, sd, length, radius, count))
     assert noise.sd == pytest.approx(sd, rel=0.15)
     assert np.sqrt(noise.correlation_area / (2.0 * np.pi)) == pytest.approx(length, rel=0.25)
+
+
+def smooth_motion(normals, count=24):
+    """Columns (n, count) of a Jacobian: the first polynomials of the normal."""
+    powers = [(i, j, k) for i in range(4) for j in range(4) for k in range(2)]
+    powers.sort(key=sum)
+    return np.column_stack([np.prod(normals**power, axis=1) for power in powers[:count]])
+
+
+def test_what_a_fit_leaves_of_errors_is_the_projected_covariance():
+    """(1 - J G) K (1 - J G)^T in bins of distance, against the product of whole matrices."""
+    places, normals = sphere(1200)
+    jacobian, length = smooth_motion(normals, 12), 6.0
+    gain = np.linalg.pinv(jacobian)
+    found = FitResponse([jacobian], gain, places, normals).left(length, [(places, normals)])
+    cosine, distance = normals @ normals.T, np.linalg.norm(places[:, None] - places[None], axis=2)
+    kept = np.eye(len(places)) - jacobian @ gain
+    left = kept @ (np.exp(-(distance**2) / (2.0 * length**2)) * cosine) @ kept.T
+    for low in (0, 2, 5, 8, 12, 18, 24):
+        pairs = (distance >= low) & (distance < low + 1) if low else distance == 0.0
+        expected = np.sum((left * cosine)[pairs]) / np.sum((cosine**2)[pairs])
+        assert found[low + 1 if low else 0] == pytest.approx(expected, abs=0.03)
+
+
+def test_the_response_of_a_fit_tells_how_large_and_how_far_correlated_the_errors_were(rng):
+    places, normals = sphere(2400, 30.0)
+    jacobian = smooth_motion(normals, 12)
+    gain = np.linalg.pinv(jacobian)
+    response = FitResponse([jacobian], gain, places, normals)
+    found = {"left": [], "told": []}
+    for _ in range(12):
+        field = smooth_field(rng, sd_mm=0.3, correlation_mm=6.0, features=500)
+        errors = np.einsum("na,na->n", field.at(places), normals)
+        left = errors - jacobian @ (gain @ errors)
+        for name, of in (("left", None), ("told", response)):
+            noise = fit_noise_model([left], [places], [normals], of)
+            found[name].append((noise.sd / 0.3, noise.variances @ noise.lengths**2 / (0.3**2 * 6.0**2)))
+    (sd, reach), (told_sd, told_reach) = (np.median(found[name], axis=0) for name in ("left", "told"))
+    assert sd < 0.95
+    assert reach < 0.7
+    assert told_sd == pytest.approx(1.0, abs=0.1)
+    assert told_reach == pytest.approx(1.0, abs=0.35)
 
 
 def test_independent_residuals_have_no_correlation_length(rng):

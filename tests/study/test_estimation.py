@@ -170,7 +170,8 @@ def test_an_estimate_at_its_bound_is_not_identified(twins, twin, observed):
 
 def test_an_imprecise_image_identifies_nothing(inversion, settings, observed):
     rough, objective = NoiseModel(np.array([1.0]), np.array([6.0])), inversion.objective
-    vague = objective.with_observations([o.with_noise(rough) for o in objective.observations])
+    stated_noise = [replace(o.with_noise(rough), stated_noise=rough) for o in objective.observations]
+    vague = objective.with_observations(stated_noise)
     verdicts = [e.verdict for e in stated(with_candidate(inversion, objective=vague), settings, observed).estimates]
     assert "identified" not in verdicts
     assert "not identified" in verdicts

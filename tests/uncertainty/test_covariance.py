@@ -38,6 +38,10 @@ class Seen:
     weighting: Weighting
     state: int = 0
     kind: str = "surface distance"
+    of_driver: bool = False
+
+    def fitted_noise(self, _residuals, _response):
+        return self.noise_model
 
 
 def surface(places, normals, jacobian, *, precision, noise, state=0, kind="surface distance"):

@@ -47,8 +47,8 @@ def seen(jacobian):
     """Objective and evaluation of one surface on the sphere: two log-moduli, then modes of unit variance."""
     places, normals = sphere()
     n, weights = len(places), np.full(len(places), 1.0 / len(places))
-    target = SimpleNamespace(area=np.ones(n))
-    surface = SurfaceDistance(target, None, NOISE, Weighting(PRECISION, Tukey()))
+    target = SimpleNamespace(area=np.ones(n), surface=SimpleNamespace(driver=False))
+    surface = SurfaceDistance(target, None, NOISE, Weighting(PRECISION, Tukey()), stated_noise=NOISE)
     residuals = Residuals(np.zeros(n), weights, places, normals, places, None, None)
     line = Linearisation(surface, 0, residuals, np.arange(5), jacobian, weights, None)
     prior = np.diag([0.0, 0.0, 1.0, 1.0, 1.0])

@@ -12,7 +12,7 @@ from scipy import sparse
 
 from palpate.images.segmentation import Segmentation
 from palpate.mesh.space import LagrangeSpace
-from palpate.observation.noise_model import NoiseModel
+from palpate.observation.noise_model import FitResponse, NoiseModel
 from palpate.observation.robust_loss import RobustLoss
 
 __all__ = ["Fit", "ImagedBody", "Observation", "Residuals", "Weighting"]
@@ -143,8 +143,11 @@ class Observation(Protocol):
         """Noise of the kind's observations in one later image, itself among its `peers`, before residuals tell."""
         ...
 
-    def fitted_noise(self, residuals: Sequence[Residuals]) -> NoiseModel:
-        """Noise that the residuals of the kind's observations in one later image tell."""
+    def fitted_noise(self, residuals: Sequence[Residuals], response: FitResponse | None = None) -> NoiseModel:
+        """Noise that the residuals of the kind's observations in one later image tell.
+
+        response: of the fit that left them, where what it took of the errors is to be told, too.
+        """
         ...
 
     def wall_motion(

@@ -8,13 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 from scipy.optimize import nnls
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from palpate.parallel import mapped
 
-__all__ = ["EXACT_NOISE", "SEGMENTATION_NOISE", "NoiseModel", "fit_noise_model", "mean_noise"]
+__all__ = ["EXACT_NOISE", "SEGMENTATION_NOISE", "FitResponse", "NoiseModel", "fit_noise_model", "mean_noise"]
 
 LENGTHS = (0.5, 0.8, 1.2, 2.0, 3.0, 4.5, 6.5, 9.5, 14.0)  # mm
 CELL = 1.0  # mm: residuals nearer than that are averaged before they are compared
@@ -24,6 +25,9 @@ ROWS = 256  # of the pairs' table at once: it stays in the cache
 REACH = 28.0  # mm
 BINS = 1 + int(REACH)  # of a cell with itself, then of 1 mm each
 FLOOR = 1e-3  # mm: no surface in an image is known better
+SMOOTH = 4.0  # mm: errors that are correlated over less are hardly taken for motion
+WITHIN = 0.75  # correlation lengths: errors so near are summed before a fit answers to them
+RESPONSE_CELLS = 800  # of a surface, on which what a fit leaves is seen
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,22 +98,77 @@ EXACT_NOISE = NoiseModel(np.array([0.03**2]), np.array([3.0]))  # of surfaces th
 SEGMENTATION_NOISE = NoiseModel(np.array([0.3**2]), np.array([3.0]))  # of segmentations of which nothing is known
 
 
+@dataclass(frozen=True, slots=True)
+class FitResponse:
+    """How a fit answers to errors e of all residuals: its unknowns move by -G e, which leaves residuals e - J G e.
+
+    jacobians: J (n, n_unknowns) of each surface's residuals; gain: G (n_unknowns, n_all) by the errors at places
+    (n_all, 3) mm with normals (n_all, 3), those of all surfaces.
+    """
+
+    jacobians: Sequence[NDArray[np.float64]]
+    gain: NDArray[np.float64]
+    places: NDArray[np.float64]
+    normals: NDArray[np.float64]
+
+    def left(
+        self, length: float, surfaces: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]
+    ) -> NDArray[np.float64]:
+        """The kernel (BINS,) of what is left of errors of variance 1 and a correlation `length` (mm).
+
+        (1 - J G) K (1 - J G)^T in bins of distance, by places and normals (n, 3) of each of the surfaces; nan where a
+        bin has no pair.
+        """
+        _, inverse = _cell_keys(self.places, WITHIN * length)
+        cells = sparse.csr_matrix((np.ones(len(inverse)), (inverse, np.arange(len(inverse)))))
+        centres = _times(cells, self.places) / np.bincount(inverse)[:, None]
+        carried = [_times(cells, (self.gain * self.normals[:, a]).T).T for a in range(3)]  # (n_unknowns, n_cells)
+        kernel = np.exp(cdist(centres, centres, "sqeuclidean") / (-2.0 * length**2))
+        by_errors = sum(((g @ kernel) @ g.T for g in carried), np.zeros((len(self.gain),) * 2))  # G K G^T
+        products, cosines = np.zeros(BINS), np.zeros(BINS)
+        for (places, normals), jacobian in zip(surfaces, self.jacobians, strict=True):
+            own = _cell_means(places, RESPONSE_CELLS)
+            places_of, jacobian_of = _times(own, places), _times(own, jacobian)
+            normals_of = _units(_times(own, normals))
+            across = np.exp(cdist(centres, places_of, "sqeuclidean") / (-2.0 * length**2))
+            pulled = sum(((g @ across) * normals_of[:, a] for a, g in enumerate(carried)), np.zeros(()))  # G K
+            taken = jacobian_of @ (pulled - 0.5 * by_errors @ jacobian_of.T)
+            distance, cosine = cdist(places_of, places_of), normals_of @ normals_of.T
+            left = np.exp(distance**2 / (-2.0 * length**2)) * cosine - taken - taken.T
+            near = distance < REACH
+            bins = _bins(distance[near])
+            products += np.bincount(bins, (left * cosine)[near], minlength=BINS)
+            cosines += np.bincount(bins, (cosine**2)[near], minlength=BINS)
+        return np.asarray(np.divide(products, cosines, out=np.full(BINS, np.nan), where=cosines > 0.0))
+
+
 def fit_noise_model(
-    values: Sequence[NDArray[np.float64]], places: Sequence[NDArray[np.float64]], normals: Sequence[NDArray[np.float64]]
+    values: Sequence[NDArray[np.float64]],
+    places: Sequence[NDArray[np.float64]],
+    normals: Sequence[NDArray[np.float64]],
+    response: FitResponse | None = None,
 ) -> NoiseModel:
     """Fit the model to residuals (n,) mm of several surfaces at places (n, 3) mm with normals (n, 3).
 
     Mean products of residuals in bins of distance, fitted by non-negative least squares to Gaussians of fixed lengths
-    (0.5 to 14 mm). Residuals below 0.001 mm tell no more: they are independent ones of that size.
+    (0.5 to 14 mm). Residuals below 0.001 mm tell no more: they are independent ones of that size. With a `response` the
+    products are compared with those that a fit leaves of such errors, E[r r^T] = (1 - J G) C (1 - J G)^T: smooth errors
+    are taken for motion, and what is left seems smaller and shorter (variance components; Patterson & Thompson,
+    Biometrika 58 (1971) 545-554, whose likelihood is of what a fit leaves, too).
     """
     sums = sum(
         mapped(lambda of: _binned_products(*of), zip(values, places, normals, strict=True)),
         np.zeros((4, BINS)),
     )
-    products, cosines, distances, count = sums[:, sums[3] > 0]
+    seen = sums[3] > 0
+    products, cosines, distances, count = sums[:, seen]
     weight = np.sqrt(count)
     # (n_bins, n_lengths)
     kernels = np.exp(-((distances / count)[:, None] ** 2) / (2.0 * np.square(LENGTHS)))
+    if response is not None:
+        smooth, surfaces = np.flatnonzero(np.array(LENGTHS) > SMOOTH), list(zip(places, normals, strict=True))
+        left = np.stack(mapped(lambda m: response.left(LENGTHS[m], surfaces)[seen], smooth), axis=1)
+        kernels[:, smooth] = np.where(np.isfinite(left), left, kernels[:, smooth])
     variances, _ = nnls(weight[:, None] * kernels, weight * products / cosines)
     kept = variances > 0.0
     if variances.sum() < FLOOR**2:
@@ -124,25 +183,43 @@ def _binned_products(
 
     A cell (1 mm; at most 2500 of them) stands for the means of its residuals, places and normals.
     """
-    keys, inverse = _cell_keys(places, CELL)
-    count = np.bincount(inverse)
-    mean = np.bincount(inverse, values) / count
-    centre = np.stack([np.bincount(inverse, places[:, a]) / count for a in range(3)], axis=1)
-    normal = np.stack([np.bincount(inverse, normals[:, a]) / count for a in range(3)], axis=1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    chosen = np.sort(np.argsort(_scattered(keys), kind="stable")[:MAX_CELLS])
-    mean, centre, normal = mean[chosen], centre[chosen], normal[chosen]
+    cells = _cell_means(places, MAX_CELLS)
+    mean, centre, normal = _times(cells, values), _times(cells, places), _units(_times(cells, normals))
     sums = np.zeros((4, BINS))
     for start in range(0, len(mean), ROWS):
         rows, others = slice(start, start + ROWS), slice(start, None)
         distance = cdist(centre[rows], centre[others])
         once = np.triu(distance < REACH)  # a pair of different cells once, then counted twice
         apart = distance[once]
-        bins = np.where(apart > 0.0, 1 + apart.astype(np.int64), 0)
+        bins = _bins(apart)
         cosine = (normal[rows] @ normal[others].T)[once]
         terms = (np.outer(mean[rows], mean[others])[once] * cosine, cosine**2, apart, np.ones_like(apart))
         sums += np.stack([np.bincount(bins, term, minlength=BINS) for term in terms])
     return sums * np.where(np.arange(BINS) > 0, 2.0, 1.0)
+
+
+def _cell_means(places: NDArray[np.float64], most: int) -> sparse.csr_matrix[np.float64]:
+    """Means (n_cells, n) over what lies in each cell of 1 mm, places (n, 3) mm; of so many cells at the most."""
+    keys, inverse = _cell_keys(places, CELL)
+    shares = 1.0 / np.bincount(inverse)[inverse]
+    chosen = np.sort(np.argsort(_scattered(keys), kind="stable")[:most])
+    every: sparse.csr_matrix[np.float64] = sparse.csr_matrix((shares, (inverse, np.arange(len(inverse)))))
+    return sparse.csr_matrix(every[chosen])
+
+
+def _times(cells: sparse.csr_matrix[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What cells (n_cells, n) make of values (n,) or (n, k)."""
+    return np.asarray(cells @ values, dtype=np.float64)
+
+
+def _units(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Vectors (n, 3) with length 1."""
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
+
+
+def _bins(distance: NDArray[np.float64]) -> NDArray[np.int64]:
+    """The bin (n,) of cells so far apart (n,) mm."""
+    return np.asarray(np.where(distance > 0.0, 1 + distance.astype(np.int64), 0))
 
 
 def _scattered(keys: NDArray[np.int64]) -> NDArray[np.uint64]:

@@ -14,7 +14,13 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.images.tissue_distance import tissue_distance_map
 from palpate.observation.contract import Fit, ImagedBody, Observation, Residuals, Weighting
-from palpate.observation.noise_model import EXACT_NOISE, SEGMENTATION_NOISE, NoiseModel, fit_noise_model
+from palpate.observation.noise_model import (
+    EXACT_NOISE,
+    SEGMENTATION_NOISE,
+    FitResponse,
+    NoiseModel,
+    fit_noise_model,
+)
 from palpate.observation.observed_surface import ObservedSurface, observed_surface
 from palpate.observation.robust_loss import HUBER, Huber, RobustLoss, Tukey
 from palpate.observation.surface_residuals import Correspondence, correspondence, surface_residuals
@@ -149,12 +155,12 @@ class SurfaceDistance:
         width = float(np.mean([m.smoothing_mm for m in maps]))
         return NoiseModel(np.array([2.0 * float(np.mean(variances))]), np.array([np.sqrt(2.0) * width]))
 
-    def fitted_noise(self, residuals: Sequence[Residuals]) -> NoiseModel:
+    def fitted_noise(self, residuals: Sequence[Residuals], response: FitResponse | None = None) -> NoiseModel:
         """What the residuals tell (see `fit_noise_model`); what is stated, where it is."""
         if self.stated_noise is not None:
             return self.stated_noise
         return fit_noise_model(
-            [r.values for r in residuals], [r.places for r in residuals], [r.normals for r in residuals]
+            [r.values for r in residuals], [r.places for r in residuals], [r.normals for r in residuals], response
         )
 
     def wall_motion(

@@ -15,7 +15,7 @@ from palpate.images.tissue_distance import cropped, window_of
 from palpate.inversion.objective import Evaluation, Linearisation, Objective
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
-from palpate.observation.noise_model import NoiseModel, mean_noise
+from palpate.observation.noise_model import FitResponse, NoiseModel, mean_noise
 from palpate.parallel import mapped
 from palpate.uncertainty.discretisation import discretisation_sd
 
@@ -23,6 +23,7 @@ __all__ = [
     "Covariance",
     "FittedState",
     "covariance_of",
+    "error_noise",
     "gain",
     "grid_position_shifts",
     "imaging_errors",
@@ -112,11 +113,12 @@ def mesh_covariance(objective: Objective) -> NDArray[np.float64]:
 def sandwich_covariance(objective: Objective, evaluation: Evaluation) -> NDArray[np.float64]:
     """Covariance (n_parameters, n_parameters) of the log-moduli: H^-1 (J^T W C W J + P) H^-1.
 
-    C is the covariance of the residuals under the noise model of their image, across all observations of a kind; P the
-    prior, whose uncertainty is thereby included (White 1980; Aitken's theorem read for correlated errors). A residual
-    is the error of a later image less that of its rest state's image, each with half of the noise: the later ones are
-    independent, that of the rest state is the same for all states that have it, at the material place, by the mean of
-    their noise models. Later states that move alike do not average it away, opposite ones do.
+    C is the covariance of the residuals' errors under the noise model of their image (see `error_noise`), across
+    all observations of a kind; P the prior, whose uncertainty is thereby included (White 1980; Aitken's theorem
+    read for correlated errors). A residual is the error of a later image less that of its rest state's image, each
+    with half of the noise: the later ones are independent, that of the rest state is the same for all states that
+    have it, at the material place, by the mean of their noise models. Later states that move alike do not average
+    it away, opposite ones do.
     """
     return sum(_sandwich(objective, evaluation), np.zeros((objective.n_parameters,) * 2))
 
@@ -126,16 +128,44 @@ def _sandwich(objective: Objective, evaluation: Evaluation) -> tuple[NDArray[np.
     n = objective.n_parameters
     inverse = evaluation.covariance_columns(n)
     data = np.zeros((n, n))
-    pairs = list(zip(evaluation.lines, gain(evaluation, n), strict=True))
+    pairs, noise_of = list(zip(evaluation.lines, gain(evaluation, n), strict=True)), error_noise(objective, evaluation)
     for kind in dict.fromkeys(line.observation.kind for line in evaluation.lines):
         of_kind = [(line, row) for line, row in pairs if line.observation.kind == kind]
         later = [line.state for line, _ in of_kind]
         for groups, at_rest in ((later, False), ([objective.states[s].reference for s in later], True)):
             for key in dict.fromkeys(groups):
                 group = [pair for pair, own in zip(of_kind, groups, strict=True) if own == key]
-                noise = mean_noise([objective.states[line.state].noise[kind] for line, _ in group])
+                noise = mean_noise([noise_of[line.state, kind] for line, _ in group])
                 data += 0.5 * _propagated(noise, group, at_rest=at_rest)
     return data, np.asarray(inverse.T @ evaluation.prior @ inverse)
+
+
+def error_noise(objective: Objective, evaluation: Evaluation) -> dict[tuple[int, str], NoiseModel]:
+    """Noise model of the residuals' errors, by later state and kind of observation.
+
+    The residuals at a minimum are what the fit left of them: see `FitResponse`. What errors of one later image do to
+    the residuals of another, by the moduli alone, is neglected.
+    """
+    n, found = len(evaluation.matrix), {}
+    of_all = list(zip(objective.observations, evaluation.lines, gain(evaluation, n), strict=True))
+    for key in dict.fromkeys((line.state, line.observation.kind) for line in evaluation.lines):
+        own = [of for of in of_all if (of[1].state, of[1].observation.kind) == key]
+        telling = [of for of in own if not of[0].of_driver] or own
+        response = FitResponse(
+            jacobians=[_among_all(line, n) for _, line, _ in telling],
+            gain=np.concatenate([row for _, _, row in own], axis=1),
+            places=np.concatenate([line.residuals.places for _, line, _ in own]),
+            normals=np.concatenate([line.residuals.normals for _, line, _ in own]),
+        )
+        found[key] = telling[0][0].fitted_noise([line.residuals for _, line, _ in telling], response)
+    return found
+
+
+def _among_all(line: Linearisation, n_unknowns: int) -> NDArray[np.float64]:
+    """An observation's Jacobian (n, n_unknowns) by all unknowns."""
+    jacobian = np.zeros((len(line.residuals.values), n_unknowns))
+    jacobian[:, line.columns] = line.jacobian
+    return jacobian
 
 
 def _propagated(
