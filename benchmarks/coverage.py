@@ -1,7 +1,7 @@
 """Whether intervals hold: random pelves, noise on exact surfaces of another mesh, the same outer loop and intervals.
 
     python benchmarks/coverage.py [--settings gauss-0.3-6,...] [--pelves N] [--draws N] [--laws linear,neo-hookean]
-                                  [--first-seed S] [--edge MM] [--output FILE] [--json]
+                                  [--first-seed S] [--edge MM] [--output FILE] [--plot FILE.svg] [--json]
 
 For each pelvis one estimate from the clean surfaces of a finer mesh. Then each draw moves both images' surfaces along
 their normals by a random field of its own, and the product's whole estimate is made of them, from the middle start
@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,13 +23,15 @@ from typing import Any
 import numpy as np
 from accuracy import true_ratios
 from accuracy_rows import ROWS, posed
+from cramer_rao import cramer_rao
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
 
 from palpate.errors import EstimationError
-from palpate.inversion import InverseProblem, Inversion, InversionSettings, LaterState, invert
+from palpate.inversion import Evaluation, InverseProblem, Inversion, InversionSettings, LaterState, invert
 from palpate.mesh import vertex_normals
-from palpate.observation import SurfaceDistance, observed_surface, surface_distance
+from palpate.observation import NoiseModel, SurfaceDistance, observed_surface, surface_distance
 from palpate.phantoms import Scene, smooth_field, target_of_truth
 from palpate.uncertainty import fixed_correspondence, mesh_covariance, modulus_interval, sandwich_covariance
 
@@ -47,8 +49,8 @@ class Setting:
     """A kind of segmentation error: how far (n,) mm surfaces at places (n, 3) move along their normals (n, 3)."""
 
     name: str
-    gaussian: bool
     shift: Shift
+    noise: NoiseModel | None = None  # of a residual, where it is normal
 
 
 def gauss(sd_mm: float, correlation_mm: float) -> Setting:
@@ -59,7 +61,8 @@ def gauss(sd_mm: float, correlation_mm: float) -> Setting:
         field = smooth_field(rng, sd_mm=sd_mm, correlation_mm=correlation_mm, features=FEATURES)
         return np.asarray(np.einsum("ni,ni->n", field.at(places), normals))
 
-    return Setting(f"gauss-{sd_mm}-{correlation_mm:g}", True, shift)
+    noise = NoiseModel(np.array([2.0 * sd_mm**2]), np.array([correlation_mm]))
+    return Setting(f"gauss-{sd_mm}-{correlation_mm:g}", shift, noise)
 
 
 def _one_sided(places: Array, normals: Array, rng: np.random.Generator, later: bool) -> Array:
@@ -89,18 +92,22 @@ SETTINGS = {
         *(gauss(sd, 6.0) for sd in (0.1, 0.2, 0.3, 0.5)),
         gauss(0.3, 3.0),
         gauss(0.3, 12.0),
-        Setting("one-sided", False, _one_sided),
-        Setting("missing-slice", False, _missing_slice),
-        Setting("shrunk", False, _shrunk),
+        Setting("one-sided", _one_sided),
+        Setting("missing-slice", _missing_slice),
+        Setting("shrunk", _shrunk),
     )
 }
 
 
 @dataclass(frozen=True)
 class Body:
-    """A pelvis, the inverse problem with the clean estimate's reduced basis lent, truth (n,): ln of the true ratios."""
+    """A pelvis, the inverse problem with the clean estimate's reduced basis lent, truth (n,): ln of the true ratios.
+
+    clean: the linear law's estimate from clean surfaces.
+    """
 
     scene: Scene
+    clean: Evaluation
     problem: InverseProblem
     settings: InversionSettings
     truth: Array
@@ -116,6 +123,7 @@ def main() -> int:
     parser.add_argument("--first-seed", type=int, default=501)
     parser.add_argument("--edge", type=float, default=8.0, help="edge length (mm) of the estimate's mesh")
     parser.add_argument("--output", type=Path, default=Path("coverage.jsonl"))
+    parser.add_argument("--plot", type=Path, help="SVG of the share of intervals that hold, by what they state")
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     asked = parser.parse_args()
     rows = [json.loads(line) for line in asked.output.read_text().splitlines()] if asked.output.exists() else []
@@ -128,13 +136,16 @@ def main() -> int:
             body = _body(law, seed, asked.edge)
             for name in open_:
                 found = [_drawn(body, SETTINGS[name], seed, draw) for draw in range(asked.draws)]
-                rows.append({"law": law, "seed": seed, "setting": name, "draws": found})
+                limit = _limit(body, SETTINGS[name].noise)
+                rows.append({"law": law, "seed": seed, "setting": name, "limit": limit, "draws": found})
                 with asked.output.open("a") as file:
                     file.write(json.dumps(rows[-1]) + "\n")
                 print(f"{law} {seed} {name}: {_line(rows[-1:])}", file=sys.stderr, flush=True)
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {(row["law"], row["setting"]): [] for row in rows}
     for row in rows:
         groups[row["law"], row["setting"]].append(row)
+    if asked.plot:
+        _plot(groups, asked.plot)
     table = {f"{law} {name}": _summary(of) for (law, name), of in groups.items()}
     print(json.dumps(table, indent=1) if asked.json else "\n".join(f"{name}: {_line(of)}" for name, of in _by(groups)))
     return 0
@@ -147,12 +158,21 @@ def _by(groups: dict[tuple[str, str], list[dict[str, Any]]]) -> list[tuple[str, 
 def _body(law: str, seed: int, edge_mm: float) -> Body:
     row = replace(ROWS["other-mesh"], law=law, edge_mm=edge_mm, truth_edge_mm=0.68 * edge_mm)
     case = posed(row, seed, 0, {})
-    clean = invert(case.problem.linear(), case.settings, progress=lambda _: None).objective
-    pairs = zip(case.problem.states, clean.approximations, strict=True)
+    clean = invert(case.problem.linear(), case.settings, progress=lambda _: None)
+    pairs = zip(case.problem.states, clean.objective.approximations, strict=True)
     lent = tuple(state.with_approximation(basis.with_constraint(state.constraint)) for state, basis in pairs)
-    truth = np.log(true_ratios(clean, case.scene))
+    truth = np.log(true_ratios(clean.objective, case.scene))
     middle = np.median(np.stack(case.settings.starts), axis=0)
-    return Body(case.scene, replace(case.problem, states=lent), replace(case.settings, starts=(middle,)), truth)
+    settings = replace(case.settings, starts=(middle,))
+    return Body(case.scene, clean.minimum.evaluation, replace(case.problem, states=lent), settings, truth)
+
+
+def _limit(body: Body, noise: NoiseModel | None) -> list[float] | None:
+    """The Cramer-Rao limit of the standard deviations under normal noise, by the derivatives of the linear law."""
+    if noise is None:
+        return None
+    limit = cramer_rao(body.clean, noise, len(body.truth), cell_mm=float(noise.lengths[0]))
+    return [float(sd) for sd in np.sqrt(np.diag(limit))]
 
 
 def _drawn(body: Body, setting: Setting, seed: int, draw: int) -> dict[str, Any]:
@@ -230,6 +250,12 @@ def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     ]
     interval = stats.binomtest(int(held.sum()), len(held)).proportion_ci()
     half = np.array([1.96 * o["sd"] for o in organs])
+    over_limit = [
+        organ["sd"] / limit
+        for row in rows
+        for draw in row["draws"]
+        for organ, limit in zip(draw["organs"], row["limit"] or [], strict=False)
+    ]
     return {
         "intervals": len(organs),
         "not_converged": sum(not draw["converged"] for row in rows for draw in row["draws"]),
@@ -237,6 +263,7 @@ def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "coverage95_interval": [float(interval.low), float(interval.high)],
         "calibration": {str(level): float(np.mean(roots <= stats.norm.ppf(0.5 + level / 2))) for level in LEVELS},
         "sd_over_spread": float(1.0 / np.median(spread)),
+        "sd_over_cramer_rao": float(np.median(over_limit)) if over_limit else None,
         "mean_error_over_sd": float(np.mean([o["error"] / o["sd"] for o in organs])),
         "beyond_three_half_widths": int(np.sum(np.abs([o["error"] for o in organs]) > FAR * half)),
         "profile_share": float(np.mean([o["kind"] == "profile" for o in organs])),
@@ -244,13 +271,34 @@ def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
+def _plot(groups: Mapping[tuple[str, str], Sequence[dict[str, Any]]], path: Path) -> None:
+    """Calibration: nominal against found, a line a setting, beside the scatter of as many intervals that hold."""
+    figure = Figure(figsize=(6.0, 5.5), layout="constrained")
+    axes = figure.add_subplot()
+    levels = np.linspace(LEVELS[0], LEVELS[-1], 60)
+    n = min(sum(len(draw["organs"]) for row in rows for draw in row["draws"]) for rows in groups.values())
+    low, high = (stats.binom.ppf(q, n, levels) / n for q in (0.025, 0.975))
+    axes.fill_between(100 * levels, 100 * low, 100 * high, color="0.9", label=f"95 % of {n} true intervals")
+    axes.plot(100 * levels, 100 * levels, color="0.5", linewidth=1)
+    for (law, name), rows in groups.items():
+        found = list(_summary(rows)["calibration"].values())
+        style = "-" if law == "linear" else "--"
+        axes.plot(
+            100 * np.array(LEVELS), 100 * np.array(found), style, marker="o", markersize=3, label=f"{law}, {name}"
+        )
+    axes.set(xlabel="stated, %", ylabel="found, %")
+    axes.legend(fontsize="small")
+    figure.savefig(path, metadata={"Date": None})
+
+
 def _line(rows: Sequence[dict[str, Any]]) -> str:
     of = _summary(rows)
     low, high = of["coverage95_interval"]
     calibration = " ".join(f"{float(level):.0%}:{found:.0%}" for level, found in of["calibration"].items())
+    limit = "" if of["sd_over_cramer_rao"] is None else f"; sd / limit {of['sd_over_cramer_rao']:.2f}"
     return (
         f"{of['coverage95']:.1%} [{low:.1%}, {high:.1%}] of {of['intervals']} held; {calibration}; sd / spread"
-        f" {of['sd_over_spread']:.2f}; beyond 3 half-widths {of['beyond_three_half_widths']};"
+        f" {of['sd_over_spread']:.2f}{limit}; beyond 3 half-widths {of['beyond_three_half_widths']};"
         f" profiles {of['profile_share']:.0%}; median error {of['median_error_percent']:.1f} %"
     )
 

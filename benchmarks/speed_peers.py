@@ -1,7 +1,7 @@
-"""What others would pay for the same gradient on the same mesh: torch-fem, scikit-fem, finite differences.
+"""What others pay for the same gradient on the same mesh: torch-fem, scikit-fem, finite differences; and our own.
 
-All of them get the misfit with closest points and weights frozen, a quadratic form in the surface's displacement, so
-that what is timed is the mechanics. Each returns the gradient (n_unknowns,) of it, or is None when it is not installed.
+All get the misfit with closest points and weights frozen, a quadratic form in the surface's displacement, so that what
+is timed is the mechanics. Each returns the gradient (n_unknowns,) of it, or is None when it is not installed.
 """
 
 from __future__ import annotations
@@ -64,6 +64,23 @@ def disagreement(gradient: Array, frozen: FrozenMisfit, problem: InverseProblem,
     pull = _widened(frozen, len(equilibrium.values)).pull(equilibrium.values)
     exact = mapping.by_unknowns(equilibrium.adjoint(pull)[None], unknowns)[0] + mapping.prior_matrix @ unknowns
     return float(np.linalg.norm(gradient - exact) / np.linalg.norm(exact))
+
+
+def reduced(objective: Objective, frozen: FrozenMisfit, unknowns: Array) -> Gradient:
+    """Our own: the approximation at the observed unknowns and its adjoint."""
+    mapping, (state,) = objective.parameters, objective.states
+    model, dofs = state.observed, np.concatenate([observation.dofs for observation in state.observations])
+    assert model is not None, "an objective is made of states with approximations"
+    design = sparse.csr_matrix(frozen.design[:, dofs])
+    transposed = sparse.csr_matrix(design.T)
+
+    def gradient() -> Array:
+        solution = model.solve(mapping.moduli(unknowns), mapping.coefficients(unknowns)[0])
+        pull = np.asarray(transposed @ (design @ solution.values + frozen.rest))
+        by_unknowns = mapping.by_unknowns(solution.adjoint(pull)[None], unknowns)[0]
+        return np.asarray(by_unknowns + mapping.prior_matrix @ unknowns)
+
+    return gradient
 
 
 def torch_fem(problem: InverseProblem, frozen: FrozenMisfit, unknowns: Array) -> Gradient | None:
