@@ -151,9 +151,9 @@ def run_outer_loop(
 ) -> OuterIterate:
     """Follow a minimum until reweighting it and updating its approximations change it no more.
 
-    The approximations of `start` can be trusted there (see `updated`). Drivers' walls are refined where their surfaces
-    ask for it (see `refined_walls`); what is believed of their motion is held from where the estimate is near, and
-    learned once more where, learned at the estimate, it would not leave that where it is. `title` begins each line of
+    The approximations of `start` are exact there (see `updated`). Drivers' walls are refined where their surfaces ask
+    for it (see `refined_walls`); what is believed of their motion is held from where the estimate is near, and learned
+    once more where, learned at the estimate, it would not leave that where it is. `title` begins each line of
     `progress`. The minimum's history is that of the loop alone, its evaluations are added to those of `start`. Raises
     `NotConverged` when the full model has no equilibrium where every part of a step leads.
     """
@@ -202,16 +202,17 @@ def _prior_holds(free: OuterIterate, settings: InversionSettings, rule: StopRule
 
 def _with_walls(objective: Objective, walls: Sequence[tuple[Wall, ...]]) -> Objective:
     """The objective whose drivers' prior is learned of these walls of each state; of none it stays as it is."""
-    states = (replace(state, walls=own) for state, own in zip(objective.states, walls, strict=True))
-    return replace(objective, states=tuple(states))
+    return replace(objective, states=tuple(replace(s, walls=w) for s, w in zip(objective.states, walls, strict=True)))
 
 
 def updated(objective: Objective, minimum: Minimum, rule: StopRule) -> OuterIterate:
-    """A minimum on approximations that are made exact there, where they cannot be trusted as they are."""
-    error, _, cost = _model_error(objective, minimum)
-    now = OuterIterate(objective, minimum, checks=cost)
-    if error < max(rule.solve_above, TRUSTED):
-        return now
+    """A minimum on approximations made exact there where the rule asks for it: what they miss would pass for noise."""
+    now = OuterIterate(objective, minimum)
+    if rule.solve_above > 0.0:
+        error, _, cost = _model_error(objective, minimum)
+        now = replace(now, checks=cost)
+        if error < rule.solve_above:
+            return now
     return _with_approximations(now, _solved(objective, minimum.unknowns, minimum.evaluation))
 
 
