@@ -213,7 +213,7 @@ def updated(objective: Objective, minimum: Minimum, rule: StopRule) -> OuterIter
         now = replace(now, checks=cost)
         if error < rule.solve_above:
             return now
-    return _with_approximations(now, _solved(objective, minimum.unknowns))
+    return _with_approximations(now, _solved(objective, minimum.unknowns, minimum.evaluation))
 
 
 def minimised(
