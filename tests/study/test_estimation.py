@@ -172,7 +172,9 @@ def test_an_imprecise_image_identifies_nothing(inversion, settings, observed):
     rough, objective = NoiseModel(np.array([1.0]), np.array([6.0])), inversion.objective
     stated_noise = [replace(o.with_noise(rough), stated_noise=rough) for o in objective.observations]
     vague = objective.with_observations(stated_noise)
-    verdicts = [e.verdict for e in stated(with_candidate(inversion, objective=vague), settings, observed).estimates]
+    minimum = replace(inversion.minimum, evaluation=vague(inversion.minimum.unknowns))
+    unknown = with_candidate(inversion, objective=vague, minimum=minimum)
+    verdicts = [e.verdict for e in stated(unknown, settings, observed).estimates]
     assert "identified" not in verdicts
     assert "not identified" in verdicts
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from palpate.observation.noise_model import NoiseModel
 from palpate.observation.robust_loss import Tukey
 from palpate.phantoms.boundary_noise import smooth_field
 from palpate.uncertainty import FittedState, gain, sandwich_covariance
-from palpate.uncertainty.covariance import grid_position_shifts, imaging_errors
+from palpate.uncertainty.covariance import error_noise, grid_position_shifts, imaging_errors
 from palpate.uncertainty.intervals import log_interval
 
 SD = 0.3
@@ -39,18 +39,26 @@ class Seen:
     state: int = 0
     kind: str = "surface distance"
     of_driver: bool = False
+    shown: list = field(default_factory=list)  # what a fit was asked with
 
-    def fitted_noise(self, _residuals, _response):
+    def fitted_noise(self, residuals, response):
+        self.shown.append((residuals, response))
         return self.noise_model
 
 
-def surface(places, normals, jacobian, *, precision, noise, state=0, kind="surface distance"):
+def surface(places, normals, jacobian, *, precision, noise, state=0, kind="surface distance", of_driver=False):
     n = len(places)
     weights = np.full(n, 1.0 / n)
     residuals = Residuals(np.zeros(n), weights, places, normals, places, None, None)
     columns = np.arange(jacobian.shape[1])
     return Linearisation(
-        Seen(noise, Weighting(precision, Tukey()), state, kind), state, residuals, columns, jacobian, weights, None
+        Seen(noise, Weighting(precision, Tukey()), state, kind, of_driver),
+        state,
+        residuals,
+        columns,
+        jacobian,
+        weights,
+        None,
     )
 
 
@@ -119,8 +127,8 @@ def test_the_interval_covers_the_truth_of_repeated_experiments(smooth, rng):
     covariance = sandwich_covariance(objective, now)
     draws = []
     for _ in range(400):
-        field = smooth_field(rng, sd_mm=SD, correlation_mm=5.0, features=200)
-        error = np.einsum("na,na->n", field.at(places), normals)
+        motion = smooth_field(rng, sd_mm=SD, correlation_mm=5.0, features=200)
+        error = np.einsum("na,na->n", motion.at(places), normals)
         prior = np.concatenate([np.zeros(2), rng.standard_normal(3)])
         score = prior - 200.0 / len(places) * jacobian.T @ error
         draws.append(-np.linalg.solve(now.matrix, score)[:2])
@@ -128,6 +136,32 @@ def test_the_interval_covers_the_truth_of_repeated_experiments(smooth, rng):
     assert np.sqrt(np.diag(covariance)) == pytest.approx(np.sqrt(np.diag(spread)), rel=0.12)
     inside = np.abs(draws) < 1.96 * np.sqrt(np.diag(covariance))
     assert np.all((inside.mean(axis=0) > 0.92) & (inside.mean(axis=0) < 0.98))
+
+
+def test_the_noise_of_errors_is_sought_by_what_the_fit_leaves_of_them(smooth, rng):
+    """Errors of a later state's surfaces, a driver's too, move the fit; residuals that tell lose J times that."""
+    places, normals, jacobian = smooth
+    none = np.zeros((len(places), 3))
+    own = {0: np.hstack([jacobian, none]), 1: np.hstack([jacobian[:, :2], none, jacobian[:, 2:]])}
+    given = {"precision": 200.0, "noise": noise_of(5.0)}
+    lines = [
+        surface(places, normals, columns * scale, state=state, of_driver=driver, **given)
+        for state, columns in own.items()
+        for driver, scale in ((True, 2.0), (False, 1.0))
+    ]
+    _, now = observed(*lines)
+    assert set(error_noise(now)) == {(0, "surface distance"), (1, "surface distance")}
+    for state, (driver, telling) in enumerate(zip(lines[::2], lines[1::2], strict=True)):
+        ((residuals, response),) = driver.observation.shown + telling.observation.shown
+        assert residuals == [telling.residuals]
+        errors = rng.standard_normal(2 * len(places))
+        halves = np.split(errors, 2)
+        score = sum(
+            line.jacobian.T @ (line.precision * line.weights * error)
+            for line, error in zip((driver, telling), halves, strict=True)
+        )
+        taken = telling.jacobian @ np.linalg.solve(now.matrix, score)
+        assert response.jacobians[0] @ (response.gain @ errors) == pytest.approx(taken), state
 
 
 def test_correlated_residuals_tell_less(smooth):

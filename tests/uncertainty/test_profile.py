@@ -37,10 +37,7 @@ def test_where_the_model_is_straight_the_ends_are_those_of_the_ellipse(objective
 
 
 def test_at_the_ends_the_objective_is_higher_by_the_level_at_its_best(objective, minimum, variance):
-    fixed, least = (
-        fixed_correspondence(objective, minimum.unknowns, minimum.evaluation),
-        minimum.evaluation.value,
-    )
+    fixed, least = fixed_correspondence(objective, minimum.unknowns, minimum.evaluation), minimum.evaluation.value
     found = profiled(objective, minimum, 0, variance[0])
     for end in (found.low, found.high):
         start = minimum.unknowns.copy()

@@ -49,7 +49,7 @@ AGREED = 0.3  # of that tolerance, to which weights and estimate agree on linear
 FIRST = 10.0  # tolerances, to which they agree there at the least, however far the estimate still is
 LINEARISED = 1e-4  # decrement of a minimum on them
 STRAIGHT = 0.4  # of ln E, within which linearised residuals are believed
-WITHIN_NOISE = 0.1  # of the posterior's width: a step that finds no smaller value
+WITHIN_NOISE = 0.1  # of the posterior's width: a step that finds no smaller value, what a start may miss
 NEAR = 0.5  # posterior standard deviations: a shorter step ends where exact derivatives are worth it, and a held prior
 LEAST_SD = 0.03  # of ln E, see `_linearisation`
 LEARNED = 2  # times at the most that the drivers' prior is held
@@ -151,11 +151,11 @@ def run_outer_loop(
 ) -> OuterIterate:
     """Follow a minimum until reweighting it and updating its approximations change it no more.
 
-    The approximations of `start` are exact there (see `updated`). Drivers' walls are refined where their surfaces ask
-    for it (see `refined_walls`); what is believed of their motion is held from where the estimate is near, and learned
-    once more where, learned at the estimate, it would not leave that where it is. `title` begins each line of
-    `progress`. The minimum's history is that of the loop alone, its evaluations are added to those of `start`. Raises
-    `NotConverged` when the full model has no equilibrium where every part of a step leads.
+    Of the approximations of `start` see `updated`. Drivers' walls are refined where their surfaces ask for it (see
+    `refined_walls`); what is believed of their motion is held from where the estimate is near, and learned once more
+    where, learned at the estimate, it would not leave that where it is. `title` begins each line of `progress`. The
+    minimum's history is that of the loop alone, its evaluations are added to those of `start`. Raises `NotConverged`
+    when the full model has no equilibrium where every part of a step leads.
     """
     walls = [state.walls for state in start.objective.states]
     at, theta = start.minimum.evaluation, start.minimum.unknowns[: start.objective.n_parameters]
@@ -206,13 +206,14 @@ def _with_walls(objective: Objective, walls: Sequence[tuple[Wall, ...]]) -> Obje
 
 
 def updated(objective: Objective, minimum: Minimum, rule: StopRule) -> OuterIterate:
-    """A minimum on approximations made exact there where the rule asks for it: what they miss would pass for noise."""
-    now = OuterIterate(objective, minimum)
-    if rule.solve_above > 0.0:
-        error, _, cost = _model_error(objective, minimum)
-        now = replace(now, checks=cost)
-        if error < rule.solve_above:
-            return now
+    """A minimum on approximations made exact there, unless what they miss is nothing beside the noise, or the rule's.
+
+    It would pass for noise: where the noise is small, so must it be.
+    """
+    error, off, cost = _model_error(objective, minimum)
+    now = OuterIterate(objective, minimum, checks=cost)
+    if error < rule.solve_above or np.all(off < WITHIN_NOISE * posterior_sd(minimum, objective.n_parameters)):
+        return now
     return _with_approximations(now, _solved(objective, minimum.unknowns, minimum.evaluation))
 
 

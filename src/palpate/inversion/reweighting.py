@@ -12,7 +12,7 @@ from palpate.inversion.objective import Evaluation, Linearisation, Objective
 from palpate.inversion.optimise import Minimum
 from palpate.observation.noise_model import NoiseModel
 
-__all__ = ["fitted_noise", "reweighted", "with_first_noise"]
+__all__ = ["fitted_noise", "of_one_noise", "reweighted", "with_first_noise"]
 
 RIDGE = 1e-9  # of the mean diagonal: a mode that moves no observed point
 
@@ -44,11 +44,20 @@ def fitted_noise(evaluation: Evaluation) -> dict[tuple[int, str], NoiseModel]:
     Each later image has its own: one that was drawn badly would else take from what the others are believed.
     """
     found = {}
-    for key in dict.fromkeys((line.state, line.observation.kind) for line in evaluation.lines):
-        own = [line for line in evaluation.lines if (line.state, line.observation.kind) == key]
-        telling = [line.residuals for line in own if not line.observation.of_driver]
-        found[key] = own[0].observation.fitted_noise(telling or [line.residuals for line in own])
+    for key, (_, telling) in of_one_noise(evaluation).items():
+        lines = [evaluation.lines[i] for i in telling]
+        found[key] = lines[0].observation.fitted_noise([line.residuals for line in lines])
     return found
+
+
+def of_one_noise(evaluation: Evaluation) -> dict[tuple[int, str], tuple[list[int], list[int]]]:
+    """Numbers of the observations that share a noise model, by later state and kind, and of those that tell of it."""
+    groups: dict[tuple[int, str], list[int]] = {}
+    for i, line in enumerate(evaluation.lines):
+        groups.setdefault((line.state, line.observation.kind), []).append(i)
+    return {
+        k: (own, [i for i in own if not evaluation.lines[i].observation.of_driver] or own) for k, own in groups.items()
+    }
 
 
 def _by_noise(objective: Objective, noise: Mapping[tuple[int, str], NoiseModel]) -> Objective:

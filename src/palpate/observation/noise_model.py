@@ -66,21 +66,12 @@ class NoiseModel:
         def term(of: tuple[float, float]) -> NDArray[np.float64]:
             """That of one variance and its length."""
             variance, length = of
-            _, inverse = _cell_keys(places, 0.5 * length)
-            count = np.bincount(inverse)
-            centres = np.stack([np.bincount(inverse, places[:, a]) / count for a in range(3)], axis=1)
-            # sum of rows times normals in cells (n_rows, n_cells, 3)
-            carried = np.stack(
-                [np.stack([np.bincount(inverse, row * normals[:, a]) for a in range(3)], axis=1) for row in rows]
-            ).astype(np.float64)
+            centres, carried = _carried(rows, places, normals, 0.5 * length)
             tree = cKDTree(centres)
             pairs = tree.sparse_distance_matrix(tree, 3.5 * length, output_type="coo_matrix").tocsr()
-            pairs.data = np.exp(-(pairs.data**2) / (2.0 * length**2))
+            pairs.data = _gaussian(pairs.data, length)
             pairs.setdiag(1.0)
-            total = np.zeros((len(rows), len(rows)))
-            for axis in range(3):
-                total += variance * carried[:, :, axis] @ np.asarray(pairs @ carried[:, :, axis].T)
-            return total
+            return variance * sum((of @ _times(pairs, of.T) for of in carried), np.zeros((len(rows), len(rows))))
 
         return np.asarray(np.sum(mapped(term, zip(self.variances, self.lengths, strict=True)), axis=0))
 
@@ -112,34 +103,55 @@ class FitResponse:
     normals: NDArray[np.float64]
 
     def left(
-        self, length: float, surfaces: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]
+        self, lengths: Sequence[float], surfaces: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]
     ) -> NDArray[np.float64]:
-        """The kernel (BINS,) of what is left of errors of variance 1 and a correlation `length` (mm).
+        """The kernels (BINS, n_lengths) of what is left of errors of variance 1 and each correlation length (mm).
 
         (1 - J G) K (1 - J G)^T in bins of distance, by places and normals (n, 3) of each of the surfaces; nan where a
         bin has no pair.
         """
-        _, inverse = _cell_keys(self.places, WITHIN * length)
-        cells = sparse.csr_matrix((np.ones(len(inverse)), (inverse, np.arange(len(inverse)))))
-        centres = _times(cells, self.places) / np.bincount(inverse)[:, None]
-        carried = [_times(cells, (self.gain * self.normals[:, a]).T).T for a in range(3)]  # (n_unknowns, n_cells)
-        kernel = np.exp(cdist(centres, centres, "sqeuclidean") / (-2.0 * length**2))
-        by_errors = sum(((g @ kernel) @ g.T for g in carried), np.zeros((len(self.gain),) * 2))  # G K G^T
-        products, cosines = np.zeros(BINS), np.zeros(BINS)
-        for (places, normals), jacobian in zip(surfaces, self.jacobians, strict=True):
-            own = _cell_means(places, RESPONSE_CELLS)
-            places_of, jacobian_of = _times(own, places), _times(own, jacobian)
-            normals_of = _units(_times(own, normals))
-            across = np.exp(cdist(centres, places_of, "sqeuclidean") / (-2.0 * length**2))
-            pulled = sum(((g @ across) * normals_of[:, a] for a, g in enumerate(carried)), np.zeros(()))  # G K
-            taken = jacobian_of @ (pulled - 0.5 * by_errors @ jacobian_of.T)
-            distance, cosine = cdist(places_of, places_of), normals_of @ normals_of.T
-            left = np.exp(distance**2 / (-2.0 * length**2)) * cosine - taken - taken.T
-            near = distance < REACH
-            bins = _bins(distance[near])
-            products += np.bincount(bins, (left * cosine)[near], minlength=BINS)
-            cosines += np.bincount(bins, (cosine**2)[near], minlength=BINS)
-        return np.asarray(np.divide(products, cosines, out=np.full(BINS, np.nan), where=cosines > 0.0))
+        seen = [_Pairs.of(*surface, j) for surface, j in zip(surfaces, self.jacobians, strict=True)]
+        cosines = sum((np.bincount(pairs.bins, pairs.cosine**2, minlength=BINS) for pairs in seen), np.zeros(BINS))
+        products = np.stack(mapped(lambda length: self._products(length, seen), lengths), axis=1)
+        there = np.broadcast_to(cosines[:, None], products.shape)
+        return np.asarray(np.divide(products, there, out=np.full(products.shape, np.nan), where=there > 0.0))
+
+    def _products(self, length: float, seen: Sequence[_Pairs]) -> NDArray[np.float64]:
+        """Sums (BINS,) of what is left in each pair, times n_i.n_j."""
+        centres, carried = _carried(self.gain, self.places, self.normals, WITHIN * length)
+        kernel = _gaussian(cdist(centres, centres), length)
+        by_errors = sum(((of @ kernel) @ of.T for of in carried), np.zeros((len(self.gain),) * 2))  # G K G^T
+        products = np.zeros(BINS)
+        for pairs in seen:
+            across = _gaussian(cdist(centres, pairs.places), length)
+            pulled = sum(((of @ across) * pairs.normals[:, a] for a, of in enumerate(carried)), np.zeros(()))  # G K
+            taken = pairs.jacobian @ (pulled - 0.5 * by_errors @ pairs.jacobian.T)
+            left = _gaussian(pairs.distance, length) * pairs.cosine - (taken + taken.T)[pairs.near]
+            products += np.bincount(pairs.bins, left * pairs.cosine, minlength=BINS)
+        return products
+
+
+@dataclass(frozen=True, slots=True)
+class _Pairs:
+    """Cells of a surface and its pairs of them that are compared: `near` (n_cells, n_cells) of all, the others (n,)."""
+
+    places: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    jacobian: NDArray[np.float64]
+    near: NDArray[np.bool_]
+    distance: NDArray[np.float64]
+    cosine: NDArray[np.float64]
+    bins: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, places: NDArray[np.float64], normals: NDArray[np.float64], jacobian: NDArray[np.float64]) -> _Pairs:
+        """Of residuals at places (n, 3) mm with normals (n, 3) and a Jacobian (n, n_unknowns)."""
+        cells = _cell_means(places, RESPONSE_CELLS)
+        centres, mean_normals = _times(cells, places), _units(_times(cells, normals))
+        apart = cdist(centres, centres)
+        near = apart < REACH
+        distance, cosine = apart[near], (mean_normals @ mean_normals.T)[near]
+        return cls(centres, mean_normals, _times(cells, jacobian), near, distance, cosine, _bins(distance))
 
 
 def fit_noise_model(
@@ -164,10 +176,10 @@ def fit_noise_model(
     products, cosines, distances, count = sums[:, seen]
     weight = np.sqrt(count)
     # (n_bins, n_lengths)
-    kernels = np.exp(-((distances / count)[:, None] ** 2) / (2.0 * np.square(LENGTHS)))
+    kernels = np.stack([_gaussian(distances / count, length) for length in LENGTHS], axis=1)
     if response is not None:
         smooth, surfaces = np.flatnonzero(np.array(LENGTHS) > SMOOTH), list(zip(places, normals, strict=True))
-        left = np.stack(mapped(lambda m: response.left(LENGTHS[m], surfaces)[seen], smooth), axis=1)
+        left = response.left([LENGTHS[m] for m in smooth], surfaces)[seen]
         kernels[:, smooth] = np.where(np.isfinite(left), left, kernels[:, smooth])
     variances, _ = nnls(weight[:, None] * kernels, weight * products / cosines)
     kept = variances > 0.0
@@ -208,8 +220,26 @@ def _cell_means(places: NDArray[np.float64], most: int) -> sparse.csr_matrix[np.
 
 
 def _times(cells: sparse.csr_matrix[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What cells (n_cells, n) make of values (n,) or (n, k)."""
+    """What a sparse matrix (m, n), of cells as a rule, makes of values (n,) or (n, k)."""
     return np.asarray(cells @ values, dtype=np.float64)
+
+
+def _carried(
+    rows: NDArray[np.float64], places: NDArray[np.float64], normals: NDArray[np.float64], size: float
+) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
+    """Centres (n_cells, 3) mm of cubes of edge `size`; sums of rows (n_rows, n) times each component of the normals.
+
+    The sums are (n_rows, n_cells) for each axis.
+    """
+    _, inverse = _cell_keys(places, size)
+    cells = sparse.csr_matrix((np.ones(len(inverse)), (inverse, np.arange(len(inverse)))))
+    centres = _times(cells, places) / np.bincount(inverse)[:, None]
+    return centres, [np.ascontiguousarray(_times(cells, (rows * normals[:, a]).T).T) for a in range(3)]
+
+
+def _gaussian(distance: NDArray[np.float64], length: float) -> NDArray[np.float64]:
+    """Correlation exp(-d^2 / (2 length^2)) at distances d, mm."""
+    return np.asarray(np.exp(-(distance**2) / (2.0 * length**2)))
 
 
 def _units(vectors: NDArray[np.float64]) -> NDArray[np.float64]:

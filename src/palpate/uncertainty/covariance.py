@@ -13,6 +13,7 @@ from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue_distance import cropped, window_of
 from palpate.inversion.objective import Evaluation, Linearisation, Objective
+from palpate.inversion.reweighting import of_one_noise
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.noise_model import FitResponse, NoiseModel, mean_noise
@@ -128,7 +129,7 @@ def _sandwich(objective: Objective, evaluation: Evaluation) -> tuple[NDArray[np.
     n = objective.n_parameters
     inverse = evaluation.covariance_columns(n)
     data = np.zeros((n, n))
-    pairs, noise_of = list(zip(evaluation.lines, gain(evaluation, n), strict=True)), error_noise(objective, evaluation)
+    pairs, noise_of = list(zip(evaluation.lines, gain(evaluation, n), strict=True)), error_noise(evaluation)
     for kind in dict.fromkeys(line.observation.kind for line in evaluation.lines):
         of_kind = [(line, row) for line, row in pairs if line.observation.kind == kind]
         later = [line.state for line, _ in of_kind]
@@ -140,24 +141,22 @@ def _sandwich(objective: Objective, evaluation: Evaluation) -> tuple[NDArray[np.
     return data, np.asarray(inverse.T @ evaluation.prior @ inverse)
 
 
-def error_noise(objective: Objective, evaluation: Evaluation) -> dict[tuple[int, str], NoiseModel]:
+def error_noise(evaluation: Evaluation) -> dict[tuple[int, str], NoiseModel]:
     """Noise model of the residuals' errors, by later state and kind of observation.
 
     The residuals at a minimum are what the fit left of them: see `FitResponse`. What errors of one later image do to
     the residuals of another, by the moduli alone, is neglected.
     """
-    n, found = len(evaluation.matrix), {}
-    of_all = list(zip(objective.observations, evaluation.lines, gain(evaluation, n), strict=True))
-    for key in dict.fromkeys((line.state, line.observation.kind) for line in evaluation.lines):
-        own = [of for of in of_all if (of[1].state, of[1].observation.kind) == key]
-        telling = [of for of in own if not of[0].of_driver] or own
+    lines, n, found = evaluation.lines, len(evaluation.matrix), {}
+    rows = gain(evaluation, n)
+    for key, (own, telling) in of_one_noise(evaluation).items():
         response = FitResponse(
-            jacobians=[_among_all(line, n) for _, line, _ in telling],
-            gain=np.concatenate([row for _, _, row in own], axis=1),
-            places=np.concatenate([line.residuals.places for _, line, _ in own]),
-            normals=np.concatenate([line.residuals.normals for _, line, _ in own]),
+            jacobians=[_among_all(lines[i], n) for i in telling],
+            gain=np.concatenate([rows[i] for i in own], axis=1),
+            places=np.concatenate([lines[i].residuals.places for i in own]),
+            normals=np.concatenate([lines[i].residuals.normals for i in own]),
         )
-        found[key] = telling[0][0].fitted_noise([line.residuals for _, line, _ in telling], response)
+        found[key] = lines[own[0]].observation.fitted_noise([lines[i].residuals for i in telling], response)
     return found
 
 
