@@ -244,8 +244,8 @@ def test_every_evaluation_of_the_objective_is_counted(twins, twin, ratios, monke
 
 def test_what_was_spent_on_other_minima_is_counted(twins, voxels, monkeypatch):
     """The second start's minimum is followed on its own, on approximations that the first one's loop has made."""
-    ends, follow, groups = [], estimate.run_outer_loop, iter([[0, 1]])
-    whole = estimate._groups
+    ends, follow, groups, same = [], estimate.run_outer_loop, iter([[0, 1]]), iter([True, False])
+    whole, alike = estimate._groups, estimate.same_minimum
 
     def followed(*of, **named):
         ends.append(follow(*of, **named))
@@ -253,6 +253,7 @@ def test_what_was_spent_on_other_minima_is_counted(twins, voxels, monkeypatch):
 
     monkeypatch.setattr(estimate, "run_outer_loop", followed)
     monkeypatch.setattr(estimate, "_groups", lambda *of: next(groups, None) or whole(*of))
+    monkeypatch.setattr(estimate, "same_minimum", lambda *of: next(same, alike(*of)))
     monkeypatch.setattr(estimate, "LOWER", -1e9)
     found = invert(voxels, twins.settings(0.5, 8.0), progress=twins.silent)
     first, second = ends
@@ -261,6 +262,16 @@ def test_what_was_spent_on_other_minima_is_counted(twins, voxels, monkeypatch):
     assert first.checks.forward > 0
     history = found.minimum.history
     assert history in (first.minimum.history, second.minimum.history)
+
+
+def test_minima_no_further_apart_than_the_noise_that_was_found_are_not_sought_again(twins, voxels, monkeypatch):
+    """Under the first noise model, which is of voxels alone, two starts may seem to end in two places."""
+    groups, whole, from_starts = iter([[0, 1]]), estimate._groups, estimate._from_starts
+    monkeypatch.setattr(estimate, "_groups", lambda *of: next(groups, None) or whole(*of))
+    monkeypatch.setattr(estimate, "_from_starts", lambda *of: from_starts(*of)[:1] * 2)
+    monkeypatch.setattr(estimate, "_another", None)
+    found = invert(voxels, twins.settings(0.5, 8.0), progress=twins.silent)
+    assert [start.candidate for start in found.starts] == [0, 0]
 
 
 def vars_of(counts):

@@ -135,15 +135,40 @@ def test_a_prior_that_was_held_too_early_is_learned_once_more(twins, voxels, mon
     wall = Wall(np.arange(0), (), ())
     problem = replace(voxels, states=tuple(replace(state, walls=(wall,)) for state in voxels.states))
     twice = invert(problem, twins.settings(0.5), progress=twins.silent)
-    assert len(held) == loop.LEARNED
+    assert len(held) == 1 + loop.RELEARNED
     from_the_start = invert(problem, twins.settings(0.5), progress=twins.silent).minimum  # held is not empty any more
     held.clear()
-    monkeypatch.setattr(loop, "LEARNED", 1)
+    monkeypatch.setattr(loop, "RELEARNED", 0)
     once = invert(problem, twins.settings(0.5), progress=twins.silent)
     assert len(held) == 1
     off = [found.minimum.unknowns[:2] - from_the_start.unknowns[:2] for found in (twice, once)]
     apart = [np.abs(of / posterior_sd(from_the_start, 2)).max() for of in off]
     assert apart[0] < 0.05 < apart[1]
+
+
+def test_with_a_finer_wall_the_prior_is_learned_anew(twins, voxels, monkeypatch):
+    """What the wall does beyond its modes is no longer asked of them."""
+    finer, held = [], loop._with_walls
+
+    def refined(objective, _):
+        finer.append([bool(any(state.walls)) for state in objective.states])
+        return [state.constraint if len(finer) == 1 else None for state in objective.states]
+
+    def with_walls(objective, walls):
+        finer[-1:] = [[*finer[-1], any(walls)]] if finer else []
+        return held(objective, walls)
+
+    wall = Wall(np.arange(0), (), ())
+    problem = replace(voxels, states=tuple(replace(state, walls=(wall,)) for state in voxels.states))
+    for name in ("estimate", "reweighting"):
+        monkeypatch.setattr(f"palpate.inversion.{name}.with_learned_prior", lambda objective, *_: objective)
+    monkeypatch.setattr(loop, "refined_walls", refined)
+    monkeypatch.setattr(loop, "_with_walls", with_walls)
+    found = invert(problem, twins.settings(0.5), progress=twins.silent)
+    assert found.convergence.converged
+    first, second, *_ = finer
+    assert first == [False, True, False]  # held, free with the finer wall, held again where the estimate is near
+    assert second[0] is False
 
 
 def test_what_has_converged_is_not_given_up_for_a_finer_wall_in_the_last_iterations(twins, voxels, monkeypatch):
@@ -244,15 +269,21 @@ def test_an_approximation_that_cannot_say_what_it_misses_leaves_everything_open(
     assert off.tolist() == [np.inf, np.inf]
 
 
-@pytest.mark.parametrize(("error", "above", "forward"), [(0.02, 0.0, 1), (0.2, 0.3, 0), (0.4, 0.3, 1)])
+@pytest.mark.parametrize(
+    ("error", "share", "above", "forward"),
+    [(0.02, 0.5, 0.0, 1), (0.02, 1e-5, 0.0, 0), (0.2, 0.5, 0.3, 0), (0.4, 0.5, 0.3, 1)],
+)
 def test_a_loop_begins_on_a_model_that_is_exact_there_unless_its_rule_asks_for_less(
-    twins, twin, voxels, monkeypatch, error, above, forward
+    twins, twin, voxels, monkeypatch, error, share, above, forward
 ):
-    """What an approximation misses passes for noise, and the loop may keep to the weights that follow."""
+    """What an approximation misses passes for noise, and the loop may keep to the weights that follow.
+
+    A share of the displacement that moves no modulus by a tenth of its standard deviation is nothing to the noise.
+    """
     objective = twins.objective_of(voxels, twin.coefficients).rematched(twin.unknowns)
     start = minimised(objective, twin.unknowns, twins.settings(1.0))
     basis = objective.states[0].approximation
-    told = ModelError(error, np.zeros(len(twin.model.space.points) * 3))
+    told = ModelError(error, share * twin.scene.displacement.ravel())
     monkeypatch.setattr(type(basis), "error", lambda _self, _at: told)
     found = loop.updated(objective, start, StopRule(solve_above=above))
     assert found.objective.states[0].approximation.counts.forward == basis.counts.forward + forward

@@ -196,11 +196,14 @@ def _linear(
     fitted = fit_coefficients(objective, begin, bounds=settings.bounds)
     objective = with_learned_prior(objective, fitted.evaluation, fitted.unknowns)
     minima = _from_starts(objective, settings, fitted.unknowns[objective.n_parameters :], progress)
-    groups = _groups(minima, objective.n_parameters)
+    n = objective.n_parameters
+    groups = _groups(minima, n)
     best = groups[_best(minima)]
     start = [updated(objective, replace(minima[_best(minima)], evaluations=0), rule)]
     del objective  # and with it its approximations, which are large, when others take their place
     followed = [run_outer_loop(start.pop(), settings, rule, progress=progress, title="linear law")]
+    known = replace(minima[_best(minima)], evaluation=followed[0].minimum.evaluation)  # as well as the noise lets it be
+    groups = [best if same_minimum(m.unknowns, known, n) else g for m, g in zip(minima, groups, strict=True)]
     for group in dict.fromkeys(g for g in groups if g != best):
         member = min((m for m, g in zip(minima, groups, strict=True) if g == group), key=lambda m: m.evaluation.value)
         followed.append(_another(followed[0], member, settings, rule, progress))

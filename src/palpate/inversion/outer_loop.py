@@ -52,7 +52,7 @@ STRAIGHT = 0.4  # of ln E, within which linearised residuals are believed
 WITHIN_NOISE = 0.1  # of the posterior's width: a step that finds no smaller value, what a start may miss
 NEAR = 0.5  # posterior standard deviations: a shorter step ends where exact derivatives are worth it, and a held prior
 LEAST_SD = 0.03  # of ln E, see `_linearisation`
-LEARNED = 2  # times at the most that the drivers' prior is held
+RELEARNED = 1  # times at the most that the drivers' prior is learned anew where the estimate had converged
 PRIOR_HOLDS = 2.5  # tolerances, by which an estimate would move, or what is known of it, if it were learned anew there
 AFTER_CHANGE = 4  # outer iterations that must be left for finer walls or another prior: what converged is not lost
 SLOW = 0.5  # of the model's error an outer iteration before: where more is left all derivatives are made exact
@@ -152,16 +152,16 @@ def run_outer_loop(
     """Follow a minimum until reweighting it and updating its approximations change it no more.
 
     Of the approximations of `start` see `updated`. Drivers' walls are refined where their surfaces ask for it (see
-    `refined_walls`); what is believed of their motion is held from where the estimate is near, and learned once more
-    where, learned at the estimate, it would not leave that where it is. `title` begins each line of `progress`. The
-    minimum's history is that of the loop alone, its evaluations are added to those of `start`. Raises `NotConverged`
-    when the full model has no equilibrium where every part of a step leads.
+    `refined_walls`); what is believed of their motion is held from where the estimate is near until they are, and
+    learned once more where, learned at the estimate, it would not leave that where it is. `title` begins each line of
+    `progress`. The minimum's history is that of the loop alone, its evaluations are added to those of `start`. Raises
+    `NotConverged` when the full model has no equilibrium where every part of a step leads.
     """
     walls = [state.walls for state in start.objective.states]
     at, theta = start.minimum.evaluation, start.minimum.unknowns[: start.objective.n_parameters]
     first = Iterate(theta, at.value, at.misfit_mm2, newton_decrement(at))
     now, refinements = replace(start, minimum=replace(start.minimum, history=(first,))), 0
-    held, learned = False, 0
+    held, relearned = False, 0
     del start  # and with it its approximations, which are large, when others take their place
     for number in range(1, rule.iterations + 1):
         line = f"{title}, outer iteration {number}"
@@ -173,21 +173,22 @@ def run_outer_loop(
         if not held and _near(now.minimum, before, now.objective.n_parameters):
             # Learned anew at every step it follows the estimate, which follows it: the wall slides off along itself.
             objective = _with_walls(now.objective, [()] * len(walls))
-            now, held, learned = replace(now, objective=objective), True, learned + 1
+            now, held = replace(now, objective=objective), True
         if now.convergence.converged:
             if number > rule.iterations - AFTER_CHANGE:
                 break
             finer = refined_walls(now.objective, now.minimum.evaluation)
             if all(of is None for of in finer) or refinements == rule.refinements:
                 free = replace(now, objective=_with_walls(now.objective, walls), convergence=Convergence())
-                if not held or learned == LEARNED or _prior_holds(free, settings, rule):
+                if not held or relearned == RELEARNED or _prior_holds(free, settings, rule):
                     break
-                now, held = free, False
+                now, held, relearned = free, False, relearned + 1
                 continue
             pairs = zip(now.objective.approximations, finer, strict=True)
             moved = [a if constraint is None else a.with_constraint(constraint) for a, constraint in pairs]
-            now, refinements = _with_approximations(now, moved), refinements + 1
-            now = replace(now, convergence=Convergence(), step=np.inf)
+            now, held, refinements = _with_approximations(now, moved), False, refinements + 1
+            objective = _with_walls(now.objective, walls)  # learned with the finer wall in the same iterations
+            now = replace(now, objective=objective, convergence=Convergence(), step=np.inf)
     else:
         if max(now.convergence.reweighting, now.convergence.linearisation) > rule.far and now.minimum.converged:
             now = replace(now, minimum=replace(now.minimum, outcome=Outcome.STEPS))
@@ -206,10 +207,7 @@ def _with_walls(objective: Objective, walls: Sequence[tuple[Wall, ...]]) -> Obje
 
 
 def updated(objective: Objective, minimum: Minimum, rule: StopRule) -> OuterIterate:
-    """A minimum on approximations made exact there, unless what they miss is nothing beside the noise, or the rule's.
-
-    It would pass for noise: where the noise is small, so must it be.
-    """
+    """A minimum on approximations made exact there, but where what they miss, which passes for noise, is none to it."""
     error, off, cost = _model_error(objective, minimum)
     now = OuterIterate(objective, minimum, checks=cost)
     if error < rule.solve_above or np.all(off < WITHIN_NOISE * posterior_sd(minimum, objective.n_parameters)):
