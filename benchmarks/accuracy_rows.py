@@ -146,8 +146,10 @@ def _from_surfaces(scene: Scene, case: Case, options: PelvisOptions, row: Row) -
         space = lagrange_space(scene.mesh, "P2")
     else:
         before, after = (segment(image, scene.tissues) for image in (scene.before, scene.after))
-        edge_mm = edge_length_of(case, before, (after,)).mm
-        space = lagrange_space(tetrahedralise(pelvis_anatomy(options), edge_length_mm=edge_mm), "P2")
+        edges = edge_length_of(case, before, (after,))
+        anatomy = pelvis_anatomy(options)
+        mesh = tetrahedralise(anatomy, edge_length_mm=edges.mm, longer_mm=edges.longer_mm)
+        space = lagrange_space(mesh, "P2")
     driver = case.driver
     motion = prescribed_motion(space, {}, n_modes=driver.modes, kernel_mm=driver.kernel_mm, prior_mm=driver.prior_mm)
     constraint = outer_constraint(

@@ -130,11 +130,12 @@ def _write_images(folder: Path, bodies: Collection[str]) -> None:
         init(before, after, labels=table, output=folder / name)
 
 
-def write_case(folder: Path, scene: Scene) -> None:
-    """A scene's images and a case of them, as a user has them."""
+def write_case(folder: Path, scene: Scene, *, unnamed: Collection[str] = ()) -> None:
+    """A scene's images and a case of them, as a user has them; `unnamed` tissues are part of the surroundings."""
     write_label_image(folder / "before.nii.gz", scene.before)
     write_label_image(folder / "after.nii.gz", scene.after)
-    seen = [t for t in scene.tissues if t.role in (Role.ESTIMATE, Role.DRIVER, Role.RIGID)]
+    roles = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
+    seen = [t for t in scene.tissues if t.role in roles and t.name not in unnamed]
     lines = [f'"{t.name}" = {{label = {t.labels[0]}, role = "{t.role.value}"}}' for t in seen]
     (folder / "case.toml").write_text(CASE + "\n".join(lines))
 

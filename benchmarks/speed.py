@@ -26,7 +26,7 @@ import speed_direct as direct
 import speed_peers as peers
 from memory import peak_mb
 from numpy.typing import NDArray
-from speed_default import default_case
+from speed_default import default_case, other_signals
 from speed_stages import shares_of_stages
 
 from palpate.images import segment
@@ -57,7 +57,7 @@ from palpate.study import (
 )
 from palpate.uncertainty import sample_posterior, sandwich_covariance
 
-PARTS = ("solver", "linear", "nonlinear", "gradient", "posterior", "scaling", "front_end", "default")
+PARTS = ("solver", "linear", "nonlinear", "gradient", "posterior", "scaling", "front_end", "default", "signals")
 IN_A_ROW = 20  # gradients, as an optimiser asks for them
 STARTS = (0.5, 1.0, 2.0, 4.0, 8.0)  # moduli to the surroundings'
 SCALING_EDGES = (9.0, 6.0, 4.0, 2.7, 1.85, 1.65)  # mm: 30 k to 1 M unknowns
@@ -346,6 +346,12 @@ def _default(sizes: Sizes, seed: int, say: Say) -> Result:
     return {"default": default_case(seed, quick=sizes == QUICK)}
 
 
+def _signals(sizes: Sizes, seed: int, say: Say) -> Result:
+    """The same beside cases whose images tell more or less."""
+    del say
+    return {"signals": other_signals(seed, quick=sizes == QUICK)}
+
+
 def _one_size(edge_mm: float, seed: int) -> Result:
     """Assembly, one forward solve and two modulus sensitivities with multigrid."""
     options = PelvisOptions(seed=seed)
@@ -400,6 +406,7 @@ PART = {
     "scaling": _scaling,
     "front_end": _front_end,
     "default": _default,
+    "signals": _signals,
 }
 
 if __name__ == "__main__":

@@ -70,6 +70,25 @@ def test_the_same_anatomy_gives_the_same_mesh(mesh, anatomy):
     assert np.array_equal(again.nodes, mesh.nodes)
 
 
+def test_organs_have_edges_of_their_own_length(mesh, anatomy):
+    """The tumour's stay; elsewhere, also far from all organs, they are longer, and its surface is nearly as exact."""
+    graded = tetrahedralise(anatomy, edge_length_mm=4.0, longer_mm={"driver": 8.0, "organ": 6.0})
+
+    def edge(of, tissue):
+        """Median edge length, mm, of a tissue's surface."""
+        corners = of.nodes[tissue_surface(of, tissue).triangles]
+        return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
+
+    assert edge(graded, 0) == pytest.approx(edge(mesh, 0), rel=0.2)
+    assert edge(graded, 2) > 1.3 * edge(mesh, 2)
+    assert len(graded.tets) < 0.6 * len(mesh.tets)
+    check_mesh(graded, anatomy)
+    off = [
+        np.abs(Ball((-2.0, 0.0, 1.0), 6.0).at(of.nodes[tissue_surface(of, 0).nodes])).mean() for of in (graded, mesh)
+    ]
+    assert off[0] < 1.5 * off[1]
+
+
 def test_a_body_in_air_has_a_free_surface():
     tissues = (DRIVER, ORGAN, Tissue("air", Role.VOID))
     shapes = (Ball((0.0, 0.0, 0.0), 8.0), Ball((0.0, 0.0, 0.0), 20.0), None)

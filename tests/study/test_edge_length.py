@@ -81,6 +81,17 @@ def test_a_large_organ_is_measured_on_every_second_voxel(monkeypatch):
     assert chosen(shell).mm == pytest.approx(whole, abs=0.8)
 
 
+@pytest.mark.parametrize(("radius_mm", "own"), [(8.0, {"bowel": 8.0}), (15.0, {})])
+def test_organs_whose_edges_would_differ_by_half_have_their_own(radius_mm, own):
+    """In the same ratio where the case states the shortest, up to the longest that shows a surface."""
+    found = chosen(image(radius_mm))
+    assert found.longer_mm == own
+    assert found.in_words == found.reason + "".join(f"; {h:g} mm at '{name}'" for name, h in own.items())
+    for share in (0.5, 1.5):
+        stated = chosen(image(radius_mm), dataclasses.replace(CASE, mesh=MeshSettings(share * found.mm)))
+        assert stated.longer_mm == {name: min(share * h, 8.0) for name, h in own.items()}
+
+
 def test_linear_elements_get_half_the_edge_length_and_so_the_same_points():
     linear = dataclasses.replace(CASE, mechanics=Mechanics("linear", "P1"))
     assert chosen(image(18.0), linear).mm == pytest.approx(0.5 * chosen(image(18.0)).mm, abs=0.25)

@@ -24,7 +24,7 @@ def tried(case_result, monkeypatch):
     edges = []
 
     def fit(*arguments):
-        edge_length_mm = arguments[2]
+        edge_length_mm = arguments[2].mm
         edges.append(edge_length_mm)
         if edge_length_mm > 2.5:
             raise MeshQualityError(f"a dihedral angle at {edge_length_mm:g} mm")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,10 +22,10 @@ from palpate.progress import Progress, silent
 
 __all__ = ["COARSER", "COARSEST", "GRADING", "boundary_of", "tetrahedralise"]
 
-COARSEST = 4.0  # longest edge far from all surfaces, in edge lengths
+COARSEST = 4.0  # longest edge far from all surfaces, in the longest of organs
 GRADING = 0.45  # growth of the edge length with the distance from a surface, mm per mm
 GRID_FACTOR = 1.5  # longest over mean edge of the grid's tetrahedra
-SAG = 0.15  # how far remeshing may move a surface, in edge lengths; snapping puts it back
+SAG = 0.15  # how far remeshing may move a surface, in longest edge lengths of organs; snapping puts it back
 GAPS = (0.4, 0.75, 0.55)  # gaps and slivers thinner than 3/4 of this share of the edge length are closed
 GOOD_ENOUGH_DEG = 8.0  # no further attempt when the smallest dihedral angle is larger
 TOUCH = 0.25  # grid nodes so near to a surface, in edge lengths, are moved onto it
@@ -30,15 +33,21 @@ CRUMB = 0.001  # a piece with a smaller share of the meshed volume that hangs on
 SMOOTHING_SWEEPS = (20, 12)
 RESCUE_SWEEPS = 40
 RESCUE_DEG = 10.0
-COARSER = 1.5  # edge length on bones, air and known tissues, in edge lengths
+COARSER = 1.5  # edge length on bones, air and known tissues, in the longest of organs
 
 
-def tetrahedralise(anatomy: Anatomy, *, edge_length_mm: float, progress: Progress = silent) -> TetMesh:
+def tetrahedralise(
+    anatomy: Anatomy,
+    *,
+    edge_length_mm: float,
+    longer_mm: Mapping[str, float] | None = None,
+    progress: Progress = silent,
+) -> TetMesh:
     """Conforming tetrahedra of the meshed tissues; hollow tissues (driver, rigid, void) are left out.
 
-    `edge_length_mm` holds on the surfaces of `estimate` tissues and drivers; it grows with the distance from them,
-    to four times as much. Surface nodes lie on the level sets. Deterministic. `progress` is called with a sentence at
-    each step.
+    `edge_length_mm` holds on the surfaces of `estimate` tissues and drivers, but of those that have a longer one by
+    their name in `longer_mm`; it grows with the distance from them, to four times the longest. Surface nodes lie on the
+    level sets. Deterministic. `progress` is called with a sentence at each step.
     Raises `GeometryError` when nothing is left to mesh or the remeshing fails.
     """
     if not 0.0 < edge_length_mm < float(anatomy.box.lengths.min()):
@@ -46,6 +55,7 @@ def tetrahedralise(anatomy: Anatomy, *, edge_length_mm: float, progress: Progres
             f"mesh.edge_length_mm is {edge_length_mm}; it must be positive and less than the smallest side of the"
             f" domain, {anatomy.box.lengths.min():.1f} mm"
         )
+    edges = _Edges.of(anatomy, edge_length_mm, longer_mm or {})
     # the first without a bad angle, or the best: a gap as wide as the closing's reach closes in patches
     grid, best_angle = None, -np.inf
     failure = GeometryError("no attempt at meshing was made")
@@ -56,7 +66,7 @@ def tetrahedralise(anatomy: Anatomy, *, edge_length_mm: float, progress: Progres
             progress(f"{line}: {step}")
 
         try:
-            attempt = _grid(closed(anatomy, gap_mm=gap * edge_length_mm), edge_length_mm, say)
+            attempt = _grid(closed(anatomy, gap_mm=gap * edge_length_mm), edges, say)
         except GeometryError as error:
             failure = error
             continue
@@ -72,18 +82,42 @@ def tetrahedralise(anatomy: Anatomy, *, edge_length_mm: float, progress: Progres
     return TetMesh(grid.nodes, grid.tets, grid.region, boundary, beyond, anatomy.tissues)
 
 
-def _grid(anatomy: Anatomy, edge_length_mm: float, progress: Progress) -> Grid:
+@dataclass(frozen=True, slots=True)
+class _Edges:
+    """Edge lengths, mm: on the surface of each tissue (n_priority,) of an anatomy; shortest and longest of organs."""
+
+    on_surfaces: NDArray[np.float64]
+    shortest: float
+    longest: float
+
+    @classmethod
+    def of(cls, anatomy: Anatomy, edge_length_mm: float, longer_mm: Mapping[str, float]) -> _Edges:
+        """One for all organs, but of those that have a longer one."""
+        longest = max([edge_length_mm, *longer_mm.values()])
+        tissues = [anatomy.tissues[i] for i in anatomy.priority]
+        fine = [tissue.role in (Role.ESTIMATE, Role.DRIVER) for tissue in tissues]
+        of_organs = [max(edge_length_mm, longer_mm.get(tissue.name, 0.0)) for tissue in tissues]
+        return cls(np.where(fine, of_organs, COARSER * longest), edge_length_mm, longest)
+
+    def wanted(self, anatomy: Anatomy, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Edge length (n,) mm at points (n, 3) mm."""
+        values = anatomy.values(points)
+        sizes = (self.on_surfaces[:, None] + GRADING * np.abs(values)).min(axis=0, initial=np.inf)
+        return np.asarray(np.minimum(sizes, COARSEST * self.longest))
+
+
+def _grid(anatomy: Anatomy, edges: _Edges, progress: Progress) -> Grid:
     progress("a graded grid, cut along every surface")
 
     def longest_edge(points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Longest edge (n,) mm that the grid may have at points (n, 3) mm."""
-        return GRID_FACTOR * _sizes(anatomy, points, edge_length_mm)
+        return GRID_FACTOR * edges.wanted(anatomy, points)
 
-    grid = graded_grid(anatomy.box, longest_edge, coarsest_mm=COARSEST * edge_length_mm, region=anatomy.filler)
+    grid = graded_grid(anatomy.box, longest_edge, coarsest_mm=COARSEST * edges.longest, region=anatomy.filler)
     for tissue in anatomy.priority:
         phi = anatomy.level_sets[tissue]
         if phi is not None:
-            touch = TOUCH * _sizes(anatomy, grid.nodes, edge_length_mm)
+            touch = TOUCH * edges.wanted(anatomy, grid.nodes)
             free = grid.region == anatomy.filler
             grid = cut(grid, phi, inside=tissue, splittable=free, touch_mm=touch, box=anatomy.box)
     keep = np.array([tissue.meshed for tissue in anatomy.tissues])[grid.region]
@@ -94,27 +128,27 @@ def _grid(anatomy: Anatomy, edge_length_mm: float, progress: Progress) -> Grid:
     volume = np.bincount(piece, signed_volumes(grid.nodes, tets))
     keep = volume[piece] > CRUMB * volume.sum()
     grid = compact(grid.nodes, tets[keep], region[keep])
-    grid = _better(grid, anatomy, edge_length_mm, progress)
+    grid = _better(grid, anatomy, edges, progress)
     try:
-        return _better(grid, anatomy, edge_length_mm, progress)
+        return _better(grid, anatomy, edges, progress)
     except GeometryError:  # the second remeshing only saves tetrahedra; its input is a mesh already
         return grid
 
 
-def _better(grid: Grid, anatomy: Anatomy, edge_length_mm: float, progress: Progress) -> Grid:
+def _better(grid: Grid, anatomy: Anatomy, edges: _Edges, progress: Progress) -> Grid:
     """The grid remeshed, its surface nodes put back where they belong and its bad tetrahedra opened."""
     progress(f"remeshing {len(grid.tets)} tetrahedra")
-    sizes = _sizes(anatomy, grid.nodes, edge_length_mm)
-    grid = remeshed(grid, sizes, box=anatomy.box, sag_mm=SAG * edge_length_mm)
+    sizes = edges.wanted(anatomy, grid.nodes)
+    grid = remeshed(grid, sizes, box=anatomy.box, sag_mm=SAG * edges.longest)
     progress(f"fitting the surfaces of {len(grid.tets)} tetrahedra")
     contacts = contacts_of(grid, anatomy)
-    grid = snapped(grid, contacts, limit_mm=edge_length_mm)
+    grid = snapped(grid, contacts, limit_mm=edges.shortest)
     for sweeps in SMOOTHING_SWEEPS:
-        grid = smoothed(grid, contacts, step_mm=0.15 * edge_length_mm, sweeps=sweeps)
+        grid = smoothed(grid, contacts, step_mm=0.15 * edges.shortest, sweeps=sweeps)
         grid, contacts = debiased(grid, contacts)
-    grid = smoothed(grid, contacts, step_mm=0.05 * edge_length_mm, sweeps=SMOOTHING_SWEEPS[-1])
+    grid = smoothed(grid, contacts, step_mm=0.05 * edges.shortest, sweeps=SMOOTHING_SWEEPS[-1])
     # where surfaces meet in too thin a wedge, a good element is worth more than a tenth of a millimetre of surface
-    step = 0.03 * edge_length_mm
+    step = 0.03 * edges.shortest
     return smoothed(grid, contacts.released(), step_mm=step, sweeps=RESCUE_SWEEPS, below_deg=RESCUE_DEG)
 
 
@@ -123,15 +157,6 @@ def boundary_of(tets: NDArray[np.int64]) -> NDArray[np.int64]:
     faces = tets[:, FACES].reshape(-1, 3)
     _, place, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
     return np.asarray(faces[np.sort(place[count == 1])])
-
-
-def _sizes(anatomy: Anatomy, points: NDArray[np.float64], edge_length_mm: float) -> NDArray[np.float64]:
-    """Wanted edge length (n,) mm at points (n, 3) mm."""
-    values = anatomy.values(points)
-    fine = [anatomy.tissues[i].role in (Role.ESTIMATE, Role.DRIVER) for i in anatomy.priority]
-    start = edge_length_mm * np.where(fine, 1.0, COARSER)[:, None]
-    sizes = (start + GRADING * np.abs(values)).min(axis=0, initial=np.inf)
-    return np.asarray(np.minimum(sizes, COARSEST * edge_length_mm))
 
 
 def _beyond(anatomy: Anatomy, nodes: NDArray[np.float64], boundary: NDArray[np.int64]) -> NDArray[np.int64]:

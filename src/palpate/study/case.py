@@ -235,7 +235,10 @@ class CaseLoad:
 
 @dataclass(frozen=True, slots=True)
 class MeshSettings:
-    """Edge length (mm) of the tetrahedra at the organs; None: "auto", chosen by the organs (see `edge_length_of`)."""
+    """Edge length (mm) of the tetrahedra at the organs; None: "auto", chosen by the organs (see `edge_length_of`).
+
+    Of organs of which some are much larger it is that of the smallest.
+    """
 
     edge_length_mm: float | None = field(default=None, metadata=rule(between=(0.01, 1e3), chosen=AUTO))
 

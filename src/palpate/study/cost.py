@@ -129,15 +129,22 @@ def tets_by_edge(case: Case, before: Segmentation, after: tuple[Segmentation, ..
     # the mesher's filler: the remaining tissue if it is meshed, else the largest
     filler = max(tissues, key=lambda i: (not before.tissues[i].labels, before.volume(i)), default=-1)
     meshed = np.array([*(tissue.meshed for tissue in before.tissues), False])[index] & (index >= 0)
+    organs = edge_length_of(case, before, after)
+    longest = max([organs.mm, *organs.longer_mm.values()]) / organs.mm
     surfaces = [
-        (1.0 if tissue.role in (Role.ESTIMATE, Role.DRIVER) else COARSER, _distance_to_surface(index == i, cell))
+        (
+            organs.longer_mm.get(tissue.name, organs.mm) / organs.mm
+            if tissue.role in (Role.ESTIMATE, Role.DRIVER)
+            else COARSER * longest,
+            _distance_to_surface(index == i, cell),
+        )
         for i, tissue in enumerate(before.tissues)
         if i != filler and (index == i).any()
     ]
 
     def tets(edge_mm: float) -> int:
         """With edges of that length at the organs."""
-        sizes = np.full(index.shape, COARSEST * edge_mm)
+        sizes = np.full(index.shape, COARSEST * longest * edge_mm)
         for start, distance in surfaces:
             sizes = np.minimum(sizes, start * edge_mm + GRADING * distance)
         return max(int(TETS_A_CUBE * np.prod(cell) * float((sizes[meshed] ** -3.0).sum())), 100)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,48 +26,63 @@ LEAST_MM, LEAST_VOXELS = 3.0, 2.0  # shorter edges cost more than they show
 LONGEST_MM = 8.0  # of a quadratic element, which has a point of the surface every 4 mm
 LINEAR = 0.5  # times the edge length of quadratic elements: the same points
 STEP_MM = 0.25  # to which the edge length is rounded
+UNLIKE = 1.5  # longest over shortest edge length of organs, from which each has its own
 MOST_VOXELS = 128  # along each axis, in which a thickness is measured
 
 
 @dataclass(frozen=True, slots=True)
 class EdgeLength:
-    """Edge length (mm) at the organs, and the reason in words."""
+    """Edge length (mm) at the organs, and the reason in words; longer_mm: that of organs that have a longer one."""
 
     mm: float
     reason: str
+    longer_mm: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def in_words(self) -> str:
+        """The reason, with the longer ones."""
+        return "; ".join([self.reason, *(f"{mm:g} mm at '{name}'" for name, mm in self.longer_mm.items())])
 
 
 def edge_length_of(case: Case, before: Segmentation, after: Sequence[Segmentation]) -> EdgeLength:
     """The edge length of `case`; where it leaves the choice, one whose error is about a fifth of the interval at most.
 
-    h = min_i min(d_i / n_i, t_i / 2.5) sqrt(s / s_1) over the `estimate` tissues (n = 5) and drivers (n = 4) of the
-    reference state, d_i the diameter of a ball of the tissue's volume and t_i that of the largest ball inside it; s the
-    standard deviation of the surfaces, by voxels v and the case's own noise, s^2 = v^2 / 12 + sd^2, and s_1 that of
-    voxels of 1 mm. The root is held between 0.75 and 1.5, h between 3 mm, or two voxels, and 8 mm; linear elements get
-    half of all but the former. docs/method.md, section 2, has the measurements.
+    h = min_i h_i, h_i = min(d_i / n_i, t_i / 2.5) sqrt(s / s_1) over the `estimate` tissues (n = 5) and drivers (n = 4)
+    of the reference state, d_i the diameter of a ball of the tissue's volume and t_i that of the largest ball inside
+    it; s the standard deviation of the surfaces, by voxels v and the case's own noise, s^2 = v^2 / 12 + sd^2, and s_1
+    that of voxels of 1 mm. The root is held between 0.75 and 1.5, h_i below 8 mm, h between 3 mm, or two voxels, and 8
+    mm; linear elements get half of all but the former. Where the largest h_i is 1.5 h or more, each organ has its own;
+    so it is, in the same ratio, where the case states h. docs/method.md, section 2, has the measurements.
     """
-    stated = case.mesh.edge_length_mm
-    if stated is not None:
-        return EdgeLength(stated, "stated by the case")
     voxel = max(image.grid.voxel_volume ** (1.0 / 3.0) for image in (before, *after))
     surface = float(np.hypot(voxel * SURFACE_MM, case.noise.surface_sd_mm or 0.0))
     order = 1.0 if choose_element(case.mechanics.element).space == "P2" else LINEAR
     factor = order * float(np.clip(np.sqrt(surface / SURFACE_MM), *FACTORS))
-    wanted = [(order * LONGEST_MM, "the longest that shows the surface of an organ")]
+    longest = (order * LONGEST_MM, "the longest that shows the surface of an organ")
+    of_organs = dict[str, tuple[float, str]]()
     for i, tissue in enumerate(before.tissues):
         if tissue.role in ACROSS_BALL and (mask := before.mask(i)).any():
             ball, thickness = (6.0 * before.volume(i) / np.pi) ** (1.0 / 3.0), _thickness(mask, before.grid)
             across, thin = ACROSS_BALL[tissue.role] / factor, ACROSS_THIN / factor
-            wanted += [
+            of_organs[tissue.name] = min(
+                longest,
                 (ball / across, f"{across:.1f} edges across '{tissue.name}', as large as a ball of {ball:.0f} mm"),
                 (thickness / thin, f"{thin:.1f} edges across '{tissue.name}', {thickness:.0f} mm thick"),
-            ]
-    mm, reason = min(wanted)
+            )
+    mm, reason = min([longest, *of_organs.values()])
     least = max(LEAST_MM, LEAST_VOXELS * voxel)
     if mm < least:
         reason = f"the shortest that is chosen, for {reason} would be {mm:.1f} mm"
-        return EdgeLength(STEP_MM * float(np.ceil(least / STEP_MM - 1e-9)), reason)
-    return EdgeLength(STEP_MM * float(np.floor(mm / STEP_MM + 1e-9)), reason)
+        mm = STEP_MM * float(np.ceil(least / STEP_MM - 1e-9))
+    else:
+        mm = STEP_MM * float(np.floor(mm / STEP_MM + 1e-9))
+    own = {name: STEP_MM * float(np.floor(h / STEP_MM + 1e-9)) for name, (h, _) in of_organs.items()}
+    stated = case.mesh.edge_length_mm
+    if stated is not None:
+        own = {name: min(h * stated / mm, longest[0]) for name, h in own.items()}
+        mm, reason = stated, "stated by the case"
+    unlike = max(own.values(), default=0.0) >= UNLIKE * mm
+    return EdgeLength(mm, reason, {name: h for name, h in own.items() if unlike and h > mm})
 
 
 def _thickness(mask: NDArray[np.bool_], grid: VoxelGrid) -> float:

@@ -19,5 +19,5 @@ def mesh_summary(body: Body) -> MeshSummary:
         quality.p5_dihedral_deg,
         quality.volume_error,
         body.edge_length.mm if body.edge_length else None,
-        body.edge_length.reason if body.edge_length else "",
+        body.edge_length.in_words if body.edge_length else "",
     )
