@@ -43,21 +43,19 @@ def fitted_noise(evaluation: Evaluation) -> dict[tuple[int, str], NoiseModel]:
 
     Each later image has its own: one that was drawn badly would else take from what the others are believed.
     """
-    found = {}
-    for key, (_, telling) in of_one_noise(evaluation).items():
-        lines = [evaluation.lines[i] for i in telling]
-        found[key] = lines[0].observation.fitted_noise([line.residuals for line in lines])
-    return found
+    lines, groups = evaluation.lines, of_one_noise(evaluation)
+    told = {key: [lines[i] for i in telling] for key, (_, telling) in groups.items()}
+    return {key: of[0].observation.fitted_noise([line.residuals for line in of]) for key, of in told.items()}
 
 
 def of_one_noise(evaluation: Evaluation) -> dict[tuple[int, str], tuple[list[int], list[int]]]:
     """Numbers of the observations that share a noise model, by later state and kind, and of those that tell of it."""
-    groups: dict[tuple[int, str], list[int]] = {}
+    groups: dict[tuple[int, str], tuple[list[int], list[int]]] = {}
     for i, line in enumerate(evaluation.lines):
-        groups.setdefault((line.state, line.observation.kind), []).append(i)
-    return {
-        k: (own, [i for i in own if not evaluation.lines[i].observation.of_driver] or own) for k, own in groups.items()
-    }
+        own, telling = groups.setdefault((line.state, line.observation.kind), ([], []))
+        own.append(i)
+        telling += [] if line.observation.of_driver else [i]
+    return {key: (own, telling or own) for key, (own, telling) in groups.items()}
 
 
 def _by_noise(objective: Objective, noise: Mapping[tuple[int, str], NoiseModel]) -> Objective:
