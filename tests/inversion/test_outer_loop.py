@@ -224,6 +224,26 @@ def test_weights_that_take_turns_within_the_noise_end_an_estimate(twins, voxels,
     assert len(passes) < 2 * StopRule().iterations
 
 
+@pytest.mark.parametrize(("damped_from", "settles"), [(loop.DAMPED_FROM, True), (99, False)])
+def test_passes_that_go_to_and_fro_settle_half_way(twins, found, monkeypatch, damped_from, settles):
+    """Each leads as far beyond the place where weights and estimate agree as it began before it."""
+    there = found.minimum.unknowns
+
+    def beyond(objective, minimum, *_):
+        return objective, replace(minimum, unknowns=2.0 * there - minimum.unknowns), 0.0
+
+    def advanced(objective, minimum, aim, _):
+        return objective, replace(minimum, unknowns=aim)
+
+    monkeypatch.setattr(loop, "_agreed", beyond)
+    monkeypatch.setattr(loop, "_advanced", advanced)
+    monkeypatch.setattr(loop, "DAMPED_FROM", damped_from)
+    before = replace(found.minimum, unknowns=there + np.eye(len(there))[0] * 0.1)
+    now = OuterIterate(found.objective, before, step=1.0)
+    _, end, change = loop._reweighted_minimum(now, twins.settings(0.5), StopRule(), twins.silent, "")
+    assert (change < 1.0 and moved(end, found.minimum) < 1e-6) == settles
+
+
 def test_every_criterion_must_hold():
     met = Convergence(0.9, 0.9, 0.9)
     assert met.converged

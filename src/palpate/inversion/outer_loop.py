@@ -56,6 +56,7 @@ RELEARNED = 1  # times at the most that the drivers' prior is learned anew where
 PRIOR_HOLDS = 2.5  # tolerances, by which an estimate would move, or what is known of it, if it were learned anew there
 AFTER_CHANGE = 4  # outer iterations that must be left for finer walls or another prior: what converged is not lost
 SLOW = 0.5  # of the model's error an outer iteration before: where more is left all derivatives are made exact
+DAMPED_FROM = 2  # passes of weights and estimate in turn, from which one that turns back goes half its way
 HALVINGS = 3
 TRUSTED = 0.03  # error in energy of an approximation, below which the step on it needs no line search
 ROUGHNESS = 0.5  # of the objective, in units of log-likelihood: the noise of re-chosen closest points
@@ -286,12 +287,18 @@ def _reweighted_minimum(
     theta, bounds = minimum.unknowns[:n], settings.bounds
     near = Bounds(np.maximum(bounds.lower, theta - reach), np.minimum(bounds.upper, theta + reach))
     forcing, change, minimised_before = max(1.0, FORCING * now.step), np.inf, False
+    last = np.zeros(n)
     for number in range(1, rule.passes + 1):
         before, (weighted, aim, left) = minimum, _agreed(objective, minimum, near, bounds, rule, forcing)
         straight = bool(np.abs(aim.unknowns - before.unknowns)[:n].max() < STRAIGHT)
         if straight:
-            objective, minimum = _advanced(weighted, minimum, aim.unknowns, replace(settings, bounds=near))
-            change = max(left, _change(before, minimum, rule, n))
+            way = aim.unknowns - before.unknowns
+            share = 0.5 if number > DAMPED_FROM and last @ way[:n] < 0.0 else 1.0  # it would go to and fro
+            last = way[:n]
+            objective, minimum = _advanced(
+                weighted, minimum, before.unknowns + share * way, replace(settings, bounds=near)
+            )
+            change = max(left, _change(before, minimum, rule, n) / share)
         else:
             within = forcing * rule.tolerance(before, n) / INNER
             found = minimised(objective, before.unknowns, replace(settings, bounds=near), within=within)
