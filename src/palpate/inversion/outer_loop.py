@@ -294,10 +294,8 @@ def _reweighted_minimum(
         if straight:
             way = aim.unknowns - before.unknowns
             share = 0.5 if number > DAMPED_FROM and last @ way[:n] < 0.0 else 1.0  # it would go to and fro
-            last = way[:n]
-            objective, minimum = _advanced(
-                weighted, minimum, before.unknowns + share * way, replace(settings, bounds=near)
-            )
+            last, aimed = way[:n], before.unknowns + share * way
+            objective, minimum = _advanced(weighted, minimum, aimed, replace(settings, bounds=near))
             change = max(left, _change(before, minimum, rule, n) / share)
         else:
             within = forcing * rule.tolerance(before, n) / INNER
