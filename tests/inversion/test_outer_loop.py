@@ -224,8 +224,8 @@ def test_weights_that_take_turns_within_the_noise_end_an_estimate(twins, voxels,
     assert len(passes) < 2 * StopRule().iterations
 
 
-@pytest.mark.parametrize(("damped_from", "settles"), [(loop.DAMPED_FROM, True), (99, False)])
-def test_passes_that_go_to_and_fro_settle_half_way(twins, found, monkeypatch, damped_from, settles):
+@pytest.mark.parametrize(("damped_after", "settles"), [(loop.DAMPED_AFTER, True), (99, False)])
+def test_passes_that_go_to_and_fro_settle_half_way(twins, found, monkeypatch, damped_after, settles):
     """Each leads as far beyond the place where weights and estimate agree as it began before it."""
     there = found.minimum.unknowns
 
@@ -237,7 +237,7 @@ def test_passes_that_go_to_and_fro_settle_half_way(twins, found, monkeypatch, da
 
     monkeypatch.setattr(loop, "_agreed", beyond)
     monkeypatch.setattr(loop, "_advanced", advanced)
-    monkeypatch.setattr(loop, "DAMPED_FROM", damped_from)
+    monkeypatch.setattr(loop, "DAMPED_AFTER", damped_after)
     before = replace(found.minimum, unknowns=there + np.eye(len(there))[0] * 0.1)
     now = OuterIterate(found.objective, before, step=1.0)
     _, end, change = loop._reweighted_minimum(now, twins.settings(0.5), StopRule(), twins.silent, "")

@@ -87,9 +87,18 @@ def test_organs_whose_edges_would_differ_by_half_have_their_own(radius_mm, own):
     found = chosen(image(radius_mm))
     assert found.longer_mm == own
     assert found.in_words == found.reason + "".join(f"; {h:g} mm at '{name}'" for name, h in own.items())
-    for share in (0.5, 1.5):
+    for share in (0.5, 1.3, 2.0):
         stated = chosen(image(radius_mm), dataclasses.replace(CASE, mesh=MeshSettings(share * found.mm)))
         assert stated.longer_mm == {name: min(share * h, 8.0) for name, h in own.items()}
+
+
+def test_a_longer_edge_makes_no_organs_edges_shorter():
+    """Or a mesh that is to be coarser, for want of memory, would be finer."""
+    stated = [dataclasses.replace(CASE, mesh=MeshSettings(mm)) for mm in np.arange(2.0, 12.0, 0.5)]
+    lengths = [chosen(image(8.0), case) for case in stated]
+    bowel = [length.longer_mm.get("bowel", length.mm) for length in lengths]
+    assert np.all(np.diff(bowel) >= 0.0)
+    assert max(bowel[:10]) == 8.0
 
 
 def test_linear_elements_get_half_the_edge_length_and_so_the_same_points():

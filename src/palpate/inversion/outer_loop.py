@@ -56,7 +56,7 @@ RELEARNED = 1  # times at the most that the drivers' prior is learned anew where
 PRIOR_HOLDS = 2.5  # tolerances, by which an estimate would move, or what is known of it, if it were learned anew there
 AFTER_CHANGE = 4  # outer iterations that must be left for finer walls or another prior: what converged is not lost
 SLOW = 0.5  # of the model's error an outer iteration before: where more is left all derivatives are made exact
-DAMPED_FROM = 2  # passes of weights and estimate in turn, from which one that turns back goes half its way
+DAMPED_AFTER = 2  # passes of weights and estimate in turn: a later one that turns back goes half its way
 HALVINGS = 3
 TRUSTED = 0.03  # error in energy of an approximation, below which the step on it needs no line search
 ROUGHNESS = 0.5  # of the objective, in units of log-likelihood: the noise of re-chosen closest points
@@ -208,7 +208,10 @@ def _with_walls(objective: Objective, walls: Sequence[tuple[Wall, ...]]) -> Obje
 
 
 def updated(objective: Objective, minimum: Minimum, rule: StopRule) -> OuterIterate:
-    """A minimum on approximations made exact there, but where what they miss, which passes for noise, is none to it."""
+    """A minimum on approximations that are made exact there: what they miss would pass for noise.
+
+    Unless that moves no log-modulus by a tenth of its posterior standard deviation, or the rule asks for less.
+    """
     error, off, cost = _model_error(objective, minimum)
     now = OuterIterate(objective, minimum, checks=cost)
     if error < rule.solve_above or np.all(off < WITHIN_NOISE * posterior_sd(minimum, objective.n_parameters)):
@@ -293,7 +296,7 @@ def _reweighted_minimum(
         straight = bool(np.abs(aim.unknowns - before.unknowns)[:n].max() < STRAIGHT)
         if straight:
             way = aim.unknowns - before.unknowns
-            share = 0.5 if number > DAMPED_FROM and last @ way[:n] < 0.0 else 1.0  # it would go to and fro
+            share = 0.5 if number > DAMPED_AFTER and last @ way[:n] < 0.0 else 1.0  # it would go to and fro
             last, aimed = way[:n], before.unknowns + share * way
             objective, minimum = _advanced(weighted, minimum, aimed, replace(settings, bounds=near))
             change = max(left, _change(before, minimum, rule, n) / share)

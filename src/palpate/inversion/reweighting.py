@@ -39,7 +39,7 @@ def reweighted(objective: Objective, minimum: Minimum) -> Objective:
 
 
 def fitted_noise(evaluation: Evaluation) -> dict[tuple[int, str], NoiseModel]:
-    """Noise model by later state and kind of observation, of the residuals that tell: modes flatten a driver's.
+    """Noise model by later state and kind of observation, of the residuals that tell (see `of_one_noise`).
 
     Each later image has its own: one that was drawn badly would else take from what the others are believed.
     """
@@ -49,7 +49,10 @@ def fitted_noise(evaluation: Evaluation) -> dict[tuple[int, str], NoiseModel]:
 
 
 def of_one_noise(evaluation: Evaluation) -> dict[tuple[int, str], tuple[list[int], list[int]]]:
-    """Numbers of the observations that share a noise model, by later state and kind, and of those that tell of it."""
+    """Numbers of the observations of each later state and kind, which share a noise model; of those that tell of it.
+
+    Modes flatten a driver's residuals: they tell where nothing else is seen.
+    """
     groups: dict[tuple[int, str], tuple[list[int], list[int]]] = {}
     for i, line in enumerate(evaluation.lines):
         own, telling = groups.setdefault((line.state, line.observation.kind), ([], []))

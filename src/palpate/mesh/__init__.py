@@ -6,19 +6,17 @@ from palpate.mesh.quality import check_mesh
 from palpate.mesh.space import LagrangeSpace, lagrange_space, triangle_shape
 from palpate.mesh.surface import tissue_surface, triangle_normals, vertex_normals
 from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh
-from palpate.mesh.tetrahedralise import COARSER, COARSEST, GRADING, boundary_of, tetrahedralise
+from palpate.mesh.tetrahedralise import SizeField, boundary_of, tetrahedralise
 
 __all__ = [
-    "COARSER",
-    "COARSEST",
     "FACES",
-    "GRADING",
     "OUTER",
     "Anatomy",
     "Box",
     "Constraint",
     "LagrangeSpace",
     "LevelSet",
+    "SizeField",
     "TetMesh",
     "anatomy_of",
     "boundary_of",

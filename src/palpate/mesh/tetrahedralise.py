@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import GeometryError
-from palpate.images.tissue import Role
+from palpate.images.tissue import Role, Tissue
 from palpate.mesh.anatomy import Anatomy
 from palpate.mesh.closing import closed
 from palpate.mesh.cutting import Grid, cut, face_pieces, graded_grid, signed_volumes
@@ -20,7 +20,7 @@ from palpate.mesh.snapping import contacts_of, debiased, snapped
 from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh
 from palpate.progress import Progress, silent
 
-__all__ = ["COARSER", "COARSEST", "GRADING", "boundary_of", "tetrahedralise"]
+__all__ = ["SizeField", "boundary_of", "tetrahedralise"]
 
 COARSEST = 4.0  # longest edge far from all surfaces, in the longest of organs
 GRADING = 0.45  # growth of the edge length with the distance from a surface, mm per mm
@@ -36,6 +36,38 @@ RESCUE_DEG = 10.0
 COARSER = 1.5  # edge length on bones, air and known tissues, in the longest of organs
 
 
+@dataclass(frozen=True, slots=True)
+class SizeField:
+    """Edge lengths that a mesh shall have, h(x) = min(min_i (h_i + 0.45 |d_i(x)|), 4 h_max), all mm.
+
+    d_i is the distance to the surface of tissue i, h_i the edge length there: `on_surfaces` (n_tissues,). It is an
+    organ's own on `estimate` tissues and drivers, between `shortest` and `longest` (h_max), and 1.5 h_max on others.
+    """
+
+    on_surfaces: NDArray[np.float64]
+    shortest: float
+    longest: float
+
+    @classmethod
+    def of(cls, tissues: Sequence[Tissue], edge_length_mm: float, longer_mm: Mapping[str, float]) -> SizeField:
+        """One edge length (mm) for all organs, but for those that have a longer one by their name."""
+        organs = {t.name for t in tissues if t.role in (Role.ESTIMATE, Role.DRIVER)}
+        own = {name: max(edge_length_mm, longer_mm.get(name, 0.0)) for name in organs}
+        longest = max(own.values(), default=edge_length_mm)
+        on_surfaces = np.array([own.get(t.name, COARSER * longest) for t in tissues])
+        return cls(on_surfaces, edge_length_mm, longest)
+
+    @property
+    def coarsest(self) -> float:
+        """The edge length far from all surfaces, mm."""
+        return COARSEST * self.longest
+
+    def at(self, distances: NDArray[np.float64]) -> NDArray[np.float64]:
+        """H (...) mm where the surfaces of the tissues are so far away, (n_tissues, ...) mm, of either sign."""
+        starts = self.on_surfaces.reshape(-1, *[1] * (distances.ndim - 1))
+        return np.asarray((starts + GRADING * np.abs(distances)).min(axis=0, initial=self.coarsest))
+
+
 def tetrahedralise(
     anatomy: Anatomy,
     *,
@@ -46,8 +78,8 @@ def tetrahedralise(
     """Conforming tetrahedra of the meshed tissues; hollow tissues (driver, rigid, void) are left out.
 
     `edge_length_mm` holds on the surfaces of `estimate` tissues and drivers, but of those that have a longer one by
-    their name in `longer_mm`; it grows with the distance from them, to four times the longest. Surface nodes lie on the
-    level sets. Deterministic. `progress` is called with a sentence at each step.
+    their name in `longer_mm`; elsewhere edges are those of `SizeField`. Surface nodes lie on the level sets.
+    Deterministic. `progress` is called with a sentence at each step.
     Raises `GeometryError` when nothing is left to mesh or the remeshing fails.
     """
     if not 0.0 < edge_length_mm < float(anatomy.box.lengths.min()):
@@ -55,7 +87,7 @@ def tetrahedralise(
             f"mesh.edge_length_mm is {edge_length_mm}; it must be positive and less than the smallest side of the"
             f" domain, {anatomy.box.lengths.min():.1f} mm"
         )
-    edges = _Edges.of(anatomy, edge_length_mm, longer_mm or {})
+    sizes = SizeField.of([anatomy.tissues[i] for i in anatomy.priority], edge_length_mm, longer_mm or {})
     # the first without a bad angle, or the best: a gap as wide as the closing's reach closes in patches
     grid, best_angle = None, -np.inf
     failure = GeometryError("no attempt at meshing was made")
@@ -66,7 +98,7 @@ def tetrahedralise(
             progress(f"{line}: {step}")
 
         try:
-            attempt = _grid(closed(anatomy, gap_mm=gap * edge_length_mm), edges, say)
+            attempt = _grid(closed(anatomy, gap_mm=gap * edge_length_mm), sizes, say)
         except GeometryError as error:
             failure = error
             continue
@@ -82,42 +114,18 @@ def tetrahedralise(
     return TetMesh(grid.nodes, grid.tets, grid.region, boundary, beyond, anatomy.tissues)
 
 
-@dataclass(frozen=True, slots=True)
-class _Edges:
-    """Edge lengths, mm: on the surface of each tissue (n_priority,) of an anatomy; shortest and longest of organs."""
-
-    on_surfaces: NDArray[np.float64]
-    shortest: float
-    longest: float
-
-    @classmethod
-    def of(cls, anatomy: Anatomy, edge_length_mm: float, longer_mm: Mapping[str, float]) -> _Edges:
-        """One for all organs, but of those that have a longer one."""
-        longest = max([edge_length_mm, *longer_mm.values()])
-        tissues = [anatomy.tissues[i] for i in anatomy.priority]
-        fine = [tissue.role in (Role.ESTIMATE, Role.DRIVER) for tissue in tissues]
-        of_organs = [max(edge_length_mm, longer_mm.get(tissue.name, 0.0)) for tissue in tissues]
-        return cls(np.where(fine, of_organs, COARSER * longest), edge_length_mm, longest)
-
-    def wanted(self, anatomy: Anatomy, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Edge length (n,) mm at points (n, 3) mm."""
-        values = anatomy.values(points)
-        sizes = (self.on_surfaces[:, None] + GRADING * np.abs(values)).min(axis=0, initial=np.inf)
-        return np.asarray(np.minimum(sizes, COARSEST * self.longest))
-
-
-def _grid(anatomy: Anatomy, edges: _Edges, progress: Progress) -> Grid:
+def _grid(anatomy: Anatomy, sizes: SizeField, progress: Progress) -> Grid:
     progress("a graded grid, cut along every surface")
 
     def longest_edge(points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Longest edge (n,) mm that the grid may have at points (n, 3) mm."""
-        return GRID_FACTOR * edges.wanted(anatomy, points)
+        return GRID_FACTOR * sizes.at(anatomy.values(points))
 
-    grid = graded_grid(anatomy.box, longest_edge, coarsest_mm=COARSEST * edges.longest, region=anatomy.filler)
+    grid = graded_grid(anatomy.box, longest_edge, coarsest_mm=sizes.coarsest, region=anatomy.filler)
     for tissue in anatomy.priority:
         phi = anatomy.level_sets[tissue]
         if phi is not None:
-            touch = TOUCH * edges.wanted(anatomy, grid.nodes)
+            touch = TOUCH * sizes.at(anatomy.values(grid.nodes))
             free = grid.region == anatomy.filler
             grid = cut(grid, phi, inside=tissue, splittable=free, touch_mm=touch, box=anatomy.box)
     keep = np.array([tissue.meshed for tissue in anatomy.tissues])[grid.region]
@@ -128,27 +136,27 @@ def _grid(anatomy: Anatomy, edges: _Edges, progress: Progress) -> Grid:
     volume = np.bincount(piece, signed_volumes(grid.nodes, tets))
     keep = volume[piece] > CRUMB * volume.sum()
     grid = compact(grid.nodes, tets[keep], region[keep])
-    grid = _better(grid, anatomy, edges, progress)
+    grid = _better(grid, anatomy, sizes, progress)
     try:
-        return _better(grid, anatomy, edges, progress)
+        return _better(grid, anatomy, sizes, progress)
     except GeometryError:  # the second remeshing only saves tetrahedra; its input is a mesh already
         return grid
 
 
-def _better(grid: Grid, anatomy: Anatomy, edges: _Edges, progress: Progress) -> Grid:
+def _better(grid: Grid, anatomy: Anatomy, sizes: SizeField, progress: Progress) -> Grid:
     """The grid remeshed, its surface nodes put back where they belong and its bad tetrahedra opened."""
     progress(f"remeshing {len(grid.tets)} tetrahedra")
-    sizes = edges.wanted(anatomy, grid.nodes)
-    grid = remeshed(grid, sizes, box=anatomy.box, sag_mm=SAG * edges.longest)
+    wanted = sizes.at(anatomy.values(grid.nodes))
+    grid = remeshed(grid, wanted, box=anatomy.box, sag_mm=SAG * sizes.longest)
     progress(f"fitting the surfaces of {len(grid.tets)} tetrahedra")
     contacts = contacts_of(grid, anatomy)
-    grid = snapped(grid, contacts, limit_mm=edges.shortest)
+    grid = snapped(grid, contacts, limit_mm=sizes.shortest)
     for sweeps in SMOOTHING_SWEEPS:
-        grid = smoothed(grid, contacts, step_mm=0.15 * edges.shortest, sweeps=sweeps)
+        grid = smoothed(grid, contacts, step_mm=0.15 * sizes.shortest, sweeps=sweeps)
         grid, contacts = debiased(grid, contacts)
-    grid = smoothed(grid, contacts, step_mm=0.05 * edges.shortest, sweeps=SMOOTHING_SWEEPS[-1])
+    grid = smoothed(grid, contacts, step_mm=0.05 * sizes.shortest, sweeps=SMOOTHING_SWEEPS[-1])
     # where surfaces meet in too thin a wedge, a good element is worth more than a tenth of a millimetre of surface
-    step = 0.03 * edges.shortest
+    step = 0.03 * sizes.shortest
     return smoothed(grid, contacts.released(), step_mm=step, sweeps=RESCUE_SWEEPS, below_deg=RESCUE_DEG)
 
 

@@ -71,7 +71,7 @@ class NoiseModel:
             pairs = tree.sparse_distance_matrix(tree, 3.5 * length, output_type="coo_matrix").tocsr()
             pairs.data = _gaussian(pairs.data, length)
             pairs.setdiag(1.0)
-            return variance * sum((of @ _times(pairs, of.T) for of in carried), np.zeros((len(rows), len(rows))))
+            return variance * sum((part @ _times(pairs, part.T) for part in carried), np.zeros((len(rows),) * 2))
 
         return np.asarray(np.sum(mapped(term, zip(self.variances, self.lengths, strict=True)), axis=0))
 
@@ -120,11 +120,11 @@ class FitResponse:
         """Sums (BINS,) of what is left in each pair, times n_i.n_j."""
         centres, carried = _carried(self.gain, self.places, self.normals, WITHIN * length)
         kernel = _gaussian(cdist(centres, centres), length)
-        by_errors = sum(((of @ kernel) @ of.T for of in carried), np.zeros((len(self.gain),) * 2))  # G K G^T
+        by_errors = sum(((part @ kernel) @ part.T for part in carried), np.zeros((len(self.gain),) * 2))  # G K G^T
         products = np.zeros(BINS)
         for pairs in seen:
             across = _gaussian(cdist(centres, pairs.places), length)
-            pulled = sum(((of @ across) * pairs.normals[:, a] for a, of in enumerate(carried)), np.zeros(()))  # G K
+            pulled = sum(((part @ across) * pairs.normals[:, a] for a, part in enumerate(carried)), np.zeros(()))  # G K
             taken = pairs.jacobian @ (pulled - 0.5 * by_errors @ pairs.jacobian.T)
             left = _gaussian(pairs.distance, length) * pairs.cosine - (taken + taken.T)[pairs.near]
             products += np.bincount(pairs.bins, left * pairs.cosine, minlength=BINS)

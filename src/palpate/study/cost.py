@@ -13,12 +13,12 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.mechanics.solvers.registry import expected_of_size
 from palpate.memory import available_memory, total_memory
-from palpate.mesh import COARSER, COARSEST, GRADING, Box
+from palpate.mesh import Box, SizeField
 from palpate.parallel import processors
 from palpate.progress import STAGES, Stage
 from palpate.study.case import Case
 from palpate.study.domain import case_domain
-from palpate.study.edge_length import edge_length_of
+from palpate.study.edge_length import EdgeLength, edge_length_of
 
 __all__ = [
     "MEMORY_FACTOR",
@@ -30,7 +30,7 @@ __all__ = [
     "free_memory_gb",
     "lack_of_memory",
     "machine_memory_gb",
-    "tets_by_edge",
+    "tets_by_edge_length",
 ]
 
 MEMORY_FACTOR = 1.5  # how far the predicted memory may be off
@@ -119,35 +119,27 @@ def cost_of_meshes(
 
 def expected_tets(case: Case, before: Segmentation, after: tuple[Segmentation, ...]) -> int:
     """Number of tetrahedra in the mesh of a reference state."""
-    return tets_by_edge(case, before, after)(edge_length_of(case, before, after).mm)
+    return tets_by_edge_length(case, before, after)(edge_length_of(case, before, after))
 
 
-def tets_by_edge(case: Case, before: Segmentation, after: tuple[Segmentation, ...]) -> Callable[[float], int]:
-    """The same as a function of the edge length, mm: distances to the organs are computed once."""
+def tets_by_edge_length(
+    case: Case, before: Segmentation, after: tuple[Segmentation, ...]
+) -> Callable[[EdgeLength], int]:
+    """The same as a function of the edge lengths: distances to the organs are computed once."""
     index, cell = _lattice(before, case_domain(before, after, case))
     tissues = [i for i, tissue in enumerate(before.tissues) if tissue.meshed]
     # the mesher's filler: the remaining tissue if it is meshed, else the largest
     filler = max(tissues, key=lambda i: (not before.tissues[i].labels, before.volume(i)), default=-1)
     meshed = np.array([*(tissue.meshed for tissue in before.tissues), False])[index] & (index >= 0)
-    organs = edge_length_of(case, before, after)
-    longest = max([organs.mm, *organs.longer_mm.values()]) / organs.mm
-    surfaces = [
-        (
-            organs.longer_mm.get(tissue.name, organs.mm) / organs.mm
-            if tissue.role in (Role.ESTIMATE, Role.DRIVER)
-            else COARSER * longest,
-            _distance_to_surface(index == i, cell),
-        )
-        for i, tissue in enumerate(before.tissues)
-        if i != filler and (index == i).any()
-    ]
+    seen = [i for i in range(len(before.tissues)) if i != filler and (index == i).any()]
+    distances = np.array([_distance_to_surface(index == i, cell)[meshed] for i in seen]).reshape(
+        len(seen), meshed.sum()
+    )
 
-    def tets(edge_mm: float) -> int:
+    def tets(lengths: EdgeLength) -> int:
         """With edges of that length at the organs."""
-        sizes = np.full(index.shape, COARSEST * longest * edge_mm)
-        for start, distance in surfaces:
-            sizes = np.minimum(sizes, start * edge_mm + GRADING * distance)
-        return max(int(TETS_A_CUBE * np.prod(cell) * float((sizes[meshed] ** -3.0).sum())), 100)
+        sizes = SizeField.of([before.tissues[i] for i in seen], lengths.mm, lengths.longer_mm).at(distances)
+        return max(int(TETS_A_CUBE * np.prod(cell) * float((sizes**-3.0).sum())), 100)
 
     return tets
 

@@ -51,8 +51,9 @@ def edge_length_of(case: Case, before: Segmentation, after: Sequence[Segmentatio
     of the reference state, d_i the diameter of a ball of the tissue's volume and t_i that of the largest ball inside
     it; s the standard deviation of the surfaces, by voxels v and the case's own noise, s^2 = v^2 / 12 + sd^2, and s_1
     that of voxels of 1 mm. The root is held between 0.75 and 1.5, h_i below 8 mm, h between 3 mm, or two voxels, and 8
-    mm; linear elements get half of all but the former. Where the largest h_i is 1.5 h or more, each organ has its own;
-    so it is, in the same ratio, where the case states h. docs/method.md, section 2, has the measurements.
+    mm; linear elements get half of all but the former. Where the largest h_i is 1.5 h or more, each organ has its own,
+    and where the case states the shortest, the others are in the same ratio to it, up to 8 mm. docs/method.md, section
+    2, has the measurements.
     """
     voxel = max(image.grid.voxel_volume ** (1.0 / 3.0) for image in (before, *after))
     surface = float(np.hypot(voxel * SURFACE_MM, case.noise.surface_sd_mm or 0.0))
@@ -74,15 +75,20 @@ def edge_length_of(case: Case, before: Segmentation, after: Sequence[Segmentatio
     if mm < least:
         reason = f"the shortest that is chosen, for {reason} would be {mm:.1f} mm"
         mm = STEP_MM * float(np.ceil(least / STEP_MM - 1e-9))
-    else:
-        mm = STEP_MM * float(np.floor(mm / STEP_MM + 1e-9))
-    own = {name: STEP_MM * float(np.floor(h / STEP_MM + 1e-9)) for name, (h, _) in of_organs.items()}
+    own = {name: h for name, (h, _) in of_organs.items()}
+    own = own if max(own.values(), default=0.0) >= UNLIKE * mm else {}
     stated = case.mesh.edge_length_mm
-    if stated is not None:
-        own = {name: min(h * stated / mm, longest[0]) for name, h in own.items()}
-        mm, reason = stated, "stated by the case"
-    unlike = max(own.values(), default=0.0) >= UNLIKE * mm
-    return EdgeLength(mm, reason, {name: h for name, h in own.items() if unlike and h > mm})
+    if stated is None:
+        chosen, ratio = _rounded(mm), 1.0
+    else:
+        chosen, ratio, reason = stated, stated / _rounded(mm), "stated by the case"
+    longer = {name: min(ratio * _rounded(h), longest[0]) for name, h in own.items()}
+    return EdgeLength(chosen, reason, {name: h for name, h in longer.items() if h > chosen})
+
+
+def _rounded(mm: float) -> float:
+    """Down to a step."""
+    return STEP_MM * float(np.floor(mm / STEP_MM + 1e-9))
 
 
 def _thickness(mask: NDArray[np.bool_], grid: VoxelGrid) -> float:

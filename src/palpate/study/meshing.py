@@ -60,11 +60,11 @@ def mesh_reference(
         lack = lack_of_memory(expected_cost(finer, before, after, n_pairs=1)) if failure else ""
         if lack:
             raise GeometryError(f"{failure}; a mesh of {edge:g} mm was not tried: {lack}") from failure
+        lengths = edge_length_of(finer, before, after) if failure else chosen
         why = f"for the mesh before was not fit: {failure}" if failure else chosen.in_words
-        longer = edge_length_of(finer, before, after).longer_mm if failure else chosen.longer_mm
         progress(f"meshing at {edge:g} mm, {why}")
         try:
-            mesh, quality = _fit_mesh(before, anatomy, EdgeLength(edge, why, longer), progress)
+            mesh, quality = _fit_mesh(before, anatomy, lengths, progress)
         except GeometryError as error:
             failure = error
             continue
@@ -75,8 +75,8 @@ def mesh_reference(
             f" mesh.edge_length_mm = {edge:g} in place of {asked:g} the attempt is saved; a repair of the labels at"
             " that place may allow coarser meshes"
         )
-        finer_edge = EdgeLength(edge, f"a mesh of {asked:g} mm was not fit", longer)
-        return ReferenceMesh(mesh, quality, finer_edge, (Finding("finer-mesh", text),))
+        lengths = replace(lengths, reason=f"a mesh of {asked:g} mm was not fit")
+        return ReferenceMesh(mesh, quality, lengths, (Finding("finer-mesh", text),))
     raise type(failure or GeometryError())(
         f"no mesh is fit to compute with, neither at mesh.edge_length_mm = {asked:g} nor at"
         f" {' and '.join(f'{edge:g}' for edge in edges[1:])} mm, where {failure}; repair the labels at that place, or"
@@ -94,11 +94,11 @@ def refuse_edge(edge_mm: float, box: Box) -> None:
 
 
 def _fit_mesh(
-    before: Segmentation, anatomy: Anatomy, edges: EdgeLength, progress: Progress
+    before: Segmentation, anatomy: Anatomy, lengths: EdgeLength, progress: Progress
 ) -> tuple[TetMesh, MeshQuality]:
     """A mesh that passed its gate, with its quality; voxels are counted inside the domain."""
     try:
-        mesh = tetrahedralise(anatomy, edge_length_mm=edges.mm, longer_mm=edges.longer_mm, progress=progress)
+        mesh = tetrahedralise(anatomy, edge_length_mm=lengths.mm, longer_mm=lengths.longer_mm, progress=progress)
     except RuntimeError as error:  # Mmg's own words, which do not tell a lack of memory from a bad surface
         raise ResourceError(
             f"the mesher stopped ({error}), most likely for want of memory; make mesh.edge_length_mm larger, or the"

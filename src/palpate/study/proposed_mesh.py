@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,8 @@ import numpy as np
 from palpate.images.label_image import LabelImage
 from palpate.images.segmentation import segment
 from palpate.images.tissue import Role
-from palpate.study.case import REMAINING, Case, CaseTissue, Domain, Images
-from palpate.study.cost import MEMORY_FACTOR, cost_of_meshes, expected_size, machine_memory_gb, tets_by_edge
+from palpate.study.case import REMAINING, Case, CaseTissue, Domain, Images, MeshSettings
+from palpate.study.cost import MEMORY_FACTOR, cost_of_meshes, expected_size, machine_memory_gb, tets_by_edge_length
 from palpate.study.edge_length import edge_length_of
 from palpate.study.guess import GuessedTissue
 
@@ -59,11 +60,13 @@ def proposed_edge(
     first, *later = (segment(image, case.resolve_tissues({})) for image in (before, *after))
     suited, has = edge_length_of(case, first, later), machine_memory_gb()
     edge, why = suited.mm, suited.reason
-    tets = tets_by_edge(case, first, tuple(later))
+    tets = tets_by_edge_length(case, first, tuple(later))
 
     def memory_gb(edge_mm: float) -> float:
         """That an estimate with such edges needs."""
-        return cost_of_meshes(case, first, [expected_size(case, tets(edge_mm))], n_after=len(later)).memory_gb
+        stated = replace(case, mesh=MeshSettings(edge_mm))
+        size = expected_size(case, tets(edge_length_of(stated, first, later)))
+        return cost_of_meshes(case, first, [size], n_after=len(later)).memory_gb
 
     while has is not None and edge < LONGEST_MM and MEMORY_FACTOR * memory_gb(edge) > has:
         edge += STEP_MM
