@@ -196,15 +196,13 @@ def _linear(
     fitted = fit_coefficients(objective, begin, bounds=settings.bounds)
     objective = with_learned_prior(objective, fitted.evaluation, fitted.unknowns)
     minima = _from_starts(objective, settings, fitted.unknowns[objective.n_parameters :], progress)
-    n, first = objective.n_parameters, minima[_best(minima)]
-    groups = _groups(minima, n)
-    best = groups[_best(minima)]
-    start = [updated(objective, replace(first, evaluations=0), rule)]
+    n, first = objective.n_parameters, _best(minima)
+    start = [updated(objective, replace(minima[first], evaluations=0), rule)]
     del objective  # and with it its approximations, which are large, when others take their place
     followed = [run_outer_loop(start.pop(), settings, rule, progress=progress, title="linear law")]
-    # Minima that lie apart under the first noise model may be one under the noise that was found.
-    wide = replace(first, evaluation=followed[0].minimum.evaluation)
-    groups = [best if same_minimum(m.unknowns, wide, n) else g for m, g in zip(minima, groups, strict=True)]
+    found = followed[0].minimum.evaluation  # minima may lie apart under the first noise and be one under what was found
+    groups = _groups([replace(minimum, evaluation=found) for minimum in minima], n)
+    best = groups[first]
     for group in dict.fromkeys(g for g in groups if g != best):
         member = min((m for m, g in zip(minima, groups, strict=True) if g == group), key=lambda m: m.evaluation.value)
         followed.append(_another(followed[0], member, settings, rule, progress))
@@ -212,10 +210,10 @@ def _linear(
     triples = zip(settings.starts, minima, groups, strict=True)
     starts = tuple(StartRun(theta, minimum, order.index(group)) for theta, minimum, group in triples)
     evaluations += 1 + fitted.evaluations + sum(m.evaluations for m in (*minima, *(f.minimum for f in followed)))
-    found = _concluded(followed, starts, rest, settings, 0)
+    concluded = _concluded(followed, starts, rest, settings, 0)
     of_first = followed[0].counts  # the others' approximations are this one's, extended
     spent = sum((other.counts - of_first for other in followed[1:]), of_first)
-    return replace(found, evaluations=found.evaluations + evaluations, counts=spent)
+    return replace(concluded, evaluations=concluded.evaluations + evaluations, counts=spent)
 
 
 def _from_starts(

@@ -31,8 +31,9 @@ FIRST_RADIUS = 1.0  # of the log-moduli, per step: a factor e
 MAX_RADIUS = 2.0
 LEAST_DAMPING = 1e-2  # of the diagonal: less is nearly the step that was refused
 SEARCHES = 8  # trials of a step
-SAME_MINIMUM, SAME_SD = 0.02, 0.3  # of ln E, and of a posterior standard deviation: minima no further apart are one
-MET = 0.5  # decrement (log-likelihood) from which an iterate is where it is going to end
+SAME_MINIMUM = 0.02  # of ln E: minima no further apart are one
+SAME_SD = 1.0  # posterior standard deviations, too: two normal densities up to two apart have one mode together
+MET = 0.5  # decrement (log-likelihood) from which an iterate knows where it is going to end
 WORTH = 1e-2  # units of log-likelihood that a damped step must promise to be tried
 SLIDING = 0.02  # decrement a driver's coefficient, a fifth of its sd: below it walls slide from voxel to voxel
 SLIDING_SD = 0.1  # posterior standard deviations of a log-modulus, which are left while they do
@@ -179,7 +180,7 @@ def gauss_newton(
     -s.d / 2, the reduction that the quadratic model still promises in units of log-likelihood. It ends when that is
     under `tolerance` and the step to the model's minimum moves each log-modulus by less than `within` (one number, or
     (n_parameters,)), or where steps within the noise of closest points lower the decrement no more: then where that was
-    least; or where it has met one of the `known` minima. `held`: which log-moduli (n_parameters,) keep their values, or
+    least; or where it is about to meet one of the `known` minima. `held`: which log-moduli (n_parameters,) keep their values, or
     whether all do. A tolerance of None: to where drivers' walls slide from voxel to voxel and the log-moduli are within
     a tenth of their posterior standard deviations, which serves where the objective is going to change.
     """
@@ -195,13 +196,14 @@ def gauss_newton(
         free = _free(objective, unknowns, now, bounds, held)
         decrement = newton_decrement(now, free)
         history.append(Iterate(unknowns[:n], now.value, now.misfit_mm2, decrement))
-        whole = _step(now, free, n, WHOLE)[:n]
+        to_end = _step(now, free, n, WHOLE)
+        whole = to_end[:n]
         if roughly and decrement < tolerance and held is not True:
             within = SLIDING_SD * np.sqrt(np.diag(now.covariance_columns(n)))
         if decrement < tolerance and np.all(np.abs(whole) < within):
             outcome = Outcome.CONVERGED
             break
-        if decrement < MET and any(same_minimum(unknowns, other, n) for other in known):
+        if decrement < MET and any(same_minimum(unknowns + to_end, other, n) for other in known):
             outcome = Outcome.JOINED
             break
         since += 1

@@ -28,6 +28,7 @@ from palpate.inversion.optimise import (
 )
 from palpate.inversion.reweighting import reweighted
 from palpate.mechanics.forward import SolveCounts
+from palpate.mesh.constraint import Constraint
 from palpate.observation.wall_modes import Wall
 
 __all__ = [
@@ -185,11 +186,8 @@ def run_outer_loop(
                     break
                 now, held, relearned = free, False, relearned + 1
                 continue
-            pairs = zip(now.objective.approximations, finer, strict=True)
-            moved = [a if constraint is None else a.with_constraint(constraint) for a, constraint in pairs]
-            now, held, refinements = _with_approximations(now, moved), False, refinements + 1
-            objective = _with_walls(now.objective, walls)  # learned with the finer wall in the same iterations
-            now = replace(now, objective=objective, convergence=Convergence(), step=np.inf)
+            now, held, refinements = _with_finer_walls(now, finer), False, refinements + 1
+            now = replace(now, objective=_with_walls(now.objective, walls))  # learned in the same iterations
     else:
         if max(now.convergence.reweighting, now.convergence.linearisation) > rule.far and now.minimum.converged:
             now = replace(now, minimum=replace(now.minimum, outcome=Outcome.STEPS))
@@ -387,12 +385,12 @@ def _line_search(now: OuterIterate, there: OuterIterate, worth: Derivatives) -> 
     `NotConverged` when the last of them has no equilibrium.
     """
     before = now.minimum.unknowns
-    here = there.objective(before)
-    step, evaluations, failure = there.minimum.unknowns - before, 1, None
+    here = LinearisedObjective(there.objective, before, now.minimum.evaluation)(before)
+    step, evaluations, failure = there.minimum.unknowns - before, 0, None
     for halving in range(HALVINGS + 1):
         unknowns = before + 0.5**halving * step
         try:
-            trial = there.objective.under(_solved(there.objective, unknowns))
+            trial = there.objective.under(_solved(there.objective, unknowns, there.minimum.evaluation, worth))
         except NotConverged as error:
             failure = error
             continue
@@ -400,8 +398,7 @@ def _line_search(now: OuterIterate, there: OuterIterate, worth: Derivatives) -> 
         if _lowers(here, evaluation, unknowns - before):
             spent = there.minimum.evaluations + evaluations
             reached = replace(there.minimum, unknowns=unknowns, evaluation=evaluation, evaluations=spent)
-            arrived = replace(there, objective=trial, minimum=reached)
-            return _with_approximations(arrived, _solved(trial, unknowns, there.minimum.evaluation, worth))
+            return replace(there, objective=trial, minimum=reached)
     if failure is not None:
         raise failure
     outcome = Outcome.STALLED if there.step < 1.0 else Outcome.STUCK
@@ -438,6 +435,15 @@ def _with_approximations(now: OuterIterate, approximations: list[Approximation])
     objective = now.objective.under(approximations)
     evaluation, spent = objective(now.minimum.unknowns), now.minimum.evaluations + 1
     return replace(now, objective=objective, minimum=replace(now.minimum, evaluation=evaluation, evaluations=spent))
+
+
+def _with_finer_walls(now: OuterIterate, finer: Sequence[Constraint | None]) -> OuterIterate:
+    """The iterate with finer motions of drivers' walls, one a state or None, exact there with what decides."""
+    objective, at = now.objective, now.minimum
+    places = objective.places(at.unknowns, at.evaluation, Derivatives.DECIDING)
+    triples = zip(objective.approximations, finer, places, strict=True)
+    moved = [a if wall is None else a.with_constraint(wall).update(place) for a, wall, place in triples]
+    return replace(_with_approximations(now, moved), convergence=Convergence())
 
 
 def _solved(
