@@ -19,6 +19,7 @@ from palpate.inversion import (
     invert,
     posterior_sd,
 )
+from palpate.inversion.optimise import same_minimum
 from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimation import Observed, conclude
 from palpate.uncertainty import FittedState, sandwich_covariance
@@ -244,8 +245,7 @@ def test_every_evaluation_of_the_objective_is_counted(twins, twin, ratios, monke
 
 def test_what_was_spent_on_other_minima_is_counted(twins, voxels, monkeypatch):
     """The second start's minimum is followed on its own, on approximations that the first one's loop has made."""
-    ends, follow, groups, same = [], estimate.run_outer_loop, iter([[0, 1]]), iter([True, False])
-    whole, alike = estimate._groups, estimate.same_minimum
+    ends, follow, groups, whole = [], estimate.run_outer_loop, iter([[0, 1]]), estimate._groups
 
     def followed(*of, **named):
         ends.append(follow(*of, **named))
@@ -253,7 +253,6 @@ def test_what_was_spent_on_other_minima_is_counted(twins, voxels, monkeypatch):
 
     monkeypatch.setattr(estimate, "run_outer_loop", followed)
     monkeypatch.setattr(estimate, "_groups", lambda *of: next(groups, None) or whole(*of))
-    monkeypatch.setattr(estimate, "same_minimum", lambda *of: next(same, alike(*of)))
     monkeypatch.setattr(estimate, "LOWER", -1e9)
     found = invert(voxels, twins.settings(0.5, 8.0), progress=twins.silent)
     first, second = ends
@@ -264,14 +263,25 @@ def test_what_was_spent_on_other_minima_is_counted(twins, voxels, monkeypatch):
     assert history in (first.minimum.history, second.minimum.history)
 
 
-def test_minima_no_further_apart_than_the_noise_that_was_found_are_not_sought_again(twins, voxels, monkeypatch):
-    """Under the first noise model, which is of voxels alone, two starts may seem to end in two places."""
-    groups, whole, from_starts = iter([[0, 1]]), estimate._groups, estimate._from_starts
-    monkeypatch.setattr(estimate, "_groups", lambda *of: next(groups, None) or whole(*of))
-    monkeypatch.setattr(estimate, "_from_starts", lambda *of: from_starts(*of)[:1] * 2)
-    monkeypatch.setattr(estimate, "_another", None)
-    found = invert(voxels, twins.settings(0.5, 8.0), progress=twins.silent)
-    assert [start.candidate for start in found.starts] == [0, 0]
+@pytest.mark.parametrize(("share", "sought"), [(0.9, 0), (1.1, 1)])
+def test_minima_within_the_noise_that_was_found_are_not_sought_again(twins, voxels, monkeypatch, share, sought):
+    """The first noise model is of voxels alone: under a third of what is found they are further apart than it lets."""
+    settings, from_starts, another = twins.settings(0.5), estimate._from_starts, estimate._another
+    found, calls = invert(voxels, settings, progress=twins.silent), []
+    way = np.append(share * posterior_sd(found.minimum, 2), np.zeros(len(found.minimum.unknowns) - 2))
+
+    def two(*of):
+        first, _ = from_starts(*of)
+        first = replace(first, evaluation=replace(first.evaluation, matrix=9.0 * first.evaluation.matrix))
+        away = replace(first, unknowns=first.unknowns + way, evaluation=replace(first.evaluation, value=np.inf))
+        assert not same_minimum(away.unknowns, first, 2)
+        return [first, away]
+
+    monkeypatch.setattr(estimate, "_from_starts", two)
+    monkeypatch.setattr(estimate, "_another", lambda *of: calls.append(1) or another(*of))
+    again = invert(voxels, replace(settings, starts=settings.starts * 2), progress=twins.silent)
+    assert len(calls) == sought
+    assert [start.candidate for start in again.starts] == [0, 0]
 
 
 def vars_of(counts):

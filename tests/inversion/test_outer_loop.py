@@ -148,27 +148,39 @@ def test_a_prior_that_was_held_too_early_is_learned_once_more(twins, voxels, mon
 
 def test_with_a_finer_wall_the_prior_is_learned_anew(twins, voxels, monkeypatch):
     """What the wall does beyond its modes is no longer asked of them."""
-    finer, held = [], loop._with_walls
+    events, with_walls = [], loop._with_walls
 
     def refined(objective, _):
-        finer.append([bool(any(state.walls)) for state in objective.states])
-        return [state.constraint if len(finer) == 1 else None for state in objective.states]
+        events.append("refined")
+        return [state.constraint if events.count("refined") == 1 else None for state in objective.states]
 
-    def with_walls(objective, walls):
-        finer[-1:] = [[*finer[-1], any(walls)]] if finer else []
-        return held(objective, walls)
+    def noted(objective, walls):
+        events.append("free" if any(walls) else "held")
+        return with_walls(objective, walls)
 
     wall = Wall(np.arange(0), (), ())
     problem = replace(voxels, states=tuple(replace(state, walls=(wall,)) for state in voxels.states))
     for name in ("estimate", "reweighting"):
         monkeypatch.setattr(f"palpate.inversion.{name}.with_learned_prior", lambda objective, *_: objective)
     monkeypatch.setattr(loop, "refined_walls", refined)
-    monkeypatch.setattr(loop, "_with_walls", with_walls)
+    monkeypatch.setattr(loop, "_with_walls", noted)
     found = invert(problem, twins.settings(0.5), progress=twins.silent)
     assert found.convergence.converged
-    first, second, *_ = finer
-    assert first == [False, True, False]  # held, free with the finer wall, held again where the estimate is near
-    assert second[0] is False
+    assert events[:5] == ["held", "refined", "free", "held", "refined"]
+
+
+def test_an_iterate_with_a_finer_wall_is_exact_with_the_derivatives_that_decide(found):
+    now = found.candidates[found.best].iterate
+    (state,), unknowns = now.objective.states, now.minimum.unknowns
+    bulged = replace(state.constraint, offset=state.constraint.offset + 0.01 * state.constraint.modes[:, 0])
+    finer = loop._with_finer_walls(now, [bulged])
+    (model,) = finer.objective.approximations
+    (place,) = finer.objective.places(unknowns)
+    assert model.constraint is bulged
+    assert model.derivatives_at == pytest.approx(place.moduli)
+    assert model.error(place).relative < 1e-3
+    assert finer.minimum.evaluations == now.minimum.evaluations + 1
+    assert not finer.convergence.converged
 
 
 def test_what_has_converged_is_not_given_up_for_a_finer_wall_in_the_last_iterations(twins, voxels, monkeypatch):

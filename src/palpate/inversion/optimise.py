@@ -180,9 +180,9 @@ def gauss_newton(
     -s.d / 2, the reduction that the quadratic model still promises in units of log-likelihood. It ends when that is
     under `tolerance` and the step to the model's minimum moves each log-modulus by less than `within` (one number, or
     (n_parameters,)), or where steps within the noise of closest points lower the decrement no more: then where that was
-    least; or where it is about to meet one of the `known` minima. `held`: which log-moduli (n_parameters,) keep their values, or
-    whether all do. A tolerance of None: to where drivers' walls slide from voxel to voxel and the log-moduli are within
-    a tenth of their posterior standard deviations, which serves where the objective is going to change.
+    least; or where it is about to meet one of the `known` minima. `held`: which log-moduli (n_parameters,) keep their
+    values, or whether all do. A tolerance of None: to where drivers' walls slide from voxel to voxel and the log-moduli
+    are within a tenth of their posterior standard deviations, which serves where the objective is going to change.
     """
     unknowns, region, history, n = start.copy(), _Region(), list[Iterate](), objective.n_parameters
     roughly = tolerance is None
