@@ -129,8 +129,11 @@ class Approximation(Protocol):
         """What it misses at a place."""
         ...
 
-    def with_constraint(self, constraint: Constraint) -> Self:
-        """The approximation of the same body with another offset of what is prescribed."""
+    def with_constraint(self, constraint: Constraint, at: Place) -> Self:
+        """The approximation of the same body with another offset of what is prescribed, exact at a place as `update`'s.
+
+        Raises as `update` does.
+        """
         ...
 
 
@@ -188,11 +191,11 @@ class ExactApproximation:
         of = there.error_estimate if isinstance(there, FiniteStrainEquilibrium) else there.system.error_bound
         return ModelError(*of(at.moduli, displacement))
 
-    def with_constraint(self, constraint: Constraint) -> ExactApproximation:
-        """The model solved again under another offset."""
+    def with_constraint(self, constraint: Constraint, at: Place) -> ExactApproximation:
+        """The model solved at a place under another offset."""
         finite = None if self.finite_strain is None else self.finite_strain.under(constraint)
         linear = with_constraint(self.linear, constraint)
-        return exact_approximation(linear, finite, self.place, nearby=self)
+        return exact_approximation(linear, finite, at, nearby=self)
 
 
 def exact_approximation(

@@ -98,17 +98,18 @@ class Expansion:
             return ModelError(0.0, np.zeros_like(displacement))
         return ModelError(*self.equilibrium.error_estimate(at.moduli, displacement))
 
-    def with_constraint(self, constraint: Constraint) -> Expansion:
-        """The expansion around the equilibrium that another offset of what is prescribed leads to; `NotConverged`."""
-        before = self.equilibrium
-        model, start = before.model.under(constraint), before.displacement
-        found = from_start(model, before.moduli, before.coefficients, start=start, nearby=before.factorisation)
-        return replace(self._around(found), derivatives_at=None)
+    def with_constraint(self, constraint: Constraint, at: Place) -> Expansion:
+        """The expansion around the equilibrium at a place that another offset of what is prescribed leads to."""
+        moved = self._solved(self.equilibrium.model.under(constraint), at)
+        return replace(moved, derivatives_at=None).update(at)
 
     def at_equilibrium(self, at: Place, *, tolerance: float) -> Expansion:
         """The expansion around the equilibrium at a place near by, to a tolerance of the forces; `NotConverged`."""
-        before, model = self.equilibrium, self.equilibrium.model.to_tolerance(tolerance)
-        start, nearby = self.model.solve(at.moduli, at.coefficients).displacement, before.factorisation
+        return self._solved(self.equilibrium.model.to_tolerance(tolerance), at)
+
+    def _solved(self, model: FiniteStrainModel, at: Place) -> Expansion:
+        """The expansion around a model's equilibrium at a place near by; `NotConverged`."""
+        start, nearby = self.model.solve(at.moduli, at.coefficients).displacement, self.factorisation
         return self._around(from_start(model, at.moduli, at.coefficients, start=start, nearby=nearby))
 
     def _equilibrium(self, at: Place) -> FiniteStrainEquilibrium:

@@ -442,7 +442,7 @@ def _with_finer_walls(now: OuterIterate, finer: Sequence[Constraint | None]) -> 
     objective, at = now.objective, now.minimum
     places = objective.places(at.unknowns, at.evaluation, Derivatives.DECIDING)
     triples = zip(objective.approximations, finer, places, strict=True)
-    moved = [a if wall is None else a.with_constraint(wall).update(place) for a, wall, place in triples]
+    moved = [a if wall is None else a.with_constraint(wall, place) for a, wall, place in triples]
     return replace(_with_approximations(now, moved), convergence=Convergence())
 
 

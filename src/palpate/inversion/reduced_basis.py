@@ -116,13 +116,13 @@ class ReducedBasis:
         displacement = self.model.solve(at.moduli, at.coefficients).values
         return ModelError(*self.system.error_bound(at.moduli, displacement))
 
-    def with_constraint(self, constraint: Constraint) -> ReducedBasis:
-        """The same vectors under another offset, and the response to it added."""
+    def with_constraint(self, constraint: Constraint, at: Place) -> ReducedBasis:
+        """The same vectors under another offset, with the response to it, and what these miss at a place."""
         model = with_constraint(self.full_model, constraint)
         system = replace(self.system, model=model)
         fresh = np.asarray(constraint.free.T @ system.solve(np.zeros(model.n_modes)).values)[:, None]
         moved = replace(self, projection=self.projection.under(model), system=system, place=None)
-        return _extended(moved, fresh, SolveCounts(forward=1))
+        return _extended(moved, fresh, SolveCounts(forward=1)).update(at)
 
     def with_modulus_series(self, coefficients: NDArray[np.float64], by_theta: NDArray[np.float64]) -> ReducedBasis:
         """Add how the displacement at `coefficients` (n_modes,) changes with the parameters, to high order.
