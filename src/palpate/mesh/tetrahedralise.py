@@ -63,7 +63,7 @@ class SizeField:
         return COARSEST * self.longest
 
     def at(self, distances: NDArray[np.float64]) -> NDArray[np.float64]:
-        """H (...) mm where the surfaces of the tissues are so far away, (n_tissues, ...) mm, of either sign."""
+        """Edge lengths (...) mm where the tissues' surfaces are so far away, (n_tissues, ...) mm of either sign."""
         starts = self.on_surfaces.reshape(-1, *[1] * (distances.ndim - 1))
         return np.asarray((starts + GRADING * np.abs(distances)).min(axis=0, initial=self.coarsest))
 
@@ -79,8 +79,8 @@ def tetrahedralise(
 
     `edge_length_mm` holds on the surfaces of `estimate` tissues and drivers, but of those that have a longer one by
     their name in `longer_mm`; elsewhere edges are those of `SizeField`. Surface nodes lie on the level sets.
-    Deterministic. `progress` is called with a sentence at each step.
-    Raises `GeometryError` when nothing is left to mesh or the remeshing fails.
+    Deterministic. `progress` is called with a sentence at each step. Raises `GeometryError` when nothing is left to
+    mesh or the remeshing fails.
     """
     if not 0.0 < edge_length_mm < float(anatomy.box.lengths.min()):
         raise GeometryError(
