@@ -256,6 +256,25 @@ def test_passes_that_go_to_and_fro_settle_half_way(twins, found, monkeypatch, da
     assert (change < 1.0 and moved(end, found.minimum) < 1e-6) == settles
 
 
+@pytest.mark.parametrize(("turned", "settles"), [(loop.TURNED, True), (99.0, False)])
+def test_outer_iterations_that_go_to_and_fro_settle_half_way(twins, found, monkeypatch, turned, settles):
+    """The approximation at either end leads to the other."""
+    there = found.minimum.unknowns
+
+    def beyond(now, *_):
+        aim = 2.0 * there - now.minimum.unknowns
+        return now.objective, replace(now.minimum, unknowns=aim, evaluation=now.objective(aim)), 0.0
+
+    monkeypatch.setattr(loop, "_reweighted_minimum", beyond)
+    monkeypatch.setattr(loop, "TURNED", turned)
+    away = there + np.eye(len(there))[0] * 0.1
+    before = replace(found.minimum, unknowns=away, evaluation=found.objective(away))
+    start, silent = OuterIterate(found.objective, before), twins.silent
+    end = loop.run_outer_loop(start, twins.settings(0.5), StopRule(), progress=silent, title="")
+    assert end.minimum.converged == settles
+    assert (moved(end.minimum, found.minimum) < 1e-6) == settles
+
+
 def test_every_criterion_must_hold():
     met = Convergence(0.9, 0.9, 0.9)
     assert met.converged

@@ -58,6 +58,7 @@ PRIOR_HOLDS = 2.5  # tolerances, by which an estimate would move, or what is kno
 AFTER_CHANGE = 4  # outer iterations that must be left for finer walls or another prior: what converged is not lost
 SLOW = 0.5  # of the model's error an outer iteration before: where more is left all derivatives are made exact
 DAMPED_AFTER = 2  # passes of weights and estimate in turn: a later one that turns back goes half its way
+TURNED = 0.5  # of the last outer iteration's step: one that leads back by more goes half its way
 HALVINGS = 3
 TRUSTED = 0.03  # error in energy of an approximation, below which the step on it needs no line search
 ROUGHNESS = 0.5  # of the objective, in units of log-likelihood: the noise of re-chosen closest points
@@ -163,13 +164,14 @@ def run_outer_loop(
     at, theta = start.minimum.evaluation, start.minimum.unknowns[: start.objective.n_parameters]
     first = Iterate(theta, at.value, at.misfit_mm2, newton_decrement(at))
     now, refinements = replace(start, minimum=replace(start.minimum, history=(first,))), 0
-    held, relearned = False, 0
+    held, relearned, last = False, 0, np.zeros(len(start.minimum.unknowns))
     del start  # and with it its approximations, which are large, when others take their place
     for number in range(1, rule.iterations + 1):
         line = f"{title}, outer iteration {number}"
         progress(f"{line}: {now.objective.parameters.in_words(now.minimum.unknowns)}")
         before = now.minimum.unknowns
-        now = _iteration(now, settings, rule, progress, line)
+        now = _iteration(now, last, settings, rule, progress, line)
+        last = now.minimum.unknowns - before
         if now.stayed:
             break
         if not held and _near(now.minimum, before, now.objective.n_parameters):
@@ -177,6 +179,7 @@ def run_outer_loop(
             objective = _with_walls(now.objective, [()] * len(walls))
             now, held = replace(now, objective=objective), True
         if now.convergence.converged:
+            last = np.zeros_like(last)  # what follows is another objective
             if number > rule.iterations - AFTER_CHANGE:
                 break
             finer = refined_walls(now.objective, now.minimum.evaluation)
@@ -238,13 +241,26 @@ def minimised(
 
 
 def _iteration(
-    now: OuterIterate, settings: InversionSettings, rule: StopRule, progress: Callable[[str], None], line: str
+    now: OuterIterate,
+    last: NDArray[np.float64],
+    settings: InversionSettings,
+    rule: StopRule,
+    progress: Callable[[str], None],
+    line: str,
 ) -> OuterIterate:
-    """Reweight and minimise on the present approximations, and update these there, or on a part of the way."""
+    """Reweight and minimise on the present approximations, and update these there, or on a part of the way.
+
+    last (n_unknowns,): the step of the iteration before. Where weights, or approximations, at either end of it lead to
+    the other, half of the way back is gone.
+    """
     objective, found, reweighting = _reweighted_minimum(now, settings, rule, progress, line)
-    progress(f"{line}: the model's error, and the model anew, there")
-    n = objective.n_parameters
+    n, way = objective.n_parameters, found.unknowns - now.minimum.unknowns
     tolerance = rule.tolerance(found, n)
+    if np.any(np.abs(way[:n]) > tolerance) and last[:n] @ way[:n] < -TURNED * last[:n] @ last[:n]:
+        half, spent = now.minimum.unknowns + 0.5 * way, found.evaluations + 1
+        objective = objective.rematched(half)
+        found = replace(found, unknowns=half, evaluation=objective(half), evaluations=spent)
+    progress(f"{line}: the model's error, and the model anew, there")
     moved = np.abs(found.unknowns - now.minimum.unknowns)[:n]
     step = float(np.max(moved / tolerance, initial=0.0))
     open_ = np.max(_linearisation(objective, found) / tolerance, initial=0.0) if rule.derivatives else step
