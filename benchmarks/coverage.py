@@ -295,7 +295,7 @@ def _width(organ: Mapping[str, Any]) -> float:
 
 def _plot(groups: Mapping[tuple[str, str], Sequence[dict[str, Any]]], path: Path) -> None:
     """Calibration: nominal against found, a line a setting, beside the scatter of as many intervals that hold."""
-    figure = Figure(figsize=(6.0, 5.5), layout="constrained")
+    figure = Figure(figsize=(8.0, 5.5), layout="constrained")
     axes = figure.add_subplot()
     levels = np.linspace(LEVELS[0], LEVELS[-1], 60)
     n = min(sum(len(draw["organs"]) for row in rows for draw in row["draws"]) for rows in groups.values())
@@ -309,7 +309,7 @@ def _plot(groups: Mapping[tuple[str, str], Sequence[dict[str, Any]]], path: Path
             100 * np.array(LEVELS), 100 * np.array(found), style, marker="o", markersize=3, label=f"{law}, {name}"
         )
     axes.set(xlabel="stated, %", ylabel="found, %")
-    axes.legend(fontsize="small")
+    figure.legend(fontsize="small", loc="outside right upper")
     figure.savefig(path, metadata={"Date": None})
 
 
