@@ -46,6 +46,16 @@ def test_starts_far_apart_end_in_one_minimum(found):
     assert len(found.candidates) == 1
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_every_start_finds_a_minimum_whatever_the_noise(twins, twin, seed):
+    """Under less noise than the images have it would seek one between the places where closest points jump."""
+    problem = twins.noisy_problem(twin, sd_mm=0.4, seed=seed)
+    inversion = invert(problem, twins.settings(0.5, 2.0, 8.0), progress=twins.silent)
+    assert inversion.minimum.converged
+    assert all(start.minimum.converged for start in inversion.starts)
+    assert max(len(start.minimum.history) for start in inversion.starts) <= 10
+
+
 def test_the_drivers_motion_is_found_with_the_moduli(found, twin):
     assert found.minimum.unknowns[2:] == pytest.approx(twin.coefficients, abs=5e-3)
 

@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 from scipy.optimize import OptimizeResult
 
-from palpate.inversion.optimise import FIRST_RADIUS, MAX_RADIUS, Bounds, Outcome, gauss_newton, lbfgs, same_minimum
+from palpate.inversion.optimise import (
+    FIRST_RADIUS,
+    MAX_RADIUS,
+    Bounds,
+    Outcome,
+    ShareOfValue,
+    gauss_newton,
+    lbfgs,
+    same_minimum,
+)
 
 WIDE = Bounds(np.full(2, -5.0), np.full(2, 5.0))
 METHODS = {"gauss-newton": gauss_newton, "lbfgs": lbfgs}
@@ -99,6 +108,21 @@ def test_a_rough_minimum_leaves_walls_sliding_but_no_log_modulus_off(toys):
     assert rough.unknowns[:2] == pytest.approx(objective.centre, abs=0.1)  # of a standard deviation of 1
     near_only = np.concatenate([objective.centre + 0.15, np.full(objective.slides, 1.5)])
     assert gauss_newton(objective, near_only, bounds=WIDE, tolerance=None).evaluations > 1
+
+
+def test_a_share_of_the_value_is_left_where_that_is_noise(toys):
+    """What no step takes away is the noise; an iteration that may leave a share of it ends earlier, and is as large."""
+    objective = toys.Saturating(np.array([3.0, 3.0]), noise=50.0)
+    start = np.full(2, -2.0)
+    exact, rough = (
+        gauss_newton(objective, start, bounds=WIDE, tolerance=tolerance) for tolerance in (1e-3, ShareOfValue(0.1))
+    )
+    assert rough.outcome is exact.outcome is Outcome.CONVERGED
+    assert rough.evaluations < exact.evaluations
+    last, before = rough.history[-1], rough.history[-2]
+    assert last.decrement < 0.1 * last.value
+    assert before.decrement > 0.1 * before.value
+    assert 1.0 <= rough.evaluation.value / exact.evaluation.value < 1.1
 
 
 def test_a_start_ends_where_it_meets_the_minimum_of_another_but_not_on_its_way_past_one(toys):

@@ -9,7 +9,7 @@ import pytest
 
 from palpate.inversion import gauss_newton, reweighted, with_first_noise
 from palpate.inversion.optimise import Minimum
-from palpate.inversion.reweighting import _beyond_modes, fitted_noise
+from palpate.inversion.reweighting import _beyond_modes, fitted_noise, with_found_noise
 from palpate.observation.noise_model import NoiseModel
 
 NOISE = NoiseModel(np.array([0.2**2]), np.array([4.0]))
@@ -48,6 +48,17 @@ def test_a_drivers_residuals_do_not_tell_the_noise(minimum):
     noise = fitted_noise(found.evaluation)[0, "surface distance"]
     assert noise.sd == alone.sd
     assert noise.sd != together.sd
+
+
+def test_under_the_noise_that_is_found_all_residuals_count_by_their_area(minimum):
+    objective, found = minimum
+    under = with_found_noise(objective, found)
+    noise = fitted_noise(found.evaluation)[0, "surface distance"]
+    assert noise.sd != objective.observations[0].noise_model.sd
+    assert all(o.noise_model.key == noise.key for o in under.observations)
+    ratios = [o.weighting.precision / o.target.area.sum() for o in under.observations]
+    assert ratios == pytest.approx([1.0 / (noise.correlation_area * noise.sd**2)] * 3)
+    assert all(np.isinf(o.weighting.loss.cutoff) for o in under.observations)
 
 
 def test_reweighting_gives_a_new_objective_and_leaves_the_old_one(minimum, twin):

@@ -38,16 +38,17 @@ class Quadratic:
 
 @dataclass(frozen=True)
 class Saturating:
-    """Residuals E - E_true of log-moduli with E = exp(theta): flat to the left, steep to the right."""
+    """Residuals E - E_true of log-moduli with E = exp(theta): flat to the left, steep to the right; `noise` stays."""
 
     truth: np.ndarray
+    noise: float = 0.0
 
     @property
     def n_parameters(self):
         return len(self.truth)
 
     def value(self, unknowns):
-        return float(0.5 * np.sum((np.exp(unknowns) - np.exp(self.truth)) ** 2))
+        return self.noise + float(0.5 * np.sum((np.exp(unknowns) - np.exp(self.truth)) ** 2))
 
     def __call__(self, unknowns):
         slope = np.exp(unknowns)

@@ -28,7 +28,8 @@ from palpate.observation.observed_surface import observed_surface
 from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.observation.surface_distance import surface_distance
 from palpate.observation.target import surface_target
-from palpate.phantoms.exact_targets import exact_target
+from palpate.phantoms.boundary_noise import smooth_field
+from palpate.phantoms.exact_targets import exact_target, target_of_truth
 from palpate.phantoms.scene import Scene, centred_grid, imaged
 from palpate.phantoms.shapes import ball
 
@@ -94,6 +95,15 @@ def problem_of(twins, targets, noise=None, tied=()) -> InverseProblem:
 def exact_problem(*twins, noise=None, tied=()) -> InverseProblem:
     """The images are the model's own triangles."""
     return problem_of(twins, tuple(tuple(exact_target(t.scene, s) for s in t.surfaces) for t in twins), noise, tied)
+
+
+def noisy_problem(twin, *, sd_mm, seed, correlation_mm=6.0) -> InverseProblem:
+    """The images are the model's own triangles, each image's moved by a smooth random field of its own."""
+    rng = np.random.default_rng(seed)
+    fields = [smooth_field(rng, sd_mm=sd_mm, correlation_mm=correlation_mm, features=400) for _ in range(2)]
+    space, displacement = twin.scene.space, twin.scene.displacement
+    warps = tuple((lambda places, field=field: places + field.at(places)) for field in fields)
+    return problem_of((twin,), (tuple(target_of_truth(space, displacement, s, warps=warps) for s in twin.surfaces),))
 
 
 def voxel_problem(*twins, bias=0.0, noise=None) -> InverseProblem:

@@ -13,7 +13,15 @@ from palpate.inversion.driver import with_learned_prior
 from palpate.inversion.expansion import Expansion, coarse_equilibrium, expansion_around
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import Evaluation, Objective
-from palpate.inversion.optimise import Iterate, Minimum, Outcome, fit_coefficients, same_minimum
+from palpate.inversion.optimise import (
+    Iterate,
+    Minimum,
+    Outcome,
+    ShareOfValue,
+    fit_coefficients,
+    gauss_newton,
+    same_minimum,
+)
 from palpate.inversion.outer_loop import (
     Convergence,
     InversionSettings,
@@ -24,7 +32,7 @@ from palpate.inversion.outer_loop import (
     updated,
 )
 from palpate.inversion.reduced_basis import reduced_basis
-from palpate.inversion.reweighting import with_first_noise
+from palpate.inversion.reweighting import with_first_noise, with_found_noise
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium
 from palpate.mechanics.forward import SolveCounts
@@ -34,6 +42,7 @@ from palpate.progress import Progress, during
 __all__ = ["Candidate", "Inversion", "StartRun", "continue_at_finite_strain", "invert"]
 
 OTHER = 1e-2  # decrement of minima that are compared: a fiftieth of what makes one lower
+TO_THE_NOISE = ShareOfValue(0.1)  # what is left of it is the noise, to so much of its variance
 LOWER = 0.5  # in units of log-likelihood: a minimum that is lower by less is as good
 REPORTED = StopRule()
 FIRST_GUESS = StopRule(
@@ -169,7 +178,7 @@ def _with_reduced_bases(
         bases.append(reduced_basis(state.model, parameters.moduli(middle)))
     progress("the drivers' motion at the middle start")
     objective = with_first_noise(Objective(problem.states, parameters).under(bases))
-    fitted = fit_coefficients(objective.rematched(middle), middle, bounds=settings.bounds)
+    fitted = fit_coefficients(objective.rematched(middle), middle, bounds=settings.bounds, tolerance=TO_THE_NOISE)
     progress("how the responses change with the moduli")
     by_theta = parameters.derivatives(middle)
     triples = zip(problem.states, bases, parameters.coefficients(fitted.unknowns), strict=True)
@@ -193,10 +202,15 @@ def _linear(
     still = np.zeros(objective.parameters.n_unknowns)
     objective = with_first_noise(objective).rematched(still)
     rest = objective(still)
-    fitted = fit_coefficients(objective, begin, bounds=settings.bounds)
+    fitted = fit_coefficients(objective, begin, bounds=settings.bounds, tolerance=TO_THE_NOISE)
     objective = with_learned_prior(objective, fitted.evaluation, fitted.unknowns)
-    minima = _from_starts(objective, settings, fitted.unknowns[objective.n_parameters :], progress)
-    n, first = objective.n_parameters, _best(minima)
+    progress("the noise of the images, near the middle start")
+    nearby = gauss_newton(
+        objective.rematched(fitted.unknowns), fitted.unknowns, bounds=settings.bounds, tolerance=TO_THE_NOISE
+    )
+    objective, n = with_found_noise(objective, nearby), objective.n_parameters
+    minima = _from_starts(objective, settings, nearby.unknowns[n:], progress)
+    first = _best(minima)
     start = [updated(objective, replace(minima[first], evaluations=0), rule)]
     del objective  # and with it its approximations, which are large, when others take their place
     followed = [run_outer_loop(start.pop(), settings, rule, progress=progress, title="linear law")]
@@ -209,7 +223,7 @@ def _linear(
     order = [best, *dict.fromkeys(g for g in groups if g != best)]
     triples = zip(settings.starts, minima, groups, strict=True)
     starts = tuple(StartRun(theta, minimum, order.index(group)) for theta, minimum, group in triples)
-    evaluations += 1 + fitted.evaluations + sum(m.evaluations for m in (*minima, *(f.minimum for f in followed)))
+    evaluations += 1 + sum(m.evaluations for m in (fitted, nearby, *minima, *(f.minimum for f in followed)))
     concluded = _concluded(followed, starts, rest, settings, 0)
     of_first = followed[0].counts  # the others' approximations are this one's, extended
     spent = sum((other.counts - of_first for other in followed[1:]), of_first)
@@ -223,7 +237,7 @@ def _from_starts(
     minima: list[Minimum] = []
     for number, theta in enumerate(settings.starts, start=1):
         begin = np.concatenate([theta, minima[0].unknowns[len(theta) :] if minima else coefficients])
-        found = minimised(objective.rematched(begin), begin, settings, tolerance=None, known=minima)
+        found = minimised(objective, begin, settings, tolerance=None, known=minima)
         minima.append(found)
         progress(f"start {number} of {len(settings.starts)}: {len(found.history)} steps, {found.outcome.value}")
     return minima

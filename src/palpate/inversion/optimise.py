@@ -18,6 +18,7 @@ __all__ = [
     "Iterate",
     "Minimum",
     "Outcome",
+    "ShareOfValue",
     "fit_coefficients",
     "gauss_newton",
     "lbfgs",
@@ -115,6 +116,13 @@ class Minimum:
 
 
 @dataclass(frozen=True, slots=True)
+class ShareOfValue:
+    """A tolerance of the decrement that grows with the objective: its residuals are then as large as they will be."""
+
+    share: float
+
+
+@dataclass(frozen=True, slots=True)
 class _Region:
     """Trust region: radius of theta, and Levenberg-Marquardt damping of all unknowns relative to the diagonal."""
 
@@ -152,7 +160,7 @@ def fit_coefficients(
     begin: NDArray[np.float64],
     *,
     bounds: Bounds,
-    tolerance: float | None = None,
+    tolerance: float | ShareOfValue | None = None,
     max_steps: int = 40,
 ) -> Minimum:
     """The best driver coefficients at the log-moduli of `begin` (n_unknowns,), sought from there.
@@ -168,7 +176,7 @@ def gauss_newton(
     *,
     bounds: Bounds,
     held: NDArray[np.bool_] | bool = False,
-    tolerance: float | None = 1e-3,
+    tolerance: float | ShareOfValue | None = 1e-3,
     within: NDArray[np.float64] | float = np.inf,
     known: Sequence[Minimum] = (),
     max_steps: int = 40,
@@ -185,8 +193,7 @@ def gauss_newton(
     are within a tenth of their posterior standard deviations, which serves where the objective is going to change.
     """
     unknowns, region, history, n = start.copy(), _Region(), list[Iterate](), objective.n_parameters
-    roughly = tolerance is None
-    tolerance = SLIDING * (len(start) - n) if tolerance is None else tolerance
+    sliding = SLIDING * (len(start) - n)
     now, evaluations, outcome = objective(unknowns), 1, Outcome.STEPS
     nearest, least, since = (unknowns, now), np.inf, 0
     for _ in range(max_steps):
@@ -198,9 +205,11 @@ def gauss_newton(
         history.append(Iterate(unknowns[:n], now.value, now.misfit_mm2, decrement))
         to_end = _step(now, free, n, WHOLE)
         whole = to_end[:n]
-        if roughly and decrement < tolerance and held is not True:
+        if tolerance is None and decrement < sliding and held is not True:
             within = SLIDING_SD * np.sqrt(np.diag(now.covariance_columns(n)))
-        if decrement < tolerance and np.all(np.abs(whole) < within):
+        small = sliding if tolerance is None else tolerance
+        small = small.share * now.value if isinstance(small, ShareOfValue) else small
+        if decrement < small and np.all(np.abs(whole) < within):
             outcome = Outcome.CONVERGED
             break
         if decrement < MET and any(same_minimum(unknowns + to_end, other, n) for other in known):

@@ -12,7 +12,7 @@ from palpate.inversion.objective import Evaluation, Linearisation, Objective
 from palpate.inversion.optimise import Minimum
 from palpate.observation.noise_model import NoiseModel
 
-__all__ = ["fitted_noise", "of_one_noise", "reweighted", "with_first_noise"]
+__all__ = ["fitted_noise", "of_one_noise", "reweighted", "with_first_noise", "with_found_noise"]
 
 RIDGE = 1e-9  # of the mean diagonal: a mode that moves no observed point
 
@@ -22,6 +22,11 @@ def with_first_noise(objective: Objective) -> Objective:
     seen = [(s, o, state.observations) for s, state in enumerate(objective.states) for o in state.observations]
     noise = {(s, o.kind): o.first_noise([p for p in peers if p.kind == o.kind]) for s, o, peers in seen}
     return _by_noise(objective, noise)
+
+
+def with_found_noise(objective: Objective, minimum: Minimum) -> Objective:
+    """The objective under the noise that the residuals at a minimum tell, by which all of them count."""
+    return _by_noise(objective, fitted_noise(minimum.evaluation)).rematched(minimum.unknowns)
 
 
 def reweighted(objective: Objective, minimum: Minimum) -> Objective:
