@@ -17,7 +17,7 @@ from cost import write_case
 
 from palpate.cli import main
 from palpate.inversion import StopRule, invert
-from palpate.phantoms import PelvisOptions, pelvis
+from palpate.phantoms import Noise, PelvisOptions, pelvis
 
 __all__ = ["default_case", "other_signals"]
 
@@ -31,6 +31,7 @@ BODIES: dict[str, dict[str, Any]] = {
     "bones": {"bones": True},
     "three tissues": {"tumour": True},
     "thick slices": {"spacing_mm": (1.0, 1.0, 4.0)},
+    "noise": {"noise": Noise(surface_sd_mm=0.3, correlation_length_mm=6.0)},
     "far driver": {"moduli_kpa": {"prostate": 10.0}},  # as the surroundings, of which it is a part: the bladder is left
 }
 
