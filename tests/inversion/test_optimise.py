@@ -125,6 +125,15 @@ def test_a_share_of_the_value_is_left_where_that_is_noise(toys):
     assert 1.0 <= rough.evaluation.value / exact.evaluation.value < 1.1
 
 
+def test_no_share_of_the_value_is_the_noise_while_the_drivers_are_at_rest(toys):
+    objective = toys.Sliding(np.array([0.3, -0.5]))
+    begin = np.concatenate([objective.centre, np.zeros(objective.slides)])
+    found = gauss_newton(objective, begin, bounds=WIDE, tolerance=ShareOfValue(1e9))
+    assert found.outcome is Outcome.CONVERGED
+    assert found.evaluations == 2
+    assert gauss_newton(objective, found.unknowns, bounds=WIDE, tolerance=ShareOfValue(1e9)).evaluations == 1
+
+
 def test_a_start_ends_where_it_meets_the_minimum_of_another_but_not_on_its_way_past_one(toys):
     objective = toys.Saturating(np.array([0.3, -0.5]))
     first = gauss_newton(objective, np.full(2, -3.0), bounds=WIDE, tolerance=1e-12)

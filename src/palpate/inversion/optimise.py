@@ -208,7 +208,8 @@ def gauss_newton(
         if tolerance is None and decrement < sliding and held is not True:
             within = SLIDING_SD * np.sqrt(np.diag(now.covariance_columns(n)))
         small = sliding if tolerance is None else tolerance
-        small = small.share * now.value if isinstance(small, ShareOfValue) else small
+        if isinstance(small, ShareOfValue):
+            small = 0.0 if _at_rest(unknowns[n:]) else small.share * now.value
         if decrement < small and np.all(np.abs(whole) < within):
             outcome = Outcome.CONVERGED
             break
@@ -261,6 +262,11 @@ def _search(
             return (trial, there, region.larger() if gain > 0.25 * promised else region), trials + 1
         region = region.smaller()
     return None, SEARCHES
+
+
+def _at_rest(coefficients: NDArray[np.float64]) -> bool:
+    """Whether the drivers (n_coefficients,) have not moved yet: no modulus shows, and no residual is the noise."""
+    return len(coefficients) > 0 and not np.any(coefficients)
 
 
 def _free(
