@@ -209,7 +209,7 @@ def gauss_newton(
             within = SLIDING_SD * np.sqrt(np.diag(now.covariance_columns(n)))
         small = sliding if tolerance is None else tolerance
         if isinstance(small, ShareOfValue):
-            small = 0.0 if _at_rest(unknowns[n:]) else small.share * now.value
+            small = max(sliding, 0.0 if _at_rest(unknowns[n:]) else small.share * now.value)
         if decrement < small and np.all(np.abs(whole) < within):
             outcome = Outcome.CONVERGED
             break
