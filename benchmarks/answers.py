@@ -108,7 +108,7 @@ def plain_estimate(
 ) -> OuterIterate:
     """The estimate from the middle start, the full model solved with all its derivatives at every place."""
     theta = np.asarray(np.median(np.stack(settings.starts), axis=0))
-    still = np.concatenate([theta, np.zeros(sum(problem.parameters.n_modes))])
+    still = np.concatenate([theta, np.zeros(problem.parameters.n_coefficients)])
     objective = with_first_noise(_exact(Objective(problem.states, problem.parameters), still)).rematched(still)
     filled = fit_coefficients(objective, still, bounds=settings.bounds)
     objective = _exact(objective, filled.unknowns).rematched(filled.unknowns)  # a body at rest shows no modulus

@@ -23,7 +23,7 @@ from palpate.experiments.reproduce.figure4 import LAW, Figure4Settings, figure4,
 from palpate.experiments.reproduce.ledger import Ledger
 from palpate.experiments.reproduce.paper_method import paper_estimate, paper_target
 from palpate.experiments.reproduce.table1 import Table1Settings, table1
-from palpate.inversion.parameters import parameter_map
+from palpate.inversion.parameters import parameter_map, unit_blocks
 from palpate.mechanics.linear_model import linear_model
 from palpate.mesh.space import lagrange_space
 from palpate.mesh.tetrahedralise import tetrahedralise
@@ -66,8 +66,8 @@ def test_the_load_sets_a_scale_and_without_it_there_are_ratios_only(model):
     once, twice = (model.solve(f * MODULI, np.zeros(6)).displacement for f in (1.0, 2.0))
     assert twice == pytest.approx(0.5 * once, abs=1e-9)
     tissues = balls_tissues(tuple(MODULI))
-    assert parameter_map(tissues, model.regions, (6,), loaded=True).absolute
-    assert not parameter_map(tissues, model.regions, (6,)).absolute
+    assert parameter_map(tissues, model.regions, unit_blocks(6), loaded=True).absolute
+    assert not parameter_map(tissues, model.regions, unit_blocks(6)).absolute
 
 
 def test_the_papers_gradient_leads_downhill_to_the_moduli_that_made_its_data(model):

@@ -8,9 +8,19 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from scipy import sparse
+from scipy import linalg, sparse
 
-from palpate.inversion import LaterState, Objective, ParameterMap, driver
+from palpate.inversion import (
+    Acts,
+    Block,
+    LaterState,
+    Objective,
+    ParameterMap,
+    driver,
+    evidence,
+    unit_blocks,
+    wall_block,
+)
 from palpate.mesh.constraint import Constraint
 from palpate.observation.wall_modes import Wall, wall_modes, wall_of
 
@@ -31,7 +41,7 @@ def ball(*, prior_mm=5.0, kernel_mm=20.0):
     points *= 30.0 / np.linalg.norm(points, axis=1, keepdims=True)
     own = {"kernel_mm": kernel_mm, "prior_mm": prior_mm}
     modes = wall_modes(points, n_modes=N_MODES, **own)
-    wall = wall_of(points, points / 30.0, modes, np.arange(modes.shape[1]), **own)
+    wall = wall_of(points, points / 30.0, modes, np.arange(modes.shape[1]), name="tube", **own)
     return Ball(points, points / 30.0, modes, wall)
 
 
@@ -51,13 +61,13 @@ def learned_precision(ball, motion, *, sd_mm, seen=None):
     score = -modes.T @ motion.ravel() / sd_mm**2  # at no motion
     prior = np.eye(len(data))
     evaluation = SimpleNamespace(matrix=data + prior, prior=prior, score=score, prior_score=np.zeros(len(data)))
-    return driver.learned_precision(moved_by(ball.wall), evaluation, np.zeros(len(data)))
+    return evidence.learned_precision(moved_by(ball.wall), evaluation, np.zeros(len(data)))
 
 
 def moved_by(*walls):
     """An objective of no moduli and one state whose modes move the walls."""
-    parameters = ParameterMap(np.ones(1), np.zeros((1, 0)), (), "rest", True, (N_MODES,))
-    return Objective((LaterState(None, (), walls=walls),), parameters)
+    blocks = tuple(wall_block(wall, 0) for wall in walls)
+    return Objective((LaterState(None, ()),), ParameterMap(np.ones(1), np.zeros((1, 0)), (), "rest", True, blocks))
 
 
 def drawn(ball, *, sd_mm, kernel_mm, seed):
@@ -126,13 +136,13 @@ def test_no_other_amplitude_has_more_evidence(sd_mm):
     precision = learned_precision(here, motion, sd_mm=sd_mm)
     data, pull = here.modes.T @ here.modes / sd_mm**2, here.modes.T @ motion.ravel() / sd_mm**2
 
-    def evidence(scale):
+    def log_evidence(scale):
         prior = precision / scale
         total = data + prior
         return 0.5 * (pull @ np.linalg.solve(total, pull) - np.linalg.slogdet(total)[1] + np.linalg.slogdet(prior)[1])
 
-    slope = (evidence(1.01) - evidence(0.99)) / 0.02
-    curvature = (evidence(1.1) - 2.0 * evidence(1.0) + evidence(0.9)) / 0.01
+    slope = (log_evidence(1.01) - log_evidence(0.99)) / 0.02
+    curvature = (log_evidence(1.1) - 2.0 * log_evidence(1.0) + log_evidence(0.9)) / 0.01
     assert curvature < -1.0
     assert abs(slope / curvature) < 2e-3  # the variance is found to two thousandths
 
@@ -146,7 +156,7 @@ def test_what_is_not_seen_at_all_keeps_a_bounded_prior():
 
 
 def test_walls_that_are_not_given_keep_the_modes_own_prior():
-    assert driver.learned_precision(moved_by(), None, np.zeros(N_MODES)) is None
+    assert evidence.learned_precision(moved_by(), None, np.zeros(N_MODES)) is None
 
 
 class Wanting(NamedTuple):
@@ -167,7 +177,7 @@ def held_by(*wanting, rest, present):
     state = LaterState(
         SimpleNamespace(constraint=rest), wanting, approximation=SimpleNamespace(constraint=present), observed=None
     )
-    parameters = ParameterMap(np.ones(1), np.zeros((1, 0)), (), "rest", True, (rest.n_modes,))
+    parameters = ParameterMap(np.ones(1), np.zeros((1, 0)), (), "rest", True, unit_blocks(rest.n_modes))
     lines = [SimpleNamespace(state=0, observation=observation, residuals=None) for observation in wanting]
     return Objective((state,), parameters), SimpleNamespace(lines=lines)
 
@@ -201,3 +211,32 @@ def test_walls_that_ask_for_nothing_are_left(walls):
     rest, present = walls
     seen = [Wanting(np.arange(6), None), Wanting(np.arange(6, 12), None)]
     assert driver.refined_walls(*held_by(*seen, rest=rest, present=present)) == [None]
+
+
+def test_what_is_believed_of_the_others_follows_their_prior_mean_too(rng):
+    """The evidence of a block is that of the whole normal model: moduli with a prior of their own are marginalised."""
+    n, k = 5, 3
+    design = rng.normal(size=(40, n))
+    values = rng.normal(size=40) - design @ np.array([0.5, 0.1, 1.5, -2.0, 1.0])
+    mean, precision = np.array([0.7, -0.4]), np.diag([3.0, 5.0])
+    term = np.diag([1.0, 2.0, 0.5])
+    parameters = ParameterMap(
+        np.ones(2), np.eye(2), ("a", "b"), "c", True, (), prior_mean=mean, prior_precision=precision
+    )
+    block = Block("b", "", "driver", Acts.BOUNDARY, (0,), np.eye(k), ((term,),), amplitudes=(1e-3, 1e3))
+    parameters = replace(parameters, blocks=(block,), nuisance_precision=np.eye(k))
+    prior, data = parameters.prior_matrix, design.T @ design
+    x = rng.normal(size=n)
+    score = design.T @ (values + design @ x)
+    evaluation = SimpleNamespace(matrix=data + prior, prior=prior, score=score, prior_score=np.zeros(n))
+    found = evidence.learned_precision(Objective((LaterState(None, ()),), parameters), evaluation, x)
+
+    def log_evidence(amplitude):
+        """ln N(values; -design mean, 1 + design C design^T), all unknowns marginalised."""
+        covariance = linalg.block_diag(np.linalg.inv(precision), amplitude**2 * (term + 1e-3 * np.eye(k)))
+        total = np.eye(40) + design @ covariance @ design.T
+        away = values + design @ np.append(mean, np.zeros(k))
+        return -0.5 * (away @ np.linalg.solve(total, away) + np.linalg.slogdet(total)[1])
+
+    amplitude = np.sqrt(1.0 / (found[0, 0] * (1.0 + 1e-3)))
+    assert log_evidence(amplitude) > max(log_evidence(0.98 * amplitude), log_evidence(1.02 * amplitude))

@@ -24,7 +24,6 @@ from palpate.inversion import outer_loop as loop
 from palpate.inversion.approximation import Derivatives, ModelError
 from palpate.inversion.optimise import posterior_sd
 from palpate.inversion.outer_loop import Convergence, Criterion, StopRule, minimised
-from palpate.observation.wall_modes import Wall
 
 
 @pytest.fixture(scope="module")
@@ -99,48 +98,44 @@ def test_a_prior_that_follows_the_estimate_is_held_from_where_that_is_near(twins
 
     def wider(objective, *_):
         asked.append(1)
-        if not any(state.walls for state in objective.states):
+        if objective.prior_held:
             return objective
-        learned.append(0.7 * objective.parameters.driver_precision)
-        return replace(objective, parameters=replace(objective.parameters, driver_precision=learned[-1]))
+        learned.append(0.7 * objective.parameters.nuisance_precision)
+        return replace(objective, parameters=replace(objective.parameters, nuisance_precision=learned[-1]))
 
-    wall = Wall(np.arange(0), (), ())
-    problem = replace(voxels, states=tuple(replace(state, walls=(wall,)) for state in voxels.states))
     monkeypatch.setattr("palpate.inversion.estimate.with_learned_prior", lambda objective, *_: objective)
     monkeypatch.setattr("palpate.inversion.reweighting.with_learned_prior", wider)
-    found = invert(problem, twins.settings(0.5), progress=twins.silent)
+    found = invert(voxels, twins.settings(0.5), progress=twins.silent)
     assert found.convergence.converged
     assert 0 < len(learned) < len(asked)
-    assert np.array_equal(found.objective.parameters.driver_precision, learned[-1])
-    assert [state.walls for state in found.objective.states] == [(wall,)]
+    assert np.array_equal(found.objective.parameters.nuisance_precision, learned[-1])
+    assert not found.objective.prior_held
 
 
 def test_a_prior_that_was_held_too_early_is_learned_once_more(twins, voxels, monkeypatch):
     """Held while it pulled the coefficient to nothing: at the estimate that it leads to it says something else."""
-    walls_held, held = loop._with_walls, []
+    learning, times_held = loop._learning, []
 
-    def with_walls(objective, walls):
-        held.extend([] if any(walls) else [1])
-        return walls_held(objective, walls)
+    def noted(now, *, held):
+        times_held.extend([1] if held else [])
+        return learning(now, held=held)
 
     def too_narrow_at_first(objective, *_):
-        if not any(state.walls for state in objective.states):
+        if objective.prior_held:
             return objective
-        precision = np.full_like(objective.parameters.driver_precision, 1e-6 if held else 1e5)
-        return replace(objective, parameters=replace(objective.parameters, driver_precision=precision))
+        precision = np.full_like(objective.parameters.nuisance_precision, 1e-6 if times_held else 1e5)
+        return replace(objective, parameters=replace(objective.parameters, nuisance_precision=precision))
 
-    monkeypatch.setattr(loop, "_with_walls", with_walls)
+    monkeypatch.setattr(loop, "_learning", noted)
     monkeypatch.setattr("palpate.inversion.estimate.with_learned_prior", lambda objective, *_: objective)
     monkeypatch.setattr("palpate.inversion.reweighting.with_learned_prior", too_narrow_at_first)
-    wall = Wall(np.arange(0), (), ())
-    problem = replace(voxels, states=tuple(replace(state, walls=(wall,)) for state in voxels.states))
-    twice = invert(problem, twins.settings(0.5), progress=twins.silent)
-    assert len(held) == 1 + loop.RELEARNED
-    from_the_start = invert(problem, twins.settings(0.5), progress=twins.silent).minimum  # held is not empty any more
-    held.clear()
+    twice = invert(voxels, twins.settings(0.5), progress=twins.silent)
+    assert len(times_held) == 1 + loop.RELEARNED
+    from_the_start = invert(voxels, twins.settings(0.5), progress=twins.silent).minimum  # it has been held before
+    times_held.clear()
     monkeypatch.setattr(loop, "RELEARNED", 0)
-    once = invert(problem, twins.settings(0.5), progress=twins.silent)
-    assert len(held) == 1
+    once = invert(voxels, twins.settings(0.5), progress=twins.silent)
+    assert len(times_held) == 1
     off = [found.minimum.unknowns[:2] - from_the_start.unknowns[:2] for found in (twice, once)]
     apart = [np.abs(of / posterior_sd(from_the_start, 2)).max() for of in off]
     assert apart[0] < 0.05 < apart[1]
@@ -148,23 +143,21 @@ def test_a_prior_that_was_held_too_early_is_learned_once_more(twins, voxels, mon
 
 def test_with_a_finer_wall_the_prior_is_learned_anew(twins, voxels, monkeypatch):
     """What the wall does beyond its modes is no longer asked of them."""
-    events, with_walls = [], loop._with_walls
+    events, learning = [], loop._learning
 
     def refined(objective, _):
         events.append("refined")
         return [state.constraint if events.count("refined") == 1 else None for state in objective.states]
 
-    def noted(objective, walls):
-        events.append("free" if any(walls) else "held")
-        return with_walls(objective, walls)
+    def noted(now, *, held):
+        events.append("held" if held else "free")
+        return learning(now, held=held)
 
-    wall = Wall(np.arange(0), (), ())
-    problem = replace(voxels, states=tuple(replace(state, walls=(wall,)) for state in voxels.states))
     for name in ("estimate", "reweighting"):
         monkeypatch.setattr(f"palpate.inversion.{name}.with_learned_prior", lambda objective, *_: objective)
     monkeypatch.setattr(loop, "refined_walls", refined)
-    monkeypatch.setattr(loop, "_with_walls", noted)
-    found = invert(problem, twins.settings(0.5), progress=twins.silent)
+    monkeypatch.setattr(loop, "_learning", noted)
+    found = invert(voxels, twins.settings(0.5), progress=twins.silent)
     assert found.convergence.converged
     assert events[:5] == ["held", "refined", "free", "held", "refined"]
 

@@ -9,7 +9,7 @@ import pytest
 
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role, Tissue
-from palpate.inversion import Bounds, gauss_newton, invert, parameter_map
+from palpate.inversion import Bounds, gauss_newton, invert, parameter_map, unit_blocks
 from palpate.inversion.optimise import posterior_sd
 from palpate.observation.noise_model import NoiseModel
 
@@ -21,14 +21,14 @@ MUSCLE = Tissue("muscle", Role.KNOWN, youngs_modulus_kpa=40.0)
 
 
 def test_moduli_are_ratios_times_the_first_known_modulus():
-    mapping = parameter_map((GLAND, TUBE, MUSCLE, SAC, FAT), (0, 2, 3, 4), (7,))
+    mapping = parameter_map((GLAND, TUBE, MUSCLE, SAC, FAT), (0, 2, 3, 4), unit_blocks(7))
     assert mapping.tissues == ("gland", "sac")
     assert (mapping.relative_to, mapping.scale_kpa, mapping.absolute) == ("muscle", 40.0, True)
     assert mapping.moduli(np.log([3.0, 0.5])) == pytest.approx([120.0, 40.0, 20.0, 10.0])
 
 
 def test_without_a_known_modulus_the_first_estimate_is_the_scale():
-    mapping = parameter_map((TUBE, GLAND, SAC), (1, 2), (7,))
+    mapping = parameter_map((TUBE, GLAND, SAC), (1, 2), unit_blocks(7))
     assert not mapping.absolute
     assert (mapping.relative_to, mapping.tissues, mapping.scale_kpa) == ("gland", ("sac",), 1.0)
     assert mapping.moduli(np.log([4.0])) == pytest.approx([1.0, 4.0])
@@ -36,7 +36,7 @@ def test_without_a_known_modulus_the_first_estimate_is_the_scale():
 
 def mapping_of(*n_modes, tied=()):
     """Gland, fat, sac and muscle as regions."""
-    return parameter_map((GLAND, FAT, SAC, MUSCLE), (0, 1, 2, 3), n_modes, tied=tied)
+    return parameter_map((GLAND, FAT, SAC, MUSCLE), (0, 1, 2, 3), unit_blocks(*n_modes), tied=tied)
 
 
 TIED = [(), (("gland", "sac"),)]
@@ -80,7 +80,7 @@ def test_every_state_has_the_moduli_and_coefficients_of_its_own():
 
 
 def test_the_base_is_not_written_into():
-    mapping = parameter_map((GLAND, FAT), (0, 1), (7,))
+    mapping = parameter_map((GLAND, FAT), (0, 1), unit_blocks(7))
     mapping.moduli(np.ones(1))
     assert np.array_equal(mapping.base, [10.0, 10.0])
 
@@ -88,17 +88,17 @@ def test_the_base_is_not_written_into():
 @pytest.mark.parametrize("tissues", [(FAT, TUBE), (GLAND, TUBE)])
 def test_a_case_without_a_ratio_is_refused(tissues):
     with pytest.raises(ConfigurationError, match="only"):
-        parameter_map(tissues, (0,), (7,))
+        parameter_map(tissues, (0,), unit_blocks(7))
 
 
 def test_tied_tissues_share_one_parameter_with_both_names():
-    mapping = parameter_map((GLAND, SAC, FAT, NODE), (0, 1, 2, 3), (7,), tied=(("gland", "node"),))
+    mapping = parameter_map((GLAND, SAC, FAT, NODE), (0, 1, 2, 3), unit_blocks(7), tied=(("gland", "node"),))
     assert mapping.tissues == ("gland and node", "sac")
     assert mapping.moduli(np.log([3.0, 0.5])) == pytest.approx([30.0, 5.0, 10.0, 30.0])
 
 
 def test_tied_tissues_may_hold_the_scale():
-    mapping = parameter_map((GLAND, SAC, NODE), (0, 1, 2), (7,), tied=(("gland", "sac"),))
+    mapping = parameter_map((GLAND, SAC, NODE), (0, 1, 2), unit_blocks(7), tied=(("gland", "sac"),))
     assert (mapping.relative_to, mapping.tissues) == ("gland and sac", ("node",))
     assert mapping.moduli(np.log([4.0])) == pytest.approx([1.0, 1.0, 4.0])
 
@@ -176,8 +176,8 @@ def test_the_mean_of_a_prior_must_be_a_number_where_it_counts(mean):
 
 @pytest.mark.parametrize("shape", [(2, 2), (4, 4), (3,)])
 def test_a_drivers_prior_of_another_size_is_refused_and_not_replaced(shape):
-    with pytest.raises(ConfigurationError, match="driver_precision"):
-        replace(mapping_of(3), driver_precision=np.ones(shape))
+    with pytest.raises(ConfigurationError, match="nuisance_precision"):
+        replace(mapping_of(3), nuisance_precision=np.ones(shape))
 
 
 def test_a_prior_of_another_number_of_moduli_is_refused():

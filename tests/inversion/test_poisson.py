@@ -18,6 +18,7 @@ from palpate.inversion import (
     parameter_map,
     posterior_sd,
     reduced_basis,
+    unit_blocks,
 )
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.finite_strain import finite_strain_model
@@ -49,7 +50,7 @@ class Open:
 def opened(twin, dilatation):
     space, own = twin.model.space, {"open_poisson": ("gland",), "dilatation": dilatation}
     model = linear_model(space, twin.model.constraint, **own)
-    return Open(model, parameter_map(space.mesh.tissues, model.regions, [model.n_modes], **own))
+    return Open(model, parameter_map(space.mesh.tissues, model.regions, unit_blocks(model.n_modes), **own))
 
 
 @pytest.fixture(scope="module", params=KINDS, ids=lambda kind: f"{kind[0]}-{kind[1]}")
@@ -147,7 +148,7 @@ def test_poissons_ratio_is_found_with_the_moduli(twins, twin):
 def test_a_model_without_the_parts_is_refused(twin):
     model = twin.model
     with pytest.raises(ConfigurationError, match="open_poisson"):
-        parameter_map(model.space.mesh.tissues, model.regions, [model.n_modes], open_poisson=("gland",))
+        parameter_map(model.space.mesh.tissues, model.regions, unit_blocks(model.n_modes), open_poisson=("gland",))
 
 
 def test_under_another_law_no_poissons_ratio_is_sought(twins, twin):

@@ -17,6 +17,7 @@ from palpate.inversion import (
     Objective,
     parameter_map,
     reduced_basis,
+    unit_blocks,
     with_first_noise,
 )
 from palpate.mechanics.boundary import outer_constraint
@@ -86,7 +87,9 @@ def deformed(model, *, voxel_mm=1.5, seed=5, truth=TRUTH) -> Twin:
 
 def problem_of(twins, targets, noise=None, tied=()) -> InverseProblem:
     models = [twin.model for twin in twins]
-    mapping = parameter_map(twins[0].scene.tissues, models[0].regions, [model.n_modes for model in models], tied=tied)
+    mapping = parameter_map(
+        twins[0].scene.tissues, models[0].regions, unit_blocks(*(m.n_modes for m in models)), tied=tied
+    )
     observations = [tuple(surface_distance(t, stated_noise=noise) for t in of_state) for of_state in targets]
     states = [LaterState(m, o, reference=i) for i, (m, o) in enumerate(zip(models, observations, strict=True))]
     return InverseProblem(tuple(states), mapping)

@@ -15,7 +15,7 @@ from palpate.cli.outcome import estimates_table
 from palpate.errors import ConfigurationError, NotConverged
 from palpate.export.fitted_model import fitted_model
 from palpate.images.readers import write_label_image
-from palpate.inversion import eta_of_ratio, parameter_map, ratio_of_eta
+from palpate.inversion import eta_of_ratio, parameter_map, ratio_of_eta, unit_blocks
 from palpate.mechanics.linear_model import linear_model
 from palpate.phantoms.spheres import SpheresOptions, spheres
 from palpate.report.case_report import write_case_report, write_failure_report
@@ -131,7 +131,7 @@ def test_what_is_believed_is_normal_in_eta_with_the_width_stated_of_the_ratio(tw
     """To the first order: eta one standard deviation off is the ratio one of its own off."""
     space = twin.model.space
     model = linear_model(space, twin.model.constraint, open_poisson=("gland",))
-    mapping = parameter_map(space.mesh.tissues, model.regions, [model.n_modes], open_poisson=("gland",))
+    mapping = parameter_map(space.mesh.tissues, model.regions, unit_blocks(model.n_modes), open_poisson=("gland",))
     case = seeking(case_result.case)
     tissues = tuple(replace(t, name="gland", poisson_ratio_sd=1e-4) for t in case.tissues[:1])
     stated = with_stated_priors(mapping, replace(case, tissues=tissues))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import EstimationError
-from palpate.inversion import LaterState, Objective, ParameterMap
+from palpate.inversion import LaterState, Objective, ParameterMap, unit_blocks
 from palpate.inversion.objective import Evaluation, Linearisation, deciding_directions
 from palpate.inversion.optimise import Minimum, Outcome, posterior_sd
 from palpate.observation.contract import Residuals, Weighting
@@ -78,7 +78,9 @@ def test_what_neither_images_nor_prior_determine_ends_as_an_estimation_that_says
 def observed(*lines, n_parameters=2, rests=(0, 1)):
     """Objective and evaluation of surfaces, with a prior of unit variance on all unknowns after the first ones."""
     n = lines[0].jacobian.shape[1]
-    parameters = ParameterMap(np.ones(2), np.eye(2), ("a", "b")[:n_parameters], "c", True, (n - n_parameters,))
+    parameters = ParameterMap(
+        np.ones(2), np.eye(2), ("a", "b")[:n_parameters], "c", True, unit_blocks(n - n_parameters)
+    )
     prior = np.diag(np.where(np.arange(n) < n_parameters, 0.0, 1.0))
     matrix = prior.copy()
     for line in lines:

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from palpate.inversion import Evaluation, LaterState, Objective, ParameterMap
+from palpate.inversion import Evaluation, LaterState, Objective, ParameterMap, unit_blocks
 from palpate.inversion.objective import Linearisation
 from palpate.observation.contract import Residuals, Weighting
 from palpate.observation.noise_model import NoiseModel
@@ -54,7 +54,7 @@ def seen(jacobian):
     prior = np.diag([0.0, 0.0, 1.0, 1.0, 1.0])
     matrix = prior + PRECISION * jacobian.T @ (weights[:, None] * jacobian)
     evaluation = Evaluation(0.0, 0.0, np.zeros(5), np.zeros(5), matrix, (line,), prior, np.zeros(5))
-    parameters = ParameterMap(np.ones(2), np.eye(2), ("a", "b"), "c", True, (3,))
+    parameters = ParameterMap(np.ones(2), np.eye(2), ("a", "b"), "c", True, unit_blocks(3))
     return Objective((LaterState(None, (surface,)),), parameters), evaluation
 
 

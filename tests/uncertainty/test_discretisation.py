@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from palpate.experiments.verification.structured_meshes import box_mesh, known, unknown
-from palpate.inversion import LaterState, Objective, parameter_map
+from palpate.inversion import LaterState, Objective, parameter_map, unit_blocks
 from palpate.mesh import lagrange_space
 from palpate.uncertainty import discretisation_sd
 from palpate.uncertainty.covariance import mesh_covariance
@@ -55,7 +55,7 @@ def variances(*spaces, references=(), tied=()):
         replace(LaterState(None, ()), model=SimpleNamespace(space=own, regions=regions), reference=reference)
         for own, reference in zip(spaces, references, strict=True)
     ]
-    mapping = parameter_map(TISSUES, regions, [0] * len(states), tied=tied)
+    mapping = parameter_map(TISSUES, regions, unit_blocks(*[0] * len(states)), tied=tied)
     covariance = mesh_covariance(Objective(tuple(states), mapping))
     assert np.array_equal(covariance, np.diag(np.diag(covariance)))
     return np.diag(covariance)

@@ -143,7 +143,7 @@ def test_modes_that_are_dropped_are_as_if_they_had_never_been(twins, found, path
     narrow = np.diag(np.where(dropped, 1e8, 1.0))
     objective = found.objective
     again = fast_path(
-        replace(objective, parameters=replace(objective.parameters, driver_precision=narrow)),
+        replace(objective, parameters=replace(objective.parameters, nuisance_precision=narrow)),
         found.minimum,
         twins.settings(3.0).bounds,
     )

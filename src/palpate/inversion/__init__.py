@@ -1,6 +1,7 @@
 """The inverse problem: from later states and what is observed of them to the moduli that explain them."""
 
 from palpate.inversion.approximation import Approximation, ExactApproximation, Place, exact_approximation
+from palpate.inversion.blocks import Acts, Block, unit_blocks, wall_block
 from palpate.inversion.driver_fit import fit_driver
 from palpate.inversion.estimate import Inversion, StartRun, continue_at_finite_strain, invert
 from palpate.inversion.later_state import InverseProblem, LaterState
@@ -12,7 +13,9 @@ from palpate.inversion.reduced_basis import ReducedBasis, reduced_basis
 from palpate.inversion.reweighting import reweighted, with_first_noise
 
 __all__ = [
+    "Acts",
     "Approximation",
+    "Block",
     "Bounds",
     "Evaluation",
     "ExactApproximation",
@@ -45,5 +48,7 @@ __all__ = [
     "reduced_basis",
     "reweighted",
     "run_outer_loop",
+    "unit_blocks",
+    "wall_block",
     "with_first_noise",
 ]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
 from palpate.inversion.approximation import Approximation, Place
-from palpate.inversion.driver import with_learned_prior
+from palpate.inversion.evidence import with_learned_prior
 from palpate.inversion.expansion import coarse_equilibrium, expansion_around
 from palpate.inversion.later_state import InverseProblem
 from palpate.inversion.objective import Objective
@@ -36,7 +36,7 @@ def fit_driver(
     """
     held = Objective(problem.states, replace(problem.parameters, base=moduli))
     linear = [reduced_basis(state.model, moduli) for state in problem.states]
-    amounts = _fitted(held, linear, np.zeros(sum(problem.parameters.n_modes)))
+    amounts = _fitted(held, linear, np.zeros(problem.parameters.n_coefficients))
     if not problem.finite_strain:
         motions = [basis.model.solve(moduli, q).displacement for basis, q in zip(linear, amounts, strict=True)]
         return tuple(tuple(share * motion for share in shares) for motion in motions)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, EstimationError
-from palpate.inversion.driver import with_learned_prior
+from palpate.inversion.evidence import with_learned_prior
 from palpate.inversion.expansion import Expansion, coarse_equilibrium, expansion_around
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import Evaluation, Objective
@@ -123,7 +123,7 @@ def invert(
             " tissues; seek none, or leave out the states' `finite_strain` models (`InverseProblem.linear`)"
         )
     middle = np.asarray(np.median(np.stack(settings.starts), axis=0))
-    begin = np.concatenate([middle, np.zeros(sum(problem.parameters.n_modes))])
+    begin = np.concatenate([middle, np.zeros(problem.parameters.n_coefficients)])
     first = FIRST_GUESS if problem.finite_strain else rule
     if any(state.approximation is None for state in problem.states):
         linear = [_linear(*_with_reduced_bases(problem, settings, begin, progress), settings, first, progress)]

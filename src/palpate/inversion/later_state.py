@@ -17,7 +17,6 @@ from palpate.mechanics.linear_model import LinearModel
 from palpate.mesh.constraint import Constraint
 from palpate.observation.contract import Observation
 from palpate.observation.noise_model import NoiseModel
-from palpate.observation.wall_modes import Wall
 
 __all__ = ["InverseProblem", "LaterState"]
 
@@ -27,16 +26,14 @@ class LaterState:
     """One later state of a body: its model, what its image shows, and what stands in for the model.
 
     model: the body under the linear law; finite_strain: under the law that the estimate is continued to, None where
-    that is the linear one; walls: the drivers' walls, whose prior is learned from the images, none where the modes' own
-    prior holds; reference: number of the rest state that it belongs to; observed: the approximation's model at the
-    observed unknowns alone, one observation after the other; bending: the linear law's one, whose curvature an
+    that is the linear one; reference: number of the rest state that it belongs to; observed: the approximation's model
+    at the observed unknowns alone, one observation after the other; bending: the linear law's one, whose curvature an
     expansion under another law lacks.
     """
 
     model: LinearModel
     observations: tuple[Observation, ...]
     finite_strain: FiniteStrainModel | None = None
-    walls: tuple[Wall, ...] = ()
     reference: int = 0
     approximation: Approximation | None = field(default=None, repr=False)
     observed: ForwardModel | None = field(default=None, repr=False)

@@ -87,11 +87,14 @@ class Evaluation:
 class Objective:
     """J(x) = 1/2 sum_s precision_s sum_j w_j rho(r_j) + 1/2 (x - m)^T P (x - m) over all observations of all states.
 
-    The unknowns x, their prior mean m and precision P are those of `parameters`; rho: see `RobustLoss`.
+    The unknowns x, their prior mean m and precision P are those of `parameters`; rho: see `RobustLoss`. To the
+    residuals of each observation its offset is added, where `parameters` have one. prior_held: whether the blocks'
+    prior stays what it is when residuals are reweighted.
     """
 
     states: tuple[LaterState, ...]
     parameters: ParameterMap
+    prior_held: bool = False
 
     @property
     def n_parameters(self) -> int:
@@ -140,8 +143,8 @@ class Objective:
         """J alone at unknowns (n_unknowns,), for trial steps."""
         total, _ = self._prior(unknowns)
         for s in range(len(self.states)):
-            pairs = self._seen(s, self._equilibrium(s, unknowns).values)
-            total += sum(mapped(lambda of: _misfit(of[0], of[0].residuals(of[1])), pairs))
+            pairs = self._residuals(s, self._equilibrium(s, unknowns).values, unknowns)
+            total += sum(mapped(lambda of: _misfit(*of), pairs))
         return total
 
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
@@ -168,10 +171,12 @@ class Objective:
         value, gradient = self._prior(unknowns)
         for s in range(len(self.states)):
             solution = self._equilibrium(s, unknowns)
-            seen = mapped(lambda of: (of[0], of[0].residuals(of[1])), self._seen(s, solution.values))
+            seen = self._residuals(s, solution.values, unknowns)
             value += sum(_misfit(*of) for of in seen)
             by_region = solution.adjoint(np.concatenate([_pull(*of) for of in seen]))[None]
-            gradient[self.parameters.unknowns_of(s)] += self.parameters.by_unknowns(by_region, unknowns)[0]
+            by_offset = [_weighted(*of).sum() for of in seen] if len(self.parameters.offsets(unknowns, s)) else []
+            own = np.concatenate([self.parameters.by_unknowns(by_region, unknowns)[0], by_offset])
+            gradient[self.parameters.unknowns_of(s)] += own
         return value, gradient
 
     def rematched(self, unknowns: NDArray[np.float64]) -> Objective:
@@ -201,21 +206,38 @@ class Objective:
         state = self.states[s]
         return [(o, values[rows]) for o, rows in zip(state.observations, state.slices, strict=True)]
 
+    def _residuals(
+        self, s: int, values: NDArray[np.float64], unknowns: NDArray[np.float64]
+    ) -> list[tuple[Observation, Residuals]]:
+        """Each observation of a state with its residuals, offsets added, at displacements (n_observed,) mm."""
+        offsets = self.parameters.offsets(unknowns, s)
+
+        def residuals(of: tuple[int, tuple[Observation, NDArray[np.float64]]]) -> tuple[Observation, Residuals]:
+            """Those of one observation."""
+            number, (observation, motion) = of
+            found = observation.residuals(motion)
+            return observation, replace(found, values=found.values + offsets[number]) if len(offsets) else found
+
+        return mapped(residuals, enumerate(self._seen(s, values)))
+
     def _linearised(self, s: int, unknowns: NDArray[np.float64]) -> list[Linearisation]:
         state, solution = self.states[s], self._equilibrium(s, unknowns)
-        values, tangent = solution.values, self.parameters.by_unknowns(solution.tangent(), unknowns)
-        columns = self.parameters.unknowns_of(s)
+        tangent = self.parameters.by_unknowns(solution.tangent(), unknowns)
+        columns, n_offsets = self.parameters.unknowns_of(s), len(self.parameters.offsets(unknowns, s))
+        seen = self._residuals(s, solution.values, unknowns)
 
-        def line(of: tuple[slice, Observation]) -> Linearisation:
+        def line(of: tuple[int, slice, tuple[Observation, Residuals]]) -> Linearisation:
             """One observation's residuals with their derivative."""
-            rows, observation = of
-            residuals = observation.residuals(values[rows])
+            number, rows, (observation, residuals) = of
             weights = residuals.weights * observation.weighting.loss.weight(residuals.values)
-            jacobian = np.asarray(residuals.smooth_jacobian @ tangent[rows])
-            gradient = np.asarray(tangent[rows].T @ _pull(observation, residuals))
+            shift = np.zeros((len(weights), n_offsets))
+            shift[:, number : number + 1] = 1.0
+            jacobian = np.concatenate([residuals.smooth_jacobian @ tangent[rows], shift], axis=1)
+            by_offset = shift.T @ _weighted(observation, residuals)
+            gradient = np.concatenate([tangent[rows].T @ _pull(observation, residuals), by_offset])
             return Linearisation(observation, s, residuals, columns, jacobian, weights, gradient)
 
-        return mapped(line, zip(state.slices, state.observations, strict=True))
+        return mapped(line, zip(range(len(seen)), state.slices, seen, strict=True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,11 +298,16 @@ def _misfit(observation: Observation, residuals: Residuals) -> float:
     return 0.5 * observation.weighting.precision * _mean_loss(observation, residuals)
 
 
-def _pull(observation: Observation, residuals: Residuals) -> NDArray[np.float64]:
-    """Derivative (n_dofs,) of that by the observation's displacement, 1/mm."""
+def _weighted(observation: Observation, residuals: Residuals) -> NDArray[np.float64]:
+    """Derivative (n,) of that by the residuals, 1/mm."""
     weighting = observation.weighting
     weights = residuals.weights * weighting.loss.weight(residuals.values)
-    return np.asarray(residuals.jacobian.T @ (weighting.precision * weights * residuals.values))
+    return np.asarray(weighting.precision * weights * residuals.values)
+
+
+def _pull(observation: Observation, residuals: Residuals) -> NDArray[np.float64]:
+    """Derivative (n_dofs,) of that by the observation's displacement, 1/mm."""
+    return np.asarray(residuals.jacobian.T @ _weighted(observation, residuals))
 
 
 def _mean_loss(observation: Observation, residuals: Residuals) -> float:

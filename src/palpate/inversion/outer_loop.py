@@ -29,7 +29,6 @@ from palpate.inversion.optimise import (
 from palpate.inversion.reweighting import reweighted
 from palpate.mechanics.forward import SolveCounts
 from palpate.mesh.constraint import Constraint
-from palpate.observation.wall_modes import Wall
 
 __all__ = [
     "Convergence",
@@ -160,7 +159,6 @@ def run_outer_loop(
     `progress`. The minimum's history is that of the loop alone, its evaluations are added to those of `start`. Raises
     `NotConverged` when the full model has no equilibrium where every part of a step leads.
     """
-    walls = [state.walls for state in start.objective.states]
     at, theta = start.minimum.evaluation, start.minimum.unknowns[: start.objective.n_parameters]
     first = Iterate(theta, at.value, at.misfit_mm2, newton_decrement(at))
     now, refinements = replace(start, minimum=replace(start.minimum, history=(first,))), 0
@@ -176,25 +174,24 @@ def run_outer_loop(
             break
         if not held and _near(now.minimum, before, now.objective.n_parameters):
             # Learned anew at every step it follows the estimate, which follows it: the wall slides off along itself.
-            objective = _with_walls(now.objective, [()] * len(walls))
-            now, held = replace(now, objective=objective), True
+            now, held = _learning(now, held=True), True
         if now.convergence.converged:
             last = np.zeros_like(last)  # what follows is another objective
             if number > rule.iterations - AFTER_CHANGE:
                 break
             finer = refined_walls(now.objective, now.minimum.evaluation)
             if all(of is None for of in finer) or refinements == rule.refinements:
-                free = replace(now, objective=_with_walls(now.objective, walls), convergence=Convergence())
+                free = replace(_learning(now, held=False), convergence=Convergence())
                 if not held or relearned == RELEARNED or _prior_holds(free, settings, rule):
                     break
                 now, held, relearned = free, False, relearned + 1
                 continue
-            now, held, refinements = _with_finer_walls(now, finer), False, refinements + 1
-            now = replace(now, objective=_with_walls(now.objective, walls))  # learned in the same iterations
+            now, refinements = _with_finer_walls(now, finer), refinements + 1
+            now, held = _learning(now, held=False), False  # learned in the same iterations
     else:
         if max(now.convergence.reweighting, now.convergence.linearisation) > rule.far and now.minimum.converged:
             now = replace(now, minimum=replace(now.minimum, outcome=Outcome.STEPS))
-    return replace(now, objective=_with_walls(now.objective, walls))  # from which another law learns
+    return _learning(now, held=False)  # another law learns anew
 
 
 def _prior_holds(free: OuterIterate, settings: InversionSettings, rule: StopRule) -> bool:
@@ -203,9 +200,9 @@ def _prior_holds(free: OuterIterate, settings: InversionSettings, rule: StopRule
     return _change(free.minimum, found, rule, free.objective.n_parameters) < PRIOR_HOLDS
 
 
-def _with_walls(objective: Objective, walls: Sequence[tuple[Wall, ...]]) -> Objective:
-    """The objective whose drivers' prior is learned of these walls of each state; of none it stays as it is."""
-    return replace(objective, states=tuple(replace(s, walls=w) for s, w in zip(objective.states, walls, strict=True)))
+def _learning(now: OuterIterate, *, held: bool) -> OuterIterate:
+    """The iterate whose blocks' prior is held, or learned with every reweighting."""
+    return replace(now, objective=replace(now.objective, prior_held=held))
 
 
 def updated(objective: Objective, minimum: Minimum, rule: StopRule) -> OuterIterate:

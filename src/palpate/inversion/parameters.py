@@ -1,10 +1,9 @@
-"""From the unknowns to Young's moduli and drivers' motion, and what is believed of both before the images are seen."""
+"""From the unknowns to what a model takes of them, and what is believed of them before the images are seen."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +11,7 @@ from scipy import linalg
 
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role, Tissue
+from palpate.inversion.blocks import Acts, Block, joined
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.stiffness import lame_parts, lame_parts_by_poisson
 
@@ -60,18 +60,18 @@ class OpenPoisson:
 
 @dataclass(frozen=True, slots=True)
 class ParameterMap:
-    """Unknowns x = [theta, q_1, ..., q_S] (n_unknowns,): the parameters theta, then each state's coefficients.
+    """Unknowns x = [theta, x_1, ..., x_B] (n_unknowns,): the parameters theta, then those of the `blocks`.
 
     theta: ln(E / E_reference) of the `tissues`, then eta = ln(lambda / mu) of those of `poisson` (see `OpenPoisson`).
     base (n_regions,) kPa: Young's moduli of the model's regions at theta = 0; selection (n_regions, n_parameters): 1
-    where a log-modulus scales a region, several regions where tissues are tied; n_modes: driver coefficients of each
-    later state. `relative_to`: the tissue that holds the scale; `absolute` is False when nothing sets one: then the
-    first `estimate` tissue is held at 1 and every value is a ratio to it. Where known loads alone set it, `relative_to`
-    says so, and the base is 1 kPa.
+    where a log-modulus scales a region, several regions where tissues are tied. `relative_to`: the tissue that holds
+    the scale; `absolute` is False when nothing sets one: then the first `estimate` tissue is held at 1 and every value
+    is a ratio to it. Where known loads alone set it, `relative_to` says so, and the base is 1 kPa. A model of a later
+    state takes its `coefficients`: of its boundary modes, then of its material modes, in the order of the blocks.
 
     The prior is normal: theta with `prior_mean` (n_parameters,) and `prior_precision` (n_parameters, n_parameters),
-    flat by default, the coefficients with mean 0 and `driver_precision` (n_coefficients, n_coefficients), by default 1.
-    Raises `ConfigurationError` for a prior of another shape.
+    flat by default, the blocks' unknowns with mean 0 and `nuisance_precision` (n_coefficients, n_coefficients), by
+    default what the blocks believe. Raises `ConfigurationError` for a prior of another shape.
     """
 
     base: NDArray[np.float64]
@@ -79,10 +79,10 @@ class ParameterMap:
     tissues: tuple[str, ...]
     relative_to: str
     absolute: bool
-    n_modes: tuple[int, ...]
+    blocks: tuple[Block, ...]
     prior_mean: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     prior_precision: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
-    driver_precision: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    nuisance_precision: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
     poisson: tuple[OpenPoisson, ...] = ()
 
     def __post_init__(self) -> None:
@@ -90,7 +90,7 @@ class ParameterMap:
         defaults = {
             "prior_mean": np.zeros(n),
             "prior_precision": np.zeros((n, n)),
-            "driver_precision": np.eye(sum(self.n_modes)),
+            "nuisance_precision": joined(self.blocks),
         }
         for name, default in defaults.items():
             given = getattr(self, name)
@@ -98,7 +98,7 @@ class ParameterMap:
                 object.__setattr__(self, name, default)
             elif given.shape != default.shape:
                 raise ConfigurationError(
-                    f"{name} has the shape {given.shape}; {n} parameters and {sum(self.n_modes)} driver coefficients"
+                    f"{name} has the shape {given.shape}; {n} parameters and {self.n_coefficients} unknowns in blocks"
                     f" need {default.shape}"
                 )
 
@@ -131,20 +131,40 @@ class ParameterMap:
     @property
     def n_unknowns(self) -> int:
         """Number of all unknowns."""
-        return self.n_parameters + sum(self.n_modes)
+        return self.n_parameters + self.n_coefficients
+
+    @property
+    def n_coefficients(self) -> int:
+        """Number of the blocks' unknowns."""
+        return sum(block.size for block in self.blocks)
+
+    @property
+    def n_states(self) -> int:
+        """Number of later states."""
+        return 1 + max((state for block in self.blocks for state in block.states), default=-1)
+
+    def columns(self, block: int) -> NDArray[np.int64]:
+        """Numbers (n,) among all unknowns of those of a block."""
+        start = self.n_parameters + sum(before.size for before in self.blocks[:block])
+        return np.arange(start, start + self.blocks[block].size)
+
+    def acting(self, acts: Acts, state: int) -> NDArray[np.int64]:
+        """Numbers (n,) of the unknowns that act so in a later state, in the order of the blocks."""
+        own = [self.columns(i) for i, b in enumerate(self.blocks) if b.acts is acts and state in b.states]
+        return np.concatenate([np.zeros(0, dtype=np.int64), *own])
 
     @property
     def prior_matrix(self) -> NDArray[np.float64]:
         """Precision P (n_unknowns, n_unknowns) of all unknowns before the images are seen."""
         n, matrix = self.n_parameters, np.zeros((self.n_unknowns, self.n_unknowns))
         matrix[:n, :n] = self.prior_precision
-        matrix[n:, n:] = self.driver_precision
+        matrix[n:, n:] = self.nuisance_precision
         return matrix
 
     @property
     def prior_centre(self) -> NDArray[np.float64]:
         """Mean (n_unknowns,) of all unknowns before the images are seen."""
-        return np.concatenate([self.prior_mean, np.zeros(sum(self.n_modes))])
+        return np.concatenate([self.prior_mean, np.zeros(self.n_coefficients)])
 
     def moduli(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """The regions' moduli (n_regions,) kPa at unknowns (n_unknowns,), or at theta (n_parameters,) alone.
@@ -164,26 +184,43 @@ class ParameterMap:
         return by_theta
 
     def coefficients(self, unknowns: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Driver coefficients (n_modes,) of each state."""
-        ends = np.add.accumulate([self.n_parameters, *self.n_modes]).tolist()
-        return [unknowns[start:end] for start, end in pairwise(ends)]
+        """What the model of each state takes beside the moduli (n_modes,): boundary modes, then material modes."""
+        return [unknowns[self._model_columns(state)] for state in range(self.n_states)]
+
+    def offsets(self, unknowns: NDArray[np.float64], state: int) -> NDArray[np.float64]:
+        """What is added to the residuals of each observation of a state (n_observations,), or none (0,)."""
+        return np.asarray(unknowns[self.acting(Acts.RESIDUALS, state)])
 
     def unknowns_of(self, state: int) -> NDArray[np.int64]:
-        """Numbers (n_parameters + n_modes,) of the unknowns that move a state: theta, then its own coefficients."""
-        start = self.n_parameters + sum(self.n_modes[:state])
-        return np.concatenate([np.arange(self.n_parameters), np.arange(start, start + self.n_modes[state])])
+        """Numbers (n_own,) of the unknowns that a state depends on: theta, its model's coefficients, its offsets."""
+        residuals = self.acting(Acts.RESIDUALS, state)
+        return np.concatenate([np.arange(self.n_parameters), self._model_columns(state), residuals])
 
     def by_unknowns(self, tangent: NDArray[np.float64], unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives (n, n_parameters + n_modes) by a state's unknowns, from those by (ln E, q), at `unknowns`."""
+        """Derivatives (n, n_parameters + n_modes) by theta and coefficients, from those by (ln E, q), at `unknowns`."""
         n_regions = len(self.base)
         return np.concatenate([tangent[:, :n_regions] @ self.derivatives(unknowns), tangent[:, n_regions:]], axis=1)
 
     def chain(self, state: int, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives (n_regions + n_modes, n_parameters + n_modes) of a state's (ln E, q) by its own unknowns.
+        """Derivatives (n_regions + n_modes, n_own) of a state's (ln E, q) by its own unknowns.
 
         Its columns are those of `unknowns_of`, at unknowns (n_unknowns,).
         """
-        return np.asarray(linalg.block_diag(self.derivatives(unknowns), np.eye(self.n_modes[state])))
+        n_modes, n_offsets = len(self._model_columns(state)), len(self.acting(Acts.RESIDUALS, state))
+        moved = linalg.block_diag(self.derivatives(unknowns), np.eye(n_modes))
+        return np.pad(moved, ((0, 0), (0, n_offsets)))
+
+    def alone(self, state: int) -> tuple[ParameterMap, NDArray[np.int64]]:
+        """The map of one later state alone, and the numbers (n_own,) of its unknowns among all."""
+        kept = [i for i, block in enumerate(self.blocks) if state in block.states]
+        blocks = tuple(replace(self.blocks[i], states=(0,)) for i in kept)
+        own = np.concatenate([np.arange(self.n_parameters), *(self.columns(i) for i in kept)])
+        nuisance = own[self.n_parameters :] - self.n_parameters
+        precision = self.nuisance_precision[np.ix_(nuisance, nuisance)]
+        return replace(self, blocks=blocks, nuisance_precision=precision), own
+
+    def _model_columns(self, state: int) -> NDArray[np.int64]:
+        return np.concatenate([self.acting(Acts.BOUNDARY, state), self.acting(Acts.MATERIAL, state)])
 
     def with_prior(self, mean: NDArray[np.float64], sd: NDArray[np.float64]) -> ParameterMap:
         """The same with a normal prior of theta: mean and standard deviation (n_parameters,), inf where it is flat.
@@ -203,14 +240,14 @@ class ParameterMap:
 def parameter_map(
     tissues: tuple[Tissue, ...],
     regions: tuple[int, ...],
-    n_modes: Sequence[int],
+    blocks: Sequence[Block],
     *,
     loaded: bool = False,
     tied: Sequence[Sequence[str]] = (),
     open_poisson: Sequence[str] = (),
     dilatation: Dilatation = Dilatation.POINTWISE,
 ) -> ParameterMap:
-    """Make the map for a mesh whose regions are `tissues[i] for i in regions` and later states with n_modes each.
+    """Make the map for a mesh whose regions are `tissues[i] for i in regions`, with these blocks of further unknowns.
 
     The scale is the modulus of the first `known` tissue in the file, or without one what the loads say (`loaded`: known
     loads act). tied: groups of `estimate` tissues, by name, that share one modulus. open_poisson: names of the tissues
@@ -245,10 +282,10 @@ def parameter_map(
         poisson.append(OpenPoisson(name, given, len(sought) + len(poisson), places, dilatation))
     columns = [[float(tissue.name in group) for group in sought] for tissue in meshed]
     selection = np.pad(np.array(columns), ((0, 0), (0, len(poisson))))
-    names, modes = tuple(" and ".join(group) for group in sought), tuple(n_modes)
+    names = tuple(" and ".join(group) for group in sought)
     if loaded and not known:
-        return ParameterMap(np.ones(len(meshed)), selection, names, LOADS, True, modes, poisson=tuple(poisson))
+        return ParameterMap(np.ones(len(meshed)), selection, names, LOADS, True, tuple(blocks), poisson=tuple(poisson))
     unit = (known[0].youngs_modulus_kpa or 1.0) if absolute else 1.0
     base = np.array([(t.youngs_modulus_kpa or unit) if t.role is Role.KNOWN else unit for t in meshed])
     scale = known[0].name if absolute else " and ".join(groups[0])
-    return ParameterMap(base, selection, names, scale, absolute, modes, poisson=tuple(poisson))
+    return ParameterMap(base, selection, names, scale, absolute, tuple(blocks), poisson=tuple(poisson))

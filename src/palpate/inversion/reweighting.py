@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inversion.driver import with_learned_prior
+from palpate.inversion.evidence import with_learned_prior
 from palpate.inversion.objective import Evaluation, Linearisation, Objective
 from palpate.inversion.optimise import Minimum
 from palpate.observation.noise_model import NoiseModel

@@ -64,7 +64,8 @@ def prescribed_motion(
         columns = np.arange(first, first + local.shape[1])
         if len(columns):
             own = {"kernel_mm": kernel_mm, "prior_mm": prior_mm}
-            walls.append(wall_of(space.points[points], normals, local, columns, **own))
+            name = space.mesh.tissues[tissue].name
+            walls.append(wall_of(space.points[points], normals, local, columns, name=name, **own))
         prescribed[points] = True
     modes = np.concatenate(blocks, axis=1) if blocks else np.zeros((3 * n, 0))
     return PrescribedMotion(modes, offset.ravel(), prescribed, tuple(walls))

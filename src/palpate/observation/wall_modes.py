@@ -18,11 +18,12 @@ SWELLING_LENGTHS = (1.0, 2.0)
 class Wall:
     """How one driver's wall may move: covariances (n_modes, n_modes) of its modes' coefficients, dimensionless.
 
-    columns (n_modes,): the constraint's modes that move it; `drifts`: of motions whose components are alike, one for
-    each of `DRIFT_LENGTHS`; `swellings`: of motions along the normals, one for each of `SWELLING_LENGTHS`. All have the
-    modes' own standard deviation.
+    name: the driver's; columns (n_modes,): the constraint's modes that move it; `drifts`: of motions whose components
+    are alike, one for each of `DRIFT_LENGTHS`; `swellings`: of motions along the normals, one for each of
+    `SWELLING_LENGTHS`. All have the modes' own standard deviation.
     """
 
+    name: str
     columns: NDArray[np.int64]
     drifts: tuple[NDArray[np.float64], ...]
     swellings: tuple[NDArray[np.float64], ...]
@@ -34,6 +35,7 @@ def wall_of(
     modes: NDArray[np.float64],
     columns: NDArray[np.int64],
     *,
+    name: str,
     kernel_mm: float,
     prior_mm: float,
 ) -> Wall:
@@ -53,6 +55,7 @@ def wall_of(
     ]
     along = [amounts.reshape(len(columns), -1) for amounts in swellings]
     return Wall(
+        name,
         columns,
         tuple(np.asarray(np.kron(a @ a.T, np.eye(3))) for a in drifts),
         tuple(np.asarray(a @ a.T) for a in along),

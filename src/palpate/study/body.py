@@ -14,7 +14,7 @@ from palpate.images.checks import check_images, later_names
 from palpate.images.distance import observation_width
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
-from palpate.inversion import InverseProblem, LaterState, parameter_map
+from palpate.inversion import InverseProblem, LaterState, parameter_map, unit_blocks, wall_block
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.equilibrium import ACCURACY
@@ -196,6 +196,8 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
     progress("assembling one stiffness matrix a tissue")
     pairs = [pair for body in bodies for pair in _models(body, case)]
     models = tuple(model for model, _ in pairs)
+    learned = case.driver.learn_prior
+    blocks = [wall_block(wall, s, learned=learned) for s, (_, walls) in enumerate(pairs) for wall in walls]
     if not case.loads and not any(model.n_modes or model.constraint.offset.any() for model in models):
         raise ConfigurationError(  # at rest every modulus explains the images equally badly
             'nothing moves this body: no tissue has role = "driver" and no `rigid` tissue moves between the images, so'
@@ -203,13 +205,13 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
         )
     finite = _finite_strain(models, case)
     states = tuple(
-        LaterState(model, observations, law, walls if case.driver.learn_prior else (), reference)
-        for (model, walls), law, (reference, observations) in zip(pairs, finite, seen, strict=True)
+        LaterState(model, observations, law, reference)
+        for model, law, (reference, observations) in zip(models, finite, seen, strict=True)
     )
     parameters = parameter_map(
         bodies[0].space.mesh.tissues,
         models[0].regions,
-        [model.n_modes for model in models],
+        blocks or unit_blocks(*(0 for _ in models)),
         loaded=bool(case.loads),
         open_poisson=_open_poisson(case, bodies[0]),
         dilatation=choose_element(case.mechanics.element).dilatation,

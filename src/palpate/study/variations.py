@@ -123,7 +123,7 @@ def fast_variations(
         return _found(path, names, each.cause, each.subject, words, tuple(amount * error for error in each.errors))
 
     found = [*_exact(inversion, tissues), *mapped(vary, jobs)]
-    if sum(inversion.objective.parameters.n_modes):
+    if inversion.objective.parameters.n_coefficients:
         found += [
             _found(path, names, "driver_prior", "", f"{width:g} times as wide", None, width=width)
             for width in PRIOR_WIDTHS
@@ -191,7 +191,7 @@ def _ranges(inversion: Inversion, tissues: tuple[Tissue, ...]) -> list[Range]:
         (known,) = (tissue.name for tissue in tissues if tissue.role is Role.KNOWN)
         scale = float(np.log(KNOWN_FACTOR))
         found.append(Range("known_modulus", known, -scale, scale, "ln E"))
-    if sum(inversion.objective.parameters.n_modes):
+    if inversion.objective.parameters.n_coefficients:
         low, high = np.log2(PRIOR_WIDTHS).tolist()
         found.append(Range("driver_prior", "", low, high, "log2 of the width"))
     return found
@@ -250,11 +250,9 @@ def _exact(inversion: Inversion, tissues: tuple[Tissue, ...]) -> list[Variation]
 def _finer_half(inversion: Inversion) -> NDArray[np.bool_]:
     """The finer half of the modes (n_coefficients,) of each driver's wall, which are sorted by their size."""
     dropped = []
-    for state, n_modes in zip(inversion.objective.states, inversion.objective.parameters.n_modes, strict=True):
-        own = np.zeros(n_modes, dtype=bool)
-        for columns in [wall.columns for wall in state.walls] or [np.arange(n_modes)]:
-            own[columns[3 * (len(columns) // 6) :]] = True
-        dropped.append(own)
+    for block in inversion.objective.parameters.blocks:
+        finer = np.arange(block.size) >= 3 * (block.size // 6)
+        dropped.append(finer & (block.cause == "driver"))
     return np.concatenate(dropped)
 
 

@@ -54,13 +54,7 @@ def pair_estimates(objective: Objective, minimum: Minimum, bounds: Bounds) -> tu
     """
     n, estimates = objective.n_parameters, []
     for s, state in enumerate(objective.states):
-        own = objective.parameters.unknowns_of(s)
-        coefficients = own[n:] - n
-        parameters = replace(
-            objective.parameters,
-            n_modes=(objective.parameters.n_modes[s],),
-            driver_precision=objective.parameters.driver_precision[np.ix_(coefficients, coefficients)],
-        )
+        parameters, own = objective.parameters.alone(s)
         alone = Objective((state,), parameters)
         seen = [line for line in minimum.evaluation.lines if line.state == s]
         lines = tuple(replace(line, state=0, columns=np.searchsorted(own, line.columns)) for line in seen)

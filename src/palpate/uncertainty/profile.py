@@ -31,11 +31,12 @@ class FixedCorrespondence:
     Residuals are r_0 + S (u(E, q) - u_0) with the smooth Jacobians S by the displacement, and count by the robust
     weights w_0 there, as in the Gauss-Newton matrix: J = 1/2 sum_j precision w_0j r_j^2 + prior. What re-chosen closest
     points add, some tenths of a unit, is noise beside its second derivative, and far away a robust loss would take
-    every residual for an outlier. models: of each state, at its observed unknowns; displacements: u_0 (n_dofs,) mm of
-    each line.
+    every residual for an outlier. unknowns (n_unknowns,): those of the evaluation; models: of each state, at its
+    observed unknowns; displacements: u_0 (n_dofs,) mm of each line.
     """
 
     objective: Objective
+    unknowns: NDArray[np.float64]
     models: tuple[ForwardModel, ...]
     lines: tuple[Linearisation, ...]
     displacements: tuple[NDArray[np.float64], ...]
@@ -50,13 +51,14 @@ class FixedCorrespondence:
         mapping, lines = self.objective.parameters, list[Linearisation]()
         left = iter(zip(self.lines, self.displacements, strict=True))
         moduli, coefficients = mapping.moduli(unknowns), mapping.coefficients(unknowns)
-        for state, model, q in zip(self.objective.states, self.models, coefficients, strict=True):
+        for s, (state, model, q) in enumerate(zip(self.objective.states, self.models, coefficients, strict=True)):
             there = model.solve(moduli, q)
             tangent = mapping.by_unknowns(there.tangent(), unknowns)
+            offset = mapping.offsets(unknowns - self.unknowns, s)
             for rows, (line, before) in zip(state.slices, left, strict=False):
-                smooth = line.residuals.smooth_jacobian
-                values = line.residuals.values + smooth @ (there.values[rows] - before)
-                jacobian = np.asarray(smooth @ tangent[rows])
+                smooth, shift = line.residuals.smooth_jacobian, line.jacobian[:, tangent.shape[1] :]
+                values = line.residuals.values + smooth @ (there.values[rows] - before) + shift @ offset
+                jacobian = np.concatenate([smooth @ tangent[rows], shift], axis=1)
                 gradient = np.asarray(jacobian.T @ (line.precision * line.weights * values))
                 residuals = replace(line.residuals, values=values)
                 lines.append(replace(line, residuals=residuals, jacobian=jacobian, gradient=gradient))
@@ -82,7 +84,7 @@ def fixed_correspondence(
         values = model.solve(moduli, q).values
         displacements += [values[rows] for rows in state.slices]
         models.append(CurvedModel.of(model, like) if like and isinstance(model, FirstOrderModel) else model)
-    return FixedCorrespondence(objective, tuple(models), evaluation.lines, tuple(displacements))
+    return FixedCorrespondence(objective, unknowns, tuple(models), evaluation.lines, tuple(displacements))
 
 
 @dataclass(frozen=True, slots=True)

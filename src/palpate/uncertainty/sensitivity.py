@@ -67,10 +67,11 @@ class FastPath:
         """
         fixed, start, n = self.fixed, self.least.unknowns.copy(), self.fixed.n_parameters
         parameters = fixed.objective.parameters
-        precision = parameters.driver_precision / width**2
+        wider = np.concatenate([np.full(b.size, width if b.cause == "driver" else 1.0) for b in parameters.blocks])
+        precision = parameters.nuisance_precision / np.outer(wider, wider)
         if dropped is not None:
             precision, start[n:] = precision + DROPPED * np.diag(dropped), np.where(dropped, 0.0, start[n:])
-        objective = replace(fixed.objective, parameters=replace(parameters, driver_precision=precision))
+        objective = replace(fixed.objective, parameters=replace(parameters, nuisance_precision=precision))
         lines = self._moved(errors, fixed.lines) if errors else fixed.lines
         changed = replace(fixed, objective=objective, lines=lines)
         return self._shift(gauss_newton(changed, start, bounds=self.bounds, tolerance=TOLERANCE, max_steps=STEPS))

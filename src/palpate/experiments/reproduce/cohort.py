@@ -20,6 +20,7 @@ from palpate.inversion import (
     invert,
     parameter_map,
     reduced_basis,
+    unit_blocks,
 )
 from palpate.mechanics import LinearModel, LinearSystem, linear_model, outer_constraint, with_constraint
 from palpate.mesh import Anatomy, Box, lagrange_space, tetrahedralise
@@ -171,7 +172,7 @@ class _Pair:
         targets = [target_of_truth(space, u, observed_surface(space, i), warps=warps) for i in observed]
         model = self.basis.full_model
         state = LaterState(model, tuple(surface_distance(target, stated_noise=stated) for target in targets))
-        mapping = parameter_map(tissues, model.regions, [model.n_modes])
+        mapping = parameter_map(tissues, model.regions, unit_blocks(model.n_modes))
         return InverseProblem((state.with_approximation(self.basis),), mapping)
 
     def displacement(self) -> Array:

@@ -25,7 +25,7 @@ from palpate.experiments.reproduce.balls import (
 from palpate.experiments.reproduce.columns import from_half
 from palpate.experiments.reproduce.jobs import Job, Progress, compute
 from palpate.experiments.reproduce.ledger import Ledger
-from palpate.inversion import InverseProblem, Inversion, LaterState, invert, parameter_map
+from palpate.inversion import InverseProblem, Inversion, LaterState, invert, parameter_map, unit_blocks
 from palpate.mechanics import (
     ACCURACY,
     Dilatation,
@@ -205,8 +205,8 @@ class _Bench:
         ).displacement
         surfaces = [observed_surface(self.space, body) for body in range(len(BODIES))]
         observations = tuple(surface_distance(target_of_truth(self.space, truth, surface)) for surface in surfaces)
-        n_modes = [self.linear.n_modes]
-        mapping = parameter_map(balls_tissues(moduli), self.linear.regions, n_modes, loaded=True)
+        blocks = unit_blocks(self.linear.n_modes)
+        mapping = parameter_map(balls_tissues(moduli), self.linear.regions, blocks, loaded=True)
         settings = from_half(mapping, dict(zip(BODIES, moduli, strict=True)))
         model = replace(self.linear, load=load.nodal)
         finite = finite_strain_model(

@@ -26,7 +26,15 @@ from palpate.experiments.reproduce.ledger import Ledger
 from palpate.experiments.reproduce.paper import PAPER_TABLE1
 from palpate.experiments.reproduce.paper_method import paper_estimate, paper_target
 from palpate.experiments.reproduce.table import COLUMNS, Entry, Table, TableRow, as_part, entries_of
-from palpate.inversion import InverseProblem, Inversion, InversionSettings, LaterState, invert, parameter_map
+from palpate.inversion import (
+    InverseProblem,
+    Inversion,
+    InversionSettings,
+    LaterState,
+    invert,
+    parameter_map,
+    unit_blocks,
+)
 from palpate.mechanics import LinearModel, linear_model, with_constraint
 from palpate.mesh import LagrangeSpace
 from palpate.observation import Observation, observed_surface, surface_distance, surface_distances
@@ -195,7 +203,7 @@ class _Case:
         self, model: LinearModel, observations: tuple[Observation, ...], progress: Progress
     ) -> tuple[Inversion, InversionSettings]:
         """The inversion of all spheres' surfaces from half of their moduli, and its settings."""
-        mapping = parameter_map(balls_tissues(self.moduli), model.regions, [model.n_modes], loaded=True)
+        mapping = parameter_map(balls_tissues(self.moduli), model.regions, unit_blocks(model.n_modes), loaded=True)
         settings = from_half(mapping, self.truth)
         problem = InverseProblem((LaterState(model, observations),), mapping)
         return invert(problem, settings, progress=progress), settings

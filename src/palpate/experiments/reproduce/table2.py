@@ -24,7 +24,15 @@ from palpate.experiments.reproduce.paper_method import paper_estimate, paper_tar
 from palpate.experiments.reproduce.real_pelvis import ORGANS, SMOOTHING_MM, RealPelvis, grid_within, real_pelvis
 from palpate.experiments.reproduce.table import COLUMNS, Entry, Table, TableRow, as_part, entries_of
 from palpate.images import Role, VoxelGrid, observation_width, smoothing_width
-from palpate.inversion import InverseProblem, LaterState, ReducedBasis, invert, parameter_map, reduced_basis
+from palpate.inversion import (
+    InverseProblem,
+    LaterState,
+    ReducedBasis,
+    invert,
+    parameter_map,
+    reduced_basis,
+    unit_blocks,
+)
 from palpate.mechanics import (
     LinearisedSystem,
     LinearModel,
@@ -241,7 +249,7 @@ class _Surfaces:
         tissues = truth.space.mesh.tissues
         surfaces = [observed_surface(self.coarse.space, i) for i, t in enumerate(tissues) if t.role is Role.ESTIMATE]
         observations = tuple(surface_distance(target_of_truth(truth.space, u, surface)) for surface in surfaces)
-        mapping = parameter_map(tissues, self.coarse.regions, [self.coarse.n_modes])
+        mapping = parameter_map(tissues, self.coarse.regions, unit_blocks(self.coarse.n_modes))
         state = LaterState(self.coarse, observations).with_approximation(self.basis)
         settings = from_half(mapping, dict.fromkeys(ORGANS, kpa))
         inversion = invert(InverseProblem((state,), mapping), settings, progress=progress)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from palpate.experiments.verification.conditions import held_components, sphere_faces
 from palpate.experiments.verification.structured_meshes import known, octant_mesh, unknown
-from palpate.inversion import Bounds, InverseProblem, InversionSettings, LaterState, parameter_map
+from palpate.inversion import Bounds, InverseProblem, InversionSettings, LaterState, parameter_map, unit_blocks
 from palpate.mechanics import LinearModel, linear_model, triangle_quadrature
 from palpate.mesh import LevelSet, lagrange_space, triangle_normals
 from palpate.observation import (
@@ -107,7 +107,7 @@ def twin_problem(
         surface = observed_surface(model.space, tissue)
         target = target_from(surface, before, after, level=0.0, image=(image, np.concatenate(areas)))
         observations.append(surface_distance(target, stated_noise=stated_noise))
-    mapping = parameter_map(model.space.mesh.tissues, model.regions, [model.n_modes])
+    mapping = parameter_map(model.space.mesh.tissues, model.regions, unit_blocks(model.n_modes))
     return InverseProblem((LaterState(model, tuple(observations)),), mapping)
 
 

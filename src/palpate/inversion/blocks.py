@@ -1,0 +1,92 @@
+"""Parameter blocks: groups of unknowns beside the moduli, each with what is believed of it before the images are seen.
+
+A block is one cause that a real pair of images brings: how a driver's wall moves, how the frame that the image cuts out
+of the body moves, how a surface is drawn, how a tissue's stiffness varies. The layers above ask a block what it acts on
+and what it believes, never what it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import ConfigurationError
+from palpate.observation.wall_modes import Wall
+
+__all__ = ["Acts", "Block", "joined", "unit_blocks", "wall_block"]
+
+AMPLITUDES = (0.005, 2.0)  # times the coefficients' own standard deviation
+
+
+class Acts(Enum):
+    """What the unknowns of a block enter."""
+
+    BOUNDARY = "the displacement of what is prescribed"
+    MATERIAL = "the material of the elements"
+    RESIDUALS = "the residuals of the observations, one unknown each"
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Unknowns x ~ N(0, P^-1) that act in the later `states` (their numbers).
+
+    name: in words, with its `unit`; cause: by which shares of a variance are told; precision: P (n, n) before anything
+    is learned. alternatives: families of covariances sum_t a_t^2 C_t (n, n), each the tuple of its terms C_t, of which
+    the images choose one with its amplitudes a_t, by their evidence; none where P is held. amplitudes: bounds of a_t;
+    scale: standard deviation of a half-normal prior of a_t, inf where there is none. Raises `ConfigurationError` for
+    terms of another size.
+    """
+
+    name: str
+    unit: str
+    cause: str
+    acts: Acts
+    states: tuple[int, ...]
+    precision: NDArray[np.float64]
+    alternatives: tuple[tuple[NDArray[np.float64], ...], ...] = ()
+    amplitudes: tuple[float, float] = AMPLITUDES
+    scale: float = np.inf
+
+    def __post_init__(self) -> None:
+        shape = (len(self.precision),) * 2
+        wrong = [term.shape for terms in self.alternatives for term in terms if term.shape != shape]
+        if self.precision.shape != shape or wrong:
+            raise ConfigurationError(
+                f"the block '{self.name}' has a precision {self.precision.shape} and covariance terms"
+                f" {wrong or [shape]}; all must be square and of one size"
+            )
+
+    @property
+    def size(self) -> int:
+        """Number of its unknowns."""
+        return len(self.precision)
+
+
+def unit_blocks(*n_modes: int) -> tuple[Block, ...]:
+    """One block of boundary modes a later state, with independent coefficients of variance 1 that are not learned."""
+    return tuple(
+        Block("motion of what is prescribed", "", "driver", Acts.BOUNDARY, (state,), np.eye(n))
+        for state, n in enumerate(n_modes)
+    )
+
+
+def wall_block(wall: Wall, state: int, *, learned: bool = True) -> Block:
+    """The motion of a driver's wall in a later state: a drift and a swelling (see `Wall`), their kernels learned."""
+    alternatives = tuple(product(wall.drifts, wall.swellings)) if learned else ()
+    n = len(wall.columns)
+    return Block(f"motion of the wall of {wall.name}", "", "driver", Acts.BOUNDARY, (state,), np.eye(n), alternatives)
+
+
+def joined(blocks: Sequence[Block]) -> NDArray[np.float64]:
+    """Precision (n, n) of the unknowns of several blocks, one after the other."""
+    total = sum(block.size for block in blocks)
+    matrix, start = np.zeros((total, total)), 0
+    for block in blocks:
+        end = start + block.size
+        matrix[start:end, start:end], start = block.precision, end
+    return matrix

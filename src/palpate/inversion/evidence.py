@@ -1,0 +1,140 @@
+"""What is believed of the blocks of unknowns, learned from the images by its evidence.
+
+A wall that moves by 3 mm as one piece must not be allowed to slide by 5 mm on its own: nothing in the images holds it
+back along itself, and the moduli then pay for it. A frame that stands still must not move, a homogeneous tissue not be
+patchy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, optimize
+
+from palpate.inversion.blocks import Block
+from palpate.inversion.objective import Evaluation, Objective, determined
+
+__all__ = ["learned_precision", "with_learned_prior"]
+
+FIRST, ELSEWHERE = 0.3, 0.05  # amplitudes of one term and of the others; one may hide the other
+LEAST_VARIANCE = 1e-3  # of a coefficient, times its variance under the block's own kernel: no mode is forbidden
+ALIKE = 2.0  # of the log-evidence
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """What the data say of one block when all else follows: information A (n, n) and pull b = A x - J^T W r (n,)."""
+
+    information: NDArray[np.float64]
+    pull: NDArray[np.float64]
+
+    def log_evidence(
+        self, terms: Sequence[NDArray[np.float64]], variances: NDArray[np.float64]
+    ) -> tuple[float, NDArray[np.float64]]:
+        """F = 1/2 (b^T (A + C^-1)^-1 b - ln det(1 + C A)) for C = sum_t v_t C_t, and dF / d v_t (n_terms,).
+
+        With x = (A + C^-1)^-1 b, w = b - A x and G = A (1 + C A)^-1 the derivative is 1/2 (w^T C_t w - tr C_t G).
+        """
+        covariance = sum((v * term for v, term in zip(variances, terms, strict=True)), np.zeros_like(terms[0]))
+        inner = covariance @ self.information
+        inner[np.diag_indices_from(inner)] += 1.0
+        factor = linalg.lu_factor(inner, overwrite_a=True, check_finite=False)
+        x = linalg.lu_solve(factor, covariance @ self.pull, check_finite=False)
+        left = self.pull - self.information @ x
+        determinant = float(np.sum(np.log(np.abs(np.diag(factor[0])))))
+        response = linalg.lu_solve(factor, self.information.T, trans=1, check_finite=False)  # G^T
+        slopes = [0.5 * float(left @ term @ left - np.sum(term * response)) for term in terms]
+        return 0.5 * float(self.pull @ x) - 0.5 * determinant, np.array(slopes)
+
+
+def learned_precision(
+    objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
+    """Precision P (n_coefficients, n_coefficients) with the largest evidence; None where no block learns its own.
+
+    With the residuals linear around `unknowns` x (n_unknowns,), A = J^T W J and b = A x - J^T W r, the log-evidence of
+    P is 1/2 (b^T (A + P)^-1 b - ln det(A + P) + ln det P) up to a constant (MacKay 1992, Neural Computation 4, 415-447,
+    section 4), block after block, the others under their present prior. Of alternatives whose evidence is as good as
+    equal, those that leave the log-moduli the widest posterior. Raises `EstimationError` where a block is left open.
+    """
+    parameters = objective.parameters
+    blocks = [(parameters.columns(i), block) for i, block in enumerate(parameters.blocks) if block.alternatives]
+    if not blocks:
+        return None
+    data, n = evaluation.matrix - evaluation.prior, objective.n_parameters
+    pull, prior = data @ unknowns - (evaluation.score - evaluation.prior_score), evaluation.prior.copy()
+    for places, block in blocks:
+        with determined():
+            seen = _seen(data + prior, data, pull + prior @ parameters.prior_centre, places)
+            beliefs = [_most_evident(terms, seen, block) for terms in block.alternatives]
+            best = max(evidence for evidence, _ in beliefs)
+            found = list[tuple[float, float, NDArray[np.float64]]]()
+            for evidence, covariance in beliefs:
+                if evidence > best - ALIKE:
+                    with_it = prior.copy()
+                    with_it[np.ix_(places, places)] = linalg.inv(covariance)
+                    width = _width(data + with_it, n) if len(beliefs) > 1 else 0.0
+                    found.append((width, evidence, with_it))
+            _, _, prior = max(found, key=lambda each: each[:2])
+    return prior[n:, n:]
+
+
+def with_learned_prior(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> Objective:
+    """The objective with the blocks' prior of the largest evidence around unknowns (n_unknowns,), if it is not held."""
+    precision = None if objective.prior_held else learned_precision(objective, evaluation, unknowns)
+    if precision is None:
+        return objective
+    return replace(objective, parameters=replace(objective.parameters, nuisance_precision=precision))
+
+
+def _seen(
+    matrix: NDArray[np.float64], data: NDArray[np.float64], pull: NDArray[np.float64], places: NDArray[np.int64]
+) -> _Seen:
+    """The Schur complement of the information `data` on the unknowns `places`, the others under their prior.
+
+    matrix (n, n): the data's and the prior's; pull (n,): likewise, with the prior's mean.
+    """
+    rest = np.setdiff1d(np.arange(len(pull)), places)
+    across = data[np.ix_(rest, places)]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix)[rest], 1e-30))
+    scaled = scale[:, None] * matrix[np.ix_(rest, rest)] * scale
+    scaled[np.diag_indices_from(scaled)] += 1e-10  # a modulus that moves nothing
+    right = scale[:, None] * np.column_stack([across, pull[rest]])
+    followed = across.T @ (scale[:, None] * linalg.solve(scaled, right, assume_a="pos", check_finite=False))
+    information = data[np.ix_(places, places)] - followed[:, :-1]
+    return _Seen(0.5 * (information + information.T), pull[places] - followed[:, -1])
+
+
+def _most_evident(terms: Sequence[NDArray[np.float64]], seen: _Seen, block: Block) -> tuple[float, NDArray[np.float64]]:
+    """The largest log-evidence of a family of priors of a block, and that prior's covariance (n, n)."""
+    floored = [term + LEAST_VARIANCE * np.eye(len(term)) for term in terms]
+
+    def worse(logs: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """Minus the log-evidence at ln of the amplitudes (n_terms,), with its derivative."""
+        squares = np.exp(2.0 * logs)
+        evidence, slopes = seen.log_evidence(floored, squares)
+        doubt = squares / block.scale**2
+        return 0.5 * float(doubt.sum()) - evidence, doubt - 2.0 * squares * slopes
+
+    limits = np.log(block.amplitudes)
+    starts = np.log(np.where(np.eye(len(terms)) > 0.0, FIRST, ELSEWHERE)).clip(*limits)
+    found = [
+        optimize.minimize(worse, start, jac=True, method="L-BFGS-B", bounds=[tuple(limits)] * len(terms))
+        for start in starts
+    ]
+    best = min(found, key=lambda trial: float(trial.fun))
+    squares = np.exp(2.0 * best.x)
+    return -float(best.fun), sum((s * t for s, t in zip(squares, floored, strict=True)), np.zeros_like(terms[0]))
+
+
+def _width(matrix: NDArray[np.float64], n_parameters: int) -> float:
+    """Sum of the log-moduli's posterior variances under a Gauss-Newton matrix (n, n)."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))
+    scaled = scale[:, None] * matrix * scale
+    scaled[np.diag_indices_from(scaled)] += 1e-12
+    unit = np.eye(len(matrix))[:, :n_parameters]
+    inverse = linalg.solve(scaled, unit, assume_a="pos", check_finite=False)
+    return float(np.sum(np.diag(inverse) * scale[:n_parameters] ** 2))
