@@ -123,8 +123,8 @@ def test_where_an_element_is_turned_inside_out_nothing_bounds_the_error(model):
     equilibrium = model.solve(MODULI, np.array([5.0, 2.0])).refactorised()
     near, far = (equilibrium.values + share * equilibrium.tangent()[:, 2] for share in (0.01, 50.0))
     assert equilibrium.balance.smallest_volume(far) < 0.0
-    assert 0.0 < equilibrium.error_estimate(MODULI, near)[0] < 0.1
-    assert equilibrium.error_estimate(MODULI, far)[0] == np.inf
+    assert 0.0 < equilibrium.error_estimate(MODULI, equilibrium.coefficients, near)[0] < 0.1
+    assert equilibrium.error_estimate(MODULI, equilibrium.coefficients, far)[0] == np.inf
 
 
 def test_an_exact_factorisation_changes_the_price_and_not_the_tangent(model):

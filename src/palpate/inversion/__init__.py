@@ -1,7 +1,15 @@
 """The inverse problem: from later states and what is observed of them to the moduli that explain them."""
 
 from palpate.inversion.approximation import Approximation, ExactApproximation, Place, exact_approximation
-from palpate.inversion.blocks import Acts, Block, unit_blocks, wall_block
+from palpate.inversion.blocks import (
+    Acts,
+    Block,
+    frame_blocks,
+    material_blocks,
+    offset_block,
+    unit_blocks,
+    wall_block,
+)
 from palpate.inversion.driver_fit import fit_driver
 from palpate.inversion.estimate import Inversion, StartRun, continue_at_finite_strain, invert
 from palpate.inversion.later_state import InverseProblem, LaterState
@@ -40,8 +48,11 @@ __all__ = [
     "exact_approximation",
     "fit_coefficients",
     "fit_driver",
+    "frame_blocks",
     "gauss_newton",
     "invert",
+    "material_blocks",
+    "offset_block",
     "parameter_map",
     "posterior_sd",
     "ratio_of_eta",

@@ -188,8 +188,11 @@ class ExactApproximation:
         if at.same_as(self.place):
             return ModelError(0.0, np.zeros_like(displacement))
         there = self.equilibrium
-        of = there.error_estimate if isinstance(there, FiniteStrainEquilibrium) else there.system.error_bound
-        return ModelError(*of(at.moduli, displacement))
+        if isinstance(there, FiniteStrainEquilibrium):
+            return ModelError(*there.error_estimate(at.moduli, at.coefficients, displacement))
+        boundary = np.arange(len(at.coefficients)) < self.constraint.n_modes  # of the linear law's homogeneous part
+        displacement = self.model.solve(at.moduli, np.where(boundary, at.coefficients, 0.0)).values
+        return ModelError(*there.system.error_bound(at.moduli, displacement))
 
     def with_constraint(self, constraint: Constraint, at: Place) -> ExactApproximation:
         """The model solved at a place under another offset."""

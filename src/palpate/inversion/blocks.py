@@ -16,11 +16,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError
+from palpate.images.tissue import Tissue
+from palpate.mechanics.material import MaterialModes
+from palpate.observation.contract import Observation
+from palpate.observation.prescribed_motion import PrescribedMotion
 from palpate.observation.wall_modes import Wall
 
-__all__ = ["Acts", "Block", "joined", "unit_blocks", "wall_block"]
+__all__ = [
+    "Acts",
+    "Block",
+    "frame_blocks",
+    "joined",
+    "material_blocks",
+    "offset_block",
+    "unit_blocks",
+    "wall_block",
+]
 
 AMPLITUDES = (0.005, 2.0)  # times the coefficients' own standard deviation
+LEAST_HETEROGENEITY, MOST_HETEROGENEITY = 1.0 / 3.0, 5.0  # times the scale of its amplitude's prior
 
 
 class Acts(Enum):
@@ -80,6 +94,50 @@ def wall_block(wall: Wall, state: int, *, learned: bool = True) -> Block:
     alternatives = tuple(product(wall.drifts, wall.swellings)) if learned else ()
     n = len(wall.columns)
     return Block(f"motion of the wall of {wall.name}", "", "driver", Acts.BOUNDARY, (state,), np.eye(n), alternatives)
+
+
+def frame_blocks(motion: PrescribedMotion, state: int) -> tuple[Block, ...]:
+    """The motion in a later state of the frame that the image cuts out of the body: smooth, and rigid."""
+    sizes = (("smooth motion of the frame", motion.n_smooth), ("rigid motion of the frame", motion.n_rigid))
+    return tuple(
+        Block(name, "", "frame", Acts.BOUNDARY, (state,), np.eye(n), ((np.eye(n),),)) for name, n in sizes if n
+    )
+
+
+def offset_block(observation: Observation, state: int, *, sd: float) -> Block:
+    """By how much more an observation's residuals are in a later state than the model has them; sd in their unit."""
+    name = f"offset of {observation.name}"
+    return Block(name, "mm", "offset", Acts.RESIDUALS, (state,), np.full((1, 1), sd**-2.0))
+
+
+def material_blocks(
+    modes: MaterialModes,
+    tissues: Sequence[Tissue],
+    states: tuple[int, ...],
+    *,
+    heterogeneity_sd: float,
+    poisson_sd: float,
+) -> tuple[Block, ...]:
+    """How ln E varies in each tissue, its amplitude learned, and by how much Poisson's ratios are not those given."""
+    blocks = [
+        Block(
+            f"ln E within {tissues[tissue].name}",
+            "",
+            "heterogeneity",
+            Acts.MATERIAL,
+            states,
+            np.eye(n) / heterogeneity_sd**2,
+            ((np.eye(n),),),
+            amplitudes=(LEAST_HETEROGENEITY * heterogeneity_sd, MOST_HETEROGENEITY * heterogeneity_sd),
+            scale=heterogeneity_sd,
+        )
+        for tissue, n in modes.sizes
+        if n
+    ]
+    if modes.poisson:
+        precision = np.eye(len(modes.poisson)) / poisson_sd**2
+        blocks.append(Block("Poisson's ratios", "", "poisson", Acts.MATERIAL, states, precision))
+    return tuple(blocks)
 
 
 def joined(blocks: Sequence[Block]) -> NDArray[np.float64]:

@@ -182,7 +182,7 @@ def _with_reduced_bases(
     progress("how the responses change with the moduli")
     by_theta = parameters.derivatives(middle)
     triples = zip(problem.states, bases, parameters.coefficients(fitted.unknowns), strict=True)
-    states = tuple(s.with_approximation(b.with_modulus_series(q, by_theta)) for s, b, q in triples)
+    states = tuple(s.with_approximation(b.with_modulus_series(q, by_theta).with_material(q)) for s, b, q in triples)
     return Objective(states, parameters), fitted.unknowns, fitted.evaluations
 
 

@@ -96,7 +96,7 @@ class Expansion:
         displacement = self.model.solve(at.moduli, at.coefficients).values
         if at.same_as(self.place):
             return ModelError(0.0, np.zeros_like(displacement))
-        return ModelError(*self.equilibrium.error_estimate(at.moduli, displacement))
+        return ModelError(*self.equilibrium.error_estimate(at.moduli, at.coefficients, displacement))
 
     def with_constraint(self, constraint: Constraint, at: Place) -> Expansion:
         """The expansion around the equilibrium at a place that another offset of what is prescribed leads to."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.inversion.approximation import ModelError, Place
+from palpate.inversion.objective import determined
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import LinearModel, LinearSystem, weighted_sum, with_constraint
 from palpate.mechanics.reduced import Projection, ReducedModel, projection
@@ -82,7 +84,7 @@ class ReducedBasis:
             near = model.system(at.moduli)
             sharper = replace(self, system=near, counts=self.counts + SolveCounts(factorisations=1))
         matrix = weighted_sum(at.moduli, model.free_stiffness)
-        displacement = self.model.solve(at.moduli, at.coefficients).values
+        displacement = self._homogeneous(at)
 
         def solved(rhs: NDArray[np.float64], tolerance: float | NDArray[np.float64]) -> NDArray[np.float64]:
             """Solution (n_free, k) mm at the place to a relative residual, one or (k,)."""
@@ -90,9 +92,12 @@ class ReducedBasis:
             return conjugate_gradients(matrix, rhs, nearly, tolerance=tolerance, max_iterations=MAX_ITERATIONS)[0]
 
         new, directions = int(not at.same_as(self.place)), at.directions  # whether the displacement is sought, too
+        if directions is not None:
+            sharper = _with_sharper_material(sharper, at, displacement, solved)
+            directions = directions[: model.n_regions + model.constraint.n_modes]
         loads = -model.residual(at.moduli, displacement[:, None])[:, :new]
         if directions is not None:
-            derivatives = model.tangent_loads(at.moduli, displacement, directions)
+            derivatives = model.boundary_loads(at.moduli, displacement, directions)
             amplitudes = self.model.system(at.moduli).backward(self.projection.components(derivatives))
             loads = np.concatenate([loads, derivatives - matrix @ self.projection.spanned(amplitudes)], axis=1)
         if not loads.shape[1]:
@@ -102,7 +107,7 @@ class ReducedBasis:
         late = np.asarray(model.constraint.free @ missing[:, :new])
         if directions is not None and np.linalg.norm(late) > FAR_OFF * np.linalg.norm(displacement):
             by_modulus = np.where(np.arange(len(directions))[:, None] < model.n_regions, directions, 0.0)
-            missing[:, new:] += solved(model.tangent_loads(at.moduli, late[:, 0], by_modulus), TANGENT)
+            missing[:, new:] += solved(model.boundary_loads(at.moduli, late[:, 0], by_modulus), TANGENT)
             cost += SolveCounts(tangent=directions.shape[1])
         return replace(_extended(sharper, missing, cost), place=at)
 
@@ -113,8 +118,7 @@ class ReducedBasis:
 
     def error(self, at: Place) -> ModelError:
         """Upper bound of the displacement's relative error in energy (see `LinearSystem.error_bound`)."""
-        displacement = self.model.solve(at.moduli, at.coefficients).values
-        return ModelError(*self.system.error_bound(at.moduli, displacement))
+        return ModelError(*self.system.error_bound(at.moduli, self._homogeneous(at)))
 
     def with_constraint(self, constraint: Constraint, at: Place) -> ReducedBasis:
         """The same vectors under another offset, with the response to it, and what these miss at a place."""
@@ -123,6 +127,22 @@ class ReducedBasis:
         fresh = np.asarray(constraint.free.T @ system.solve(np.zeros(model.n_modes)).values)[:, None]
         moved = replace(self, projection=self.projection.under(model), system=system, place=None)
         return _extended(moved, fresh, SolveCounts(forward=1)).update(at)
+
+    def with_material(self, coefficients: NDArray[np.float64]) -> ReducedBasis:
+        """The responses to the material modes at the factorised moduli and at `coefficients` (n_modes,)."""
+        n_material = self.full_model.material.n_modes
+        if not n_material:
+            return self
+        values = self._homogeneous(Place(self.system.moduli, coefficients))
+        responses = self.system.material_responses(values, tolerance=SNAPSHOT)
+        counts = self.counts + SolveCounts(tangent=n_material)
+        return replace(self, projection=self.projection.with_material(responses), counts=counts)
+
+    def _homogeneous(self, at: Place) -> NDArray[np.float64]:
+        """The displacement (n_dof,) mm at a place as it would be of homogeneous tissues."""
+        boundary = self.full_model.constraint.n_modes
+        of_boundary = np.where(np.arange(len(at.coefficients)) < boundary, at.coefficients, 0.0)
+        return self.model.solve(at.moduli, of_boundary).values
 
     def with_modulus_series(self, coefficients: NDArray[np.float64], by_theta: NDArray[np.float64]) -> ReducedBasis:
         """Add how the displacement at `coefficients` (n_modes,) changes with the parameters, to high order.
@@ -133,7 +153,7 @@ class ReducedBasis:
         """
         model, system, regions = self.full_model, self.system, np.flatnonzero(by_theta.any(axis=1))
         n_parameters = by_theta.shape[1]
-        level = self.model.solve(system.moduli, coefficients).values[:, None]
+        level = self._homogeneous(Place(system.moduli, coefficients))[:, None]
         vectors: list[NDArray[np.float64]] = []
         while level.shape[1] * n_parameters + sum(v.shape[1] for v in vectors) <= SERIES:
             by_region = system.modulus_responses(level, regions=regions, tolerance=SNAPSHOT)
@@ -151,7 +171,7 @@ class ReducedBasis:
         """
         system = self.full_model.system(moduli)
         responses = system.responses()
-        solution = responses @ np.append(coefficients, 1.0)
+        solution = responses @ np.append(coefficients[: self.constraint.n_modes], 1.0)
         derivatives = system.modulus_responses(solution[:, None])[:, :, 0].T
         free = self.constraint.free
         fresh = np.concatenate([free.T @ responses, free.T @ derivatives], axis=1)
@@ -164,6 +184,32 @@ def reduced_basis(model: LinearModel, moduli: NDArray[np.float64]) -> ReducedBas
     system = model.system(moduli)
     snapshots = np.asarray(model.constraint.free.T @ system.responses(tolerance=SNAPSHOT))
     return ReducedBasis(projection(model, snapshots), system, system.response_counts)
+
+
+def _with_sharper_material(
+    basis: ReducedBasis,
+    at: Place,
+    displacement: NDArray[np.float64],
+    solved: Callable[[NDArray[np.float64], float], NDArray[np.float64]],
+) -> ReducedBasis:
+    """The responses U to the material modes made exact at a place along its directions D of these coefficients.
+
+    They become U + (C - U D) (D^T H D)^+ D^T H with the exact C and the metric H, as those of an `Expansion`.
+    """
+    model, first = basis.full_model, basis.full_model.n_regions + basis.constraint.n_modes
+    if not model.material.n_modes or at.directions is None or at.metric is None:
+        return basis
+    along, metric = at.directions[first:], at.metric[first:, first:]
+    along = along[:, np.linalg.norm(along, axis=0) > 0.0]
+    free, before = model.constraint.free, basis.model.output_material
+    loads = -np.asarray(free.T @ (model.material_forces(at.moduli, displacement) @ along))
+    known = np.asarray(free.T @ (before @ along))
+    lacking = loads - weighted_sum(at.moduli, model.free_stiffness) @ known
+    change = np.asarray(free @ solved(lacking, TANGENT))
+    with determined():
+        share = np.linalg.pinv(along.T @ metric @ along, hermitian=True) @ (along.T @ metric)
+    counts = basis.counts + SolveCounts(tangent=along.shape[1])
+    return replace(basis, projection=basis.projection.with_material(before + change @ share), counts=counts)
 
 
 def _extended(basis: ReducedBasis, snapshots: NDArray[np.float64], cost: SolveCounts) -> ReducedBasis:

@@ -7,16 +7,14 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from palpate.errors import ConfigurationError
-from palpate.images.tissue import Role
 from palpate.mechanics.rigid import refuse_floating
 from palpate.mesh.constraint import Constraint
 from palpate.mesh.space import LagrangeSpace
-from palpate.mesh.surface import tissue_surface, triangle_normals
-from palpate.mesh.tet_mesh import OUTER
+from palpate.mesh.surface import cut_faces, triangle_normals
 
 __all__ = ["outer_constraint"]
 
-OUTER_KINDS = ("fixed", "sliding", "free")
+OUTER_KINDS = ("moving", "fixed", "sliding", "free")
 SAME_PLANE = 1e-3  # share of the normals' second moment: directions that differ by less than 2 deg are one plane
 
 
@@ -31,22 +29,18 @@ def outer_constraint(
     """Admissible displacements of a body whose `prescribed` (n_points,) points move by modes q + offset.
 
     modes (n_dof, n_modes) mm and offset (n_dof,) mm must vanish elsewhere. outer holds the points on the cut of the
-    image: "fixed", "sliding" (not along the normals of the cut's faces: one on a face, two on an edge, three in a
-    corner) or "free". The cut faces of `estimate` tissues are free in any case; a point that is also on the cut face
-    of a `known` tissue is held; a prescribed point follows its prescription. Raises `GeometryError` when nothing
-    opposes some rigid motion, `ConfigurationError` for another `outer` or for arrays that do not fit.
+    image: "moving" (held where nothing else is prescribed, for modes of the frame are prescriptions), "fixed",
+    "sliding" (not along the normals of the cut's faces: one on a face, two on an edge, three in a corner) or "free".
+    The cut faces of `estimate` tissues are free in any case; a point that is also on the cut face of a `known` tissue
+    is held; a prescribed point follows its prescription. Raises `GeometryError` when nothing opposes some rigid motion,
+    `ConfigurationError` for another `outer` or for arrays that do not fit.
     """
     if outer not in OUTER_KINDS:
         raise ConfigurationError(f"outer_boundary is '{outer}'; it must be one of {list(OUTER_KINDS)}")
     _check_prescription(space, modes, offset, prescribed)
-    # of `known` tissues on the cut of the image
-    tissues = space.mesh.tissues
-    known = [number for number, tissue in enumerate(tissues) if tissue.role is Role.KNOWN]
-    surfaces = [tissue_surface(space.mesh, number) for number in known]
-    cuts = [surface.triangles[surface.other == OUTER] for surface in surfaces]
-    faces = np.concatenate([np.zeros((0, 3), dtype=np.int64), *cuts])
+    faces = cut_faces(space.mesh)
     held = np.zeros((len(space.points), 3, 3))
-    if outer == "fixed":
+    if outer in ("fixed", "moving"):
         held[np.unique(space.facets(faces))] = np.eye(3)
     elif outer == "sliding":
         # the sum of n (x) n over the unit normals n of the faces at each point

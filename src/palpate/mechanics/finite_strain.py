@@ -7,6 +7,7 @@ tissue, and du/dq = M - F K_ff^-1 F^T K M.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,6 +21,7 @@ from palpate.mechanics.hyperelastic import Elements, Moduli, elements_of
 from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.linearised import TIGHT, LinearisedSystem
 from palpate.mechanics.loads import Load
+from palpate.mechanics.material import HOMOGENEOUS, MaterialModes, material_forces
 from palpate.mechanics.newton import NewtonPath, NewtonSettings, follow
 from palpate.mechanics.pattern import BlockPattern, Restriction, Stiffness, block_pattern, restriction
 from palpate.mechanics.solvers.contract import Factorisation
@@ -32,6 +34,7 @@ __all__ = ["FiniteStrainEquilibrium", "FiniteStrainModel", "finite_strain_model"
 Array = NDArray[np.float64]
 
 FACTORISATION_IN_SOLVES = 30  # right-hand sides that cost as much as a factorisation
+NEARLY_INCOMPRESSIBLE = 0.4999  # no coefficient leads Poisson's ratio beyond
 LACKING = 1e-2  # relative residual of a correction to derivatives of a like state
 REFINEMENTS = 12  # solutions with an old factorisation that an exact one takes
 
@@ -41,7 +44,8 @@ class FiniteStrainModel:
     """All meshed tissues of a body under one law, one constraint and given loads; implements `ForwardModel`.
 
     regions: indices in `space.mesh.tissues` of the meshed ones; element_region (n_tets,): place in `regions` of each
-    tetrahedron; poisson_ratios (n_regions,), dimensionless.
+    tetrahedron; poisson_ratios (n_regions,), dimensionless; material: how the tissues may differ from homogeneous ones.
+    Coefficients are those of the boundary modes, then of the material modes.
     """
 
     space: LagrangeSpace
@@ -54,6 +58,7 @@ class FiniteStrainModel:
     pattern: BlockPattern
     restriction: Restriction
     settings: NewtonSettings
+    material: MaterialModes = HOMOGENEOUS
 
     @property
     def n_regions(self) -> int:
@@ -62,8 +67,8 @@ class FiniteStrainModel:
 
     @property
     def n_modes(self) -> int:
-        """Number of boundary modes."""
-        return self.constraint.n_modes
+        """Number of boundary modes and material modes."""
+        return self.constraint.n_modes + self.material.n_modes
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -102,10 +107,11 @@ class FiniteStrainModel:
         It is then marked `converged` False, with the reason and the share of the motion that was reached.
         """
         checked, amounts = checked_moduli(moduli, self.names), checked_coefficients(coefficients, self.n_modes)
-        balance = self.balance(checked)
+        boundary = amounts[: self.constraint.n_modes]
+        balance = self.balance(checked, amounts[self.constraint.n_modes :])
         begin = np.zeros(3 * len(self.space.points)) if start is None else self._checked_start(start)
         free = self.constraint.free
-        given = self.constraint.modes @ amounts + self.constraint.offset
+        given = self.constraint.modes @ boundary + self.constraint.offset
         now = begin - np.asarray(free @ np.asarray(free.T @ begin))
         path = follow(balance, begin, given - now, settings=self.settings, nearby=nearby)
         if path.converged:  # what is prescribed is met to the last digit
@@ -113,8 +119,11 @@ class FiniteStrainModel:
         path.displacement.setflags(write=False)
         return FiniteStrainEquilibrium(self, balance, checked, amounts, path)
 
-    def balance(self, moduli: NDArray[np.float64]) -> TissueBalance:
-        """The forces at Young's moduli (n_regions,) kPa, as functions of the displacement."""
+    def balance(self, moduli: NDArray[np.float64], material: NDArray[np.float64] | None = None) -> TissueBalance:
+        """The forces at Young's moduli (n_regions,) kPa, as functions of the displacement.
+
+        material (n_material,): coefficients of the material modes, by default of homogeneous tissues.
+        """
         return TissueBalance(
             space=self.space,
             elements=self.elements,
@@ -124,17 +133,16 @@ class FiniteStrainModel:
             pattern=self.pattern,
             restriction=self.restriction,
             solver=self.settings.solver,
-            moduli=self.moduli_of(moduli),
+            moduli=self.moduli_of(moduli, material),
         )
 
-    def moduli_of(self, moduli: NDArray[np.float64]) -> Moduli:
-        """Lame's constants of every element at Young's moduli (n_regions,) kPa."""
-        return self._spread(moduli, [lame_parts(nu, self.elements.dilatation) for nu in self.poisson_ratios])
+    def moduli_of(self, moduli: NDArray[np.float64], material: NDArray[np.float64] | None = None) -> Moduli:
+        """Lame's constants of every element at Young's moduli (n_regions,) kPa and material coefficients."""
+        return self._spread(moduli, material, lame_parts)
 
-    def moduli_by_poisson(self, moduli: NDArray[np.float64]) -> Moduli:
-        """Derivatives of every element's Lame constants with respect to its nu, at moduli (n_regions,) kPa."""
-        slopes = [lame_parts_by_poisson(nu, self.elements.dilatation) for nu in self.poisson_ratios]
-        return self._spread(moduli, slopes)
+    def moduli_by_poisson(self, moduli: NDArray[np.float64], material: NDArray[np.float64] | None = None) -> Moduli:
+        """Derivatives of every element's Lame constants with respect to its nu, as `moduli_of`."""
+        return self._spread(moduli, material, lame_parts_by_poisson)
 
     def under(self, constraint: Constraint) -> FiniteStrainModel:
         """The same body with other modes and another offset of the same prescribed points.
@@ -153,8 +161,17 @@ class FiniteStrainModel:
         """The same body, its equilibria found to another `tolerance` of the forces (see `NewtonSettings`)."""
         return replace(self, settings=replace(self.settings, tolerance=tolerance))
 
-    def _spread(self, moduli: NDArray[np.float64], units: list[tuple[float, float, float]]) -> Moduli:
-        mu, pointwise, mean = (moduli[:, None] * np.array(units)).T[:, self.element_region]
+    def _spread(
+        self, moduli: Array, material: Array | None, of_ratio: Callable[[float, Dilatation], tuple[float, float, float]]
+    ) -> Moduli:
+        ratios = dict(zip(self.regions, self.poisson_ratios.tolist(), strict=True))
+        scale = np.ones(len(self.element_region))
+        if material is not None and self.material.n_modes:
+            scale = self.material.scale(material)
+            for tissue, by in self.material.poisson_shifts(material).items():
+                ratios[tissue] = min(ratios[tissue] + by, NEARLY_INCOMPRESSIBLE)
+        units = [of_ratio(ratio, self.elements.dilatation) for ratio in ratios.values()]
+        mu, pointwise, mean = scale * (moduli[:, None] * np.array(units)).T[:, self.element_region]
         return Moduli(mu, pointwise, mean)
 
     def _checked_start(self, start: Array) -> Array:
@@ -222,15 +239,15 @@ class FiniteStrainEquilibrium:
         return self.path.factorisation
 
     def error_estimate(
-        self, moduli: NDArray[np.float64], displacement: NDArray[np.float64]
+        self, moduli: NDArray[np.float64], coefficients: NDArray[np.float64], displacement: NDArray[np.float64]
     ) -> tuple[float, NDArray[np.float64]]:
-        """Estimated relative error in energy of a displacement (n_dof,) mm at other moduli (n_regions,) kPa.
+        """Estimated relative error in energy of a displacement (n_dof,) mm at other moduli and coefficients (n_modes,).
 
         It is that of one correction -K^-1 r (n_dof,) mm by the residual r, K the stiffness of this equilibrium, which
         comes with it: one right-hand side. Infinite where no factorisation of K is kept, and where an element is turned
         inside out, which no law answers.
         """
-        balance = self.model.balance(moduli)
+        balance = self.model.balance(moduli, coefficients[self.model.constraint.n_modes :])
         if self.factorisation is None or balance.smallest_volume(displacement) <= 0.0:
             return np.inf, np.zeros_like(displacement)
         residual = np.asarray(balance.free.T @ balance.residual(displacement)[0])
@@ -257,7 +274,8 @@ class FiniteStrainEquilibrium:
         loads = self._parameter_loads(stiffness)
         system = self._system(stiffness, loads.shape[1])
         result = np.asarray(self.balance.free @ system.solve(loads, tolerance=tolerance))
-        result[:, self.model.n_regions :] += self.model.constraint.modes
+        first = self.model.n_regions
+        result[:, first : first + self.model.constraint.n_modes] += self.model.constraint.modes
         return result
 
     def tangent_along(self, directions: NDArray[np.float64], guess: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -266,9 +284,11 @@ class FiniteStrainEquilibrium:
         guess (n_dof, k) mm: the same of a like state; what it lacks is found to a hundredth, without a factorisation.
         """
         stiffness, free = self._stiffness(), self.balance.free
-        by_modulus, by_mode = directions[: self.model.n_regions], directions[self.model.n_regions :]
+        ends = np.cumsum([self.model.n_regions, self.model.constraint.n_modes])
+        by_modulus, by_mode, by_material = np.split(directions, ends)
         prescribed = np.asarray(self.model.constraint.modes @ by_mode)
         forces = self.balance.region_forces(self.values, self.balance.moduli) @ by_modulus
+        forces += self._material_forces() @ by_material
         system, known = self._system(stiffness, 1), np.asarray(free.T @ guess)
         lacking = -np.asarray(free.T @ (forces + stiffness @ prescribed)) - system.matrix @ known
         return np.asarray(free @ (known + system.solve(lacking, tolerance=LACKING))) + prescribed
@@ -283,8 +303,8 @@ class FiniteStrainEquilibrium:
         """T^T g (n_regions + n_modes,) for g (n_dof,), by one adjoint solve; raises `NotConverged`."""
         stiffness = self._stiffness()
         dual = self._dual(stiffness, gradient)
-        result = np.asarray(self._parameter_loads(stiffness).T @ dual)
-        result[self.model.n_regions :] += self.model.constraint.modes.T @ gradient
+        result, first = np.asarray(self._parameter_loads(stiffness).T @ dual), self.model.n_regions
+        result[first : first + self.model.constraint.n_modes] += self.model.constraint.modes.T @ gradient
         return result
 
     def poisson_adjoint(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -316,14 +336,26 @@ class FiniteStrainEquilibrium:
         return self._system(stiffness, 1).transposed().solve(load[:, None])[:, 0]
 
     def _parameter_loads(self, stiffness: Stiffness) -> Array:
-        """-F^T [dR / d ln E_r, K M] (n_free, n_regions + n_modes), mN."""
+        """-F^T [dR / d ln E_r, K M, dR / dc_k] (n_free, n_regions + n_modes), mN."""
         forces = self.balance.region_forces(self.values, self.balance.moduli)
         moved = np.asarray(stiffness @ self.model.constraint.modes)
-        return -np.asarray(self.balance.free.T @ np.concatenate([forces, moved], axis=1))
+        both = np.concatenate([forces, moved, self._material_forces()], axis=1)
+        return -np.asarray(self.balance.free.T @ both)
+
+    def _material_forces(self) -> Array:
+        """DR / dc_k (n_dof, n_material), mN, by the coefficients of the material modes."""
+        model = self.model
+        if not model.material.n_modes:
+            return np.zeros((len(self.values), 0))
+        slopes = model.moduli_by_poisson(self.moduli, self.coefficients[model.constraint.n_modes :])
+        tissue = np.array(model.regions)[model.element_region]
+        return material_forces(
+            model.elements, model.material, self.values, self.balance.moduli, by_poisson=slopes, tissue=tissue
+        )
 
     def _poisson_forces(self) -> Array:
         """F^T dR / d nu_r (n_free, n_regions), mN."""
-        slopes = self.model.moduli_by_poisson(self.moduli)
+        slopes = self.model.moduli_by_poisson(self.moduli, self.coefficients[self.model.constraint.n_modes :])
         return np.asarray(self.balance.free.T @ self.balance.region_forces(self.values, slopes))
 
 
@@ -334,6 +366,7 @@ def finite_strain_model(
     *,
     dilatation: Dilatation = Dilatation.BLENDED,
     loads: tuple[Load, ...] = (),
+    material: MaterialModes = HOMOGENEOUS,
     settings: NewtonSettings | None = None,
 ) -> FiniteStrainModel:
     """The model of all meshed tissues of `space.mesh` under `law`, with their Poisson's ratios.
@@ -361,4 +394,5 @@ def finite_strain_model(
         pattern=pattern,
         restriction=restriction(constraint, pattern.assemble(blocks)),
         settings=settings or NewtonSettings(),
+        material=material,
     )

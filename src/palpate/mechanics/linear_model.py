@@ -17,11 +17,20 @@ from palpate.errors import ConfigurationError
 from palpate.mechanics.coarser import linear_displacements
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.forward import SolveCounts, checked_coefficients, checked_moduli
+from palpate.mechanics.hyperelastic import Elements, Moduli, elements_of
+from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.loads import Load
+from palpate.mechanics.material import HOMOGENEOUS, MaterialModes, material_forces
 from palpate.mechanics.rigid import rigid_modes
 from palpate.mechanics.solvers.contract import EXACT, Factorisation
 from palpate.mechanics.solvers.registry import factorise
-from palpate.mechanics.stiffness import stiffness_by_poisson, stiffness_parts, tissue_stiffness
+from palpate.mechanics.stiffness import (
+    lame_parts,
+    lame_parts_by_poisson,
+    stiffness_by_poisson,
+    stiffness_parts,
+    tissue_stiffness,
+)
 from palpate.mesh.constraint import Constraint
 from palpate.mesh.space import LagrangeSpace
 from palpate.parallel import mapped
@@ -36,6 +45,7 @@ __all__ = [
     "with_constraint",
 ]
 
+LINEAR = Linear()
 OF_ERROR = 1e-4  # relative residual of the solution that an error is made of
 FURTHER = 10  # right-hand sides a modulus, beside one for each mode: sensitivities, series
 
@@ -47,7 +57,9 @@ class LinearModel:
     regions: indices in `space.mesh.tissues` of the meshed ones, one for each of `stiffness_parts` where the Poisson's
     ratio is open (the moduli are then E times its `lame_parts`); per region at 1 kPa: stiffness K_r (n_dof, n_dof),
     free_stiffness F^T K_r F (n_free, n_free), coupling F^T K_r [M, o] (n_free, n_modes + 1), all mN/mm.
-    load (n_dof,) mN: the nodal forces f of all dead loads.
+    load (n_dof,) mN: the nodal forces f of all dead loads. material: how the tissues may differ from homogeneous ones,
+    to first order in its coefficients: u(E, q, c) = u(E, q) + sum_k c_k du/dc_k, coefficients being those of the
+    boundary modes, then c; weights: of each region (mu, lambda at the points, in the mean) at 1 kPa.
     """
 
     space: LagrangeSpace
@@ -58,6 +70,9 @@ class LinearModel:
     coupling: tuple[sparse.csr_matrix[np.float64], ...]
     solver: str
     load: NDArray[np.float64]
+    weights: tuple[tuple[float, float, float], ...]
+    elements: Elements | None = None
+    material: MaterialModes = HOMOGENEOUS
 
     @property
     def free_load(self) -> NDArray[np.float64]:
@@ -71,8 +86,8 @@ class LinearModel:
 
     @property
     def n_modes(self) -> int:
-        """Number of boundary modes."""
-        return self.constraint.n_modes
+        """Number of boundary modes and material modes."""
+        return self.constraint.n_modes + self.material.n_modes
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -120,16 +135,40 @@ class LinearModel:
     ) -> NDArray[np.float64]:
         """Loads (n_free, k), mN, whose responses are the free part of the tangent at an equilibrium u (n_dof,) mm.
 
-        directions (n_regions + n_modes, k) of (ln E, q), by default each of them alone; moduli (n_regions,) kPa.
+        directions (n_regions + n_modes, k) of (ln E, q, c), by default each of them alone; moduli (n_regions,) kPa.
         """
-        pairs = zip(moduli, self.stiffness, strict=True)
-        forces = [
-            modulus * np.asarray(self.constraint.free.T @ np.asarray(matrix @ values)) for modulus, matrix in pairs
-        ]
+        n = self.n_regions + self.constraint.n_modes
+        of_boundary, of_material = (None, None) if directions is None else np.split(directions, [n])
+        boundary = self.boundary_loads(moduli, values, of_boundary)
+        material = -np.asarray(self.constraint.free.T @ self.material_forces(moduli, values))
+        if of_material is None:
+            return np.concatenate([boundary, material], axis=1)
+        return np.asarray(boundary + material @ of_material)
+
+    def boundary_loads(
+        self, moduli: NDArray[np.float64], values: NDArray[np.float64], directions: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """Those loads (n_free, k), mN, by moduli and boundary modes alone; directions (n_regions + n_boundary, k)."""
+        pairs, free = zip(moduli, self.stiffness, strict=True), self.constraint.free
+        forces = [modulus * np.asarray(free.T @ np.asarray(matrix @ values)) for modulus, matrix in pairs]
         by_modulus, by_mode = np.stack(forces, axis=1), weighted_sum(moduli, self.coupling)[:, :-1]
         if directions is None:
             return -np.concatenate([by_modulus, by_mode.toarray()], axis=1)
         return -np.asarray(by_modulus @ directions[: self.n_regions] + by_mode @ directions[self.n_regions :])
+
+    def material_forces(self, moduli: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivatives (n_dof, n_material), mN, of the nodal forces at u (n_dof,) mm by the material coefficients."""
+        if self.elements is None:
+            return np.zeros((len(values), 0))
+        tissue, dilatation = self.space.mesh.region, self.elements.dilatation
+        lame, slopes = (np.zeros((3, len(tissue))) for _ in range(2))
+        for modulus, region, weight in zip(moduli, self.regions, self.weights, strict=True):
+            own, ratio = tissue == region, self.space.mesh.tissues[region].poisson_ratio
+            lame[:, own] += modulus * np.array(weight)[:, None]
+            slopes[:, own] = modulus * np.array(lame_parts_by_poisson(ratio, dilatation))[:, None]
+        return material_forces(
+            self.elements, self.material, values, Moduli(*lame), by_poisson=Moduli(*slopes), tissue=tissue
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,10 +182,10 @@ class LinearSystem:
     @property
     def response_counts(self) -> SolveCounts:
         """What this system and one call of `responses` cost together."""
-        return SolveCounts(forward=self.model.n_modes + 1, factorisations=1)
+        return SolveCounts(forward=self.model.constraint.n_modes + 1, factorisations=1)
 
     def responses(self, *, tolerance: float = EXACT) -> NDArray[np.float64]:
-        """Displacement (n_dof, n_modes + 1) mm for each unit mode alone and, last, for the offset and the loads.
+        """Displacement (n_dof, n_boundary + 1) mm for each boundary mode alone and, last, for offset and loads.
 
         tolerance: of the forces out of balance, relative.
         """
@@ -174,13 +213,27 @@ class LinearSystem:
         solution = free @ self.factorisation.solve(-np.concatenate(forces, axis=1), tolerance=tolerance)
         return np.stack(np.split(np.asarray(solution), len(chosen), axis=1))
 
+    def material_responses(
+        self, values: NDArray[np.float64], directions: NDArray[np.float64] | None = None, *, tolerance: float = EXACT
+    ) -> NDArray[np.float64]:
+        """Derivatives du / dc_k (n_dof, n_material) mm at an equilibrium u (n_dof,) mm of homogeneous tissues.
+
+        directions (n_material, k): sums of them instead; tolerance: of the relative residual.
+        """
+        free, forces = self.model.constraint.free, self.model.material_forces(self.moduli, values)
+        loads = np.asarray(free.T @ (forces if directions is None else forces @ directions))
+        return np.asarray(free @ self.factorisation.solve(-loads, tolerance=tolerance))
+
     def solve(self, coefficients: NDArray[np.float64]) -> LinearEquilibrium:
-        """Equilibrium at mode coefficients (n_modes,), dimensionless; one right-hand side."""
+        """Equilibrium at coefficients (n_modes,), dimensionless: one right-hand side, or two with material modes."""
         checked = checked_coefficients(coefficients, self.model.n_modes)
         constraint = self.model.constraint
-        loads = weighted_sum(self.moduli, self.model.coupling) @ np.append(checked, 1.0) - self.model.free_load
-        given = constraint.modes @ checked + constraint.offset
+        boundary, material = np.split(checked, [constraint.n_modes])
+        loads = weighted_sum(self.moduli, self.model.coupling) @ np.append(boundary, 1.0) - self.model.free_load
+        given = constraint.modes @ boundary + constraint.offset
         values = given - constraint.free @ self.factorisation.solve(loads[:, None])[:, 0]
+        if np.any(material):
+            values = values + self.material_responses(values, material[:, None])[:, 0]
         values.setflags(write=False)
         return LinearEquilibrium(self, checked, values)
 
@@ -235,7 +288,8 @@ class LinearEquilibrium:
         constraint = self.system.model.constraint
         solution = self.system.factorisation.solve(self.system.model.tangent_loads(self.system.moduli, self.values))
         tangent = np.asarray(constraint.free @ solution)
-        tangent[:, self.system.model.n_regions :] += constraint.modes
+        first = self.system.model.n_regions
+        tangent[:, first : first + constraint.n_modes] += constraint.modes
         return tangent
 
     def adjoint(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -244,7 +298,8 @@ class LinearEquilibrium:
         load = np.asarray(constraint.free.T @ gradient)
         adjoint = self.system.factorisation.solve(load[:, None])[:, 0]
         result = np.asarray(self.system.model.tangent_loads(self.system.moduli, self.values).T @ adjoint)
-        result[self.system.model.n_regions :] += constraint.modes.T @ gradient
+        first = self.system.model.n_regions
+        result[first : first + constraint.n_modes] += constraint.modes.T @ gradient
         return result
 
 
@@ -274,6 +329,7 @@ def linear_model(
     dilatation: Dilatation = Dilatation.POINTWISE,
     loads: tuple[Load, ...] = (),
     open_poisson: tuple[str, ...] = (),
+    material: MaterialModes = HOMOGENEOUS,
 ) -> LinearModel:
     """Assemble the linear model of all meshed tissues of `space.mesh`, with their Poisson's ratios.
 
@@ -281,8 +337,9 @@ def linear_model(
 
     solver: a name of `palpate.mechanics.solvers.registry.SOLVERS` or "auto"; dilatation: that of the element, as
     `choose_element` gives it; open_poisson: names of tissues whose Poisson's ratio the moduli say, which have one
-    modulus (kPa) for each part of their stiffness, see `LinearModel`. Raises `ConfigurationError` when the constraint
-    is of another space, `GeometryError` for tetrahedra without positive volume.
+    modulus (kPa) for each part of their stiffness, see `LinearModel`; material: how tissues may differ from homogeneous
+    ones. Raises `ConfigurationError` when the constraint is of another space, `GeometryError` for tetrahedra without
+    positive volume.
     """
     n_dof = 3 * len(space.points)
     if constraint.free.shape[0] != n_dof or len(constraint.modes) != n_dof or len(constraint.offset) != n_dof:
@@ -291,20 +348,29 @@ def linear_model(
         )
     tissues = space.mesh.tissues
 
-    def assembled(region: int) -> list[tuple[int, sparse.csr_matrix[np.float64], sparse.csr_matrix[np.float64]]]:
-        """The region with K_r and F^T K_r F of one tissue, or of each part of it."""
-        matrices = [tissue_stiffness(space, region, tissues[region].poisson_ratio, dilatation=dilatation)]
-        if tissues[region].name in open_poisson:
-            matrices = [part for part in stiffness_parts(space, region, dilatation) if part is not None]
-        free = constraint.free
-        return [(region, part, sparse.csr_matrix(sparse.csr_matrix(free.T @ part) @ free)) for part in matrices]
+    Assembled = tuple[int, tuple[float, float, float], sparse.csr_matrix[np.float64], sparse.csr_matrix[np.float64]]
+
+    def assembled(region: int) -> list[Assembled]:
+        """The region with its weights, K_r and F^T K_r F of one tissue, or of each part of it."""
+        tissue, free = tissues[region], constraint.free
+        if tissue.name in open_poisson:
+            units = [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]
+            every = zip(units, stiffness_parts(space, region, dilatation), strict=True)
+            parts = [(weights, part) for weights, part in every if part is not None]
+        else:
+            whole = tissue_stiffness(space, region, tissue.poisson_ratio, dilatation=dilatation)
+            parts = [(lame_parts(tissue.poisson_ratio, dilatation), whole)]
+        return [(region, w, k, sparse.csr_matrix(sparse.csr_matrix(free.T @ k) @ free)) for w, k in parts]
 
     meshed = [number for number, tissue in enumerate(tissues) if tissue.meshed]
     parts = [part for of_tissue in mapped(assembled, meshed) for part in of_tissue]
-    regions, stiffness, free_stiffness = zip(*parts, strict=True)
+    regions, weights, stiffness, free_stiffness = zip(*parts, strict=True)
     still = np.zeros_like(space.points)
     load = sum((part.forces(still) for part in loads), np.zeros(n_dof))
-    model = LinearModel(space, constraint, regions, stiffness, free_stiffness, (), solver, load)
+    elements = elements_of(space, LINEAR, dilatation) if material.n_modes else None
+    model = LinearModel(
+        space, constraint, regions, stiffness, free_stiffness, (), solver, load, weights, elements, material
+    )
     return with_constraint(model, constraint)
 
 

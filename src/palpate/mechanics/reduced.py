@@ -37,8 +37,9 @@ ROWS = 4096  # of them, made orthogonal at once
 class ReducedModel:
     """A linear model on m basis vectors; implements `ForwardModel`.
 
-    Per region at 1 kPa: stiffness (n_regions, m, m) and coupling (n_regions, m, n_modes + 1), mN/mm; load (m,) mN.
-    Outputs (rows): output_basis (n_outputs, m), output_modes (n_outputs, n_modes) and output_offset (n_outputs,), mm.
+    Per region at 1 kPa: stiffness (n_regions, m, m) and coupling (n_regions, m, n_boundary + 1), mN/mm; load (m,) mN.
+    Outputs (rows): output_basis (n_outputs, m), output_modes (n_outputs, n_boundary), output_offset (n_outputs,) and
+    output_material (n_outputs, n_material), mm: the responses du/dc_k to the material modes, held as they are.
     """
 
     names: tuple[str, ...]
@@ -48,6 +49,7 @@ class ReducedModel:
     output_basis: NDArray[np.float64]
     output_modes: NDArray[np.float64]
     output_offset: NDArray[np.float64]
+    output_material: NDArray[np.float64]
 
     @property
     def n_regions(self) -> int:
@@ -56,6 +58,11 @@ class ReducedModel:
 
     @property
     def n_modes(self) -> int:
+        """Number of boundary modes and material modes."""
+        return self.n_boundary + int(self.output_material.shape[1])
+
+    @property
+    def n_boundary(self) -> int:
         """Number of boundary modes."""
         return int(self.coupling.shape[2]) - 1
 
@@ -66,8 +73,13 @@ class ReducedModel:
 
     def at(self, dofs: NDArray[np.int64]) -> ReducedModel:
         """The same model with the outputs `dofs` (n,) only, by their place among the present outputs."""
-        basis, modes, offset = self.output_basis[dofs], self.output_modes[dofs], self.output_offset[dofs]
-        return replace(self, output_basis=basis, output_modes=modes, output_offset=offset)
+        return replace(
+            self,
+            output_basis=self.output_basis[dofs],
+            output_modes=self.output_modes[dofs],
+            output_offset=self.output_offset[dofs],
+            output_material=self.output_material[dofs],
+        )
 
     def through(self, operator: sparse.csr_matrix[np.float64]) -> ReducedModel:
         """The same model with the outputs H u for an operator H (n, n_outputs), such as a surface interpolation."""
@@ -76,6 +88,7 @@ class ReducedModel:
             output_basis=np.asarray(operator @ self.output_basis),
             output_modes=np.asarray(operator @ self.output_modes),
             output_offset=np.asarray(operator @ self.output_offset),
+            output_material=np.asarray(operator @ self.output_material),
         )
 
     def system(self, moduli: NDArray[np.float64]) -> ReducedSystem:
@@ -95,7 +108,7 @@ class ReducedModel:
         return self.system(moduli).solve(coefficients)
 
     def amplitude(self, moduli: NDArray[np.float64], given: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Basis coefficients (m,) alone, at moduli (n_regions,) kPa and [q, 1] (n_modes + 1,); raises `SolverError`.
+        """Basis coefficients (m,) alone, at moduli (n_regions,) kPa and [q, 1] (n_boundary + 1,); raises `SolverError`.
 
         Nothing is checked: it is the fast way of those who ask ten thousands of times.
         """
@@ -122,7 +135,7 @@ class ReducedModel:
 class ReducedSystem:
     """A reduced model at fixed moduli (n_regions,) kPa.
 
-    factor (m, m): lower Cholesky factor; amplitudes (m, n_modes + 1): basis coefficients of every unit response.
+    factor (m, m): lower Cholesky factor; amplitudes (m, n_boundary + 1): basis coefficients of every unit response.
     """
 
     model: ReducedModel
@@ -138,10 +151,11 @@ class ReducedSystem:
 
     def solve(self, coefficients: NDArray[np.float64]) -> ReducedEquilibrium:
         """Equilibrium at mode coefficients (n_modes,), dimensionless: no further solve."""
-        checked = checked_coefficients(coefficients, self.model.n_modes)
-        amplitude = self.amplitudes @ np.append(checked, 1.0)
-        given = self.model.output_modes @ checked + self.model.output_offset
-        values = given + self.model.output_basis @ amplitude
+        checked, model = checked_coefficients(coefficients, self.model.n_modes), self.model
+        boundary, material = np.split(checked, [model.n_boundary])
+        amplitude = self.amplitudes @ np.append(boundary, 1.0)
+        given = model.output_modes @ boundary + model.output_offset + model.output_material @ material
+        values = given + model.output_basis @ amplitude
         values.setflags(write=False)
         return ReducedEquilibrium(self, checked, amplitude, values)
 
@@ -166,7 +180,7 @@ class ReducedEquilibrium(DenseEquilibrium):
         amplitudes = np.concatenate([by_modulus, system.amplitudes[:, :-1]], axis=1)
         tangent = model.output_basis @ amplitudes
         tangent[:, model.n_regions :] += model.output_modes
-        return np.asarray(tangent)
+        return np.concatenate([tangent, model.output_material], axis=1)
 
     def adjoint(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
         """T^T g (n_regions + n_modes,) for g (n_outputs,), by one dense adjoint solve."""
@@ -175,12 +189,13 @@ class ReducedEquilibrium(DenseEquilibrium):
         adjoint = self.system.backward(reduced[:, None])[:, 0]
         by_modulus = -self._modulus_forces().T @ adjoint
         by_mode = self.system.amplitudes[:, :-1].T @ reduced + model.output_modes.T @ gradient
-        return np.concatenate([by_modulus, by_mode])
+        return np.concatenate([by_modulus, by_mode, model.output_material.T @ gradient])
 
     def _modulus_forces(self) -> NDArray[np.float64]:
         """E_r (A_r a + B_r [q, 1]), (m, n_regions) mN."""
         model = self.system.model
-        forces = model.stiffness @ self.amplitude + model.coupling @ np.append(self.coefficients, 1.0)
+        forces = model.stiffness @ self.amplitude
+        forces += model.coupling @ np.append(self.coefficients[: model.n_boundary], 1.0)
         return np.asarray((self.system.moduli[:, None] * forces).T)
 
 
@@ -229,6 +244,10 @@ class Projection:
         modes, offset = constraint.modes, constraint.offset
         return Projection(model, replace(self.reduced, coupling=coupling, output_modes=modes, output_offset=offset))
 
+    def with_material(self, responses: NDArray[np.float64]) -> Projection:
+        """The projection with responses du/dc_k (n_dof, n_material) mm to the material modes."""
+        return replace(self, reduced=replace(self.reduced, output_material=responses))
+
     def _complement(self, snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
         """Orthonormal columns (n_free, m) that span what the snapshots (n_free, k) add to the present vectors."""
         lengths = np.linalg.norm(snapshots, axis=0)
@@ -251,7 +270,8 @@ def projection(model: LinearModel, snapshots: NDArray[np.float64]) -> Projection
     stiffness = np.stack([_products(matrix, vectors) for matrix in model.free_stiffness])
     load, coupling = np.asarray(vectors.T @ model.free_load), _coupling(model, vectors)
     outputs, constraint = np.asarray(model.constraint.free @ vectors), model.constraint
-    reduced = ReducedModel(model.names, stiffness, coupling, load, outputs, constraint.modes, constraint.offset)
+    none = np.zeros((len(outputs), model.material.n_modes))
+    reduced = ReducedModel(model.names, stiffness, coupling, load, outputs, constraint.modes, constraint.offset, none)
     return Projection(model, reduced)
 
 

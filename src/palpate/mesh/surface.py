@@ -8,9 +8,10 @@ import igl
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.mesh.tet_mesh import FACES, TetMesh
+from palpate.images.tissue import Role
+from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh
 
-__all__ = ["Surface", "mean_curvature", "tissue_surface", "triangle_normals", "vertex_normals"]
+__all__ = ["Surface", "cut_faces", "mean_curvature", "tissue_surface", "triangle_normals", "vertex_normals"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +51,14 @@ def tissue_surface(mesh: TetMesh, tissue: int) -> Surface:
     other = _look_up(keys[count == 1], _keys(rest, mesh), regions)
     on_boundary = _look_up(keys[count == 1], _keys(mesh.boundary, mesh), mesh.beyond)
     return Surface(triangles, np.where(other == MISSING, on_boundary, other))
+
+
+def cut_faces(mesh: TetMesh) -> NDArray[np.int64]:
+    """Triangles (n_faces, 3) where the image's border cuts a `known` tissue; normals point out of the body."""
+    known = [number for number, tissue in enumerate(mesh.tissues) if tissue.role is Role.KNOWN]
+    surfaces = [tissue_surface(mesh, number) for number in known]
+    cuts = [surface.triangles[surface.other == OUTER] for surface in surfaces]
+    return np.concatenate([np.zeros((0, 3), dtype=np.int64), *cuts])
 
 
 def triangle_normals(points: NDArray[np.float64], triangles: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""What the images prescribe: the driver wall's modes, and the measured motion of the bones."""
+"""What the images prescribe: the modes of drivers' walls and of the frame, and the measured motion of the bones."""
 
 from __future__ import annotations
 
@@ -10,30 +10,58 @@ from numpy.typing import NDArray
 
 from palpate.images.alignment import RigidMotion
 from palpate.images.tissue import Role
+from palpate.mesh.gaussian_process import karhunen_loeve
 from palpate.mesh.space import LagrangeSpace
-from palpate.mesh.surface import tissue_surface, triangle_normals
+from palpate.mesh.surface import cut_faces, tissue_surface, triangle_normals
 from palpate.observation.wall_modes import Wall, wall_modes, wall_of
 
-__all__ = ["PrescribedMotion", "prescribed_motion"]
+__all__ = ["FrameMotion", "PrescribedMotion", "prescribed_motion"]
+
+FRAME_SHARE, FRAME_MODES = 0.99, 60  # of the frame's variance that its scalar modes hold; their largest number
 
 
 @dataclass(frozen=True, slots=True)
 class PrescribedMotion:
     """Displacement `modes q + offset` of the marked points.
 
-    modes (3 n_points, n_modes) mm, offset (3 n_points,) mm, prescribed (n_points,); `walls`: what the modes move.
+    modes (3 n_points, n_modes) mm, offset (3 n_points,) mm, prescribed (n_points,); `walls`: what the first modes move;
+    after theirs come n_smooth and n_rigid modes of the frame.
     """
 
     modes: NDArray[np.float64]
     offset: NDArray[np.float64]
     prescribed: NDArray[np.bool_]
     walls: tuple[Wall, ...] = ()
+    n_smooth: int = 0
+    n_rigid: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class FrameMotion:
+    """How the frame, the body's faces on the cut of the image, may move.
+
+    motion_mm: standard deviation of each component of a smooth motion with a Gaussian kernel of kernel_mm;
+    translation_mm, rotation_deg: those of its rigid motion along and about each axis.
+    """
+
+    motion_mm: float
+    kernel_mm: float
+    translation_mm: float = 10.0
+    rotation_deg: float = 5.0
 
 
 def prescribed_motion(
-    space: LagrangeSpace, bones: Mapping[int, RigidMotion], *, n_modes: int, kernel_mm: float, prior_mm: float
+    space: LagrangeSpace,
+    bones: Mapping[int, RigidMotion],
+    *,
+    n_modes: int,
+    kernel_mm: float,
+    prior_mm: float,
+    frame: FrameMotion | None = None,
 ) -> PrescribedMotion:
     """Modes of every driver's wall and the offset of every rigid tissue (by index in `bones`; held where absent).
+
+    With a `frame` the points on the image's cut that neither a wall nor a bone moves follow modes of their own.
 
     A point that a driver and a bone share follows the bone. Each driver has its own `n_modes` modes (see
     `wall_modes` for kernel_mm and prior_mm, mm).
@@ -67,5 +95,32 @@ def prescribed_motion(
             name = space.mesh.tissues[tissue].name
             walls.append(wall_of(space.points[points], normals, local, columns, name=name, **own))
         prescribed[points] = True
+    n_smooth = n_rigid = 0
+    if frame is not None:
+        points = np.unique(space.facets(cut_faces(space.mesh)))
+        points = points[~prescribed[points]]
+        smooth, rigid = _frame_modes(space.points[points], frame)
+        for local in (smooth, rigid):
+            block = np.zeros((n, 3, local.shape[1]))
+            block[points] = local.reshape(len(points), 3, -1)
+            blocks.append(block.reshape(3 * n, -1))
+        n_smooth, n_rigid = smooth.shape[1], rigid.shape[1]
+        prescribed[points] = True
     modes = np.concatenate(blocks, axis=1) if blocks else np.zeros((3 * n, 0))
-    return PrescribedMotion(modes, offset.ravel(), prescribed, tuple(walls))
+    return PrescribedMotion(modes, offset.ravel(), prescribed, tuple(walls), n_smooth, n_rigid)
+
+
+def _frame_modes(points: NDArray[np.float64], frame: FrameMotion) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Smooth modes (3 n_points, k) mm and rigid ones (3 n_points, 6) mm of the frame's points (n_points, 3) mm.
+
+    What the smooth ones leave out is so short that it does not reach into the body (Saint-Venant). Rotations are about
+    the points' mean, to first order: images are aligned before.
+    """
+    if not len(points):
+        return np.zeros((0, 0)), np.zeros((0, 0))
+    weights = np.ones(len(points))
+    scalar = karhunen_loeve(points, weights, kernel_mm=frame.kernel_mm, share=FRAME_SHARE, most=FRAME_MODES)
+    arms, turn = points - points.mean(axis=0), np.deg2rad(frame.rotation_deg)
+    rotations = [turn * np.cross(axis, arms).ravel() for axis in np.eye(3)]
+    translations = [frame.translation_mm * np.tile(axis, len(points)) for axis in np.eye(3)]
+    return np.asarray(frame.motion_mm * np.kron(scalar, np.eye(3))), np.stack(translations + rotations, axis=1)

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from palpate.mesh.gaussian_process import kernel_factor
 from palpate.mesh.surface import vertex_normals
 from palpate.observation.contract import Residuals
 from palpate.observation.observed_surface import ObservedSurface
-from palpate.observation.wall_modes import kernel_factor
 
 __all__ = ["wall_correction"]
 

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Wall", "kernel_factor", "wall_modes", "wall_of"]
+from palpate.mesh.gaussian_process import RANK_TOLERANCE, kernel_factor
 
-RANK_TOLERANCE = 1e-12
+__all__ = ["Wall", "wall_modes", "wall_of"]
+
 DRIFT_LENGTHS = (1.0, 2.0, 4.0)  # times the modes' own kernel, which they cannot go below
 SWELLING_LENGTHS = (1.0, 2.0)
 
@@ -76,21 +77,3 @@ def wall_modes(points: NDArray[np.float64], *, n_modes: int, kernel_mm: float, p
     keep = min(n_modes // 3, int(np.count_nonzero(scale > RANK_TOLERANCE * scale.max(initial=0.0))))
     scalar = prior_mm * left[:, :keep] * scale[:keep]
     return np.asarray(np.kron(scalar, np.eye(3)))
-
-
-def kernel_factor(points: NDArray[np.float64], kernel_mm: float, rank: int) -> NDArray[np.float64]:
-    """Factor L (n_points, rank) with L L^T close to exp(-|x - y|^2 / (2 kernel^2)) at points (n_points, 3) mm.
-
-    Pivoted Cholesky decomposition, stopped at `rank` or at rounding; Harbrecht, Peters & Schneider 2012, Algorithm 1.
-    """
-    left = np.ones(len(points))
-    factor = np.zeros((len(points), rank))
-    for k in range(rank):
-        pivot = int(np.argmax(left))
-        if left[pivot] < RANK_TOLERANCE:
-            return factor[:, :k]
-        distance2 = np.sum((points - points[pivot]) ** 2, axis=1)
-        column = np.exp(-distance2 / (2.0 * kernel_mm**2)) - factor[:, :k] @ factor[pivot, :k]
-        factor[:, k] = column / np.sqrt(left[pivot])
-        left = np.maximum(left - factor[:, k] ** 2, 0.0)
-    return factor

@@ -14,20 +14,30 @@ from palpate.images.checks import check_images, later_names
 from palpate.images.distance import observation_width
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
-from palpate.inversion import InverseProblem, LaterState, parameter_map, unit_blocks, wall_block
+from palpate.inversion import (
+    Block,
+    InverseProblem,
+    LaterState,
+    frame_blocks,
+    material_blocks,
+    offset_block,
+    parameter_map,
+    unit_blocks,
+    wall_block,
+)
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_model
 from palpate.mechanics.linear_model import LinearModel, linear_model, with_constraint
+from palpate.mechanics.material import MaterialModes, material_modes
 from palpate.mechanics.newton import NewtonSettings
 from palpate.mesh.quality import MeshQuality
 from palpate.mesh.space import LagrangeSpace, lagrange_space
-from palpate.observation.contract import ImagedBody
+from palpate.observation.contract import ImagedBody, Observation
 from palpate.observation.noise_model import NoiseModel
-from palpate.observation.prescribed_motion import prescribed_motion
+from palpate.observation.prescribed_motion import FrameMotion, PrescribedMotion, prescribed_motion
 from palpate.observation.registry import observations
-from palpate.observation.wall_modes import Wall
 from palpate.progress import Progress, silent
 from palpate.study.case import Case
 from palpate.study.case_loads import case_loads
@@ -196,9 +206,7 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
     progress("assembling one stiffness matrix a tissue")
     pairs = [pair for body in bodies for pair in _models(body, case)]
     models = tuple(model for model, _ in pairs)
-    learned = case.driver.learn_prior
-    blocks = [wall_block(wall, s, learned=learned) for s, (_, walls) in enumerate(pairs) for wall in walls]
-    if not case.loads and not any(model.n_modes or model.constraint.offset.any() for model in models):
+    if not case.loads and not any(motion.walls or model.constraint.offset.any() for model, motion in pairs):
         raise ConfigurationError(  # at rest every modulus explains the images equally badly
             'nothing moves this body: no tissue has role = "driver" and no `rigid` tissue moves between the images, so'
             " no modulus can be estimated; give the role driver to the hollow organ whose wall deforms the others"
@@ -211,12 +219,38 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
     parameters = parameter_map(
         bodies[0].space.mesh.tissues,
         models[0].regions,
-        blocks or unit_blocks(*(0 for _ in models)),
+        _blocks(case, pairs, seen),
         loaded=bool(case.loads),
         open_poisson=_open_poisson(case, bodies[0]),
         dilatation=choose_element(case.mechanics.element).dilatation,
     )
     return InverseProblem(states, with_stated_priors(parameters, case))
+
+
+def _blocks(
+    case: Case,
+    pairs: Sequence[tuple[LinearModel, PrescribedMotion]],
+    seen: Sequence[tuple[int, tuple[Observation, ...]]],
+) -> tuple[Block, ...]:
+    """All that is unknown beside the moduli: of each later state its motion and its drawing, then the material."""
+    blocks = list[Block]()
+    for s, ((_, motion), (_, observed)) in enumerate(zip(pairs, seen, strict=True)):
+        blocks += [wall_block(wall, s, learned=case.driver.learn_prior) for wall in motion.walls]
+        blocks += frame_blocks(motion, s)
+        if case.discrepancy.surface_offset_mm:
+            blocks += [offset_block(observation, s, sd=case.discrepancy.surface_offset_mm) for observation in observed]
+    references = [reference for reference, _ in seen]
+    for reference in dict.fromkeys(references):
+        states = tuple(s for s, own in enumerate(references) if own == reference)
+        model = pairs[states[0]][0]
+        blocks += material_blocks(
+            model.material,
+            model.space.mesh.tissues,
+            states,
+            heterogeneity_sd=case.discrepancy.heterogeneity_sd,
+            poisson_sd=case.discrepancy.poisson_sd,
+        )
+    return tuple(blocks) or unit_blocks(*(0 for _ in pairs))
 
 
 def _open_poisson(case: Case, body: Body) -> tuple[str, ...]:
@@ -233,9 +267,11 @@ def stated_noise(case: Case) -> NoiseModel | None:
     return NoiseModel(np.array([2.0 * case.noise.surface_sd_mm**2]), np.array([length]))
 
 
-def _models(body: Body, case: Case) -> list[tuple[LinearModel, tuple[Wall, ...]]]:
-    """One model a later image, and its drivers' walls; they share the stiffness and differ in the bones' motion."""
-    models: list[tuple[LinearModel, tuple[Wall, ...]]] = []
+def _models(body: Body, case: Case) -> list[tuple[LinearModel, PrescribedMotion]]:
+    """One model a later image, and what is prescribed; they share the stiffness and differ in the bones' motion."""
+    models: list[tuple[LinearModel, PrescribedMotion]] = []
+    moving, domain = case.domain.outer_boundary == "moving", case.domain
+    frame = FrameMotion(domain.outer_motion_mm, domain.outer_kernel_mm) if moving else None
     dilatation, loads = choose_element(case.mechanics.element).dilatation, case_loads(case, body.space)
     for bones in body.states.bones:
         motion = prescribed_motion(
@@ -244,6 +280,7 @@ def _models(body: Body, case: Case) -> list[tuple[LinearModel, tuple[Wall, ...]]
             n_modes=case.driver.modes,
             kernel_mm=case.driver.kernel_mm,
             prior_mm=case.driver.prior_mm,
+            frame=frame,
         )
         constraint = outer_constraint(
             body.space,
@@ -262,10 +299,23 @@ def _models(body: Body, case: Case) -> list[tuple[LinearModel, tuple[Wall, ...]]
                 loads=loads,
                 solver=case.mechanics.solver,
                 open_poisson=_open_poisson(case, body),
+                material=_material(body, case),
             )
         )
-        models.append((made, motion.walls))
+        models.append((made, motion))
     return models
+
+
+def _material(body: Body, case: Case) -> MaterialModes:
+    """How the tissues of a body may differ from homogeneous ones with the Poisson's ratios that the case gives."""
+    mesh, sought = body.space.mesh, _open_poisson(case, body)
+    meshed = [i for i, tissue in enumerate(mesh.tissues) if tissue.meshed]
+    return material_modes(
+        mesh,
+        meshed if case.discrepancy.heterogeneity_sd else (),
+        length_mm=case.discrepancy.heterogeneity_length_mm,
+        poisson=[i for i in meshed if mesh.tissues[i].name not in sought] if case.discrepancy.poisson_sd else (),
+    )
 
 
 def _finite_strain(models: tuple[LinearModel, ...], case: Case) -> Sequence[FiniteStrainModel | None]:
@@ -282,6 +332,10 @@ def _finite_strain(models: tuple[LinearModel, ...], case: Case) -> Sequence[Fini
         if like:
             found.append(like.under(constraint))
             continue
-        loads = case_loads(case, space)
-        found.append(finite_strain_model(space, constraint, law, dilatation=dilatation, loads=loads, settings=settings))
+        loads, material = case_loads(case, space), model.material
+        found.append(
+            finite_strain_model(
+                space, constraint, law, dilatation=dilatation, loads=loads, material=material, settings=settings
+            )
+        )
     return found

@@ -20,6 +20,7 @@ __all__ = [
     "Case",
     "CaseLoad",
     "CaseTissue",
+    "Discrepancy",
     "Domain",
     "DriverMotion",
     "Estimate",
@@ -114,11 +115,32 @@ class Pair:
 
 @dataclass(frozen=True, slots=True)
 class Domain:
-    """What is meshed, and how its outer border is held."""
+    """What is meshed, and how its outer border is held.
+
+    `outer_boundary` "moving": the border's motion is an unknown, `outer_motion_mm` the prior standard deviation of each
+    component of its smooth part, with a Gaussian kernel of `outer_kernel_mm`; the images say how much of it there is.
+    """
 
     extent: str = field(default="image", metadata=rule(choices=("image", "margin")))
     margin_mm: float = field(default=40.0, metadata=rule(between=(0.1, 1e4)))
-    outer_boundary: str = field(default="fixed", metadata=rule(choices=("fixed", "sliding", "free")))
+    outer_boundary: str = field(default="moving", metadata=rule(choices=("moving", "fixed", "sliding", "free")))
+    outer_motion_mm: float = field(default=1.5, metadata=rule(between=(1e-3, 100.0)))
+    outer_kernel_mm: float = field(default=60.0, metadata=rule(between=(1.0, 1e4)))
+
+
+@dataclass(frozen=True, slots=True)
+class Discrepancy:
+    """What the model leaves out, as unknowns with these prior standard deviations; 0 leaves one out.
+
+    heterogeneity_sd: of ln E inside each tissue, the scale of the prior of the amplitude, which the images tell, never
+    below a third of it, with a Gaussian kernel of heterogeneity_length_mm; poisson_sd: of each Poisson's ratio that is
+    given; surface_offset_mm: of how much larger each surface, and each driver's wall, is drawn in each later image.
+    """
+
+    heterogeneity_sd: float = field(default=0.3, metadata=rule(between=(0.0, 3.0)))
+    heterogeneity_length_mm: float = field(default=25.0, metadata=rule(between=(1.0, 1e3)))
+    poisson_sd: float = field(default=0.02, metadata=rule(between=(0.0, 0.2)))
+    surface_offset_mm: float = field(default=0.5, metadata=rule(between=(0.0, 100.0)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -368,6 +390,7 @@ class Case:
     mesh: MeshSettings = MeshSettings()
     driver: DriverMotion = DriverMotion()
     noise: Noise = Noise()
+    discrepancy: Discrepancy = Discrepancy()
     estimate: Estimate = Estimate()
     overrides: tuple[str, ...] = field(default=(), compare=False, metadata={"rule": Rule(unwritten=True)})
 

@@ -42,8 +42,9 @@ GAP = 1.0  # of log-likelihood, that the frozen posterior may be off; re-chosen 
 class FrozenPosterior:
     """Minus log-posterior 1/2 sum_s z_s^T Q_s z_s + 1/2 (x - m)^T P (x - m), dimensionless, of unknowns x (n,).
 
-    z_s = [a, q, 1] of each state s: amplitudes a (m,) of its reduced model `models[s]` and mode coefficients q; of a
-    `CurvedModel`, whose expansion adds to that, [a, q, ln E - ln E_0, 1]. forms: Q_s (k, k); prior: P (n, n).
+    z_s = [a, q, 1] of each state s: amplitudes a (m,) of its reduced model `models[s]` and its coefficients q; of a
+    `CurvedModel`, whose expansion adds to that, [a, q, ln E - ln E_0, 1]; offsets of the residuals before the 1. forms:
+    Q_s (k, k); prior: P (n, n).
     """
 
     objective: Objective
@@ -57,8 +58,9 @@ class FrozenPosterior:
         moduli, away = parameters.moduli(unknowns), unknowns - parameters.prior_centre
         total = 0.5 * float(away @ self.prior @ away)
         parts = zip(self.models, self.forms, parameters.coefficients(unknowns), strict=True)
-        for model, form, coefficients in parts:
-            state = np.concatenate([_coordinates(model, moduli, coefficients), ONE])
+        for s, (model, form, coefficients) in enumerate(parts):
+            offsets = parameters.offsets(unknowns, s)
+            state = np.concatenate([_coordinates(model, moduli, coefficients), offsets, ONE])
             total += 0.5 * float(state @ (form @ state))
         return total
 
@@ -114,10 +116,12 @@ def frozen_posterior(
             )
         assert isinstance(model, ReducedModel | CurvedModel)
         lines = [line for line in evaluation.lines if line.state == number]
-        answer, state = _answer(model), _coordinates(model, moduli, coefficients[number])
+        answer, offsets = _answer(model), parameters.offsets(unknowns, number)
+        state = np.concatenate([_coordinates(model, moduli, coefficients[number]), offsets])
         form = np.zeros((len(state) + 1,) * 2)
         for rows, line in zip(objective.states[number].slices, lines, strict=True):
-            moved = np.asarray(line.residuals.smooth_jacobian @ answer[rows])
+            shift = line.jacobian[:, line.jacobian.shape[1] - len(offsets) :]
+            moved = np.concatenate([line.residuals.smooth_jacobian @ answer[rows], shift], axis=1)
             design = np.column_stack([moved, line.residuals.values - moved @ state])
             design *= np.sqrt(line.precision * line.weights)[:, None]
             form += design.T @ design
@@ -137,7 +141,8 @@ def _coordinates(
     """[a, q], and [a, q, ln E - ln E_0] of a model that an expansion adds to."""
     reduced = _reduced(model)
     assert isinstance(reduced, ReducedModel)
-    found = [reduced.amplitude(moduli, np.concatenate([coefficients, ONE])), coefficients]
+    boundary = coefficients[: reduced.n_boundary]
+    found = [reduced.amplitude(moduli, np.concatenate([boundary, ONE])), coefficients]
     if isinstance(model, CurvedModel):
         found.append(np.log(moduli / model.expansion.moduli))
     return np.concatenate(found)
@@ -147,11 +152,12 @@ def _answer(model: ReducedModel | CurvedModel) -> NDArray[np.float64]:
     """Derivatives (n_outputs, k) mm of the outputs by the coordinates."""
     reduced = _reduced(model)
     assert isinstance(reduced, ReducedModel)
+    by_coefficient = np.concatenate([reduced.output_modes, reduced.output_material], axis=1)
     if not isinstance(model, CurvedModel):
-        return np.concatenate([reduced.output_basis, reduced.output_modes], axis=1)
+        return np.concatenate([reduced.output_basis, by_coefficient], axis=1)
     rest = model.expansion.derivatives - model.straight.derivatives
     by_modulus, by_mode = rest[:, : model.n_regions], rest[:, model.n_regions :]
-    return np.concatenate([reduced.output_basis, reduced.output_modes + by_mode, by_modulus], axis=1)
+    return np.concatenate([reduced.output_basis, by_coefficient + by_mode, by_modulus], axis=1)
 
 
 @blas_on_one_thread()

@@ -1,0 +1,99 @@
+"""How the material of a body may differ from that of homogeneous tissues: modes of ln E, and of Poisson's ratios."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from palpate.mechanics.hyperelastic import Elements, Moduli
+from palpate.mesh.gaussian_process import karhunen_loeve
+from palpate.mesh.tet_mesh import TetMesh
+
+__all__ = ["HOMOGENEOUS", "MaterialModes", "material_forces", "material_modes"]
+
+SHARE, MOST = 0.95, 120  # of the variance of a tissue's ln E that its modes hold; their largest number
+
+
+@dataclass(frozen=True, slots=True)
+class MaterialModes:
+    """Element e of a tissue t has ln E_e = ln E_t + sum_k fields[e, k] c_k, and Poisson's ratio nu_t + c_t.
+
+    fields (n_tets, n_fields) dimensionless; poisson: numbers of the tissues whose ratio may differ, one coefficient
+    each, after those of the fields; sizes: tissue and number of the fields of each tissue that has any, in order.
+    """
+
+    fields: sparse.csr_matrix[np.float64]
+    poisson: tuple[int, ...] = ()
+    sizes: tuple[tuple[int, int], ...] = ()
+
+    @property
+    def n_modes(self) -> int:
+        """Number of coefficients."""
+        return int(self.fields.shape[1]) + len(self.poisson)
+
+    def scale(self, coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
+        """E_e / E_t (n_tets,), dimensionless, at coefficients (n_modes,)."""
+        logarithms = np.asarray(self.fields @ coefficients[: self.fields.shape[1]], dtype=np.float64)
+        return np.asarray(np.exp(logarithms))
+
+    def poisson_shifts(self, coefficients: NDArray[np.float64]) -> dict[int, float]:
+        """By how much the Poisson's ratio of each tissue differs, dimensionless, at coefficients (n_modes,)."""
+        return dict(zip(self.poisson, coefficients[self.fields.shape[1] :].tolist(), strict=True))
+
+
+HOMOGENEOUS = MaterialModes(sparse.csr_matrix((0, 0)))
+
+
+def material_modes(
+    mesh: TetMesh, tissues: Sequence[int], *, length_mm: float, poisson: Sequence[int] = ()
+) -> MaterialModes:
+    """Modes of ln E in each of the meshed `tissues` (numbers), and of the Poisson's ratios of those of `poisson`.
+
+    Fields are Karhunen-Loeve modes of a Gaussian kernel of length_mm and standard deviation 1, less their mean by
+    volume: the modulus of a tissue is the geometric mean over it.
+    """
+    centres, found, sizes = mesh.nodes[mesh.tets].mean(axis=1), [], []
+    for tissue in tissues:
+        own = np.flatnonzero(mesh.region == tissue)
+        volumes = mesh.volumes[own]
+        local = karhunen_loeve(centres[own], volumes, kernel_mm=length_mm, share=SHARE, most=MOST)
+        local = local - (volumes @ local) / volumes.sum()
+        rows, columns = np.repeat(own, local.shape[1]), np.tile(np.arange(local.shape[1]), len(own))
+        found.append(sparse.csr_matrix((local.ravel(), (rows, columns)), shape=(len(mesh.tets), local.shape[1])))
+        sizes.append((tissue, local.shape[1]))
+    fields = sparse.csr_matrix(sparse.hstack(found)) if found else sparse.csr_matrix((len(mesh.tets), 0))
+    return MaterialModes(fields, tuple(poisson), tuple(sizes))
+
+
+def material_forces(
+    elements: Elements,
+    modes: MaterialModes,
+    displacement: NDArray[np.float64],
+    moduli: Moduli,
+    *,
+    by_poisson: Moduli,
+    tissue: NDArray[np.int64],
+) -> NDArray[np.float64]:
+    """Derivatives (n_dof, n_modes), mN, of the internal forces at u (n_dof,) mm by the coefficients.
+
+    moduli: Lame's constants of the elements there; by_poisson: their derivatives by Poisson's ratio; tissue (n_tets,):
+    of which tissue each element is.
+    """
+    nodal, n_dof = displacement.reshape(-1, 3), len(displacement)
+
+    def summed(forces: NDArray[np.float64], amounts: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Nodal forces (n_dof, k) of element forces (n_cells, n_a, 3) times amounts (n_cells, k)."""
+        rows = (3 * elements.cells[:, :, None] + np.arange(3)).reshape(len(elements.cells), -1)
+        ends = rows.shape[1] * np.arange(len(rows) + 1)
+        scatter = sparse.csc_matrix((forces.ravel(), rows.ravel(), ends), shape=(n_dof, len(rows)))
+        return np.asarray(scatter @ amounts)
+
+    found = [summed(elements.forces(nodal, moduli), modes.fields.toarray())] if modes.fields.shape[1] else []
+    if modes.poisson:
+        own = np.stack([tissue == number for number in modes.poisson], axis=1).astype(np.float64)
+        found.append(summed(elements.forces(nodal, by_poisson), own))
+    return np.concatenate(found, axis=1) if found else np.zeros((n_dof, 0))
