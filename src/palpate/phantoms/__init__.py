@@ -2,34 +2,54 @@
 
 from palpate.phantoms.boundary_noise import SmoothField, smooth_field
 from palpate.phantoms.exact_targets import exact_target, target_of_truth
-from palpate.phantoms.motion import filling_of
-from palpate.phantoms.pelvis import PelvisOptions, pelvis, pelvis_anatomy, pelvis_grid
+from palpate.phantoms.motion import AffineMotion, ScaledMotion, WallMotion, filling_of
+from palpate.phantoms.patches import patched
+from palpate.phantoms.pelvis import PelvisOptions, pelvis, pelvis_anatomy, pelvis_grid, pelvis_motions
 from palpate.phantoms.pelvis_shapes import PelvisShapes, draw_pelvis
-from palpate.phantoms.scene import Noise, Scene, centred_grid, grid_box, imaged, reimaged, rescaled
+from palpate.phantoms.redrawn import redrawn
+from palpate.phantoms.scene import (
+    BoundaryMotion,
+    Noise,
+    Scene,
+    centred_grid,
+    displacements,
+    grid_box,
+    imaged,
+    reimaged,
+    rescaled,
+)
 from palpate.phantoms.shapes import Complement, Ellipsoid, Tube, ball, rotation_about
 from palpate.phantoms.spheres import SpheresOptions, spheres
 from palpate.phantoms.wall_filling import wall_filling
 
 __all__ = [
+    "AffineMotion",
+    "BoundaryMotion",
     "Complement",
     "Ellipsoid",
     "Noise",
     "PelvisOptions",
     "PelvisShapes",
+    "ScaledMotion",
     "Scene",
     "SmoothField",
     "SpheresOptions",
     "Tube",
+    "WallMotion",
     "ball",
     "centred_grid",
+    "displacements",
     "draw_pelvis",
     "exact_target",
     "filling_of",
     "grid_box",
     "imaged",
+    "patched",
     "pelvis",
     "pelvis_anatomy",
     "pelvis_grid",
+    "pelvis_motions",
+    "redrawn",
     "reimaged",
     "rescaled",
     "rotation_about",

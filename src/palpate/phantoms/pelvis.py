@@ -18,7 +18,7 @@ from palpate.phantoms.pelvis_shapes import PelvisShapes, draw_pelvis
 from palpate.phantoms.scene import Noise, Scene, centred_grid, grid_box, make_scene
 from palpate.phantoms.shapes import rotation_about
 
-__all__ = ["PelvisOptions", "pelvis", "pelvis_anatomy", "pelvis_grid"]
+__all__ = ["PelvisOptions", "pelvis", "pelvis_anatomy", "pelvis_grid", "pelvis_motions"]
 
 SURROUNDINGS_KPA = 10.0
 STRAY = 0.05  # non-radial motion of the rectum's wall, standard deviation a component in parts of the filling
@@ -60,10 +60,23 @@ def pelvis(options: PelvisOptions) -> Scene:
     that tumour, noise or voxel size leave the rest of the body as it is. Raises `GeometryError` when the truth folds
     over, `ConfigurationError` for a field that is too small or a modulus for an unknown tissue.
     """
+    anatomy = pelvis_anatomy(options)
+    return make_scene(
+        anatomy,
+        pelvis_motions(options),
+        pelvis_grid(options),
+        edge_length_mm=options.truth_edge_mm,
+        noise=options.noise,
+        seed=options.seed,
+        law=law_from(options.law, options.law_parameters),
+    )
+
+
+def pelvis_motions(options: PelvisOptions) -> dict[str, WallMotion]:
+    """How the walls of the body of `options` move, by tissue."""
     motion_rng = np.random.default_rng(options.seed).spawn(3)[2]
     if options.motion_seed is not None:
         motion_rng = np.random.default_rng([options.seed, options.motion_seed])
-    grid = pelvis_grid(options)
     body = _body(options)
     turn = rotation_about(motion_rng.normal(size=3), motion_rng.uniform(0.0, 30.0))
     motions: dict[str, WallMotion] = {
@@ -85,16 +98,7 @@ def pelvis(options: PelvisOptions) -> Scene:
         motion = AffineMotion(gradient, bone.centre, options.bone_motion_mm * direction / np.linalg.norm(direction))
         if options.bones and options.bone_motion_mm > 0.0:
             motions[name] = motion
-    anatomy = pelvis_anatomy(options)
-    return make_scene(
-        anatomy,
-        motions,
-        grid,
-        edge_length_mm=options.truth_edge_mm,
-        noise=options.noise,
-        seed=options.seed,
-        law=law_from(options.law, options.law_parameters),
-    )
+    return motions
 
 
 def pelvis_grid(options: PelvisOptions) -> VoxelGrid:

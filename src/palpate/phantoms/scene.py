@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,19 +16,22 @@ from palpate.mechanics.deformation import deformation_determinants
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.equilibrium import equilibrium
 from palpate.mechanics.laws.contract import Law
+from palpate.mechanics.linear_model import linear_model
 from palpate.mesh.anatomy import Anatomy, Box
 from palpate.mesh.space import LagrangeSpace, lagrange_space
-from palpate.mesh.tet_mesh import TetMesh
+from palpate.mesh.tet_mesh import OUTER, TetMesh
 from palpate.mesh.tetrahedralise import tetrahedralise
 from palpate.mesh.voxelise import Warp, voxelise
 from palpate.phantoms.boundary_noise import smooth_field
 from palpate.phantoms.motion import ScaledMotion, WallMotion
 
 __all__ = [
+    "BoundaryMotion",
     "Noise",
     "Scene",
     "centred_grid",
     "deformation_determinants",
+    "displacements",
     "grid_box",
     "imaged",
     "make_scene",
@@ -43,6 +46,17 @@ class Noise:
 
     surface_sd_mm: float
     correlation_length_mm: float
+
+
+@dataclass(frozen=True, slots=True)
+class BoundaryMotion:
+    """How a body's boundary moves: `walls` by name of a hollow tissue, and the `border` of the body; None: it is held.
+
+    A hollow tissue that is not among the walls holds still.
+    """
+
+    walls: Mapping[str, WallMotion] = field(default_factory=dict)
+    border: WallMotion | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,29 +108,61 @@ def make_scene(
     `seed` only draws the noise. Raises `GeometryError` where the truth folds over or cannot be meshed.
     """
     space = lagrange_space(tetrahedralise(anatomy, edge_length_mm=edge_length_mm), "P2")
-    # the points (n_points,) on walls of drivers and rigid tissues, and the displacement (n_points, 3) mm there
-    offset = np.zeros_like(space.points)
-    walls = np.zeros(len(space.points), dtype=np.bool_)
-    for index, tissue in enumerate(space.mesh.tissues):
-        if tissue.role not in (Role.DRIVER, Role.RIGID):
-            continue
-        points = np.unique(space.facets(space.mesh.boundary[space.mesh.beyond == index]))
-        walls[points] = True
-        if tissue.name in motions:
-            offset[points] = motions[tissue.name].at(space.points[points])
-    no_modes = np.zeros((offset.size, 0))
-    constraint = outer_constraint(space, outer="fixed", modes=no_modes, offset=offset.ravel(), prescribed=walls)
-    moduli = [tissue.youngs_modulus_kpa or np.nan for tissue in space.mesh.tissues if tissue.meshed]
-    dilatation = Dilatation.BLENDED if law.finite else Dilatation.POINTWISE
-    displacement = equilibrium(space, constraint, np.array(moduli), law=law, dilatation=dilatation).displacement
-    smallest = float(deformation_determinants(space, displacement).min())
-    if smallest <= 0.0:
-        raise GeometryError(
-            f"the truth folds over (smallest determinant of the deformation gradient {smallest:.3f}): move the walls"
-            " less or leave more room around them"
-        )
+    displacement = displacements(space, [BoundaryMotion(motions)], law=law)[0]
     before, after = _images(space, displacement, grid, noise, seed)
     return Scene(space, displacement, before, after, dict(motions), seed)
+
+
+def displacements(space: LagrangeSpace, motions: Sequence[BoundaryMotion], *, law: Law) -> list[NDArray[np.float64]]:
+    """Displacement (n_points, 3) mm of a body under each of some motions of its boundary, by tissues of one `law`.
+
+    Every meshed tissue of the space needs its `youngs_modulus_kpa`; finite strain is on elements that do not lock; the
+    motions of the linear law share one factorisation. Raises `GeometryError` where the body folds over.
+    """
+    tissues = space.mesh.tissues
+    hollow = [i for i, tissue in enumerate(tissues) if tissue.role in (Role.DRIVER, Role.RIGID)]
+    moduli = np.array([tissue.youngs_modulus_kpa or np.nan for tissue in tissues if tissue.meshed])
+    found = []
+    if law.finite:
+        for motion in motions:
+            offset, moved = _prescribed(space, motion, hollow)
+            no_modes = np.zeros((offset.size, 0))
+            constraint = outer_constraint(space, outer="fixed", modes=no_modes, offset=offset, prescribed=moved)
+            found.append(equilibrium(space, constraint, moduli, law=law, dilatation=Dilatation.BLENDED).displacement)
+    else:
+        given = [_prescribed(space, motion, hollow) for motion in motions]
+        modes = np.stack([offset for offset, _ in given], axis=1)
+        prescribed = np.any([moved for _, moved in given], axis=0)
+        still = np.zeros(len(modes))
+        constraint = outer_constraint(space, outer="fixed", modes=modes, offset=still, prescribed=prescribed)
+        system = linear_model(space, constraint).system(moduli)
+        found = [system.solve(q).displacement for q in np.eye(len(motions))]
+    for displacement in found:
+        smallest = float(deformation_determinants(space, displacement).min())
+        if smallest <= 0.0:
+            raise GeometryError(
+                f"the truth folds over (smallest determinant of the deformation gradient {smallest:.3f}): move the"
+                " walls less or leave more room around them"
+            )
+    return found
+
+
+def _prescribed(
+    space: LagrangeSpace, motion: BoundaryMotion, hollow: Sequence[int]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Displacement (n_dof,) mm that the boundary is given, and the points (n_points,) that are given one.
+
+    Where the border meets a wall that moves, it moves with the wall.
+    """
+    offset = np.zeros_like(space.points)
+    prescribed = np.zeros(len(space.points), dtype=np.bool_)
+    moves = [(OUTER, motion.border)] if motion.border is not None else []
+    for beyond, moved in [*moves, *((i, motion.walls.get(space.mesh.tissues[i].name)) for i in hollow)]:
+        points = np.unique(space.facets(space.mesh.boundary[space.mesh.beyond == beyond]))
+        prescribed[points] = True
+        if moved is not None:
+            offset[points] = moved.at(space.points[points])
+    return offset.ravel(), prescribed
 
 
 def reimaged(scene: Scene, grid: VoxelGrid, *, noise: Noise | None) -> Scene:
