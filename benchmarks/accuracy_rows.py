@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from palpate.images import Role, segment
-from palpate.inversion import InverseProblem, InversionSettings, LaterState, parameter_map, wall_block
+from palpate.inversion import InverseProblem, InversionSettings, LaterState, parameter_map, wall_blocks
 from palpate.mechanics import ACCURACY, NewtonSettings, finite_strain_model, linear_model, outer_constraint
 from palpate.mesh import LagrangeSpace, lagrange_space, tetrahedralise
 from palpate.observation import observed_surface, prescribed_motion, surface_distance
@@ -163,7 +163,7 @@ def _from_surfaces(scene: Scene, case: Case, options: PelvisOptions, row: Row) -
         scene = replace(scene, displacement=model.solve(moduli, q).displacement)
     observed = [i for i, t in enumerate(scene.tissues) if t.role in (Role.ESTIMATE, Role.DRIVER)]
     seen = tuple(surface_distance(exact_target(scene, observed_surface(space, i))) for i in observed)
-    mapping = parameter_map(scene.tissues, model.regions, [wall_block(wall, 0) for wall in motion.walls])
+    mapping = parameter_map(scene.tissues, model.regions, [b for wall in motion.walls for b in wall_blocks(wall, 0)])
     law = case.mechanics.material_law
     finite = finite_strain_model(space, constraint, law, settings=NewtonSettings(ACCURACY)) if law.finite else None
     return space, InverseProblem((LaterState(model, seen, finite),), mapping)

@@ -35,6 +35,7 @@ Misleading = Literal[
     "units",
     "linear-strains",
     "volume-change",
+    "drawn-otherwise",
     "several-bodies",
     "open-contours",
     "overlap",

@@ -19,7 +19,7 @@ from palpate.inversion import (
     driver,
     evidence,
     unit_blocks,
-    wall_block,
+    wall_blocks,
 )
 from palpate.mesh.constraint import Constraint
 from palpate.observation.wall_modes import Wall, wall_modes, wall_of
@@ -66,7 +66,7 @@ def learned_precision(ball, motion, *, sd_mm, seen=None):
 
 def moved_by(*walls):
     """An objective of no moduli and one state whose modes move the walls."""
-    blocks = tuple(wall_block(wall, 0) for wall in walls)
+    blocks = tuple(block for wall in walls for block in wall_blocks(wall, 0))
     return Objective((LaterState(None, ()),), ParameterMap(np.ones(1), np.zeros((1, 0)), (), "rest", True, blocks))
 
 
@@ -223,7 +223,7 @@ def test_what_is_believed_of_the_others_follows_their_prior_mean_too(rng):
     parameters = ParameterMap(
         np.ones(2), np.eye(2), ("a", "b"), "c", True, (), prior_mean=mean, prior_precision=precision
     )
-    block = Block("b", "", "driver", Acts.BOUNDARY, (0,), np.eye(k), ((term,),), amplitudes=(1e-3, 1e3))
+    block = Block("b", "driver", Acts.BOUNDARY, (0,), np.eye(k), ((term,),), amplitudes=(1e-3, 1e3))
     parameters = replace(parameters, blocks=(block,), nuisance_precision=np.eye(k))
     prior, data = parameters.prior_matrix, design.T @ design
     x = rng.normal(size=n)

@@ -8,7 +8,7 @@ from palpate.inversion.blocks import (
     material_blocks,
     offset_block,
     unit_blocks,
-    wall_block,
+    wall_blocks,
 )
 from palpate.inversion.driver_fit import fit_driver
 from palpate.inversion.estimate import Inversion, StartRun, continue_at_finite_strain, invert
@@ -60,6 +60,6 @@ __all__ = [
     "reweighted",
     "run_outer_loop",
     "unit_blocks",
-    "wall_block",
+    "wall_blocks",
     "with_first_noise",
 ]

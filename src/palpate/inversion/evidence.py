@@ -69,14 +69,17 @@ def learned_precision(
     for places, block in blocks:
         with determined():
             seen = _seen(data + prior, data, pull + prior @ parameters.prior_centre, places)
-            beliefs = [_most_evident(terms, seen, block) for terms in block.alternatives]
+            odds = block.odds or (0.0,) * len(block.alternatives)
+            beliefs = [
+                _most_evident(terms, seen, block, odd) for terms, odd in zip(block.alternatives, odds, strict=True)
+            ]
             best = max(evidence for evidence, _ in beliefs)
             found = list[tuple[float, float, NDArray[np.float64]]]()
             for evidence, covariance in beliefs:
                 if evidence > best - ALIKE:
                     with_it = prior.copy()
                     with_it[np.ix_(places, places)] = linalg.inv(covariance)
-                    width = _width(data + with_it, n) if len(beliefs) > 1 else 0.0
+                    width = _width(data + with_it, n) if len(beliefs) > 1 and not block.odds else 0.0
                     found.append((width, evidence, with_it))
             _, _, prior = max(found, key=lambda each: each[:2])
     return prior[n:, n:]
@@ -108,8 +111,10 @@ def _seen(
     return _Seen(0.5 * (information + information.T), pull[places] - followed[:, -1])
 
 
-def _most_evident(terms: Sequence[NDArray[np.float64]], seen: _Seen, block: Block) -> tuple[float, NDArray[np.float64]]:
-    """The largest log-evidence of a family of priors of a block, and that prior's covariance (n, n)."""
+def _most_evident(
+    terms: Sequence[NDArray[np.float64]], seen: _Seen, block: Block, odds: float
+) -> tuple[float, NDArray[np.float64]]:
+    """The largest log-evidence, with its log prior odds, of a family of priors of a block; its covariance (n, n)."""
     floored = [term + LEAST_VARIANCE * np.eye(len(term)) for term in terms]
 
     def worse(logs: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
@@ -127,7 +132,7 @@ def _most_evident(terms: Sequence[NDArray[np.float64]], seen: _Seen, block: Bloc
     ]
     best = min(found, key=lambda trial: float(trial.fun))
     squares = np.exp(2.0 * best.x)
-    return -float(best.fun), sum((s * t for s, t in zip(squares, floored, strict=True)), np.zeros_like(terms[0]))
+    return odds - float(best.fun), sum((s * t for s, t in zip(squares, floored, strict=True)), np.zeros_like(terms[0]))
 
 
 def _width(matrix: NDArray[np.float64], n_parameters: int) -> float:

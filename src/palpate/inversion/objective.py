@@ -87,8 +87,8 @@ class Evaluation:
 class Objective:
     """J(x) = 1/2 sum_s precision_s sum_j w_j rho(r_j) + 1/2 (x - m)^T P (x - m) over all observations of all states.
 
-    The unknowns x, their prior mean m and precision P are those of `parameters`; rho: see `RobustLoss`. To the
-    residuals of each observation its offset is added, where `parameters` have one. prior_held: whether the blocks'
+    The unknowns x, their prior mean m and precision P are those of `parameters`; rho: see `RobustLoss`. Each
+    observation has an offset, where `parameters` have one. prior_held: whether the blocks'
     prior stays what it is when residuals are reweighted.
     """
 
@@ -186,8 +186,8 @@ class Objective:
         """
         fresh = []
         for s in range(len(self.states)):
-            pairs = self._seen(s, self._equilibrium(s, unknowns).values)
-            fresh += [observation.rematched(motion) for observation, motion in pairs]
+            pairs = zip(self._seen(s, self._equilibrium(s, unknowns).values), self._offsets(s, unknowns), strict=True)
+            fresh += [observation.rematched(motion, offset) for (observation, motion), offset in pairs]
         return self.with_observations(fresh)
 
     def _equilibrium(self, s: int, unknowns: NDArray[np.float64]) -> Equilibrium:
@@ -209,16 +209,13 @@ class Objective:
     def _residuals(
         self, s: int, values: NDArray[np.float64], unknowns: NDArray[np.float64]
     ) -> list[tuple[Observation, Residuals]]:
-        """Each observation of a state with its residuals, offsets added, at displacements (n_observed,) mm."""
-        offsets = self.parameters.offsets(unknowns, s)
+        """Each observation of a state with its residuals at displacements (n_observed,) mm and its offset."""
+        every = zip(self._seen(s, values), self._offsets(s, unknowns), strict=True)
+        return mapped(lambda of: (of[0][0], of[0][0].residuals(of[0][1], of[1])), every)
 
-        def residuals(of: tuple[int, tuple[Observation, NDArray[np.float64]]]) -> tuple[Observation, Residuals]:
-            """Those of one observation."""
-            number, (observation, motion) = of
-            found = observation.residuals(motion)
-            return observation, replace(found, values=found.values + offsets[number]) if len(offsets) else found
-
-        return mapped(residuals, enumerate(self._seen(s, values)))
+    def _offsets(self, s: int, unknowns: NDArray[np.float64]) -> list[float]:
+        """The offset of each observation of a state."""
+        return self.parameters.offsets(unknowns, s).tolist() or [0.0] * len(self.states[s].observations)
 
     def _linearised(self, s: int, unknowns: NDArray[np.float64]) -> list[Linearisation]:
         state, solution = self.states[s], self._equilibrium(s, unknowns)

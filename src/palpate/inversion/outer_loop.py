@@ -119,7 +119,7 @@ class StopRule:
     solve_above: float = 0.0
     passes: int = 6
     iterations: int = 16
-    refinements: int = 2
+    refinements: int = 0
     far: float = 5.0
 
     def tolerance(self, minimum: Minimum, n_parameters: int) -> NDArray[np.float64]:

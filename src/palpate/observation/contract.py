@@ -117,12 +117,16 @@ class Observation(Protocol):
         """The noise by which they count."""
         ...
 
-    def residuals(self, displacement: NDArray[np.float64]) -> Residuals:
-        """Residuals at displacements (n_dofs,) mm of what it sees."""
+    def residuals(self, displacement: NDArray[np.float64], offset: float = 0.0) -> Residuals:
+        """Residuals at displacements (n_dofs,) mm of what it sees; their derivative by the `offset` is 1 each.
+
+        offset: by how much the image shows more than what is there, in the residuals' unit: how much further out a
+        surface is drawn.
+        """
         ...
 
-    def rematched(self, displacement: NDArray[np.float64]) -> Self:
-        """The same with what belongs together chosen anew at displacements (n_dofs,) mm.
+    def rematched(self, displacement: NDArray[np.float64], offset: float = 0.0) -> Self:
+        """The same with what belongs together chosen anew at displacements (n_dofs,) mm and an offset.
 
         Raises `EstimationError` when nothing is left to compare.
         """

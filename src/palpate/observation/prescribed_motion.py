@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from palpate.images.alignment import RigidMotion
 from palpate.images.tissue import Role
-from palpate.mesh.gaussian_process import karhunen_loeve
+from palpate.mesh.gaussian_process import karhunen_loeve, kernel_factor
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.surface import cut_faces, tissue_surface, triangle_normals
-from palpate.observation.wall_modes import Wall, wall_modes, wall_of
+from palpate.observation.wall_modes import Wall, fine_modes, wall_modes, wall_of
 
 __all__ = ["FrameMotion", "PrescribedMotion", "prescribed_motion"]
 
+FRAME_LENGTHS = (0.6, 1.0, 2.0)  # times the kernel of the frame's smooth motion
 FRAME_SHARE, FRAME_MODES = 0.99, 60  # of the frame's variance that its scalar modes hold; their largest number
 
 
@@ -25,15 +26,18 @@ class PrescribedMotion:
     """Displacement `modes q + offset` of the marked points.
 
     modes (3 n_points, n_modes) mm, offset (3 n_points,) mm, prescribed (n_points,); `walls`: what the first modes move;
-    after theirs come n_smooth and n_rigid modes of the frame.
+    after theirs come the smooth modes of the frame and n_rigid ones. smooth: covariances (n_smooth, n_smooth) of the
+    former's coefficients, one for each of `FRAME_LENGTHS`, none without a frame; smooth_mm: the motion's standard
+    deviation where theirs is 1.
     """
 
     modes: NDArray[np.float64]
     offset: NDArray[np.float64]
     prescribed: NDArray[np.bool_]
     walls: tuple[Wall, ...] = ()
-    n_smooth: int = 0
+    smooth: tuple[NDArray[np.float64], ...] = ()
     n_rigid: int = 0
+    smooth_mm: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,11 +61,13 @@ def prescribed_motion(
     n_modes: int,
     kernel_mm: float,
     prior_mm: float,
+    fine: bool = False,
     frame: FrameMotion | None = None,
 ) -> PrescribedMotion:
     """Modes of every driver's wall and the offset of every rigid tissue (by index in `bones`; held where absent).
 
-    With a `frame` the points on the image's cut that neither a wall nor a bone moves follow modes of their own.
+    fine: whether each has modes of a finer motion along its normals, too. With a `frame` the points on the image's cut
+    that neither a wall nor a bone moves follow modes of their own.
 
     A point that a driver and a bone share follows the bone. Each driver has its own `n_modes` modes (see
     `wall_modes` for kernel_mm and prior_mm, mm).
@@ -84,43 +90,63 @@ def prescribed_motion(
         points = np.unique(facets)
         points = points[~held[points]]
         normals = sums[points] / np.maximum(np.linalg.norm(sums[points], axis=1, keepdims=True), np.finfo(float).tiny)
-        local = wall_modes(space.points[points], n_modes=n_modes, kernel_mm=kernel_mm, prior_mm=prior_mm)
-        block = np.zeros((n, 3, local.shape[1]))
-        block[points] = local.reshape(len(points), 3, -1)
-        first = sum(b.shape[1] for b in blocks)
+        own = {"kernel_mm": kernel_mm, "prior_mm": prior_mm}
+        local = wall_modes(space.points[points], n_modes=n_modes, **own)
+        finer = fine_modes(space.points[points], normals) if fine else np.zeros((3 * len(points), 0))
+        first, n_local = sum(b.shape[1] for b in blocks), local.shape[1]
+        if n_local:
+            walls.append(
+                wall_of(
+                    space.points[points],
+                    normals,
+                    local,
+                    np.arange(first, first + n_local),
+                    name=space.mesh.tissues[tissue].name,
+                    n_fine=finer.shape[1],
+                    **own,
+                )
+            )
+        every = np.concatenate([local, finer], axis=1)
+        block = np.zeros((n, 3, every.shape[1]))
+        block[points] = every.reshape(len(points), 3, -1)
         blocks.append(block.reshape(3 * n, -1))
-        columns = np.arange(first, first + local.shape[1])
-        if len(columns):
-            own = {"kernel_mm": kernel_mm, "prior_mm": prior_mm}
-            name = space.mesh.tissues[tissue].name
-            walls.append(wall_of(space.points[points], normals, local, columns, name=name, **own))
         prescribed[points] = True
-    n_smooth = n_rigid = 0
+    covariances, n_rigid = tuple[NDArray[np.float64], ...](), 0
     if frame is not None:
         points = np.unique(space.facets(cut_faces(space.mesh)))
         points = points[~prescribed[points]]
-        smooth, rigid = _frame_modes(space.points[points], frame)
+        smooth, rigid, covariances = _frame_modes(space.points[points], frame)
         for local in (smooth, rigid):
             block = np.zeros((n, 3, local.shape[1]))
             block[points] = local.reshape(len(points), 3, -1)
             blocks.append(block.reshape(3 * n, -1))
-        n_smooth, n_rigid = smooth.shape[1], rigid.shape[1]
+        n_rigid = rigid.shape[1]
         prescribed[points] = True
     modes = np.concatenate(blocks, axis=1) if blocks else np.zeros((3 * n, 0))
-    return PrescribedMotion(modes, offset.ravel(), prescribed, tuple(walls), n_smooth, n_rigid)
+    return PrescribedMotion(
+        modes, offset.ravel(), prescribed, tuple(walls), covariances, n_rigid, frame.motion_mm if frame else 1.0
+    )
 
 
-def _frame_modes(points: NDArray[np.float64], frame: FrameMotion) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Smooth modes (3 n_points, k) mm and rigid ones (3 n_points, 6) mm of the frame's points (n_points, 3) mm.
+def _frame_modes(
+    points: NDArray[np.float64], frame: FrameMotion
+) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[NDArray[np.float64], ...]]:
+    """Smooth modes (3 n_points, k) mm, rigid ones (3 n_points, 6) mm and covariances (k, k) of the smooth ones.
 
     What the smooth ones leave out is so short that it does not reach into the body (Saint-Venant). Rotations are about
-    the points' mean, to first order: images are aligned before.
+    the mean of the frame's points (n_points, 3) mm, to first order: images are aligned before. Covariances are those of
+    Gaussian processes with kernels of several lengths, seen through the modes: a kernel that is too long forbids
+    what a real border does.
     """
     if not len(points):
-        return np.zeros((0, 0)), np.zeros((0, 0))
+        return np.zeros((0, 0)), np.zeros((0, 0)), ()
     weights = np.ones(len(points))
     scalar = karhunen_loeve(points, weights, kernel_mm=frame.kernel_mm, share=FRAME_SHARE, most=FRAME_MODES)
+    inverse, rank = np.linalg.pinv(scalar), min(len(points), 6 * scalar.shape[1])
+    amounts = [inverse @ kernel_factor(points, multiple * frame.kernel_mm, rank) for multiple in FRAME_LENGTHS]
     arms, turn = points - points.mean(axis=0), np.deg2rad(frame.rotation_deg)
     rotations = [turn * np.cross(axis, arms).ravel() for axis in np.eye(3)]
     translations = [frame.translation_mm * np.tile(axis, len(points)) for axis in np.eye(3)]
-    return np.asarray(frame.motion_mm * np.kron(scalar, np.eye(3))), np.stack(translations + rotations, axis=1)
+    smooth = np.asarray(frame.motion_mm * np.kron(scalar, np.eye(3)))
+    covariances = tuple(np.asarray(np.kron(a @ a.T, np.eye(3))) for a in amounts)
+    return smooth, np.stack(translations + rotations, axis=1), covariances

@@ -13,6 +13,7 @@ from palpate.images.distance import DistanceMap
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.images.tissue_distance import tissue_distance_map
+from palpate.mesh.surface import vertex_normals
 from palpate.observation.contract import Fit, ImagedBody, Observation, Residuals, Weighting
 from palpate.observation.noise_model import (
     EXACT_NOISE,
@@ -91,24 +92,28 @@ class SurfaceDistance:
         """Share of the surface's area that touches neither driver, bone nor the image's border."""
         return self.target.surface.share
 
-    def residuals(self, displacement: NDArray[np.float64]) -> Residuals:
+    def residuals(self, displacement: NDArray[np.float64], offset: float = 0.0) -> Residuals:
         """Residuals and their derivative at a displacement (n_dofs,) mm: model -> image first, then image -> model.
 
+        A surface that is drawn by an offset (mm) further out is the deformed one moved so far along its normals: both
+        are compared where they meet. Added to the distance instead, it would be rewarded for leading away from the
+        surface, where a distance map has less of the voxels' noise.
         The smooth Jacobian is that of a smooth surface without noise, n . du. The exact one also holds how voxel noise
         and facets change as the surface slides along itself, which tells nothing of how it slides.
         """
-        found = surface_residuals(self.target, displacement.reshape(-1, 3), self.held)
+        found = surface_residuals(self.target, self._drawn(displacement, offset), self.held)
         noise = self.noise_model.sd**2 * self.noise_model.correlation_area
         terraces = np.concatenate([self.target.terraces, self.held.terraces[self.held.kept]])
         weights = found.weights * noise / (noise + terraces)
-        return replace(found, weights=weights * (found.weights.sum() / weights.sum()))
+        places = found.places - offset * found.normals  # in the body, not on what is drawn of it
+        return replace(found, places=places, weights=weights * (found.weights.sum() / weights.sum()))
 
-    def rematched(self, displacement: NDArray[np.float64]) -> SurfaceDistance:
-        """The same with the image points that face the observed part chosen at a displacement (n_dofs,) mm.
+    def rematched(self, displacement: NDArray[np.float64], offset: float = 0.0) -> SurfaceDistance:
+        """The same with the image points that face the observed part chosen at a displacement (n_dofs,) and offset, mm.
 
         Raises `EstimationError` when none does.
         """
-        held = correspondence(self.target, displacement.reshape(-1, 3))
+        held = correspondence(self.target, self._drawn(displacement, offset))
         if not held.kept.any():
             raise EstimationError(
                 f"'{self.name}': none of the {len(held.kept)} points of its surface in the later image faces the"
@@ -231,6 +236,13 @@ class SurfaceDistance:
             hd95_mm=float(distance[order][np.searchsorted(share, 0.95)]),
             dice=2.0 * int((shown & seen).sum()) / max(int(shown.sum()) + int(seen.sum()), 1),
         )
+
+    def _drawn(self, displacement: NDArray[np.float64], offset: float) -> NDArray[np.float64]:
+        """Displacement (n_vertices, 3) mm from rest to the surface as an image draws it, an offset (mm) further out."""
+        moved, surface = displacement.reshape(-1, 3), self.target.surface
+        if offset == 0.0:
+            return moved
+        return moved + offset * vertex_normals(surface.rest + moved, surface.triangles)
 
     def _precision(self, noise: NoiseModel) -> float:
         """Weight (mm^-2) of the surface's mean square: its independent residuals, by their variance."""

@@ -7,25 +7,28 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.mesh.gaussian_process import RANK_TOLERANCE, kernel_factor
+from palpate.mesh.gaussian_process import RANK_TOLERANCE, karhunen_loeve, kernel_factor
 
-__all__ = ["Wall", "wall_modes", "wall_of"]
+__all__ = ["Wall", "fine_modes", "wall_modes", "wall_of"]
 
 DRIFT_LENGTHS = (1.0, 2.0, 4.0)  # times the modes' own kernel, which they cannot go below
 SWELLING_LENGTHS = (1.0, 2.0)
+FINE_KERNEL_MM, FINE_MM = 8.0, 0.3  # of what a wall does on a finer scale than its modes
+FINE_SHARE, FINE_MODES = 0.95, 150  # of its variance; number of modes at the most
 
 
 @dataclass(frozen=True, slots=True)
 class Wall:
     """How one driver's wall may move: covariances (n_modes, n_modes) of its modes' coefficients, dimensionless.
 
-    name: the driver's; columns (n_modes,): the constraint's modes that move it; `drifts`: of motions whose components
-    are alike, one for each of `DRIFT_LENGTHS`; `swellings`: of motions along the normals, one for each of
-    `SWELLING_LENGTHS`. All have the modes' own standard deviation.
+    name: the driver's; columns (n_modes,): the constraint's modes that move it, n_fine more follow them; `drifts`: of
+    motions whose components are alike, one for each of `DRIFT_LENGTHS`; `swellings`: of motions along the normals, one
+    for each of `SWELLING_LENGTHS`. All have the modes' own standard deviation.
     """
 
     name: str
     columns: NDArray[np.int64]
+    n_fine: int
     drifts: tuple[NDArray[np.float64], ...]
     swellings: tuple[NDArray[np.float64], ...]
 
@@ -37,6 +40,7 @@ def wall_of(
     columns: NDArray[np.int64],
     *,
     name: str,
+    n_fine: int = 0,
     kernel_mm: float,
     prior_mm: float,
 ) -> Wall:
@@ -58,9 +62,20 @@ def wall_of(
     return Wall(
         name,
         columns,
+        n_fine,
         tuple(np.asarray(np.kron(a @ a.T, np.eye(3))) for a in drifts),
         tuple(np.asarray(a @ a.T) for a in along),
     )
+
+
+def fine_modes(points: NDArray[np.float64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Modes (3 n_points, k) mm of what a wall does on a finer scale, along its unit normals (n_points, 3).
+
+    Karhunen-Loeve modes of a Gaussian process with a kernel of `FINE_KERNEL_MM` and a standard deviation of
+    `FINE_MM` on points (n_points, 3) mm.
+    """
+    scalar = karhunen_loeve(points, np.ones(len(points)), kernel_mm=FINE_KERNEL_MM, share=FINE_SHARE, most=FINE_MODES)
+    return np.asarray(FINE_MM * (normals[:, :, None] * scalar[:, None, :]).reshape(3 * len(points), -1))
 
 
 def wall_modes(points: NDArray[np.float64], *, n_modes: int, kernel_mm: float, prior_mm: float) -> NDArray[np.float64]:

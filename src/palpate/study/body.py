@@ -23,7 +23,7 @@ from palpate.inversion import (
     offset_block,
     parameter_map,
     unit_blocks,
-    wall_block,
+    wall_blocks,
 )
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.dilatation import choose_element
@@ -235,7 +235,7 @@ def _blocks(
     """All that is unknown beside the moduli: of each later state its motion and its drawing, then the material."""
     blocks = list[Block]()
     for s, ((_, motion), (_, observed)) in enumerate(zip(pairs, seen, strict=True)):
-        blocks += [wall_block(wall, s, learned=case.driver.learn_prior) for wall in motion.walls]
+        blocks += [b for wall in motion.walls for b in wall_blocks(wall, s, learned=case.driver.learn_prior)]
         blocks += frame_blocks(motion, s)
         if case.discrepancy.surface_offset_mm:
             blocks += [offset_block(observation, s, sd=case.discrepancy.surface_offset_mm) for observation in observed]
@@ -280,6 +280,7 @@ def _models(body: Body, case: Case) -> list[tuple[LinearModel, PrescribedMotion]
             n_modes=case.driver.modes,
             kernel_mm=case.driver.kernel_mm,
             prior_mm=case.driver.prior_mm,
+            fine=True,
             frame=frame,
         )
         constraint = outer_constraint(

@@ -13,6 +13,7 @@ from palpate.inversion import Bounds, Inversion, InversionSettings, Iterate, Out
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit
 from palpate.progress import Progress, silent
+from palpate.study.discrepancy import FoundDiscrepancy, discrepancy_findings, discrepancy_of
 from palpate.study.estimate_findings import fold_findings, inversion_findings, pair_findings
 from palpate.study.poisson_ratios import PoissonRatioEstimate, no_ratio, ratio_verdict
 from palpate.study.samples import CHAINS, ModulusSamples, draw_moduli, sample_findings
@@ -46,7 +47,7 @@ __all__ = [
 ]
 
 GRID_DRAWS = 8
-IDENTIFIED, WEAK = 2.0, 10.0  # largest ratio of an interval's ends
+IDENTIFIED, WEAK = 4.0, 10.0  # largest ratio of an interval's ends: a factor of 2 to each side, and of 3.2
 AS_GOOD = 0.05  # of the objective: another minimum that is worse by less cannot be excluded
 
 
@@ -84,7 +85,9 @@ class Start:
 class ModulusEstimate:
     """Young's modulus of one tissue, in `unit` (kPa, or a ratio to `relative_to`), with its 95 % interval.
 
-    None in an interval is an open end; `value` is None in ratio mode and when nothing converged. variance_shares: of
+    interval95: what is believed with all of the model's discrepancies unknown, by which the verdict is told;
+    interval95_given_model: what would be left if the model held. None in an interval is an open end; `value` is None in
+    ratio mode and when nothing converged. variance_shares: of
     each cause in the variance of ln E; profile: values (kPa, or ratios) with their signed root deviances.
     """
 
@@ -102,6 +105,7 @@ class ModulusEstimate:
     parameter: str = "youngs_modulus"
     variance_shares: Mapping[str, float] | None = None
     profile: tuple[tuple[float, float], ...] = ()
+    interval95_given_model: Interval | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +127,8 @@ class Estimation:
     (n_points, 3) mm of each later image;
     outer_loop: the steps from the best start's minimum to the estimate, which all starts of that minimum share;
     counts: of all starts and minima together; observations: what was compared, in words, by its kind; information: the
-    directions of the log-moduli by how well they are known; combinations: what is known where single moduli are not;
+    directions of the log-moduli by how well they are known; discrepancy: what the images say of frame, drawing and
+    material; combinations: what is known where single moduli are not;
     regions: joint ones of two moduli; image_pairs: what each of several later images says alone; samples: of the
     moduli's posterior, where the case asks for them and the estimate converged.
     """
@@ -141,6 +146,7 @@ class Estimation:
     observations: Mapping[str, str] = field(default_factory=dict)
     information: Information | None = None
     combinations: tuple[Combination, ...] = ()
+    discrepancy: FoundDiscrepancy = field(default_factory=FoundDiscrepancy)
     regions: tuple[ModulusRegion, ...] = ()
     image_pairs: ImagePairs | None = None
     samples: ModulusSamples | None = None
@@ -193,11 +199,13 @@ def conclude(
         progress(f"intervals: {samples} samples of the posterior in each of {CHAINS} chains")
         stated = [e.interval95 if objective.parameters.absolute else e.ratio_interval95 for e in estimates]
         drawn = draw_moduli(inversion, covariance.total, stated, bounds=settings.bounds, draws=samples, rng=rng)
+    found_discrepancy = discrepancy_of(inversion, observed.states) if minimum.converged else FoundDiscrepancy()
     findings = (
         *inversion_findings(inversion, covariance.total),
         *pair_findings(pairs),
         *fold_findings(observed.states),
         *sample_findings(drawn),
+        *discrepancy_findings(found_discrepancy),
     )
     return Estimation(
         status="converged" if minimum.converged else "not converged",
@@ -213,6 +221,7 @@ def conclude(
         remarks=findings,
         observations={observation.kind: observation.description for observation in objective.observations},
         information=information(of_moduli),
+        discrepancy=found_discrepancy,
         combinations=combinations_of(inversion, of_moduli, within=IDENTIFIED),
         regions=regions,
         image_pairs=pairs,
@@ -250,8 +259,8 @@ def hull(intervals: Sequence[Interval]) -> Interval:
 def verdict(interval: Interval, *, at_bound: bool, absolute: bool) -> tuple[str, str]:
     """Verdict and its reason from the interval of a modulus or ratio.
 
-    `identified`: closed and high/low <= 2; `weak`: closed and wider; `not identified`: an open end, a bound, or
-    high/low > 10; `ratio only`: identified or weak, but no known modulus holds the scale.
+    `identified`: closed and high/low <= 4, a factor of 2 to each side; `weak`: closed and wider; `not identified`: an
+    open end, a bound, or high/low > 10; `ratio only`: identified or weak, but no known modulus holds the scale.
     """
     low, high = interval
     if at_bound:
@@ -324,14 +333,18 @@ def _estimates(
     if not known:
         return tuple(none)
     found, unit = [], scale if mapping.absolute else 1.0
+    given = np.diag(covariance.total if covariance.given_model is None else covariance.given_model)
     for i, (nothing, of) in enumerate(zip(none, known, strict=False)):
         ratio, (low, high) = float(np.exp(inversion.minimum.unknowns[i])), of.interval
         word, why = verdict(of.interval, at_bound=of.at_bound, absolute=mapping.absolute)
         points = zip(unit * np.exp(of.own.profile.theta), of.own.profile.root, strict=True)
+        inside = log_interval(ratio, float(np.sqrt(given[i])), lower=low or 0.0, upper=high or np.inf)
+        within = tuple(unit * end if end else None for end in (inside[0] or low, inside[1] or high))
         found.append(
             replace(
                 nothing,
                 interval_kind=of.own.kind,
+                interval95_given_model=(within[0], within[1]),
                 variance_shares=covariance.shares(i),
                 profile=tuple((float(value), float(root)) for value, root in points),
                 value=ratio * scale if mapping.absolute else None,

@@ -20,6 +20,7 @@ from palpate.images.tissue import Role, Tissue
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.case import Case, CaseTissue
 from palpate.study.case_text import case_tables
+from palpate.study.discrepancy import FoundDiscrepancy
 from palpate.study.estimation import Estimation, ModulusEstimate, TissueFit, no_estimate
 from palpate.study.poisson_ratios import PoissonRatioEstimate, no_ratio
 
@@ -165,6 +166,7 @@ class CaseResult:
                 for start in estimation.starts
             ],
             "outer_loop": {"history_mm2": [step.objective_mm2 for step in estimation.outer_loop]},
+            **_discrepancy(estimation.discrepancy, names),
             "observations": dict(estimation.observations),
             "counts": dict(estimation.counts),
             "mesh": _plain(self.mesh_summary),
@@ -247,6 +249,7 @@ def failure_document(case: Case, error: PalpateError) -> dict[str, Any]:
         "fit": [],
         "starts": [],
         "outer_loop": {"history_mm2": []},
+        **_discrepancy(FoundDiscrepancy(), []),
         "observations": {},
         "counts": {},
         "mesh": None,
@@ -318,7 +321,7 @@ def _estimate(item: ModulusEstimate, status: str) -> dict[str, Any]:
     """One entry of "estimates"; an estimate that did not converge must not look like a result."""
     document = _plain(item)
     if status != "converged":
-        document |= dict.fromkeys(("value", "interval95", "ratio", "ratio_interval95"))
+        document |= dict.fromkeys(("value", "interval95", "interval95_given_model", "ratio", "ratio_interval95"))
         document["verdict"] = "not identified"
     return document
 
@@ -330,6 +333,18 @@ def _ratio(item: PoissonRatioEstimate, status: str) -> dict[str, Any]:
     if status != "converged":
         document |= dict.fromkeys(("value", "interval95")) | {"verdict": "not identified"}
     return document
+
+
+def _discrepancy(found: FoundDiscrepancy, names: Sequence[str]) -> dict[str, Any]:
+    """The keys that say what frame, drawing and material were found to do."""
+    return {
+        "frame": [{"after": name} | _plain(of) for name, of in zip(names, found.frame, strict=False) if of is not None],
+        "offsets": [
+            {"after": names[of.state], "tissue": of.tissue, "mm": of.mm, "interval95": of.interval95}
+            for of in found.offsets
+        ],
+        "heterogeneity": [_plain(of) for of in found.heterogeneity],
+    }
 
 
 def _fit(name: str, fits: tuple[TissueFit, ...]) -> dict[str, Any]:

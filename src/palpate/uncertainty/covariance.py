@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ __all__ = [
     "sandwich_covariance",
 ]
 
+ROUNDING = 1e-9  # of a variance
 MARGIN_MM, MARGIN_VOXELS = 12.0, 8.0  # around the residuals' places, further than a distance map there is smoothed
 
 
@@ -59,26 +60,29 @@ class Covariance:
     """Of the parameters, (n_parameters, n_parameters) each, dimensionless, by its independent causes.
 
     Parameters are the log-moduli, then eta = ln(lambda / mu) of Poisson's ratios that are sought. noise: of the
-    residuals; prior: what is believed of the drivers' motion, and of parameters; grid: the place of the voxels; mesh:
-    what another mesh would make of it (of Young's moduli).
+    residuals; prior: what is believed of all unknowns, of which `causes` are the parts by the cause of their block;
+    grid: the place of the voxels; mesh: what another mesh would make of it (of Young's moduli). given_model: all that
+    would be left if frame, drawing and material were as the model has them, and only the drivers' motion unknown.
     """
 
     noise: NDArray[np.float64]
     prior: NDArray[np.float64]
     grid: NDArray[np.float64]
     mesh: NDArray[np.float64]
+    causes: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    given_model: NDArray[np.float64] | None = None
 
     @property
     def total(self) -> NDArray[np.float64]:
-        """Their sum."""
+        """The sum of all causes."""
         return self.noise + self.prior + self.grid + self.mesh
 
     def shares(self, number: int) -> dict[str, float]:
         """Share of each cause, 0 to 1, in the variance of the log-modulus with a `number`."""
-        return {
-            part.name: float(getattr(self, part.name)[number, number] / self.total[number, number])
-            for part in fields(self)
-        }
+        rest = self.prior - sum(self.causes.values(), np.zeros_like(self.prior))
+        parts = {"noise": self.noise, **self.causes, "prior": rest, "grid": self.grid, "mesh": self.mesh}
+        shares = {name: float(part[number, number] / self.total[number, number]) for name, part in parts.items()}
+        return {name: share for name, share in shares.items() if name != "prior" or share > ROUNDING}
 
 
 def covariance_of(
@@ -90,9 +94,53 @@ def covariance_of(
     rng: np.random.Generator,
 ) -> Covariance:
     """All that is known of the log-moduli's errors: the sandwich, the scatter over so many grid positions, the mesh."""
-    noise, prior = _sandwich(objective, evaluation)
-    shifts = grid_position_shifts(objective, evaluation, states, draws=draws, rng=rng)
-    return Covariance(noise, prior, shifts.T @ shifts / len(shifts), mesh_covariance(objective))
+    noise_of, mesh = error_noise(evaluation), mesh_covariance(objective)
+    errors = mapped(lambda own: imaging_errors(objective, evaluation, states, rng=own), rng.spawn(draws))
+    given = _given_model(objective, evaluation)
+
+    def parts(of: Evaluation) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Covariances by noise, prior and grid of one set of unknowns."""
+        noise, prior = _sandwich(objective, of, noise_of)
+        shifts = _shifts(of, errors, objective.n_parameters)
+        return noise, prior, shifts.T @ shifts / len(shifts)
+
+    noise, prior, grid = parts(evaluation)
+    left = noise + prior + grid if given is evaluation else sum(parts(given), np.zeros_like(noise))
+    return Covariance(noise, prior, grid, mesh, _causes(objective, evaluation), left + mesh)
+
+
+def _causes(objective: Objective, evaluation: Evaluation) -> dict[str, NDArray[np.float64]]:
+    """The parts H^-1 P_b H^-1 of the prior's covariance (n_parameters, n_parameters), by the cause of the blocks."""
+    inverse, found = evaluation.covariance_columns(objective.n_parameters), dict[str, NDArray[np.float64]]()
+    for i, block in enumerate(objective.parameters.blocks):
+        own = objective.parameters.columns(i)
+        part = inverse[own].T @ evaluation.prior[np.ix_(own, own)] @ inverse[own]
+        found[block.cause] = found.get(block.cause, np.zeros_like(part)) + part
+    return found
+
+
+def _given_model(objective: Objective, evaluation: Evaluation) -> Evaluation:
+    """The evaluation with the unknowns of parameters and drivers alone, all others held where they are."""
+    parameters = objective.parameters
+    kept = [parameters.columns(i) for i, block in enumerate(parameters.blocks) if block.cause == "driver"]
+    own = np.concatenate([np.arange(parameters.n_parameters), *kept])
+    if len(own) == parameters.n_unknowns:
+        return evaluation
+    lines = []
+    for line in evaluation.lines:
+        inside = np.isin(line.columns, own)
+        columns = np.searchsorted(own, line.columns[inside])
+        lines.append(replace(line, columns=columns, jacobian=line.jacobian[:, inside]))
+    within = np.ix_(own, own)
+    return replace(
+        evaluation,
+        gradient=evaluation.gradient[own],
+        score=evaluation.score[own],
+        matrix=evaluation.matrix[within],
+        lines=tuple(lines),
+        prior=evaluation.prior[within],
+        prior_score=evaluation.prior_score[own],
+    )
 
 
 def mesh_covariance(objective: Objective) -> NDArray[np.float64]:
@@ -121,15 +169,18 @@ def sandwich_covariance(objective: Objective, evaluation: Evaluation) -> NDArray
     have it, at the material place, by the mean of their noise models. Later states that move alike do not average
     it away, opposite ones do.
     """
-    return sum(_sandwich(objective, evaluation), np.zeros((objective.n_parameters,) * 2))
+    noise, prior = _sandwich(objective, evaluation, error_noise(evaluation))
+    return noise + prior
 
 
-def _sandwich(objective: Objective, evaluation: Evaluation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _sandwich(
+    objective: Objective, evaluation: Evaluation, noise_of: Mapping[tuple[int, str], NoiseModel]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Its two parts, (n_parameters, n_parameters) each: by the residuals, and by the prior."""
     n = objective.n_parameters
     inverse = evaluation.covariance_columns(n)
     data = np.zeros((n, n))
-    pairs, noise_of = list(zip(evaluation.lines, gain(evaluation, n), strict=True)), error_noise(evaluation)
+    pairs = list(zip(evaluation.lines, gain(evaluation, n), strict=True))
     for kind in dict.fromkeys(line.observation.kind for line in evaluation.lines):
         of_kind = [(line, row) for line, row in pairs if line.observation.kind == kind]
         later = [line.state for line, _ in of_kind]
@@ -190,14 +241,17 @@ def grid_position_shifts(
     The errors e of the residuals (see `imaging_errors`) go through the gain of one Gauss-Newton step, -G e. Every draw
     has a generator of its own, so that they can be made side by side.
     """
-    rows = gain(evaluation, objective.n_parameters)
+    errors = mapped(lambda own: imaging_errors(objective, evaluation, states, rng=own), rng.spawn(draws))
+    return _shifts(evaluation, errors, objective.n_parameters)
 
-    def shift(own: np.random.Generator) -> NDArray[np.float64]:
-        """That of one draw (n_parameters,)."""
-        errors = imaging_errors(objective, evaluation, states, rng=own)
-        return -sum((row @ error for row, error in zip(rows, errors, strict=True)), np.zeros(objective.n_parameters))
 
-    return np.asarray(mapped(shift, rng.spawn(draws))).reshape(draws, objective.n_parameters)
+def _shifts(
+    evaluation: Evaluation, errors: Sequence[Sequence[NDArray[np.float64]]], n_parameters: int
+) -> NDArray[np.float64]:
+    """Shifts -G e (draws, n_parameters) of the log-moduli by errors e (n,) mm of each surface, of each draw."""
+    rows = gain(evaluation, n_parameters)
+    moved = [-sum((row @ e for row, e in zip(rows, of, strict=True)), np.zeros(n_parameters)) for of in errors]
+    return np.asarray(moved).reshape(len(moved), n_parameters)
 
 
 def imaging_errors(

@@ -1,0 +1,121 @@
+"""What an estimate found of all that a model leaves out: the frame's motion, how surfaces are drawn, the material."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.findings import Finding
+from palpate.images.checks import later_names
+from palpate.inversion import Inversion
+from palpate.mesh.surface import cut_faces
+from palpate.uncertainty import NORMAL_95, FittedState
+
+__all__ = [
+    "FoundDiscrepancy",
+    "FrameFound",
+    "HeterogeneityFound",
+    "OffsetFound",
+    "discrepancy_findings",
+    "discrepancy_of",
+]
+
+TOLD = 2.0  # standard deviations, from which an offset is said in words
+LEAST_TOLD_MM = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class FrameFound:
+    """Motion of the frame, the body's faces on the image's cut, in one later state: root mean square and largest, mm.
+
+    prior_mm: learned standard deviation of each component of its smooth part.
+    """
+
+    rms_mm: float
+    largest_mm: float
+    prior_mm: float
+
+
+@dataclass(frozen=True, slots=True)
+class OffsetFound:
+    """By how much further out (mm) a tissue's surface is drawn in a later image, with a 95 % interval."""
+
+    tissue: str
+    state: int
+    mm: float
+    interval95: tuple[float, float]
+
+    @property
+    def told(self) -> bool:
+        """Whether it is so much larger than its own uncertainty that it is worth a sentence."""
+        sd = (self.interval95[1] - self.interval95[0]) / (2.0 * NORMAL_95)
+        return abs(self.mm) > max(TOLD * sd, LEAST_TOLD_MM)
+
+
+@dataclass(frozen=True, slots=True)
+class HeterogeneityFound:
+    """Standard deviation of ln E inside a tissue: learned, and the scale of its prior."""
+
+    tissue: str
+    sd: float
+    prior: float
+
+
+@dataclass(frozen=True, slots=True)
+class FoundDiscrepancy:
+    """All of it: the frame of each later state (None: it is held), offsets, tissues that are not homogeneous."""
+
+    frame: tuple[FrameFound | None, ...] = ()
+    offsets: tuple[OffsetFound, ...] = ()
+    heterogeneity: tuple[HeterogeneityFound, ...] = ()
+
+
+def discrepancy_of(inversion: Inversion, states: Sequence[FittedState]) -> FoundDiscrepancy:
+    """What the blocks of unknowns of a converged inversion say, with the fitted later states."""
+    parameters, unknowns = inversion.objective.parameters, inversion.minimum.unknowns
+    n = parameters.n_parameters
+    offsets, heterogeneity = list[OffsetFound](), list[HeterogeneityFound]()
+    smooth = dict[int, float]()
+    rows = np.linalg.inv(inversion.minimum.evaluation.matrix)
+    for number, block in enumerate(parameters.blocks):
+        own = parameters.columns(number)
+        precision = parameters.nuisance_precision[np.ix_(own - n, own - n)]
+        learned = float(np.sqrt(np.mean(np.diag(np.linalg.inv(precision))))) if block.size else 0.0
+        if block.cause == "offset":
+            value, half = float(unknowns[own[0]]), NORMAL_95 * float(np.sqrt(rows[own[0], own[0]]))
+            offsets.append(OffsetFound(block.of, block.states[0], value, (value - half, value + half)))
+        elif block.cause == "heterogeneity":
+            heterogeneity.append(HeterogeneityFound(block.of, learned, block.scale))
+        elif block.cause == "frame":
+            smooth.setdefault(block.states[0], learned * block.unit_mm)
+    frames = tuple(None if s not in smooth else _frame(fitted, smooth[s]) for s, fitted in enumerate(states))
+    return FoundDiscrepancy(frames, tuple(offsets), tuple(heterogeneity))
+
+
+def _frame(fitted: FittedState, prior_mm: float) -> FrameFound:
+    points = np.unique(fitted.space.facets(cut_faces(fitted.space.mesh)))
+    motion: NDArray[np.float64] = np.linalg.norm(fitted.displacement[points], axis=1)
+    if not len(points):
+        return FrameFound(0.0, 0.0, prior_mm)
+    return FrameFound(float(np.sqrt(np.mean(motion**2))), float(motion.max()), prior_mm)
+
+
+def discrepancy_findings(found: FoundDiscrepancy) -> tuple[Finding, ...]:
+    """A sentence for each surface that is drawn otherwise in a later image."""
+    findings = []
+    names = later_names(1 + max((offset.state for offset in found.offsets), default=0))
+    for offset in found.offsets:
+        if offset.told:
+            how = "larger" if offset.mm > 0.0 else "thinner or smaller"
+            place = f"in '{names[offset.state]}'"
+            text = (
+                f"'{offset.tissue}' is drawn {abs(offset.mm):.2g} mm {how} on every side {place} than its motion"
+                f" explains ({offset.interval95[0]:.2g} to {offset.interval95[1]:.2g} mm): the outer wall in one image"
+                " and the lumen in the other, or another reader? The estimate has taken it out; draw both alike to be"
+                " sure"
+            )
+            findings.append(Finding("drawn-otherwise", text, place=place))
+    return tuple(findings)

@@ -1,0 +1,127 @@
+"""Modes of the material: what a body does whose tissues are not homogeneous, and its derivatives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from palpate.images.tissue import Role, Tissue
+from palpate.mechanics.boundary import outer_constraint
+from palpate.mechanics.dilatation import Dilatation
+from palpate.mechanics.finite_strain import finite_strain_model
+from palpate.mechanics.laws.neo_hookean import NeoHookean
+from palpate.mechanics.linear_model import linear_model
+from palpate.mechanics.material import MaterialModes, material_modes
+from palpate.mechanics.newton import NewtonSettings
+from palpate.mesh.anatomy import Anatomy, Box
+from palpate.mesh.space import lagrange_space
+from palpate.mesh.tetrahedralise import tetrahedralise
+from palpate.observation.prescribed_motion import prescribed_motion
+from palpate.phantoms.shapes import ball
+
+MODULI = np.array([30.0, 10.0])
+
+
+@pytest.fixture(scope="module")
+def body():
+    """A gland beside a driver, in a box, with its constraint."""
+    tissues = (
+        Tissue("gland", Role.ESTIMATE, (1,), 0.40),
+        Tissue("tube", Role.DRIVER, (2,)),
+        Tissue("rest", Role.KNOWN, (3,), 0.43, youngs_modulus_kpa=10.0),
+    )
+    box = Box(np.full(3, -20.0), np.eye(3), np.full(3, 40.0))
+    shapes = (ball([0.0, -7.0, 0.0], 7.0), ball([0.0, 9.0, 0.0], 6.0), None)
+    space = lagrange_space(tetrahedralise(Anatomy(tissues, shapes, box), edge_length_mm=7.0), "P1")
+    motion = prescribed_motion(space, {}, n_modes=6, kernel_mm=12.0, prior_mm=2.0)
+    given = {"modes": motion.modes, "offset": motion.offset, "prescribed": motion.prescribed}
+    return space, outer_constraint(space, outer="fixed", **given)
+
+
+@pytest.fixture(scope="module")
+def modes(body):
+    return material_modes(body[0].mesh, (0, 2), length_mm=15.0, poisson=(0, 2))
+
+
+@pytest.fixture
+def coefficients(body, modes):
+    rng = np.random.default_rng(3)
+    boundary = rng.normal(size=body[1].n_modes)
+    return boundary, np.concatenate([0.3 * rng.normal(size=modes.fields.shape[1]), [0.01, -0.02]])
+
+
+def finite(body, modes):
+    return finite_strain_model(*body, NeoHookean(), material=modes, settings=NewtonSettings(tolerance=1e-11))
+
+
+def test_the_modulus_of_a_tissue_is_the_geometric_mean_over_it(body, modes, coefficients):
+    mesh = body[0].mesh
+    logarithms = np.log(modes.scale(coefficients[1]))
+    assert logarithms.std() > 0.05
+    for tissue in (0, 2):
+        own = mesh.region == tissue
+        assert np.average(logarithms[own], weights=mesh.volumes[own]) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_fields_have_the_covariance_of_their_kernel(body, modes):
+    """But for the mean that is taken off and the twentieth of the variance that is left out."""
+    mesh = body[0].mesh
+    own = np.flatnonzero(mesh.region == 2)
+    centres, volumes = mesh.nodes[mesh.tets].mean(axis=1)[own], mesh.volumes[own]
+    kernel = np.exp(-np.sum((centres[:, None] - centres) ** 2, axis=2) / (2.0 * 15.0**2))
+    mean = np.eye(len(own)) - volumes / volumes.sum()
+    fields = modes.fields[own].toarray()
+    assert np.abs(fields @ fields.T - mean @ kernel @ mean.T).mean() < 0.03
+
+
+def test_a_field_that_is_the_same_everywhere_in_a_tissue_is_a_modulus(body, coefficients):
+    mesh = body[0].mesh
+    uniform = MaterialModes(sparse.csr_matrix((mesh.region == 0).astype(float)[:, None]))
+    moved = finite(body, uniform).solve(MODULI, np.append(coefficients[0], np.log(2.0))).values
+    stiffer = finite(body, uniform).solve(MODULI * [2.0, 1.0], np.append(coefficients[0], 0.0)).values
+    assert moved == pytest.approx(stiffer, abs=1e-8)
+
+
+def test_all_moduli_scaled_together_leave_a_patchy_body_where_it_is(body, modes, coefficients):
+    model, every = finite(body, modes), np.concatenate(coefficients)
+    assert model.solve(5.0 * MODULI, every).values == pytest.approx(model.solve(MODULI, every).values, abs=1e-8)
+
+
+@pytest.mark.parametrize("column", [-9, -3, -2, -1])
+def test_the_derivative_by_a_material_mode_is_that_of_finite_differences(body, modes, coefficients, column):
+    model, every = finite(body, modes), np.concatenate(coefficients)
+    there = model.solve(MODULI, every)
+    step = np.zeros(len(every))
+    step[column] = 1e-4
+    ahead, behind = (model.solve(MODULI, every + sign * step).values for sign in (1.0, -1.0))
+    expected = (ahead - behind) / 2e-4
+    assert there.tangent()[:, column] == pytest.approx(expected, abs=1e-5 * np.abs(expected).max())
+    direction = np.zeros((2 + len(every), 1))
+    direction[column] = 1.0  # counted from the end: moduli come first
+    found = there.tangent_along(direction, np.zeros((len(there.values), 1)))[:, 0]
+    assert np.linalg.norm(found - expected) < 2e-2 * np.linalg.norm(expected)
+
+
+def test_the_adjoint_of_a_patchy_body_is_its_transposed_tangent(body, modes, coefficients, rng):
+    model = finite(body, modes)
+    there = model.solve(MODULI, np.concatenate(coefficients))
+    gradient = rng.normal(size=len(there.values))
+    assert there.adjoint(gradient) == pytest.approx(there.tangent().T @ gradient, rel=1e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize("dilatation", list(Dilatation))
+def test_the_linear_law_is_the_small_strain_limit_of_a_patchy_body(body, modes, coefficients, dilatation):
+    """To first order in the material: a hundredth of the motion and of the modes, derivatives and all."""
+    linear = linear_model(*body, dilatation=dilatation, material=modes)
+    model = finite_strain_model(
+        *body, NeoHookean(), dilatation=dilatation, material=modes, settings=NewtonSettings(tolerance=1e-11)
+    )
+    amounts = np.concatenate([1e-3 * coefficients[0], 1e-3 * coefficients[1]])
+    small, exact = linear.solve(MODULI, amounts), model.solve(MODULI, amounts)
+    assert np.linalg.norm(small.values - exact.values) < 2e-3 * np.linalg.norm(exact.values)
+    first = 2 + body[1].n_modes
+    by_material, expected = small.tangent()[:, first:], exact.tangent()[:, first:]
+    assert np.linalg.norm(by_material - expected) < 5e-3 * np.linalg.norm(expected)
+    gradient = np.random.default_rng(1).normal(size=len(small.values))
+    assert small.adjoint(gradient) == pytest.approx(small.tangent().T @ gradient, rel=1e-6, abs=1e-6)
