@@ -53,13 +53,14 @@ def main() -> int:
         for key in keys:
             place: Key = (key.kind, key.seed, key.law, key.noise_mm, overrides)
             if arguments.make_only:
-                began = time.perf_counter()
-                _say(f"{scene_folder(key, Path(cache))} ({time.perf_counter() - began:.0f} s)")
+                _say(_made(key, Path(cache)))
                 continue
             if place not in done:
                 done[place] = _case(key, Path(cache), overrides, arguments.keep)
                 _append(arguments.output, done[place])
             _say(_line(done[place]))
+    if arguments.make_only:
+        return 0
     rows = {}
     for kind, law, noise in dict.fromkeys((key.kind, key.law, key.noise_mm) for key in keys):
         cases = [r for k, r in sorted(done.items()) if (k[0], *k[2:]) == (kind, law, noise, overrides)]
@@ -107,6 +108,16 @@ def _keys(arguments: argparse.Namespace) -> list[SceneKey]:
         for noise in noises
         for kind in arguments.scenes.split(",")
     ]
+
+
+def _made(key: SceneKey, cache: Path) -> str:
+    """What became of the making of a scene."""
+    began = time.perf_counter()
+    try:
+        what = str(scene_folder(key, cache))
+    except Exception as error:  # the next scene is worth making
+        what = f"{key.name}: {type(error).__name__}: {error}"
+    return f"{what} ({time.perf_counter() - began:.0f} s)"
 
 
 def _case(key: SceneKey, cache: Path, overrides: tuple[str, ...], keep: Path | None) -> Result:

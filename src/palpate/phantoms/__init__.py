@@ -18,7 +18,7 @@ from palpate.phantoms.scene import (
     reimaged,
     rescaled,
 )
-from palpate.phantoms.shapes import Complement, Ellipsoid, Tube, ball, rotation_about
+from palpate.phantoms.shapes import Complement, Ellipsoid, Grown, Tube, ball, rotation_about
 from palpate.phantoms.spheres import SpheresOptions, spheres
 from palpate.phantoms.wall_filling import wall_filling
 
@@ -27,6 +27,7 @@ __all__ = [
     "BoundaryMotion",
     "Complement",
     "Ellipsoid",
+    "Grown",
     "Noise",
     "PelvisOptions",
     "PelvisShapes",
