@@ -10,7 +10,7 @@ import json
 import os
 import shutil
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.errors import GeometryError, NotConverged
+from palpate.errors import GeometryError, NotConverged, PalpateError
 from palpate.images import LabelImage, Role, VoxelGrid, write_label_image
-from palpate.mechanics import law_named
+from palpate.mechanics import Law, law_named
 from palpate.mesh import OUTER, Anatomy, LagrangeSpace, TetMesh, lagrange_space, tetrahedralise
 from palpate.observation import observed_surface
 from palpate.phantoms import (
@@ -39,6 +39,7 @@ from palpate.phantoms import (
     pelvis_grid,
     pelvis_motions,
     redrawn,
+    refuse_folded,
     rotation_about,
     smooth_field,
 )
@@ -306,16 +307,40 @@ def _solved(
     patches (n_tets,): ln E, but for a constant a tissue. The rectum fills less where the truth would fold over.
     """
     solved = space if patches is None else replace(space, mesh=patched(space.mesh, patches))
+    law = law_named(options.law)
+    asked = []
     for share in FILLINGS:
-        filling = share * options.filling_mm
-        walls = pelvis_motions(replace(options, filling_mm=filling))
-        try:
-            motions = [BoundaryMotion(walls, border) for border in borders]
-            return displacements(solved, motions, law=law_named(options.law)), filling
-        except (GeometryError, NotConverged):
+        walls = pelvis_motions(replace(options, filling_mm=share * options.filling_mm))
+        asked.append([BoundaryMotion(walls, border) for border in borders])
+    batches = [asked[k : k + 1] for k in range(len(asked))] if law.finite else [asked]
+    tried = (found for batch in batches for found in _together(solved, batch, law))
+    for share, found in zip(FILLINGS, tried, strict=True):
+        if isinstance(found, PalpateError):
             if share == FILLINGS[-1]:
-                raise
+                raise found
+            continue
+        return found, share * options.filling_mm
     raise AssertionError("the last filling returns or raises")
+
+
+def _together(
+    space: LagrangeSpace, asked: Sequence[Sequence[BoundaryMotion]], law: Law
+) -> Iterator[list[Array] | PalpateError]:
+    """The displacements of each list of motions, all by one call, or why there are none."""
+    try:
+        found = iter(displacements(space, [motion for motions in asked for motion in motions], law=law))
+    except NotConverged as error:
+        yield from [error] * len(asked)
+        return
+    for motions in asked:
+        of_motions = [next(found) for _ in motions]
+        try:
+            for displacement in of_motions:
+                refuse_folded(space, displacement)
+        except GeometryError as error:
+            yield error
+        else:
+            yield of_motions
 
 
 def _mesh(options: PelvisOptions, cache: Path, *, sheathed: bool) -> TetMesh:

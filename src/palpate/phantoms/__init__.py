@@ -15,6 +15,7 @@ from palpate.phantoms.scene import (
     displacements,
     grid_box,
     imaged,
+    refuse_folded,
     reimaged,
     rescaled,
 )
@@ -51,6 +52,7 @@ __all__ = [
     "pelvis_grid",
     "pelvis_motions",
     "redrawn",
+    "refuse_folded",
     "reimaged",
     "rescaled",
     "rotation_about",
