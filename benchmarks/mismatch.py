@@ -2,7 +2,7 @@
 
     python benchmarks/mismatch.py [--scenes still,crop,...] [--laws linear,neo-hookean] [--noise clean,0.3] [--bodies N]
         [--first-seed S] [--share k/n] [--scenes-cache FOLDER] [--output FILE.jsonl] [--set key=value ...]
-        [--keep FOLDER] [--make-only] [--json]
+        [--keep FOLDER] [--make-only] [--summary] [--json]
 
 Simulated data. Each scene (mismatch_scenes.py) shows a random pelvis whose truth is larger and finer than what the
 estimate meshes, in images of 1 mm voxels, and is a folder with a case.toml, which is estimated with the program's
@@ -50,7 +50,7 @@ def main() -> int:
     done = _read(arguments.output)
     made = nullcontext(arguments.scenes_cache) if arguments.scenes_cache else tempfile.TemporaryDirectory()
     with made as cache:
-        for key in keys:
+        for key in () if arguments.summary else keys:
             place: Key = (key.kind, key.seed, key.law, key.noise_mm, overrides)
             if arguments.make_only:
                 _say(_made(key, Path(cache)))
@@ -86,6 +86,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of the case; repeatable")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="for the outputs of each estimate")
     parser.add_argument("--make-only", action="store_true", help="make the scenes and estimate nothing")
+    parser.add_argument("--summary", action="store_true", help="of what FILE.jsonl has; estimate nothing")
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     arguments = parser.parse_args()
     unknown = [name for name in arguments.scenes.split(",") if name not in KINDS]
