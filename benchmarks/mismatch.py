@@ -2,7 +2,7 @@
 
     python benchmarks/mismatch.py [--scenes still,crop,...] [--laws linear,neo-hookean] [--noise clean,0.3] [--bodies N]
         [--first-seed S] [--share k/n] [--scenes-cache FOLDER] [--output FILE.jsonl] [--set key=value ...]
-        [--keep FOLDER] [--make-only] [--json]
+        [--keep FOLDER] [--make-only] [--summary] [--json]
 
 Simulated data. Each scene (mismatch_scenes.py) shows a random pelvis whose truth is larger and finer than what the
 estimate meshes, in images of 1 mm voxels, and is a folder with a case.toml, which is estimated with the program's
@@ -50,16 +50,17 @@ def main() -> int:
     done = _read(arguments.output)
     made = nullcontext(arguments.scenes_cache) if arguments.scenes_cache else tempfile.TemporaryDirectory()
     with made as cache:
-        for key in keys:
+        for key in () if arguments.summary else keys:
             place: Key = (key.kind, key.seed, key.law, key.noise_mm, overrides)
             if arguments.make_only:
-                began = time.perf_counter()
-                _say(f"{scene_folder(key, Path(cache))} ({time.perf_counter() - began:.0f} s)")
+                _say(_made(key, Path(cache)))
                 continue
             if place not in done:
                 done[place] = _case(key, Path(cache), overrides, arguments.keep)
                 _append(arguments.output, done[place])
             _say(_line(done[place]))
+    if arguments.make_only:
+        return 0
     rows = {}
     for kind, law, noise in dict.fromkeys((key.kind, key.law, key.noise_mm) for key in keys):
         cases = [r for k, r in sorted(done.items()) if (k[0], *k[2:]) == (kind, law, noise, overrides)]
@@ -85,6 +86,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of the case; repeatable")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="for the outputs of each estimate")
     parser.add_argument("--make-only", action="store_true", help="make the scenes and estimate nothing")
+    parser.add_argument("--summary", action="store_true", help="of what FILE.jsonl has; estimate nothing")
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     arguments = parser.parse_args()
     unknown = [name for name in arguments.scenes.split(",") if name not in KINDS]
@@ -107,6 +109,16 @@ def _keys(arguments: argparse.Namespace) -> list[SceneKey]:
         for noise in noises
         for kind in arguments.scenes.split(",")
     ]
+
+
+def _made(key: SceneKey, cache: Path) -> str:
+    """What became of the making of a scene."""
+    began = time.perf_counter()
+    try:
+        what = str(scene_folder(key, cache))
+    except Exception as error:  # the next scene is worth making
+        what = f"{key.name}: {type(error).__name__}: {error}"
+    return f"{what} ({time.perf_counter() - began:.0f} s)"
 
 
 def _case(key: SceneKey, cache: Path, overrides: tuple[str, ...], keep: Path | None) -> Result:

@@ -10,31 +10,36 @@ import json
 import os
 import shutil
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.errors import GeometryError, NotConverged
+from palpate.errors import GeometryError, NotConverged, PalpateError
 from palpate.images import LabelImage, Role, VoxelGrid, write_label_image
-from palpate.mechanics import law_named
-from palpate.mesh import OUTER, LagrangeSpace, TetMesh, lagrange_space, tetrahedralise
+from palpate.mechanics import Law, law_named
+from palpate.mesh import OUTER, Anatomy, LagrangeSpace, TetMesh, lagrange_space, tetrahedralise
 from palpate.observation import observed_surface
 from palpate.phantoms import (
     AffineMotion,
     BoundaryMotion,
+    Grown,
     PelvisOptions,
     ScaledMotion,
+    WallMotion,
     displacements,
+    grid_box,
     imaged,
     patched,
     pelvis_anatomy,
     pelvis_grid,
     pelvis_motions,
     redrawn,
+    refuse_folded,
     rotation_about,
     smooth_field,
 )
@@ -56,6 +61,8 @@ FOV_MM, FOV_SIDES = (4.0, 10.0), (3, 5)
 ORGANS_OFF_MM, DRIVER_OFF_MM = 0.25, 1.0  # smaller for odd seeds, larger for even ones
 FILLINGS = (1.0, 0.8, 0.6, 0.4)  # of the rectum's 6 to 8 mm: the first at which no tetrahedron of the truth folds over
 STIFFER = 3.0  # one half of the surroundings than the other
+FIELD_SD, FIELD_LENGTH_MM = (0.3, 0.6), (20.0, 30.0)  # of ln E
+SHEATH_MM, SHEATH = 3.0, (1.0 / 3.0, 1.0 / 20.0)  # its share of the surroundings' stiffness: of even seeds, of odd ones
 
 
 @dataclass(frozen=True)
@@ -144,9 +151,27 @@ def _driver(truth: Truth, seed: int) -> tuple[View, Facts]:
     return replace(view, off_mm=off), {"off_mm": off}
 
 
+def _fov(truth: Truth, seed: int) -> tuple[View, Facts]:
+    """The later image ends 4 to 10 mm before the first one on 3 to 5 sides."""
+    view, _ = _still(truth, seed)
+    rng = _rng(seed, "fov")
+    less = np.zeros(6)
+    sides = rng.permutation(6)[: rng.integers(*FOV_SIDES, endpoint=True)]
+    less[sides] = rng.uniform(*FOV_MM, len(sides))
+    box = grid_box(view.before)
+    shape = np.floor(box.lengths - less[:3] - less[3:]).astype(int)
+    return replace(view, after=_grid(box.origin + less[:3], shape, np.eye(3))), {"less_mm": less.round(2).tolist()}
+
+
+def _all(truth: Truth, seed: int) -> tuple[View, Facts]:
+    """The patient lies elsewhere and the organs are drawn smaller or larger, as in those scenes of the body."""
+    (view, facts), (drawn, told) = _shift(truth, seed), _organs(truth, seed)
+    return replace(view, off_mm=drawn.off_mm), facts | told
+
+
 @dataclass(frozen=True)
 class Kind:
-    """A kind of scene: the truth that it shows, a key of TRUTHS, and how."""
+    """A kind of scene: the truth that it shows ("held", "border" or a key of PATCHES), and how."""
 
     truth: str
     view: Callable[[Truth, int], tuple[View, Facts]]
@@ -160,7 +185,12 @@ KINDS = {
     "shift": Kind("held", _shift, "the patient lies elsewhere"),
     "organs": Kind("held", _organs, "organs drawn 0.25 mm smaller or larger"),
     "driver": Kind("held", _driver, "rectum drawn 1 mm thinner or thicker"),
+    "fov": Kind("held", _fov, "later field of view smaller"),
+    "all": Kind("border", _all, "border moves, the patient lies elsewhere, organs drawn off"),
     "halves": Kind("halves", _still, "surroundings three times stiffer in a half"),
+    "field": Kind("field", _still, "a Gaussian field of ln E in the surroundings"),
+    "field-organs": Kind("field-organs", _still, "Gaussian fields of ln E in surroundings and organs"),
+    "sheath": Kind("sheath", _still, "a soft sheath round the prostate"),
 }
 
 
@@ -249,45 +279,80 @@ def _images(truth: Truth, view: View, key: SceneKey) -> tuple[LabelImage, LabelI
 def _truth(name: str, seed: int, law: str, cache: Path) -> Truth:
     """A truth of a body, from the cache or solved; those of the linear law that differ in the border share a solve."""
     path = cache / "truths" / f"{name}-{seed}-{law}.npz"
-    options = _options(seed)
-    mesh = _mesh(options, cache)
-    space = lagrange_space(mesh, "P2")
+    options = _options(seed, law)
+    raw = _mesh(options, cache, sheathed=name == "sheath")
+    space = lagrange_space(_merged(raw), "P2")
     if not path.exists():
-        made = _solved(name, space, law, options)
-        for other, (displacement, facts) in made.items():
-            target = path.with_name(f"{other}-{seed}-{law}.npz")
-            _save(target, {"version": VERSION, "displacement": displacement, "facts": json.dumps(facts)})
-    kept = np.load(path)
-    _refuse_version(int(kept["version"]), path)
-    return Truth(space, kept["displacement"], json.loads(str(kept["facts"])))
+        border, told = _border(seed, space)
+        asked, patches = {"held": (None, Facts()), "border": (border, told)}, None
+        if name in PATCHES:
+            patches, told = PATCHES[name](raw, seed)
+            asked = {name: (None, told)}
+        elif law != "linear":
+            asked = {name: asked[name]}
+        found, filling = _solved(space, patches, [outside for outside, _ in asked.values()], options)
+        for (other, (_, facts)), displacement in zip(asked.items(), found, strict=True):
+            kept = {"displacement": displacement, "facts": json.dumps({"filling_mm": filling} | facts)}
+            _save(path.with_name(f"{other}-{seed}-{law}.npz"), {"version": VERSION} | kept)
+    loaded = np.load(path)
+    _refuse_version(int(loaded["version"]), path)
+    return Truth(space, loaded["displacement"], json.loads(str(loaded["facts"])))
 
 
-def _solved(name: str, space: LagrangeSpace, law: str, options: PelvisOptions) -> dict[str, tuple[Array, Facts]]:
-    """Displacement and facts of a truth, and of those that come with it; the rectum fills less where it folds over."""
-    border, told = _border(options.seed, space)
-    solved, asked = space, {"held": (None, Facts()), "border": (border, told)}
-    if name == "halves":
-        factors, told = _halves(space.mesh, options.seed)
-        solved, asked = replace(space, mesh=patched(space.mesh, factors)), {name: (None, told)}
-    elif law != "linear":
-        asked = {name: asked[name]}
+def _solved(
+    space: LagrangeSpace, patches: Array | None, borders: Sequence[WallMotion | None], options: PelvisOptions
+) -> tuple[list[Array], float]:
+    """Displacements (n_points, 3) mm under each of some motions of the border, and the rectum's filling, mm.
+
+    patches (n_tets,): ln E, but for a constant a tissue. The rectum fills less where the truth would fold over.
+    """
+    solved = space if patches is None else replace(space, mesh=patched(space.mesh, patches))
+    law = law_named(options.law)
+    asked = []
     for share in FILLINGS:
         walls = pelvis_motions(replace(options, filling_mm=share * options.filling_mm))
-        motions = [BoundaryMotion(walls, outside) for outside, _ in asked.values()]
-        try:
-            found = displacements(solved, motions, law=law_named(law))
-        except (GeometryError, NotConverged):
+        asked.append([BoundaryMotion(walls, border) for border in borders])
+    batches = [asked[k : k + 1] for k in range(len(asked))] if law.finite else [asked]
+    tried = (found for batch in batches for found in _together(solved, batch, law))
+    for share, found in zip(FILLINGS, tried, strict=True):
+        if isinstance(found, PalpateError):
             if share == FILLINGS[-1]:
-                raise
+                raise found
             continue
-        break
-    filling = {"filling_mm": share * options.filling_mm}
-    return {key: (u, filling | facts) for (key, (_, facts)), u in zip(asked.items(), found, strict=True)}
+        return found, share * options.filling_mm
+    raise AssertionError("the last filling returns or raises")
 
 
-def _mesh(options: PelvisOptions, cache: Path) -> TetMesh:
-    """The truth's mesh of a body, from the cache or made."""
-    path, anatomy = cache / "truths" / f"mesh-{options.seed}.npz", pelvis_anatomy(options)
+def _together(
+    space: LagrangeSpace, asked: Sequence[Sequence[BoundaryMotion]], law: Law
+) -> Iterator[list[Array] | PalpateError]:
+    """The displacements of each list of motions, all by one call, or why there are none."""
+    try:
+        found = iter(displacements(space, [motion for motions in asked for motion in motions], law=law))
+    except NotConverged as error:
+        yield from [error] * len(asked)
+        return
+    for motions in asked:
+        of_motions = [next(found) for _ in motions]
+        try:
+            for displacement in of_motions:
+                refuse_folded(space, displacement)
+        except GeometryError as error:
+            yield error
+        else:
+            yield of_motions
+
+
+def _mesh(options: PelvisOptions, cache: Path, *, sheathed: bool) -> TetMesh:
+    """The truth's mesh of a body, from the cache or made; with the sheath for a last tissue, if there is to be one."""
+    path = cache / "truths" / f"{'sheathed-' * sheathed}mesh-{options.seed}.npz"
+    anatomy = pelvis_anatomy(options)
+    if sheathed:
+        prostate = anatomy.level_sets[[t.name for t in anatomy.tissues].index(ORGANS[0])]
+        known = next(t for t in anatomy.tissues if t.name == KNOWN)
+        assert prostate is not None
+        tissues = (*anatomy.tissues, replace(known, name="sheath", labels=(len(anatomy.tissues) + 1,)))
+        anatomy = Anatomy(tissues, (*anatomy.level_sets, Grown(prostate, SHEATH_MM)), anatomy.box)
     if not path.exists():
         mesh = tetrahedralise(anatomy, edge_length_mm=options.truth_edge_mm)
         parts = {name: getattr(mesh, name) for name in ("nodes", "tets", "region", "boundary", "beyond")}
@@ -295,6 +360,13 @@ def _mesh(options: PelvisOptions, cache: Path) -> TetMesh:
     kept = np.load(path)
     _refuse_version(int(kept["version"]), path)
     return TetMesh(kept["nodes"], kept["tets"], kept["region"], kept["boundary"], kept["beyond"], anatomy.tissues)
+
+
+def _merged(mesh: TetMesh) -> TetMesh:
+    """The mesh with the sheath, if there is one, as a part of the surroundings."""
+    tissues = tuple(t for t in mesh.tissues if t.name != "sheath")
+    region = np.where(mesh.region >= len(tissues), mesh.tissue_index(KNOWN), mesh.region)
+    return replace(mesh, region=region, tissues=tissues)
 
 
 def _border(seed: int, space: LagrangeSpace) -> tuple[ScaledMotion, Facts]:
@@ -322,12 +394,39 @@ def _halves(mesh: TetMesh, seed: int) -> tuple[Array, Facts]:
     return factors, {"stiffer": STIFFER, "towards": direction.tolist()}
 
 
+def _field(mesh: TetMesh, seed: int, *, organs: bool = False) -> tuple[Array, Facts]:
+    """The same of a Gaussian field in the surroundings, and of others in the organs."""
+    rng = _rng(seed, "field")
+    sd, length = rng.uniform(*FIELD_SD), rng.uniform(*FIELD_LENGTH_MM)
+    drawn = smooth_field(rng, sd_mm=sd, correlation_mm=length).at(mesh.nodes[mesh.tets].mean(axis=1))
+    factors = np.zeros(len(mesh.tets))
+    for component, name in enumerate((KNOWN, *ORGANS) if organs else (KNOWN,)):
+        here = mesh.region == mesh.tissue_index(name)
+        factors[here] = drawn[here, component]
+    return factors, {"field_sd": sd, "field_length_mm": length}
+
+
+def _sheath(mesh: TetMesh, seed: int) -> tuple[Array, Facts]:
+    """The same of a sheath of 3 mm round the prostate, where neither bladder nor rectum is."""
+    share = SHEATH[seed % 2]
+    factors = np.where(mesh.region == mesh.tissue_index("sheath"), np.log(share), 0.0)
+    return factors, {"sheath_mm": SHEATH_MM, "sheath_share": share}
+
+
+PATCHES: dict[str, Callable[[TetMesh, int], tuple[Array, Facts]]] = {
+    "halves": _halves,
+    "field": _field,
+    "field-organs": partial(_field, organs=True),
+    "sheath": _sheath,
+}
+
+
 # ---- common parts ----------------------------------------------------------------------------------------------------
 
 
-def _options(seed: int) -> PelvisOptions:
+def _options(seed: int, law: str = "linear") -> PelvisOptions:
     filling = float(np.random.default_rng([seed, 7]).uniform(6.0, 8.0))
-    return PelvisOptions(seed=seed, filling_mm=filling, field_mm=FIELD_MM, truth_edge_mm=TRUTH_EDGE_MM)
+    return PelvisOptions(seed=seed, filling_mm=filling, field_mm=FIELD_MM, truth_edge_mm=TRUTH_EDGE_MM, law=law)
 
 
 def _rng(seed: int, purpose: str) -> np.random.Generator:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from palpate.phantoms.shapes import Complement, Ellipsoid, Tube, Union, ball, rotation_about
+from palpate.phantoms.shapes import Complement, Ellipsoid, Grown, Tube, Union, ball, rotation_about
 
 TURN = rotation_about(np.array([1.0, 2.0, -0.5]), 25.0)
 ELLIPSOID = Ellipsoid(np.array([1.0, -2.0, 3.0]), np.array([17.0, 22.0, 28.0]), TURN)
@@ -46,13 +46,19 @@ def test_distance_to_a_curved_tube_is_nearly_euclidean():
 
 
 @pytest.mark.parametrize(
-    "shape", [ELLIPSOID, TUBE, Complement(TUBE), Union([ELLIPSOID, ball(np.array([30.0, 0, 0]), 9.0)])]
+    "shape",
+    [ELLIPSOID, TUBE, Complement(TUBE), Grown(TUBE, 3.0), Union([ELLIPSOID, ball(np.array([30.0, 0, 0]), 9.0)])],
 )
 def test_gradient_is_the_derivative_of_the_distance(shape):
     points = 40.0 * directions(200, seed=3)
     step = 1e-3 * directions(200, seed=4)
     change = (shape.at(points + step) - shape.at(points - step)) / 2.0
     assert change == pytest.approx((shape.gradient_at(points) * step).sum(axis=1), abs=2e-6)
+
+
+def test_a_ball_that_has_grown_is_a_larger_ball():
+    points = np.random.default_rng(1).normal(scale=20.0, size=(300, 3))
+    assert Grown(ball(np.ones(3), 10.0), 3.0).at(points) == pytest.approx(ball(np.ones(3), 13.0).at(points), abs=1e-5)
 
 
 def test_rotation_keeps_lengths_and_turns_by_its_angle():

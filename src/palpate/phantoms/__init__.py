@@ -15,10 +15,11 @@ from palpate.phantoms.scene import (
     displacements,
     grid_box,
     imaged,
+    refuse_folded,
     reimaged,
     rescaled,
 )
-from palpate.phantoms.shapes import Complement, Ellipsoid, Tube, ball, rotation_about
+from palpate.phantoms.shapes import Complement, Ellipsoid, Grown, Tube, ball, rotation_about
 from palpate.phantoms.spheres import SpheresOptions, spheres
 from palpate.phantoms.wall_filling import wall_filling
 
@@ -27,6 +28,7 @@ __all__ = [
     "BoundaryMotion",
     "Complement",
     "Ellipsoid",
+    "Grown",
     "Noise",
     "PelvisOptions",
     "PelvisShapes",
@@ -50,6 +52,7 @@ __all__ = [
     "pelvis_grid",
     "pelvis_motions",
     "redrawn",
+    "refuse_folded",
     "reimaged",
     "rescaled",
     "rotation_about",

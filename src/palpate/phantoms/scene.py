@@ -35,6 +35,7 @@ __all__ = [
     "grid_box",
     "imaged",
     "make_scene",
+    "refuse_folded",
     "reimaged",
     "rescaled",
 ]
@@ -109,6 +110,7 @@ def make_scene(
     """
     space = lagrange_space(tetrahedralise(anatomy, edge_length_mm=edge_length_mm), "P2")
     displacement = displacements(space, [BoundaryMotion(motions)], law=law)[0]
+    refuse_folded(space, displacement)
     before, after = _images(space, displacement, grid, noise, seed)
     return Scene(space, displacement, before, after, dict(motions), seed)
 
@@ -117,7 +119,7 @@ def displacements(space: LagrangeSpace, motions: Sequence[BoundaryMotion], *, la
     """Displacement (n_points, 3) mm of a body under each of some motions of its boundary, by tissues of one `law`.
 
     Every meshed tissue of the space needs its `youngs_modulus_kpa`; finite strain is on elements that do not lock; the
-    motions of the linear law share one factorisation. Raises `GeometryError` where the body folds over.
+    motions of the linear law share one factorisation.
     """
     tissues = space.mesh.tissues
     hollow = [i for i, tissue in enumerate(tissues) if tissue.role in (Role.DRIVER, Role.RIGID)]
@@ -137,14 +139,17 @@ def displacements(space: LagrangeSpace, motions: Sequence[BoundaryMotion], *, la
         constraint = outer_constraint(space, outer="fixed", modes=modes, offset=still, prescribed=prescribed)
         system = linear_model(space, constraint).system(moduli)
         found = [system.solve(q).displacement for q in np.eye(len(motions))]
-    for displacement in found:
-        smallest = float(deformation_determinants(space, displacement).min())
-        if smallest <= 0.0:
-            raise GeometryError(
-                f"the truth folds over (smallest determinant of the deformation gradient {smallest:.3f}): move the"
-                " walls less or leave more room around them"
-            )
     return found
+
+
+def refuse_folded(space: LagrangeSpace, displacement: NDArray[np.float64]) -> None:
+    """Raise `GeometryError` where a displacement (n_points, 3) mm folds the body over."""
+    smallest = float(deformation_determinants(space, displacement).min())
+    if smallest <= 0.0:
+        raise GeometryError(
+            f"the truth folds over (smallest determinant of the deformation gradient {smallest:.3f}): move the walls"
+            " less or leave more room around them"
+        )
 
 
 def _prescribed(
