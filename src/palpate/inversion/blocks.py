@@ -35,6 +35,7 @@ __all__ = [
 
 AMPLITUDES = (0.005, 2.0)  # times the coefficients' own standard deviation
 ALIKE, SELDOM = 0.1, 0.01  # an offset of a surface that is drawn alike, over that of others; how often one is not
+HELD = 1e8  # times its precision: an unknown that is considered does not move
 LEAST_HETEROGENEITY, MOST_HETEROGENEITY = 1.0 / 3.0, 5.0  # times the scale of its amplitude's prior
 
 
@@ -51,12 +52,13 @@ class Block:
     """Unknowns x ~ N(0, P^-1) that act in the later `states` (their numbers).
 
     of: the tissue that it is of, or the frame; cause: by which shares of a variance are told; unit_mm: what a
-    coefficient of 1 is worth where it is a motion; precision: P (n, n) before anything
-    is learned. alternatives: families of covariances sum_t a_t^2 C_t (n, n), each the tuple of its terms C_t, of which
-    the images choose one with its amplitudes a_t, by their evidence; none where P is held. amplitudes: bounds of a_t;
-    scale: standard deviation of a half-normal prior of a_t, inf where there is none; odds: log prior odds of the
-    alternatives, of which the likeliest is taken; none: of alternatives that are alike the widest. Raises `ConfigurationError` for
-    terms of another size.
+    coefficient of 1 is worth where it is a motion; precision: P (n, n) before anything is learned. alternatives:
+    families of covariances sum_t a_t^2 C_t (n, n), each the tuple of its terms C_t, of which the images choose one with
+    its amplitudes a_t, by their evidence; none where P is held. amplitudes: bounds of a_t; scale: standard deviation of
+    a half-normal prior of a_t, inf where there is none; odds: log prior odds of the alternatives, of which the
+    likeliest is taken; none: of alternatives that are alike the widest. considered: the images cannot tell them, so
+    that they are held at 0, and what they may be counts in the covariance (Schmidt 1966). Raises `ConfigurationError`
+    for terms of another size.
     """
 
     of: str
@@ -68,6 +70,7 @@ class Block:
     amplitudes: tuple[float, float] = AMPLITUDES
     scale: float = np.inf
     odds: tuple[float, ...] = ()
+    considered: bool = False
     unit_mm: float = 1.0
 
     def __post_init__(self) -> None:
@@ -78,6 +81,11 @@ class Block:
                 f"the block '{self.cause}' of '{self.of}' has a precision {self.precision.shape} and covariance"
                 f" terms {wrong or [shape]}; all must be square and of one size"
             )
+
+    @property
+    def first_precision(self) -> NDArray[np.float64]:
+        """Precision (n, n) with which an estimate begins."""
+        return HELD * self.precision if self.considered else self.precision
 
     @property
     def size(self) -> int:
@@ -124,18 +132,15 @@ def offset_block(observation: Observation, state: int, *, sd: float) -> Block:
     """By how much more an observation shows in a later state than is there; sd in the unit of its residuals.
 
     A mixture of two normal laws, of which the evidence chooses: drawn alike but for a tenth of sd, or otherwise by sd,
-    which is so seldom that a bias of some hundredths of a millimetre is not taken for it.
+    which is so seldom that a bias of some hundredths of a millimetre is not taken for it. A driver's wall moves as its
+    drawing does: its offset is considered, not estimated.
     """
-    return Block(
-        observation.name,
-        "offset",
-        Acts.RESIDUALS,
-        (state,),
-        np.full((1, 1), (ALIKE * sd) ** -2.0),
-        ((np.full((1, 1), (ALIKE * sd) ** 2),), (np.full((1, 1), sd**2),)),
-        amplitudes=(1.0, 1.0),
-        odds=(0.0, float(np.log(SELDOM))),
-    )
+    precision, common = np.full((1, 1), sd**-2.0), (observation.name, "offset", Acts.RESIDUALS, (state,))
+    if observation.of_driver:
+        return Block(*common, precision, considered=True)
+    alternatives = tuple((1.0 / (precision * share**-2.0),) for share in (ALIKE, 1.0))
+    odds = (0.0, float(np.log(SELDOM)))
+    return Block(*common, precision / ALIKE**2, alternatives, amplitudes=(1.0, 1.0), odds=odds)
 
 
 def material_blocks(
@@ -173,5 +178,5 @@ def joined(blocks: Sequence[Block]) -> NDArray[np.float64]:
     matrix, start = np.zeros((total, total)), 0
     for block in blocks:
         end = start + block.size
-        matrix[start:end, start:end], start = block.precision, end
+        matrix[start:end, start:end], start = block.first_precision, end
     return matrix

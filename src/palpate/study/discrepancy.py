@@ -85,7 +85,8 @@ def discrepancy_of(inversion: Inversion, states: Sequence[FittedState]) -> Found
         precision = parameters.nuisance_precision[np.ix_(own - n, own - n)]
         learned = float(np.sqrt(np.mean(np.diag(np.linalg.inv(precision))))) if block.size else 0.0
         if block.cause == "offset":
-            value, half = float(unknowns[own[0]]), NORMAL_95 * float(np.sqrt(rows[own[0], own[0]]))
+            variance = 1.0 / block.precision[0, 0] if block.considered else rows[own[0], own[0]]
+            value, half = float(unknowns[own[0]]), NORMAL_95 * float(np.sqrt(variance))
             offsets.append(OffsetFound(block.of, block.states[0], value, (value - half, value + half)))
         elif block.cause == "heterogeneity":
             heterogeneity.append(HeterogeneityFound(block.of, learned, block.scale))

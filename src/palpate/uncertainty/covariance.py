@@ -105,17 +105,33 @@ def covariance_of(
         return noise, prior, shifts.T @ shifts / len(shifts)
 
     noise, prior, grid = parts(evaluation)
+    prior = prior + sum(_considered(objective, evaluation).values(), np.zeros_like(prior))
     left = noise + prior + grid if given is evaluation else sum(parts(given), np.zeros_like(noise))
     return Covariance(noise, prior, grid, mesh, _causes(objective, evaluation), left + mesh)
 
 
 def _causes(objective: Objective, evaluation: Evaluation) -> dict[str, NDArray[np.float64]]:
     """The parts H^-1 P_b H^-1 of the prior's covariance (n_parameters, n_parameters), by the cause of the blocks."""
-    inverse, found = evaluation.covariance_columns(objective.n_parameters), dict[str, NDArray[np.float64]]()
+    inverse, found = evaluation.covariance_columns(objective.n_parameters), _considered(objective, evaluation)
     for i, block in enumerate(objective.parameters.blocks):
         own = objective.parameters.columns(i)
         part = inverse[own].T @ evaluation.prior[np.ix_(own, own)] @ inverse[own]
         found[block.cause] = found.get(block.cause, np.zeros_like(part)) + part
+    return found
+
+
+def _considered(objective: Objective, evaluation: Evaluation) -> dict[str, NDArray[np.float64]]:
+    """By cause, S P_b^-1 S^T (n_parameters, n_parameters) of blocks that are considered, not estimated.
+
+    S = -H^-1 J^T W J_b: how the estimate answers to them.
+    """
+    inverse, found = evaluation.covariance_columns(objective.n_parameters), dict[str, NDArray[np.float64]]()
+    for i, block in enumerate(objective.parameters.blocks):
+        if block.considered:
+            own = objective.parameters.columns(i)
+            answer = inverse.T @ (evaluation.matrix - evaluation.prior)[:, own]
+            part = answer @ np.linalg.inv(block.precision) @ answer.T
+            found[block.cause] = found.get(block.cause, np.zeros_like(part)) + part
     return found
 
 
