@@ -196,8 +196,8 @@ def at_truth(inversion: Inversion, problem: InverseProblem, scene: Scene) -> Inv
     """
     state, mapping, noise = problem.states[0], problem.parameters, inversion.objective.states[0].noise
     wall = next(observation for observation in state.observations if observation.of_driver)
-    rest, modes = state.model.space.points.ravel()[wall.dofs].reshape(-1, 3), state.constraint.modes[wall.dofs]
-    motion = scene.motions[wall.name].at(rest).ravel() - state.constraint.offset[wall.dofs]
+    rest, modes = state.model.space.points.ravel()[wall.dofs].reshape(-1, 3), state.model.constraint.modes[wall.dofs]
+    motion = scene.motions[wall.name].at(rest).ravel() - state.model.constraint.offset[wall.dofs]
     coefficients = np.asarray(np.linalg.lstsq(modes, motion)[0], dtype=np.float64)
     unknowns = np.concatenate([np.log(true_ratios(inversion.objective, scene)), coefficients])
     exact = exact_approximation(state.model, state.finite_strain, Place(mapping.moduli(unknowns), coefficients))

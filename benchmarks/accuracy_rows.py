@@ -151,7 +151,9 @@ def _from_surfaces(scene: Scene, case: Case, options: PelvisOptions, row: Row) -
         mesh = tetrahedralise(anatomy, edge_length_mm=edges.mm, longer_mm=edges.longer_mm)
         space = lagrange_space(mesh, "P2")
     driver = case.driver
-    motion = prescribed_motion(space, {}, n_modes=driver.modes, kernel_mm=driver.kernel_mm, prior_mm=driver.prior_mm)
+    motion = prescribed_motion(
+        space, {}, n_modes=driver.modes, kernel_mm=driver.kernel_mm, prior_mm=driver.prior_mm, fine=True
+    )
     constraint = outer_constraint(
         space, outer="fixed", modes=motion.modes, offset=motion.offset, prescribed=motion.prescribed
     )

@@ -113,8 +113,7 @@ def plain_estimate(
     filled = fit_coefficients(objective, still, bounds=settings.bounds)
     objective = _exact(objective, filled.unknowns).rematched(filled.unknowns)  # a body at rest shows no modulus
     filled = replace(filled, evaluation=objective(filled.unknowns))
-    rule = replace(RULE, refinements=0) if problem.finite_strain else RULE
-    found = run_outer_loop(OuterIterate(objective, filled), settings, rule, progress=progress, title="linear law")
+    found = run_outer_loop(OuterIterate(objective, filled), settings, RULE, progress=progress, title="linear law")
     if not problem.finite_strain:
         return found
     unknowns = found.minimum.unknowns

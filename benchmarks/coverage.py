@@ -166,10 +166,7 @@ def _body(law: str, seed: int, edge_mm: float) -> Body:
     problem = case.problem.linear() if law == "linear" else case.problem
     found = invert(problem, case.settings, progress=lambda _: None)
     clean, truth = found.candidates[found.best].iterate, np.log(true_ratios(found.objective, case.scene))
-    places = clean.objective.places(clean.minimum.unknowns)
-    triples = zip(clean.objective.approximations, problem.states, places, strict=True)
-    unrefined = clean.objective.under([model.with_constraint(state.constraint, at) for model, state, at in triples])
-    return Body(case.scene, replace(clean, objective=unrefined), case.settings, truth)
+    return Body(case.scene, clean, case.settings, truth)
 
 
 def _limit(body: Body, noise: NoiseModel | None) -> list[float] | None:

@@ -16,7 +16,7 @@ __all__ = ["shares_of_stages"]
 STAGES = {  # functions whose time, with all that they call, is a stage of its own
     "images checked and aligned": ("body.py", "aligned"),
     "level sets": ("anatomy.py", "anatomy_of"),
-    "tetrahedra cut": ("tetrahedralise.py", "_cut_grid"),
+    "tetrahedra cut": ("tetrahedralise.py", "_grid"),
     "tetrahedra remeshed": ("remeshing.py", "remeshed"),
     "surfaces fitted, tetrahedra smoothed": ("tetrahedralise.py", "_fitted"),
     "mesh gate": ("quality.py", "check_mesh"),

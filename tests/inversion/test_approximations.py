@@ -159,23 +159,9 @@ def test_along_the_directions_wanted_its_derivatives_are_those_of_the_full_model
     assert off(body, updated, deciding) < 1e-5
 
 
-@pytest.mark.parametrize("where", ["here", "deciding"])
-def test_another_offset_is_answered_for_at_the_place_asked_for(body, made, where, request):
-    held, at = made.constraint, request.getfixturevalue(where)
-    constraint = replace(held, offset=held.offset + 0.3 * held.modes[:, 1])
-    moved = made.with_constraint(constraint, at)
-    assert moved.constraint is constraint
-    assert off(body, moved, at) > 1e-2
-    assert off(body.under(constraint), moved, at) < 1e-5
-    if at.directions is not None:
-        assert np.array_equal(moved.derivatives_at, at.moduli)
-
-
 def test_nothing_that_it_is_asked_changes_it(made, deciding):
-    constraint = replace(made.constraint, offset=made.constraint.offset + 0.1 * made.constraint.modes[:, 0])
     before, counts, at = stated(made, deciding), made.counts, made.derivatives_at
     made.update(deciding)
-    made.with_constraint(constraint, deciding)
     made.error(deciding)
     assert np.array_equal(stated(made, deciding), before)
     assert made.counts == counts

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from scipy import linalg, sparse
+from scipy import linalg
 
 from palpate.inversion import (
     Acts,
@@ -16,12 +16,9 @@ from palpate.inversion import (
     LaterState,
     Objective,
     ParameterMap,
-    driver,
     evidence,
-    unit_blocks,
     wall_blocks,
 )
-from palpate.mesh.constraint import Constraint
 from palpate.observation.wall_modes import Wall, wall_modes, wall_of
 
 N_MODES = 90
@@ -157,60 +154,6 @@ def test_what_is_not_seen_at_all_keeps_a_bounded_prior():
 
 def test_walls_that_are_not_given_keep_the_modes_own_prior():
     assert evidence.learned_precision(moved_by(), None, np.zeros(N_MODES)) is None
-
-
-class Wanting(NamedTuple):
-    """An observation of some points that asks for a motion of its wall, or for none."""
-
-    dofs: np.ndarray
-    asked: np.ndarray | None
-    kind: str = "surface distance"
-
-    def wall_motion(self, _residuals, *, present, kernel_mm):
-        assert kernel_mm > 0.0
-        assert present.shape == self.dofs.shape
-        return self.asked
-
-
-def held_by(*wanting, rest, present):
-    """Objective and evaluation of one state with these observations, whose walls have been refined to `present`."""
-    state = LaterState(
-        SimpleNamespace(constraint=rest), wanting, approximation=SimpleNamespace(constraint=present), observed=None
-    )
-    parameters = ParameterMap(np.ones(1), np.zeros((1, 0)), (), "rest", True, unit_blocks(rest.n_modes))
-    lines = [SimpleNamespace(state=0, observation=observation, residuals=None) for observation in wanting]
-    return Objective((state,), parameters), SimpleNamespace(lines=lines)
-
-
-@pytest.fixture
-def walls():
-    """Two drivers' walls of two points each, the last point held by a bone; its constraint, at rest and refined."""
-    modes = np.zeros((12, 2))
-    modes[:6, 0], modes[6:9, 1] = 1.0, 1.0
-    rest = Constraint(sparse.csr_matrix((12, 0)), modes, np.arange(12.0))
-    refined = replace(rest, offset=rest.offset + np.append(np.full(6, 0.5), [0.25, 0.25, 0.25, 0.0, 0.0, 0.0]))
-    return rest, refined
-
-
-def test_refining_one_wall_keeps_what_another_has_been_refined_to(walls):
-    rest, present = walls
-    first, second = Wanting(np.arange(6), None), Wanting(np.arange(6, 12), np.full(6, -1.0))
-    (finer,) = driver.refined_walls(*held_by(first, second, rest=rest, present=present))
-    assert finer.offset[:6] == pytest.approx(present.offset[:6])
-    assert finer.offset[6:9] == pytest.approx(rest.offset[6:9] - 1.0)
-
-
-def test_a_bone_that_holds_a_wall_keeps_it(walls):
-    rest, present = walls
-    second = Wanting(np.arange(6, 12), np.full(6, -1.0))
-    (finer,) = driver.refined_walls(*held_by(second, rest=rest, present=present))
-    assert np.array_equal(finer.offset[9:], rest.offset[9:])
-
-
-def test_walls_that_ask_for_nothing_are_left(walls):
-    rest, present = walls
-    seen = [Wanting(np.arange(6), None), Wanting(np.arange(6, 12), None)]
-    assert driver.refined_walls(*held_by(*seen, rest=rest, present=present)) == [None]
 
 
 def test_what_is_believed_of_the_others_follows_their_prior_mean_too(rng):

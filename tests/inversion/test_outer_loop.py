@@ -141,55 +141,6 @@ def test_a_prior_that_was_held_too_early_is_learned_once_more(twins, voxels, mon
     assert apart[0] < 0.05 < apart[1]
 
 
-def test_with_a_finer_wall_the_prior_is_learned_anew(twins, voxels, monkeypatch):
-    """What the wall does beyond its modes is no longer asked of them."""
-    events, learning = [], loop._learning
-
-    def refined(objective, _):
-        events.append("refined")
-        return [state.constraint if events.count("refined") == 1 else None for state in objective.states]
-
-    def noted(now, *, held):
-        events.append("held" if held else "free")
-        return learning(now, held=held)
-
-    for name in ("estimate", "reweighting"):
-        monkeypatch.setattr(f"palpate.inversion.{name}.with_learned_prior", lambda objective, *_: objective)
-    monkeypatch.setattr(loop, "refined_walls", refined)
-    monkeypatch.setattr(loop, "_learning", noted)
-    found = invert(voxels, twins.settings(0.5), progress=twins.silent)
-    assert found.convergence.converged
-    assert events[:5] == ["held", "refined", "free", "held", "refined"]
-
-
-def test_an_iterate_with_a_finer_wall_is_exact_with_the_derivatives_that_decide(found):
-    now = found.candidates[found.best].iterate
-    (state,), unknowns = now.objective.states, now.minimum.unknowns
-    bulged = replace(state.constraint, offset=state.constraint.offset + 0.01 * state.constraint.modes[:, 0])
-    finer = loop._with_finer_walls(now, [bulged])
-    (model,) = finer.objective.approximations
-    (place,) = finer.objective.places(unknowns)
-    assert model.constraint is bulged
-    assert model.derivatives_at == pytest.approx(place.moduli)
-    assert model.error(place).relative < 1e-3
-    assert finer.minimum.evaluations == now.minimum.evaluations + 1
-    assert not finer.convergence.converged
-
-
-def test_what_has_converged_is_not_given_up_for_a_finer_wall_in_the_last_iterations(twins, voxels, monkeypatch):
-    asked = []
-
-    def as_it_is(objective, _):
-        asked.append(1)
-        return [state.constraint for state in objective.states]
-
-    monkeypatch.setattr(loop, "refined_walls", as_it_is)
-    rule = StopRule(iterations=loop.AFTER_CHANGE)
-    found = invert(voxels, twins.settings(0.5), progress=twins.silent, rule=rule)
-    assert found.minimum.converged
-    assert not asked
-
-
 def test_weights_that_never_agree_are_not_called_convergence(twins, voxels, monkeypatch):
     """Three sets of weights in turn: a loop of three passes ends where it began, and still nothing agrees."""
     passes = count()

@@ -56,9 +56,6 @@ class PointMotion:
     def fitted_noise(self, _residuals, _response=None):
         return self.stated_noise
 
-    def wall_motion(self, _residuals, *, present, kernel_mm):  # noqa: ARG002
-        return None
-
     def imaging_error(self, _residuals, _before, _after):
         return np.zeros(3)
 

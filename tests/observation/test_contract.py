@@ -158,7 +158,6 @@ def test_nothing_that_it_is_asked_changes_it(case):
     held = {member.name: getattr(seen, member.name) for member in fields(seen)}
     others = [seen.rematched(case.place), seen.with_noise(NOISE), seen.reweighted(before)]
     seen.fitted_noise([before])
-    seen.wall_motion(before, present=np.zeros(len(seen.dofs)), kernel_mm=8.0)
     assert all(type(one) is type(seen) for one in others)
     assert all(getattr(seen, name) is value for name, value in held.items())
     assert np.array_equal(case.residuals.values, before.values)
@@ -181,13 +180,6 @@ def test_noise_is_known_before_residuals_tell_and_after(case):
     assert first.sd > 0.0
     assert fitted.sd > 0.0
     assert case.seen.noise_model.sd == pytest.approx(first.sd)
-
-
-def test_only_a_drivers_wall_has_a_finer_motion(case):
-    motion = case.seen.wall_motion(case.residuals, present=np.zeros(len(case.seen.dofs)), kernel_mm=8.0)
-    assert (motion is not None) == case.seen.of_driver
-    if motion is not None:
-        assert motion.shape == case.seen.dofs.shape
 
 
 def test_the_fit_is_a_length_and_an_overlap(case):

@@ -135,16 +135,6 @@ def test_an_image_without_a_point_that_faces_the_model_is_refused_by_name(seen):
         lost.rematched(np.zeros(len(seen.dofs)))
 
 
-@pytest.mark.parametrize(("later", "driver", "asks"), [(9.6, True, True), (9.6, False, False), (9.0, True, False)])
-def test_only_a_drivers_wall_that_fits_worse_than_the_noise_asks_for_a_finer_motion(sphere, later, driver, asks):
-    seen = exact(sphere, later=later, driver=driver)
-    motion = seen.wall_motion(still(seen), present=np.zeros(len(seen.dofs)), kernel_mm=8.0)
-    assert (motion is not None) == asks
-    if motion is not None:
-        outwards = seen.target.surface.rest / 9.0
-        assert np.einsum("na,na->n", motion.reshape(-1, 3), outwards) == pytest.approx(later - 9.0, rel=0.15)
-
-
 def test_the_fit_is_by_area_and_overlap(sphere):
     seen = exact(sphere, later=9.5)
     index = np.zeros((2, 2, 2), dtype=np.int16)

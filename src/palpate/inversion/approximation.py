@@ -13,7 +13,7 @@ from palpate.mechanics.equilibrium import from_start
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
 from palpate.mechanics.first_order import FirstOrderModel, expanded
 from palpate.mechanics.forward import ForwardModel, SolveCounts
-from palpate.mechanics.linear_model import LinearEquilibrium, LinearModel, with_constraint
+from palpate.mechanics.linear_model import LinearEquilibrium, LinearModel
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.constraint import Constraint
 
@@ -129,13 +129,6 @@ class Approximation(Protocol):
         """What it misses at a place."""
         ...
 
-    def with_constraint(self, constraint: Constraint, at: Place) -> Self:
-        """The approximation of the same body with another offset of what is prescribed, exact at a place as `update`'s.
-
-        Raises as `update` does.
-        """
-        ...
-
 
 @dataclass(frozen=True, slots=True)
 class ExactApproximation:
@@ -193,12 +186,6 @@ class ExactApproximation:
         boundary = np.arange(len(at.coefficients)) < self.constraint.n_modes  # of the linear law's homogeneous part
         displacement = self.model.solve(at.moduli, np.where(boundary, at.coefficients, 0.0)).values
         return ModelError(*there.system.error_bound(at.moduli, displacement))
-
-    def with_constraint(self, constraint: Constraint, at: Place) -> ExactApproximation:
-        """The model solved at a place under another offset."""
-        finite = None if self.finite_strain is None else self.finite_strain.under(constraint)
-        linear = with_constraint(self.linear, constraint)
-        return exact_approximation(linear, finite, at, nearby=self)
 
 
 def exact_approximation(

@@ -98,11 +98,6 @@ class Expansion:
             return ModelError(0.0, np.zeros_like(displacement))
         return ModelError(*self.equilibrium.error_estimate(at.moduli, at.coefficients, displacement))
 
-    def with_constraint(self, constraint: Constraint, at: Place) -> Expansion:
-        """The expansion around the equilibrium at a place that another offset of what is prescribed leads to."""
-        moved = self._solved(self.equilibrium.model.under(constraint), at)
-        return replace(moved, derivatives_at=None).update(at)
-
     def at_equilibrium(self, at: Place, *, tolerance: float) -> Expansion:
         """The expansion around the equilibrium at a place near by, to a tolerance of the forces; `NotConverged`."""
         return self._solved(self.equilibrium.model.to_tolerance(tolerance), at)

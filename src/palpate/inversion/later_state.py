@@ -14,7 +14,6 @@ from palpate.inversion.parameters import ParameterMap
 from palpate.mechanics.finite_strain import FiniteStrainModel
 from palpate.mechanics.forward import ForwardModel
 from palpate.mechanics.linear_model import LinearModel
-from palpate.mesh.constraint import Constraint
 from palpate.observation.contract import Observation
 from palpate.observation.noise_model import NoiseModel
 
@@ -38,11 +37,6 @@ class LaterState:
     approximation: Approximation | None = field(default=None, repr=False)
     observed: ForwardModel | None = field(default=None, repr=False)
     bending: ForwardModel | None = field(default=None, repr=False)
-
-    @property
-    def constraint(self) -> Constraint:
-        """What is prescribed: the approximation's, where a wall has been refined there."""
-        return self.model.constraint if self.approximation is None else self.approximation.constraint
 
     @property
     def noise(self) -> dict[str, NoiseModel]:

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
 from palpate.inversion.approximation import Approximation, Derivatives
-from palpate.inversion.driver import refined_walls
 from palpate.inversion.objective import Evaluation, LinearisedObjective, Objective
 from palpate.inversion.optimise import (
     Bounds,
@@ -28,7 +27,6 @@ from palpate.inversion.optimise import (
 )
 from palpate.inversion.reweighting import reweighted
 from palpate.mechanics.forward import SolveCounts
-from palpate.mesh.constraint import Constraint
 
 __all__ = [
     "Convergence",
@@ -52,9 +50,9 @@ STRAIGHT = 0.4  # of ln E, within which linearised residuals are believed
 WITHIN_NOISE = 0.1  # of the posterior's width: a step that finds no smaller value, what a start may miss
 NEAR = 0.5  # posterior standard deviations: a shorter step ends where exact derivatives are worth it, and a held prior
 LEAST_SD = 0.03  # of ln E, see `_linearisation`
-RELEARNED = 1  # times at the most that the drivers' prior is learned anew where the estimate had converged
+RELEARNED = 1  # times at the most that the blocks' prior is learned anew where the estimate had converged
 PRIOR_HOLDS = 2.5  # tolerances, by which an estimate would move, or what is known of it, if it were learned anew there
-AFTER_CHANGE = 4  # outer iterations that must be left for finer walls or another prior: what converged is not lost
+AFTER_CHANGE = 4  # outer iterations that must be left for another prior: what converged is not lost
 SLOW = 0.5  # of the model's error an outer iteration before: where more is left all derivatives are made exact
 DAMPED_AFTER = 2  # passes of weights and estimate in turn: a later one that turns back goes half its way
 TURNED = 0.5  # of the last outer iteration's step: one that leads back by more goes half its way
@@ -106,8 +104,8 @@ class StopRule:
     step_sd, floor: a log-modulus may still move by so many of its standard deviations, or by `floor` (of ln E) where
     that is more; model_error: share of that by which what the approximation misses may set it off; derivatives: whether
     those that decide the moduli must be exact so near that they leave no more than a step; solve_above: error from
-    which the full model is solved; passes: of weights and estimate in turn on one approximation; iterations;
-    refinements of the drivers' walls: the largest numbers of each; far: tolerances by which an estimate may still move
+    which the full model is solved; passes, of weights and estimate in turn on one approximation, and
+    iterations: the largest numbers of each; far: tolerances by which an estimate may still move
     where more iterations do no better: at the largest number of them, where more has not converged, and where the
     passes of one lead back to where it began (weightings that explain the images as well take turns).
     """
@@ -119,7 +117,6 @@ class StopRule:
     solve_above: float = 0.0
     passes: int = 6
     iterations: int = 16
-    refinements: int = 0
     far: float = 5.0
 
     def tolerance(self, minimum: Minimum, n_parameters: int) -> NDArray[np.float64]:
@@ -153,15 +150,14 @@ def run_outer_loop(
 ) -> OuterIterate:
     """Follow a minimum until reweighting it and updating its approximations change it no more.
 
-    Of the approximations of `start` see `updated`. Drivers' walls are refined where their surfaces ask for it (see
-    `refined_walls`); what is believed of their motion is held from where the estimate is near until they are, and
-    learned once more where, learned at the estimate, it would not leave that where it is. `title` begins each line of
-    `progress`. The minimum's history is that of the loop alone, its evaluations are added to those of `start`. Raises
-    `NotConverged` when the full model has no equilibrium where every part of a step leads.
+    Of the approximations of `start` see `updated`. What is believed of the blocks is held from where the estimate is
+    near, and learned once more where, learned at the estimate, it would not leave that where it is. `title` begins each
+    line of `progress`. The minimum's history is that of the loop alone, its evaluations are added to those of `start`.
+    Raises `NotConverged` when the full model has no equilibrium where every part of a step leads.
     """
     at, theta = start.minimum.evaluation, start.minimum.unknowns[: start.objective.n_parameters]
     first = Iterate(theta, at.value, at.misfit_mm2, newton_decrement(at))
-    now, refinements = replace(start, minimum=replace(start.minimum, history=(first,))), 0
+    now = replace(start, minimum=replace(start.minimum, history=(first,)))
     held, relearned, last = False, 0, np.zeros(len(start.minimum.unknowns))
     del start  # and with it its approximations, which are large, when others take their place
     for number in range(1, rule.iterations + 1):
@@ -179,15 +175,10 @@ def run_outer_loop(
             last = np.zeros_like(last)  # what follows is another objective
             if number > rule.iterations - AFTER_CHANGE:
                 break
-            finer = refined_walls(now.objective, now.minimum.evaluation)
-            if all(of is None for of in finer) or refinements == rule.refinements:
-                free = replace(_learning(now, held=False), convergence=Convergence())
-                if not held or relearned == RELEARNED or _prior_holds(free, settings, rule):
-                    break
-                now, held, relearned = free, False, relearned + 1
-                continue
-            now, refinements = _with_finer_walls(now, finer), refinements + 1
-            now, held = _learning(now, held=False), False  # learned in the same iterations
+            free = replace(_learning(now, held=False), convergence=Convergence())
+            if not held or relearned == RELEARNED or _prior_holds(free, settings, rule):
+                break
+            now, held, relearned = free, False, relearned + 1
     else:
         if max(now.convergence.reweighting, now.convergence.linearisation) > rule.far and now.minimum.converged:
             now = replace(now, minimum=replace(now.minimum, outcome=Outcome.STEPS))
@@ -195,7 +186,7 @@ def run_outer_loop(
 
 
 def _prior_holds(free: OuterIterate, settings: InversionSettings, rule: StopRule) -> bool:
-    """Whether the drivers' prior, learned anew at an estimate that held it, would leave the estimate as it is."""
+    """Whether the blocks' prior, learned anew at an estimate that held it, would leave the estimate as it is."""
     found = _agreed(free.objective, free.minimum, settings.bounds, settings.bounds, rule, 1.0)[1]
     return _change(free.minimum, found, rule, free.objective.n_parameters) < PRIOR_HOLDS
 
@@ -448,15 +439,6 @@ def _with_approximations(now: OuterIterate, approximations: list[Approximation])
     objective = now.objective.under(approximations)
     evaluation, spent = objective(now.minimum.unknowns), now.minimum.evaluations + 1
     return replace(now, objective=objective, minimum=replace(now.minimum, evaluation=evaluation, evaluations=spent))
-
-
-def _with_finer_walls(now: OuterIterate, finer: Sequence[Constraint | None]) -> OuterIterate:
-    """The iterate with finer motions of drivers' walls, one a state or None, exact there with what decides."""
-    objective, at = now.objective, now.minimum
-    places = objective.places(at.unknowns, at.evaluation, Derivatives.DECIDING)
-    triples = zip(objective.approximations, finer, places, strict=True)
-    moved = [a if wall is None else a.with_constraint(wall, place) for a, wall, place in triples]
-    return replace(_with_approximations(now, moved), convergence=Convergence())
 
 
 def _solved(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from palpate.inversion.approximation import ModelError, Place
 from palpate.inversion.objective import determined
 from palpate.mechanics.forward import SolveCounts
-from palpate.mechanics.linear_model import LinearModel, LinearSystem, weighted_sum, with_constraint
+from palpate.mechanics.linear_model import LinearModel, LinearSystem, weighted_sum
 from palpate.mechanics.reduced import Projection, ReducedModel, projection
 from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
 from palpate.mechanics.solvers.contract import Factorisation
@@ -119,14 +119,6 @@ class ReducedBasis:
     def error(self, at: Place) -> ModelError:
         """Upper bound of the displacement's relative error in energy (see `LinearSystem.error_bound`)."""
         return ModelError(*self.system.error_bound(at.moduli, self._homogeneous(at)))
-
-    def with_constraint(self, constraint: Constraint, at: Place) -> ReducedBasis:
-        """The same vectors under another offset, with the response to it, and what these miss at a place."""
-        model = with_constraint(self.full_model, constraint)
-        system = replace(self.system, model=model)
-        fresh = np.asarray(constraint.free.T @ system.solve(np.zeros(model.n_modes)).values)[:, None]
-        moved = replace(self, projection=self.projection.under(model), system=system, place=None)
-        return _extended(moved, fresh, SolveCounts(forward=1)).update(at)
 
     def with_material(self, coefficients: NDArray[np.float64]) -> ReducedBasis:
         """The responses to the material modes at the factorised moduli and at `coefficients` (n_modes,)."""

@@ -237,13 +237,6 @@ class Projection:
         )
         return Projection(model, reduced)
 
-    def under(self, model: LinearModel) -> Projection:
-        """The same vectors for a `model` of the same body with other modes or another offset."""
-        constraint = model.constraint
-        coupling = np.stack([self.components(matrix.toarray()) for matrix in model.coupling])
-        modes, offset = constraint.modes, constraint.offset
-        return Projection(model, replace(self.reduced, coupling=coupling, output_modes=modes, output_offset=offset))
-
     def with_material(self, responses: NDArray[np.float64]) -> Projection:
         """The projection with responses du/dc_k (n_dof, n_material) mm to the material modes."""
         return replace(self, reduced=replace(self.reduced, output_material=responses))

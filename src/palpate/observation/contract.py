@@ -154,16 +154,6 @@ class Observation(Protocol):
         """
         ...
 
-    def wall_motion(
-        self, residuals: Residuals, *, present: NDArray[np.float64], kernel_mm: float
-    ) -> NDArray[np.float64] | None:
-        """Displacement (n_dofs,) mm beyond the modes that a driver's residuals ask for, in place of the `present` one.
-
-        present (n_dofs,) mm: what is prescribed so far; kernel_mm: its correlation length. None where the residuals are
-        no larger than noise, or where what is seen is no driver's wall.
-        """
-        ...
-
     def imaging_error(self, residuals: Residuals, before: Segmentation, after: Segmentation) -> NDArray[np.float64]:
         """Errors (n,) mm of the residuals when the model itself is imaged: `before` at rest, `after` deformed."""
         ...

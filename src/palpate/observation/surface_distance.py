@@ -26,7 +26,6 @@ from palpate.observation.observed_surface import ObservedSurface, observed_surfa
 from palpate.observation.robust_loss import HUBER, Huber, RobustLoss, Tukey
 from palpate.observation.surface_residuals import Correspondence, correspondence, surface_residuals
 from palpate.observation.target import SurfaceTarget, surface_target
-from palpate.observation.wall_correction import wall_correction
 from palpate.parallel import mapped
 
 __all__ = ["SurfaceDistance", "robust_loss", "surface_distance", "surface_distances"]
@@ -34,8 +33,6 @@ __all__ = ["SurfaceDistance", "robust_loss", "surface_distance", "surface_distan
 TUKEY = 4.685  # cutoff in standard deviations, 95 % efficient for normal errors (Huber 1981)
 MAD = 1.4826  # standard deviations of a normal law in one median absolute deviation
 LEAST_CUTOFF = 5e-3  # mm
-ROUGH_WALL = 1.5  # times the noise's variance: a driver's mean square residual above it is motion, not noise
-FINEST_WALL = 5e-3  # mm, root mean square: less moves no modulus
 AROUND = 8.0  # widths of the Gaussian, within which the maps of an imaged model are asked
 
 
@@ -167,26 +164,6 @@ class SurfaceDistance:
         return fit_noise_model(
             [r.values for r in residuals], [r.places for r in residuals], [r.normals for r in residuals], response
         )
-
-    def wall_motion(
-        self, residuals: Residuals, *, present: NDArray[np.float64], kernel_mm: float
-    ) -> NDArray[np.float64] | None:
-        """See `Observation` and `wall_correction`, for motions (n_dofs,) mm.
-
-        The prior is as wide as the residuals' root mean square.
-        """
-        mean_square = float(np.average(np.square(residuals.values), weights=residuals.weights))
-        if not self.of_driver or mean_square <= max(ROUGH_WALL * self.noise_model.sd**2, FINEST_WALL**2):
-            return None
-        correction = wall_correction(
-            self.target.surface,
-            residuals,
-            residuals.weights * self._precision(self.noise_model),
-            present=present.reshape(-1, 3),
-            kernel_mm=kernel_mm,
-            prior_mm=float(np.sqrt(mean_square)),
-        )
-        return correction.ravel()
 
     def imaging_error(self, residuals: Residuals, before: Segmentation, after: Segmentation) -> NDArray[np.float64]:
         """Errors (n,) mm of the residuals when the fitted model itself is imaged.

@@ -17,7 +17,7 @@ from palpate.inversion import Bounds, Evaluation, Linearisation, Minimum, Object
 from palpate.inversion.expansion import Expansion
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium
-from palpate.mechanics.linear_model import LinearEquilibrium, poisson_tangents, with_constraint
+from palpate.mechanics.linear_model import LinearEquilibrium, poisson_tangents
 from palpate.uncertainty.profile import FixedCorrespondence, fixed_correspondence
 from palpate.uncertainty.refit import refitted
 
@@ -107,7 +107,7 @@ def poisson_errors(
             there = approximation.equilibrium
             tangents.append(there.poisson_tangents())
         else:
-            there = with_constraint(state.model, state.constraint).solve(place.moduli, place.coefficients)
+            there = state.model.solve(place.moduli, place.coefficients)
             tangents.append(poisson_tangents(there, dilatation))
     return tuple(
         np.asarray(line.residuals.smooth_jacobian @ tangents[line.state][line.observation.dofs])
