@@ -307,7 +307,7 @@ def warp(results: Results, folder: Path) -> Iterator[Row]:
     before = space.points[points]
     after = before + displacement[points]
     if result.alignments:
-        after = result.alignments[-1].apply(after)
+        after = result.alignments[-1].motion.apply(after)
     for name, start, goal in (("warp", before, after), ("inverse_warp", after, before)):
         image = sitk.ReadImage(str(folder / "warp" / f"{name}.nii.gz"), sitk.sitkVectorFloat64)
         transform = sitk.DisplacementFieldTransform(image)

@@ -26,6 +26,7 @@ from palpate.export.fitted_model import fitted_model
 from palpate.export.groups import element_faces, face_groups, plain_names
 from palpate.images.alignment import RigidMotion
 from palpate.images.label_image import VoxelGrid
+from palpate.images.registration import Registration
 from palpate.mechanics.laws.contract import energy
 from palpate.mesh.space import lagrange_space
 from palpate.mesh.surface import triangle_normals
@@ -246,7 +247,7 @@ def test_vtk_has_each_state_and_each_group(exported, model):
 def test_the_warp_takes_points_to_where_the_model_has_them(case_result, tmp_path, model):
     """Before's surfaces come to lie on after's, in the worlds of both images; the inverse takes them back."""
     shift = RigidMotion([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], [5.0, -3.0, 2.0])
-    result = dataclasses.replace(case_result, alignments=(shift,))
+    result = dataclasses.replace(case_result, alignments=(Registration("surfaces", shift, np.zeros(3), 0.0),))
     palpate.export(result, tmp_path, format="warp")
     body = model.bodies[0]
     surface = np.unique(np.concatenate([body.space.facets(g.triangles) for g in face_groups(body.mesh)]))

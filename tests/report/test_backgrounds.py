@@ -7,8 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+from palpate.images.label_image import VoxelGrid
 from palpate.images.readers import write_scalar_image
+from palpate.report.backgrounds import whole_box, whole_images
 from palpate.report.collect import collect
+from palpate.report.section import cut_image
+from palpate.report.slices import first_planes
 
 
 @pytest.fixture
@@ -71,3 +75,15 @@ def test_a_ct_opens_with_soft_tissue_in_its_window_and_keeps_the_rest(with_grey)
     assert float(volume.shade(np.array((40.0 - volume.span[0]) / step))) == pytest.approx(0.5)
     assert volume.span[0] <= -900.0
     assert volume.span[1] >= 1500.0
+
+
+def test_images_that_lie_on_each_other_but_for_rounding_look_the_same(case_result):
+    image = case_result.before
+    for step in (0.0, 1e-3, -1e-3):
+        affine = image.grid.affine.copy()
+        affine[:3, 3] += step
+        nudged = dataclasses.replace(image, grid=VoxelGrid(image.grid.shape, affine))
+        first, second = whole_images(whole_box(image), (image, None), (nudged, None))
+        for plane in first_planes(whole_box(image)):
+            shown = [cut_image(volume.values, volume.grid, plane, order=0) for volume in (first, second)]
+            np.testing.assert_array_equal(*shown)

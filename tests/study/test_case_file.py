@@ -57,9 +57,21 @@ def test_paths_are_relative_to_the_file(case_file):
     assert read_case(case_file).images.before == case_file.parent / "before.nii.gz"
 
 
-@pytest.mark.parametrize(("role", "align"), [("rigid", "rigid-tissues"), ("driver", "none")])
-def test_alignment_follows_the_rigid_tissues(case_file, role, align):
-    assert read_case(case_file, [f"tissues.rectum.role={role}"]).align == align
+@pytest.mark.parametrize(
+    ("role", "boundary", "align"),
+    [
+        ("rigid", "fixed", "rigid-tissues"),
+        ("rigid", "moving", "rigid-tissues"),
+        ("driver", "fixed", "none"),
+        ("driver", "sliding", "none"),
+        ("driver", "free", "surfaces"),
+        ("driver", "moving", "surfaces"),
+    ],
+)
+def test_alignment_follows_the_rigid_tissues_and_what_is_said_of_the_frame(case_file, role, boundary, align):
+    overrides = [f"tissues.rectum.role={role}", f"domain.outer_boundary={boundary}"]
+    assert read_case(case_file, overrides).align == align
+    assert read_case(case_file, [*overrides, "images.align=surfaces"]).align == "surfaces"
 
 
 def test_an_override_replaces_one_value_and_keeps_the_rest(case_file):

@@ -131,7 +131,7 @@ def fitted_model(result: CaseResult, *, seal: str) -> FittedModel:
 def _body(pair: CaseResult | PairResult, displacements: tuple[NDArray[np.float64], ...]) -> FittedBody:
     mesh = pair.space.mesh
     nameless = tuple(replace(tissue, called=()) for tissue in mesh.tissues)  # the labels' own names are the image's
-    alignments = tuple(motion.matrix for motion in pair.alignments) or tuple(np.eye(4) for _ in displacements)
+    alignments = tuple(found.motion.matrix for found in pair.alignments) or tuple(np.eye(4) for _ in displacements)
     motions = displacements or (np.zeros_like(pair.space.points),)
     return FittedBody(
         replace(mesh, tissues=nameless),

@@ -20,7 +20,17 @@ from palpate.images.tissue import Role
 from palpate.images.tissue_distance import tissue_distance_map
 from palpate.parallel import mapped
 
-__all__ = ["Alignment", "RigidFit", "RigidMotion", "align", "fit_rigid_motion", "moved"]
+__all__ = [
+    "TUKEY",
+    "Alignment",
+    "RigidFit",
+    "RigidMotion",
+    "align",
+    "fit_rigid_motion",
+    "moved",
+    "seen_surface",
+    "within_border",
+]
 
 BORDER_VOXELS = 3.0  # nearer to the image's border the map continues what it cannot see
 MAX_POINTS = 20_000
@@ -105,9 +115,9 @@ class Alignment:
     tissues: Mapping[str, RigidFit]
     loose: Mapping[str, float] = field(default_factory=dict)
 
-    def remaining(self, tissue: str) -> RigidMotion:
-        """The tissue's own motion once the after image has been moved by `overall.motion.inverse()`."""
-        return self.overall.motion.inverse().compose(self.tissues[tissue].motion)
+    def remaining(self, tissue: str, overall: RigidFit | None = None) -> RigidMotion:
+        """The tissue's own motion once the after image has been moved back by `overall`, by default that of all."""
+        return (overall or self.overall).motion.inverse().compose(self.tissues[tissue].motion)
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,11 +160,11 @@ def fit_rigid_motion(pairs: Sequence[tuple[DistanceMap, DistanceMap]]) -> RigidF
     smooth = [(_smoothed(before, voxel), _smoothed(after, voxel)) for before, after in pairs]
     matches = []
     for before, after in smooth:
-        surface = _surface(before)
+        surface = seen_surface(before)
         step = -(-len(surface.area) // MAX_POINTS) or 1
         thinned = IsosurfacePoints(surface.places[::step], surface.normals[::step], surface.area[::step] * step)
         matches.append(_Match(thinned, before.at(thinned.places), after))
-    target = [_surface(after) for _, after in smooth]
+    target = [seen_surface(after) for _, after in smooth]
     for where, surfaces in (("before", [match.surface for match in matches]), ("after", target)):
         n = sum(len(surface.area) for surface in surfaces)
         if n < MIN_POINTS:
@@ -170,7 +180,7 @@ def fit_rigid_motion(pairs: Sequence[tuple[DistanceMap, DistanceMap]]) -> RigidF
         turns = [second @ np.diag(signs) @ first.T for signs in product((1.0, -1.0), repeat=3)]
         starts = [_about_centroids(turn, source, aim) for turn in turns if np.linalg.det(turn) > 0.0]
         for start in starts:
-            inside = [_inside(match.after.grid, start.apply(match.surface.places)) for match in matches]
+            inside = [within_border(match.after.grid, start.apply(match.surface.places)) for match in matches]
             if sum(map(np.count_nonzero, inside)) >= MIN_POINTS:
                 best = min(best, _descend(start, matches), key=_misfit)
     weight = best.area * _tukey(best, _scale(best))
@@ -226,8 +236,8 @@ def _off_the_motion(mask: NDArray[np.bool_], pair: tuple[DistanceMap, DistanceMa
     if count < 2:
         return 0.0
     before, after = pair
-    places = _surface(before).places
-    seen = _inside(after.grid, motion.apply(places))
+    places = seen_surface(before).places
+    seen = within_border(after.grid, motion.apply(places))
     places = places[seen]
     nearest = np.clip(np.rint(before.grid.index(places)).astype(int), 0, np.array(mask.shape) - 1)
     number = ndimage.grey_dilation(pieces, size=(3, 3, 3))[tuple(nearest.T)]  # the surface lies beside the voxels
@@ -241,10 +251,10 @@ def _smoothed(surface: DistanceMap, voxel: float) -> DistanceMap:
     return replace(surface, coefficients=ndimage.gaussian_filter(surface.coefficients, sigma, mode="mirror"))
 
 
-def _surface(distance: DistanceMap) -> IsosurfacePoints:
-    """The zero level, away from the image's border."""
+def seen_surface(distance: DistanceMap) -> IsosurfacePoints:
+    """The zero level of a distance map, away from the image's border."""
     found = isosurface_points(distance)
-    keep = _inside(distance.grid, found.places)
+    keep = within_border(distance.grid, found.places)
     return IsosurfacePoints(found.places[keep], found.normals[keep], found.area[keep])
 
 
@@ -290,7 +300,7 @@ def _state(motion: RigidMotion, matches: Sequence[_Match]) -> _State:
     radius = float(np.sqrt(area @ ((places - centre) ** 2).sum(axis=1) / area.sum()))
     residual = np.concatenate([m.after.at(x) - m.rest for m, x in zip(matches, groups, strict=True)])
     slope = np.concatenate([m.after.gradient_at(x) for m, x in zip(matches, groups, strict=True)])
-    inside = np.concatenate([_inside(m.after.grid, x) for m, x in zip(matches, groups, strict=True)])
+    inside = np.concatenate([within_border(m.after.grid, x) for m, x in zip(matches, groups, strict=True)])
     if np.count_nonzero(inside) < MIN_POINTS:
         raise InputDataError(
             f"only {np.count_nonzero(inside)} of {len(places)} surface points of the rigid tissue come to lie inside"
@@ -299,7 +309,8 @@ def _state(motion: RigidMotion, matches: Sequence[_Match]) -> _State:
     return _State(motion, residual, np.hstack([np.cross(places - centre, slope), slope]), area * inside, centre, radius)
 
 
-def _inside(grid: VoxelGrid, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+def within_border(grid: VoxelGrid, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which of points (n, 3) in RAS mm lie so far inside a grid that a map on it is measured there, not continued."""
     index = grid.index(points)
     return np.asarray(((index >= BORDER_VOXELS) & (index <= np.array(grid.shape) - 1.0 - BORDER_VOXELS)).all(axis=1))
 

@@ -68,8 +68,12 @@ def background(
 
 
 def whole_box(image: Segmentation, position: NDArray[np.float64] | None = None) -> SliceBox:
-    """The box around an image but for its border; the first planes go through `position` (3,) mm, or its middle."""
-    corners = np.array(np.meshgrid(*[[0.5, n - 1.5] for n in image.grid.shape])).reshape(3, -1).T  # not on the border
+    """The box around an image but for its border; the first planes go through `position` (3,) mm, or its middle.
+
+    It begins and ends in the middle of voxels: half-way between two the one that is shown would be the rounding's, and
+    another one in each image.
+    """
+    corners = np.array(np.meshgrid(*[[n > 3, n - 1 - (n > 3)] for n in image.grid.shape])).reshape(3, -1).T
     places = image.grid.world(corners)
     low, high = places.min(axis=0), places.max(axis=0)
     return SliceBox(low, high, 0.5 * (low + high) if position is None else position)

@@ -21,6 +21,10 @@ ELEMENTS = {
     "P2-P0": "quadratic tetrahedra with the mean dilatation of each",
     "auto": "quadratic tetrahedra whose volumetric stiffness is partly that of their mean dilatation, against locking",
 }
+ALIGNED = {
+    "rigid-tissues": " The later images were brought to the first on the rigid tissues.",
+    "surfaces": " The later images were brought to the first by the rigid motion that most of the surfaces agree on.",
+}
 OPTIMISERS = {"gauss-newton": ("Gauss-Newton steps in a trust region", "nocedal"), "lbfgs": ("L-BFGS-B", "byrd")}
 
 
@@ -76,8 +80,7 @@ def _aim(data: ReportData, cite: _Citations) -> str:
     roles: dict[str, list[str]] = {}
     for tissue in data.tissues:
         roles.setdefault(tissue.role, []).append(tissue.name)
-    on_bones = dict(data.settings).get("alignment") == "rigid-tissues"
-    aligned = " The later images were brought to the first on the rigid tissues." if on_bones else ""
+    aligned = ALIGNED.get(dict(data.settings).get("alignment", ""), "")
     known = [f"{t.name} ({t.given_kpa:g} kPa)" for t in data.tissues if t.given_kpa is not None]
     moved = f" The motion was driven by {listed(roles['driver'])} (hollow, not meshed)." if "driver" in roles else ""
     scale = " No modulus was given, so only ratios were found."

@@ -96,7 +96,7 @@ def render(data: ReportData) -> str:
             tuple(image for image in data.images if image.pair == pair)
             for pair in sorted({image.pair for image in data.images})
         ),
-        aligned=dict(data.settings).get("alignment") == "rigid-tissues",
+        registrations={row["after"]: row for row in data.document.get("alignment", ())},
         policy=_policy(scripts),
         scripts=scripts,
         live=live if scripts else None,

@@ -20,6 +20,7 @@ CT_WINDOW = (-160.0, 240.0)  # Hounsfield units in which soft tissues differ
 CT_SPAN = (-1024.0, 3072.0)  # Hounsfield units from air to metal, which clips nothing in four to a step
 CT_AIR = -500.0  # an image with less is a CT
 MOST_TISSUES = 254
+AWAY_FROM_TIES = 5e-4  # voxels: half-way between two voxels images that differ by rounding show the same one
 
 
 def grey_volume(values: NDArray[Any], grid: VoxelGrid, box: SliceBox, *, most_voxels: float = MOST_VOXELS) -> Volume:
@@ -66,11 +67,12 @@ def _cut(
     window = window_of(grid.index(corners), grid, margin=1)
     part = cropped(grid, window)
     inverse = np.linalg.inv(part.affine)
+    start = inverse[:3, :3] @ box.low + inverse[:3, 3] + (AWAY_FROM_TIES if order == 0 else 0.0)
     counts = np.rint((box.high - box.low) / step).astype(np.int64) + 1
     cut = ndimage.affine_transform(
         values[window].astype(np.float32),
         inverse[:3, :3] * step,
-        inverse[:3, :3] @ box.low + inverse[:3, 3],
+        start,
         output_shape=(int(counts[0]), int(counts[1]), int(counts[2])),
         order=order,
         mode="constant",

@@ -12,7 +12,9 @@ from palpate.findings import Finding
 from palpate.images.alignment import Alignment, RigidMotion, align, moved
 from palpate.images.checks import check_images, later_names
 from palpate.images.distance import observation_width
+from palpate.images.registration import ON, Registration, registration
 from palpate.images.segmentation import Segmentation
+from palpate.images.surface_alignment import align_surfaces
 from palpate.images.tissue import Role
 from palpate.inversion import (
     Block,
@@ -69,8 +71,8 @@ STATED = (
 class ImagedStates:
     """The reference state and the later states, brought to it; `bones`: each later state's motions by tissue index.
 
-    `inputs`: SHA-256 of each file that was read for them, by its key in `result.json`; `alignments`: each later
-    state's motion from the first image's world to its own, of all bones as one body; none where nothing was aligned.
+    `inputs`: SHA-256 of each file that was read for them, by its key in `result.json`; `alignments`: how each later
+    state lay before it was brought to the first; none where nothing was aligned.
     """
 
     before: Segmentation
@@ -78,7 +80,7 @@ class ImagedStates:
     bones: tuple[Mapping[int, RigidMotion], ...]
     findings: tuple[Finding, ...]
     inputs: Mapping[str, str] = field(default_factory=dict)
-    alignments: tuple[RigidMotion, ...] = ()
+    alignments: tuple[Registration, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +112,7 @@ def aligned(
     loaded: bool = False,
     progress: Progress = silent,
 ) -> ImagedStates:
-    """Bring the later images to the first on their rigid tissues (`method` "rigid-tissues") and check them all.
+    """Bring the later images to the first (`method`: "rigid-tissues", "surfaces" or "none") and check them all.
 
     `loaded`: whether known loads act on the body, for what is found of its motion.
     Raises `InputDataError` as `check_images`, `align` and `refuse_lost` do, `GeometryError` as `refuse_unmeshable`.
@@ -129,21 +131,23 @@ def aligned(
 def brought(
     before: Segmentation, after: tuple[Segmentation, ...], *, method: str, progress: Progress = silent
 ) -> ImagedStates:
-    """Bring the later images to the first as `aligned` does, but check nothing; raises `InputDataError` as `align`."""
-    images, bones, findings, alignments = [], [], list[Finding](), list[RigidMotion]()
-    names = later_names(len(after))
-    for name, image in zip(names, after, strict=True):
-        if method == "none":
-            images.append(image)
-            bones.append(dict[int, RigidMotion]())
-            continue
-        progress(f"aligning '{name}' on the rigid tissues")
-        alignment = align(before, image)
-        alignments.append(alignment.overall.motion)
-        images.append(moved(image, alignment.overall.motion.inverse()))
-        rigid = {i: t.name for i, t in enumerate(before.tissues) if t.role is Role.RIGID}
-        bones.append({i: alignment.remaining(bone) for i, bone in rigid.items()})
-        findings += _alignment_findings(alignment, name)
+    """Bring the later images to the first as `aligned` does, but check nothing.
+
+    Raises `InputDataError` as `align` and `align_surfaces`.
+    """
+    if method == "none":
+        return ImagedStates(before, after, tuple(dict[int, RigidMotion]() for _ in after), ())
+    images, bones, findings, alignments = [], [], list[Finding](), list[Registration]()
+    rigid = {i: t.name for i, t in enumerate(before.tissues) if t.role is Role.RIGID}
+    for name, image in zip(later_names(len(after)), after, strict=True):
+        progress(f"aligning '{name}' on {ON[method]}")
+        alignment = align(before, image) if rigid or method == "rigid-tissues" else None
+        fit = alignment.overall if alignment and method == "rigid-tissues" else align_surfaces(before, image)
+        alignments.append(registration(before, image, fit, by=method))
+        progress(f"'{name}' {alignments[-1].in_words}")
+        images.append(moved(image, fit.motion.inverse()))
+        bones.append({i: alignment.remaining(bone, fit) for i, bone in rigid.items()} if alignment else {})
+        findings += _alignment_findings(alignment, name) if alignment else []
     return ImagedStates(before, tuple(images), tuple(bones), tuple(findings), alignments=tuple(alignments))
 
 

@@ -36,6 +36,7 @@ __all__ = [
 
 REMAINING = "remaining"
 AUTO = "auto"
+HELD = ("fixed", "sliding")  # outer boundaries that leave a body no rigid motion
 LAW_NAMES = tuple(LAWS)
 SOLVER_NAMES = ("auto", *SOLVERS)
 
@@ -97,7 +98,7 @@ class Images:
     names: Path | None = None
     intensities_before: Path | None = None
     intensities_after: tuple[Path, ...] = ()
-    align: str | None = field(default=None, metadata=rule(choices=("rigid-tissues", "none")))
+    align: str = field(default=AUTO, metadata=rule(choices=(AUTO, "rigid-tissues", "surfaces", "none")))
     body_from_ct: bool = False
 
     def __post_init__(self) -> None:
@@ -420,10 +421,16 @@ class Case:
 
     @property
     def align(self) -> str:
-        """How the later images are brought to the first: as the case says, else on the rigid tissues, if any."""
-        if self.images is not None and self.images.align is not None:
+        """How the later images are brought to the first: "rigid-tissues", "surfaces" or "none".
+
+        As the case says; else on the rigid tissues, if any, or on all surfaces, but where the outer boundary is held:
+        that states that the images lie on each other.
+        """
+        if self.images is not None and self.images.align != AUTO:
             return self.images.align
-        return "rigid-tissues" if any(tissue.role is Role.RIGID for tissue in self.tissues) else "none"
+        if any(tissue.role is Role.RIGID for tissue in self.tissues):
+            return "rigid-tissues"
+        return "none" if self.domain.outer_boundary in HELD else "surfaces"
 
     def resolve_tissues(self, names: Mapping[int, str]) -> tuple[Tissue, ...]:
         """The tissues with their labels; `names` (label -> name) is the label table, empty when there is none.

@@ -15,6 +15,7 @@ from palpate.findings import Finding, of_pair, one_a_cause, rank
 from palpate.images.checks import check_pair, check_segmentation, later_names
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_intensities
+from palpate.images.registration import Registration
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.observation.observed_surface import observed_surface
@@ -68,13 +69,17 @@ class OrganRow:
 
 @dataclass(frozen=True, slots=True)
 class CheckReport:
-    """All problems of a case, its organs and what its estimate would cost (None when that cannot be told)."""
+    """All problems of a case, its organs and what its estimate would cost (None when that cannot be told).
+
+    alignments: how each later image lay, by its name; none where nothing was aligned.
+    """
 
     id: str
     problems: tuple[Problem, ...]
     images: tuple[str, ...] = ()
     organs: tuple[OrganRow, ...] = ()
     cost: ExpectedCost | None = None
+    alignments: tuple[tuple[str, Registration], ...] = ()
 
     @property
     def exit_code(self) -> int:
@@ -97,6 +102,7 @@ class CheckReport:
                 }
                 for problem in self.problems
             ],
+            "alignment": [found.row(name) for name, found in self.alignments],
             "organs": [
                 {
                     "tissue": row.tissue,
@@ -125,6 +131,9 @@ class CheckReport:
         for row in self.organs:
             volumes = ", ".join(f"{volume:.4g}" for volume in row.volumes_ml)
             lines.append(f"{row.tissue} ({row.role}): {volumes} mL")
+        for name, found in self.alignments:
+            kept = ", ".join(f"{tissue} {mm:.2g}" for tissue, mm in found.residual_by_tissue_mm.items())
+            lines.append(f"alignment: '{name}' {found.in_words} (surfaces then lie apart by, in mm: {kept})")
         if self.cost is not None:
             cost = self.cost
             lines.append(
@@ -194,7 +203,17 @@ def check_case(path: Path, overrides: Sequence[str], *, progress: Progress) -> C
         OrganRow(t.name, str(t.role), tuple(round(image.volume(i) / 1000.0, 4) for image in (before, *after)))
         for i, t in enumerate(before.tissues)
     )
-    return CheckReport(case.id, problems.all(), names, organs, cost)
+    found = [
+        (f"pair {n}: {name}" if n > 1 else name, one)
+        for n, pair in enumerate(pairs, start=1)
+        for name, one in _lay(pair)
+    ]
+    return CheckReport(case.id, problems.all(), names, organs, cost, tuple(found))
+
+
+def _lay(pair: ImagedStates) -> list[tuple[str, Registration]]:
+    """The name of each later image with how it lay, where that was measured."""
+    return list(zip(later_names(len(pair.after)), pair.alignments, strict=False))
 
 
 def _cost(problems: _Problems, pairs: Sequence[ImagedStates], case: Case, progress: Progress) -> ExpectedCost:

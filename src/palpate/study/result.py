@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from palpate.errors import NotConverged, PalpateError
 from palpate.findings import Finding, one_a_cause, warning_rows
-from palpate.images.alignment import RigidMotion
 from palpate.images.label_image import LabelImage
+from palpate.images.registration import Registration
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.mesh.space import LagrangeSpace
@@ -83,7 +83,7 @@ class PairResult:
     before: Segmentation
     after: tuple[Segmentation, ...]
     displacements: tuple[NDArray[np.float64], ...]
-    alignments: tuple[RigidMotion, ...] = ()
+    alignments: tuple[Registration, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ class CaseResult:
     brought to the first (aligned), all in RAS mm; remarks: those of the study, beside the estimation's own;
     note: a sentence that must stand wherever the numbers are shown (of what a demo simulates, say);
     further: the pairs after the first. The estimation's fits and displacements are those of `after`, then theirs;
-    alignments: the motion that takes each of `after` to where its own image has it; empty where nothing was aligned.
+    alignments: how each of `after` lay in its own image; empty where nothing was aligned.
     """
 
     case: Case
@@ -107,7 +107,7 @@ class CaseResult:
     remarks: tuple[Finding, ...] = ()
     note: str = ""
     further: tuple[PairResult, ...] = ()
-    alignments: tuple[RigidMotion, ...] = ()
+    alignments: tuple[Registration, ...] = ()
 
     @property
     def tissues(self) -> tuple[Tissue, ...]:
@@ -118,6 +118,11 @@ class CaseResult:
     def all_remarks(self) -> tuple[Finding, ...]:
         """Warnings of the study and of the estimation, one a cause, in the order of what they cost in the answer."""
         return one_a_cause((*self.remarks, *self.estimation.remarks))
+
+    @property
+    def every_alignment(self) -> tuple[Registration, ...]:
+        """How each later image of all pairs lay, in the order of the case; empty where nothing was aligned."""
+        return (*self.alignments, *(found for pair in self.further for found in pair.alignments))
 
     @property
     def unit(self) -> str:
@@ -151,6 +156,7 @@ class CaseResult:
             "regions": [_plain(region) for region in estimation.regions],
             "image_pairs": pairs and _plain(pairs) | {"alone": alone},
             "samples": drawn and drawn.to_dict(),
+            "alignment": [found.row(name) for name, found in zip(names, self.every_alignment, strict=False)],
             "fit": [_fit(name, fits) for name, fits in zip(names, estimation.fits, strict=False)],
             "starts": [
                 {
@@ -246,6 +252,7 @@ def failure_document(case: Case, error: PalpateError) -> dict[str, Any]:
         "regions": [],
         "image_pairs": None,
         "samples": None,
+        "alignment": [],
         "fit": [],
         "starts": [],
         "outer_loop": {"history_mm2": []},

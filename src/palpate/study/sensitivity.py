@@ -251,7 +251,8 @@ def _variants(case: Case, edge_mm: float) -> Iterator[_Variant]:
         other = replace(case, domain=replace(domain, outer_boundary=name))
         yield _Variant(f"outer-boundary-{name}", "outer_boundary", name, other)
     yield from (of_law(name) for name in laws if name != "linear")
-    if case.images is not None and any(tissue.role is Role.RIGID for tissue in case.tissues):
+    rigid = any(tissue.role is Role.RIGID for tissue in case.tissues)
+    if case.images is not None and (rigid or case.align != "none"):
         method = "none" if case.align != "none" else "rigid-tissues"
         unaligned = replace(case, images=replace(case.images, align=method))
         yield _Variant(f"alignment-{method}", "alignment", method, unaligned, "images")

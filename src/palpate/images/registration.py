@@ -1,0 +1,81 @@
+"""How a later image lay when it was read: the rigid motion that was measured, and taken out of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.images.alignment import RigidFit, RigidMotion
+from palpate.images.segmentation import Segmentation
+from palpate.images.surface_alignment import residuals_by_tissue
+from palpate.images.tissue import Role
+
+__all__ = ["ON", "Registration", "registration"]
+
+
+ON = {"rigid-tissues": "the rigid tissues", "surfaces": "all surfaces that both images show"}
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """The rigid motion from the first image's world to a later one's, and what was left of it.
+
+    by: "rigid-tissues" or "surfaces", on which it was measured; centre (3,) mm: that of the reference's organs, whose
+    motion is stated; residual_mm: robust root mean square of what the surfaces keep that it was measured on;
+    residual_by_tissue_mm: root mean square of each surface that both images show.
+    """
+
+    by: str
+    motion: RigidMotion
+    centre: NDArray[np.float64]
+    residual_mm: float
+    residual_by_tissue_mm: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def translation_mm(self) -> NDArray[np.float64]:
+        """Displacement (3,) mm of the centre of the reference's organs."""
+        return np.asarray(self.motion.apply(self.centre[None])[0] - self.centre)
+
+    @property
+    def distance_mm(self) -> float:
+        """Length of that displacement, mm."""
+        return float(np.linalg.norm(self.translation_mm))
+
+    @property
+    def rotation_deg(self) -> float:
+        """Angle of the rotation, degrees."""
+        return self.motion.angle_deg
+
+    @property
+    def in_words(self) -> str:
+        """What goes on after the later image's name: where it lay, on what that was measured, what was done."""
+        if self.distance_mm == 0.0 and self.rotation_deg == 0.0:
+            return f"is left where it lies: {ON[self.by]} show no clear motion of the whole"
+        return (
+            f"lay {self.distance_mm:.1f} mm and {self.rotation_deg:.1f} degrees elsewhere, measured on {ON[self.by]},"
+            f" and was brought back; these keep {self.residual_mm:.2g} mm"
+        )
+
+    def row(self, after: str) -> dict[str, Any]:
+        """One entry of `alignment` in a JSON document; after: the later image's name."""
+        return {
+            "after": after,
+            "by": self.by,
+            "translation_mm": [round(float(part), 4) for part in self.translation_mm],
+            "rotation_deg": round(self.rotation_deg, 4),
+            "residual_mm": round(self.residual_mm, 4),
+            "residual_by_tissue_mm": {name: round(mm, 4) for name, mm in self.residual_by_tissue_mm.items()},
+        }
+
+
+def registration(before: Segmentation, after: Segmentation, fit: RigidFit, *, by: str) -> Registration:
+    """What a measured motion does to the organs, and what it leaves of each surface."""
+    organs = [i for i, tissue in enumerate(before.tissues) if tissue.role is Role.ESTIMATE]
+    shown = np.isin(before.index, organs)
+    voxels = np.argwhere(shown if shown.any() else before.index >= 0)
+    centre = before.grid.world(voxels.mean(axis=0)[None])[0]
+    return Registration(by, fit.motion, centre, fit.rms_mm, residuals_by_tissue(before, after, fit.motion))

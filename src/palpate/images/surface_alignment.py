@@ -1,0 +1,259 @@
+"""Rigid motion between two images without bones: of all surfaces that both show, most of which nearly keep together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+from scipy.spatial.distance import cdist
+from scipy.spatial.transform import Rotation
+
+from palpate.errors import InputDataError
+from palpate.images.alignment import TUKEY, RigidFit, RigidMotion, seen_surface, within_border
+from palpate.images.distance import DistanceMap, smoothing_width
+from palpate.images.segmentation import Segmentation
+from palpate.images.tissue import Role
+from palpate.images.tissue_distance import tissue_distance_map
+from palpate.parallel import mapped
+
+__all__ = ["align_surfaces", "residuals_by_tissue", "shown_tissues"]
+
+SMOOTHER = 2.0  # times the usual smoothing: it takes the stairs of the voxels, and does the same to both images
+MOST_POINTS = 400  # of one surface: those between them say the same
+LEAST_POINTS = 30
+LENGTH_MM = 40.0  # over which an organ's own motion is alike
+OWN_MOTION_MM = {  # standard deviation of each component of a surface's own motion
+    Role.ESTIMATE: 1.5,
+    Role.KNOWN: 1.5,
+    Role.VOID: 1.5,
+    Role.DRIVER: 4.0,  # it fills
+    Role.RIGID: 0.3,
+}
+ROUGHNESS_MM = 1.0  # of a surface from place to place
+SHIFT_MM, TURN_DEG = 10.0, 10.0  # standard deviation of each component of the motion, before anything is seen
+CLEARLY = 5.0  # log of the odds by which a motion must explain the images better than none
+LEAST_WEIGHT = 1e-3
+MOST_STEPS = 40
+STEP_TOLERANCE_MM = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class _Shown:
+    """Points of one surface of the earlier image, and the later map of its tissue.
+
+    places (n, 3) mm; rest (n,) mm: the earlier map there; own (n, n) mm^2: covariance of the surface's own motion along
+    its normals.
+    """
+
+    places: NDArray[np.float64]
+    rest: NDArray[np.float64]
+    after: DistanceMap
+    own: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class _Trial:
+    """What the surfaces (n,) points each say of a motion, which turns about `centre` (3,) mm.
+
+    residuals (n,) mm with their derivatives (n, 6) by turn (rad) and shift (mm); seen (n,): in the later image;
+    parameters (6,): turn (rad) and shift (mm) of the motion.
+    """
+
+    motion: RigidMotion
+    parameters: NDArray[np.float64]
+    residuals: tuple[NDArray[np.float64], ...]
+    jacobians: tuple[NDArray[np.float64], ...]
+    seen: tuple[NDArray[np.bool_], ...]
+
+    @property
+    def n_seen(self) -> int:
+        """Number of points that come to lie inside the later image."""
+        return int(sum(map(np.count_nonzero, self.seen)))
+
+
+def shown_tissues(segmentation: Segmentation) -> tuple[int, ...]:
+    """Indices of the tissues that have a surface of their own: all but the meshed one that fills what others leave.
+
+    That is the "remaining" one, or else the largest.
+    """
+    tissues = segmentation.tissues
+    meshed = sorted((i for i, t in enumerate(tissues) if t.meshed), key=segmentation.volume)
+    filler = [i for i in meshed if not tissues[i].labels] or meshed[-1:]
+    return tuple(i for i in range(len(tissues)) if i not in filler)
+
+
+def align_surfaces(before: Segmentation, after: Segmentation) -> RigidFit:
+    """The rigid motion before -> after that most surfaces agree on; none where that explains the images about as well.
+
+    Most probable motion under r_i = phi_after(R x_i + t) - phi_before(x_i) ~ N(0, K) of points x_i of every tissue's
+    surface: K is that of a smooth motion of the tissue's own, alike over 40 mm, of 1.5 mm (a driver: 4 mm), and 1 mm
+    from place to place, more where a residual is an outlier (Tukey); shifts of 10 mm and turns of 10 degrees are usual.
+    It counts where it makes the images e^5 times as probable as no motion. Raises `InputDataError` when the images
+    share too few surface points.
+    """
+    surfaces, middles = _surfaces(before, after)
+    if not surfaces:
+        raise InputDataError(
+            "no tissue shows enough of its surface in both images, away from their borders, for a motion between them"
+            " to be measured; enlarge the images, or set align = 'none'"
+        )
+    centre = np.average([first for first, _ in middles], axis=0)
+    shift = np.median([second - first for first, second in middles], axis=0)
+    still = _trial(surfaces, centre, np.zeros(6))
+    starts = [still, _trial(surfaces, centre, np.concatenate([np.zeros(3), shift]))]
+    found = [_descended(surfaces, centre, start) for start in starts if start.n_seen >= LEAST_POINTS]
+    if not found:
+        raise InputDataError(
+            f"under {LEAST_POINTS} surface points come to lie inside the later image: the images show different parts"
+            " of the body"
+        )
+    best = min(found, key=_misfit)
+    if 2 * still.n_seen > best.n_seen and _odds(surfaces, still, best) < CLEARLY:
+        best = still
+    seen = np.concatenate(best.seen)
+    residual = np.concatenate(best.residuals)[seen]
+    weight = _tukey(residual, _cutoff(best))
+    rms = float(np.sqrt(weight @ residual**2 / max(float(weight.sum()), 1e-12)))
+    return RigidFit(best.motion, rms, int(np.count_nonzero(weight)), np.zeros((0, 3)))
+
+
+def residuals_by_tissue(before: Segmentation, after: Segmentation, motion: RigidMotion) -> dict[str, float]:
+    """How far each tissue's surface lies from the later image's once it has moved so, mm: root mean square.
+
+    Of the tissues that both images show, the one left out that fills what others leave.
+    """
+    found = {}
+    for tissue, pair in _maps(before, after).items():
+        places = seen_surface(pair[0]).places
+        places = places[within_border(pair[1].grid, motion.apply(places))]
+        if len(places) >= LEAST_POINTS:
+            distance = pair[1].at(motion.apply(places)) - pair[0].at(places)
+            found[before.tissues[tissue].name] = float(np.sqrt(np.mean(distance**2)))
+    return found
+
+
+def _maps(before: Segmentation, after: Segmentation) -> dict[int, tuple[DistanceMap, DistanceMap]]:
+    """Distance maps in both images of every tissue with a surface of its own that both have."""
+    present = [set(np.unique(image.index).tolist()) for image in (before, after)]
+    tissues = [i for i in shown_tissues(before) if i in present[0] & present[1]]
+    width = SMOOTHER * smoothing_width(before.grid, after.grid)
+    images = list(product(tissues, (before, after)))
+    maps = mapped(lambda of: tissue_distance_map(of[1], of[0], smoothing_mm=width), images)
+    return dict(zip(tissues, zip(maps[::2], maps[1::2], strict=True), strict=True))
+
+
+def _surfaces(
+    before: Segmentation, after: Segmentation
+) -> tuple[list[_Shown], list[tuple[NDArray[np.float64], NDArray[np.float64]]]]:
+    """The surfaces that are seen, and the middles (3,) mm of each in both images."""
+    surfaces, middles = [], []
+    for tissue, maps in _maps(before, after).items():
+        first, second = (seen_surface(one) for one in maps)
+        if min(len(first.area), len(second.area)) < LEAST_POINTS:
+            continue
+        step = -(-len(first.area) // MOST_POINTS)
+        places, normals = first.places[::step], first.normals[::step]
+        alike = np.exp(-0.5 * cdist(places, places, "sqeuclidean") / LENGTH_MM**2) * (normals @ normals.T)
+        own = OWN_MOTION_MM[before.tissues[tissue].role] ** 2 * alike
+        surfaces.append(_Shown(places, maps[0].at(places), maps[1], own))
+        middles.append((first.area @ first.places / first.area.sum(), second.area @ second.places / second.area.sum()))
+    return surfaces, middles
+
+
+def _trial(surfaces: Sequence[_Shown], centre: NDArray[np.float64], parameters: NDArray[np.float64]) -> _Trial:
+    turn, shift = Rotation.from_rotvec(parameters[:3]).as_matrix(), parameters[3:]
+    motion = RigidMotion(turn, centre + shift - turn @ centre)
+    residuals, jacobians, seen = [], [], []
+    for surface in surfaces:
+        places = motion.apply(surface.places)
+        distance, slope = surface.after.values_and_gradients(places)
+        residuals.append(distance - surface.rest)
+        jacobians.append(np.hstack([np.cross(places - centre - shift, slope), slope]))
+        seen.append(within_border(surface.after.grid, places))
+    return _Trial(motion, parameters, tuple(residuals), tuple(jacobians), tuple(seen))
+
+
+def _descended(surfaces: Sequence[_Shown], centre: NDArray[np.float64], trial: _Trial) -> _Trial:
+    """Gauss-Newton; a step that does not lower the objective at the noise of its beginning is halved."""
+    for _ in range(MOST_STEPS):
+        noise, prior = _noise(surfaces, trial, trial.seen), _prior(trial.parameters)
+        normal, slope = np.diag(prior), prior * trial.parameters
+        for factor, residual, jacobian, seen in zip(noise, trial.residuals, trial.jacobians, trial.seen, strict=True):
+            whitened = linalg.solve_triangular(factor, np.column_stack([jacobian, residual])[seen], lower=True)
+            normal += whitened[:, :6].T @ whitened[:, :6]
+            slope += whitened[:, :6].T @ whitened[:, 6]
+        step = -np.linalg.solve(normal, slope)
+        for _ in range(6):
+            turn = Rotation.from_rotvec(step[:3]) * Rotation.from_rotvec(trial.parameters[:3])
+            other = _trial(surfaces, centre, np.concatenate([turn.as_rotvec(), trial.parameters[3:] + step[3:]]))
+            if _cost(other, noise, trial.seen, prior) <= _cost(trial, noise, trial.seen, prior):
+                break
+            step = 0.5 * step
+        else:
+            return trial
+        trial = other
+        if np.abs(step * np.array([LENGTH_MM] * 3 + [1.0] * 3)).max() < STEP_TOLERANCE_MM:
+            break
+    return trial
+
+
+def _noise(
+    surfaces: Sequence[_Shown], trial: _Trial, seen: Sequence[NDArray[np.bool_]]
+) -> tuple[NDArray[np.float64], ...]:
+    """Cholesky factors of the residuals' covariance among the points that are seen; outliers of the trial have more."""
+    factors, cutoff = [], _cutoff(trial)
+    for surface, residual, inside in zip(surfaces, trial.residuals, seen, strict=True):
+        rough = ROUGHNESS_MM**2 / np.maximum(_tukey(residual[inside], cutoff), LEAST_WEIGHT)
+        factors.append(linalg.cholesky(surface.own[np.ix_(inside, inside)] + np.diag(rough), lower=True))
+    return tuple(factors)
+
+
+def _cost(
+    trial: _Trial,
+    noise: Sequence[NDArray[np.float64]],
+    seen: Sequence[NDArray[np.bool_]],
+    prior: NDArray[np.float64],
+) -> float:
+    """Minus log probability of the residuals of the points that are seen, and of the motion, up to a constant."""
+    whitened = [
+        linalg.solve_triangular(factor, residual[inside], lower=True)
+        for factor, residual, inside in zip(noise, trial.residuals, seen, strict=True)
+    ]
+    return 0.5 * float(sum(each @ each for each in whitened) + prior @ trial.parameters**2)
+
+
+def _prior(parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Precision (6,) of turn and shift, less for unusually large ones: images may be in worlds of their own."""
+    usual = np.array([np.deg2rad(TURN_DEG)] * 3 + [SHIFT_MM] * 3) ** -2.0
+    return np.asarray(usual * min(1.0, len(usual) / max(float(usual @ parameters**2), 1e-12)))
+
+
+def _odds(surfaces: Sequence[_Shown], still: _Trial, moved: _Trial) -> float:
+    """Log of how much more probable a motion is than none, by the noise at either, whichever says less."""
+    both = [a & b for a, b in zip(still.seen, moved.seen, strict=True)]
+    prior = _prior(moved.parameters)
+    gains = []
+    for trial in (still, moved):
+        noise = _noise(surfaces, trial, both)
+        gains.append(_cost(still, noise, both, prior) - _cost(moved, noise, both, prior))
+    return min(gains)
+
+
+def _misfit(trial: _Trial) -> float:
+    """Mean size of the residuals, mm, over the share of points that are inside: compares the ends of several starts."""
+    inside = np.concatenate(trial.seen)
+    return float(np.abs(np.concatenate(trial.residuals)[inside]).mean() / inside.mean())
+
+
+def _cutoff(trial: _Trial) -> float:
+    """Size from which a residual is an outlier, mm: 4.685 of their robust standard deviations."""
+    residual = np.concatenate(trial.residuals)[np.concatenate(trial.seen)]
+    return TUKEY * max(1.4826 * float(np.median(np.abs(residual))), OWN_MOTION_MM[Role.ESTIMATE])
+
+
+def _tukey(residual: NDArray[np.float64], cutoff: float) -> NDArray[np.float64]:
+    return np.asarray(np.maximum(1.0 - (residual / cutoff) ** 2, 0.0) ** 2)

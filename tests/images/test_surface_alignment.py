@@ -1,0 +1,123 @@
+"""Without bones the motion of the whole is found among organs that move by themselves; none is found where none is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from palpate.errors import InputDataError
+from palpate.images.alignment import RigidMotion, moved
+from palpate.images.label_image import VoxelGrid
+from palpate.images.registration import registration
+from palpate.images.segmentation import Segmentation
+from palpate.images.surface_alignment import align_surfaces
+from palpate.images.tissue import Role, Tissue
+
+TISSUES = (
+    Tissue("prostate", Role.ESTIMATE, (1,)),
+    Tissue("bladder", Role.ESTIMATE, (2,)),
+    Tissue("rectum", Role.DRIVER, (3,)),
+    Tissue("air", Role.VOID, (4,)),
+    Tissue("rest", Role.KNOWN, (), youngs_modulus_kpa=10.0),
+)
+STILL = RigidMotion.identity()
+ELSEWHERE = RigidMotion(Rotation.from_rotvec(np.deg2rad([2.0, -1.0, 3.0])).as_matrix(), np.array([4.0, -3.0, 2.0]))
+FIELD = (110.0, 100.0, 100.0)
+VOXEL = 1.6
+
+
+def body(
+    motion: RigidMotion, *, filling: float = 0.0, skin: bool = True, field: tuple[float, ...] = FIELD, seed: int = 0
+) -> Segmentation:
+    """Two organs, a tube behind them that fills and pushes them, and the skin around all."""
+    shape = tuple(int(side / VOXEL) for side in field)
+    affine = np.diag([VOXEL, VOXEL, VOXEL, 1.0])
+    affine[:3, 3] = -0.5 * VOXEL * (np.array(shape) - 1.0) + np.random.default_rng(seed).uniform(-0.5, 0.5, 3)
+    grid = VoxelGrid((shape[0], shape[1], shape[2]), affine)
+    index = np.stack(np.meshgrid(*map(np.arange, grid.shape), indexing="ij"), axis=-1).reshape(-1, 3).astype(float)
+    x = motion.inverse().apply(grid.world(index))
+    pushed = x - np.array([0.0, 0.4 * filling, 0.1 * filling]) * np.exp(-((x[:, 1:2] + 20.0) ** 2) / 40.0**2)
+    tissue = np.full(len(x), 4)
+    if skin:
+        tissue[((x[:, :2] / [50.0, 38.0]) ** 2).sum(axis=1) > 1.0] = 3
+    tissue[inside(pushed, (0.0, 5.0, -12.0), (20.0, 16.0, 15.0))] = 0
+    tissue[inside(pushed, (2.0, 10.0, 16.0), (25.0, 16.0, 12.0))] = 1
+    tissue[np.hypot(x[:, 0], x[:, 1] + 22.0 - 0.05 * x[:, 2]) < 8.0 + filling * np.exp(-((x[:, 2] / 30.0) ** 2))] = 2
+    return Segmentation(tissue.reshape(grid.shape), grid, TISSUES)
+
+
+def inside(points: NDArray[np.float64], centre: tuple[float, ...], axes: tuple[float, ...]) -> NDArray[np.bool_]:
+    return np.asarray((((points - centre) / axes) ** 2).sum(axis=1) < 1.0)
+
+
+def error(found: RigidMotion, truth: RigidMotion) -> tuple[float, float]:
+    """Of the place of the organs' centre, mm, and of the turn, degrees."""
+    wrong = found.compose(truth.inverse())
+    place = truth.apply(np.array([[1.0, 7.0, 0.0]]))
+    return float(np.linalg.norm(wrong.apply(place) - place)), wrong.angle_deg
+
+
+@pytest.mark.parametrize("skin", [True, False])
+def test_a_body_that_moves_as_a_whole_is_found_to_fractions_of_a_voxel(skin):
+    fit = align_surfaces(body(STILL, skin=skin), body(ELSEWHERE, skin=skin, seed=1))
+    shift, turn = error(fit.motion, ELSEWHERE)
+    assert shift < 0.25
+    assert turn < 0.8
+    assert fit.rms_mm < 0.5
+
+
+@pytest.mark.parametrize("filling", [3.0, 6.0])
+@pytest.mark.parametrize("skin", [True, False])
+def test_organs_that_move_by_themselves_do_not_hide_the_motion_of_the_whole(filling, skin):
+    fit = align_surfaces(body(STILL, skin=skin), body(ELSEWHERE, filling=filling, skin=skin, seed=1))
+    shift, turn = error(fit.motion, ELSEWHERE)
+    assert shift < 1.2
+    assert turn < 1.6
+
+
+@pytest.mark.parametrize("filling", [0.0, 3.0, 6.0])
+@pytest.mark.parametrize("skin", [True, False])
+def test_organs_that_move_by_themselves_are_no_motion_of_the_whole(filling, skin):
+    fit = align_surfaces(body(STILL, skin=skin), body(STILL, filling=filling, skin=skin, seed=1))
+    assert np.array_equal(fit.motion.matrix, np.eye(4))
+
+
+def test_a_later_image_with_a_smaller_field_of_view_shows_the_same_motion():
+    fit = align_surfaces(body(STILL), body(ELSEWHERE, filling=3.0, field=(80.0, 84.0, 70.0), seed=1))
+    shift, turn = error(fit.motion, ELSEWHERE)
+    assert shift < 1.0
+    assert turn < 2.5
+
+
+def test_images_in_worlds_of_their_own_are_laid_on_each_other():
+    away = RigidMotion(np.eye(3), np.array([150.0, -40.0, 300.0]))
+    fit = align_surfaces(body(STILL), moved(body(ELSEWHERE, filling=3.0, seed=1), away))
+    shift, turn = error(fit.motion, away.compose(ELSEWHERE))
+    assert shift < 1.0
+    assert turn < 1.6
+
+
+def test_the_motion_that_is_told_is_that_of_the_organs_wherever_the_world_begins():
+    before, after = body(STILL), body(ELSEWHERE, seed=1)
+    away = RigidMotion(np.eye(3), np.array([500.0, -300.0, 900.0]))
+    told = [
+        registration(first, second, align_surfaces(first, second), by="surfaces").row("after")
+        for first, second in ((before, after), (moved(before, away), moved(after, away)))
+    ]
+    np.testing.assert_allclose(
+        told[0]["translation_mm"], told[1]["translation_mm"], atol=0.4
+    )  # of rounding which points count
+    voxels = np.argwhere(before.index < 2).astype(float)
+    centre = before.grid.world(voxels).mean(axis=0)
+    np.testing.assert_allclose(told[0]["translation_mm"], ELSEWHERE.apply(centre[None])[0] - centre, atol=0.4)
+    assert told[0]["rotation_deg"] == pytest.approx(ELSEWHERE.angle_deg, abs=0.8)
+    assert set(told[0]["residual_by_tissue_mm"]) == {"prostate", "bladder", "rectum", "air"}
+    assert max(told[0]["residual_by_tissue_mm"].values()) < 0.7
+
+
+def test_images_that_show_no_surface_away_from_their_border_are_refused():
+    small = body(STILL, field=(14.0, 14.0, 14.0))
+    with pytest.raises(InputDataError, match="align = 'none'"):
+        align_surfaces(small, small)
