@@ -36,7 +36,7 @@ __all__ = [
 AMPLITUDES = (0.005, 2.0)  # times the coefficients' own standard deviation
 ALIKE, SELDOM = 0.1, 0.01  # an offset of a surface that is drawn alike, over that of others; how often one is not
 HELD = 1e8  # times its precision: an unknown that is considered does not move
-LEAST_HETEROGENEITY, MOST_HETEROGENEITY = 1.0 / 3.0, 5.0  # times the scale of its amplitude's prior
+LEAST_HETEROGENEITY, MOST_HETEROGENEITY = 1.0 / 3.0, 2.0  # times the scale of its amplitude's prior
 
 
 class Acts(Enum):
@@ -132,15 +132,16 @@ def offset_block(observation: Observation, state: int, *, sd: float) -> Block:
     """By how much more an observation shows in a later state than is there; sd in the unit of its residuals.
 
     A mixture of two normal laws, of which the evidence chooses: drawn alike but for a tenth of sd, or otherwise by sd,
-    which is so seldom that a bias of some hundredths of a millimetre is not taken for it. A driver's wall moves as its
-    drawing does: its offset is considered, not estimated.
+    which is so seldom that a bias of some hundredths of a millimetre is not taken for it. An estimate begins with the
+    latter: what is held at first is taken for motion. A driver's wall moves as its drawing does: its offset is
+    considered, not estimated.
     """
     precision, common = np.full((1, 1), sd**-2.0), (observation.name, "offset", Acts.RESIDUALS, (state,))
     if observation.of_driver:
         return Block(*common, precision, considered=True)
     alternatives = tuple((1.0 / (precision * share**-2.0),) for share in (ALIKE, 1.0))
     odds = (0.0, float(np.log(SELDOM)))
-    return Block(*common, precision / ALIKE**2, alternatives, amplitudes=(1.0, 1.0), odds=odds)
+    return Block(*common, precision, alternatives, amplitudes=(1.0, 1.0), odds=odds)
 
 
 def material_blocks(
@@ -158,7 +159,7 @@ def material_blocks(
             "heterogeneity",
             Acts.MATERIAL,
             states,
-            np.eye(n) / heterogeneity_sd**2,
+            np.eye(n) / (LEAST_HETEROGENEITY * heterogeneity_sd) ** 2,  # else it takes what the frame does
             ((np.eye(n),),),
             amplitudes=(LEAST_HETEROGENEITY * heterogeneity_sd, MOST_HETEROGENEITY * heterogeneity_sd),
             scale=heterogeneity_sd,
