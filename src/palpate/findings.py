@@ -25,6 +25,7 @@ __all__ = [
 
 Misleading = Literal[
     "mirrored",
+    "frame-moves",
     "voxel-size",
     "large-shift",
     "volume-implausible",
@@ -62,6 +63,7 @@ Widening = Literal[
 ]
 Harmless = Literal[
     "samples-not-mixed",
+    "frame-aligned",
     "finer-mesh",
     "front-exchanged",
     "sides-exchanged",

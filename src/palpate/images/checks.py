@@ -166,7 +166,7 @@ def _common_part(before: Segmentation, after: Segmentation, name: str) -> list[F
         )
     if share >= COMMON_SHARE:
         return []
-    text = f"'before' and '{name}' share only {share:.0%} of the smaller image; what lies outside of it is left out"
+    text = f"'before' and '{name}' share only {share:.0%} of the smaller image; surfaces outside of it are not compared"
     return [Finding("little-in-common", text, place=f"'{name}' ({share:.0%})")]
 
 
@@ -246,7 +246,10 @@ def _volume_change(before: Segmentation, after: Segmentation, i: int, name: str)
         " explains: give a hollow organ the role driver"
     )
     place = f"to '{name}' ({change:+.1%})"
-    if any(_touching(image.mask(i)) for image in (before, after)):
+    cut = [_touching(image.mask(i)) for image in (before, after)]
+    if cut[1] and not cut[0]:
+        return []  # the later image's field of view ends in the organ, and shows less of it
+    if any(cut):
         text += "; here the image's border cuts the organ, which may be the cause"
         return [Finding("volume-change", text, tissue.name, place)]
     if abs(change) > VOLUME_IMPLAUSIBLE:

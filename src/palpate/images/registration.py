@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from palpate.images.alignment import RigidFit, RigidMotion
 from palpate.images.segmentation import Segmentation
 from palpate.images.surface_alignment import residuals_by_tissue
-from palpate.images.tissue import Role
+from palpate.images.tissue import Role, Tissue
 
 __all__ = ["ON", "Registration", "registration"]
 
@@ -59,6 +59,12 @@ class Registration:
             f"lay {self.distance_mm:.1f} mm and {self.rotation_deg:.1f} degrees elsewhere, measured on {ON[self.by]},"
             f" and was brought back; these keep {self.residual_mm:.2g} mm"
         )
+
+    def own_motion_mm(self, tissues: Sequence[Tissue]) -> float:
+        """How far organs and drivers move against the whole, mm: root mean square of their surfaces' distances."""
+        moving = [tissue.name for tissue in tissues if tissue.role in (Role.ESTIMATE, Role.DRIVER)]
+        kept = [mm for name, mm in self.residual_by_tissue_mm.items() if name in moving]
+        return float(np.sqrt(np.mean(np.square(kept)))) if kept else 0.0
 
     def row(self, after: str) -> dict[str, Any]:
         """One entry of `alignment` in a JSON document; after: the later image's name."""

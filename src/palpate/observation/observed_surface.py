@@ -8,15 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import GeometryError
+from palpate.images.segmentation import Segmentation
+from palpate.images.surface_alignment import shown_tissues
 from palpate.images.tissue import Role
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.surface import tissue_surface, triangle_normals
 from palpate.mesh.tet_mesh import OUTER
+from palpate.observation.field_of_view import FieldOfView
 
-__all__ = ["ObservedSurface", "observed_surface"]
+__all__ = ["ObservedSurface", "observed_surface", "observed_surfaces", "seen_in"]
 
 SUBTRIANGLES = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])  # of a quadratic triangle
 MIN_SHARE = 0.1
+NEEDED = (Role.ESTIMATE, Role.DRIVER)
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +32,8 @@ class ObservedSurface:
     the cut of the image; rim (n_triangles, 3) marks edges (opposite each corner) where the observed part ends;
     share of the area that is observed; faces (n_faces, 6): the vertices of each face that its four triangles stand for,
     corners and then the middles of the edges 01, 12, 20, none where faces are plane; driver: whether it is the wall of
-    one, whose motion is prescribed.
+    one, whose motion is prescribed; needed: whether it is an `estimate` tissue's or a driver's, without which there is
+    no estimate.
     """
 
     tissue: int
@@ -41,6 +46,7 @@ class ObservedSurface:
     share: float
     faces: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 6), dtype=np.int64))
     driver: bool = False
+    needed: bool = True
 
     @property
     def dofs(self) -> NDArray[np.int64]:
@@ -49,10 +55,9 @@ class ObservedSurface:
 
 
 def observed_surface(space: LagrangeSpace, tissue: int) -> ObservedSurface:
-    """Surface of an `estimate` tissue or a driver on `space`.
+    """Surface of a tissue on `space`.
 
-    Raises `GeometryError` when the mesh has nothing of it, or under 10 % of an `estimate` tissue's surface is left to
-    observe.
+    Raises `GeometryError` when the mesh has nothing of it, or under 10 % of its surface is left to observe.
     """
     mesh = space.mesh
     surface, name = tissue_surface(mesh, tissue), mesh.tissues[tissue].name
@@ -84,4 +89,41 @@ def observed_surface(space: LagrangeSpace, tissue: int) -> ObservedSurface:
     shown = np.sort(keys[observed].ravel())
     count = np.searchsorted(shown, keys, side="right") - np.searchsorted(shown, keys, side="left")
     rim = (count == 1) & observed[:, None]
-    return ObservedSurface(tissue, name, points, rest, triangles, observed, rim, share, faces, driver)
+    needed = mesh.tissues[tissue].role in NEEDED
+    return ObservedSurface(tissue, name, points, rest, triangles, observed, rim, share, faces, driver, needed)
+
+
+def observed_surfaces(space: LagrangeSpace, before: Segmentation) -> tuple[ObservedSurface, ...]:
+    """Every surface that the reference image shows, in the order of the tissues.
+
+    Those of `estimate` tissues, drivers, `void` tissues beside meshed ones, and `known` tissues, but for the one that
+    fills what the others leave; bones' motion is prescribed. Raises `GeometryError` as `observed_surface` for
+    `estimate` tissues and drivers; others of which little is seen are left out.
+    """
+    found = []
+    for i in shown_tissues(before):
+        role = before.tissues[i].role
+        if role is Role.RIGID or (role not in NEEDED and not before.mask(i).any()):
+            continue
+        try:
+            found.append(observed_surface(space, i))
+        except GeometryError:
+            if role in NEEDED:
+                raise
+    return tuple(found)
+
+
+def seen_in(surface: ObservedSurface, image: Segmentation, view: FieldOfView, *, name: str) -> bool:
+    """Whether the later image called `name`, which shows `view`, has enough of a surface to be compared.
+
+    Raises `GeometryError` where under 10 % of an `estimate` tissue's or a driver's surface is seen in it.
+    """
+    normals = triangle_normals(surface.rest, surface.triangles)
+    area, centres = np.linalg.norm(normals, axis=1), surface.rest[surface.triangles].mean(axis=1)
+    share = float(area[surface.observed & view.shows(centres)].sum() / area.sum())
+    if share >= MIN_SHARE or not surface.needed:
+        return share >= MIN_SHARE and bool(image.mask(surface.tissue).any())
+    raise GeometryError(
+        f"'{surface.name}': the field of view of '{name}' shows only {100 * share:.0f} % of its surface free of"
+        f" drivers, bones and borders, and {100 * MIN_SHARE:.0f} % are needed; use an image that shows more of it"
+    )

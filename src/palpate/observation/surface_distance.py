@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import EstimationError
+from palpate.images.checks import later_names
 from palpate.images.distance import DistanceMap
 from palpate.images.segmentation import Segmentation
-from palpate.images.tissue import Role
 from palpate.images.tissue_distance import tissue_distance_map
 from palpate.mesh.surface import vertex_normals
 from palpate.observation.contract import Fit, ImagedBody, Observation, Residuals, Weighting
+from palpate.observation.field_of_view import field_of_view
 from palpate.observation.noise_model import (
     EXACT_NOISE,
     SEGMENTATION_NOISE,
@@ -22,7 +23,7 @@ from palpate.observation.noise_model import (
     NoiseModel,
     fit_noise_model,
 )
-from palpate.observation.observed_surface import ObservedSurface, observed_surface
+from palpate.observation.observed_surface import ObservedSurface, observed_surfaces, seen_in
 from palpate.observation.robust_loss import HUBER, Huber, RobustLoss, Tukey
 from palpate.observation.surface_residuals import Correspondence, correspondence, surface_residuals
 from palpate.observation.target import SurfaceTarget, surface_target
@@ -33,6 +34,7 @@ __all__ = ["SurfaceDistance", "robust_loss", "surface_distance", "surface_distan
 TUKEY = 4.685  # cutoff in standard deviations, 95 % efficient for normal errors (Huber 1981)
 MAD = 1.4826  # standard deviations of a normal law in one median absolute deviation
 LEAST_CUTOFF = 5e-3  # mm
+LEAST_POINTS = 30  # of a surface that is neither an organ's nor a driver's, to be compared
 AROUND = 8.0  # widths of the Gaussian, within which the maps of an imaged model are asked
 
 
@@ -86,8 +88,9 @@ class SurfaceDistance:
 
     @property
     def observed_share(self) -> float:
-        """Share of the surface's area that touches neither driver, bone nor the image's border."""
-        return self.target.surface.share
+        """Share of the surface's area that both images show, and that touches neither driver, bone nor their border."""
+        area = self.target.area
+        return self.target.surface.share * float(self.held.of_model(area).sum() / area.sum())
 
     def residuals(self, displacement: NDArray[np.float64], offset: float = 0.0) -> Residuals:
         """Residuals and their derivative at a displacement (n_dofs,) mm: model -> image first, then image -> model.
@@ -100,18 +103,19 @@ class SurfaceDistance:
         """
         found = surface_residuals(self.target, self._drawn(displacement, offset), self.held)
         noise = self.noise_model.sd**2 * self.noise_model.correlation_area
-        terraces = np.concatenate([self.target.terraces, self.held.terraces[self.held.kept]])
+        terraces = np.concatenate([self.held.of_model(self.target.terraces), self.held.terraces[self.held.kept]])
         weights = found.weights * noise / (noise + terraces)
         places = found.places - offset * found.normals  # in the body, not on what is drawn of it
         return replace(found, places=places, weights=weights * (found.weights.sum() / weights.sum()))
 
     def rematched(self, displacement: NDArray[np.float64], offset: float = 0.0) -> SurfaceDistance:
-        """The same with the image points that face the observed part chosen at a displacement (n_dofs,) and offset, mm.
+        """The same with the points that both images show chosen at a displacement (n_dofs,) mm and an offset, mm.
 
-        Raises `EstimationError` when none does.
+        Those of the later image that face the observed part, and those of the model that come to lie in its field of
+        view. Raises `EstimationError` when there are none.
         """
         held = correspondence(self.target, self._drawn(displacement, offset))
-        if not held.kept.any():
+        if not held.kept.any() or not held.of_model(self.target.area).any():
             raise EstimationError(
                 f"'{self.name}': none of the {len(held.kept)} points of its surface in the later image faces the"
                 " observed part of the model; is it the same organ, and do the images lie on each other?"
@@ -175,9 +179,10 @@ class SurfaceDistance:
         if target.voxels is None:
             return np.zeros(len(residuals.values))
         width = target.voxels[1].smoothing_mm
-        corners = surface.triangles[target.triangle]
-        rest = np.einsum("qk,qka->qa", target.barycentric, surface.rest[corners])
-        excess = np.einsum("qk,qk->q", target.barycentric, self.held.excess[corners])
+        corners, barycentric = (self.held.of_model(of) for of in (target.triangle, target.barycentric))
+        corners = surface.triangles[corners]
+        rest = np.einsum("qk,qka->qa", barycentric, surface.rest[corners])
+        excess = np.einsum("qk,qk->q", barycentric, self.held.excess[corners])
         maps = [
             tissue_distance_map(image, surface.tissue, smoothing_mm=width, reach_mm=AROUND * width, far=False)
             for image in (before, after)
@@ -223,7 +228,7 @@ class SurfaceDistance:
 
     def _precision(self, noise: NoiseModel) -> float:
         """Weight (mm^-2) of the surface's mean square: its independent residuals, by their variance."""
-        return max(float(self.target.area.sum()) / noise.correlation_area, 1.0) / noise.sd**2
+        return max(float(self.held.of_model(self.target.area).sum()) / noise.correlation_area, 1.0) / noise.sd**2
 
 
 def surface_distance(target: SurfaceTarget, *, stated_noise: NoiseModel | None = None) -> SurfaceDistance:
@@ -236,23 +241,26 @@ def surface_distance(target: SurfaceTarget, *, stated_noise: NoiseModel | None =
 def surface_distances(
     imaged: ImagedBody, surfaces: Sequence[ObservedSurface] | None = None
 ) -> tuple[tuple[SurfaceDistance, ...], ...]:
-    """Those of each later image; `surfaces` None: of all `estimate` tissues and drivers."""
-    tissues = imaged.space.mesh.tissues
-    shown = [i for i, tissue in enumerate(tissues) if tissue.role in (Role.ESTIMATE, Role.DRIVER)]
-    seen = [observed_surface(imaged.space, i) for i in shown] if surfaces is None else surfaces
+    """Those of each later image, by default of every surface that it and the reference image show.
 
-    def maps(image: Segmentation) -> list[DistanceMap]:
+    Raises `GeometryError` where too little is seen of an `estimate` tissue or a driver; other surfaces are left out.
+    """
+    seen = observed_surfaces(imaged.space, imaged.before) if surfaces is None else tuple(surfaces)
+
+    def maps(image: Segmentation, of: Sequence[ObservedSurface]) -> list[DistanceMap]:
         """The distance map of each surface's tissue."""
-        return mapped(lambda s: tissue_distance_map(image, s.tissue, smoothing_mm=imaged.smoothing_mm), seen)
+        return mapped(lambda s: tissue_distance_map(image, s.tissue, smoothing_mm=imaged.smoothing_mm), of)
 
-    before = maps(imaged.before)
-    return tuple(
-        tuple(
-            surface_distance(surface_target(*of), stated_noise=imaged.stated_noise)
-            for of in zip(seen, before, maps(image), strict=True)
-        )
-        for image in imaged.after
-    )
+    before = dict(zip([s.tissue for s in seen], maps(imaged.before, seen), strict=True))
+    found = []
+    for name, image in zip(later_names(len(imaged.after)), imaged.after, strict=True):
+        view = field_of_view(imaged.before.grid, image.grid, smoothing_mm=imaged.smoothing_mm)
+        both = [s for s in seen if surfaces is not None or seen_in(s, image, view, name=name)]
+        pairs = zip(both, maps(image, both), strict=True)
+        targets = [surface_target(s, before[s.tissue], after, view) for s, after in pairs]
+        needed = [t for t in targets if t.surface.needed or min(len(t.area), len(t.image_points)) >= LEAST_POINTS]
+        found.append(tuple(surface_distance(target, stated_noise=imaged.stated_noise) for target in needed))
+    return tuple(found)
 
 
 def robust_loss(values: NDArray[np.float64], target: SurfaceTarget) -> RobustLoss:
@@ -275,6 +283,7 @@ def robust_loss(values: NDArray[np.float64], target: SurfaceTarget) -> RobustLos
 
 
 def _everywhere(target: SurfaceTarget) -> Correspondence:
-    """Every image point, until the model is near enough to choose."""
+    """Every image point in the later image's field of view, until the model is near enough to choose."""
     n = len(target.image_points)
-    return Correspondence(np.ones(n, dtype=bool), np.zeros(n), np.zeros(len(target.surface.rest)))
+    shown = None if target.view is None else target.shown(np.zeros_like(target.surface.rest))
+    return Correspondence(np.ones(n, dtype=bool), np.zeros(n), np.zeros(len(target.surface.rest)), shown)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import igl
 import numpy as np
@@ -16,6 +17,7 @@ from palpate.observation.target import SurfaceTarget, places_within, values_and_
 
 __all__ = ["Correspondence", "correspondence", "surface_residuals"]
 
+T = TypeVar("T", bound=np.generic)
 ON_EDGE = 1e-9
 # Directions (8, 2, 3) in barycentric coordinates along which a closest point may slide, zero where none: by which
 # corners have no share in it (1, 2, 4 added up). Inside there are two, on an edge one, at a corner none.
@@ -29,12 +31,18 @@ class Correspondence:
     """What is held while one objective is minimised: of the image points n_i, and of the surface's vertices.
 
     kept (n_i,): the image points in use; terraces (n_i,) mm^4: the voxels' on the model's surface there; excess
-    (n_vertices,) mm: the residual of a perfect fit, which the maps' smoothing and the surface's plane pieces leave.
+    (n_vertices,) mm: the residual of a perfect fit, which the maps' smoothing and the surface's plane pieces leave;
+    shown (n_q,): the quadrature points of the model's surface in use, None: all of them.
     """
 
     kept: NDArray[np.bool_]
     terraces: NDArray[np.float64]
     excess: NDArray[np.float64]
+    shown: NDArray[np.bool_] | None = None
+
+    def of_model(self, values: NDArray[T]) -> NDArray[T]:
+        """The rows of `values` (n_q, ...) that belong to the quadrature points in use."""
+        return values if self.shown is None else np.asarray(values[self.shown])
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +96,7 @@ def surface_residuals(target: SurfaceTarget, displacement: NDArray[np.float64], 
 
 
 def correspondence(target: SurfaceTarget, displacement: NDArray[np.float64]) -> Correspondence:
-    """Of a displacement (n_vertices, 3) mm: the image points that face the observed part, not its rim; the excess."""
+    """Of a displacement (n_vertices, 3) mm: which points of either surface are compared; the excess."""
     surface, vertices = target.surface, target.surface.rest + displacement
     closest = _closest(surface, vertices, target.image_points)
     at_rim = np.any((closest.barycentric < ON_EDGE) & surface.rim[closest.triangle], axis=1)
@@ -100,7 +108,8 @@ def correspondence(target: SurfaceTarget, displacement: NDArray[np.float64]) -> 
     else:
         widths = tuple(distance.smoothing_mm for distance in target.voxels)
         excess = _shrinkage(surface, displacement, widths) - _bulge(surface, displacement)
-    return Correspondence(kept, target.terraces_along(normals), excess)
+    shown = None if target.view is None else target.shown(displacement)
+    return Correspondence(kept, target.terraces_along(normals), excess, shown)
 
 
 def _shrinkage(
@@ -143,15 +152,17 @@ def _model_to_image(
     target: SurfaceTarget, vertices: NDArray[np.float64], normals: NDArray[np.float64], held: Correspondence
 ) -> _Direction:
     """Of the deformed vertices (n_vertices, 3) mm with unit normals (n_vertices, 3)."""
-    corners = target.surface.triangles[target.triangle]
-    material, places = (places_within(of[corners], target.barycentric) for of in (target.surface.rest, vertices))
+    barycentric, area = held.of_model(target.barycentric), held.of_model(target.area)
+    corners = target.surface.triangles[held.of_model(target.triangle)]
+    material, places = (places_within(of[corners], barycentric) for of in (target.surface.rest, vertices))
     distance, gradient = values_and_gradients(target.after, places)
-    excess = np.einsum("qk,qk->q", target.barycentric, held.excess[corners])
-    exact = target.barycentric[:, :, None] * gradient[:, None]
-    normal = _within(normals, corners, target.barycentric)
+    excess = np.einsum("qk,qk->q", barycentric, held.excess[corners])
+    exact = barycentric[:, :, None] * gradient[:, None]
+    normal = _within(normals, corners, barycentric)
     slope = np.einsum("qa,qa->q", gradient, normal)
-    smooth = target.barycentric[:, :, None] * (slope[:, None] * normal)[:, None]
-    values, weights = distance - target.rest_distance - excess, 0.5 * target.area / target.area.sum()
+    smooth = barycentric[:, :, None] * (slope[:, None] * normal)[:, None]
+    values = distance - held.of_model(target.rest_distance) - excess
+    weights = 0.5 * area / max(float(area.sum()), 1e-30)
     return _Direction(values, weights, places, normal, material, corners, exact, smooth)
 
 

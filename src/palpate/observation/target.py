@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.images.distance import DistanceMap
-from palpate.images.isosurface import isosurface_points
+from palpate.images.isosurface import IsosurfacePoints, isosurface_points
 from palpate.images.voxel_noise import terrace_noise
 from palpate.mesh.anatomy import LevelSet
 from palpate.mesh.surface import triangle_normals
+from palpate.observation.field_of_view import FieldOfView
 from palpate.observation.observed_surface import ObservedSurface
 
 __all__ = ["OneLookUp", "SurfaceTarget", "places_within", "surface_target", "target_from", "values_and_gradients"]
@@ -31,7 +32,7 @@ class SurfaceTarget:
     rest_distance (n_q,) mm: the map `before` there, subtracted from the map `after` (difference to the rest state);
     level (mm): its mean; image_points (n_i, 3) mm with areas (n_i,) mm^2: the later surface, taken at `level`;
     terraces (n_q,) mm^4: coherent rounding noise of the voxels (see `terrace_noise`); `voxels`: the two maps where they
-    are made of voxels.
+    are made of voxels; view: what the later image shows, None where that is everything.
     """
 
     surface: ObservedSurface
@@ -46,6 +47,14 @@ class SurfaceTarget:
     image_area: NDArray[np.float64]
     terraces: NDArray[np.float64]
     voxels: tuple[DistanceMap, DistanceMap] | None = None
+    view: FieldOfView | None = None
+
+    def shown(self, displacement: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which quadrature points (n_q,) the later image shows once the vertices (n_vertices, 3) mm have moved so."""
+        if self.view is None:
+            return np.ones(len(self.triangle), dtype=bool)
+        corners = (self.surface.rest + displacement)[self.surface.triangles[self.triangle]]
+        return self.view.shows(places_within(corners, self.barycentric))
 
     def terraces_along(self, normals: NDArray[np.float64]) -> NDArray[np.float64]:
         """Coherent rounding noise (n,) mm^4 of the voxels at places with unit normals (n, 3) of a smooth surface.
@@ -56,8 +65,10 @@ class SurfaceTarget:
         return np.zeros(len(normals)) if self.voxels is None else terrace_noise(*self.voxels, normals)
 
 
-def surface_target(surface: ObservedSurface, before: DistanceMap, after: DistanceMap) -> SurfaceTarget:
-    """Make the target of `surface` from the maps of its tissue in the two images.
+def surface_target(
+    surface: ObservedSurface, before: DistanceMap, after: DistanceMap, view: FieldOfView | None = None
+) -> SurfaceTarget:
+    """Make the target of `surface` from the maps of its tissue in the two images; view: what the later one shows.
 
     The later surface is taken where `after` equals the mean of `before` over the model's rest surface, so that a bias
     common to both maps changes nothing.
@@ -67,6 +78,9 @@ def surface_target(surface: ObservedSurface, before: DistanceMap, after: Distanc
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     level = float(np.average(rest.rest_distance, weights=rest.area))
     points = isosurface_points(after, level)
+    if view is not None:
+        away = view.shows(points.places)
+        points = IsosurfacePoints(points.places[away], points.normals[away], points.area[away])
     stride = max(int(AREA_OF_A_POINT * len(points.area) / max(float(points.area.sum()), 1e-9)), 1)
     return replace(
         rest,
@@ -75,6 +89,7 @@ def surface_target(surface: ObservedSurface, before: DistanceMap, after: Distanc
         image_area=points.area[::stride],
         terraces=terrace_noise(before, after, normals),
         voxels=(before, after),
+        view=view,
     )
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from palpate.errors import ConfigurationError
+from palpate.errors import ConfigurationError, InputDataError
 from palpate.findings import Finding
 from palpate.images.alignment import Alignment, RigidMotion, align, moved
 from palpate.images.checks import check_images, later_names
@@ -60,6 +60,9 @@ __all__ = [
     "stated_noise",
 ]
 
+SMALL_FRAME_MOTION = 1.0 / 3.0  # of what the organs do against each other: a smaller one is not worth a word
+LEVER_MM = 25.0  # about the size of an organ, at which a turn counts as a motion
+SEEN_MM = 0.2  # less is the measurement's own error
 STATED = (
     "motion-below-noise",
     "sides-exchanged",
@@ -135,9 +138,12 @@ def brought(
 
     Raises `InputDataError` as `align` and `align_surfaces`.
     """
-    if method == "none":
-        return ImagedStates(before, after, tuple(dict[int, RigidMotion]() for _ in after), ())
     images, bones, findings, alignments = [], [], list[Finding](), list[Registration]()
+    if method == "none":
+        for name, image in zip(later_names(len(after)), after, strict=True):
+            progress(f"looking for a motion of the whole in '{name}'")
+            findings += _unaligned_findings(before, image, name)
+        return ImagedStates(before, after, tuple(dict[int, RigidMotion]() for _ in after), tuple(findings))
     rigid = {i: t.name for i, t in enumerate(before.tissues) if t.role is Role.RIGID}
     for name, image in zip(later_names(len(after)), after, strict=True):
         progress(f"aligning '{name}' on {ON[method]}")
@@ -148,7 +154,40 @@ def brought(
         images.append(moved(image, fit.motion.inverse()))
         bones.append({i: alignment.remaining(bone, fit) for i, bone in rigid.items()} if alignment else {})
         findings += _alignment_findings(alignment, name) if alignment else []
+        findings += _frame_findings(before, alignments[-1], name)
     return ImagedStates(before, tuple(images), tuple(bones), tuple(findings), alignments=tuple(alignments))
+
+
+def _frame_findings(before: Segmentation, found: Registration, name: str, *, aligned: bool = True) -> list[Finding]:
+    """What is said of a motion of the whole that is larger than a third of what the organs do against each other."""
+    own = found.own_motion_mm(before.tissues)
+    moved_mm = float(np.hypot(found.distance_mm, LEVER_MM * np.deg2rad(found.rotation_deg)))
+    if moved_mm <= SMALL_FRAME_MOTION * own or moved_mm < SEEN_MM:
+        return []
+    size = f"{found.distance_mm:.1f} mm and {found.rotation_deg:.1f} degrees"
+    place = f"in '{name}' ({size})"
+    if aligned:
+        text = (
+            f"'{name}' lay {size} elsewhere, measured on {ON[found.by]}, where organs and drivers move by {own:.2g} mm"
+            " against each other: it was brought back before anything was compared; look at the alignment in the report"
+        )
+        return [Finding("frame-aligned", text, place=place)]
+    text = (
+        f"all surfaces together say that '{name}' lies {size} elsewhere, where organs and drivers move by {own:.2g} mm"
+        " against each other, and nothing was done about it, for the case states that the images lie on each other: an"
+        " offset in a header (half a voxel, say), or a patient who lay otherwise, will pass for motion of the organs."
+        ' Look at the headers, or set images.align = "surfaces"'
+    )
+    return [Finding("frame-moves", text, place=place)]
+
+
+def _unaligned_findings(before: Segmentation, image: Segmentation, name: str) -> list[Finding]:
+    """What is said of a later image that is taken as it lies."""
+    try:
+        found = registration(before, image, align_surfaces(before, image), by="surfaces")
+    except InputDataError:  # too little is seen for a motion of the whole; nothing rests on it here
+        return []
+    return _frame_findings(before, found, name, aligned=False)
 
 
 def _alignment_findings(alignment: Alignment, name: str) -> list[Finding]:

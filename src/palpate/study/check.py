@@ -18,7 +18,8 @@ from palpate.images.readers import read_intensities
 from palpate.images.registration import Registration
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
-from palpate.observation.observed_surface import observed_surface
+from palpate.observation.field_of_view import field_of_view
+from palpate.observation.observed_surface import observed_surfaces, seen_in
 from palpate.progress import Progress
 from palpate.study.body import Body, ImagedStates, brought, make_body
 from palpate.study.case import Case
@@ -221,7 +222,7 @@ def _cost(problems: _Problems, pairs: Sequence[ImagedStates], case: Case, progre
     first = pairs[0]
     cost = expected_cost(case, first.before, first.after, n_pairs=len(pairs))
     edge = edge_length_of(case, first.before, first.after).mm
-    problems.attempt(lambda: refuse_edge(edge, case_domain(first.before, first.after, case)))
+    problems.attempt(lambda: refuse_edge(edge, case_domain(first.before, case)))
     if any(problem.exit_code for problem in problems.all()):
         return cost
     if lack_of_memory(cost):
@@ -240,10 +241,12 @@ def _cost(problems: _Problems, pairs: Sequence[ImagedStates], case: Case, progre
 
 
 def _observe(body: Body) -> None:
-    """Refuse what the mesh leaves nothing of to observe."""
-    for i, tissue in enumerate(body.space.mesh.tissues):
-        if tissue.role in (Role.ESTIMATE, Role.DRIVER):
-            observed_surface(body.space, i)
+    """Refuse what the mesh, or a later image's field of view, leaves nothing of to observe."""
+    before, after = body.states.before, body.states.after
+    for surface in observed_surfaces(body.space, before):
+        for name, image in zip(later_names(len(after)), after, strict=True):
+            view = field_of_view(before.grid, image.grid, smoothing_mm=body.smoothing_mm)
+            seen_in(surface, image, view, name=name)
 
 
 Pair = tuple[Segmentation, tuple[Segmentation, ...]]

@@ -119,14 +119,12 @@ def cost_of_meshes(
 
 def expected_tets(case: Case, before: Segmentation, after: tuple[Segmentation, ...]) -> int:
     """Number of tetrahedra in the mesh of a reference state."""
-    return tets_by_edge_length(case, before, after)(edge_length_of(case, before, after))
+    return tets_by_edge_length(case, before)(edge_length_of(case, before, after))
 
 
-def tets_by_edge_length(
-    case: Case, before: Segmentation, after: tuple[Segmentation, ...]
-) -> Callable[[EdgeLength], int]:
+def tets_by_edge_length(case: Case, before: Segmentation) -> Callable[[EdgeLength], int]:
     """The same as a function of the edge lengths: distances to the organs are computed once."""
-    index, cell = _lattice(before, case_domain(before, after, case))
+    index, cell = _lattice(before, case_domain(before, case))
     tissues = [i for i, tissue in enumerate(before.tissues) if tissue.meshed]
     # the mesher's filler: the remaining tissue if it is meshed, else the largest
     filler = max(tissues, key=lambda i: (not before.tissues[i].labels, before.volume(i)), default=-1)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from palpate.images.segmentation import Segmentation
@@ -14,12 +12,12 @@ from palpate.study.case import Case
 __all__ = ["case_domain"]
 
 
-def case_domain(before: Segmentation, after: Sequence[Segmentation], case: Case) -> Box:
-    """The box that is meshed: what the images share, or with extent "margin" its part around organs and drivers.
+def case_domain(before: Segmentation, case: Case) -> Box:
+    """The box that is meshed: all that the reference image shows, or with extent "margin" its part around the organs.
 
-    Raises `GeometryError` when the images share no volume.
+    A later image with a smaller field of view shows less of it, and cuts nothing off of the body.
     """
-    box = domain_box([before.grid, *(image.grid for image in after)])
+    box = domain_box([before.grid])
     if case.domain.extent == "image":
         return box
     shown = [i for i, tissue in enumerate(before.tissues) if tissue.role in (Role.ESTIMATE, Role.DRIVER)]

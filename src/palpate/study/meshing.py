@@ -40,13 +40,13 @@ class ReferenceMesh:
 def mesh_reference(
     before: Segmentation, after: tuple[Segmentation, ...], case: Case, *, progress: Progress
 ) -> ReferenceMesh:
-    """Mesh `before` inside the domain that it shares with the later images, with the edge length of `edge_length_of`.
+    """Mesh `before` as far as it goes, or the case's margin, with the edge length of `edge_length_of`.
 
     A mesh that fails its gate, or that Mmg gives up, is followed by one of 0.75 times the edge length, at most twice
     and where this machine has the memory for an estimate on it; the finding "finer-mesh" tells of it. Raises
     `GeometryError` when none is fit, `ResourceError` where the mesher stops for want of memory.
     """
-    box = case_domain(before, after, case)
+    box = case_domain(before, case)
     chosen = edge_length_of(case, before, after)
     asked = chosen.mm
     refuse_edge(asked, box)

@@ -60,7 +60,7 @@ def proposed_edge(
     first, *later = (segment(image, case.resolve_tissues({})) for image in (before, *after))
     suited, has = edge_length_of(case, first, later), machine_memory_gb()
     edge, why = suited.mm, suited.reason
-    tets = tets_by_edge_length(case, first, tuple(later))
+    tets = tets_by_edge_length(case, first)
 
     def memory_gb(edge_mm: float) -> float:
         """That an estimate with such edges needs."""
