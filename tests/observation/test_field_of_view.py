@@ -16,6 +16,7 @@ from palpate.mesh.space import lagrange_space
 from palpate.mesh.tetrahedralise import tetrahedralise
 from palpate.observation.contract import ImagedBody
 from palpate.observation.field_of_view import field_of_view
+from palpate.observation.observed_surface import observed_surfaces
 from palpate.observation.surface_distance import surface_distances
 
 SHAPE = (44, 40, 40)
@@ -78,6 +79,13 @@ def test_every_surface_that_both_images_show_is_compared_but_the_bones_and_the_f
         residuals = observation.residuals(np.zeros(len(observation.dofs)))
         assert residuals.weights.sum() == pytest.approx(1.0)
         assert 0.5 < observation.observed_share <= 1.0
+
+
+def test_an_estimate_tissue_is_compared_even_where_it_fills_what_others_leave(space):
+    tissues = (*TISSUES[:-1], replace(TISSUES[-1], role=Role.ESTIMATE, youngs_modulus_kpa=None))
+    mesh = replace(space.mesh, tissues=tissues)
+    found = observed_surfaces(lagrange_space(mesh, "P1"), replace(image(), tissues=tissues))
+    assert [surface.name for surface in found] == ["organ", "fat", "tube", "air", "rest"]
 
 
 def test_a_surface_that_a_later_image_does_not_show_is_left_out_there_alone(space):

@@ -96,14 +96,15 @@ def observed_surface(space: LagrangeSpace, tissue: int) -> ObservedSurface:
 def observed_surfaces(space: LagrangeSpace, before: Segmentation) -> tuple[ObservedSurface, ...]:
     """Every surface that the reference image shows, in the order of the tissues.
 
-    Those of `estimate` tissues, drivers, `void` tissues beside meshed ones, and `known` tissues, but for the one that
+    Those of `estimate` tissues, drivers, `void` tissues beside meshed ones, and `known` tissues, but for one that
     fills what the others leave; bones' motion is prescribed. Raises `GeometryError` as `observed_surface` for
     `estimate` tissues and drivers; others of which little is seen are left out.
     """
-    found = []
-    for i in shown_tissues(before):
-        role = before.tissues[i].role
-        if role is Role.RIGID or (role not in NEEDED and not before.mask(i).any()):
+    found, shown = [], shown_tissues(before)
+    for i, tissue in enumerate(before.tissues):
+        role = tissue.role
+        beside = i in shown and role is not Role.RIGID and bool(before.mask(i).any())
+        if role not in NEEDED and not beside:
             continue
         try:
             found.append(observed_surface(space, i))
