@@ -23,7 +23,7 @@ from palpate.experiments.reproduce.figure4 import LAW, Figure4Settings, figure4,
 from palpate.experiments.reproduce.ledger import Ledger
 from palpate.experiments.reproduce.paper_method import paper_estimate, paper_target
 from palpate.experiments.reproduce.table1 import Table1Settings, table1
-from palpate.inversion.parameters import parameter_map, unit_blocks
+from palpate.inversion import parameter_map, unit_blocks
 from palpate.mechanics.linear_model import linear_model
 from palpate.mesh.space import lagrange_space
 from palpate.mesh.tetrahedralise import tetrahedralise

@@ -34,14 +34,14 @@ class PointMotion:
     def dofs(self):
         return 3 * self.point + np.arange(3)
 
-    def residuals(self, displacement):
+    def residuals(self, displacement, offset=0.0):
         identity = sparse.csr_matrix(np.eye(3))
         places = np.tile(self.rest + displacement, (3, 1))
         material = np.tile(self.rest, (3, 1))
         weights = np.full(3, 1.0 / 3.0)
-        return Residuals(displacement - self.seen, weights, places, np.eye(3), material, identity, identity)
+        return Residuals(displacement - self.seen + offset, weights, places, np.eye(3), material, identity, identity)
 
-    def rematched(self, _displacement):
+    def rematched(self, _displacement, _offset=0.0):
         return self
 
     def with_noise(self, noise):

@@ -43,7 +43,7 @@ def test_defaults_are_those_of_the_schema(case_file):
     case = read_case(case_file)
     assert (case.id, case.patient, case.stage, case.seed) == ("sub-01", "sub-01", None, 0)
     assert (case.mechanics.law, case.mechanics.element) == ("neo-hookean", "auto")
-    assert (case.domain.extent, case.domain.margin_mm, case.domain.outer_boundary) == ("image", 40.0, "fixed")
+    assert (case.domain.extent, case.domain.margin_mm, case.domain.outer_boundary) == ("image", 40.0, "moving")
     assert (case.driver.modes, case.driver.kernel_mm, case.driver.prior_mm) == (90, 20.0, 5.0)
     assert case.mesh.edge_length_mm is None
     assert read_case(case_file, ["mesh.edge_length_mm='auto'"]).mesh == case.mesh

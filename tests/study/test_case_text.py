@@ -90,7 +90,7 @@ def resolved(path: Path) -> str:
 def test_every_default_is_written_out(tmp_path):
     tables = tomllib.loads(case_text(read(tmp_path, CASES["least"]), tmp_path))
     assert tables["mesh"]["edge_length_mm"] == "auto"
-    assert tables["domain"]["outer_boundary"] == "fixed"
+    assert tables["domain"]["outer_boundary"] == "moving"
     assert tables["images"]["align"] == "rigid-tissues"
     assert tables["tissues"]["left hip"]["poisson_ratio"] == 0.45
     assert tables["estimate"]["start_ratios"] == [0.5, 2.0, 8.0]

@@ -299,8 +299,8 @@ def test_another_minimum_that_fits_as_well_is_within_the_interval(inversion, set
 @pytest.mark.parametrize(
     ("interval", "absolute", "word"),
     [
-        ((1.0, 2.0), True, "identified"),
-        ((1.0, 2.01), True, "weak"),
+        ((1.0, 4.0), True, "identified"),
+        ((1.0, 4.01), True, "weak"),
         ((1.0, 10.0), True, "weak"),
         ((1.0, 10.1), True, "not identified"),
         ((None, 2.0), True, "not identified"),

@@ -108,7 +108,7 @@ def prescribed_motion(
             )
         every = np.concatenate([local, finer], axis=1)
         block = np.zeros((n, 3, every.shape[1]))
-        block[points] = every.reshape(len(points), 3, -1)
+        block[points] = every.reshape(len(points), 3, every.shape[1])
         blocks.append(block.reshape(3 * n, -1))
         prescribed[points] = True
     covariances, n_rigid = tuple[NDArray[np.float64], ...](), 0
@@ -118,7 +118,7 @@ def prescribed_motion(
         smooth, rigid, covariances = _frame_modes(space.points[points], frame)
         for local in (smooth, rigid):
             block = np.zeros((n, 3, local.shape[1]))
-            block[points] = local.reshape(len(points), 3, -1)
+            block[points] = local.reshape(len(points), 3, local.shape[1])
             blocks.append(block.reshape(3 * n, -1))
         n_rigid = rigid.shape[1]
         prescribed[points] = True

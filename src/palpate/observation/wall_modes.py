@@ -75,7 +75,8 @@ def fine_modes(points: NDArray[np.float64], normals: NDArray[np.float64]) -> NDA
     `FINE_MM` on points (n_points, 3) mm.
     """
     scalar = karhunen_loeve(points, np.ones(len(points)), kernel_mm=FINE_KERNEL_MM, share=FINE_SHARE, most=FINE_MODES)
-    return np.asarray(FINE_MM * (normals[:, :, None] * scalar[:, None, :]).reshape(3 * len(points), -1))
+    along = normals[:, :, None] * scalar[:, None, :]
+    return np.asarray(FINE_MM * along.reshape(3 * len(points), scalar.shape[1]))
 
 
 def wall_modes(points: NDArray[np.float64], *, n_modes: int, kernel_mm: float, prior_mm: float) -> NDArray[np.float64]:
