@@ -73,11 +73,11 @@ FILES = {
 }
 ESTIMATE_KEYS = {
     *("tissue", "parameter", "unit", "value", "interval95", "interval_kind", "relative_to", "ratio"),
-    *("ratio_interval95", "verdict", "why", "truth", "variance_shares", "profile"),
+    *("ratio_interval95", "verdict", "why", "truth", "variance_shares", "profile", "interval95_given_model"),
 }
 KEYS = {
     *("schema", "id", "status", "reason", "law", "element", "method", "estimates", "correlation", "fit", "starts"),
-    *("counts", "mesh", "seconds", "inputs", "versions", "seed", "warnings"),
+    *("counts", "mesh", "seconds", "inputs", "versions", "seed", "warnings", "frame", "offsets", "heterogeneity"),
 }
 
 
@@ -118,7 +118,7 @@ def test_the_case_beside_the_result_gives_the_same_numbers(outputs, result, tmp_
 
 def test_the_case_in_the_result_is_the_one_beside_it(outputs, result):
     beside = tomllib.loads((outputs / "case.toml").read_text())
-    named = {"before": "before.nii.gz", "after": ["after.nii.gz"], "align": "none", "body_from_ct": False}
+    named = {"before": "before.nii.gz", "after": ["after.nii.gz"], "align": "surfaces", "body_from_ct": False}
     assert result["case"] == beside | {"images": named}
     assert result["overrides"] == []
 

@@ -48,6 +48,14 @@ edge_length_mm = 7.0
 [driver]
 modes = 12
 
+[domain]
+outer_boundary = "fixed"
+
+[discrepancy]
+heterogeneity_sd = 0.0
+poisson_sd = 0.0
+surface_offset_mm = 0.0
+
 [estimate]
 start_ratios = [3.0]
 """

@@ -73,15 +73,13 @@ def learned_precision(
             beliefs = [
                 _most_evident(terms, seen, block, odd) for terms, odd in zip(block.alternatives, odds, strict=True)
             ]
-            best = max(evidence for evidence, _ in beliefs)
-            found = list[tuple[float, float, NDArray[np.float64]]]()
-            for evidence, covariance in beliefs:
-                if evidence > best - ALIKE:
-                    with_it = prior.copy()
-                    with_it[np.ix_(places, places)] = linalg.inv(covariance)
-                    width = _width(data + with_it, n) if len(beliefs) > 1 and not block.odds else 0.0
-                    found.append((width, evidence, with_it))
-            _, _, prior = max(found, key=lambda each: each[:2])
+            if block.odds:
+                chosen = _likeliest(beliefs, prior[np.ix_(places, places)])
+            else:
+                others = data + prior
+                others[np.ix_(places, places)] = data[np.ix_(places, places)]
+                chosen = _widest(beliefs, others, places, n)
+            prior[np.ix_(places, places)] = linalg.inv(chosen)
     return prior[n:, n:]
 
 
@@ -133,6 +131,40 @@ def _most_evident(
     best = min(found, key=lambda trial: float(trial.fun))
     squares = np.exp(2.0 * best.x)
     return odds - float(best.fun), sum((s * t for s, t in zip(squares, floored, strict=True)), np.zeros_like(terms[0]))
+
+
+def _likeliest(
+    beliefs: Sequence[tuple[float, NDArray[np.float64]]], present: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The covariance with the most evidence, but the one like the `present` precision unless that is clearly less."""
+    level = -np.linalg.slogdet(present)[1]
+    now = min(beliefs, key=lambda belief: abs(float(np.linalg.slogdet(belief[1])[1]) - level))
+    best = max(beliefs, key=lambda belief: belief[0])
+    return best[1] if best[0] > now[0] + ALIKE else now[1]
+
+
+def _widest(
+    beliefs: Sequence[tuple[float, NDArray[np.float64]]],
+    matrix: NDArray[np.float64],
+    places: NDArray[np.int64],
+    n_parameters: int,
+) -> NDArray[np.float64]:
+    """Of covariances of a block whose evidence is as good as the best, that which leaves the widest posterior.
+
+    matrix (n, n): the Gauss-Newton matrix without a prior on the block's `places`.
+    """
+    best = max(evidence for evidence, _ in beliefs)
+    alike = [belief for belief in beliefs if belief[0] > best - ALIKE]
+    if len(alike) == 1:
+        return alike[0][1]
+
+    def width(belief: tuple[float, NDArray[np.float64]]) -> tuple[float, float]:
+        """The posterior's width under a belief, and its evidence."""
+        with_it = matrix.copy()
+        with_it[np.ix_(places, places)] += linalg.inv(belief[1])
+        return _width(with_it, n_parameters), belief[0]
+
+    return max(alike, key=width)[1]
 
 
 def _width(matrix: NDArray[np.float64], n_parameters: int) -> float:

@@ -15,7 +15,12 @@ NONE = "–"
 BAR = 200.0  # width of a bar, in its own units
 CAUSES = {
     "noise": "the surfaces' noise",
-    "prior": "the drivers' motion",
+    "driver": "the drivers' motion",
+    "frame": "the frame's motion",
+    "offset": "how surfaces are drawn",
+    "heterogeneity": "tissues that are not homogeneous",
+    "poisson": "Poisson's ratios",
+    "prior": "what is believed of parameters",
     "grid": "the voxels' place",
     "mesh": "the mesh",
 }
@@ -115,9 +120,6 @@ def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tu
     `colours`: tissue -> #rrggbb.
     """
     items = moduli_in(document)
-    causes = CAUSES | (
-        {"prior": "what is believed of walls and ratios"} if len(items) < len(document["estimates"]) else {}
-    )
     shown = document["status"] == "converged"
     scale = _scale(items) if shown else None
     rows = []
@@ -138,7 +140,7 @@ def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tu
             truth=number(truth),
             error=f"{100.0 * (value / truth - 1.0):+.1f} %" if shown and value and truth else NONE,
             bar=_bar(value, interval, truth=truth, scale=scale) if scale and value else None,
-            shares=_shares({causes[cause]: share for cause, share in shares.items()}) if shown else (),
+            shares=_shares({CAUSES[cause]: share for cause, share in shares.items()}) if shown else (),
         )
         rows.append(row)
     return tuple(rows)
