@@ -128,7 +128,7 @@ def test_without_anything_known_a_ratio_is_stated_and_a_bound_ends_no_interval(g
     folder = Path(shutil.copytree(good, tmp_path / "ratio"))
     changed(folder, '"known"\nyoungs_modulus_kpa = 10.0', '"estimate"')
     changed(folder, "[1.0]", "[1.0]\nbounds_ratio = [0.98, 1.02]")
-    held = ("--set", "discrepancy.heterogeneity_sd=0")  # else it answers for the ratio that the bounds forbid
+    held = ("--set", "discrepancy.heterogeneity_sd=0", "--set", "domain.outer_boundary=fixed")  # what bounds forbid
     done = palpate("estimate", "case.toml", "--output", "out", "--json", "--quiet", *held, cwd=folder)
     assert done["code"] == 0, done["err"]
     document = json.loads(done["out"])
