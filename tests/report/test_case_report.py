@@ -385,7 +385,7 @@ def test_the_methods_can_be_copied_with_their_bibtex(page):
 
 def test_the_profile_and_the_causes_of_the_variance_are_shown_where_they_are_known(case_result, tmp_path):
     first, second = case_result.estimation.estimates
-    shares = {"noise": 0.6, "prior": 0.1, "grid": 0.2, "mesh": 0.1}
+    shares = {"noise": 0.6, "driver": 0.1, "grid": 0.2, "mesh": 0.1}
     seen = dataclasses.replace(first, variance_shares=shares, profile=((40.0, -2.5), (58.9, 0.0), (75.0, 1.96)))
     estimation = dataclasses.replace(case_result.estimation, estimates=(seen, second))
     page = write_case_report(dataclasses.replace(case_result, estimation=estimation), tmp_path).read_text()
