@@ -102,11 +102,11 @@ def unit_blocks(*n_modes: int) -> tuple[Block, ...]:
 
 def wall_blocks(wall: Wall, state: int, *, learned: bool = True) -> tuple[Block, ...]:
     """The motion of a driver's wall in a later state: a drift and a swelling (see `Wall`), and what is finer."""
-    families = [tuple(product(wall.drifts, wall.swellings))] + [((np.eye(wall.n_fine),),)] * (wall.n_fine > 0)
-    sizes = (len(wall.columns), wall.n_fine)
+    families = (tuple(product(wall.drifts, wall.swellings)), ((np.eye(wall.n_fine),),))
     return tuple(
         Block(wall.name, "driver", Acts.BOUNDARY, (state,), np.eye(n), terms if learned else ())
-        for terms, n in zip(families, sizes, strict=False)
+        for n, terms in zip((len(wall.columns), wall.n_fine), families, strict=True)
+        if n
     )
 
 
@@ -136,12 +136,11 @@ def offset_block(observation: Observation, state: int, *, sd: float) -> Block:
     latter: what is held at first is taken for motion. A driver's wall moves as its drawing does: its offset is
     considered, not estimated.
     """
-    precision, common = np.full((1, 1), sd**-2.0), (observation.name, "offset", Acts.RESIDUALS, (state,))
+    own = (observation.name, "offset", Acts.RESIDUALS, (state,), np.full((1, 1), sd**-2.0))
     if observation.of_driver:
-        return Block(*common, precision, considered=True)
-    alternatives = tuple((1.0 / (precision * share**-2.0),) for share in (ALIKE, 1.0))
-    odds = (0.0, float(np.log(SELDOM)))
-    return Block(*common, precision, alternatives, amplitudes=(1.0, 1.0), odds=odds)
+        return Block(*own, considered=True)
+    alternatives = tuple((np.full((1, 1), (share * sd) ** 2),) for share in (ALIKE, 1.0))
+    return Block(*own, alternatives, amplitudes=(1.0, 1.0), odds=(0.0, float(np.log(SELDOM))))
 
 
 def material_blocks(

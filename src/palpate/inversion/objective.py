@@ -88,8 +88,8 @@ class Objective:
     """J(x) = 1/2 sum_s precision_s sum_j w_j rho(r_j) + 1/2 (x - m)^T P (x - m) over all observations of all states.
 
     The unknowns x, their prior mean m and precision P are those of `parameters`; rho: see `RobustLoss`. Each
-    observation has an offset, where `parameters` have one. prior_held: whether the blocks'
-    prior stays what it is when residuals are reweighted.
+    observation has an offset, where `parameters` have one. prior_held: whether the blocks' prior stays what it is when
+    residuals are reweighted.
     """
 
     states: tuple[LaterState, ...]
@@ -230,8 +230,8 @@ class Objective:
             shift = np.zeros((len(weights), n_offsets))
             shift[:, number : number + 1] = 1.0
             jacobian = np.concatenate([residuals.smooth_jacobian @ tangent[rows], shift], axis=1)
-            by_offset = shift.T @ _weighted(observation, residuals)
-            gradient = np.concatenate([tangent[rows].T @ _pull(observation, residuals), by_offset])
+            weighted = _weighted(observation, residuals)
+            gradient = np.concatenate([tangent[rows].T @ (residuals.jacobian.T @ weighted), shift.T @ weighted])
             return Linearisation(observation, s, residuals, columns, jacobian, weights, gradient)
 
         return mapped(line, zip(range(len(seen)), state.slices, seen, strict=True))

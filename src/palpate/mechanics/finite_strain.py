@@ -343,7 +343,7 @@ class FiniteStrainEquilibrium:
         return -np.asarray(self.balance.free.T @ both)
 
     def _material_forces(self) -> Array:
-        """DR / dc_k (n_dof, n_material), mN, by the coefficients of the material modes."""
+        """Derivatives dR / dc_k (n_dof, n_material), mN, by the coefficients of the material modes."""
         model = self.model
         if not model.material.n_modes:
             return np.zeros((len(self.values), 0))
