@@ -34,8 +34,8 @@ __all__ = [
 ]
 
 AMPLITUDES = (0.005, 2.0)  # times the coefficients' own standard deviation
-ALIKE, SELDOM = 0.1, 0.01  # an offset of a surface that is drawn alike, over that of others; how often one is not
-HELD = 1e8  # times its precision: an unknown that is considered does not move
+DRAWN_ALIKE, SELDOM = 0.1, 0.01  # an offset of a surface that is drawn alike, over that of others; how often not
+CONSIDERED = 1e8  # times its precision: an unknown that is considered does not move
 LEAST_HETEROGENEITY, MOST_HETEROGENEITY = 1.0 / 3.0, 2.0  # times the scale of its amplitude's prior
 
 
@@ -85,7 +85,7 @@ class Block:
     @property
     def first_precision(self) -> NDArray[np.float64]:
         """Precision (n, n) with which an estimate begins."""
-        return HELD * self.precision if self.considered else self.precision
+        return CONSIDERED * self.precision if self.considered else self.precision
 
     @property
     def size(self) -> int:
@@ -139,7 +139,7 @@ def offset_block(observation: Observation, state: int, *, sd: float) -> Block:
     own = (observation.name, "offset", Acts.RESIDUALS, (state,), np.full((1, 1), sd**-2.0))
     if observation.of_driver:
         return Block(*own, considered=True)
-    alternatives = tuple((np.full((1, 1), (share * sd) ** 2),) for share in (ALIKE, 1.0))
+    alternatives = tuple((np.full((1, 1), (share * sd) ** 2),) for share in (DRAWN_ALIKE, 1.0))
     return Block(*own, alternatives, amplitudes=(1.0, 1.0), odds=(0.0, float(np.log(SELDOM))))
 
 
