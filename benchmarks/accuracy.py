@@ -55,6 +55,7 @@ def main() -> int:
     parser.add_argument("--first-seed", type=int, default=101)
     parser.add_argument("--share", default="0/1", help="k/n: every n-th seed from the k-th, to run n at once")
     parser.add_argument("--output", type=Path, default=Path("accuracy.jsonl"))
+    parser.add_argument("--defaults", action="store_true", help="the program's defaults: nothing is held")
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     arguments = parser.parse_args()
     done = _read(arguments.output)
@@ -71,7 +72,7 @@ def main() -> int:
             for draw in range(ROWS[name].draws):
                 key = (name, seed, draw)
                 if key not in done:
-                    done[key] = _case(key, ROWS[name], truths)
+                    done[key] = _case(key, replace(ROWS[name], held=not arguments.defaults), truths)
                     with arguments.output.open("a") as file:
                         file.write(json.dumps(done[key]) + "\n")
                 _say(_line(done[key]))

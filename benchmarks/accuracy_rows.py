@@ -25,6 +25,8 @@ from palpate.phantoms import (
 from palpate.study import (
     Body,
     Case,
+    Discrepancy,
+    Domain,
     Mechanics,
     MeshSettings,
     Phantom,
@@ -37,6 +39,7 @@ from palpate.study import (
 
 __all__ = ["NOISE", "ROWS", "Posed", "Row", "Truths", "from_voxels", "posed", "truth_of"]
 
+NOTHING_LEFT_OUT = Discrepancy(heterogeneity_sd=0.0, poisson_sd=0.0, surface_offset_mm=0.0)
 NOISE = Noise(surface_sd_mm=0.3, correlation_length_mm=6.0)
 
 
@@ -55,6 +58,7 @@ class Row:
     draws: int = 1  # of the noise, for each pelvis
     law: str = "linear"  # of the truth and of the estimate
     poisson_ratio: float | None = None  # None: 0.40 to 0.45 at random
+    held: bool = True  # the frame, and all else that the model leaves out; False: the program's defaults
 
 
 ROWS = {
@@ -122,6 +126,8 @@ def posed(row: Row, seed: int, draw: int, truths: Truths) -> Posed:
         phantom=Phantom("pelvis", seed),
         mesh=MeshSettings(row.edge_mm),
         mechanics=Mechanics(row.law, "P2" if row.law == "linear" and row.poisson_ratio is None else "auto"),
+        domain=Domain(outer_boundary="fixed") if row.held else Domain(),
+        discrepancy=NOTHING_LEFT_OUT if row.held else Discrepancy(),
     )
     bodies: tuple[Body, ...] = ()
     if row.data == "voxels":

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from palpate.study.body import Body, ImagedStates, aligned, inverse_problem, make_body
-    from palpate.study.case import Case, Domain, DriverMotion, Mechanics, MeshSettings, Phantom
+    from palpate.study.case import Case, Discrepancy, Domain, DriverMotion, Mechanics, MeshSettings, Phantom
     from palpate.study.case_file import read_case
     from palpate.study.cost import ExpectedCost, expected_cost
     from palpate.study.earlier import strange_files
@@ -26,6 +26,7 @@ __all__ = [
     "Body",
     "Case",
     "CaseResult",
+    "Discrepancy",
     "Domain",
     "DriverMotion",
     "EdgeLength",
@@ -67,6 +68,7 @@ _HOMES = {
     "Body": "palpate.study.body",
     "Case": "palpate.study.case",
     "CaseResult": "palpate.study.result",
+    "Discrepancy": "palpate.study.case",
     "Domain": "palpate.study.case",
     "DriverMotion": "palpate.study.case",
     "EdgeLength": "palpate.study.edge_length",
