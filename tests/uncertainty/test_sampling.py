@@ -15,7 +15,8 @@ from palpate.mechanics.laws.registry import law_named
 from palpate.observation.noise_model import NoiseModel
 from palpate.uncertainty import sample_posterior
 from palpate.uncertainty.profile import fixed_correspondence
-from palpate.uncertainty.sampling import frozen_posterior, posterior_chains
+from palpate.uncertainty.frozen_posterior import frozen_posterior
+from palpate.uncertainty.sampling import posterior_chains
 
 WIDE = Bounds(np.full(2, np.log(0.02)), np.full(2, np.log(200.0)))
 NOISE = NoiseModel(np.array([0.05**2]), np.array([3.0]))
@@ -38,10 +39,10 @@ def minimum(objective, twin):
 def test_the_frozen_posterior_has_the_value_and_score_of_the_objective_where_it_is_frozen(objective, minimum, rng):
     place = minimum + 0.05 * rng.standard_normal(len(minimum))
     frozen, evaluation = frozen_posterior(objective, place), objective(place)
-    assert frozen(place) == pytest.approx(evaluation.value, rel=1e-9)
+    assert frozen.value(place) == pytest.approx(evaluation.value, rel=1e-9)
     for _ in range(3):
         step = 1e-4 * rng.standard_normal(len(minimum))
-        slope = 0.5 * (frozen(place + step) - frozen(place - step))
+        slope = 0.5 * (frozen.value(place + step) - frozen.value(place - step))
         assert slope == pytest.approx(float(evaluation.score @ step), rel=1e-4, abs=1e-9)
 
 
@@ -49,7 +50,7 @@ def test_in_the_driver_the_frozen_posterior_is_the_quadratic_of_gauss_newton(obj
     frozen, evaluation = frozen_posterior(objective, minimum), objective(minimum)
     step = np.concatenate([np.zeros(2), 0.1 * rng.standard_normal(len(minimum) - 2)])
     expected = evaluation.value + evaluation.score @ step + 0.5 * step @ evaluation.matrix @ step
-    assert frozen(minimum + step) == pytest.approx(expected, rel=1e-9)
+    assert frozen.value(minimum + step) == pytest.approx(expected, rel=1e-9)
 
 
 def test_a_narrow_posterior_is_sampled_with_the_covariance_of_laplace(objective, minimum, rng):
@@ -135,5 +136,5 @@ def test_an_expansion_that_bends_is_frozen_with_its_own_value_far_away(twins, rn
     evaluation = bent(unknowns)
     frozen, fixed = frozen_posterior(bent, unknowns, evaluation), fixed_correspondence(bent, unknowns, evaluation)
     away = unknowns + 0.5 * rng.standard_normal(len(unknowns))
-    assert frozen(away) == pytest.approx(fixed(away).value, rel=1e-9)
-    assert frozen(unknowns) == pytest.approx(fixed(unknowns).value, rel=1e-9)
+    assert frozen.value(away) == pytest.approx(fixed(away).value, rel=1e-9)
+    assert frozen.value(unknowns) == pytest.approx(fixed(unknowns).value, rel=1e-9)

@@ -14,7 +14,16 @@ from palpate.inversion.driver_fit import fit_driver
 from palpate.inversion.estimate import Inversion, StartRun, continue_at_finite_strain, invert
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import Evaluation, Linearisation, LinearisedObjective, Objective
-from palpate.inversion.optimise import Bounds, Iterate, Minimum, Outcome, fit_coefficients, gauss_newton, posterior_sd
+from palpate.inversion.optimise import (
+    Bounds,
+    Iterate,
+    LeastSquares,
+    Minimum,
+    Outcome,
+    fit_coefficients,
+    gauss_newton,
+    posterior_sd,
+)
 from palpate.inversion.outer_loop import InversionSettings, OuterIterate, StopRule, run_outer_loop
 from palpate.inversion.parameters import ParameterMap, eta_of_ratio, parameter_map, ratio_of_eta
 from palpate.inversion.reduced_basis import ReducedBasis, reduced_basis
@@ -32,6 +41,7 @@ __all__ = [
     "InversionSettings",
     "Iterate",
     "LaterState",
+    "LeastSquares",
     "Linearisation",
     "LinearisedObjective",
     "Minimum",

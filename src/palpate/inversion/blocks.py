@@ -8,7 +8,7 @@ and what it believes, never what it is.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import product
 
@@ -91,6 +91,21 @@ class Block:
     def size(self) -> int:
         """Number of its unknowns."""
         return len(self.precision)
+
+    @property
+    def widest(self) -> NDArray[np.float64]:
+        """Covariance (n, n) with the largest amplitudes, the mean of its alternatives; P^-1 where there are none."""
+        if not self.alternatives:
+            return np.asarray(np.linalg.inv(self.precision))
+        every = [sum(terms, np.zeros_like(self.precision)) for terms in self.alternatives]
+        return np.asarray(self.amplitudes[1] ** 2 * np.mean(every, axis=0))
+
+    def combined(self, inverse: NDArray[np.float64]) -> Block:
+        """The block of the combinations z = inverse x, inverse (k, n), what they leave out held at 0."""
+        covariance = inverse @ np.linalg.inv(self.precision) @ inverse.T
+        alternatives = tuple(tuple(inverse @ term @ inverse.T for term in terms) for terms in self.alternatives)
+        precision = np.asarray(np.linalg.inv(0.5 * (covariance + covariance.T)), dtype=np.float64)
+        return replace(self, precision=precision, alternatives=alternatives)
 
 
 def unit_blocks(*n_modes: int) -> tuple[Block, ...]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from palpate.errors import ConfigurationError, EstimationError
 from palpate.inversion.evidence import with_learned_prior
 from palpate.inversion.expansion import Expansion, coarse_equilibrium, expansion_around
+from palpate.inversion.informed_subspace import informed_problem
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import Evaluation, Objective
 from palpate.inversion.optimise import (
@@ -170,20 +171,19 @@ def continue_at_finite_strain(
 def _with_reduced_bases(
     problem: InverseProblem, settings: InversionSettings, middle: NDArray[np.float64], progress: Progress
 ) -> tuple[Objective, NDArray[np.float64], int]:
-    """The objective on reduced bases at unknowns (n_unknowns,), these with the drivers' motion fitted, its cost."""
-    parameters = problem.parameters
-    bases = []
-    for number, state in enumerate(problem.states, start=1):
-        progress(f"responses of the full model at the middle start, state {number} of {len(problem.states)}")
-        bases.append(reduced_basis(state.model, parameters.moduli(middle)))
-    progress("the drivers' motion at the middle start")
-    objective = with_first_noise(Objective(problem.states, parameters).under(bases))
-    fitted = fit_coefficients(objective.rematched(middle), middle, bounds=settings.bounds, tolerance=TO_THE_NOISE)
-    progress("how the responses change with the moduli")
-    by_theta = parameters.derivatives(middle)
-    triples = zip(problem.states, bases, parameters.coefficients(fitted.unknowns), strict=True)
-    states = tuple(s.with_approximation(b.with_modulus_series(q, by_theta).with_material(q)) for s, b, q in triples)
-    return Objective(states, parameters), fitted.unknowns, fitted.evaluations
+    """The objective on reduced bases at unknowns (n_unknowns,), these with the drivers' motion fitted, its cost.
+
+    Its blocks hold what the images tell of those of the problem.
+    """
+    informed = informed_problem(problem, middle, bounds=settings.bounds, progress=progress)
+    parameters, unknowns = informed.problem.parameters, informed.unknowns
+    progress(f"how the responses to {parameters.n_coefficients} unknowns that are seen change with the moduli")
+    by_theta, states = parameters.derivatives(unknowns), list[LaterState]()
+    coefficients = parameters.coefficients(unknowns)
+    for state, system, q in zip(informed.problem.states, informed.systems, coefficients, strict=True):
+        basis = reduced_basis(state.model, system.moduli, system=system)
+        states.append(state.with_approximation(basis.with_modulus_series(q, by_theta).with_material(q)))
+    return Objective(tuple(states), parameters), unknowns, informed.evaluations
 
 
 def _linear(

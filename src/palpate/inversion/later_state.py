@@ -13,7 +13,7 @@ from palpate.inversion.approximation import Approximation
 from palpate.inversion.parameters import ParameterMap
 from palpate.mechanics.finite_strain import FiniteStrainModel
 from palpate.mechanics.forward import ForwardModel
-from palpate.mechanics.linear_model import LinearModel
+from palpate.mechanics.linear_model import LinearModel, with_constraint
 from palpate.observation.contract import Observation
 from palpate.observation.noise_model import NoiseModel
 
@@ -49,10 +49,22 @@ class LaterState:
         ends = np.cumsum([len(observation.dofs) for observation in self.observations])
         return [slice(e - len(o.dofs), e) for e, o in zip(ends.tolist(), self.observations, strict=True)]
 
+    @property
+    def dofs(self) -> NDArray[np.int64]:
+        """Numbers (n_observed,) of the displacement's unknowns that are observed, one observation after the other."""
+        return np.concatenate([observation.dofs for observation in self.observations])
+
+    def combined(self, boundary: NDArray[np.float64], fields: NDArray[np.float64]) -> LaterState:
+        """The same state with models on combinations of boundary modes (n_boundary, k) and of fields (n_fields, l)."""
+        constraint = replace(self.model.constraint, modes=self.model.constraint.modes @ boundary)
+        material = self.model.material.combined(fields)
+        finite = None if self.finite_strain is None else self.finite_strain.under(constraint, material)
+        model = replace(with_constraint(self.model, constraint), material=material)
+        return replace(self, model=model, finite_strain=finite)
+
     def with_approximation(self, approximation: Approximation) -> LaterState:
         """The same state with another approximation of its model."""
-        dofs = np.concatenate([observation.dofs for observation in self.observations])
-        return replace(self, approximation=approximation, observed=approximation.model.at(dofs))
+        return replace(self, approximation=approximation, observed=approximation.model.at(self.dofs))
 
     def with_observations(self, observations: Sequence[Observation]) -> LaterState:
         """The same state with the same observations otherwise weighted or matched."""

@@ -171,11 +171,16 @@ class ReducedBasis:
         return _extended(replace(self, system=system), fresh, cost)
 
 
-def reduced_basis(model: LinearModel, moduli: NDArray[np.float64]) -> ReducedBasis:
-    """The model on its responses to every boundary mode at moduli (n_regions,) kPa; one factorisation."""
-    system = model.system(moduli)
-    snapshots = np.asarray(model.constraint.free.T @ system.responses(tolerance=SNAPSHOT))
-    return ReducedBasis(projection(model, snapshots), system, system.response_counts)
+def reduced_basis(
+    model: LinearModel, moduli: NDArray[np.float64], *, system: LinearSystem | None = None
+) -> ReducedBasis:
+    """The model on its responses to every boundary mode at moduli (n_regions,) kPa; one factorisation.
+
+    system: the model's, factorised there, where it is at hand.
+    """
+    there = system or model.system(moduli)
+    snapshots = np.asarray(model.constraint.free.T @ there.responses(tolerance=SNAPSHOT))
+    return ReducedBasis(projection(model, snapshots), there, there.response_counts)
 
 
 def _with_sharper_material(

@@ -144,10 +144,10 @@ class FiniteStrainModel:
         """Derivatives of every element's Lame constants with respect to its nu, as `moduli_of`."""
         return self._spread(moduli, material, lame_parts_by_poisson)
 
-    def under(self, constraint: Constraint) -> FiniteStrainModel:
-        """The same body with other modes and another offset of the same prescribed points.
+    def under(self, constraint: Constraint, material: MaterialModes | None = None) -> FiniteStrainModel:
+        """The same body with other modes and another offset of the same prescribed points, and other material modes.
 
-        Raises `ConfigurationError` when the constraint leaves other displacements free.
+        material: by default its own. Raises `ConfigurationError` when the constraint leaves other displacements free.
         """
         free, other = self.constraint.free, constraint.free
         if free is not other and (free.shape != other.shape or abs(free - other).max() > 0.0):
@@ -155,7 +155,7 @@ class FiniteStrainModel:
                 f"the constraint frees other displacements ({other.shape[1]}) than the model ({free.shape[1]}):"
                 " make another model with `finite_strain_model`"
             )
-        return replace(self, constraint=constraint)
+        return replace(self, constraint=constraint, material=self.material if material is None else material)
 
     def to_tolerance(self, tolerance: float) -> FiniteStrainModel:
         """The same body, its equilibria found to another `tolerance` of the forces (see `NewtonSettings`)."""
@@ -288,7 +288,7 @@ class FiniteStrainEquilibrium:
         by_modulus, by_mode, by_material = np.split(directions, ends)
         prescribed = np.asarray(self.model.constraint.modes @ by_mode)
         forces = self.balance.region_forces(self.values, self.balance.moduli) @ by_modulus
-        forces += self._material_forces() @ by_material
+        forces += self._material_forces(by_material)
         system, known = self._system(stiffness, 1), np.asarray(free.T @ guess)
         lacking = -np.asarray(free.T @ (forces + stiffness @ prescribed)) - system.matrix @ known
         return np.asarray(free @ (known + system.solve(lacking, tolerance=LACKING))) + prescribed
@@ -342,15 +342,21 @@ class FiniteStrainEquilibrium:
         both = np.concatenate([forces, moved, self._material_forces()], axis=1)
         return -np.asarray(self.balance.free.T @ both)
 
-    def _material_forces(self) -> Array:
-        """Derivatives dR / dc_k (n_dof, n_material), mN, by the coefficients of the material modes."""
+    def _material_forces(self, directions: Array | None = None) -> Array:
+        """Derivatives of R (n_dof, k), mN, along directions (n_material, k) of the material modes, or by each alone."""
         model = self.model
         if not model.material.n_modes:
-            return np.zeros((len(self.values), 0))
+            return np.zeros((len(self.values), 0 if directions is None else directions.shape[1]))
         slopes = model.moduli_by_poisson(self.moduli, self.coefficients[model.constraint.n_modes :])
         tissue = np.array(model.regions)[model.element_region]
         return material_forces(
-            model.elements, model.material, self.values, self.balance.moduli, by_poisson=slopes, tissue=tissue
+            model.elements,
+            model.material,
+            self.values,
+            self.balance.moduli,
+            by_poisson=slopes,
+            tissue=tissue,
+            directions=directions,
         )
 
     def _poisson_forces(self) -> Array:

@@ -47,6 +47,7 @@ __all__ = [
 
 LINEAR = Linear()
 OF_ERROR = 1e-4  # relative residual of the solution that an error is made of
+AT_ONCE = 64  # right-hand sides, where few of the answers are kept
 FURTHER = 10  # right-hand sides a modulus, beside one for each mode: sensitivities, series
 
 
@@ -140,10 +141,8 @@ class LinearModel:
         n = self.n_regions + self.constraint.n_modes
         of_boundary, of_material = (None, None) if directions is None else np.split(directions, [n])
         boundary = self.boundary_loads(moduli, values, of_boundary)
-        material = -np.asarray(self.constraint.free.T @ self.material_forces(moduli, values))
-        if of_material is None:
-            return np.concatenate([boundary, material], axis=1)
-        return np.asarray(boundary + material @ of_material)
+        material = -np.asarray(self.constraint.free.T @ self.material_forces(moduli, values, of_material))
+        return np.concatenate([boundary, material], axis=1) if of_material is None else np.asarray(boundary + material)
 
     def boundary_loads(
         self, moduli: NDArray[np.float64], values: NDArray[np.float64], directions: NDArray[np.float64] | None = None
@@ -156,10 +155,15 @@ class LinearModel:
             return -np.concatenate([by_modulus, by_mode.toarray()], axis=1)
         return -np.asarray(by_modulus @ directions[: self.n_regions] + by_mode @ directions[self.n_regions :])
 
-    def material_forces(self, moduli: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives (n_dof, n_material), mN, of the nodal forces at u (n_dof,) mm by the material coefficients."""
+    def material_forces(
+        self, moduli: NDArray[np.float64], values: NDArray[np.float64], directions: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """Derivatives (n_dof, k), mN, of the nodal forces at u (n_dof,) mm along directions (n_material, k).
+
+        Of the material coefficients, by default each of them alone; moduli (n_regions,) kPa.
+        """
         if self.elements is None:
-            return np.zeros((len(values), 0))
+            return np.zeros((len(values), 0 if directions is None else directions.shape[1]))
         tissue, dilatation = self.space.mesh.region, self.elements.dilatation
         lame, slopes = (np.zeros((3, len(tissue))) for _ in range(2))
         for modulus, region, weight in zip(moduli, self.regions, self.weights, strict=True):
@@ -167,7 +171,13 @@ class LinearModel:
             lame[:, own] += modulus * np.array(weight)[:, None]
             slopes[:, own] = modulus * np.array(lame_parts_by_poisson(ratio, dilatation))[:, None]
         return material_forces(
-            self.elements, self.material, values, Moduli(*lame), by_poisson=Moduli(*slopes), tissue=tissue
+            self.elements,
+            self.material,
+            values,
+            Moduli(*lame),
+            by_poisson=Moduli(*slopes),
+            tissue=tissue,
+            directions=directions,
         )
 
 
@@ -220,9 +230,30 @@ class LinearSystem:
 
         directions (n_material, k): sums of them instead; tolerance: of the relative residual.
         """
-        free, forces = self.model.constraint.free, self.model.material_forces(self.moduli, values)
-        loads = np.asarray(free.T @ (forces if directions is None else forces @ directions))
-        return np.asarray(free @ self.factorisation.solve(-loads, tolerance=tolerance))
+        free, forces = self.model.constraint.free, self.model.material_forces(self.moduli, values, directions)
+        return np.asarray(free @ self.factorisation.solve(-np.asarray(free.T @ forces), tolerance=tolerance))
+
+    def seen_responses(self, dofs: NDArray[np.int64], *, tolerance: float = EXACT) -> NDArray[np.float64]:
+        """Rows `dofs` (n,) of `responses`, some modes at a time: whole, all of them are the largest thing there is."""
+        constraint = self.model.constraint
+        loads = sparse.csc_matrix(weighted_sum(self.moduli, self.model.coupling))
+        seen = np.column_stack([constraint.modes[dofs], constraint.offset[dofs]])
+        rows = constraint.free[dofs]
+        for start in range(0, loads.shape[1], AT_ONCE):
+            some = loads[:, start : start + AT_ONCE].toarray()
+            if start + AT_ONCE >= loads.shape[1]:
+                some[:, -1] -= self.model.free_load
+            seen[:, start : start + AT_ONCE] -= np.asarray(rows @ self.factorisation.solve(some, tolerance=tolerance))
+        return np.asarray(seen)
+
+    def seen_material_responses(
+        self, values: NDArray[np.float64], dofs: NDArray[np.int64], *, tolerance: float = EXACT
+    ) -> NDArray[np.float64]:
+        """Rows `dofs` (n,) of `material_responses` at u (n_dof,) mm, some modes at a time."""
+        each = np.eye(self.model.material.n_modes)
+        some = [each[:, start : start + AT_ONCE] for start in range(0, len(each), AT_ONCE)]
+        parts = [self.material_responses(values, along, tolerance=tolerance)[dofs] for along in some]
+        return np.concatenate([np.zeros((len(dofs), 0)), *parts], axis=1)
 
     def solve(self, coefficients: NDArray[np.float64]) -> LinearEquilibrium:
         """Equilibrium at coefficients (n_modes,), dimensionless: one right-hand side, or two with material modes."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,13 @@ class MaterialModes:
     def n_modes(self) -> int:
         """Number of coefficients."""
         return int(self.fields.shape[1]) + len(self.poisson)
+
+    def combined(self, basis: NDArray[np.float64]) -> MaterialModes:
+        """The modes on combinations c = basis z of the fields' coefficients, basis (n_fields, k).
+
+        Poisson's ratios stay as they are; which combination is of which tissue is not kept.
+        """
+        return replace(self, fields=sparse.csr_matrix(self.fields @ sparse.csr_matrix(basis)), sizes=())
 
     def scale(self, coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
         """E_e / E_t (n_tets,), dimensionless, at coefficients (n_modes,)."""
@@ -77,11 +84,12 @@ def material_forces(
     *,
     by_poisson: Moduli,
     tissue: NDArray[np.int64],
+    directions: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
-    """Derivatives (n_dof, n_modes), mN, of the internal forces at u (n_dof,) mm by the coefficients.
+    """Derivatives (n_dof, k), mN, of the internal forces at u (n_dof,) mm along directions of the coefficients.
 
-    moduli: Lame's constants of the elements there; by_poisson: their derivatives by Poisson's ratio; tissue (n_tets,):
-    of which tissue each element is.
+    directions (n_modes, k), by default each coefficient alone; moduli: Lame's constants of the elements there;
+    by_poisson: their derivatives by Poisson's ratio; tissue (n_tets,): of which tissue each element is.
     """
     nodal, n_dof = displacement.reshape(-1, 3), len(displacement)
 
@@ -92,8 +100,12 @@ def material_forces(
         scatter = sparse.csc_matrix((forces.ravel(), rows.ravel(), ends), shape=(n_dof, len(rows)))
         return np.asarray(scatter @ amounts)
 
-    found = [summed(elements.forces(nodal, moduli), modes.fields.toarray())] if modes.fields.shape[1] else []
+    n_fields = int(modes.fields.shape[1])
+    along = np.eye(modes.n_modes) if directions is None else directions
+    total = np.zeros((n_dof, along.shape[1]))
+    if n_fields:
+        total += summed(elements.forces(nodal, moduli), np.asarray(modes.fields @ along[:n_fields]))
     if modes.poisson:
         own = np.stack([tissue == number for number in modes.poisson], axis=1).astype(np.float64)
-        found.append(summed(elements.forces(nodal, by_poisson), own))
-    return np.concatenate(found, axis=1) if found else np.zeros((n_dof, 0))
+        total += summed(elements.forces(nodal, by_poisson), own @ along[n_fields:])
+    return total

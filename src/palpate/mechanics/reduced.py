@@ -173,12 +173,15 @@ class ReducedEquilibrium(DenseEquilibrium):
     amplitude: NDArray[np.float64]
     values: NDArray[np.float64]
 
+    def amplitude_tangent(self) -> NDArray[np.float64]:
+        """Derivatives (m, n_regions + n_boundary) of the basis coefficients by ln E, then by the boundary modes."""
+        by_modulus = self.system.backward(-self._modulus_forces())
+        return np.concatenate([by_modulus, self.system.amplitudes[:, :-1]], axis=1)
+
     def tangent(self) -> NDArray[np.float64]:
         """T (n_outputs, n_regions + n_modes), mm: columns du / d ln E_r, then du / dq_k."""
-        model, system = self.system.model, self.system
-        by_modulus = system.backward(-self._modulus_forces())
-        amplitudes = np.concatenate([by_modulus, system.amplitudes[:, :-1]], axis=1)
-        tangent = model.output_basis @ amplitudes
+        model = self.system.model
+        tangent = model.output_basis @ self.amplitude_tangent()
         tangent[:, model.n_regions :] += model.output_modes
         return np.concatenate([tangent, model.output_material], axis=1)
 

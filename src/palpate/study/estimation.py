@@ -9,7 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.findings import Finding
-from palpate.inversion import Bounds, Inversion, InversionSettings, Iterate, Outcome, StartRun, ratio_of_eta
+from palpate.inversion import (
+    Bounds,
+    Inversion,
+    InversionSettings,
+    Iterate,
+    LeastSquares,
+    Outcome,
+    StartRun,
+    ratio_of_eta,
+)
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit
 from palpate.progress import Progress, silent
@@ -22,12 +31,11 @@ from palpate.uncertainty import (
     Combination,
     Covariance,
     FittedState,
-    FixedCorrespondence,
     Information,
     Interval,
     ModulusInterval,
     covariance_of,
-    fixed_correspondence,
+    frozen_posterior,
     information,
     log_interval,
     modulus_interval,
@@ -189,7 +197,7 @@ def conclude(
     covariance = covariance_of(objective, minimum.evaluation, observed.states, draws=GRID_DRAWS, rng=rng)
     progress("intervals: profiles, and the fit of every surface before and after")
     pairs = image_pairs_of(inversion, settings.bounds)
-    fixed = fixed_correspondence(objective, minimum.unknowns, minimum.evaluation)
+    fixed = frozen_posterior(objective, minimum.unknowns, minimum.evaluation)
     known = _intervals(inversion, fixed, settings.bounds, covariance) if minimum.converged else ()
     estimates = _estimates(inversion, known, covariance, truth)
     of_moduli = covariance.total[: len(estimates), : len(estimates)]
@@ -298,9 +306,7 @@ class _Known:
     at_bound: bool
 
 
-def _intervals(
-    inversion: Inversion, fixed: FixedCorrespondence, bounds: Bounds, covariance: Covariance
-) -> tuple[_Known, ...]:
+def _intervals(inversion: Inversion, fixed: LeastSquares, bounds: Bounds, covariance: Covariance) -> tuple[_Known, ...]:
     n = inversion.objective.n_parameters
     found, variances, at_bound = [], np.diag(covariance.total), bounds.reached(inversion.minimum.unknowns[:n])
     # Voxels make the objective rough by some hundredths of it: its value alone cannot choose between such minima.

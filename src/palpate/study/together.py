@@ -9,12 +9,11 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inversion import Bounds, Inversion
+from palpate.inversion import Bounds, Inversion, LeastSquares
 from palpate.uncertainty import (
     NORMAL_95,
     Agreement,
     Combination,
-    FixedCorrespondence,
     agreement,
     joint_region,
     known_pairs,
@@ -112,7 +111,7 @@ def combinations_of(inversion: Inversion, covariance: NDArray[np.float64], *, wi
 
 
 def regions_of(
-    inversion: Inversion, fixed: FixedCorrespondence, covariance: NDArray[np.float64], bounds: Bounds
+    inversion: Inversion, fixed: LeastSquares, covariance: NDArray[np.float64], bounds: Bounds
 ) -> tuple[ModulusRegion, ...]:
     """Of the pairs of moduli that are correlated most, `MOST_REGIONS` at the most; covariance (n, n) of ln E."""
     mapping, sd = inversion.objective.parameters, np.sqrt(np.diag(covariance))

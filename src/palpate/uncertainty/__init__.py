@@ -13,12 +13,13 @@ from palpate.uncertainty.covariance import (
 )
 from palpate.uncertainty.diagnostics import ChainDiagnostics, chain_diagnostics, require_arviz
 from palpate.uncertainty.discretisation import discretisation_sd
+from palpate.uncertainty.frozen_posterior import FrozenPosterior, frozen_posterior
 from palpate.uncertainty.image_pairs import Agreement, PairEstimate, agreement, pair_estimates
 from palpate.uncertainty.intervals import NORMAL_95, Interval, ModulusInterval, log_interval, modulus_interval
 from palpate.uncertainty.joint_region import JointRegion, joint_region
 from palpate.uncertainty.profile import FixedCorrespondence, Profile, fixed_correspondence
 from palpate.uncertainty.refit import refitted
-from palpate.uncertainty.sampling import PosteriorChains, frozen_posterior, posterior_chains, sample_posterior
+from palpate.uncertainty.sampling import PosteriorChains, posterior_chains, sample_posterior
 from palpate.uncertainty.sensitivity import (
     Errors,
     FastPath,
@@ -40,6 +41,7 @@ __all__ = [
     "FastPath",
     "FittedState",
     "FixedCorrespondence",
+    "FrozenPosterior",
     "Information",
     "Interval",
     "JointRegion",

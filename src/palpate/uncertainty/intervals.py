@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from palpate.inversion import Bounds, Minimum
-from palpate.uncertainty.profile import FixedCorrespondence, Profile, profile
+from palpate.inversion import Bounds, LeastSquares, Minimum
+from palpate.uncertainty.profile import Profile, profile
 
 __all__ = ["NORMAL_95", "Interval", "ModulusInterval", "log_interval", "modulus_interval"]
 
@@ -27,7 +27,7 @@ class ModulusInterval:
 
 
 def modulus_interval(
-    fixed: FixedCorrespondence, minimum: Minimum, number: int, *, variance: float, bounds: Bounds
+    fixed: LeastSquares, minimum: Minimum, number: int, *, variance: float, bounds: Bounds
 ) -> ModulusInterval:
     """That of the log-modulus with a `number` and a `variance`: its ellipse, where the profile ends there, too."""
     centre, half = float(np.exp(minimum.unknowns[number])), NORMAL_95 * float(np.sqrt(variance))

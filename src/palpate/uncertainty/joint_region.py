@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from palpate.inversion import Bounds, Minimum, gauss_newton
-from palpate.uncertainty.profile import FixedCorrespondence, Ray
+from palpate.inversion import Bounds, LeastSquares, Minimum, gauss_newton
+from palpate.uncertainty.profile import Ray
 
 __all__ = ["JointRegion", "joint_region"]
 
@@ -32,7 +32,7 @@ class JointRegion:
 
 
 def joint_region(
-    fixed: FixedCorrespondence,
+    fixed: LeastSquares,
     minimum: Minimum,
     numbers: tuple[int, int],
     *,

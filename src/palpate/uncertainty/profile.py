@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import SolverError
-from palpate.inversion import Bounds, Evaluation, Linearisation, Minimum, Objective, gauss_newton
+from palpate.inversion import Bounds, Evaluation, LeastSquares, Linearisation, Minimum, Objective, gauss_newton
 from palpate.mechanics.curved import CurvedModel
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import ForwardModel
@@ -103,7 +103,7 @@ class Profile:
 
 
 def profile(
-    fixed: FixedCorrespondence, minimum: Minimum, number: int, *, variance: float, bounds: Bounds, level: float
+    fixed: LeastSquares, minimum: Minimum, number: int, *, variance: float, bounds: Bounds, level: float
 ) -> Profile:
     """The profile of the log-modulus with a `number`, as far as |r| = `level` or its bound, on both sides.
 
@@ -131,7 +131,7 @@ class Ray:
     holds; scale: that of the deviance 2 (min J - least J), whose root is r.
     """
 
-    fixed: FixedCorrespondence
+    fixed: LeastSquares
     least: Minimum
     direction: NDArray[np.float64]
     held: NDArray[np.bool_]

@@ -1,8 +1,4 @@
-"""The posterior of the unknowns by sampling, on reduced models with frozen closest points.
-
-With the closest points, their normals and the robust weights held, every residual is linear in the displacement, and
-the misfit is a quadratic form in the reduced model's amplitudes: an evaluation forgets mesh and surfaces.
-"""
+"""The posterior of the unknowns by sampling, with frozen closest points."""
 
 from __future__ import annotations
 
@@ -12,20 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from palpate.errors import ConfigurationError, EstimationError
+from palpate.errors import EstimationError
 from palpate.inversion.objective import Evaluation, Objective, determined
 from palpate.inversion.optimise import Bounds
-from palpate.mechanics.curved import CurvedModel
-from palpate.mechanics.forward import ForwardModel
-from palpate.mechanics.reduced import ReducedModel
 from palpate.parallel import blas_on_one_thread
-from palpate.uncertainty.profile import fixed_correspondence
+from palpate.uncertainty.frozen_posterior import FrozenPosterior, frozen_posterior
 
 __all__ = [
-    "FrozenPosterior",
     "PosteriorChains",
     "PosteriorSamples",
-    "frozen_posterior",
     "posterior_chains",
     "sample_posterior",
 ]
@@ -34,35 +25,7 @@ STEP = 0.35  # of a proposal, in standard deviations of the posterior
 THIN = 10  # steps of a draw that is kept
 SPREAD = 1.5  # standard deviations, by which chains start apart
 BETWEEN_CHECKS = 4000  # evaluations
-ONE = np.ones(1)  # the coordinate of what no unknown moves
 GAP = 1.0  # of log-likelihood, that the frozen posterior may be off; re-chosen closest points alone make some tenths
-
-
-@dataclass(frozen=True, slots=True)
-class FrozenPosterior:
-    """Minus log-posterior 1/2 sum_s z_s^T Q_s z_s + 1/2 (x - m)^T P (x - m), dimensionless, of unknowns x (n,).
-
-    z_s = [a, q, 1] of each state s: amplitudes a (m,) of its reduced model `models[s]` and its coefficients q; of a
-    `CurvedModel`, whose expansion adds to that, [a, q, ln E - ln E_0, 1]; offsets of the residuals before the 1. forms:
-    Q_s (k, k); prior: P (n, n).
-    """
-
-    objective: Objective
-    models: tuple[ReducedModel | CurvedModel, ...]
-    forms: tuple[NDArray[np.float64], ...]
-    prior: NDArray[np.float64]
-
-    def __call__(self, unknowns: NDArray[np.float64]) -> float:
-        """Its value at unknowns (n,); raises `SolverError` where a reduced stiffness is not positive definite."""
-        parameters = self.objective.parameters
-        moduli, away = parameters.moduli(unknowns), unknowns - parameters.prior_centre
-        total = 0.5 * float(away @ self.prior @ away)
-        parts = zip(self.models, self.forms, parameters.coefficients(unknowns), strict=True)
-        for s, (model, form, coefficients) in enumerate(parts):
-            offsets = parameters.offsets(unknowns, s)
-            state = np.concatenate([_coordinates(model, moduli, coefficients), offsets, ONE])
-            total += 0.5 * float(state @ (form @ state))
-        return total
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,69 +60,6 @@ class PosteriorChains:
     accepted: NDArray[np.float64]
 
 
-def frozen_posterior(
-    objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation | None = None
-) -> FrozenPosterior:
-    """The posterior with the closest points and weights at `unknowns` (n,), under the objective's own prior of them.
-
-    Residuals are point-to-plane, r + n.(u - u_0), as in the Gauss-Newton matrix. evaluation: that of the objective
-    there, where it is known. Raises `ConfigurationError` for models that are neither reduced ones nor bent by one.
-    """
-    evaluation = evaluation or objective(unknowns)
-    parameters = objective.parameters
-    moduli, coefficients = parameters.moduli(unknowns), parameters.coefficients(unknowns)
-    models, forms = [], []
-    for number, model in enumerate(fixed_correspondence(objective, unknowns, evaluation).models):
-        if not isinstance(_reduced(model), ReducedModel):
-            raise ConfigurationError(
-                f"the posterior is sampled on reduced models; state {number} has a {type(model).__name__}"
-            )
-        assert isinstance(model, ReducedModel | CurvedModel)
-        lines = [line for line in evaluation.lines if line.state == number]
-        answer, offsets = _answer(model), parameters.offsets(unknowns, number)
-        state = np.concatenate([_coordinates(model, moduli, coefficients[number]), offsets])
-        form = np.zeros((len(state) + 1,) * 2)
-        for rows, line in zip(objective.states[number].slices, lines, strict=True):
-            shift = line.jacobian[:, line.jacobian.shape[1] - len(offsets) :]
-            moved = np.concatenate([line.residuals.smooth_jacobian @ answer[rows], shift], axis=1)
-            design = np.column_stack([moved, line.residuals.values - moved @ state])
-            design *= np.sqrt(line.precision * line.weights)[:, None]
-            form += design.T @ design
-        models.append(model)
-        forms.append(form)
-    return FrozenPosterior(objective, tuple(models), tuple(forms), evaluation.prior)
-
-
-def _reduced(model: ForwardModel) -> ForwardModel:
-    """The model whose amplitudes are coordinates."""
-    return model.like if isinstance(model, CurvedModel) else model
-
-
-def _coordinates(
-    model: ReducedModel | CurvedModel, moduli: NDArray[np.float64], coefficients: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """[a, q], and [a, q, ln E - ln E_0] of a model that an expansion adds to."""
-    reduced = _reduced(model)
-    assert isinstance(reduced, ReducedModel)
-    boundary = coefficients[: reduced.n_boundary]
-    found = [reduced.amplitude(moduli, np.concatenate([boundary, ONE])), coefficients]
-    if isinstance(model, CurvedModel):
-        found.append(np.log(moduli / model.expansion.moduli))
-    return np.concatenate(found)
-
-
-def _answer(model: ReducedModel | CurvedModel) -> NDArray[np.float64]:
-    """Derivatives (n_outputs, k) mm of the outputs by the coordinates."""
-    reduced = _reduced(model)
-    assert isinstance(reduced, ReducedModel)
-    by_coefficient = np.concatenate([reduced.output_modes, reduced.output_material], axis=1)
-    if not isinstance(model, CurvedModel):
-        return np.concatenate([reduced.output_basis, by_coefficient], axis=1)
-    rest = model.expansion.derivatives - model.straight.derivatives
-    by_modulus, by_mode = rest[:, : model.n_regions], rest[:, model.n_regions :]
-    return np.concatenate([reduced.output_basis, by_coefficient + by_mode, by_modulus], axis=1)
-
-
 @blas_on_one_thread()
 def sample_posterior(
     objective: Objective,
@@ -179,7 +79,7 @@ def sample_posterior(
     evaluation = objective(start)
     frozen = frozen_posterior(objective, start, evaluation)
     laplace = _laplace(start, evaluation)
-    anchor = evaluation.value - frozen(start)
+    anchor = evaluation.value - frozen.value(start)
     now, chain, counts, gap, refreshed = start, [], 0, 0.0, 0
     for done in range(0, evaluations, BETWEEN_CHECKS):
         steps = min(BETWEEN_CHECKS, evaluations - done)
@@ -187,11 +87,11 @@ def sample_posterior(
         now = stretch.end
         chain.append(stretch.theta)
         counts += stretch.accepted
-        off = abs(objective.value(now) - frozen(now) - anchor)
+        off = abs(objective.value(now) - frozen.value(now) - anchor)
         gap = max(gap, off)
         if off > GAP:
             frozen = frozen_posterior(objective, now)
-            anchor, refreshed = objective.value(now) - frozen(now), refreshed + 1
+            anchor, refreshed = objective.value(now) - frozen.value(now), refreshed + 1
     return PosteriorSamples(np.concatenate(chain), counts / evaluations, refreshed, gap)
 
 
@@ -290,13 +190,13 @@ def _chain(
 ) -> _Stretch:
     n = frozen.objective.n_parameters
     theta, energy, accepted = np.empty((steps, n)), np.empty(steps), 0
-    now, value = start, frozen(start)
+    now, value = start, frozen.value(start)
     level = value - laplace.energy(start)
     draws, thresholds = laplace.draws(steps, rng), np.log(rng.random(steps))
     for k in range(steps):
         trial = laplace.centre + np.sqrt(1.0 - STEP**2) * (now - laplace.centre) + STEP * draws[k]
         if np.all((trial[:n] >= bounds.lower) & (trial[:n] <= bounds.upper)):
-            there = frozen(trial)
+            there = frozen.value(trial)
             above = there - laplace.energy(trial)
             if thresholds[k] < level - above:
                 now, value, level, accepted = trial, there, above, accepted + 1

@@ -1,0 +1,141 @@
+"""The posterior of all unknowns near an estimate, its closest points and weights held: a quadratic form.
+
+With the closest points, their normals and the robust weights held, every residual is linear in the displacement, and
+the misfit is a quadratic form in the reduced model's amplitudes: an evaluation forgets mesh and surfaces.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from palpate.errors import ConfigurationError
+from palpate.inversion.objective import Evaluation, Objective
+from palpate.mechanics.curved import CurvedModel
+from palpate.mechanics.reduced import ReducedModel
+from palpate.uncertainty.profile import fixed_correspondence
+
+__all__ = ["FrozenPosterior", "frozen_posterior"]
+
+ONE = np.ones(1)  # the coordinate of what no unknown moves
+
+
+@dataclass(frozen=True, slots=True)
+class FrozenState:
+    """One later state: z = [a, q, 1] with the amplitudes a (m,) of its `reduced` model, which answers nothing else.
+
+    Offsets of the residuals stand before the 1. expanded (n_regions,) kPa: E_0 where an expansion adds to the model, z
+    = [a, q, ln E - ln E_0, 1]; form: Q (k, k), the misfit is 1/2 z^T Q z.
+    """
+
+    reduced: ReducedModel
+    expanded: NDArray[np.float64] | None
+    form: NDArray[np.float64]
+
+    def coordinates(
+        self, moduli: NDArray[np.float64], coefficients: NDArray[np.float64], offsets: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Z (k,) at moduli (n_regions,) kPa, coefficients (n_modes,) and offsets (n_offsets,)."""
+        boundary = coefficients[: self.reduced.n_boundary]
+        further = [] if self.expanded is None else [np.log(moduli / self.expanded)]
+        amplitude = self.reduced.amplitude(moduli, np.concatenate([boundary, ONE]))
+        return np.concatenate([amplitude, coefficients, *further, offsets, ONE])
+
+    def slopes(
+        self, moduli: NDArray[np.float64], coefficients: NDArray[np.float64], n_offsets: int
+    ) -> NDArray[np.float64]:
+        """Derivatives (k, n_regions + n_modes + n_offsets) of z by ln E, coefficients and offsets."""
+        n, m = len(moduli), len(coefficients)
+        amplitude = self.reduced.solve(moduli, coefficients).amplitude_tangent()
+        rows = [np.pad(amplitude, ((0, 0), (0, n + m - amplitude.shape[1]))), np.eye(m, n + m, n)]
+        rows += [] if self.expanded is None else [np.eye(n, n + m)]
+        whole = linalg.block_diag(np.concatenate(rows), np.eye(n_offsets))
+        return np.pad(whole, ((0, 1), (0, 0)))
+
+
+@dataclass(frozen=True, slots=True)
+class FrozenPosterior:
+    """Minus log-posterior 1/2 sum_s z_s^T Q_s z_s + 1/2 (x - m)^T P (x - m), dimensionless, of unknowns x (n,).
+
+    z_s: see `FrozenState`; prior: P (n, n).
+    """
+
+    objective: Objective
+    states: tuple[FrozenState, ...]
+    prior: NDArray[np.float64]
+
+    @property
+    def n_parameters(self) -> int:
+        """Number of log-moduli among the unknowns."""
+        return self.objective.n_parameters
+
+    def value(self, unknowns: NDArray[np.float64]) -> float:
+        """Its value alone at unknowns (n,); raises `SolverError` where a reduced stiffness is not positive definite."""
+        parameters = self.objective.parameters
+        moduli, away = parameters.moduli(unknowns), unknowns - parameters.prior_centre
+        total = 0.5 * float(away @ self.prior @ away)
+        for s, (state, coefficients) in enumerate(zip(self.states, parameters.coefficients(unknowns), strict=True)):
+            z = state.coordinates(moduli, coefficients, parameters.offsets(unknowns, s))
+            total += 0.5 * float(z @ (state.form @ z))
+        return total
+
+    def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
+        """Its value, gradient and Gauss-Newton matrix at unknowns (n,), without residuals; raises `SolverError`.
+
+        With D_s = d z_s / dx the gradient is sum_s D_s^T Q_s z_s + P (x - m), the matrix sum_s D_s^T Q_s D_s + P.
+        """
+        parameters = self.objective.parameters
+        moduli, away = parameters.moduli(unknowns), unknowns - parameters.prior_centre
+        pull = self.prior @ away
+        value, gradient, matrix = 0.5 * float(away @ pull), pull.copy(), self.prior.copy()
+        for s, (state, coefficients) in enumerate(zip(self.states, parameters.coefficients(unknowns), strict=True)):
+            offsets, own = parameters.offsets(unknowns, s), parameters.unknowns_of(s)
+            z = state.coordinates(moduli, coefficients, offsets)
+            slopes = parameters.by_unknowns(state.slopes(moduli, coefficients, len(offsets)), unknowns)
+            force = state.form @ z
+            value += 0.5 * float(z @ force)
+            gradient[own] += slopes.T @ force
+            matrix[np.ix_(own, own)] += slopes.T @ (state.form @ slopes)
+        return Evaluation(value, np.nan, gradient, gradient, matrix, (), self.prior, pull)
+
+
+def frozen_posterior(
+    objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation | None = None
+) -> FrozenPosterior:
+    """The posterior with the closest points and weights at `unknowns` (n,), under the objective's own prior of them.
+
+    Residuals are point-to-plane, r + n.(u - u_0), as in the Gauss-Newton matrix. evaluation: that of the objective
+    there, where it is known. Raises `ConfigurationError` for models that are neither reduced ones nor bent by one.
+    """
+    evaluation = evaluation or objective(unknowns)
+    parameters = objective.parameters
+    moduli, coefficients = parameters.moduli(unknowns), parameters.coefficients(unknowns)
+    states = []
+    for s, model in enumerate(fixed_correspondence(objective, unknowns, evaluation).models):
+        reduced = model.like if isinstance(model, CurvedModel) else model
+        if not isinstance(reduced, ReducedModel):
+            raise ConfigurationError(
+                f"the posterior is frozen on reduced models; state {s} has a {type(model).__name__}"
+            )
+        answer = np.concatenate([reduced.output_basis, reduced.output_modes, reduced.output_material], axis=1)
+        expanded = None
+        if isinstance(model, CurvedModel):
+            rest, expanded = model.expansion.derivatives - model.straight.derivatives, model.expansion.moduli
+            answer[:, reduced.n_basis :] += rest[:, model.n_regions :]
+            answer = np.concatenate([answer, rest[:, : model.n_regions]], axis=1)
+        offsets = parameters.offsets(unknowns, s)
+        bare = FrozenState(reduced.at(np.zeros(0, dtype=np.int64)), expanded, np.zeros((0, 0)))
+        z = bare.coordinates(moduli, coefficients[s], offsets)
+        form = np.zeros((len(z), len(z)))
+        lines = [line for line in evaluation.lines if line.state == s]
+        for rows, line in zip(objective.states[s].slices, lines, strict=True):
+            shift = line.jacobian[:, line.jacobian.shape[1] - len(offsets) :]
+            moved = np.concatenate([line.residuals.smooth_jacobian @ answer[rows], shift], axis=1)
+            design = np.column_stack([moved, line.residuals.values - moved @ z[:-1]])
+            design *= np.sqrt(line.precision * line.weights)[:, None]
+            form += design.T @ design
+        states.append(replace(bare, form=form))
+    return FrozenPosterior(objective, tuple(states), evaluation.prior)
