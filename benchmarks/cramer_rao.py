@@ -108,7 +108,7 @@ def _whitened(lines: Sequence[Linearisation], noise: NoiseModel, cell_mm: float)
 
 def _jacobian(lines: Sequence[Linearisation]) -> NDArray[np.float64]:
     """Derivative (n_q, n_columns) of the surfaces' model -> image residuals, one surface after the other."""
-    return np.concatenate([line.jacobian[model_to_image(line)] for line in lines])
+    return np.concatenate([line.jacobian.of_rows(model_to_image(line)).dense for line in lines])
 
 
 def _cell_means(line: Linearisation, edge_mm: float) -> sparse.csr_matrix[np.float64]:

@@ -109,7 +109,7 @@ def _row(
 ) -> dict[str, object]:
     """Standard deviations of the log-moduli: as promised, and as the draws scatter, with the prior's part."""
     n = len(names)
-    jacobian = np.concatenate([line.jacobian[model_to_image(line)] for line in evaluation.lines])
+    jacobian = np.concatenate([line.jacobian.of_rows(model_to_image(line)).dense for line in evaluation.lines])
     by_modes = weights.rows @ jacobian[:, n:]  # modes that the weights do not keep out of the moduli
     by_prior = by_modes @ np.linalg.solve(evaluation.prior[n:, n:], by_modes.T)
     scatter = np.sqrt(np.diag(np.cov(shifts.T) + by_prior))

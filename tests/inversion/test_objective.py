@@ -77,8 +77,8 @@ def place(objective, seed):
 
 def whole(line, unknowns):
     """The derivative (n, n_unknowns) of a surface's residuals by all unknowns."""
-    jacobian = np.zeros((len(line.jacobian), len(unknowns)))
-    jacobian[:, line.columns] = line.jacobian
+    jacobian = np.zeros((line.jacobian.shape[0], len(unknowns)))
+    jacobian[:, line.columns] = line.jacobian.dense
     return jacobian
 
 

@@ -246,7 +246,7 @@ def test_what_an_approximation_misses_is_told_by_how_far_it_sets_the_moduli_off(
     pull = np.zeros(len(here.unknowns))
     for line, exact in zip(here.evaluation.lines, full.lines, strict=True):
         change = exact.residuals.values - line.residuals.values
-        pull[line.columns] += line.jacobian.T @ (line.precision * line.weights * change)
+        pull[line.columns] += line.jacobian.pulled(line.precision * line.weights * change)
     true = np.abs(here.evaluation.covariance_columns(2).T @ pull)
     assert error > 1e-3
     assert true.max() > 1e-3

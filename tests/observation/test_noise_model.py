@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import FitResponse, NoiseModel, fit_noise_model, mean_noise
 from palpate.phantoms.boundary_noise import smooth_field
 
@@ -53,12 +56,17 @@ def smooth_motion(normals, count):
     return np.column_stack([np.prod(normals**power, axis=1) for power in powers[:count]])
 
 
+def response_of(jacobian, gain, places, normals):
+    """The response of a fit to one surface."""
+    return FitResponse([Jacobian.of(jacobian)], [Jacobian.of(gain.T)], [places], [normals])
+
+
 def test_what_a_fit_leaves_of_errors_is_the_projected_covariance():
     """(1 - J G) K (1 - J G)^T in bins of distance, against the product of whole matrices."""
     places, normals = sphere(1200)
     jacobian, length = smooth_motion(normals, 12), 6.0
     gain = np.linalg.pinv(jacobian)
-    found = FitResponse([jacobian], gain, places, normals).left([length], [(places, normals)])[:, 0]
+    found = response_of(jacobian, gain, places, normals).left([length], [(places, normals)])[:, 0]
     cosine, distance = normals @ normals.T, np.linalg.norm(places[:, None] - places[None], axis=2)
     kept = np.eye(len(places)) - jacobian @ gain
     left = kept @ (np.exp(-(distance**2) / (2.0 * length**2)) * cosine) @ kept.T
@@ -80,7 +88,9 @@ def test_the_response_of_a_fit_tells_how_much_the_errors_move_it(rng):
         left.append(errors - jacobian @ (gain @ errors))
     alike = [places] * 12, [normals] * 12
     seen = fit_noise_model(left, *alike)
-    told = fit_noise_model(left, *alike, FitResponse([jacobian] * 12, gain, places, normals))
+    told = fit_noise_model(
+        left, *alike, replace(response_of(jacobian, gain, places, normals), jacobians=[Jacobian.of(jacobian)] * 12)
+    )
 
     def sd_of_fit(noise):
         """Standard deviations (12,) of the unknowns, over the true ones."""

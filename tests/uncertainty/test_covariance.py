@@ -12,6 +12,7 @@ from palpate.inversion import LaterState, Objective, ParameterMap, unit_blocks
 from palpate.inversion.objective import Evaluation, Linearisation, deciding_directions
 from palpate.inversion.optimise import Minimum, Outcome, posterior_sd
 from palpate.observation.contract import Residuals, Weighting
+from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.robust_loss import Tukey
 from palpate.phantoms.boundary_noise import smooth_field
@@ -56,7 +57,7 @@ def surface(places, normals, jacobian, *, precision, noise, state=0, kind="surfa
         state,
         residuals,
         columns,
-        jacobian,
+        Jacobian.of(jacobian),
         weights,
         None,
     )
@@ -84,7 +85,7 @@ def observed(*lines, n_parameters=2, rests=(0, 1)):
     prior = np.diag(np.where(np.arange(n) < n_parameters, 0.0, 1.0))
     matrix = prior.copy()
     for line in lines:
-        matrix += line.precision * line.jacobian.T @ (line.weights[:, None] * line.jacobian)
+        matrix += line.jacobian.gram(line.precision * line.weights)
     numbers = sorted({line.state for line in lines})
     states = [
         LaterState(None, tuple(line.observation for line in lines if line.state == s), reference=rests[s])
@@ -159,11 +160,12 @@ def test_the_noise_of_errors_is_sought_by_what_the_fit_leaves_of_them(smooth, rn
         errors = rng.standard_normal(2 * len(places))
         halves = np.split(errors, 2)
         score = sum(
-            line.jacobian.T @ (line.precision * line.weights * error)
+            line.jacobian.pulled(line.precision * line.weights * error)
             for line, error in zip((driver, telling), halves, strict=True)
         )
-        taken = telling.jacobian @ np.linalg.solve(now.matrix, score)
-        assert response.jacobians[0] @ (response.gain @ errors) == pytest.approx(taken), state
+        taken = telling.jacobian.times(np.linalg.solve(now.matrix, score))
+        moved = sum(gain.pulled(error) for gain, error in zip(response.gains, halves, strict=True))
+        assert response.jacobians[0].times(moved) == pytest.approx(taken), state
 
 
 def test_correlated_residuals_tell_less(smooth):

@@ -13,6 +13,7 @@ import pytest
 from palpate.inversion import Evaluation, LaterState, Objective, ParameterMap, unit_blocks
 from palpate.inversion.objective import Linearisation
 from palpate.observation.contract import Residuals, Weighting
+from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.robust_loss import Tukey
 from palpate.observation.surface_distance import SurfaceDistance
@@ -50,7 +51,7 @@ def seen(jacobian):
     target = SimpleNamespace(area=np.ones(n), surface=SimpleNamespace(driver=False))
     surface = SurfaceDistance(target, None, NOISE, Weighting(PRECISION, Tukey()), stated_noise=NOISE)
     residuals = Residuals(np.zeros(n), weights, places, normals, places, None, None)
-    line = Linearisation(surface, 0, residuals, np.arange(5), jacobian, weights, None)
+    line = Linearisation(surface, 0, residuals, np.arange(5), Jacobian.of(jacobian), weights, None)
     prior = np.diag([0.0, 0.0, 1.0, 1.0, 1.0])
     matrix = prior + PRECISION * jacobian.T @ (weights[:, None] * jacobian)
     evaluation = Evaluation(0.0, 0.0, np.zeros(5), np.zeros(5), matrix, (line,), prior, np.zeros(5))
@@ -78,7 +79,7 @@ def test_the_weights_of_the_limit_attain_it_under_noise_of_its_model(limits, smo
     now, rng = smooth[1], np.random.default_rng(20240511)
     places, normals = sphere()
     rows, *_ = limits.efficient_gain(now, NOISE, 2, cell_mm=5.0)
-    kept = np.eye(5)[:2] - rows @ now.lines[0].jacobian  # what is not seen of the unknowns comes from their prior
+    kept = np.eye(5)[:2] - rows @ now.lines[0].jacobian.dense  # what is not seen of the unknowns comes from their prior
     assert kept[:, :2] == pytest.approx(np.zeros((2, 2)), abs=1e-9)  # no bias in the log-moduli
     fields = (smooth_field(rng, sd_mm=NOISE.sd, correlation_mm=5.0, features=200) for _ in range(400))
     draws = [rows @ np.einsum("na,na->n", field.at(places), normals) for field in fields]

@@ -14,8 +14,8 @@ from palpate.mechanics.first_order import expanded
 from palpate.mechanics.laws.registry import law_named
 from palpate.observation.noise_model import NoiseModel
 from palpate.uncertainty import sample_posterior
-from palpate.uncertainty.profile import fixed_correspondence
 from palpate.uncertainty.frozen_posterior import frozen_posterior
+from palpate.uncertainty.profile import fixed_correspondence
 from palpate.uncertainty.sampling import posterior_chains
 
 WIDE = Bounds(np.full(2, np.log(0.02)), np.full(2, np.log(200.0)))

@@ -25,7 +25,7 @@ from palpate.progress import Progress
 
 __all__ = ["InformedProblem", "informed_problem"]
 
-LEFT_OUT = 0.05  # variances of the noise, in all, that what a block leaves out may explain
+LEFT_OUT = 1.0  # variances of the first noise, a tenth of the found one, that what a block leaves out may explain
 SMALL = 12  # unknowns of a block, which are kept
 SEEN = 1e-4  # relative residual of responses that only say what is seen
 
@@ -85,7 +85,7 @@ def informed_problem(
     fit = [inverse @ fitted.unknowns[own] for (own, _), (_, inverse) in zip(_with_columns(problem), bases, strict=True)]
     unknowns = np.concatenate([fitted.unknowns[: parameters.n_parameters], *fit])
     again = [replace(system, model=state.model) for system, state in zip(systems, reduced, strict=True)]
-    return InformedProblem(InverseProblem(tuple(reduced), found), tuple(again), unknowns, fitted.evaluations)
+    return InformedProblem(InverseProblem(tuple(reduced), found), tuple(again), unknowns, fitted.evaluations + 1)
 
 
 def _with_columns(problem: InverseProblem) -> list[tuple[NDArray[np.int64], Block]]:

@@ -15,6 +15,7 @@ from palpate.inversion.later_state import LaterState
 from palpate.inversion.parameters import ParameterMap
 from palpate.mechanics.forward import Equilibrium
 from palpate.observation.contract import Observation, Residuals
+from palpate.observation.jacobian import Jacobian, jacobian_of
 from palpate.parallel import mapped
 
 __all__ = ["Evaluation", "Linearisation", "LinearisedObjective", "Objective", "deciding_directions", "determined"]
@@ -46,7 +47,7 @@ class Linearisation:
     state: int
     residuals: Residuals
     columns: NDArray[np.int64]
-    jacobian: NDArray[np.float64]
+    jacobian: Jacobian
     weights: NDArray[np.float64]
     gradient: NDArray[np.float64]
 
@@ -227,11 +228,11 @@ class Objective:
             """One observation's residuals with their derivative."""
             number, rows, (observation, residuals) = of
             weights = residuals.weights * observation.weighting.loss.weight(residuals.values)
-            shift = np.zeros((len(weights), n_offsets))
-            shift[:, number : number + 1] = 1.0
-            jacobian = np.concatenate([residuals.smooth_jacobian @ tangent[rows], shift], axis=1)
+            smooth, seen_by = residuals.smooth_jacobian, tangent[rows]
+            jacobian = jacobian_of(smooth, seen_by, number=number, n_offsets=n_offsets)
             weighted = _weighted(observation, residuals)
-            gradient = np.concatenate([tangent[rows].T @ (residuals.jacobian.T @ weighted), shift.T @ weighted])
+            own = np.eye(1, n_offsets, number)[0] * weighted.sum()
+            gradient = np.concatenate([seen_by.T @ (residuals.jacobian.T @ weighted), own])
             return Linearisation(observation, s, residuals, columns, jacobian, weights, gradient)
 
         return mapped(line, zip(range(len(seen)), state.slices, seen, strict=True))
@@ -261,10 +262,10 @@ class LinearisedObjective:
         def line(of: tuple[Observation, Linearisation]) -> Linearisation:
             """One observation's residuals with their derivative."""
             observation, known = of
-            values = known.residuals.values + known.jacobian @ step[known.columns]
+            values = known.residuals.values + known.jacobian.times(step[known.columns])
             residuals = replace(known.residuals, values=values)
             weights = residuals.weights * observation.weighting.loss.weight(values)
-            gradient = np.asarray(known.jacobian.T @ (observation.weighting.precision * weights * values))
+            gradient = known.jacobian.pulled(observation.weighting.precision * weights * values)
             return replace(known, observation=observation, residuals=residuals, weights=weights, gradient=gradient)
 
         lines = mapped(line, zip(self.objective.observations, self.evaluation.lines, strict=True))
@@ -285,9 +286,8 @@ def deciding_directions(evaluation: Evaluation, n_parameters: int) -> NDArray[np
 
 def _normal_equations(line: Linearisation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """J^T W r (n_columns,) and J^T W J (n_columns, n_columns) of one observation."""
-    root = np.sqrt(line.precision * line.weights)
-    scaled = root[:, None] * line.jacobian
-    return scaled.T @ (root * line.residuals.values), scaled.T @ scaled  # of one array: half of a general product
+    weights = line.precision * line.weights
+    return line.jacobian.pulled(weights * line.residuals.values), line.jacobian.gram(weights)
 
 
 def _misfit(observation: Observation, residuals: Residuals) -> float:

@@ -469,6 +469,6 @@ def _model_error(objective: Objective, minimum: Minimum) -> tuple[float, NDArray
     for line in minimum.evaluation.lines:
         du = errors[line.state].missing[line.observation.dofs]
         missing = np.asarray(line.residuals.smooth_jacobian @ du)
-        pull[line.columns] += line.jacobian.T @ (line.precision * line.weights * missing)
+        pull[line.columns] += line.jacobian.pulled(line.precision * line.weights * missing)
     off = np.abs(minimum.evaluation.covariance_columns(objective.n_parameters).T @ pull)
     return largest, np.asarray(off), cost

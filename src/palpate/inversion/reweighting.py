@@ -80,9 +80,8 @@ def _beyond_modes(line: Linearisation, n_parameters: int) -> NDArray[np.float64]
     """
     if not line.observation.of_driver:
         return None
-    values, by_modes = line.residuals.values, line.jacobian[:, n_parameters:]
-    weighted = by_modes.T * line.weights
-    matrix = weighted @ by_modes
+    values, by_modes = line.residuals.values, line.jacobian.of_columns(np.arange(n_parameters, line.jacobian.shape[1]))
+    matrix = by_modes.gram(line.weights)
     ridge = RIDGE * max(float(np.trace(matrix)) / max(len(matrix), 1), np.finfo(float).tiny)
-    step = np.linalg.solve(matrix + ridge * np.eye(len(matrix)), weighted @ values)
-    return np.asarray(values - by_modes @ step)
+    step = np.asarray(np.linalg.solve(matrix + ridge * np.eye(len(matrix)), by_modes.pulled(line.weights * values)))
+    return np.asarray(values - by_modes.times(step))

@@ -13,6 +13,7 @@ from scipy.optimize import nnls
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from palpate.observation.jacobian import Jacobian
 from palpate.parallel import mapped
 
 __all__ = ["EXACT_NOISE", "SEGMENTATION_NOISE", "FitResponse", "NoiseModel", "fit_noise_model", "mean_noise"]
@@ -93,14 +94,14 @@ SEGMENTATION_NOISE = NoiseModel(np.array([0.3**2]), np.array([3.0]))  # of segme
 class FitResponse:
     """How a fit answers to errors e of all residuals: its unknowns move by -G e, which leaves residuals e - J G e.
 
-    jacobians: J (n, n_unknowns) of each surface's residuals; gain: G (n_unknowns, n_all) by the errors at places
-    (n_all, 3) mm with normals (n_all, 3), those of all surfaces.
+    jacobians: J (n, n_unknowns) of each surface's residuals; gains: G^T (n, n_unknowns) by the errors of each surface
+    at its places (n, 3) mm with normals (n, 3).
     """
 
-    jacobians: Sequence[NDArray[np.float64]]
-    gain: NDArray[np.float64]
-    places: NDArray[np.float64]
-    normals: NDArray[np.float64]
+    jacobians: Sequence[Jacobian]
+    gains: Sequence[Jacobian]
+    places: Sequence[NDArray[np.float64]]
+    normals: Sequence[NDArray[np.float64]]
 
     def left(
         self, lengths: Sequence[float], surfaces: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]
@@ -118,9 +119,10 @@ class FitResponse:
 
     def _products(self, length: float, seen: Sequence[_Pairs]) -> NDArray[np.float64]:
         """Sums (BINS,) of what is left in each pair, times n_i.n_j."""
-        centres, carried = _carried(self.gain, self.places, self.normals, WITHIN * length)
+        centres, carried = self._carried(WITHIN * length)
         kernel = _gaussian(cdist(centres, centres), length)
-        by_errors = sum(((part @ kernel) @ part.T for part in carried), np.zeros((len(self.gain),) * 2))  # G K G^T
+        n_unknowns = self.gains[0].shape[1]
+        by_errors = sum(((part @ kernel) @ part.T for part in carried), np.zeros((n_unknowns, n_unknowns)))  # G K G^T
         products = np.zeros(BINS)
         for pairs in seen:
             across = _gaussian(cdist(centres, pairs.places), length)
@@ -129,6 +131,18 @@ class FitResponse:
             left = _gaussian(pairs.distance, length) * pairs.cosine - (taken + taken.T)[pairs.near]
             products += np.bincount(pairs.bins, left * pairs.cosine, minlength=BINS)
         return products
+
+    def _carried(self, size: float) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
+        """Centres (n_cells, 3) mm of cubes of edge `size`, and sums of G (n_unknowns, n_cells) times each normal."""
+        cells, centres = _cubes(np.concatenate(self.places), size)
+        ends = np.cumsum([len(places) for places in self.places])
+        parts = [sparse.csc_matrix(cells)[:, e - len(n) : e] for e, n in zip(ends, self.normals, strict=True)]
+        every = list(zip(parts, self.gains, self.normals, strict=True))
+        along = [
+            sum((gain.summed(sparse.csr_matrix(part.multiply(n[:, a]))) for part, gain, n in every), np.zeros(()))
+            for a in range(3)
+        ]
+        return centres, [np.ascontiguousarray(sums.T) for sums in along]
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,14 +158,14 @@ class _Pairs:
     bins: NDArray[np.int64]
 
     @classmethod
-    def of(cls, places: NDArray[np.float64], normals: NDArray[np.float64], jacobian: NDArray[np.float64]) -> _Pairs:
+    def of(cls, places: NDArray[np.float64], normals: NDArray[np.float64], jacobian: Jacobian) -> _Pairs:
         """Of residuals at places (n, 3) mm with normals (n, 3) and a Jacobian (n, n_unknowns)."""
         cells = _cell_means(places, RESPONSE_CELLS)
         centres, mean_normals = _times(cells, places), _units(_times(cells, normals))
         apart = cdist(centres, centres)
         near = apart < REACH
         distance, cosine = apart[near], (mean_normals @ mean_normals.T)[near]
-        return cls(centres, mean_normals, _times(cells, jacobian), near, distance, cosine, _bins(distance))
+        return cls(centres, mean_normals, jacobian.summed(cells), near, distance, cosine, _bins(distance))
 
 
 def fit_noise_model(
@@ -231,10 +245,16 @@ def _carried(
 
     The sums are (n_rows, n_cells) for each axis.
     """
-    _, inverse = _cell_keys(places, size)
-    cells = sparse.csr_matrix((np.ones(len(inverse)), (inverse, np.arange(len(inverse)))))
-    centres = _times(cells, places) / np.bincount(inverse)[:, None]
+    cells, centres = _cubes(places, size)
     return centres, [np.ascontiguousarray(_times(cells, (rows * normals[:, a]).T).T) for a in range(3)]
+
+
+def _cubes(places: NDArray[np.float64], size: float) -> tuple[sparse.csr_matrix[np.float64], NDArray[np.float64]]:
+    """Sums (n_cells, n) over the places (n, 3) mm in each cube of edge `size`, and their centres (n_cells, 3) mm."""
+    _, inverse = _cell_keys(places, size)
+    entries = (np.ones(len(inverse)), (inverse, np.arange(len(inverse))))
+    cells: sparse.csr_matrix[np.float64] = sparse.csr_matrix(entries)
+    return cells, _times(cells, places) / np.bincount(inverse)[:, None]
 
 
 def _gaussian(distance: NDArray[np.float64], length: float) -> NDArray[np.float64]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
@@ -16,6 +17,7 @@ from palpate.inversion.objective import Evaluation, Linearisation, Objective
 from palpate.inversion.reweighting import of_one_noise
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
+from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import FitResponse, NoiseModel, mean_noise
 from palpate.parallel import mapped
 from palpate.uncertainty.discretisation import discretisation_sd
@@ -52,7 +54,7 @@ def gain(evaluation: Evaluation, n_parameters: int) -> tuple[NDArray[np.float64]
     G = H^-1 J^T W: a change e of the data moves the estimate by -G e; H is the Gauss-Newton matrix with the prior.
     """
     rows = evaluation.covariance_columns(n_parameters).T
-    return tuple(rows[:, s.columns] @ (s.precision * s.weights[:, None] * s.jacobian).T for s in evaluation.lines)
+    return tuple(s.jacobian.times(rows[:, s.columns].T).T * (s.precision * s.weights) for s in evaluation.lines)
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +148,7 @@ def _given_model(objective: Objective, evaluation: Evaluation) -> Evaluation:
     for line in evaluation.lines:
         inside = np.isin(line.columns, own)
         columns = np.searchsorted(own, line.columns[inside])
-        lines.append(replace(line, columns=columns, jacobian=line.jacobian[:, inside]))
+        lines.append(replace(line, columns=columns, jacobian=line.jacobian.of_columns(inside)))
     within = np.ix_(own, own)
     return replace(
         evaluation,
@@ -215,23 +217,30 @@ def error_noise(evaluation: Evaluation) -> dict[tuple[int, str], NoiseModel]:
     the residuals of another, by the moduli alone, is neglected.
     """
     lines, n, found = evaluation.lines, len(evaluation.matrix), {}
-    rows = gain(evaluation, n)
+    inverse = evaluation.covariance_columns(n)
     for key, (own, telling) in of_one_noise(evaluation).items():
         response = FitResponse(
             jacobians=[_among_all(lines[i], n) for i in telling],
-            gain=np.concatenate([rows[i] for i in own], axis=1),
-            places=np.concatenate([lines[i].residuals.places for i in own]),
-            normals=np.concatenate([lines[i].residuals.normals for i in own]),
+            gains=[_gains(lines[i], inverse) for i in own],
+            places=[lines[i].residuals.places for i in own],
+            normals=[lines[i].residuals.normals for i in own],
         )
         found[key] = lines[own[0]].observation.fitted_noise([lines[i].residuals for i in telling], response)
     return found
 
 
-def _among_all(line: Linearisation, n_unknowns: int) -> NDArray[np.float64]:
+def _among_all(line: Linearisation, n_unknowns: int) -> Jacobian:
     """An observation's Jacobian (n, n_unknowns) by all unknowns."""
-    jacobian = np.zeros((len(line.residuals.values), n_unknowns))
-    jacobian[:, line.columns] = line.jacobian
-    return jacobian
+    tangent = np.zeros((len(line.jacobian.tangent), n_unknowns))
+    tangent[:, line.columns] = line.jacobian.tangent
+    return replace(line.jacobian, tangent=tangent)
+
+
+def _gains(line: Linearisation, inverse: NDArray[np.float64]) -> Jacobian:
+    """W J H^-1 (n, n_unknowns), an observation's part of the gain's transpose, with H^-1 (n_unknowns, n_unknowns)."""
+    weights = sparse.diags_array(line.precision * line.weights)
+    seen = sparse.csr_matrix(weights @ line.jacobian.by_displacement)
+    return Jacobian(seen, line.jacobian.tangent @ inverse[line.columns])
 
 
 def _propagated(

@@ -132,10 +132,12 @@ def frozen_posterior(
         form = np.zeros((len(z), len(z)))
         lines = [line for line in evaluation.lines if line.state == s]
         for rows, line in zip(objective.states[s].slices, lines, strict=True):
-            shift = line.jacobian[:, line.jacobian.shape[1] - len(offsets) :]
-            moved = np.concatenate([line.residuals.smooth_jacobian @ answer[rows], shift], axis=1)
-            design = np.column_stack([moved, line.residuals.values - moved @ z[:-1]])
-            design *= np.sqrt(line.precision * line.weights)[:, None]
-            form += design.T @ design
+            of_offsets = line.jacobian.tangent[:, line.jacobian.shape[1] - len(offsets) :]
+            moved = np.concatenate([np.pad(answer[rows], ((0, 1), (0, 0))), of_offsets], axis=1)
+            by_z = replace(line.jacobian, tangent=moved)
+            weights, rest = line.precision * line.weights, line.residuals.values - by_z.times(z[:-1])
+            side = by_z.pulled(weights * rest)[:, None]
+            corner = np.array([[float(weights @ rest**2)]])
+            form += np.block([[by_z.gram(weights), side], [side.T, corner]])
         states.append(replace(bare, form=form))
     return FrozenPosterior(objective, tuple(states), evaluation.prior)

@@ -56,10 +56,10 @@ class FixedCorrespondence:
             tangent = mapping.by_unknowns(there.tangent(), unknowns)
             offset = mapping.offsets(unknowns - self.unknowns, s)
             for rows, (line, before) in zip(state.slices, left, strict=False):
-                smooth, shift = line.residuals.smooth_jacobian, line.jacobian[:, tangent.shape[1] :]
-                values = line.residuals.values + smooth @ (there.values[rows] - before) + shift @ offset
-                jacobian = np.concatenate([smooth @ tangent[rows], shift], axis=1)
-                gradient = np.asarray(jacobian.T @ (line.precision * line.weights * values))
+                moved = np.append(there.values[rows] - before, line.jacobian.tangent[-1, tangent.shape[1] :] @ offset)
+                values = line.residuals.values + line.jacobian.by_displacement @ moved
+                jacobian = line.jacobian.under(tangent[rows])
+                gradient = jacobian.pulled(line.precision * line.weights * values)
                 residuals = replace(line.residuals, values=values)
                 lines.append(replace(line, residuals=residuals, jacobian=jacobian, gradient=gradient))
         found = self.objective.assembled(unknowns, lines)

@@ -1,0 +1,96 @@
+"""The Jacobian of residuals by unknowns as a product of a sparse and a small dense matrix, which is never formed.
+
+A surface has many times more residuals than displacements, and far more than unknowns: formed, the Jacobians would be
+the largest things there are, and their products the longest part of an evaluation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+__all__ = ["Jacobian", "jacobian_of"]
+
+
+@dataclass(frozen=True)
+class Jacobian:
+    """J = S T (n, n_columns) of one observation, mm per unit of each unknown.
+
+    by_displacement: S (n, n_dofs + 1), dimensionless, its last column 1: the derivative by an offset of all residuals;
+    tangent: T (n_dofs + 1, n_columns) mm, the derivatives of displacements, and of the offset, by the unknowns.
+    """
+
+    by_displacement: sparse.csr_matrix[np.float64]
+    tangent: NDArray[np.float64]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(n, n_columns)."""
+        return int(self.by_displacement.shape[0]), int(self.tangent.shape[1])
+
+    def times(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """J x (n,) or (n, k) for x (n_columns,) or (n_columns, k)."""
+        return np.asarray(self.by_displacement @ (self.tangent @ values))
+
+    def pulled(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """J^T y (n_columns,) or (n_columns, k) for y (n,) or (n, k)."""
+        return np.asarray(self.tangent.T @ (self.by_displacement.T @ values))
+
+    def gram(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
+        """J^T W J (n_columns, n_columns) for W = diag(weights (n,)), none negative."""
+        middle = self.gram_by_displacement(weights)
+        return np.asarray(self.tangent.T @ (middle @ self.tangent))
+
+    def gram_by_displacement(self, weights: NDArray[np.float64]) -> sparse.csr_matrix[np.float64]:
+        """S^T W S (n_dofs + 1, n_dofs + 1) for W = diag(weights (n,)), none negative."""
+        matrix = self.by_displacement
+        scaled = np.repeat(np.sqrt(weights), np.diff(matrix.indptr)) * matrix.data
+        root = sparse.csr_matrix((scaled, matrix.indices, matrix.indptr), shape=matrix.shape)
+        return sparse.csr_matrix(root.T @ root)
+
+    def summed(self, rows: sparse.csr_matrix[np.float64]) -> NDArray[np.float64]:
+        """A J (m, n_columns) for sparse sums A (m, n) of residuals."""
+        return np.asarray(sparse.csr_matrix(rows @ self.by_displacement) @ self.tangent)
+
+    @classmethod
+    def of(cls, matrix: NDArray[np.float64]) -> Jacobian:
+        """That of residuals that are themselves what the unknowns move, J (n, n_columns)."""
+        return cls(sparse.csr_matrix(matrix), np.eye(matrix.shape[1]))
+
+    def of_columns(self, columns: NDArray[np.bool_] | NDArray[np.int64]) -> Jacobian:
+        """The same by some of the unknowns, a mask or numbers of them."""
+        return replace(self, tangent=self.tangent[:, columns])
+
+    def of_rows(self, rows: slice) -> Jacobian:
+        """The same of some of the residuals."""
+        return replace(self, by_displacement=sparse.csr_matrix(self.by_displacement[rows]))
+
+    def under(self, tangent: NDArray[np.float64]) -> Jacobian:
+        """The same with other derivatives of the displacements (n_dofs, k) by the first k unknowns."""
+        whole = self.tangent.copy()
+        whole[:-1, : tangent.shape[1]] = tangent
+        return replace(self, tangent=whole)
+
+    @cached_property
+    def dense(self) -> NDArray[np.float64]:
+        """J (n, n_columns) itself."""
+        return self.times(np.eye(self.tangent.shape[1]))
+
+
+def jacobian_of(
+    smooth: sparse.csr_matrix[np.float64], tangent: NDArray[np.float64], *, number: int, n_offsets: int
+) -> Jacobian:
+    """Of residuals with derivatives smooth (n, n_dofs) by displacements, these with tangent (n_dofs, k) by unknowns.
+
+    Columns of n_offsets offsets follow, of which that with a `number` is the residuals' own.
+    """
+    ones = sparse.csr_matrix(np.ones((smooth.shape[0], 1)))
+    below = np.zeros((1, tangent.shape[1] + n_offsets))
+    if n_offsets:
+        below[0, tangent.shape[1] + number] = 1.0
+    whole = np.concatenate([np.pad(tangent, ((0, 0), (0, n_offsets))), below])
+    return Jacobian(sparse.csr_matrix(sparse.hstack([smooth, ones], format="csr")), whole)
