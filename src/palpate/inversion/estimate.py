@@ -32,7 +32,6 @@ from palpate.inversion.outer_loop import (
     run_outer_loop,
     updated,
 )
-from palpate.inversion.reduced_basis import reduced_basis
 from palpate.inversion.reweighting import with_first_noise, with_found_noise
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium
@@ -178,12 +177,10 @@ def _with_reduced_bases(
     informed = informed_problem(problem, middle, bounds=settings.bounds, progress=progress)
     parameters, unknowns = informed.problem.parameters, informed.unknowns
     progress(f"how the responses to {parameters.n_coefficients} unknowns that are seen change with the moduli")
-    by_theta, states = parameters.derivatives(unknowns), list[LaterState]()
-    coefficients = parameters.coefficients(unknowns)
-    for state, system, q in zip(informed.problem.states, informed.systems, coefficients, strict=True):
-        basis = reduced_basis(state.model, system.moduli, system=system)
-        states.append(state.with_approximation(basis.with_modulus_series(q, by_theta).with_material(q)))
-    return Objective(tuple(states), parameters), unknowns, informed.evaluations
+    by_theta, coefficients = parameters.derivatives(unknowns), parameters.coefficients(unknowns)
+    triples = zip(informed.problem.states, informed.bases, coefficients, strict=True)
+    states = tuple(state.with_approximation(basis.with_modulus_series(q, by_theta)) for state, basis, q in triples)
+    return Objective(states, parameters), unknowns, informed.evaluations
 
 
 def _linear(

@@ -7,8 +7,7 @@ estimate's time and memory.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,27 +17,29 @@ from palpate.inversion.blocks import Acts, Block
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import Objective
 from palpate.inversion.optimise import Bounds, ShareOfValue, fit_coefficients
+from palpate.inversion.reduced_basis import SNAPSHOT, ReducedBasis, basis_of
 from palpate.inversion.reweighting import with_first_noise
 from palpate.mechanics.first_order import FirstOrderModel
-from palpate.mechanics.linear_model import LinearSystem
+from palpate.mechanics.forward import SolveCounts
+from palpate.mechanics.linear_model import LinearModel, LinearSystem
 from palpate.progress import Progress
 
 __all__ = ["InformedProblem", "informed_problem"]
 
 LEFT_OUT = 1.0  # variances of the first noise, a tenth of the found one, that what a block leaves out may explain
 SMALL = 12  # unknowns of a block, which are kept
-SEEN = 1e-4  # relative residual of responses that only say what is seen
+TO_THE_NOISE = ShareOfValue(0.1)  # as where starts begin
 
 
 @dataclass(frozen=True, slots=True)
 class InformedProblem:
-    """An inverse problem on the combinations that are seen, with each state's system at the middle start.
+    """An inverse problem on the combinations that are seen, with each state's reduced basis of them.
 
-    unknowns (n_unknowns,): there, with the boundary's motion fitted; evaluations: what that cost.
+    unknowns (n_unknowns,): the middle start, with the boundary's motion fitted; evaluations: what that cost.
     """
 
     problem: InverseProblem
-    systems: tuple[LinearSystem, ...]
+    bases: tuple[ReducedBasis, ...]
     unknowns: NDArray[np.float64]
     evaluations: int
 
@@ -53,60 +54,73 @@ def informed_problem(
     out widens the posterior by a share of less than its sum (Spantini et al. 2015, SIAM J. Sci. Comput. 37, A2451,
     Theorem 2.3; Cui et al. 2014, Inverse Problems 30, 114015). Noise is that before residuals are seen, which is small.
     """
-    parameters, states, systems = problem.parameters, list[LaterState](), list[LinearSystem]()
-    moduli = parameters.moduli(begin)
+    parameters, states, found = problem.parameters, list[LaterState](), list[_Responses]()
     for number, state in enumerate(problem.states, start=1):
         progress(f"responses of the full model at the middle start, state {number} of {len(problem.states)}")
-        system = state.model.system(moduli)
-        seen = system.seen_responses(state.dofs, tolerance=SEEN)
-        fixed, material = np.zeros((len(seen), len(moduli))), np.zeros((len(seen), state.model.material.n_modes))
-        still = np.zeros(state.model.n_modes)
-        tangent = np.concatenate([fixed, seen[:, :-1], material], axis=1)
-        model = FirstOrderModel(state.model.names, moduli, still, seen[:, -1], tangent)
-        states.append(replace(state, observed=model))
-        systems.append(system)
+        system = state.model.system(parameters.moduli(begin))
+        found.append(_Responses(system, system.single_responses(tolerance=SNAPSHOT)))
+        states.append(replace(state, observed=found[-1].seen(state, np.zeros(state.model.n_modes))))
     progress("the motion of walls and frame at the middle start")
     objective = with_first_noise(Objective(tuple(states), parameters)).rematched(begin)
-    fitted = fit_coefficients(objective, begin, bounds=bounds, tolerance=ShareOfValue(0.1))
+    fitted = fit_coefficients(objective, begin, bounds=bounds, tolerance=TO_THE_NOISE)
     progress("what the images tell of all unknowns there")
-    evaluation = _with_material(objective, systems, fitted.unknowns)(fitted.unknowns)
-    data = evaluation.matrix - evaluation.prior
-    bases = [_informed(block, data[np.ix_(own, own)]) for own, block in _with_columns(problem)]
-    blocks = [block.combined(inverse) for block, (_, inverse) in zip(parameters.blocks, bases, strict=True)]
-    found = replace(parameters, blocks=tuple(blocks), nuisance_precision=np.zeros((0, 0)))
-    reduced = []
+    for s, (state, q) in enumerate(zip(objective.states, parameters.coefficients(fitted.unknowns), strict=True)):
+        found[s] = found[s].with_material(q)
+        states[s] = replace(state, observed=found[s].seen(state, q))
+    evaluation = replace(objective, states=tuple(states))(fitted.unknowns)
+    data, columns = evaluation.matrix - evaluation.prior, [parameters.columns(i) for i in range(len(parameters.blocks))]
+    bases = [_informed(b, data[np.ix_(own, own)]) for b, own in zip(parameters.blocks, columns, strict=True)]
+    blocks = tuple(b.combined(inverse) for b, (_, inverse) in zip(parameters.blocks, bases, strict=True))
+    reduced, kept = list[LaterState](), list[ReducedBasis]()
     for s, state in enumerate(problem.states):
-        own = [(block, basis) for block, (basis, _) in zip(parameters.blocks, bases, strict=True) if s in block.states]
-        boundary = [basis for block, basis in own if block.acts is Acts.BOUNDARY]
-        n_fields = state.model.material.fields.shape[1]
-        material = linalg.block_diag(*(basis for block, basis in own if block.acts is Acts.MATERIAL))
-        n_kept = material.shape[1] - len(state.model.material.poisson)
-        reduced.append(state.combined(linalg.block_diag(*boundary), material[:n_fields, :n_kept]))
-    fit = [inverse @ fitted.unknowns[own] for (own, _), (_, inverse) in zip(_with_columns(problem), bases, strict=True)]
-    unknowns = np.concatenate([fitted.unknowns[: parameters.n_parameters], *fit])
-    again = [replace(system, model=state.model) for system, state in zip(systems, reduced, strict=True)]
-    return InformedProblem(InverseProblem(tuple(reduced), found), tuple(again), unknowns, fitted.evaluations + 1)
+        of_state = [(b.acts, basis) for b, (basis, _) in zip(parameters.blocks, bases, strict=True) if s in b.states]
+        boundary, material = (
+            linalg.block_diag(*(basis for acts, basis in of_state if acts is wanted))
+            for wanted in (Acts.BOUNDARY, Acts.MATERIAL)
+        )
+        n_poisson = len(state.model.material.poisson)
+        fields = material[: material.shape[0] - n_poisson, : material.shape[1] - n_poisson]
+        reduced.append(state.combined(boundary, fields))
+        kept.append(found[s].combined(reduced[-1].model, boundary, material))
+    theta = fitted.unknowns[: parameters.n_parameters]
+    fit = [inverse @ fitted.unknowns[own] for own, (_, inverse) in zip(columns, bases, strict=True)]
+    seen = InverseProblem(tuple(reduced), replace(parameters, blocks=blocks, nuisance_precision=np.zeros((0, 0))))
+    return InformedProblem(seen, tuple(kept), np.concatenate([theta, *fit]), fitted.evaluations + 1)
 
 
-def _with_columns(problem: InverseProblem) -> list[tuple[NDArray[np.int64], Block]]:
-    """Each block with the numbers (n,) of its unknowns."""
-    return [(problem.parameters.columns(i), block) for i, block in enumerate(problem.parameters.blocks)]
+@dataclass(frozen=True, slots=True)
+class _Responses:
+    """A system with the responses (n_dof, n_boundary + 1) and (n_dof, n_material) mm of its model to all modes."""
 
+    system: LinearSystem
+    boundary: NDArray[np.float32]
+    material: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), dtype=np.float32))
 
-def _with_material(objective: Objective, systems: Sequence[LinearSystem], unknowns: NDArray[np.float64]) -> Objective:
-    """The objective whose observed models answer to the material, too, to first order around unknowns (n_unknowns,)."""
-    states = []
-    coefficients = objective.parameters.coefficients(unknowns)
-    for state, system, q in zip(objective.states, systems, coefficients, strict=True):
-        model = state.observed
-        assert isinstance(model, FirstOrderModel)
-        n_material = state.model.material.n_modes
-        boundary = np.where(np.arange(len(q)) < len(q) - n_material, q, 0.0)
-        values = system.solve(boundary).values
-        by_material = system.seen_material_responses(values, state.dofs, tolerance=SEEN)
-        tangent = np.concatenate([model.derivatives[:, : model.derivatives.shape[1] - n_material], by_material], axis=1)
-        states.append(replace(state, observed=replace(model, derivatives=tangent)))
-    return replace(objective, states=tuple(states))
+    def with_material(self, coefficients: NDArray[np.float64]) -> _Responses:
+        """With those to the material modes at coefficients (n_modes,) of homogeneous tissues."""
+        q = coefficients[: self.boundary.shape[1] - 1]
+        values = np.asarray(self.boundary @ np.append(q, 1.0).astype(np.float32), dtype=np.float64)
+        return replace(self, material=self.system.single_material_responses(values, tolerance=SNAPSHOT))
+
+    def seen(self, state: LaterState, coefficients: NDArray[np.float64]) -> FirstOrderModel:
+        """What is observed of them, to first order around coefficients (n_modes,); moduli move nothing."""
+        model, moduli, dofs = self.system.model, self.system.moduli, state.dofs
+        by_boundary = self.boundary[dofs].astype(np.float64)
+        by_material = np.zeros((len(dofs), model.material.n_modes))
+        by_material[:, : self.material.shape[1]] = self.material[dofs] if self.material.size else 0.0
+        tangent = np.concatenate([np.zeros((len(dofs), len(moduli))), by_boundary[:, :-1], by_material], axis=1)
+        values = by_boundary[:, -1] + tangent[:, len(moduli) :] @ coefficients
+        return FirstOrderModel(model.names, moduli, coefficients, values, tangent)
+
+    def combined(
+        self, model: LinearModel, boundary: NDArray[np.float64], material: NDArray[np.float64]
+    ) -> ReducedBasis:
+        """The reduced basis of combinations (n_boundary, k) and (n_material, l), of which `model` is made."""
+        every = linalg.block_diag(boundary, np.eye(1)).astype(np.float32)
+        responses = np.asarray(self.boundary @ every, dtype=np.float64)
+        cost = self.system.response_counts + SolveCounts(tangent=self.material.shape[1])
+        basis = basis_of(replace(self.system, model=model), responses, cost)
+        return basis.with_material(np.asarray(self.material @ material.astype(np.float32), dtype=np.float64))
 
 
 def _informed(block: Block, information: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -18,7 +18,7 @@ from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mechanics.solvers.registry import SOLVERS, CheckedFactorisation
 from palpate.mesh.constraint import Constraint
 
-__all__ = ["ReducedBasis", "reduced_basis"]
+__all__ = ["SNAPSHOT", "ReducedBasis", "basis_of", "reduced_basis"]
 
 SERIES = 40  # vectors at the most
 FAR = 30.0  # spread of the moduli's ratios to the factorised ones, beyond which a new factorisation costs less
@@ -120,15 +120,9 @@ class ReducedBasis:
         """Upper bound of the displacement's relative error in energy (see `LinearSystem.error_bound`)."""
         return ModelError(*self.system.error_bound(at.moduli, self._homogeneous(at)))
 
-    def with_material(self, coefficients: NDArray[np.float64]) -> ReducedBasis:
-        """The responses to the material modes at the factorised moduli and at `coefficients` (n_modes,)."""
-        n_material = self.full_model.material.n_modes
-        if not n_material:
-            return self
-        values = self._homogeneous(Place(self.system.moduli, coefficients))
-        responses = self.system.material_responses(values, tolerance=SNAPSHOT)
-        counts = self.counts + SolveCounts(tangent=n_material)
-        return replace(self, projection=self.projection.with_material(responses), counts=counts)
+    def with_material(self, responses: NDArray[np.float64]) -> ReducedBasis:
+        """With the responses (n_dof, n_material) mm to the material modes at the factorised moduli."""
+        return replace(self, projection=self.projection.with_material(responses))
 
     def _homogeneous(self, at: Place) -> NDArray[np.float64]:
         """The displacement (n_dof,) mm at a place as it would be of homogeneous tissues."""
@@ -171,16 +165,16 @@ class ReducedBasis:
         return _extended(replace(self, system=system), fresh, cost)
 
 
-def reduced_basis(
-    model: LinearModel, moduli: NDArray[np.float64], *, system: LinearSystem | None = None
-) -> ReducedBasis:
-    """The model on its responses to every boundary mode at moduli (n_regions,) kPa; one factorisation.
+def reduced_basis(model: LinearModel, moduli: NDArray[np.float64]) -> ReducedBasis:
+    """The model on its responses to every boundary mode at moduli (n_regions,) kPa; one factorisation."""
+    system = model.system(moduli)
+    return basis_of(system, system.responses(tolerance=SNAPSHOT), system.response_counts)
 
-    system: the model's, factorised there, where it is at hand.
-    """
-    there = system or model.system(moduli)
-    snapshots = np.asarray(model.constraint.free.T @ there.responses(tolerance=SNAPSHOT))
-    return ReducedBasis(projection(model, snapshots), there, there.response_counts)
+
+def basis_of(system: LinearSystem, responses: NDArray[np.float64], counts: SolveCounts) -> ReducedBasis:
+    """A system's model on displacements (n_dof, k) mm that are there, with what they, and the system, cost."""
+    snapshots = np.asarray(system.model.constraint.free.T @ responses)
+    return ReducedBasis(projection(system.model, snapshots), system, counts)
 
 
 def _with_sharper_material(

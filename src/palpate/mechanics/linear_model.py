@@ -233,27 +233,29 @@ class LinearSystem:
         free, forces = self.model.constraint.free, self.model.material_forces(self.moduli, values, directions)
         return np.asarray(free @ self.factorisation.solve(-np.asarray(free.T @ forces), tolerance=tolerance))
 
-    def seen_responses(self, dofs: NDArray[np.int64], *, tolerance: float = EXACT) -> NDArray[np.float64]:
-        """Rows `dofs` (n,) of `responses`, some modes at a time: whole, all of them are the largest thing there is."""
+    def single_responses(self, *, tolerance: float = EXACT) -> NDArray[np.float32]:
+        """As `responses`, in single precision, some modes at a time: the largest thing there is, at half its size."""
         constraint = self.model.constraint
         loads = sparse.csc_matrix(weighted_sum(self.moduli, self.model.coupling))
-        seen = np.column_stack([constraint.modes[dofs], constraint.offset[dofs]])
-        rows = constraint.free[dofs]
+        found = np.column_stack([constraint.modes, constraint.offset]).astype(np.float32)
         for start in range(0, loads.shape[1], AT_ONCE):
             some = loads[:, start : start + AT_ONCE].toarray()
             if start + AT_ONCE >= loads.shape[1]:
                 some[:, -1] -= self.model.free_load
-            seen[:, start : start + AT_ONCE] -= np.asarray(rows @ self.factorisation.solve(some, tolerance=tolerance))
-        return np.asarray(seen)
+            solution = self.factorisation.solve(some, tolerance=tolerance)
+            found[:, start : start + AT_ONCE] -= np.asarray(constraint.free @ solution, dtype=np.float32)
+        return found
 
-    def seen_material_responses(
-        self, values: NDArray[np.float64], dofs: NDArray[np.int64], *, tolerance: float = EXACT
-    ) -> NDArray[np.float64]:
-        """Rows `dofs` (n,) of `material_responses` at u (n_dof,) mm, some modes at a time."""
+    def single_material_responses(
+        self, values: NDArray[np.float64], *, tolerance: float = EXACT
+    ) -> NDArray[np.float32]:
+        """As `material_responses` at u (n_dof,) mm, in single precision, some modes at a time."""
         each = np.eye(self.model.material.n_modes)
-        some = [each[:, start : start + AT_ONCE] for start in range(0, len(each), AT_ONCE)]
-        parts = [self.material_responses(values, along, tolerance=tolerance)[dofs] for along in some]
-        return np.concatenate([np.zeros((len(dofs), 0)), *parts], axis=1)
+        found = np.zeros((len(values), len(each)), dtype=np.float32)
+        for start in range(0, len(each), AT_ONCE):
+            some = slice(start, start + AT_ONCE)
+            found[:, some] = self.material_responses(values, each[:, some], tolerance=tolerance)
+        return found
 
     def solve(self, coefficients: NDArray[np.float64]) -> LinearEquilibrium:
         """Equilibrium at coefficients (n_modes,), dimensionless: one right-hand side, or two with material modes."""
