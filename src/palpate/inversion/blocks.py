@@ -34,9 +34,11 @@ __all__ = [
 ]
 
 AMPLITUDES = (0.005, 2.0)  # times the coefficients' own standard deviation
+STILL, MOVES = 0.02, (1.0, 2.0)  # amplitudes of a frame that stands still, times what is stated; of one that moves
+STILL_RIGID, MOVED_RIGID = 0.005, 0.2
 DRAWN_ALIKE, SELDOM = 0.1, 0.01  # an offset of a surface that is drawn alike, over that of others; how often not
 CONSIDERED = 1e8  # times its precision: an unknown that is considered does not move
-LEAST_HETEROGENEITY, MOST_HETEROGENEITY = 1.0 / 3.0, 2.0  # times the scale of its amplitude's prior
+HOMOGENEOUS_SHARE, PATCHY = 1.0 / 3.0, 0.3  # sd of ln E in a tissue that is nearly homogeneous, over that stated; odds
 
 
 class Acts(Enum):
@@ -54,11 +56,11 @@ class Block:
     of: the tissue that it is of, or the frame; cause: by which shares of a variance are told; unit_mm: what a
     coefficient of 1 is worth where it is a motion; precision: P (n, n) before anything is learned. alternatives:
     families of covariances sum_t a_t^2 C_t (n, n), each the tuple of its terms C_t, of which the images choose one with
-    its amplitudes a_t, by their evidence; none where P is held. amplitudes: bounds of a_t; scale: standard deviation of
-    a half-normal prior of a_t, inf where there is none; odds: log prior odds of the alternatives, of which the
-    likeliest is taken; none: of alternatives that are alike the widest. considered: the images cannot tell them, so
-    that they are held at 0, and what they may be counts in the covariance (Schmidt 1966). Raises `ConfigurationError`
-    for terms of another size.
+    its amplitudes a_t, by their evidence; none where P is held. amplitudes: bounds of a_t; odds: log prior
+    odds of the alternatives, of which the likeliest is taken; none: of alternatives that are alike the widest.
+    considered: the images cannot tell them, so that they are held at 0, and what they may be counts in the covariance
+    (Schmidt 1966). last: its prior is learned where the estimate has converged under those of the others; before it
+    would take what they explain. Raises `ConfigurationError` for terms of another size.
     """
 
     of: str
@@ -71,6 +73,7 @@ class Block:
     scale: float = np.inf
     odds: tuple[float, ...] = ()
     considered: bool = False
+    last: bool = False
     unit_mm: float = 1.0
 
     def __post_init__(self) -> None:
@@ -126,19 +129,27 @@ def wall_blocks(wall: Wall, state: int, *, learned: bool = True) -> tuple[Block,
 
 
 def frame_blocks(motion: PrescribedMotion, state: int) -> tuple[Block, ...]:
-    """The motion in a later state of the frame that the image cuts out of the body: smooth, and rigid."""
-    families = (motion.smooth, (np.eye(motion.n_rigid),))
+    """The motion in a later state of the frame that the image cuts out of the body: smooth, and rigid.
+
+    Each a mixture, of which the evidence chooses: the frame stands still, or it moves as far as is stated. With an
+    amplitude that may be anything between the frame is believed to move less than it does, for patchy tissues explain
+    as much, and the moduli pay for it.
+    """
+    smooth = [motion.smooth[0] * STILL**2, *motion.smooth] if motion.smooth else []
+    rigid = [np.eye(motion.n_rigid) * amount**2 for amount in (STILL_RIGID, MOVED_RIGID)]
     return tuple(
         Block(
             "frame",
             "frame",
             Acts.BOUNDARY,
             (state,),
-            np.eye(len(terms[0])),
+            np.linalg.inv(terms[-1]) if terms is rigid else np.eye(len(terms[0])),
             tuple((term,) for term in terms),
+            amplitudes=amplitudes,
+            odds=(0.0, *(-float(np.log(len(terms) - 1)),) * (len(terms) - 1)),
             unit_mm=motion.smooth_mm,
         )
-        for terms in families
+        for terms, amplitudes in ((smooth, MOVES), (rigid, (1.0, 1.0)))
         if terms and len(terms[0])
     )
 
@@ -166,17 +177,23 @@ def material_blocks(
     heterogeneity_sd: float,
     poisson_sd: float,
 ) -> tuple[Block, ...]:
-    """How ln E varies in each tissue, its amplitude learned, and by how much Poisson's ratios are not those given."""
+    """How ln E varies in each tissue, and by how much Poisson's ratios are not those given.
+
+    A tissue is nearly homogeneous, by a third of what is stated, or patchy by all of it, of which the evidence chooses;
+    surfaces hardly tell the two apart, so that the former stays until the latter is clearly more likely.
+    """
+    levels = [(share * heterogeneity_sd) ** 2 for share in (HOMOGENEOUS_SHARE, 1.0)]
     blocks = [
         Block(
             tissues[tissue].name,
             "heterogeneity",
             Acts.MATERIAL,
             states,
-            np.eye(n) / (LEAST_HETEROGENEITY * heterogeneity_sd) ** 2,  # else it takes what the frame does
-            ((np.eye(n),),),
-            amplitudes=(LEAST_HETEROGENEITY * heterogeneity_sd, MOST_HETEROGENEITY * heterogeneity_sd),
-            scale=heterogeneity_sd,
+            np.eye(n) / levels[0],
+            tuple((level * np.eye(n),) for level in levels),
+            amplitudes=(1.0, 1.0),
+            odds=(0.0, float(np.log(PATCHY))),
+            last=True,
         )
         for tissue, n in modes.sizes
         if n

@@ -17,11 +17,12 @@ from scipy import linalg, optimize
 from palpate.inversion.blocks import Block
 from palpate.inversion.objective import Evaluation, Objective, determined
 
-__all__ = ["learned_precision", "with_learned_prior"]
+__all__ = ["learned_precision", "undecided_covariance", "with_learned_prior"]
 
 FIRST, ELSEWHERE = 0.3, 0.05  # amplitudes of one term and of the others; one may hide the other
 LEAST_VARIANCE = 1e-3  # of a coefficient, times its variance under the block's own kernel: no mode is forbidden
 ALIKE = 2.0  # of the log-evidence
+NEGLIGIBLE = 1e-3  # posterior probability of an alternative
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,18 +62,15 @@ def learned_precision(
     equal, those that leave the log-moduli the widest posterior. Raises `EstimationError` where a block is left open.
     """
     parameters = objective.parameters
-    blocks = [(parameters.columns(i), block) for i, block in enumerate(parameters.blocks) if block.alternatives]
+    learned = [b.alternatives and not (b.last and objective.last_held) for b in parameters.blocks]
+    blocks = [(parameters.columns(i), b) for i, b in enumerate(parameters.blocks) if learned[i]]
     if not blocks:
         return None
     data, n = evaluation.matrix - evaluation.prior, objective.n_parameters
     pull, prior = data @ unknowns - (evaluation.score - evaluation.prior_score), evaluation.prior.copy()
     for places, block in blocks:
+        beliefs = _beliefs(block, places, data, prior, pull + prior @ parameters.prior_centre)
         with determined():
-            seen = _seen(data + prior, data, pull + prior @ parameters.prior_centre, places)
-            odds = block.odds or (0.0,) * len(block.alternatives)
-            beliefs = [
-                _most_evident(terms, seen, block, odd) for terms, odd in zip(block.alternatives, odds, strict=True)
-            ]
             if block.odds:
                 chosen = _likeliest(beliefs, prior[np.ix_(places, places)])
             else:
@@ -81,6 +79,70 @@ def learned_precision(
                 chosen = _widest(beliefs, others, places, n)
             prior[np.ix_(places, places)] = linalg.inv(chosen)
     return prior[n:, n:]
+
+
+def undecided_covariance(
+    objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]
+) -> dict[str, NDArray[np.float64]]:
+    """What a covariance (n_parameters, n_parameters) lacks where alternatives were not decided, by the blocks' cause.
+
+    The second moment about the estimate of a mixture: sum_k w_k (V_k - V + d_k d_k^T) over the alternatives of a block
+    that were not chosen, with their posterior probability w_k by evidence and odds, the Gauss-Newton covariance V_k
+    of the log-moduli under each, and how far d_k it moves them, with the residuals linear around unknowns (n_unknowns,)
+    (law of total variance).
+    """
+    parameters, n = objective.parameters, objective.n_parameters
+    data, prior = evaluation.matrix - evaluation.prior, evaluation.prior
+    centre = parameters.prior_centre
+    pull = data @ unknowns - (evaluation.score - evaluation.prior_score)
+
+    def posterior(of: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Mean (n,) and covariance (n, n) of the log-moduli under a prior's precision."""
+        right = np.column_stack([np.eye(len(of))[:, :n], pull + of @ centre])
+        solved = linalg.solve(data + of, right, assume_a="pos", check_finite=False)
+        return solved[:n, n], solved[:n, :n]
+
+    found = dict[str, NDArray[np.float64]]()
+    with determined():
+        mean, covariance = posterior(prior)
+        for i, block in enumerate(parameters.blocks):
+            if not block.odds:
+                continue
+            places = parameters.columns(i)
+            beliefs = _beliefs(block, places, data, prior, pull + prior @ centre)
+            level = -np.linalg.slogdet(prior[np.ix_(places, places)])[1]
+            chosen = min(range(len(beliefs)), key=lambda k: abs(float(np.linalg.slogdet(beliefs[k][1])[1]) - level))
+            evidences = np.array([evidence for evidence, _ in beliefs])
+            shares = np.exp(evidences - evidences.max())
+            shares /= shares.sum()
+            part = np.zeros((n, n))
+            for k, (_, believed) in enumerate(beliefs):
+                if k == chosen or shares[k] < NEGLIGIBLE:
+                    continue
+                other = prior.copy()
+                other[np.ix_(places, places)] = linalg.inv(believed)
+                moved, spread = posterior(other)
+                part += shares[k] * (spread - covariance + np.outer(moved - mean, moved - mean))
+            sizes, axes = np.linalg.eigh(part)  # an alternative that knows more makes nothing narrower
+            found[block.cause] = found.get(block.cause, np.zeros((n, n))) + (axes * np.maximum(sizes, 0.0)) @ axes.T
+    return found
+
+
+def _beliefs(
+    block: Block,
+    places: NDArray[np.int64],
+    data: NDArray[np.float64],
+    prior: NDArray[np.float64],
+    pull: NDArray[np.float64],
+) -> list[tuple[float, NDArray[np.float64]]]:
+    """Log-evidence and covariance (n, n) of each alternative of a block at its best, all others under their prior.
+
+    data, prior: information and precision (n_unknowns, n_unknowns); pull (n_unknowns,): of data and prior means.
+    """
+    with determined():
+        seen = _seen(data + prior, data, pull, places)
+        odds = block.odds or (0.0,) * len(block.alternatives)
+        return [_most_evident(terms, seen, block, odd) for terms, odd in zip(block.alternatives, odds, strict=True)]
 
 
 def with_learned_prior(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> Objective:
@@ -119,8 +181,7 @@ def _most_evident(
         """Minus the log-evidence at ln of the amplitudes (n_terms,), with its derivative."""
         squares = np.exp(2.0 * logs)
         evidence, slopes = seen.log_evidence(floored, squares)
-        doubt = squares / block.scale**2
-        return 0.5 * float(doubt.sum()) - evidence, doubt - 2.0 * squares * slopes
+        return -evidence, -2.0 * squares * slopes
 
     limits = np.log(block.amplitudes)
     starts = np.log(np.where(np.eye(len(terms)) > 0.0, FIRST, ELSEWHERE)).clip(*limits)

@@ -75,7 +75,7 @@ def informed_problem(
     for s, state in enumerate(problem.states):
         of_state = [(b.acts, basis) for b, (basis, _) in zip(parameters.blocks, bases, strict=True) if s in b.states]
         boundary, material = (
-            linalg.block_diag(*(basis for acts, basis in of_state if acts is wanted))
+            linalg.block_diag(np.zeros((0, 0)), *(basis for acts, basis in of_state if acts is wanted))
             for wanted in (Acts.BOUNDARY, Acts.MATERIAL)
         )
         n_poisson = len(state.model.material.poisson)

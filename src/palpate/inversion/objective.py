@@ -90,12 +90,13 @@ class Objective:
 
     The unknowns x, their prior mean m and precision P are those of `parameters`; rho: see `RobustLoss`. Each
     observation has an offset, where `parameters` have one. prior_held: whether the blocks' prior stays what it is when
-    residuals are reweighted.
+    residuals are reweighted; last_held: whether that of the blocks that are learned last does.
     """
 
     states: tuple[LaterState, ...]
     parameters: ParameterMap
     prior_held: bool = False
+    last_held: bool = True
 
     @property
     def n_parameters(self) -> int:

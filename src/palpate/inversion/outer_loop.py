@@ -151,7 +151,8 @@ def run_outer_loop(
     """Follow a minimum until reweighting it and updating its approximations change it no more.
 
     Of the approximations of `start` see `updated`. What is believed of the blocks is held from where the estimate is
-    near, and learned once more where, learned at the estimate, it would not leave that where it is. `title` begins each
+    near, and learned once more, then of those that are learned last, too, where, learned at the estimate, it would not
+    leave that where it is. `title` begins each
     line of `progress`. The minimum's history is that of the loop alone, its evaluations are added to those of `start`.
     Raises `NotConverged` when the full model has no equilibrium where every part of a step leads.
     """
@@ -175,7 +176,7 @@ def run_outer_loop(
             last = np.zeros_like(last)  # what follows is another objective
             if number > rule.iterations - AFTER_CHANGE:
                 break
-            free = replace(_learning(now, held=False), convergence=Convergence())
+            free = replace(_learning(now, held=False, last_held=False), convergence=Convergence())
             if not held or relearned == RELEARNED or _prior_holds(free, settings, rule):
                 break
             now, held, relearned = free, False, relearned + 1
@@ -191,9 +192,10 @@ def _prior_holds(free: OuterIterate, settings: InversionSettings, rule: StopRule
     return _change(free.minimum, found, rule, free.objective.n_parameters) < PRIOR_HOLDS
 
 
-def _learning(now: OuterIterate, *, held: bool) -> OuterIterate:
-    """The iterate whose blocks' prior is held, or learned with every reweighting."""
-    return replace(now, objective=replace(now.objective, prior_held=held))
+def _learning(now: OuterIterate, *, held: bool, last_held: bool | None = None) -> OuterIterate:
+    """The iterate whose blocks' prior is held, or learned with every reweighting; of those learned last as it was."""
+    last = now.objective.last_held if last_held is None else last_held
+    return replace(now, objective=replace(now.objective, prior_held=held, last_held=last))
 
 
 def updated(objective: Objective, minimum: Minimum, rule: StopRule) -> OuterIterate:

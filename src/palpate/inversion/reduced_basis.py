@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ SERIES = 40  # vectors at the most
 FAR = 30.0  # spread of the moduli's ratios to the factorised ones, beyond which a new factorisation costs less
 SNAPSHOT = 1e-5  # relative residual of basis vectors: what they miss is measured at each place and added there
 DISPLACEMENT, TANGENT = 1e-4, 1e-2  # of the reduced model's error, that a correction may leave
+STALE = 0.3  # of ln E, from which on all responses to the material modes are made anew
 FAR_OFF = 3e-3  # of the displacement, missing: derivatives are off by as small a share
 MAX_ITERATIONS = 60
 
@@ -32,13 +33,15 @@ MAX_ITERATIONS = 60
 class ReducedBasis:
     """A linear model projected on m displacements (n_free, m); implements `Approximation`.
 
-    system: the last factorised one; counts: what it cost; place: where it was last made exact, None: nowhere yet.
+    system: the last factorised one; counts: what it cost; place: where it was last made exact, None: nowhere yet;
+    material_at (n_regions,) kPa: where all responses to the material modes were made.
     """
 
     projection: Projection
     system: LinearSystem
     counts: SolveCounts
     place: Place | None = None
+    material_at: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
     @property
     def full_model(self) -> LinearModel:
@@ -122,7 +125,7 @@ class ReducedBasis:
 
     def with_material(self, responses: NDArray[np.float64]) -> ReducedBasis:
         """With the responses (n_dof, n_material) mm to the material modes at the factorised moduli."""
-        return replace(self, projection=self.projection.with_material(responses))
+        return replace(self, projection=self.projection.with_material(responses), material_at=self.system.moduli)
 
     def _homogeneous(self, at: Place) -> NDArray[np.float64]:
         """The displacement (n_dof,) mm at a place as it would be of homogeneous tissues."""
@@ -190,6 +193,11 @@ def _with_sharper_material(
     model, first = basis.full_model, basis.full_model.n_regions + basis.constraint.n_modes
     if not model.material.n_modes or at.directions is None or at.metric is None:
         return basis
+    if np.abs(np.log(at.moduli / basis.material_at)).max() > STALE:
+        system = model.system(at.moduli)
+        responses = system.material_responses(displacement, tolerance=TANGENT)
+        cost = basis.counts + SolveCounts(tangent=model.material.n_modes, factorisations=1)
+        return replace(basis, system=system, counts=cost).with_material(responses)
     along, metric = at.directions[first:], at.metric[first:, first:]
     along = along[:, np.linalg.norm(along, axis=0) > 0.0]
     free, before = model.constraint.free, basis.model.output_material

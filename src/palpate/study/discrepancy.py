@@ -89,7 +89,7 @@ def discrepancy_of(inversion: Inversion, states: Sequence[FittedState]) -> Found
             value, half = float(unknowns[own[0]]), NORMAL_95 * float(np.sqrt(variance))
             offsets.append(OffsetFound(block.of, block.states[0], value, (value - half, value + half)))
         elif block.cause == "heterogeneity":
-            heterogeneity.append(HeterogeneityFound(block.of, learned, block.scale))
+            heterogeneity.append(HeterogeneityFound(block.of, learned, float(np.sqrt(block.widest[0, 0]))))
         elif block.cause == "frame":
             smooth.setdefault(block.states[0], learned * block.unit_mm)
     frames = tuple(None if s not in smooth else _frame(fitted, smooth[s]) for s, fitted in enumerate(states))

@@ -194,7 +194,9 @@ def conclude(
     objective, minimum = inversion.objective, inversion.minimum
     rng = np.random.default_rng(seed)
     progress(f"intervals: correlation of the residuals, and the model as {GRID_DRAWS} random voxel grids show it")
-    covariance = covariance_of(objective, minimum.evaluation, observed.states, draws=GRID_DRAWS, rng=rng)
+    covariance = covariance_of(
+        objective, minimum.evaluation, observed.states, unknowns=minimum.unknowns, draws=GRID_DRAWS, rng=rng
+    )
     progress("intervals: profiles, and the fit of every surface before and after")
     pairs = image_pairs_of(inversion, settings.bounds)
     fixed = frozen_posterior(objective, minimum.unknowns, minimum.evaluation)

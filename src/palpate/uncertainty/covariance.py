@@ -13,6 +13,7 @@ from scipy import sparse
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue_distance import cropped, window_of
+from palpate.inversion.evidence import undecided_covariance
 from palpate.inversion.objective import Evaluation, Linearisation, Objective
 from palpate.inversion.reweighting import of_one_noise
 from palpate.mesh.space import LagrangeSpace
@@ -92,10 +93,14 @@ def covariance_of(
     evaluation: Evaluation,
     states: tuple[FittedState, ...],
     *,
+    unknowns: NDArray[np.float64],
     draws: int,
     rng: np.random.Generator,
 ) -> Covariance:
-    """All that is known of the log-moduli's errors: the sandwich, the scatter over so many grid positions, the mesh."""
+    """All that is known of the log-moduli's errors at unknowns (n_unknowns,).
+
+    The sandwich, what is considered or undecided, the scatter over so many grid positions, the mesh.
+    """
     noise_of, mesh = error_noise(evaluation), mesh_covariance(objective)
     errors = mapped(lambda own: imaging_errors(objective, evaluation, states, rng=own), rng.spawn(draws))
     given = _given_model(objective, evaluation)
@@ -107,14 +112,22 @@ def covariance_of(
         return noise, prior, shifts.T @ shifts / len(shifts)
 
     noise, prior, grid = parts(evaluation)
-    prior = prior + sum(_considered(objective, evaluation).values(), np.zeros_like(prior))
+    further = [_considered(objective, evaluation), undecided_covariance(objective, evaluation, unknowns)]
+    prior = prior + sum((part for of in further for part in of.values()), np.zeros_like(prior))
     left = noise + prior + grid if given is evaluation else sum(parts(given), np.zeros_like(noise))
-    return Covariance(noise, prior, grid, mesh, _causes(objective, evaluation), left + mesh)
+    return Covariance(noise, prior, grid, mesh, _causes(objective, evaluation, further), left + mesh)
 
 
-def _causes(objective: Objective, evaluation: Evaluation) -> dict[str, NDArray[np.float64]]:
-    """The parts H^-1 P_b H^-1 of the prior's covariance (n_parameters, n_parameters), by the cause of the blocks."""
-    inverse, found = evaluation.covariance_columns(objective.n_parameters), _considered(objective, evaluation)
+def _causes(
+    objective: Objective, evaluation: Evaluation, further: Sequence[Mapping[str, NDArray[np.float64]]]
+) -> dict[str, NDArray[np.float64]]:
+    """The parts H^-1 P_b H^-1 of the prior's covariance (n_parameters, n_parameters), by the cause of the blocks.
+
+    With the `further` parts of each.
+    """
+    inverse, found = evaluation.covariance_columns(objective.n_parameters), dict[str, NDArray[np.float64]]()
+    for cause, part in (item for of in further for item in of.items()):
+        found[cause] = found.get(cause, np.zeros_like(part)) + part
     for i, block in enumerate(objective.parameters.blocks):
         own = objective.parameters.columns(i)
         part = inverse[own].T @ evaluation.prior[np.ix_(own, own)] @ inverse[own]
