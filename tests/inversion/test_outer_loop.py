@@ -116,9 +116,9 @@ def test_a_prior_that_was_held_too_early_is_learned_once_more(twins, voxels, mon
     """Held while it pulled the coefficient to nothing: at the estimate that it leads to it says something else."""
     learning, times_held = loop._learning, []
 
-    def noted(now, *, held):
+    def noted(now, *, held, **last):
         times_held.extend([1] if held else [])
-        return learning(now, held=held)
+        return learning(now, held=held, **last)
 
     def too_narrow_at_first(objective, *_):
         if objective.prior_held:

@@ -70,7 +70,6 @@ class Block:
     precision: NDArray[np.float64]
     alternatives: tuple[tuple[NDArray[np.float64], ...], ...] = ()
     amplitudes: tuple[float, float] = AMPLITUDES
-    scale: float = np.inf
     odds: tuple[float, ...] = ()
     considered: bool = False
     last: bool = False

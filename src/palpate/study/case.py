@@ -133,8 +133,8 @@ class Domain:
 class Discrepancy:
     """What the model leaves out, as unknowns with these prior standard deviations; 0 leaves one out.
 
-    heterogeneity_sd: of ln E inside each tissue, the scale of the prior of the amplitude, which the images tell, never
-    below a third of it, with a Gaussian kernel of heterogeneity_length_mm; poisson_sd: of each Poisson's ratio that is
+    heterogeneity_sd: of ln E inside a patchy tissue, with a Gaussian kernel of heterogeneity_length_mm, and a third of
+    it inside one that is nearly homogeneous, of which the images choose; poisson_sd: of each Poisson's ratio that is
     given; surface_offset_mm: of how much larger each surface, and each driver's wall, is drawn in each later image.
     """
 

@@ -1,0 +1,105 @@
+"""The combinations of a block's unknowns that the images tell: what is left out of them moves no estimate."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from palpate.inversion import Acts, Block, LaterState, invert, material_blocks, parameter_map, posterior_sd, unit_blocks
+from palpate.inversion import informed_subspace as informed
+from palpate.inversion.evidence import undecided_covariance
+from palpate.mechanics.linear_model import linear_model
+from palpate.mechanics.material import material_modes
+
+
+def spread(rng, n):
+    """A covariance (n, n) whose sizes span three orders of magnitude."""
+    axes = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    return (axes * np.geomspace(1e-3, 1.0, n)) @ axes.T
+
+
+@pytest.fixture(scope="module")
+def patchy(twins, twin):
+    """The voxel problem of a twin with modes of ln E in all tissues."""
+    space = twin.model.space
+    modes = material_modes(space.mesh, (0, 1, 3), length_mm=9.0)
+    model = linear_model(space, twin.model.constraint, material=modes)
+    blocks = material_blocks(modes, space.mesh.tissues, (0,), heterogeneity_sd=0.3, poisson_sd=0.0)
+    problem = twins.voxel_problem(twin)
+    parameters = parameter_map(twin.scene.tissues, model.regions, [*unit_blocks(model.constraint.n_modes), *blocks])
+    return replace(problem, states=(LaterState(model, problem.states[0].observations),), parameters=parameters)
+
+
+def test_estimates_with_what_is_seen_are_those_with_all_unknowns(twins, patchy, monkeypatch):
+    settings = twins.settings(2.0)
+    seen = invert(patchy, settings, progress=twins.silent)
+    monkeypatch.setattr(informed, "LEFT_OUT", -1.0)
+    whole = invert(patchy, settings, progress=twins.silent)
+    assert whole.objective.parameters.n_unknowns == patchy.parameters.n_unknowns
+    assert seen.objective.parameters.n_unknowns < 0.7 * patchy.parameters.n_unknowns
+    sd = posterior_sd(whole.minimum, 2)
+    assert np.abs(seen.minimum.unknowns - np.resize(whole.minimum.unknowns, len(seen.minimum.unknowns)))[:2] == (
+        pytest.approx(np.zeros(2), abs=0.1 * sd.min())
+    )
+    assert posterior_sd(seen.minimum, 2) == pytest.approx(sd, rel=0.03)
+
+
+def test_what_is_left_out_could_explain_less_than_it_may(rng):
+    """The posterior's covariance of what is kept is that of all unknowns, but for the share that is stated."""
+    n = 40
+    covariance, information = spread(rng, n), 40.0 * spread(rng, n)
+    block = Block("a", "b", Acts.BOUNDARY, (0,), np.linalg.inv(covariance))
+    basis, inverse = informed._informed(block, information)
+    assert basis.shape[1] < n
+    assert inverse @ basis == pytest.approx(np.eye(basis.shape[1]), abs=1e-9)
+    left = np.eye(n) - basis @ inverse
+    assert np.trace(information @ left @ covariance @ left.T) < informed.LEFT_OUT
+    kept = block.combined(inverse)
+    narrow = basis @ np.linalg.inv(basis.T @ information @ basis + kept.precision) @ basis.T
+    whole = np.linalg.inv(information + block.precision)
+    rest = left @ covariance @ left.T
+    assert np.linalg.eigvalsh(narrow + rest - whole).min() > -1e-9  # what is left at its prior is no narrower
+
+
+def test_a_block_of_few_unknowns_and_offsets_stay_as_they_are():
+    few = Block("a", "b", Acts.BOUNDARY, (0,), np.eye(informed.SMALL))
+    drawn = Block("a", "b", Acts.RESIDUALS, (0,), np.eye(informed.SMALL + 1))
+    for block in (few, drawn):
+        basis, inverse = informed._informed(block, np.zeros((block.size, block.size)))
+        assert np.array_equal(basis, np.eye(block.size))
+        assert np.array_equal(inverse, np.eye(block.size))
+
+
+def test_what_is_undecided_is_the_second_moment_of_the_mixture(twins, twin, voxels):
+    """Against the posterior of each alternative by whole matrices, and their evidence."""
+    objective = twins.objective_of(voxels, twin.coefficients)
+    n, size = 2, voxels.parameters.n_coefficients
+    levels, odds = (0.3, 1.5), (0.0, -0.7)
+    terms = tuple((level**2 * np.eye(size),) for level in levels)
+    block = Block("a", "wall", Acts.BOUNDARY, (0,), np.eye(size) / levels[0] ** 2, terms, (1.0, 1.0), odds)
+    parameters = replace(objective.parameters, blocks=(block,), nuisance_precision=np.zeros((0, 0)))
+    objective = replace(objective, parameters=parameters)
+    unknowns = twin.unknowns
+    evaluation = objective.rematched(unknowns)(unknowns)
+    data = evaluation.matrix - evaluation.prior
+    pull = data @ unknowns - (evaluation.score - evaluation.prior_score)
+    means, spreads, evidences = [], [], []
+    for level, odd in zip(levels, odds, strict=True):
+        variance = level**2 * (1.0 + 1e-3 / level**2)  # no mode is forbidden, see LEAST_VARIANCE
+        prior = np.zeros_like(data)
+        prior[n:, n:] = np.eye(size) / variance
+        means.append(np.linalg.solve(data + prior, pull)[:n])
+        spreads.append(np.linalg.inv(data + prior)[:n, :n])
+        logdet = np.linalg.slogdet(data + prior)[1] + size * np.log(variance)
+        evidences.append(odd + 0.5 * float(pull @ np.linalg.solve(data + prior, pull)) - 0.5 * logdet)
+    weight = 1.0 / (1.0 + np.exp(evidences[0] - evidences[1]))
+    prior = np.zeros_like(data)
+    prior[n:, n:] = np.eye(size) / levels[0] ** 2
+    chosen, own = np.linalg.solve(data + prior, pull)[:n], np.linalg.inv(data + prior)[:n, :n]
+    moved = means[1] - chosen
+    part = weight * (spreads[1] - own + np.outer(moved, moved))
+    (found,) = undecided_covariance(objective, evaluation, unknowns).values()
+    sizes, axes = np.linalg.eigh(part)
+    assert found == pytest.approx((axes * np.maximum(sizes, 0.0)) @ axes.T, rel=1e-3, abs=1e-12)
