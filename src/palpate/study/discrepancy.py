@@ -57,7 +57,7 @@ class OffsetFound:
 
 @dataclass(frozen=True, slots=True)
 class HeterogeneityFound:
-    """Standard deviation of ln E inside a tissue: learned, and the scale of its prior."""
+    """Standard deviation of ln E inside a tissue: learned, and what it is in a patchy one."""
 
     tissue: str
     sd: float
@@ -89,7 +89,8 @@ def discrepancy_of(inversion: Inversion, states: Sequence[FittedState]) -> Found
             value, half = float(unknowns[own[0]]), NORMAL_95 * float(np.sqrt(variance))
             offsets.append(OffsetFound(block.of, block.states[0], value, (value - half, value + half)))
         elif block.cause == "heterogeneity":
-            heterogeneity.append(HeterogeneityFound(block.of, learned, float(np.sqrt(block.widest[0, 0]))))
+            patchy = max(float(term[0, 0]) for terms in block.alternatives for term in terms)
+            heterogeneity.append(HeterogeneityFound(block.of, learned, float(np.sqrt(patchy))))
         elif block.cause == "frame":
             smooth.setdefault(block.states[0], learned * block.unit_mm)
     frames = tuple(None if s not in smooth else _frame(fitted, smooth[s]) for s, fitted in enumerate(states))
