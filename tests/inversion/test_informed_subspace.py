@@ -63,10 +63,11 @@ def test_what_is_left_out_could_explain_less_than_it_may(rng):
     assert np.linalg.eigvalsh(narrow + rest - whole).min() > -1e-9  # what is left at its prior is no narrower
 
 
-def test_a_block_of_few_unknowns_and_offsets_stay_as_they_are():
+def test_a_block_of_few_unknowns_offsets_and_poissons_ratios_stay_as_they_are():
     few = Block("a", "b", Acts.BOUNDARY, (0,), np.eye(informed.SMALL))
     drawn = Block("a", "b", Acts.RESIDUALS, (0,), np.eye(informed.SMALL + 1))
-    for block in (few, drawn):
+    ratios = Block("all", "poisson", Acts.MATERIAL, (0,), np.eye(informed.SMALL + 1))
+    for block in (few, drawn, ratios):
         basis, inverse = informed._informed(block, np.zeros((block.size, block.size)))
         assert np.array_equal(basis, np.eye(block.size))
         assert np.array_equal(inverse, np.eye(block.size))
