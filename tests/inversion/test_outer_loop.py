@@ -112,6 +112,16 @@ def test_a_prior_that_follows_the_estimate_is_held_from_where_that_is_near(twins
     assert not found.objective.prior_held
 
 
+def test_what_has_converged_is_not_given_up_for_another_prior_in_the_last_iterations(twins, voxels, monkeypatch):
+    asked = []
+    monkeypatch.setattr(loop, "_prior_holds", lambda *_: asked.append(1) or True)
+    found = invert(voxels, twins.settings(0.5), progress=twins.silent, rule=StopRule(iterations=loop.AFTER_CHANGE))
+    assert found.minimum.converged
+    assert not asked
+    invert(voxels, twins.settings(0.5), progress=twins.silent)
+    assert asked
+
+
 def test_a_prior_that_was_held_too_early_is_learned_once_more(twins, voxels, monkeypatch):
     """Held while it pulled the coefficient to nothing: at the estimate that it leads to it says something else."""
     learning, times_held = loop._learning, []
@@ -246,7 +256,7 @@ def test_what_an_approximation_misses_is_told_by_how_far_it_sets_the_moduli_off(
     pull = np.zeros(len(here.unknowns))
     for line, exact in zip(here.evaluation.lines, full.lines, strict=True):
         change = exact.residuals.values - line.residuals.values
-        pull[line.columns] += line.jacobian.pulled(line.precision * line.weights * change)
+        pull[line.columns] += line.jacobian.transposed_times(line.precision * line.weights * change)
     true = np.abs(here.evaluation.covariance_columns(2).T @ pull)
     assert error > 1e-3
     assert true.max() > 1e-3

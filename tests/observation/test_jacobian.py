@@ -25,7 +25,7 @@ def test_it_is_the_product_of_its_factors(whole, rng):
     assert jacobian.shape == dense.shape
     assert jacobian.dense == pytest.approx(dense)
     assert jacobian.times(x) == pytest.approx(dense @ x)
-    assert jacobian.pulled(y) == pytest.approx(dense.T @ y)
+    assert jacobian.transposed_times(y) == pytest.approx(dense.T @ y)
     assert jacobian.gram(weights) == pytest.approx(dense.T @ (weights[:, None] * dense))
     assert jacobian.summed(sums) == pytest.approx(sums @ dense)
     some = np.array([0, 3, 8])

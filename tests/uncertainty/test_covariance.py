@@ -160,11 +160,11 @@ def test_the_noise_of_errors_is_sought_by_what_the_fit_leaves_of_them(smooth, rn
         errors = rng.standard_normal(2 * len(places))
         halves = np.split(errors, 2)
         score = sum(
-            line.jacobian.pulled(line.precision * line.weights * error)
+            line.jacobian.transposed_times(line.precision * line.weights * error)
             for line, error in zip((driver, telling), halves, strict=True)
         )
         taken = telling.jacobian.times(np.linalg.solve(now.matrix, score))
-        moved = sum(gain.pulled(error) for gain, error in zip(response.gains, halves, strict=True))
+        moved = sum(gain.transposed_times(error) for gain, error in zip(response.gains, halves, strict=True))
         assert response.jacobians[0].times(moved) == pytest.approx(taken), state
 
 

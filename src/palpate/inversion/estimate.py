@@ -15,10 +15,10 @@ from palpate.inversion.informed_subspace import informed_problem
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import Evaluation, Objective
 from palpate.inversion.optimise import (
+    TO_THE_NOISE,
     Iterate,
     Minimum,
     Outcome,
-    ShareOfValue,
     fit_coefficients,
     gauss_newton,
     same_minimum,
@@ -42,7 +42,6 @@ from palpate.progress import Progress, during
 __all__ = ["Candidate", "Inversion", "StartRun", "continue_at_finite_strain", "invert"]
 
 OTHER = 1e-2  # decrement of minima that are compared: a fiftieth of what makes one lower
-TO_THE_NOISE = ShareOfValue(0.1)  # what is left of it is the noise, to so much of its variance
 LOWER = 0.5  # in units of log-likelihood: a minimum that is lower by less is as good
 REPORTED = StopRule()
 FIRST_GUESS = StopRule(

@@ -110,8 +110,7 @@ def undecided_covariance(
                 continue
             places = parameters.columns(i)
             beliefs = _beliefs(block, places, data, prior, pull + prior @ centre)
-            level = -np.linalg.slogdet(prior[np.ix_(places, places)])[1]
-            chosen = min(range(len(beliefs)), key=lambda k: abs(float(np.linalg.slogdet(beliefs[k][1])[1]) - level))
+            chosen = _present(beliefs, prior[np.ix_(places, places)])
             evidences = np.array([evidence for evidence, _ in beliefs])
             shares = np.exp(evidences - evidences.max())
             shares /= shares.sum()
@@ -197,11 +196,15 @@ def _most_evident(
 def _likeliest(
     beliefs: Sequence[tuple[float, NDArray[np.float64]]], present: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The covariance with the most evidence, but the one like the `present` precision unless that is clearly less."""
-    level = -np.linalg.slogdet(present)[1]
-    now = min(beliefs, key=lambda belief: abs(float(np.linalg.slogdet(belief[1])[1]) - level))
-    best = max(beliefs, key=lambda belief: belief[0])
+    """The covariance with the most evidence, but that of the `present` precision unless its is clearly less."""
+    now, best = beliefs[_present(beliefs, present)], max(beliefs, key=lambda belief: belief[0])
     return best[1] if best[0] > now[0] + ALIKE else now[1]
+
+
+def _present(beliefs: Sequence[tuple[float, NDArray[np.float64]]], precision: NDArray[np.float64]) -> int:
+    """Number of the alternative that a precision (n, n) is of: the one whose covariance is as large."""
+    level = -np.linalg.slogdet(precision)[1]
+    return min(range(len(beliefs)), key=lambda k: abs(float(np.linalg.slogdet(beliefs[k][1])[1]) - level))
 
 
 def _widest(

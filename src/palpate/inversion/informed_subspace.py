@@ -16,7 +16,7 @@ from scipy import linalg
 from palpate.inversion.blocks import Acts, Block
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import Objective
-from palpate.inversion.optimise import Bounds, ShareOfValue, fit_coefficients
+from palpate.inversion.optimise import TO_THE_NOISE, Bounds, fit_coefficients
 from palpate.inversion.reduced_basis import SNAPSHOT, ReducedBasis, basis_of
 from palpate.inversion.reweighting import with_first_noise
 from palpate.mechanics.first_order import FirstOrderModel
@@ -28,7 +28,6 @@ __all__ = ["InformedProblem", "informed_problem"]
 
 LEFT_OUT = 1.0  # variances of the first noise, a tenth of the found one, that what a block leaves out may explain
 SMALL = 12  # unknowns of a block, which are kept
-TO_THE_NOISE = ShareOfValue(0.1)  # as where starts begin
 
 
 @dataclass(frozen=True, slots=True)

@@ -266,7 +266,7 @@ class LinearisedObjective:
             values = known.residuals.values + known.jacobian.times(step[known.columns])
             residuals = replace(known.residuals, values=values)
             weights = residuals.weights * observation.weighting.loss.weight(values)
-            gradient = known.jacobian.pulled(observation.weighting.precision * weights * values)
+            gradient = known.jacobian.transposed_times(observation.weighting.precision * weights * values)
             return replace(known, observation=observation, residuals=residuals, weights=weights, gradient=gradient)
 
         lines = mapped(line, zip(self.objective.observations, self.evaluation.lines, strict=True))
@@ -288,7 +288,7 @@ def deciding_directions(evaluation: Evaluation, n_parameters: int) -> NDArray[np
 def _normal_equations(line: Linearisation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """J^T W r (n_columns,) and J^T W J (n_columns, n_columns) of one observation."""
     weights = line.precision * line.weights
-    return line.jacobian.pulled(weights * line.residuals.values), line.jacobian.gram(weights)
+    return line.jacobian.transposed_times(weights * line.residuals.values), line.jacobian.gram(weights)
 
 
 def _misfit(observation: Observation, residuals: Residuals) -> float:

@@ -14,6 +14,7 @@ from scipy import optimize
 from palpate.inversion.objective import Evaluation, Objective, determined
 
 __all__ = [
+    "TO_THE_NOISE",
     "Bounds",
     "Iterate",
     "Minimum",
@@ -120,6 +121,9 @@ class ShareOfValue:
     """A tolerance of the decrement that grows with the objective: its residuals are then as large as they will be."""
 
     share: float
+
+
+TO_THE_NOISE = ShareOfValue(0.1)  # what is left of it is the noise, to so much of its variance
 
 
 @dataclass(frozen=True, slots=True)

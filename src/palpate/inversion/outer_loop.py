@@ -152,9 +152,9 @@ def run_outer_loop(
 
     Of the approximations of `start` see `updated`. What is believed of the blocks is held from where the estimate is
     near, and learned once more, then of those that are learned last, too, where, learned at the estimate, it would not
-    leave that where it is. `title` begins each
-    line of `progress`. The minimum's history is that of the loop alone, its evaluations are added to those of `start`.
-    Raises `NotConverged` when the full model has no equilibrium where every part of a step leads.
+    leave that where it is. `title` begins each line of `progress`. The minimum's history is that of the loop alone, its
+    evaluations are added to those of `start`. Raises `NotConverged` when the full model has no equilibrium where every
+    part of a step leads.
     """
     at, theta = start.minimum.evaluation, start.minimum.unknowns[: start.objective.n_parameters]
     first = Iterate(theta, at.value, at.misfit_mm2, newton_decrement(at))
@@ -471,6 +471,6 @@ def _model_error(objective: Objective, minimum: Minimum) -> tuple[float, NDArray
     for line in minimum.evaluation.lines:
         du = errors[line.state].missing[line.observation.dofs]
         missing = np.asarray(line.residuals.smooth_jacobian @ du)
-        pull[line.columns] += line.jacobian.pulled(line.precision * line.weights * missing)
+        pull[line.columns] += line.jacobian.transposed_times(line.precision * line.weights * missing)
     off = np.abs(minimum.evaluation.covariance_columns(objective.n_parameters).T @ pull)
     return largest, np.asarray(off), cost

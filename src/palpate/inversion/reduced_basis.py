@@ -34,7 +34,7 @@ class ReducedBasis:
     """A linear model projected on m displacements (n_free, m); implements `Approximation`.
 
     system: the last factorised one; counts: what it cost; place: where it was last made exact, None: nowhere yet;
-    material_at (n_regions,) kPa: where all responses to the material modes were made.
+    material_at (n_regions,) kPa: where all responses to the material modes were made, (0,) where none were yet.
     """
 
     projection: Projection
@@ -82,8 +82,9 @@ class ReducedBasis:
         """
         model, near, sharper = self.full_model, self.system, self
         direct = isinstance(near.factorisation, CheckedFactorisation) and SOLVERS[near.factorisation.solver].direct
-        ratios = at.moduli / near.moduli
-        if not direct or ratios.max() >= FAR * ratios.min():  # solutions that iterate themselves help none
+        ratios, stale = at.moduli / near.moduli, at.directions is not None and self._stale(at.moduli)
+        # solutions that iterate themselves help none; many right-hand sides are worth a factorisation of their own
+        if stale or not direct or ratios.max() >= FAR * ratios.min():
             near = model.system(at.moduli)
             sharper = replace(self, system=near, counts=self.counts + SolveCounts(factorisations=1))
         matrix = weighted_sum(at.moduli, model.free_stiffness)
@@ -96,7 +97,10 @@ class ReducedBasis:
 
         new, directions = int(not at.same_as(self.place)), at.directions  # whether the displacement is sought, too
         if directions is not None:
-            sharper = _with_sharper_material(sharper, at, displacement, solved)
+            if stale:
+                sharper = _with_material_anew(sharper, displacement)
+            else:
+                sharper = _with_sharper_material(sharper, at, displacement, solved)
             directions = directions[: model.n_regions + model.constraint.n_modes]
         loads = -model.residual(at.moduli, displacement[:, None])[:, :new]
         if directions is not None:
@@ -126,6 +130,12 @@ class ReducedBasis:
     def with_material(self, responses: NDArray[np.float64]) -> ReducedBasis:
         """With the responses (n_dof, n_material) mm to the material modes at the factorised moduli."""
         return replace(self, projection=self.projection.with_material(responses), material_at=self.system.moduli)
+
+    def _stale(self, moduli: NDArray[np.float64]) -> bool:
+        """Whether responses to the material modes are not there yet, or of far from moduli (n_regions,) kPa."""
+        if not self.full_model.material.n_modes:
+            return False
+        return not len(self.material_at) or bool(np.abs(np.log(moduli / self.material_at)).max() > STALE)
 
     def _homogeneous(self, at: Place) -> NDArray[np.float64]:
         """The displacement (n_dof,) mm at a place as it would be of homogeneous tissues."""
@@ -180,6 +190,13 @@ def basis_of(system: LinearSystem, responses: NDArray[np.float64], counts: Solve
     return ReducedBasis(projection(system.model, snapshots), system, counts)
 
 
+def _with_material_anew(basis: ReducedBasis, displacement: NDArray[np.float64]) -> ReducedBasis:
+    """All responses to the material modes at the factorised moduli and a displacement (n_dof,) mm there."""
+    responses = basis.system.material_responses(displacement, tolerance=TANGENT)
+    counts = basis.counts + SolveCounts(tangent=basis.full_model.material.n_modes)
+    return replace(basis, counts=counts).with_material(responses)
+
+
 def _with_sharper_material(
     basis: ReducedBasis,
     at: Place,
@@ -193,15 +210,10 @@ def _with_sharper_material(
     model, first = basis.full_model, basis.full_model.n_regions + basis.constraint.n_modes
     if not model.material.n_modes or at.directions is None or at.metric is None:
         return basis
-    if np.abs(np.log(at.moduli / basis.material_at)).max() > STALE:
-        system = model.system(at.moduli)
-        responses = system.material_responses(displacement, tolerance=TANGENT)
-        cost = basis.counts + SolveCounts(tangent=model.material.n_modes, factorisations=1)
-        return replace(basis, system=system, counts=cost).with_material(responses)
     along, metric = at.directions[first:], at.metric[first:, first:]
     along = along[:, np.linalg.norm(along, axis=0) > 0.0]
     free, before = model.constraint.free, basis.model.output_material
-    loads = -np.asarray(free.T @ (model.material_forces(at.moduli, displacement) @ along))
+    loads = -np.asarray(free.T @ model.material_forces(at.moduli, displacement, along))
     known = np.asarray(free.T @ (before @ along))
     lacking = loads - weighted_sum(at.moduli, model.free_stiffness) @ known
     change = np.asarray(free @ solved(lacking, TANGENT))

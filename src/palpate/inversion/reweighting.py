@@ -83,5 +83,7 @@ def _beyond_modes(line: Linearisation, n_parameters: int) -> NDArray[np.float64]
     values, by_modes = line.residuals.values, line.jacobian.of_columns(np.arange(n_parameters, line.jacobian.shape[1]))
     matrix = by_modes.gram(line.weights)
     ridge = RIDGE * max(float(np.trace(matrix)) / max(len(matrix), 1), np.finfo(float).tiny)
-    step = np.asarray(np.linalg.solve(matrix + ridge * np.eye(len(matrix)), by_modes.pulled(line.weights * values)))
+    step = np.asarray(
+        np.linalg.solve(matrix + ridge * np.eye(len(matrix)), by_modes.transposed_times(line.weights * values))
+    )
     return np.asarray(values - by_modes.times(step))

@@ -7,7 +7,6 @@ the largest things there are, and their products the longest part of an evaluati
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from scipy import sparse
 __all__ = ["Jacobian", "jacobian_of"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Jacobian:
     """J = S T (n, n_columns) of one observation, mm per unit of each unknown.
 
@@ -36,21 +35,16 @@ class Jacobian:
         """J x (n,) or (n, k) for x (n_columns,) or (n_columns, k)."""
         return np.asarray(self.by_displacement @ (self.tangent @ values))
 
-    def pulled(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def transposed_times(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """J^T y (n_columns,) or (n_columns, k) for y (n,) or (n, k)."""
         return np.asarray(self.tangent.T @ (self.by_displacement.T @ values))
 
     def gram(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
         """J^T W J (n_columns, n_columns) for W = diag(weights (n,)), none negative."""
-        middle = self.gram_by_displacement(weights)
-        return np.asarray(self.tangent.T @ (middle @ self.tangent))
-
-    def gram_by_displacement(self, weights: NDArray[np.float64]) -> sparse.csr_matrix[np.float64]:
-        """S^T W S (n_dofs + 1, n_dofs + 1) for W = diag(weights (n,)), none negative."""
         matrix = self.by_displacement
         scaled = np.repeat(np.sqrt(weights), np.diff(matrix.indptr)) * matrix.data
         root = sparse.csr_matrix((scaled, matrix.indices, matrix.indptr), shape=matrix.shape)
-        return sparse.csr_matrix(root.T @ root)
+        return np.asarray(self.tangent.T @ (sparse.csr_matrix(root.T @ root) @ self.tangent))
 
     def summed(self, rows: sparse.csr_matrix[np.float64]) -> NDArray[np.float64]:
         """A J (m, n_columns) for sparse sums A (m, n) of residuals."""
@@ -75,7 +69,7 @@ class Jacobian:
         whole[:-1, : tangent.shape[1]] = tangent
         return replace(self, tangent=whole)
 
-    @cached_property
+    @property
     def dense(self) -> NDArray[np.float64]:
         """J (n, n_columns) itself."""
         return self.times(np.eye(self.tangent.shape[1]))

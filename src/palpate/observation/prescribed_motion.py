@@ -106,26 +106,27 @@ def prescribed_motion(
                     **own,
                 )
             )
-        every = np.concatenate([local, finer], axis=1)
-        block = np.zeros((n, 3, every.shape[1]))
-        block[points] = every.reshape(len(points), 3, every.shape[1])
-        blocks.append(block.reshape(3 * n, -1))
+        blocks.append(_among(points, n, np.concatenate([local, finer], axis=1)))
         prescribed[points] = True
     covariances, n_rigid = tuple[NDArray[np.float64], ...](), 0
     if frame is not None:
         points = np.unique(space.facets(cut_faces(space.mesh)))
         points = points[~prescribed[points]]
         smooth, rigid, covariances = _frame_modes(space.points[points], frame)
-        for local in (smooth, rigid):
-            block = np.zeros((n, 3, local.shape[1]))
-            block[points] = local.reshape(len(points), 3, local.shape[1])
-            blocks.append(block.reshape(3 * n, -1))
+        blocks.append(_among(points, n, np.concatenate([smooth, rigid], axis=1)))
         n_rigid = rigid.shape[1]
         prescribed[points] = True
     modes = np.concatenate(blocks, axis=1) if blocks else np.zeros((3 * n, 0))
     return PrescribedMotion(
         modes, offset.ravel(), prescribed, tuple(walls), covariances, n_rigid, frame.motion_mm if frame else 1.0
     )
+
+
+def _among(points: NDArray[np.int64], n: int, local: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Modes (3 n, k) mm of all n points, of which `points` (n_points,) move by local modes (3 n_points, k) mm."""
+    modes = np.zeros((n, 3, local.shape[1]))
+    modes[points] = local.reshape(len(points), 3, local.shape[1])
+    return modes.reshape(3 * n, -1)
 
 
 def _frame_modes(

@@ -136,7 +136,7 @@ def frozen_posterior(
             moved = np.concatenate([np.pad(answer[rows], ((0, 1), (0, 0))), of_offsets], axis=1)
             by_z = replace(line.jacobian, tangent=moved)
             weights, rest = line.precision * line.weights, line.residuals.values - by_z.times(z[:-1])
-            side = by_z.pulled(weights * rest)[:, None]
+            side = by_z.transposed_times(weights * rest)[:, None]
             corner = np.array([[float(weights @ rest**2)]])
             form += np.block([[by_z.gram(weights), side], [side.T, corner]])
         states.append(replace(bare, form=form))

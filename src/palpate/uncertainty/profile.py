@@ -59,7 +59,7 @@ class FixedCorrespondence:
                 moved = np.append(there.values[rows] - before, line.jacobian.tangent[-1, tangent.shape[1] :] @ offset)
                 values = line.residuals.values + line.jacobian.by_displacement @ moved
                 jacobian = line.jacobian.under(tangent[rows])
-                gradient = jacobian.pulled(line.precision * line.weights * values)
+                gradient = jacobian.transposed_times(line.precision * line.weights * values)
                 residuals = replace(line.residuals, values=values)
                 lines.append(replace(line, residuals=residuals, jacobian=jacobian, gradient=gradient))
         found = self.objective.assembled(unknowns, lines)
