@@ -22,12 +22,14 @@ import SimpleITK
 import palpate
 from dicom_files import PLANTED, TILTED, ct_slices, save_series
 from palpate.errors import ConfigurationError, InputDataError
+from palpate.export import abaqus, febio
 from palpate.export.fitted_model import fitted_model
 from palpate.export.groups import element_faces, face_groups, plain_names
 from palpate.images.alignment import RigidMotion
 from palpate.images.label_image import VoxelGrid
 from palpate.images.registration import Registration
 from palpate.mechanics.laws.contract import energy
+from palpate.mechanics.laws.registry import LAWS
 from palpate.mesh.space import lagrange_space
 from palpate.mesh.surface import triangle_normals
 from palpate.mesh.tet_mesh import FACES
@@ -462,6 +464,41 @@ def test_febio_and_sofa_have_our_energies(case_result, tmp_path):
     np.testing.assert_allclose(
         theirs, energy(case_result.case.mechanics.material_law, F, mu=shear, lame=lame), rtol=1e-9
     )
+
+
+def test_each_later_image_bears_its_own_loads(model, tmp_path):
+    """A weight in the first later image alone: FEBio's curve goes back to 0, and Abaqus' next step begins anew."""
+    weight = CaseLoad("gravity", acceleration_m_s2=(0.0, -9.81, 0.0))
+    pressed = CaseLoad("pressure", surface="outer", pressure_kpa=2.0)
+    linear = model.bodies[0].with_linear_tetrahedra()
+    body = dataclasses.replace(linear, displacements=2 * linear.displacements, loads=((weight, pressed), (pressed,)))
+    febio.write(model, body, tmp_path, None)
+    root = ET.parse(tmp_path / "palpate.feb").getroot()
+    curves = {c.get("id"): [pt.text for pt in c.find("points")] for c in root.find("LoadData")}
+    of_load = [[node.get("lc") for node in load.iter() if node.get("lc")] for load in root.find("Loads")]
+    assert [curves[of[0]] for of in of_load] == [["0,0", "1,1", "2,0"], ["0,0", "1,1", "2,1"]]
+    abaqus.write(model, body, tmp_path, None)
+    first, second = (tmp_path / "palpate.inp").read_text().split("*STEP")[1:]
+    assert "*CLOAD\n" in first
+    assert "*DLOAD\n" in first
+    assert "*CLOAD, OP=NEW\n*DLOAD, OP=NEW\n*DLOAD, OP=NEW\n" in second
+
+
+@pytest.mark.parametrize("name", ["abaqus", "febio", "sofa"])
+def test_a_law_that_a_format_has_not_is_refused(case_result, tmp_path, monkeypatch, name):
+    """Another program would else compute with a neo-Hookean solid, and nobody would know."""
+
+    class Plain:
+        """No relative of a law that the formats have."""
+
+        name = "plain"
+        parameters = ()
+        finite = True
+
+    monkeypatch.setitem(LAWS, "plain", Plain())
+    result = with_mechanics(case_result, "plain")
+    with pytest.raises(ConfigurationError, match="'plain' is none that this format"):
+        palpate.export(result, tmp_path, format=name, linear=True)
 
 
 def test_the_linear_law_is_a_linear_step(case_result, tmp_path):

@@ -13,11 +13,12 @@ import pytest
 import palpate.inversion
 from palpate.inversion import Approximation, ExactApproximation, Place, ReducedBasis, exact_approximation, reduced_basis
 from palpate.inversion.expansion import Expansion, coarse_equilibrium, expansion_around
+from palpate.mechanics.conditions import Conditions
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_model
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.laws.registry import law_named
-from palpate.mechanics.linear_model import LinearModel, with_constraint
+from palpate.mechanics.linear_model import LinearModel
 from palpate.mechanics.solvers.registry import CheckedFactorisation
 
 MEMBERS = [name for name in vars(Approximation) if not name.startswith("_")]
@@ -47,7 +48,8 @@ class Body:
         return model.solve(at.moduli, at.coefficients)
 
     def under(self, constraint):
-        return Body(with_constraint(self.linear, constraint), self.finite.under(constraint), self.law)
+        conditions = Conditions(constraint)
+        return Body(self.linear.under(conditions), self.finite.under(conditions), self.law)
 
 
 def of_reduced_basis(body, at):

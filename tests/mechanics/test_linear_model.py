@@ -9,8 +9,9 @@ import pytest
 
 from palpate.errors import ConfigurationError
 from palpate.mechanics.boundary import outer_constraint
+from palpate.mechanics.conditions import Conditions
 from palpate.mechanics.forward import SolveCounts
-from palpate.mechanics.linear_model import linear_model, with_constraint
+from palpate.mechanics.linear_model import linear_model
 from palpate.mesh.space import lagrange_space
 
 MODULI = np.array([2.0, 12.0, 0.5])
@@ -146,7 +147,7 @@ def test_a_constraint_of_another_space_is_refused(model, meshes):
 
 def test_other_modes_of_the_same_points_need_no_new_assembly(model):
     constraint = replace(model.constraint, modes=model.constraint.modes[:, :2], offset=3.0 * model.constraint.offset)
-    quick, anew = with_constraint(model, constraint), linear_model(model.space, constraint)
+    quick, anew = model.under(Conditions(constraint)), linear_model(model.space, constraint)
     assert quick.stiffness is model.stiffness
     found, expected = (m.solve(MODULI, np.array([1.0, -2.0])).values for m in (quick, anew))
     assert np.allclose(found, expected, atol=1e-12 * abs(expected).max())
@@ -155,5 +156,5 @@ def test_other_modes_of_the_same_points_need_no_new_assembly(model):
 def test_a_constraint_that_frees_other_points_needs_a_new_assembly(model, meshes):
     points = np.unique(model.space.facets(model.space.mesh.boundary))
     given = meshes.prescribe(model.space, points, np.zeros((len(points), 3)))
-    with pytest.raises(ConfigurationError, match="frees other displacements"):
-        with_constraint(model, outer_constraint(model.space, outer="free", **given))
+    with pytest.raises(ConfigurationError, match="free other displacements"):
+        model.under(Conditions(outer_constraint(model.space, outer="free", **given)))

@@ -12,6 +12,7 @@ from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers import write_label_image
 from palpate.images.segmentation import first_labels
 from palpate.mechanics.deformation import largest_strains
+from palpate.study.case import CaseLoad
 from palpate.study.case_file import read_case
 from palpate.study.run import estimate, simulate
 
@@ -135,9 +136,27 @@ def test_twice_the_load_on_the_same_images_is_twice_the_modulus(case, result):
         assert twice.interval95 == pytest.approx(tuple(2.0 * end for end in once.interval95), rel=1e-3)
 
 
+def test_each_load_acts_in_the_state_that_it_is_stated_for(folder, case):
+    """The table tilted one way for the first later image, the other way for the second: the same moduli."""
+    tilts = [CaseLoad("gravity", state=1, acceleration_m_s2=(3.0, 0.0, 0.0))]
+    tilts += [CaseLoad("gravity", state=2, acceleration_m_s2=(0.0, -2.0, 0.0))]
+    other = replace(case, images=replace(case.images, after=()), loads=(replace(tilts[1], state=None),))
+    write_label_image(folder / "other.nii.gz", simulate(other, progress=lambda _: None).after)
+    both = replace(case, images=replace(case.images, after=(*case.images.after, folder / "other.nii.gz")), loads=())
+    found = estimate(replace(both, loads=tuple(tilts)))
+    for estimated, truth in zip(found.estimation.estimates, (16.0, 8.0), strict=True):
+        assert estimated.value == pytest.approx(truth, rel=0.15)
+    exchanged = tuple(replace(load, state=3 - load.state) for load in tilts)
+    wrong = estimate(replace(both, loads=exchanged))
+    organs = [[of for image in r.estimation.fits for of in image if of.tissue != "air"] for r in (wrong, found)]
+    worst, best = (max(of.end.rms_mm for of in fits) for fits in organs)
+    assert worst > 5.0 * best
+
+
 @pytest.mark.parametrize(
     ("override", "words"),
     [
+        ("loads=[{kind='gravity', state=2, acceleration_m_s2=[0,0,-9.81]}]", "has 1 later state"),
         ("loads=[{kind='pressure', surface='air'}]", "needs the key 'pressure_kpa'"),
         ("loads=[{kind='gravity', surface='air', acceleration_m_s2=[0,0,-9.81]}]", "a gravity has no 'surface'"),
         ("loads=[{kind='push'}]", "did you mean"),

@@ -23,6 +23,7 @@ label = 1
 role = "estimate"
 """
 NEEDED = {
+    "state": 'loads=[{kind="gravity", state=VALUE, acceleration_m_s2=[0.0, 0.0, 1.0]}]',
     "pressure_kpa": 'loads=[{kind="pressure", surface="outer", pressure_kpa=VALUE}]',
     "traction_kpa": 'loads=[{kind="traction", surface="outer", traction_kpa=[VALUE, 0.0, 0.0]}]',
     "acceleration_m_s2": 'loads=[{kind="gravity", acceleration_m_s2=[VALUE, 0.0, 0.0]}]',

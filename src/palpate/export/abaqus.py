@@ -7,6 +7,7 @@ not: C10, C01 and D1 = 2 / K give the same moduli at small strain, mu and K, and
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,10 @@ from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.formats import Options
 from palpate.export.groups import element_faces, face_groups, plain_names, tissue_groups
 from palpate.export.text_lines import rows, wrapped
+from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
-from palpate.mechanics.loads import FollowingPressure
+from palpate.mechanics.laws.neo_hookean import NeoHookean
+from palpate.mechanics.loads import FollowingPressure, Load
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.case_loads import loads_on
 from palpate.study.outputs import write_text
@@ -25,6 +28,7 @@ from palpate.study.outputs import write_text
 __all__ = ["write"]
 
 FACE = np.array([3, 4, 2, 1])  # Abaqus' number of each row of FACES
+LAWS = (Linear, NeoHookean, MooneyRivlin)  # that it has
 INCREMENT = 0.2  # of a step at finite strain, at first
 
 
@@ -65,8 +69,8 @@ def _text(model: FittedModel, body: FittedBody, space: LagrangeSpace, element: s
 
 def _material(model: FittedModel, number: int) -> str:
     """The law of a tissue (index) with its constants in kPa, D1 in 1/kPa."""
-    modulus, ratio, law = float(model.moduli[number]), model.tissues[number].poisson_ratio, model.material_law
-    if not law.finite:
+    modulus, ratio, law = float(model.moduli[number]), model.tissues[number].poisson_ratio, model.law_among(*LAWS)
+    if isinstance(law, Linear):
         return f"*ELASTIC\n{modulus:.12g}, {ratio:.12g}\n"
     shear, compliance = modulus / (2.0 * (1.0 + ratio)), 6.0 * (1.0 - 2.0 * ratio) / modulus
     if isinstance(law, MooneyRivlin):
@@ -93,21 +97,23 @@ def _steps(model: FittedModel, body: FittedBody, space: LagrangeSpace) -> list[s
             parts += [rows("%d, %d, %d, %.12g", held.whole + 1, along, along, displacement[held.whole, axis])]
             still = held.sliding[held.held[:, axis]] + 1
             parts += [rows("%d, %d, %d", still, np.full(len(still), axis + 1), np.full(len(still), axis + 1))]
-        parts += _loads(model, body, space)
+        if any(body.loads[: number - 1]):  # what acted in the step before does not stay
+            parts += ["*CLOAD, OP=NEW\n*DLOAD, OP=NEW\n"]
+        parts += _loads(loads_on(space, body.loads[number - 1], densities=model.densities), body, space, number)
         parts += ["*NODE PRINT, NSET=ALL_NODES\nU\n*NODE FILE\nU\n*END STEP\n"]
     return parts
 
 
-def _loads(model: FittedModel, body: FittedBody, space: LagrangeSpace) -> list[str]:
+def _loads(loads: Sequence[Load], body: FittedBody, space: LagrangeSpace, step: int) -> list[str]:
     """A pressure that follows its surface on the elements' faces; other loads as their forces on the nodes, mN."""
-    parts = []
-    for load in loads_on(space, model.loads, densities=model.densities):
+    parts, new = [], ", OP=NEW" if step > 1 else ""
+    for load in loads:
         if isinstance(load, FollowingPressure):
             cells, faces = element_faces(body.mesh, load.faces[:, :3])
             pressures = np.full(len(cells), load.kilopascal)
-            parts += ["*DLOAD\n", rows("%d, P%d, %.12g", cells + 1, FACE[faces], pressures)]
+            parts += [f"*DLOAD{new}\n", rows("%d, P%d, %.12g", cells + 1, FACE[faces], pressures)]
         else:
             forces = load.forces(np.zeros_like(space.points)).reshape(-1, 3)
             points, axes = np.nonzero(forces)
-            parts += ["*CLOAD\n", rows("%d, %d, %.12g", points + 1, axes + 1, forces[points, axes])]
+            parts += [f"*CLOAD{new}\n", rows("%d, %d, %.12g", points + 1, axes + 1, forces[points, axes])]
     return parts

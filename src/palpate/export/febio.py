@@ -19,7 +19,9 @@ from palpate.export.conditions import Prescribed, prescribed
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.formats import Options
 from palpate.export.groups import face_groups, tissue_groups
+from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
+from palpate.mechanics.laws.neo_hookean import NeoHookean
 from palpate.mechanics.loads import FollowingPressure, Load
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.case_loads import loads_on
@@ -29,6 +31,7 @@ __all__ = ["write"]
 
 Element = ET.Element
 AXES = "xyz"
+LAWS = (Linear, NeoHookean, MooneyRivlin)  # that it has
 STEPS = 10  # of the time a later image takes, at first
 
 
@@ -42,7 +45,8 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
             'with outer_boundary = "sliding" the cut of the image slides along the image\'s own axes, which lie askew'
             " to the world's; FEBio holds nodes along these only: export to abaqus, or estimate with another boundary"
         )
-    loads = loads_on(space, model.loads, densities=model.densities)
+    acting = list(dict.fromkeys(load for of_image in body.loads for load in of_image))
+    loads = loads_on(space, acting, densities=model.densities)
     root = Element("febio_spec", version="4.0")
     root.append(ET.Comment(f" fitted by Palpate; {model.units}; stresses in kPa, forces in mN "))
     _add(root, "Module", type="solid")
@@ -56,7 +60,7 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
     data = _add(root, "MeshData")
     curves = _add(root, "LoadData")
     if loads:
-        _loads(data, _add(root, "Loads"), loads, len(space.points))
+        _loads(data, _add(root, "Loads"), loads, len(space.points), first_curve=len(body.displacements) + 1)
     steps = _add(root, "Step")
     for number in range(1, len(body.displacements) + 1):
         step = _add(steps, "step", id=number, name=f"later image {number}")
@@ -68,7 +72,10 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
             _add(stepper, name, limit)
         _add(control, "solver", type="solid")
         _boundary(step, data, body, held, number)
-        _curve(curves, number)
+        _curve(curves, number, ((number - 1, 0), (number, 1)))
+    for number, load in enumerate(acting, start=len(body.displacements) + 1):
+        shares = [int(load in of_image) for of_image in body.loads]
+        _curve(curves, number, tuple(enumerate([0, *shares])))
     output = _add(_add(root, "Output"), "plotfile", type="febio")
     for name in ("displacement", "stress"):
         _add(output, "var", type=name)
@@ -85,7 +92,11 @@ def _add(parent: Element, tag: str, text: object = None, **attributes: object) -
 def _material(parent: Element, model: FittedModel, name: str, number: int) -> None:
     """A tissue's law with its constants in kPa."""
     index = [tissue.name for tissue in model.tissues].index(name)
-    modulus, ratio, law = float(model.moduli[index]), model.tissues[index].poisson_ratio, model.material_law
+    modulus, ratio, law = (
+        float(model.moduli[index]),
+        model.tissues[index].poisson_ratio,
+        model.law_among(Linear, NeoHookean, MooneyRivlin),
+    )
     constants = {"E": modulus, "v": ratio}
     kind = "neo-Hookean" if law.finite else "isotropic elastic"
     if isinstance(law, MooneyRivlin):
@@ -159,10 +170,10 @@ def _boundary(step: Element, data: Element, body: FittedBody, held: Prescribed, 
             _add(condition, f"{AXES[other]}_dof", int(other == axis))
 
 
-def _loads(data: Element, parent: Element, loads: tuple[Load, ...], n_points: int) -> None:
-    """Pressures on surfaces as they move; other loads as their forces on the nodes, mN. All grow in the first step."""
+def _loads(data: Element, parent: Element, loads: tuple[Load, ...], n_points: int, *, first_curve: int) -> None:
+    """Pressures on surfaces as they move; other loads as their forces on the nodes, mN; each by a curve of its own."""
     for number, load in enumerate(loads, start=1):
-        name, curve = f"load {number}", 1
+        name, curve = f"load {number}", first_curve + number - 1
         if isinstance(load, FollowingPressure):
             pressure = _add(parent, "surface_load", name=name, type="pressure", surface=name)
             _add(pressure, "pressure", f"{load.kilopascal:.12g}", lc=curve)
@@ -175,11 +186,11 @@ def _loads(data: Element, parent: Element, loads: tuple[Load, ...], n_points: in
         _add(nodal, "value", name, lc=curve, type="map")
 
 
-def _curve(parent: Element, number: int) -> None:
-    """From 0 to 1 in the time of step `number`."""
+def _curve(parent: Element, number: int, course: tuple[tuple[int, int], ...]) -> None:
+    """A curve through pairs of time (a later image takes one unit) and share, straight between them."""
     controller = _add(parent, "load_controller", id=number, type="loadcurve")
     _add(controller, "interpolate", "LINEAR")
     _add(controller, "extend", "CONSTANT")
     points = _add(controller, "points")
-    for time, value in ((number - 1, 0), (number, 1)):
+    for time, value in course:
         _add(points, "pt", f"{time},{value}")

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.errors import EstimationError
+from palpate.errors import ConfigurationError, EstimationError
 from palpate.images.label_image import VoxelGrid
 from palpate.images.tissue import Tissue
 from palpate.mechanics.laws.contract import Law
@@ -29,7 +30,8 @@ class FittedBody:
 
     order: 1 or 2, of the displacements (n_points, 3) mm on the points of `space`, one a later image; alignments: one
     (4, 4) a later image, which takes points from the world of the first image, RAS mm, to where the later one has them;
-    index (n_x, n_y, n_z): the tissue of each voxel of the first image, on `grid`.
+    index (n_x, n_y, n_z): the tissue of each voxel of the first image, on `grid`; loads: the known ones in each later
+    image.
     """
 
     mesh: TetMesh
@@ -38,6 +40,7 @@ class FittedBody:
     alignments: tuple[NDArray[np.float64], ...]
     index: NDArray[np.int16]
     grid: VoxelGrid
+    loads: tuple[tuple[CaseLoad, ...], ...]
 
     @property
     def tissues(self) -> tuple[Tissue, ...]:
@@ -60,7 +63,7 @@ class FittedModel:
     """All bodies of a case with the moduli that they share.
 
     moduli (n_tissues,) in `unit`, "kPa" or "ratio" to `relative_to`; NaN of hollow tissues; covariance (n, n) of the
-    natural logarithms of the `estimates`; law_parameters, element, outer_boundary, loads, densities (n_tissues,), in
+    natural logarithms of the `estimates`; law_parameters, element, outer_boundary, densities (n_tissues,), in
     kg/m^3: as the case has them; seal: SHA-256 of the numbers of the result.json beside it; samples: chains of the
     moduli's posterior, where the case asked for them.
     """
@@ -75,7 +78,6 @@ class FittedModel:
     law_parameters: Mapping[str, float]
     element: str
     outer_boundary: str
-    loads: tuple[CaseLoad, ...]
     densities: NDArray[np.float64]
     seal: str
     samples: ModulusSamples | None = None
@@ -84,6 +86,17 @@ class FittedModel:
     def material_law(self) -> Law:
         """The law with its parameters."""
         return law_from(self.law, self.law_parameters)
+
+    def law_among(self, *written: type[Law]) -> Law:
+        """The law, where it is one of those that a format can write; raises `ConfigurationError` for another."""
+        law = self.material_law
+        if not isinstance(law, written):
+            names = " and ".join(f"'{kind().name}'" for kind in written)
+            raise ConfigurationError(
+                f"the law '{self.law}' is none that this format is written for ({names}): another program would compute"
+                " with another material; export to vtu, whose fields are those of the estimate"
+            )
+        return law
 
     @property
     def tissues(self) -> tuple[Tissue, ...]:
@@ -105,9 +118,12 @@ def fitted_model(result: CaseResult, *, seal: str) -> FittedModel:
             f"the estimate ended with the status '{estimation.status}' ({estimation.reason}), so there is no model to"
             " export: nothing that did not converge is passed on"
         )
-    first = len(result.after)
-    bodies = [_body(result, estimation.displacements[:first])]
-    bodies += [_body(pair, pair.displacements) for pair in result.further]
+    pairs: list[tuple[CaseResult | PairResult, tuple[NDArray[np.float64], ...]]] = []
+    pairs += [(result, estimation.displacements[: len(result.after)])]
+    pairs += [(pair, pair.displacements) for pair in result.further]
+    numbers = np.cumsum([1, *(len(motions) for _, motions in pairs)]).tolist()
+    loads = [tuple(case.loads_in(n) for n in range(*ends)) for ends in pairwise(numbers)]
+    bodies = [_body(*pair, acting) for pair, acting in zip(pairs, loads, strict=True)]
     density = {tissue.name: tissue.density_kg_m3 for tissue in case.tissues}
     law = case.mechanics.material_law
     return FittedModel(
@@ -121,14 +137,17 @@ def fitted_model(result: CaseResult, *, seal: str) -> FittedModel:
         {parameter.name: getattr(law, parameter.name) for parameter in law.parameters},
         case.mechanics.element,
         case.domain.outer_boundary,
-        case.loads,
         np.array([density.get(tissue.name, 1000.0) for tissue in result.tissues]),
         seal,
         estimation.samples,
     )
 
 
-def _body(pair: CaseResult | PairResult, displacements: tuple[NDArray[np.float64], ...]) -> FittedBody:
+def _body(
+    pair: CaseResult | PairResult,
+    displacements: tuple[NDArray[np.float64], ...],
+    loads: tuple[tuple[CaseLoad, ...], ...],
+) -> FittedBody:
     mesh = pair.space.mesh
     nameless = tuple(replace(tissue, called=()) for tissue in mesh.tissues)  # the labels' own names are the image's
     alignments = tuple(found.motion.matrix for found in pair.alignments) or tuple(np.eye(4) for _ in displacements)
@@ -140,4 +159,5 @@ def _body(pair: CaseResult | PairResult, displacements: tuple[NDArray[np.float64
         alignments or (np.eye(4),),
         pair.before.index,
         pair.before.grid,
+        loads or ((),),
     )

@@ -16,7 +16,9 @@ from palpate.export.conditions import prescribed
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.formats import Options
 from palpate.export.groups import face_groups, plain_names, tissue_groups
+from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
+from palpate.mechanics.laws.neo_hookean import NeoHookean
 from palpate.study.outputs import write_bytes, write_json, write_text
 
 __all__ = ["write"]
@@ -116,7 +118,7 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
     del options
     linear = body.with_linear_tetrahedra()
     held = prescribed(linear, linear.space, outer=model.outer_boundary)
-    if model.loads or not held.along_world:
+    if any(body.loads) or not held.along_world:
         raise ConfigurationError(
             "the SOFA scene has neither known loads nor faces that slide askew to the world's axes; export to abaqus or"
             " febio"
@@ -150,7 +152,7 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
 def _tissue(model: FittedModel, number: int, plain: str) -> dict[str, object]:
     """A tissue's force field with its parameters, moduli in kPa."""
     tissue, modulus = model.tissues[number], float(model.moduli[number])
-    ratio, law = tissue.poisson_ratio, model.material_law
+    ratio, law = tissue.poisson_ratio, model.law_among(Linear, NeoHookean, MooneyRivlin)
     shear = modulus / (2.0 * (1.0 + ratio))
     lame, bulk = 2.0 * shear * ratio / (1.0 - 2.0 * ratio), modulus / (3.0 * (1.0 - 2.0 * ratio))
     parameters: dict[str, object] = {"materialName": "NeoHookean", "ParameterSet": f"{shear:.12g} {lame:.12g}"}

@@ -50,7 +50,8 @@ def fit_driver(
     for near, q in zip([expansion.equilibrium for expansion in first], amounts, strict=True):
         states, offset = list[NDArray[np.float64]](), near.model.constraint.offset
         for share in shares:  # each from the one before it
-            model = near.model.under(replace(near.model.constraint, offset=share * offset))
+            constraint = replace(near.model.constraint, offset=share * offset)
+            model = near.model.under(replace(near.model.conditions, constraint=constraint))
             start = states[-1] if states else share * near.displacement
             states.append(model.solve(near.moduli, share * q, start=start).displacement)
         found.append(tuple(states))

@@ -13,7 +13,7 @@ from palpate.inversion.approximation import Approximation
 from palpate.inversion.parameters import ParameterMap
 from palpate.mechanics.finite_strain import FiniteStrainModel
 from palpate.mechanics.forward import ForwardModel
-from palpate.mechanics.linear_model import LinearModel, with_constraint
+from palpate.mechanics.linear_model import LinearModel
 from palpate.observation.contract import Observation
 from palpate.observation.noise_model import NoiseModel
 
@@ -58,9 +58,9 @@ class LaterState:
         """The same state with models on combinations of boundary modes (n_boundary, k) and of fields (n_fields, l)."""
         constraint = replace(self.model.constraint, modes=self.model.constraint.modes @ boundary)
         material = self.model.material.combined(fields)
-        finite = None if self.finite_strain is None else self.finite_strain.under(constraint, material)
-        model = replace(with_constraint(self.model, constraint), material=material)
-        return replace(self, model=model, finite_strain=finite)
+        conditions = replace(self.model.conditions, constraint=constraint)
+        finite = self.finite_strain and replace(self.finite_strain.under(conditions), material=material)
+        return replace(self, model=replace(self.model.under(conditions), material=material), finite_strain=finite)
 
     def with_approximation(self, approximation: Approximation) -> LaterState:
         """The same state with another approximation of its model."""

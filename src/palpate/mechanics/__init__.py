@@ -1,6 +1,7 @@
 """Elastic equilibrium: stiffness, boundary conditions, linear solvers, forward models and their derivatives."""
 
 from palpate.mechanics.boundary import outer_constraint
+from palpate.mechanics.conditions import Conditions
 from palpate.mechanics.dilatation import ELEMENTS, Dilatation, ElementChoice, choose_element
 from palpate.mechanics.element import (
     barycentric_gradients,
@@ -14,7 +15,7 @@ from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_mod
 from palpate.mechanics.forward import ForwardModel
 from palpate.mechanics.laws.contract import Law, stress
 from palpate.mechanics.laws.registry import LAWS, law_named
-from palpate.mechanics.linear_model import LinearModel, LinearSystem, linear_model, weighted_sum, with_constraint
+from palpate.mechanics.linear_model import LinearModel, LinearSystem, linear_model, weighted_sum
 from palpate.mechanics.linearised import LinearisedSystem
 from palpate.mechanics.loads import DeadLoad, boundary_named, pressure, traction
 from palpate.mechanics.newton import NewtonSettings
@@ -28,6 +29,7 @@ __all__ = [
     "ELEMENTS",
     "LAWS",
     "SOLVERS",
+    "Conditions",
     "DeadLoad",
     "Dilatation",
     "ElementChoice",
@@ -59,5 +61,4 @@ __all__ = [
     "traction",
     "triangle_quadrature",
     "weighted_sum",
-    "with_constraint",
 ]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, NotConverged
 from palpate.mechanics.balance import TissueBalance
+from palpate.mechanics.conditions import Conditions
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.forward import SolveCounts, checked_coefficients, checked_moduli
 from palpate.mechanics.hyperelastic import Elements, Moduli, elements_of
@@ -41,7 +42,7 @@ REFINEMENTS = 12  # solutions with an old factorisation that an exact one takes
 
 @dataclass(frozen=True, slots=True)
 class FiniteStrainModel:
-    """All meshed tissues of a body under one law, one constraint and given loads; implements `ForwardModel`.
+    """All meshed tissues of a body under one law and the conditions of one state; implements `ForwardModel`.
 
     regions: indices in `space.mesh.tissues` of the meshed ones; element_region (n_tets,): place in `regions` of each
     tetrahedron; poisson_ratios (n_regions,), dimensionless; material: how the tissues may differ from homogeneous ones.
@@ -49,16 +50,20 @@ class FiniteStrainModel:
     """
 
     space: LagrangeSpace
-    constraint: Constraint
+    conditions: Conditions
     elements: Elements
     regions: tuple[int, ...]
     element_region: NDArray[np.int64]
     poisson_ratios: Array
-    loads: tuple[Load, ...]
     pattern: BlockPattern
     restriction: Restriction
     settings: NewtonSettings
     material: MaterialModes = HOMOGENEOUS
+
+    @property
+    def constraint(self) -> Constraint:
+        """What is prescribed."""
+        return self.conditions.constraint
 
     @property
     def n_regions(self) -> int:
@@ -129,7 +134,7 @@ class FiniteStrainModel:
             elements=self.elements,
             element_region=self.element_region,
             n_regions=self.n_regions,
-            loads=self.loads,
+            loads=self.conditions.loads,
             pattern=self.pattern,
             restriction=self.restriction,
             solver=self.settings.solver,
@@ -144,18 +149,13 @@ class FiniteStrainModel:
         """Derivatives of every element's Lame constants with respect to its nu, as `moduli_of`."""
         return self._spread(moduli, material, lame_parts_by_poisson)
 
-    def under(self, constraint: Constraint, material: MaterialModes | None = None) -> FiniteStrainModel:
-        """The same body with other modes and another offset of the same prescribed points, and other material modes.
+    def under(self, conditions: Conditions) -> FiniteStrainModel:
+        """The same body with other loads, modes and offset of the same prescribed points.
 
-        material: by default its own. Raises `ConfigurationError` when the constraint leaves other displacements free.
+        Raises `ConfigurationError` when the conditions leave other displacements free.
         """
-        free, other = self.constraint.free, constraint.free
-        if free is not other and (free.shape != other.shape or abs(free - other).max() > 0.0):
-            raise ConfigurationError(
-                f"the constraint frees other displacements ({other.shape[1]}) than the model ({free.shape[1]}):"
-                " make another model with `finite_strain_model`"
-            )
-        return replace(self, constraint=constraint, material=self.material if material is None else material)
+        conditions.require_same_free(self.constraint)
+        return replace(self, conditions=conditions)
 
     def to_tolerance(self, tolerance: float) -> FiniteStrainModel:
         """The same body, its equilibria found to another `tolerance` of the forces (see `NewtonSettings`)."""
@@ -380,23 +380,18 @@ def finite_strain_model(
     Raises `ConfigurationError` when the constraint is of another space, `GeometryError` for tetrahedra without positive
     volume.
     """
-    n_dof = 3 * len(space.points)
-    if constraint.free.shape[0] != n_dof or len(constraint.modes) != n_dof or len(constraint.offset) != n_dof:
-        raise ConfigurationError(
-            f"the constraint has {constraint.free.shape[0]} unknowns and the space {n_dof}: make both of the same space"
-        )
-    tissues = space.mesh.tissues
+    conditions, tissues = Conditions(constraint, loads), space.mesh.tissues
+    conditions.require_space(space)
     regions = tuple(number for number, tissue in enumerate(tissues) if tissue.meshed)
     pattern = block_pattern(space.cells, len(space.points))
     blocks = np.ones((space.cells.size * space.cells.shape[1], 9))
     return FiniteStrainModel(
         space=space,
-        constraint=constraint,
+        conditions=conditions,
         elements=elements_of(space, law, dilatation),
         regions=regions,
         element_region=np.searchsorted(regions, space.mesh.region),
         poisson_ratios=np.array([tissues[region].poisson_ratio for region in regions]),
-        loads=loads,
         pattern=pattern,
         restriction=restriction(constraint, pattern.assemble(blocks)),
         settings=settings or NewtonSettings(),

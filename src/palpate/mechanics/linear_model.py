@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from palpate.errors import ConfigurationError
 from palpate.mechanics.coarser import linear_displacements
+from palpate.mechanics.conditions import Conditions
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.forward import SolveCounts, checked_coefficients, checked_moduli
 from palpate.mechanics.hyperelastic import Elements, Moduli, elements_of
@@ -42,7 +42,6 @@ __all__ = [
     "linear_model",
     "poisson_tangents",
     "weighted_sum",
-    "with_constraint",
 ]
 
 LINEAR = Linear()
@@ -53,7 +52,7 @@ FURTHER = 10  # right-hand sides a modulus, beside one for each mode: sensitivit
 
 @dataclass(frozen=True, slots=True)
 class LinearModel:
-    """Assembled stiffness of every meshed tissue under one constraint.
+    """Assembled stiffness of every meshed tissue under the conditions of one state.
 
     regions: indices in `space.mesh.tissues` of the meshed ones, one for each of `stiffness_parts` where the Poisson's
     ratio is open (the moduli are then E times its `lame_parts`); per region at 1 kPa: stiffness K_r (n_dof, n_dof),
@@ -64,7 +63,7 @@ class LinearModel:
     """
 
     space: LagrangeSpace
-    constraint: Constraint
+    conditions: Conditions
     regions: tuple[int, ...]
     stiffness: tuple[sparse.csr_matrix[np.float64], ...]
     free_stiffness: tuple[sparse.csr_matrix[np.float64], ...]
@@ -74,6 +73,22 @@ class LinearModel:
     weights: tuple[tuple[float, float, float], ...]
     elements: Elements | None = None
     material: MaterialModes = HOMOGENEOUS
+
+    @property
+    def constraint(self) -> Constraint:
+        """What is prescribed."""
+        return self.conditions.constraint
+
+    def under(self, conditions: Conditions) -> LinearModel:
+        """The same body with other loads, modes and offset of the same prescribed points; nothing is assembled again.
+
+        Raises `ConfigurationError` when the conditions leave other displacements free than the model's own.
+        """
+        conditions.require_same_free(self.constraint)
+        constraint = conditions.constraint
+        given = sparse.csr_matrix(np.column_stack([constraint.modes, constraint.offset]))
+        coupling = tuple(sparse.csr_matrix(constraint.free.T @ (matrix @ given)) for matrix in self.stiffness)
+        return replace(self, conditions=conditions, coupling=coupling, load=conditions.forces(self.space))
 
     @property
     def free_load(self) -> NDArray[np.float64]:
@@ -374,12 +389,8 @@ def linear_model(
     ones. Raises `ConfigurationError` when the constraint is of another space, `GeometryError` for tetrahedra without
     positive volume.
     """
-    n_dof = 3 * len(space.points)
-    if constraint.free.shape[0] != n_dof or len(constraint.modes) != n_dof or len(constraint.offset) != n_dof:
-        raise ConfigurationError(
-            f"the constraint has {constraint.free.shape[0]} unknowns and the space {n_dof}: make both of the same space"
-        )
-    tissues = space.mesh.tissues
+    conditions, tissues = Conditions(constraint, loads), space.mesh.tissues
+    conditions.require_space(space)
 
     Assembled = tuple[int, tuple[float, float, float], sparse.csr_matrix[np.float64], sparse.csr_matrix[np.float64]]
 
@@ -398,29 +409,12 @@ def linear_model(
     meshed = [number for number, tissue in enumerate(tissues) if tissue.meshed]
     parts = [part for of_tissue in mapped(assembled, meshed) for part in of_tissue]
     regions, weights, stiffness, free_stiffness = zip(*parts, strict=True)
-    still = np.zeros_like(space.points)
-    load = sum((part.forces(still) for part in loads), np.zeros(n_dof))
     elements = elements_of(space, LINEAR, dilatation) if material.n_modes else None
+    load = np.zeros(3 * len(space.points))
     model = LinearModel(
-        space, constraint, regions, stiffness, free_stiffness, (), solver, load, weights, elements, material
+        space, conditions, regions, stiffness, free_stiffness, (), solver, load, weights, elements, material
     )
-    return with_constraint(model, constraint)
-
-
-def with_constraint(model: LinearModel, constraint: Constraint) -> LinearModel:
-    """The same body under other modes and another offset of the same prescribed points; nothing is assembled again.
-
-    Raises `ConfigurationError` when the constraint leaves other displacements free than the model's own.
-    """
-    free, other = model.constraint.free, constraint.free
-    if free is not other and (free.shape != other.shape or abs(free - other).max() > 0.0):
-        raise ConfigurationError(
-            f"the constraint frees other displacements ({other.shape[1]}) than the model ({free.shape[1]}):"
-            " assemble it with `linear_model`"
-        )
-    given = sparse.csr_matrix(np.column_stack([constraint.modes, constraint.offset]))
-    coupling = tuple(sparse.csr_matrix(constraint.free.T @ (matrix @ given)) for matrix in model.stiffness)
-    return replace(model, constraint=constraint, coupling=coupling)
+    return model.under(conditions)
 
 
 def weighted_sum(

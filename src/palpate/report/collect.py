@@ -176,9 +176,9 @@ def _settings(case: Case, mesh: MeshSummary | None = None) -> tuple[tuple[str, s
 
 def _load(load: CaseLoad) -> str:
     """A known load in words."""
-    where = f" on {load.surface}" if load.surface else ""
+    where = (f" on {load.surface}" if load.surface else "") + (f", in later state {load.state}" if load.state else "")
     if load.acceleration_m_s2 is not None:
-        return f"gravity {_vector(load.acceleration_m_s2)} m/s^2"
+        return f"gravity {_vector(load.acceleration_m_s2)} m/s^2{where}"
     if load.traction_kpa is not None:
         return f"traction {_vector(load.traction_kpa)} kPa{where}"
     kind = "following pressure" if load.following else "dead pressure"

@@ -28,10 +28,11 @@ from palpate.inversion import (
     wall_blocks,
 )
 from palpate.mechanics.boundary import outer_constraint
+from palpate.mechanics.conditions import Conditions
 from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_model
-from palpate.mechanics.linear_model import LinearModel, linear_model, with_constraint
+from palpate.mechanics.linear_model import LinearModel, linear_model
 from palpate.mechanics.material import MaterialModes, material_modes
 from palpate.mechanics.newton import NewtonSettings
 from palpate.mesh.quality import MeshQuality
@@ -247,7 +248,8 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
     noise = stated_noise(case)
     seen = [(r, o) for r, body in enumerate(bodies) for o in observations(body.imaged(noise))]
     progress("assembling one stiffness matrix a tissue")
-    pairs = [pair for body in bodies for pair in _models(body, case)]
+    numbers = np.cumsum([0, *(len(body.states.after) for body in bodies)]).tolist()
+    pairs = [pair for body, first in zip(bodies, numbers, strict=False) for pair in _models(body, case, first)]
     models = tuple(model for model, _ in pairs)
     if not case.loads and not any(motion.walls or model.constraint.offset.any() for model, motion in pairs):
         raise ConfigurationError(  # at rest every modulus explains the images equally badly
@@ -310,13 +312,16 @@ def stated_noise(case: Case) -> NoiseModel | None:
     return NoiseModel(np.array([2.0 * case.noise.surface_sd_mm**2]), np.array([length]))
 
 
-def _models(body: Body, case: Case) -> list[tuple[LinearModel, PrescribedMotion]]:
-    """One model a later image, and what is prescribed; they share the stiffness and differ in the bones' motion."""
+def _models(body: Body, case: Case, first: int) -> list[tuple[LinearModel, PrescribedMotion]]:
+    """One model a later image, and what is prescribed; they share the stiffness and differ in their conditions.
+
+    first: number of later states of the bodies before this one.
+    """
     models: list[tuple[LinearModel, PrescribedMotion]] = []
     moving, domain = case.domain.outer_boundary == "moving", case.domain
     frame = FrameMotion(domain.outer_motion_mm, domain.outer_kernel_mm) if moving else None
-    dilatation, loads = choose_element(case.mechanics.element).dilatation, case_loads(case, body.space)
-    for bones in body.states.bones:
+    dilatation = choose_element(case.mechanics.element).dilatation
+    for state, bones in enumerate(body.states.bones, start=first + 1):
         motion = prescribed_motion(
             body.space,
             bones,
@@ -333,8 +338,9 @@ def _models(body: Body, case: Case) -> list[tuple[LinearModel, PrescribedMotion]
             offset=motion.offset,
             prescribed=motion.prescribed,
         )
+        loads = case_loads(case, body.space, state)
         made = (
-            with_constraint(models[0][0], constraint)
+            models[0][0].under(Conditions(constraint, loads))
             if models
             else linear_model(
                 body.space,
@@ -371,15 +377,21 @@ def _finite_strain(models: tuple[LinearModel, ...], case: Case) -> Sequence[Fini
     settings = NewtonSettings(tolerance=ACCURACY, solver=case.mechanics.solver)
     found: list[FiniteStrainModel] = []
     for model in models:
-        space, constraint = model.space, model.constraint
+        space, conditions = model.space, model.conditions
         like = next((other for other in found if other.space is space), None)
         if like:
-            found.append(like.under(constraint))
+            found.append(like.under(conditions))
             continue
-        loads, material = case_loads(case, space), model.material
+        loads, material = conditions.loads, model.material
         found.append(
             finite_strain_model(
-                space, constraint, law, dilatation=dilatation, loads=loads, material=material, settings=settings
+                space,
+                conditions.constraint,
+                law,
+                dilatation=dilatation,
+                loads=loads,
+                material=material,
+                settings=settings,
             )
         )
     return found

@@ -226,14 +226,16 @@ class Mechanics:
 
 @dataclass(frozen=True, slots=True)
 class CaseLoad:
-    """A known load on the later states: a pressure or traction on a surface, or gravity; kPa, RAS directions.
+    """A known load on a later state: a pressure or traction on a surface, or gravity; kPa, RAS directions.
 
     `surface`: a hollow tissue whose wall moves freely (role `void`), or "outer", the cut of the image; a pressure of
     `pressure_kpa` pushes into the body, on the surface as it moves or (`following` false) as it was; `traction_kpa`
-    (3,) is per area at rest; `acceleration_m_s2` (3,) acts on the tissues' `density_kg_m3`.
+    (3,) is per area at rest; `acceleration_m_s2` (3,) acts on the tissues' `density_kg_m3`. `state`: number, from 1, of
+    the later image in which it acts, those of further [[pairs]] after those of [images]; None: it acts in all.
     """
 
     kind: str = field(metadata=rule(choices=("pressure", "traction", "gravity")))
+    state: int | None = field(default=None, metadata=rule(between=(1, 1000)))
     surface: str | None = None
     pressure_kpa: float | None = field(default=None, metadata=rule(between=STRESSES_KPA))
     following: bool = True
@@ -416,8 +418,24 @@ class Case:
             raise ConfigurationError(
                 f"case '{self.id}' has [[loads]] on a [phantom], whose walls alone move it; take the loads out"
             )
+        beyond = [load.state for load in self.loads if load.state is not None and load.state > self.n_states]
+        if beyond:
+            raise ConfigurationError(
+                f"[[loads]] state = {beyond[0]}: case '{self.id}' has {self.n_states} later state(s); their numbers"
+                " begin with 1 and follow the order of `after`, those of [[pairs]] last"
+            )
         self._check_tissues()
         self._check_ratios()
+
+    @property
+    def n_states(self) -> int:
+        """Number of later states: of the later images of all pairs, or the one that is simulated."""
+        further = sum(len(pair.after) for pair in self.pairs)
+        return max(len(self.images.after) if self.images else 0, 1) + further
+
+    def loads_in(self, state: int) -> tuple[CaseLoad, ...]:
+        """The known loads that act in the later state with a number, from 1."""
+        return tuple(load for load in self.loads if load.state in (None, state))
 
     @property
     def align(self) -> str:

@@ -1,4 +1,4 @@
-"""The known loads of a case, on the mesh that they act on."""
+"""The known loads of a case in one of its later states, on the mesh that they act on."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from palpate.study.case import Case, CaseLoad
 __all__ = ["case_loads", "loads_on"]
 
 
-def case_loads(case: Case, space: LagrangeSpace, *, share: float = 1.0) -> tuple[Load, ...]:
-    """The loads of `case` on `space`, or a `share` of them.
+def case_loads(case: Case, space: LagrangeSpace, state: int, *, share: float = 1.0) -> tuple[Load, ...]:
+    """The loads of `case` in the later state with a number, from 1, on `space`, or a `share` of them.
 
     Raises `ConfigurationError` for a surface that the mesh has not, or whose motion is prescribed.
     """
     density = {tissue.name: tissue.density_kg_m3 for tissue in case.tissues}
     heavy = np.array([density.get(tissue.name, 1000.0) for tissue in space.mesh.tissues])
-    return loads_on(space, case.loads, densities=heavy, share=share)
+    return loads_on(space, case.loads_in(state), densities=heavy, share=share)
 
 
 def loads_on(

@@ -130,7 +130,7 @@ def _moved(body: Body, case: Case, share: float) -> NDArray[np.float64]:
         filling_mm=share * case.motion.filling_mm if case.motion else 0.0,
         outer=case.domain.outer_boundary,
         mechanics=case.mechanics,
-        loads=case_loads(case, body.space, share=share),
+        loads=case_loads(case, body.space, 1, share=share),
     )
 
 

@@ -35,7 +35,7 @@ from palpate.inversion import (
     parameter_map,
     unit_blocks,
 )
-from palpate.mechanics import LinearModel, linear_model, with_constraint
+from palpate.mechanics import Conditions, LinearModel, linear_model
 from palpate.mesh import LagrangeSpace
 from palpate.observation import Observation, observed_surface, surface_distance, surface_distances
 from palpate.phantoms import target_of_truth
@@ -218,7 +218,7 @@ class _Case:
             terms = np.column_stack([np.ones(NEAREST), away[near]])
             offset[dof] = np.linalg.lstsq(terms, u[near, dof % 3], rcond=None)[0][0]
         held = replace(own.constraint, modes=np.zeros((len(offset), 0)), offset=offset)
-        model = with_constraint(_pulled_by(own, self.stress_kpa), held)
+        model = own.under(Conditions(held, (pulled(own.space, self.stress_kpa),)))
         targets = [paper_target(truth.space, u, observed_surface(own.space, body)) for body in range(len(BODIES))]
         fit = paper_estimate(model, targets, moduli=0.5 * np.array(self.moduli), columns=np.arange(len(BODIES)))
         values = fit.moduli.tolist() if fit.converged else [None] * len(BODIES)
@@ -234,4 +234,4 @@ def _model(space: LagrangeSpace) -> LinearModel:
 
 def _pulled_by(model: LinearModel, stress_kpa: float) -> LinearModel:
     """The model with a pull of `stress_kpa` instead of 1 kPa."""
-    return replace(model, load=stress_kpa * model.load)
+    return model.under(Conditions(model.constraint, (pulled(model.space, stress_kpa),)))
