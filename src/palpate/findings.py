@@ -27,6 +27,8 @@ Misleading = Literal[
     "mirrored",
     "frame-moves",
     "voxel-size",
+    "spacing-nearly-same",
+    "half-voxel",
     "large-shift",
     "volume-implausible",
     "fold-over",

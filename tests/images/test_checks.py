@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
 from palpate.findings import Finding
-from palpate.images.checks import check_images, check_pair, check_segmentation
+from palpate.images.checks import check_headers, check_images, check_pair, check_segmentation
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers import read_label_image
 from palpate.images.segmentation import Segmentation, segment
@@ -202,3 +202,22 @@ def test_findings_name_the_later_state_they_are_about() -> None:
     findings = check_images(BEFORE, [AFTER, body(radii={1: 8.6})])
     assert codes(findings) == ["volume-change"]
     assert "'after[2]'" in findings[0].message
+
+
+@pytest.mark.parametrize(
+    ("spacing", "origin", "expected"),
+    [
+        ((1.0, 1.0, 1.01), (0.0, 0.0, 0.0), ["spacing-nearly-same"]),
+        ((1.0, 1.0, 1.0001), (0.0, 0.0, 0.0), []),  # as NIfTI's single precision rounds
+        ((1.0, 1.0, 3.0), (0.0, 0.0, 0.0), []),
+        ((1.0, 1.0, 1.0), (0.5, 0.5, -0.5), ["half-voxel"]),
+        ((1.0, 1.0, 1.0), (0.0, 0.5, 0.0), ["half-voxel"]),
+        ((1.0, 1.0, 1.0), (0.2, 0.5, 0.0), []),
+        ((1.0, 1.0, 1.0), (7.5, 0.5, 0.0), []),  # another field of view
+    ],
+)
+def test_slips_in_headers_are_named(spacing, origin, expected):
+    later = np.diag([*spacing, 1.0])
+    later[:3, 3] = origin
+    grids = VoxelGrid((40, 40, 40), np.eye(4)), VoxelGrid((40, 40, 40), later)
+    assert [finding.code for finding in check_headers(*grids, "after")] == expected

@@ -16,7 +16,7 @@ from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 
-__all__ = ["check_images", "check_pair", "check_segmentation", "later_names"]
+__all__ = ["check_headers", "check_images", "check_pair", "check_segmentation", "later_names"]
 
 OBSERVED = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
 VOLUME_CHANGE = 0.05  # no modulus explains a filling between the scans
@@ -30,6 +30,8 @@ MIRROR_CERTAIN = 0.25  # gain in agreement, of 1, at which a mirrored image is r
 MIRROR_LIKELY = 0.10
 MIRROR_SAMPLES = 4000
 DIRECTIONS = ("left-right", "front-back", "head-foot")
+SAME_SPACING, NEARLY_SAME_SPACING = 5e-4, 0.02  # relative: rounding in a header, and what no other protocol explains
+HALF_VOXEL = 0.02  # voxels, by which an offset is half of one
 
 
 def check_images(before: Segmentation, after: Sequence[Segmentation]) -> tuple[Finding, ...]:
@@ -47,6 +49,37 @@ def check_images(before: Segmentation, after: Sequence[Segmentation]) -> tuple[F
 def later_names(count: int) -> list[str]:
     """What the later images of a pair are called in sentences: "after", or "after[1]", "after[2]" ... of several."""
     return ["after"] if count == 1 else [f"after[{number}]" for number in range(1, count + 1)]
+
+
+def check_headers(before: VoxelGrid, after: VoxelGrid, name: str) -> tuple[Finding, ...]:
+    """What the grids of two images, as they were read, say of slips in their headers.
+
+    Spacings that differ by a per cent, and origins that differ by half a voxel, deform or move every organ by as much
+    as its stiffness does; no two scans are usually so alike and not the same.
+    """
+    ratio = after.spacing / before.spacing - 1.0
+    odd = [axis for axis in range(3) if SAME_SPACING < abs(ratio[axis]) < NEARLY_SAME_SPACING]
+    if odd:
+        axis = max(odd, key=lambda a: abs(ratio[a]))
+        sizes = f"{before.spacing[axis]:.5g} and {after.spacing[axis]:.5g} mm"
+        text = (
+            f"voxels of 'before' and '{name}' differ by {abs(ratio[axis]):.2%} along image axis {axis + 1} ({sizes}): a"
+            " spacing that was rounded or mistyped in a header stretches all organs by as much, which no stiffness"
+            " explains; compare both headers with the scanner's, or with the DICOM series"
+        )
+        return (Finding("spacing-nearly-same", text, place=f"in '{name}' ({abs(ratio[axis]):.2%})"),)
+    if before.shape != after.shape or np.abs(before.affine[:3, :3] - after.affine[:3, :3]).max() > SAME_SPACING:
+        return ()
+    offset = after.index(before.world(np.zeros((1, 3))))[0]
+    halves, wholes = np.abs(offset % 1.0 - 0.5) < HALF_VOXEL, np.abs(offset - np.rint(offset)) < HALF_VOXEL
+    if not halves.any() or not np.all(halves | wholes) or np.abs(offset).max() > 1.0:
+        return ()
+    shift = " x ".join(f"{part:.2g}" for part in np.abs(offset))
+    text = (
+        f"'before' and '{name}' have the same voxels, and origins that differ by {shift} of one: so do headers"
+        " of which one gives the centre of the first voxel and the other its corner; compare both with the scanner's"
+    )
+    return (Finding("half-voxel", text, place=f"in '{name}'"),)
 
 
 def check_segmentation(segmentation: Segmentation, name: str) -> tuple[Finding, ...]:

@@ -10,7 +10,7 @@ import numpy as np
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.findings import Finding
 from palpate.images.alignment import Alignment, RigidMotion, align, moved
-from palpate.images.checks import check_images, later_names
+from palpate.images.checks import check_headers, check_images, later_names
 from palpate.images.distance import observation_width
 from palpate.images.registration import ON, Registration, registration
 from palpate.images.segmentation import Segmentation
@@ -135,7 +135,7 @@ def aligned(
 def brought(
     before: Segmentation, after: tuple[Segmentation, ...], *, method: str, progress: Progress = silent
 ) -> ImagedStates:
-    """Bring the later images to the first as `aligned` does, but check nothing.
+    """Bring the later images to the first as `aligned` does, but check nothing besides their headers.
 
     Raises `InputDataError` as `align` and `align_surfaces`.
     """
@@ -143,11 +143,13 @@ def brought(
     if method == "none":
         for name, image in zip(later_names(len(after)), after, strict=True):
             progress(f"looking for a motion of the whole in '{name}'")
+            findings += check_headers(before.grid, image.grid, name)
             findings += _unaligned_findings(before, image, name)
         return ImagedStates(before, after, tuple(dict[int, RigidMotion]() for _ in after), tuple(findings))
     rigid = {i: t.name for i, t in enumerate(before.tissues) if t.role is Role.RIGID}
     for name, image in zip(later_names(len(after)), after, strict=True):
         progress(f"aligning '{name}' on {ON[method]}")
+        findings += check_headers(before.grid, image.grid, name)
         alignment = align(before, image) if rigid or method == "rigid-tissues" else None
         fit = alignment.overall if alignment and method == "rigid-tissues" else align_surfaces(before, image)
         alignments.append(registration(before, image, fit, by=method))
