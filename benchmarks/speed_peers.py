@@ -18,7 +18,7 @@ from scipy.sparse.linalg import splu
 
 from palpate.inversion import InverseProblem, InversionSettings, Objective
 from palpate.mechanics import LinearSystem
-from palpate.observation import SEGMENTATION_NOISE
+from palpate.observation import SEGMENTATION_NOISE, SurfaceDistance
 
 Array = NDArray[np.float64]
 Gradient = Callable[[], Array]
@@ -179,7 +179,7 @@ def finite_difference_lm(problem: InverseProblem, settings: InversionSettings) -
     """
     state, mapping = problem.states[0], problem.parameters
     weighted = [observation.with_noise(SEGMENTATION_NOISE) for observation in state.observations]
-    seen = [observation.rematched(np.zeros(len(observation.dofs))) for observation in weighted]
+    seen = [o.rematched(np.zeros(len(o.dofs))) for o in weighted if isinstance(o, SurfaceDistance)]
     kept: dict[bytes, LinearSystem] = {}
 
     def residuals(unknowns: Array) -> Array:

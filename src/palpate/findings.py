@@ -51,6 +51,8 @@ Misleading = Literal[
     "cropped",
     "rotation-undetermined",
     "rigid-unseen",
+    "points-outside",
+    "data-misfit",
     "no-equilibrium",
 ]
 Widening = Literal[

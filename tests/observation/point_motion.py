@@ -28,6 +28,7 @@ class PointMotion:
     kind: str = "point motion"
     description: str = "the displacement of points that were seen in both images"
     of_driver: bool = False
+    has_offset: bool = True
     observed_share: float = 1.0
 
     @property
@@ -41,9 +42,6 @@ class PointMotion:
         weights = np.full(3, 1.0 / 3.0)
         return Residuals(displacement - self.seen + offset, weights, places, np.eye(3), material, identity, identity)
 
-    def rematched(self, _displacement, _offset=0.0):
-        return self
-
     def with_noise(self, noise):
         return replace(self, noise_model=noise, weighting=Weighting(3.0 / noise.sd**2, Tukey()))
 
@@ -56,13 +54,7 @@ class PointMotion:
     def fitted_noise(self, _residuals, _response=None):
         return self.stated_noise
 
-    def imaging_error(self, _residuals, _before, _after):
-        return np.zeros(3)
-
-    def growth_error(self, residuals, _tissue, _peers):
-        return np.zeros(len(residuals.values))
-
-    def fit(self, residuals, _modelled, _image):
+    def fit(self, residuals):
         length = float(np.linalg.norm(residuals.values))
         return Fit(length, length, length, None)
 

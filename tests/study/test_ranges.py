@@ -23,6 +23,8 @@ label = 1
 role = "estimate"
 """
 NEEDED = {
+    "sd_mm": 'data=[{kind="landmarks", file="m.csv", sd_mm=VALUE}]',
+    "correlation_mm": 'data=[{kind="landmarks", file="m.csv", sd_mm=1.0, correlation_mm=VALUE}]',
     "state": 'loads=[{kind="gravity", state=VALUE, acceleration_m_s2=[0.0, 0.0, 1.0]}]',
     "pressure_kpa": 'loads=[{kind="pressure", surface="outer", pressure_kpa=VALUE}]',
     "traction_kpa": 'loads=[{kind="traction", surface="outer", traction_kpa=[VALUE, 0.0, 0.0]}]',
@@ -46,7 +48,7 @@ def numbers(kind: type, where: str = ""):
             yield from numbers(table, f"{where}{item.name}{name}.")
         for key, between in item.metadata.get("rule", Rule()).collects.items():
             yield f"{where}{key}", dataclasses.field(metadata=rule(between=between), default=between[0])
-        if {int, float} & set(flat) and item.name not in ("label", "law_parameters"):
+        if {int, float} & set(flat) and item.name not in ("label", "law_parameters", "covariance_mm2"):
             yield f"{where}{item.name}", item
 
 

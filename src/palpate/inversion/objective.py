@@ -14,7 +14,7 @@ from palpate.inversion.approximation import Approximation, Derivatives, Place
 from palpate.inversion.later_state import LaterState
 from palpate.inversion.parameters import ParameterMap
 from palpate.mechanics.forward import Equilibrium
-from palpate.observation.contract import Observation, Residuals
+from palpate.observation.contract import Observation, Rematched, Residuals
 from palpate.observation.jacobian import Jacobian, jacobian_of
 from palpate.parallel import mapped
 
@@ -176,7 +176,8 @@ class Objective:
             seen = self._residuals(s, solution.values, unknowns)
             value += sum(_misfit(*of) for of in seen)
             by_region = solution.adjoint(np.concatenate([_pull(*of) for of in seen]))[None]
-            by_offset = [_weighted(*of).sum() for of in seen] if len(self.parameters.offsets(unknowns, s)) else []
+            known = len(self.parameters.offsets(unknowns, s)) > 0
+            by_offset = [_weighted(*of).sum() for of in seen if known and of[0].has_offset]
             own = np.concatenate([self.parameters.by_unknowns(by_region, unknowns)[0], by_offset])
             gradient[self.parameters.unknowns_of(s)] += own
         return value, gradient
@@ -189,7 +190,7 @@ class Objective:
         fresh = []
         for s in range(len(self.states)):
             pairs = zip(self._seen(s, self._equilibrium(s, unknowns).values), self._offsets(s, unknowns), strict=True)
-            fresh += [observation.rematched(motion, offset) for (observation, motion), offset in pairs]
+            fresh += [o.rematched(motion, off) if isinstance(o, Rematched) else o for (o, motion), off in pairs]
         return self.with_observations(fresh)
 
     def _equilibrium(self, s: int, unknowns: NDArray[np.float64]) -> Equilibrium:
@@ -216,27 +217,30 @@ class Objective:
         return mapped(lambda of: (of[0][0], of[0][0].residuals(of[0][1], of[1])), every)
 
     def _offsets(self, s: int, unknowns: NDArray[np.float64]) -> list[float]:
-        """The offset of each observation of a state."""
-        return self.parameters.offsets(unknowns, s).tolist() or [0.0] * len(self.states[s].observations)
+        """The offset of each observation of a state, 0 of those that have none."""
+        known = iter(self.parameters.offsets(unknowns, s).tolist())
+        return [next(known, 0.0) if o.has_offset else 0.0 for o in self.states[s].observations]
 
     def _linearised(self, s: int, unknowns: NDArray[np.float64]) -> list[Linearisation]:
         state, solution = self.states[s], self._equilibrium(s, unknowns)
         tangent = self.parameters.by_unknowns(solution.tangent(), unknowns)
         columns, n_offsets = self.parameters.unknowns_of(s), len(self.parameters.offsets(unknowns, s))
         seen = self._residuals(s, solution.values, unknowns)
+        of_offset = np.cumsum([0, *(o.has_offset for o in state.observations[:-1])]).tolist()
 
         def line(of: tuple[int, slice, tuple[Observation, Residuals]]) -> Linearisation:
             """One observation's residuals with their derivative."""
             number, rows, (observation, residuals) = of
             weights = residuals.weights * observation.weighting.loss.weight(residuals.values)
             smooth, seen_by = residuals.smooth_jacobian, tangent[rows]
-            jacobian = jacobian_of(smooth, seen_by, number=number, n_offsets=n_offsets)
+            own_number = number if observation.has_offset else None
+            jacobian = jacobian_of(smooth, seen_by, number=own_number, n_offsets=n_offsets)
             weighted = _weighted(observation, residuals)
-            own = np.eye(1, n_offsets, number)[0] * weighted.sum()
+            own = observation.has_offset * np.eye(1, n_offsets, number)[0] * weighted.sum()
             gradient = np.concatenate([seen_by.T @ (residuals.jacobian.T @ weighted), own])
             return Linearisation(observation, s, residuals, columns, jacobian, weights, gradient)
 
-        return mapped(line, zip(range(len(seen)), state.slices, seen, strict=True))
+        return mapped(line, zip(of_offset, state.slices, seen, strict=True))
 
 
 @dataclass(frozen=True, slots=True)

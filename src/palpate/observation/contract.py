@@ -1,21 +1,38 @@
-"""What an observation of a later state owes the inversion: residuals with their derivatives, noise, fit."""
+"""What a data term of a later state owes the inversion: residuals with their derivatives, noise, fit.
+
+What only some kinds have is a capability, a protocol of its own, which the layers above ask for: to choose anew what
+belongs together (`Rematched`), to be shown by a segmented image (`Imaged`).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, Self
+from pathlib import Path
+from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from palpate.findings import Finding
+from palpate.images.alignment import RigidMotion
 from palpate.images.segmentation import Segmentation
 from palpate.mesh.space import LagrangeSpace
 from palpate.observation.noise_model import FitResponse, NoiseModel
 from palpate.observation.robust_loss import RobustLoss
 
-__all__ = ["Fit", "ImagedBody", "Observation", "Residuals", "Weighting"]
+__all__ = [
+    "DataFile",
+    "DataSource",
+    "Fit",
+    "Imaged",
+    "ImagedBody",
+    "Observation",
+    "Rematched",
+    "Residuals",
+    "Weighting",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +57,8 @@ class Residuals:
     values (n,) mm; weights (n,), dimensionless, their sum 1; places (n, 3) mm in the deformed body and normals (n, 3):
     where each was taken and along which direction; material (n, 3) mm: the same places at rest. jacobian (n, n_dofs):
     the exact d values / d displacement of the unknowns that the observation sees. smooth_jacobian: the same without
-    what only image noise makes of it (that of the exact one where there is no such thing).
+    what only image noise makes of it (that of the exact one where there is no such thing). distances (m,) mm: of what
+    is compared, where the residuals are not these themselves.
     """
 
     values: NDArray[np.float64]
@@ -50,6 +68,7 @@ class Residuals:
     material: NDArray[np.float64]
     jacobian: sparse.csr_matrix[np.float64]
     smooth_jacobian: sparse.csr_matrix[np.float64]
+    distances: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +90,7 @@ class Fit:
 
 
 class Observation(Protocol):
-    """One thing that the images of a later state show, with how much it counts; an immutable value.
+    """One thing that was measured of a later state, with how much it counts; an immutable value.
 
     Observations of one `kind` share a noise model. A new kind is a file with a class that has these members; the tests
     of the contract find it by itself.
@@ -103,6 +122,11 @@ class Observation(Protocol):
         ...
 
     @property
+    def has_offset(self) -> bool:
+        """Whether all its residuals may be off by one unknown amount, as those of a surface that is drawn too large."""
+        ...
+
+    @property
     def observed_share(self) -> float:
         """Share, 0 to 1, of what could be seen that is compared."""
         ...
@@ -122,13 +146,6 @@ class Observation(Protocol):
 
         offset: by how much the image shows more than what is there, in the residuals' unit: how much further out a
         surface is drawn.
-        """
-        ...
-
-    def rematched(self, displacement: NDArray[np.float64], offset: float = 0.0) -> Self:
-        """The same with what belongs together chosen anew at displacements (n_dofs,) mm and an offset.
-
-        Raises `EstimationError` when nothing is left to compare.
         """
         ...
 
@@ -154,6 +171,32 @@ class Observation(Protocol):
         """
         ...
 
+    def fit(self, residuals: Residuals) -> Fit:
+        """How well the model fits, by its residuals; without Dice's overlap."""
+        ...
+
+
+@runtime_checkable
+class Rematched(Protocol):
+    """An observation that compares what belongs together, and must find it again as the model moves."""
+
+    def rematched(self, displacement: NDArray[np.float64], offset: float = 0.0) -> Self:
+        """The same with what belongs together chosen anew at displacements (n_dofs,) mm and an offset.
+
+        Raises `EstimationError` when nothing is left to compare.
+        """
+        ...
+
+
+@runtime_checkable
+class Imaged(Protocol):
+    """An observation of a tissue that segmented images show: it errs as voxels do, and as the tissue is drawn."""
+
+    @property
+    def tissue(self) -> int:
+        """Index of the tissue whose voxels it is made of."""
+        ...
+
     def imaging_error(self, residuals: Residuals, before: Segmentation, after: Segmentation) -> NDArray[np.float64]:
         """Errors (n,) mm of the residuals when the model itself is imaged: `before` at rest, `after` deformed."""
         ...
@@ -165,6 +208,52 @@ class Observation(Protocol):
         """
         ...
 
-    def fit(self, residuals: Residuals, modelled: NDArray[np.int16], image: NDArray[np.int16]) -> Fit:
-        """How well the model fits: by residuals, and by tissue indices (nx, ny, nz) of model and image on one grid."""
+
+@dataclass(frozen=True, slots=True)
+class DataFile:
+    """What a case says of a file of measurements beside the images: [[data]]; name: what its term is called.
+
+    state: number of the later state, from 1; sd_mm: standard deviation of each component's errors; covariance_mm2 (3,
+    3): of a point's error instead; correlation_mm: length over which errors of a field are alike, exp(-d / length);
+    axes: of the vectors of a field that is an image, "LPS" as ITK has them, or "RAS".
+    """
+
+    kind: str
+    paths: tuple[Path, ...]
+    state: int
+    sd_mm: float
+    name: str = ""
+    covariance_mm2: NDArray[np.float64] | None = None
+    correlation_mm: float = 0.0
+    axes: str = "LPS"
+
+
+class DataSource(Protocol):
+    """Measurements as they were read, before there is a mesh; an immutable value. One file a kind, see `sources`."""
+
+    @property
+    def file(self) -> DataFile:
+        """What the case says of it."""
+        ...
+
+    @property
+    def digests(self) -> tuple[str, ...]:
+        """SHA-256 (hexadecimal) of each file that was read."""
+        ...
+
+    @property
+    def in_words(self) -> str:
+        """What was read, as a line of `check` says it: "30 pairs of points, moved by 4.1 mm (rms)"."""
+        ...
+
+    def brought(self, motion: RigidMotion) -> Self:
+        """The same with the later state moved back by the rigid motion that its alignment found."""
+        ...
+
+    def against(self, before: Segmentation, after: Segmentation) -> None:
+        """Raise `InputDataError` where the images say that it is another's, or was written otherwise than stated."""
+        ...
+
+    def on(self, space: LagrangeSpace) -> tuple[Observation, tuple[Finding, ...]]:
+        """The data term on a meshed body, and what the user should know of it; raises `InputDataError`."""
         ...

@@ -76,15 +76,15 @@ class Jacobian:
 
 
 def jacobian_of(
-    smooth: sparse.csr_matrix[np.float64], tangent: NDArray[np.float64], *, number: int, n_offsets: int
+    smooth: sparse.csr_matrix[np.float64], tangent: NDArray[np.float64], *, number: int | None, n_offsets: int
 ) -> Jacobian:
     """Of residuals with derivatives smooth (n, n_dofs) by displacements, these with tangent (n_dofs, k) by unknowns.
 
-    Columns of n_offsets offsets follow, of which that with a `number` is the residuals' own.
+    Columns of n_offsets offsets follow, of which that with a `number` is the residuals' own; None: they have none.
     """
     ones = sparse.csr_matrix(np.ones((smooth.shape[0], 1)))
     below = np.zeros((1, tangent.shape[1] + n_offsets))
-    if n_offsets:
+    if n_offsets and number is not None:
         below[0, tangent.shape[1] + number] = 1.0
     whole = np.concatenate([np.pad(tangent, ((0, 0), (0, n_offsets))), below])
     return Jacobian(sparse.csr_matrix(sparse.hstack([smooth, ones], format="csr")), whole)

@@ -82,6 +82,16 @@ class SurfaceDistance:
         return self.target.surface.dofs
 
     @property
+    def tissue(self) -> int:
+        """Index of the tissue."""
+        return self.target.surface.tissue
+
+    @property
+    def has_offset(self) -> bool:
+        """It may be drawn larger or smaller than it is."""
+        return True
+
+    @property
     def of_driver(self) -> bool:
         """Whether the surface is a driver's wall."""
         return self.target.surface.driver
@@ -206,17 +216,16 @@ class SurfaceDistance:
                 errors[np.abs(peer.target.after.at(residuals.places)) < reach] = 1.0
         return errors
 
-    def fit(self, residuals: Residuals, modelled: NDArray[np.int16], image: NDArray[np.int16]) -> Fit:
-        """Distances by area, and Dice's 2 |A and B| / (|A| + |B|) of the tissue in both indices (nx, ny, nz)."""
+    def fit(self, residuals: Residuals) -> Fit:
+        """Distances by area."""
         distance, weights = np.abs(residuals.values), residuals.weights
         order = np.argsort(distance)
         share = np.cumsum(weights[order]) / float(weights.sum())
-        shown, seen = modelled == self.target.surface.tissue, image == self.target.surface.tissue
         return Fit(
             mean_mm=float(np.average(distance, weights=weights)),
             rms_mm=float(np.sqrt(np.average(distance**2, weights=weights))),
             hd95_mm=float(distance[order][np.searchsorted(share, 0.95)]),
-            dice=2.0 * int((shown & seen).sum()) / max(int(shown.sum()) + int(seen.sum()), 1),
+            dice=None,
         )
 
     def _drawn(self, displacement: NDArray[np.float64], offset: float) -> NDArray[np.float64]:

@@ -37,7 +37,7 @@ from palpate.mechanics.material import MaterialModes, material_modes
 from palpate.mechanics.newton import NewtonSettings
 from palpate.mesh.quality import MeshQuality
 from palpate.mesh.space import LagrangeSpace, lagrange_space
-from palpate.observation.contract import ImagedBody, Observation
+from palpate.observation.contract import DataSource, ImagedBody, Observation
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.prescribed_motion import FrameMotion, PrescribedMotion, prescribed_motion
 from palpate.observation.registry import observations
@@ -76,7 +76,8 @@ class ImagedStates:
     """The reference state and the later states, brought to it; `bones`: each later state's motions by tissue index.
 
     `inputs`: SHA-256 of each file that was read for them, by its key in `result.json`; `alignments`: how each later
-    state lay before it was brought to the first; none where nothing was aligned.
+    state lay before it was brought to the first; none where nothing was aligned; `data`: measurements beside the
+    images.
     """
 
     before: Segmentation
@@ -84,6 +85,7 @@ class ImagedStates:
     bones: tuple[Mapping[int, RigidMotion], ...]
     findings: tuple[Finding, ...]
     inputs: Mapping[str, str] = field(default_factory=dict)
+    data: tuple[DataSource, ...] = ()
     alignments: tuple[Registration, ...] = ()
 
 
@@ -91,7 +93,8 @@ class ImagedStates:
 class Body:
     """A meshed reference state with its images.
 
-    `smoothing_mm`: the width of every distance map that is compared; `edge_length`: the mesh's at the organs with its
+    `measured`: the data terms beside the images, by the number of their later state among all; `smoothing_mm`: the
+    width of every distance map that is compared; `edge_length`: the mesh's at the organs with its
     reason, None where it was made otherwise; `findings`: of the mesh.
     """
 
@@ -101,6 +104,7 @@ class Body:
     smoothing_mm: float
     edge_length: EdgeLength | None = None
     findings: tuple[Finding, ...] = ()
+    measured: tuple[tuple[int, Observation], ...] = ()
 
     def imaged(self, stated_noise: NoiseModel | None = None) -> ImagedBody:
         """What observations are made of, under the noise that a case states."""
@@ -233,7 +237,10 @@ def make_body(states: ImagedStates, case: Case, *, progress: Progress) -> Body:
         f" {found.quality.min_dihedral_deg:.1f} degrees"
     )
     grids = (states.before.grid, *(image.grid for image in states.after))
-    return Body(states, space, found.quality, observation_width(*grids), found.edge_length, found.findings)
+    terms = [(source.file.state, *source.on(space)) for source in states.data]
+    findings = (*found.findings, *(finding for _, _, of_term in terms for finding in of_term))
+    measured = tuple((state, term) for state, term, _ in terms)
+    return Body(states, space, found.quality, observation_width(*grids), found.edge_length, findings, measured)
 
 
 def inverse_problem(body: Body, case: Case, *, progress: Progress) -> InverseProblem:
@@ -248,7 +255,9 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
     """
     progress("distances to the surfaces of all images")
     noise = stated_noise(case)
-    seen = [(r, o) for r, body in enumerate(bodies) for o in observations(body.imaged(noise))]
+    imaged = [(r, o) for r, body in enumerate(bodies) for o in observations(body.imaged(noise))]
+    measured = [of for body in bodies for of in body.measured]
+    seen = [(r, (*o, *(term for s, term in measured if s == n))) for n, (r, o) in enumerate(imaged, start=1)]
     progress("assembling one stiffness matrix a tissue")
     numbers = np.cumsum([0, *(len(body.states.after) for body in bodies)]).tolist()
     pairs = [pair for body, first in zip(bodies, numbers, strict=False) for pair in _models(body, case, first)]
@@ -285,7 +294,7 @@ def _blocks(
         blocks += [b for wall in motion.walls for b in wall_blocks(wall, s, learned=case.driver.learn_prior)]
         blocks += frame_blocks(motion, s)
         if case.discrepancy.surface_offset_mm:
-            blocks += [offset_block(observation, s, sd=case.discrepancy.surface_offset_mm) for observation in observed]
+            blocks += [offset_block(o, s, sd=case.discrepancy.surface_offset_mm) for o in observed if o.has_offset]
     references = [reference for reference, _ in seen]
     for reference in dict.fromkeys(references):
         states = tuple(s for s, own in enumerate(references) if own == reference)

@@ -6,18 +6,23 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from palpate.errors import ConfigurationError
 from palpate.images.named_labels import MAX_LABEL, MAX_NAME, computed_by_spreadsheets
 from palpate.images.tissue import Role, Tissue
 from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.laws.registry import LAWS, law_from, law_parameters
 from palpate.mechanics.solvers.registry import SOLVERS
+from palpate.observation.contract import DataFile
+from palpate.observation.sources import SOURCES
 from palpate.study.schema import Rule, nearest, rule, shown
 
 __all__ = [
     "REMAINING",
     "SAMPLES",
     "Case",
+    "CaseData",
     "CaseLoad",
     "CaseTissue",
     "Discrepancy",
@@ -38,6 +43,7 @@ REMAINING = "remaining"
 AUTO = "auto"
 HELD = ("fixed", "sliding")  # outer boundaries that leave a body no rigid motion
 LAW_NAMES = tuple(LAWS)
+Row = tuple[float, float, float]
 SOLVER_NAMES = ("auto", *SOLVERS)
 
 POSITIVE_NUMBERS = "a list of positive numbers"
@@ -259,6 +265,44 @@ class CaseLoad:
 
 
 @dataclass(frozen=True, slots=True)
+class CaseData:
+    """Measurements beside the images, of the later state with the number `state`; `file_after`: of a second list.
+
+    `sd_mm`: standard deviation of each component's error, or `covariance_mm2` (3, 3) of a point's; `correlation_mm`:
+    length over which a field's errors are alike; `axes`: of the vectors of a field that is an image.
+    """
+
+    kind: str = field(metadata=rule(choices=tuple(SOURCES)))
+    file: Path
+    file_after: Path | None = None
+    state: int = field(default=1, metadata=rule(between=(1, 1000)))
+    sd_mm: float | None = field(default=None, metadata=rule(between=(1e-6, 100.0)))
+    covariance_mm2: tuple[Row, Row, Row] | None = field(default=None, metadata=rule(instead_of="sd_mm"))
+    correlation_mm: float = field(default=0.0, metadata=rule(between=(0.0, 1e3)))
+    axes: str = field(default="LPS", metadata=rule(choices=("LPS", "RAS")))
+
+    def __post_init__(self) -> None:
+        if self.sd_mm is None and self.covariance_mm2 is None:
+            raise ConfigurationError(
+                f"[[data]] '{self.file.name}' says nothing of its errors: give sd_mm, the standard deviation of each"
+                " component (mm), by which it counts beside the images"
+            )
+        if self.covariance_mm2 is not None:
+            matrix = np.array(self.covariance_mm2)
+            if not np.allclose(matrix, matrix.T) or np.linalg.eigvalsh(matrix)[0] <= 0.0:
+                raise ConfigurationError(
+                    f"[[data]] covariance_mm2 is {matrix.tolist()}; it must be symmetric and positive definite, mm^2"
+                )
+
+    def named(self, name: str) -> DataFile:
+        """What the layers below are told of it, under a name of its term."""
+        matrix = None if self.covariance_mm2 is None else np.array(self.covariance_mm2)
+        paths = (self.file,) if self.file_after is None else (self.file, self.file_after)
+        sd_mm = self.sd_mm or float(np.sqrt(np.trace(np.eye(3) if matrix is None else matrix) / 3.0))
+        return DataFile(self.kind, paths, self.state, sd_mm, name, matrix, self.correlation_mm, self.axes)
+
+
+@dataclass(frozen=True, slots=True)
 class MeshSettings:
     """Edge length (mm) of the tetrahedra at the organs; None: "auto", chosen by the organs (see `edge_length_of`).
 
@@ -390,6 +434,7 @@ class Case:
     domain: Domain = Domain()
     mechanics: Mechanics = Mechanics()
     loads: tuple[CaseLoad, ...] = ()
+    data: tuple[CaseData, ...] = ()
     mesh: MeshSettings = MeshSettings()
     driver: DriverMotion = DriverMotion()
     noise: Noise = Noise()
@@ -418,14 +463,24 @@ class Case:
             raise ConfigurationError(
                 f"case '{self.id}' has [[loads]] on a [phantom], whose walls alone move it; take the loads out"
             )
-        beyond = [load.state for load in self.loads if load.state is not None and load.state > self.n_states]
+        stated = [("loads", load.state or 1) for load in self.loads] + [("data", data.state) for data in self.data]
+        beyond = [(table, state) for table, state in stated if state > self.n_states]
         if beyond:
+            table, state = beyond[0]
             raise ConfigurationError(
-                f"[[loads]] state = {beyond[0]}: case '{self.id}' has {self.n_states} later state(s); their numbers"
-                " begin with 1 and follow the order of `after`, those of [[pairs]] last"
+                f"[[{table}]] state = {state}: case '{self.id}' has {self.n_states} later state(s); their numbers begin"
+                " with 1 and follow the order of `after`, those of [[pairs]] last"
             )
         self._check_tissues()
         self._check_ratios()
+
+    @property
+    def data_files(self) -> tuple[DataFile, ...]:
+        """The measurements beside the images, each with a name of its own."""
+        kinds = [data.kind for data in self.data]
+        numbers = [kinds[: i + 1].count(kind) for i, kind in enumerate(kinds)]
+        names = [kind if n == 1 else f"{kind} {n}" for kind, n in zip(kinds, numbers, strict=True)]
+        return tuple(data.named(name) for data, name in zip(self.data, names, strict=True))
 
     @property
     def n_states(self) -> int:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -38,7 +38,7 @@ from palpate.study.domain import case_domain
 from palpate.study.edge_length import edge_length_of
 from palpate.study.meshing import refuse_edge
 from palpate.study.plausibility import unit_warnings
-from palpate.study.read import read_segmentation, read_states
+from palpate.study.read import measured, read_segmentation, read_states
 from palpate.study.refusals import refuse_lost, refuse_unmeshable
 from palpate.study.run import refuse_what_cannot_be_estimated
 from palpate.study.samples import require_samples
@@ -72,7 +72,8 @@ class OrganRow:
 class CheckReport:
     """All problems of a case, its organs and what its estimate would cost (None when that cannot be told).
 
-    alignments: how each later image lay, by its name; none where nothing was aligned.
+    alignments: how each later image lay, by its name; none where nothing was aligned; measured: what was read of each
+    file of [[data]], by its place in the case.
     """
 
     id: str
@@ -81,6 +82,7 @@ class CheckReport:
     organs: tuple[OrganRow, ...] = ()
     cost: ExpectedCost | None = None
     alignments: tuple[tuple[str, Registration], ...] = ()
+    measured: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def exit_code(self) -> int:
@@ -104,6 +106,7 @@ class CheckReport:
                 for problem in self.problems
             ],
             "alignment": [found.row(name) for name, found in self.alignments],
+            "data": dict(self.measured),
             "organs": [
                 {
                     "tissue": row.tissue,
@@ -135,6 +138,7 @@ class CheckReport:
         for name, found in self.alignments:
             kept = ", ".join(f"{tissue} {mm:.2g}" for tissue, mm in found.residual_by_tissue_mm.items())
             lines.append(f"alignment: '{name}' {found.in_words} (surfaces then lie apart by, in mm: {kept})")
+        lines += [f"{name}: {words}" for name, words in self.measured.items()]
         if self.cost is not None:
             cost = self.cost
             lines.append(
@@ -195,6 +199,8 @@ def check_case(path: Path, overrides: Sequence[str], *, progress: Progress) -> C
     read = _read_pairs(case, problems) if case.phantom is None else []
     pairs = [phantom] if phantom is not None else [ImagedStates(before, after, (), ()) for before, after in read]
     pairs = [_checked_pair(problems, pair, case, number, progress) for number, pair in enumerate(pairs, start=1)]
+    firsts = np.cumsum([0, *(len(pair.after) for pair in pairs)]).tolist()
+    pairs = [_with_data(problems, pair, case, first) for pair, first in zip(pairs, firsts, strict=False)]
     if not pairs:
         return CheckReport(case.id, problems.all())
     cost = problems.attempt(lambda: _cost(problems, pairs, case, progress))
@@ -209,7 +215,14 @@ def check_case(path: Path, overrides: Sequence[str], *, progress: Progress) -> C
         for n, pair in enumerate(pairs, start=1)
         for name, one in _lay(pair)
     ]
-    return CheckReport(case.id, problems.all(), names, organs, cost, tuple(found))
+    measured_words = {source.file.name: source.in_words for pair in pairs for source in pair.data}
+    return CheckReport(case.id, problems.all(), names, organs, cost, tuple(found), measured_words)
+
+
+def _with_data(problems: _Problems, pair: ImagedStates, case: Case, first: int) -> ImagedStates:
+    """The pair with the measurements of its later states, which are numbered after `first`."""
+    found = problems.attempt(lambda: measured(case, pair, first=first))
+    return pair if found is None else replace(pair, data=found[0])
 
 
 def _lay(pair: ImagedStates) -> list[tuple[str, Registration]]:

@@ -11,13 +11,15 @@ from palpate.findings import Finding
 from palpate.images.checks import later_names
 from palpate.inversion import Inversion, Outcome
 from palpate.mechanics.deformation import deformation_determinants
+from palpate.observation.contract import Imaged
 from palpate.study.together import ImagePairs
 from palpate.uncertainty import FittedState
 
-__all__ = ["fold_findings", "inversion_findings", "pair_findings"]
+__all__ = ["data_findings", "fold_findings", "inversion_findings", "pair_findings"]
 
 STRONG_CORRELATION = 0.99
 HETEROGENEOUS = 0.01  # probability of such differences between image pairs that have the same moduli
+MISFIT = 1.5  # times the stated standard deviation: measurements that are not what they are said to be
 NOISIER, LEAST_IMAGES = 1.6, 3  # times the usual noise of so many later images: one is drawn badly
 
 
@@ -99,6 +101,21 @@ def _noisy_pairs(pairs: ImagePairs) -> Iterable[Finding]:
                 text = f"'{name}' fits worse than the other later images: noise of {noise:.2g} mm beside {usual:.2g} mm"
                 advice = f"{text}, so that it counts for less. Look at its labels; it may be left out"
                 yield Finding("pair-noise", advice, place=f"in '{name}'")
+
+
+def data_findings(inversion: Inversion) -> tuple[Finding, ...]:
+    """A finding for each kind of measurements beside the images that the model misses by more than is stated."""
+    findings = []
+    for line in inversion.minimum.evaluation.lines:
+        seen = line.observation
+        stated, found = seen.first_noise((seen,)).sd, seen.noise_model.sd
+        if not isinstance(seen, Imaged) and found > MISFIT * stated:
+            text = (
+                f"the fitted model misses the {seen.name} by {found:.2g} mm where sd_mm = {stated:.2g} is stated; they"
+                " count by the former. Are they of this state, and is their error larger than stated?"
+            )
+            findings.append(Finding("data-misfit", text, seen.name, place=f"in state {line.state + 1}"))
+    return tuple(findings)
 
 
 def fold_findings(states: Sequence[FittedState]) -> tuple[Finding, ...]:

@@ -15,15 +15,16 @@ from palpate.inversion import (
     InversionSettings,
     Iterate,
     LeastSquares,
+    Linearisation,
     Outcome,
     StartRun,
     ratio_of_eta,
 )
 from palpate.mesh.voxelise import voxelise
-from palpate.observation.contract import Fit
+from palpate.observation.contract import Fit, Imaged
 from palpate.progress import Progress, silent
 from palpate.study.discrepancy import FoundDiscrepancy, discrepancy_findings, discrepancy_of
-from palpate.study.estimate_findings import fold_findings, inversion_findings, pair_findings
+from palpate.study.estimate_findings import data_findings, fold_findings, inversion_findings, pair_findings
 from palpate.study.poisson_ratios import PoissonRatioEstimate, no_ratio, ratio_verdict
 from palpate.study.samples import CHAINS, ModulusSamples, draw_moduli, sample_findings
 from palpate.study.together import ImagePairs, ModulusRegion, combinations_of, image_pairs_of, regions_of
@@ -135,7 +136,8 @@ class Estimation:
     (n_points, 3) mm of each later image;
     outer_loop: the steps from the best start's minimum to the estimate, which all starts of that minimum share;
     counts: of all starts and minima together; observations: what was compared, in words, by its kind; information: the
-    directions of the log-moduli by how well they are known; discrepancy: what the images say of frame, drawing and
+    directions of the log-moduli by how well they are known; information_shares: by tissue, of each kind of data, and of
+    what was believed before; discrepancy: what the images say of frame, drawing and
     material; combinations: what is known where single moduli are not;
     regions: joint ones of two moduli; image_pairs: what each of several later images says alone; samples: of the
     moduli's posterior, where the case asks for them and the estimate converged.
@@ -153,6 +155,7 @@ class Estimation:
     remarks: tuple[Finding, ...] = ()
     observations: Mapping[str, str] = field(default_factory=dict)
     information: Information | None = None
+    information_shares: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     combinations: tuple[Combination, ...] = ()
     discrepancy: FoundDiscrepancy = field(default_factory=FoundDiscrepancy)
     regions: tuple[ModulusRegion, ...] = ()
@@ -214,6 +217,7 @@ def conclude(
         *inversion_findings(inversion, covariance.total),
         *pair_findings(pairs),
         *fold_findings(observed.states),
+        *data_findings(inversion),
         *sample_findings(drawn),
         *discrepancy_findings(found_discrepancy),
     )
@@ -231,6 +235,7 @@ def conclude(
         remarks=findings,
         observations={observation.kind: observation.description for observation in objective.observations},
         information=information(of_moduli),
+        information_shares=_information_shares(inversion) if minimum.converged else {},
         discrepancy=found_discrepancy,
         combinations=combinations_of(inversion, of_moduli, within=IDENTIFIED),
         regions=regions,
@@ -421,6 +426,35 @@ def _moduli(inversion: Inversion, theta: NDArray[np.float64]) -> dict[str, float
     return dict(zip(mapping.tissues, moduli.tolist(), strict=True))
 
 
+def _fit(line: Linearisation, modelled: NDArray[np.int16], image: NDArray[np.int16]) -> Fit:
+    """The fit of one observation; of a tissue that images show with Dice's 2 |A and B| / (|A| + |B|)."""
+    found, seen = line.observation.fit(line.residuals), line.observation
+    if not isinstance(seen, Imaged):
+        return found
+    both = modelled == seen.tissue, image == seen.tissue
+    overlap = 2.0 * int((both[0] & both[1]).sum()) / max(sum(int(of.sum()) for of in both), 1)
+    return replace(found, dice=overlap)
+
+
+def _information_shares(inversion: Inversion) -> dict[str, dict[str, float]]:
+    """Share of each kind of data in what is known of each log-modulus, 0 to 1, and of what was believed before.
+
+    With h = H^-1 e_i the precision of theta_i is sum_k h^T J_k^T W_k J_k h / h^T H h over the kinds, and the prior's.
+    """
+    found, parameters = inversion.minimum.evaluation, inversion.objective.parameters
+    columns = found.covariance_columns(inversion.objective.n_parameters)
+    shares = dict[str, dict[str, float]]()
+    for tissue, h in zip(parameters.tissues, columns.T, strict=False):
+        parts = {"prior": float(h @ found.prior @ h)}
+        for line in found.lines:
+            moved = line.jacobian.times(h[line.columns])
+            known = parts.get(line.observation.kind, 0.0)
+            parts[line.observation.kind] = known + float(line.precision * line.weights @ moved**2)
+        total = sum(parts.values())
+        shares[tissue] = {kind: part / total for kind, part in parts.items()}
+    return shares
+
+
 def _fits(inversion: Inversion, observed: Observed) -> tuple[tuple[TissueFit, ...], ...]:
     fits = []
     for s, (fitted, image) in enumerate(zip(observed.states, observed.images, strict=True)):
@@ -432,8 +466,8 @@ def _fits(inversion: Inversion, observed: Observed) -> tuple[tuple[TissueFit, ..
             tuple(
                 TissueFit(
                     end.observation.name,
-                    start.observation.fit(start.residuals, modelled[0], image),
-                    end.observation.fit(end.residuals, modelled[1], image),
+                    _fit(start, modelled[0], image),
+                    _fit(end, modelled[1], image),
                     end.observation.observed_share,
                 )
                 for start, end in of_state

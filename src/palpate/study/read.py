@@ -16,6 +16,8 @@ from palpate.images.readers import read_intensities, read_label_image
 from palpate.images.readers.registry import format_of
 from palpate.images.segmentation import Segmentation, segment
 from palpate.images.tissue import Tissue
+from palpate.observation.contract import DataSource
+from palpate.observation.sources import read_source
 from palpate.phantoms.pelvis import PelvisOptions, pelvis, pelvis_anatomy
 from palpate.phantoms.scene import Scene
 from palpate.phantoms.spheres import SpheresOptions, spheres, spheres_anatomy
@@ -25,7 +27,7 @@ from palpate.study.case import Case, CaseTissue
 from palpate.study.provenance import file_digest
 from palpate.study.schema import nearest, shown
 
-__all__ = ["phantom_scene", "read_pairs", "read_segmentation", "read_states"]
+__all__ = ["measured", "phantom_scene", "read_pairs", "read_segmentation", "read_states"]
 
 
 def read_states(case: Case, *, progress: Progress = silent) -> ImagedStates:
@@ -39,14 +41,16 @@ def read_states(case: Case, *, progress: Progress = silent) -> ImagedStates:
         return aligned(segment(scene.before, scene.tissues), after, method=case.align, loaded=bool(case.loads))
     if case.images is None:
         raise ConfigurationError(f"case '{case.id}' has neither [images] nor [phantom]")
-    return _read_pair(case, case.images.before, case.images.after, key="", progress=progress)
+    return _read_pair(case, case.images.before, case.images.after, key="", first=0, progress=progress)
 
 
 def read_pairs(case: Case, *, progress: Progress = silent) -> tuple[ImagedStates, ...]:
     """The same of each of the case's further [[pairs]]; their findings begin with the pair's number, from 2."""
-    found = []
+    found, first = [], len(case.images.after) if case.images else 0
     for number, pair in enumerate(case.pairs, start=2):
-        states = _read_pair(case, pair.before, pair.after, key=f"pairs[{number - 2}].", progress=progress)
+        key = f"pairs[{number - 2}]."
+        states = _read_pair(case, pair.before, pair.after, key=key, first=first, progress=progress)
+        first += len(pair.after)
         findings = tuple(replace(f, message=f"pair {number}: {f.message}") for f in states.findings)
         found.append(replace(states, findings=findings))
     return tuple(found)
@@ -124,8 +128,29 @@ def _phantom_tissues(case: Case, options: PelvisOptions | SpheresOptions) -> tup
     return tuple(tissue for tissue in case.tissues if own[tissue.name].meshed)
 
 
-def _read_pair(case: Case, before: Path, after: tuple[Path, ...], *, key: str, progress: Progress) -> ImagedStates:
-    """One pair; `key` begins the keys of its files' digests."""
+def measured(case: Case, states: ImagedStates, *, first: int) -> tuple[tuple[DataSource, ...], dict[str, str]]:
+    """The [[data]] of later states that are numbered after `first`, brought to the first image, and files' digests.
+
+    Raises `InputDataError` for files that cannot be used, or that the images contradict.
+    """
+    found, digests = [], {}
+    for number, file in enumerate(case.data_files):
+        place = file.state - first - 1
+        if not 0 <= place < len(states.after):
+            continue
+        source = read_source(file)
+        for part, digest in enumerate(source.digests):
+            digests[f"data[{number}]" + (f".{part}" if part else "")] = digest
+        source = source.brought(states.alignments[place].motion) if states.alignments else source
+        source.against(states.before, states.after[place])
+        found.append(source)
+    return tuple(found), digests
+
+
+def _read_pair(
+    case: Case, before: Path, after: tuple[Path, ...], *, key: str, first: int, progress: Progress
+) -> ImagedStates:
+    """One pair; `key` begins the keys of its files' digests, `first`: number of later states before its own."""
     table = case.images.names if case.images else None
     names = read_label_table(table) if table else None
     reference = read_segmentation(case, before, names, None)
@@ -136,4 +161,7 @@ def _read_pair(case: Case, before: Path, after: tuple[Path, ...], *, key: str, p
     for name, image, path in zip(keys, (reference, *later), (before, *after), strict=True):
         digests = image.digests or {"": file_digest(path)}  # a reader from elsewhere may not say what it read
         inputs |= {f"{name}.{part}" if part else name: digest for part, digest in digests.items()}
-    return replace(states, inputs=inputs)
+    data, digests = measured(case, states, first=first)
+    for source in data:
+        progress(f"'{source.file.paths[0].name}': {source.in_words}")
+    return replace(states, inputs=inputs | digests, data=data)

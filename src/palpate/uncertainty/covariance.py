@@ -18,6 +18,7 @@ from palpate.inversion.objective import Evaluation, Linearisation, Objective
 from palpate.inversion.reweighting import of_one_noise
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
+from palpate.observation.contract import Imaged
 from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import FitResponse, NoiseModel, mean_noise
 from palpate.parallel import mapped
@@ -309,8 +310,16 @@ def imaging_errors(
             rest[reference] = _imaged(fitted.space, np.zeros_like(fitted.displacement), fitted.before, material, rng)
         places = [line.residuals.places for line in lines]
         after = _imaged(fitted.space, fitted.displacement, fitted.after, places, rng)
-        errors += [line.observation.imaging_error(line.residuals, rest[reference], after) for line in lines]
+        errors += [_imaging_error(line, rest[reference], after) for line in lines]
     return errors
+
+
+def _imaging_error(line: Linearisation, before: Segmentation, after: Segmentation) -> NDArray[np.float64]:
+    """Errors (n,) mm of one observation's residuals; none of what no segmented image shows."""
+    seen = line.observation
+    return (
+        seen.imaging_error(line.residuals, before, after) if isinstance(seen, Imaged) else np.zeros(len(line.weights))
+    )
 
 
 def _imaged(

@@ -18,6 +18,7 @@ from palpate.inversion.expansion import Expansion
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium
 from palpate.mechanics.linear_model import LinearEquilibrium, poisson_tangents
+from palpate.observation.contract import Imaged
 from palpate.uncertainty.profile import FixedCorrespondence, fixed_correspondence
 from palpate.uncertainty.refit import refitted
 
@@ -128,12 +129,14 @@ def modulus_errors(objective: Objective, unknowns: NDArray[np.float64], evaluati
 def surface_errors(evaluation: Evaluation, tissue: str) -> Errors:
     """Derivatives (n,), dimensionless, of each observation's residuals by how far `tissue` reaches in all later images.
 
-    By its growth along its normals, which takes from its neighbours (see `Observation.growth_error`). To first order
+    By its growth along its normals, which takes from its neighbours (see `Imaged.growth_error`). To first order
     the same growth in the first image, the mesh held, has the opposite effect: residuals are differences.
     """
-    return tuple(
-        line.observation.growth_error(
-            line.residuals, tissue, [other.observation for other in evaluation.lines if other.state == line.state]
-        )
-        for line in evaluation.lines
-    )
+    found = []
+    for line in evaluation.lines:
+        seen, peers = line.observation, [o.observation for o in evaluation.lines if o.state == line.state]
+        if isinstance(seen, Imaged):
+            found.append(seen.growth_error(line.residuals, tissue, peers))
+        else:
+            found.append(np.zeros_like(line.residuals.values))
+    return tuple(found)

@@ -1,0 +1,213 @@
+"""A measured displacement field: a vector image, a transform of ITK, or a table of points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.errors import ConfigurationError, InputDataError
+from palpate.findings import Finding
+from palpate.images.alignment import RigidMotion
+from palpate.images.input_file import open_input
+from palpate.images.segmentation import Segmentation
+from palpate.mesh.locate import located
+from palpate.mesh.space import LagrangeSpace
+from palpate.observation.contract import DataFile
+from palpate.observation.direction import refuse_direction
+from palpate.observation.landmarks import PointTable, read_point_table, refuse_slips
+from palpate.observation.point_displacement import PointDisplacement, point_displacement
+
+__all__ = ["KIND", "DisplacementField", "read_displacement_field"]
+
+KIND = "displacement field"
+MOST_VECTORS = 2**26  # 1.6 GB as they are read
+LPS = np.array([-1.0, -1.0, 1.0])
+OF_LENGTH, OF_EDGE = 0.5, 0.35  # edge of a cell, over the correlation length and over an edge of the mesh
+
+
+@dataclass(frozen=True, slots=True)
+class DisplacementField:
+    """Points with their displacements as they were read; implements `DataSource`."""
+
+    file: DataFile
+    table: PointTable
+
+    @property
+    def digests(self) -> tuple[str, ...]:
+        """SHA-256 of each file."""
+        return self.table.digests
+
+    @property
+    def in_words(self) -> str:
+        """Number of points, and how far they move."""
+        moved = np.linalg.norm(self.table.after - self.table.before, axis=1)
+        return f"a field at {len(moved)} points, which move by {np.sqrt(np.mean(moved**2)):.2g} mm (root mean square)"
+
+    def brought(self, motion: RigidMotion) -> DisplacementField:
+        """The same with the later points moved back by the rigid motion of the later state."""
+        return replace(self, table=replace(self.table, after=motion.inverse().apply(self.table.after)))
+
+    def against(self, before: Segmentation, after: Segmentation) -> None:
+        """Raise `InputDataError` where the points arrive in other tissues (see `refuse_direction`)."""
+        table = self.table
+        refuse_direction(table.before, table.after - table.before, before, after, self.file.paths[0])
+
+    def on(self, space: LagrangeSpace) -> tuple[PointDisplacement, tuple[Finding, ...]]:
+        """The term of the points in the mesh, in means of some that are near each other; raises `InputDataError`.
+
+        What is nearer than half a correlation length, or a third of an element, says the same.
+        """
+        places = located(space.mesh, self.table.before)
+        inside = places.inside
+        if self.file.paths[0].suffix.lower() == ".csv":
+            refuse_slips(space, self.table.before, inside, self.file.paths[0])
+        if not inside.any():
+            raise InputDataError(
+                f"no vector of '{self.file.paths[0]}' lies in the meshed body; is the field on the grid of the first"
+                " image, and of this patient?"
+            )
+        points, moved = self.table.before[inside], (self.table.after - self.table.before)[inside]
+        edge = float(np.cbrt(6.0 * np.sqrt(2.0) * np.median(space.mesh.volumes)))
+        size = max(OF_LENGTH * self.file.correlation_mm, OF_EDGE * edge)
+        term = point_displacement(
+            space,
+            points,
+            moved,
+            replace(places, tet=places.tet[inside], barycentric=places.barycentric[inside]),
+            file=self.file,
+            kind=KIND,
+            description="the difference between the model's displacement and a measured field",
+            cells=np.floor((points - points.min(axis=0)) / size).astype(np.int64),
+        )
+        return term, ()
+
+
+def read_displacement_field(file: DataFile) -> DisplacementField:
+    """Read a field that maps the first state to the later one, mm.
+
+    .csv as landmarks have it; .nii, .nii.gz (intent 1006 or 1007); .nrrd, .mha, .mhd and transforms .h5, .tfm, .xfm,
+    .mat by SimpleITK, which the extra `itk` brings. Voxels without a finite vector, or whose vector is exactly 0, are
+    taken for empty. Raises `InputDataError`.
+    """
+    path = file.paths[0]
+    if len(file.paths) != 1:
+        raise InputDataError(f"a displacement field is one file; {len(file.paths)} are named, '{path}' first")
+    if path.suffix.lower() == ".csv":
+        return DisplacementField(file, read_point_table(path))
+    reader = next((read for endings, read in READERS.items() if path.name.lower().endswith(endings)), None)
+    if reader is None:
+        known = ", ".join(ending for endings in READERS for ending in endings)
+        raise InputDataError(f"'{path}' is no kind of displacement field that is read: .csv, {known}")
+    try:
+        with open_input(path) as stream:
+            digest = stream.sha256()
+    except (OSError, ValueError) as error:
+        raise InputDataError(f"'{path}' cannot be read: {error}") from error
+    vectors, affine = reader(path)
+    flat = vectors.reshape(-1, 3) * (LPS if file.axes == "LPS" else np.ones(3))
+    told = np.isfinite(flat).all(axis=1) & flat.any(axis=1)
+    if not told.any():
+        raise InputDataError(f"'{path}' holds no vector but zeros; nothing moved, or it is another file")
+    index = np.stack(np.unravel_index(np.flatnonzero(told), vectors.shape[:3]), axis=1).astype(np.float64)
+    before = index @ affine[:3, :3].T + affine[:3, 3]
+    table = PointTable(before, before + flat[told], ("",) * len(before), (digest,))
+    return DisplacementField(file, table)
+
+
+def _nifti(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    nibabel = import_module("nibabel")
+    try:
+        image = nibabel.load(path)
+        shape = tuple(int(n) for n in image.shape)
+    except Exception as error:  # nibabel raises what its formats raise
+        raise InputDataError(f"'{path}' cannot be read as NIfTI: {error}") from error
+    flat = (*shape[:3], *(n for n in shape[3:] if n != 1))
+    if len(shape) < 4 or len(flat) != 4 or flat[3] != 3:
+        raise InputDataError(
+            f"'{path}' has the sizes {list(shape)}; a displacement field has three axes and three components"
+        )
+    _refuse_many(flat[:3], path)
+    try:
+        values = np.asarray(image.dataobj, dtype=np.float64)
+    except Exception as error:
+        raise InputDataError(f"'{path}' is damaged: {error}") from error
+    return values.reshape(flat), np.asarray(image.affine, dtype=np.float64)
+
+
+def _itk(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    sitk = _simpleitk(path)
+    try:
+        reader = sitk.ImageFileReader()
+        reader.SetFileName(str(path))
+        reader.ReadImageInformation()
+        if reader.GetDimension() != 3 or reader.GetNumberOfComponents() != 3:
+            raise InputDataError(
+                f"'{path}' has {reader.GetDimension()} axes and {reader.GetNumberOfComponents()} components; a"
+                " displacement field has three of both"
+            )
+        _refuse_many(reader.GetSize(), path)
+        return _of_itk(sitk, reader.Execute())
+    except RuntimeError as error:
+        raise InputDataError(f"'{path}' cannot be read by SimpleITK: {str(error).splitlines()[-1]}") from error
+
+
+def _transform(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The displacement field that a transform holds; others are maps without a grid, which a field must have."""
+    sitk = _simpleitk(path)
+    try:
+        transform = sitk.ReadTransform(str(path))
+        parts = (
+            [transform.GetNthTransform(n) for n in range(transform.GetNumberOfTransforms())]
+            if hasattr(transform, "GetNumberOfTransforms")
+            else [transform]
+        )
+        fields = [part for part in parts if part.GetName() == "DisplacementFieldTransform"]
+        if not fields:
+            raise InputDataError(
+                f"'{path}' holds no displacement field ({transform.GetName()}); write the transform as a field on the"
+                " first image's grid"
+            )
+        grid = sitk.DisplacementFieldTransform(fields[-1]).GetDisplacementField()
+        whole = sitk.TransformToDisplacementField(
+            transform, sitk.sitkVectorFloat64, grid.GetSize(), grid.GetOrigin(), grid.GetSpacing(), grid.GetDirection()
+        )
+        return _of_itk(sitk, whole)
+    except RuntimeError as error:
+        raise InputDataError(f"'{path}' cannot be read by SimpleITK: {str(error).splitlines()[-1]}") from error
+
+
+def _of_itk(sitk: Any, image: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    values = np.moveaxis(sitk.GetArrayFromImage(image), (0, 1, 2), (2, 1, 0)).astype(np.float64)
+    affine = np.eye(4)
+    affine[:3, :3] = np.array(image.GetDirection()).reshape(3, 3) * np.array(image.GetSpacing())
+    affine[:3, 3] = image.GetOrigin()
+    return values, np.diag([*LPS, 1.0]) @ affine
+
+
+def _simpleitk(path: Path) -> Any:
+    try:
+        return import_module("SimpleITK")
+    except ImportError as error:
+        raise ConfigurationError(
+            f"'{path}' is read by SimpleITK: pip install 'palpate[itk]', or write .nii.gz"
+        ) from error
+
+
+def _refuse_many(sizes: tuple[int, ...], path: Path) -> None:
+    if np.prod([float(n) for n in sizes]) > MOST_VECTORS:
+        raise InputDataError(
+            f"'{path}' has {' x '.join(map(str, sizes))} vectors; resample it to {MOST_VECTORS} at most"
+        )
+
+
+READERS: dict[tuple[str, ...], Callable[[Path], tuple[NDArray[np.float64], NDArray[np.float64]]]] = {
+    (".nii", ".nii.gz"): _nifti,
+    (".nrrd", ".mha", ".mhd"): _itk,
+    (".h5", ".tfm", ".xfm", ".mat"): _transform,
+}

@@ -1,0 +1,160 @@
+"""Measured displacements of points of the body, of markers or of a field: an `Observation`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from palpate.mesh.locate import Places, point_interpolation
+from palpate.mesh.space import LagrangeSpace
+from palpate.observation.contract import DataFile, Fit, Residuals, Weighting
+from palpate.observation.noise_model import FitResponse, NoiseModel
+from palpate.observation.robust_loss import Tukey
+from palpate.observation.whitening import whitener
+
+__all__ = ["PointDisplacement", "point_displacement"]
+
+TUKEY = 4.685  # cutoff in standard deviations, 95 % efficient for normal errors (Huber 1981)
+MAD = 1.4826  # standard deviations of a normal law in one median absolute deviation
+ALONE = 1e-3  # mm: length over which errors that are independent are alike
+FEW = 30  # residuals, of which a spread is not told
+TOGETHER = 6  # points of one cell whose mean is compared, of errors that are alike
+
+
+@dataclass(frozen=True, slots=True)
+class PointDisplacement:
+    """Residuals r = W (N u - d) of points with measured displacements d; implements `Observation`.
+
+    operator: W N (n, n_dofs) with the interpolation N to the points, or to means of several, and W, which makes their
+    errors independent, each with the standard deviation stated; data: W d (n,) mm. shown: N (3 n_shown, n_dofs),
+    measured: d (3 n_shown,) mm; material (n, 3) mm: the point that a residual is of; axes (n, 3): along which.
+    """
+
+    kind: str
+    description: str
+    name: str
+    dofs: NDArray[np.int64]
+    operator: sparse.csr_matrix[np.float64]
+    data: NDArray[np.float64]
+    shown: sparse.csr_matrix[np.float64]
+    measured: NDArray[np.float64]
+    material: NDArray[np.float64]
+    axes: NDArray[np.float64]
+    observed_share: float
+    stated: NoiseModel
+    noise_model: NoiseModel
+    weighting: Weighting
+
+    @property
+    def of_driver(self) -> bool:
+        """It shows no wall."""
+        return False
+
+    @property
+    def has_offset(self) -> bool:
+        """A motion of the whole is the frame's."""
+        return False
+
+    def residuals(self, displacement: NDArray[np.float64], offset: float = 0.0) -> Residuals:
+        """Residuals and their derivative at displacements (n_dofs,) mm; they are linear, and have no `offset`."""
+        n = len(self.data)
+        values = self.operator @ displacement - self.data + offset
+        weights = np.full(n, 1.0 / n)
+        away = np.linalg.norm((self.shown @ displacement - self.measured).reshape(-1, 3), axis=1)
+        return Residuals(values, weights, self.material, self.axes, self.material, self.operator, self.operator, away)
+
+    def with_noise(self, noise: NoiseModel) -> PointDisplacement:
+        """All points count, by the variance of the noise."""
+        return replace(self, noise_model=noise, weighting=Weighting(len(self.data) / noise.sd**2, Tukey()))
+
+    def reweighted(self, residuals: Residuals, beyond_modes: NDArray[np.float64] | None = None) -> PointDisplacement:
+        """The same with Tukey's loss: a point that was mistaken for another counts less, or not at all."""
+        del beyond_modes
+        spread = max(MAD * float(np.median(np.abs(residuals.values))), self.noise_model.sd)
+        return replace(self, weighting=Weighting(self.weighting.precision, Tukey(TUKEY * spread)))
+
+    def first_noise(self, peers: Sequence[PointDisplacement]) -> NoiseModel:
+        """What is stated."""
+        del peers
+        return self.stated
+
+    def fitted_noise(self, residuals: Sequence[Residuals], response: FitResponse | None = None) -> NoiseModel:
+        """What is stated, or the residuals' robust spread where that is larger."""
+        del response
+        every = np.concatenate([found.values for found in residuals])
+        spread = MAD * float(np.median(np.abs(every))) if len(every) >= FEW else 0.0
+        return self.stated if spread <= self.stated.sd else NoiseModel(np.array([spread**2]), self.stated.lengths)
+
+    def fit(self, residuals: Residuals) -> Fit:
+        """Distances of the model's points to where they were measured."""
+        away = np.abs(residuals.values) if residuals.distances is None else residuals.distances
+        return Fit(float(away.mean()), float(np.sqrt(np.mean(away**2))), float(np.quantile(away, 0.95)), None)
+
+
+def point_displacement(
+    space: LagrangeSpace,
+    points: NDArray[np.float64],
+    moved: NDArray[np.float64],
+    places: Places,
+    *,
+    file: DataFile,
+    kind: str,
+    description: str,
+    cells: NDArray[np.int64] | None = None,
+) -> PointDisplacement:
+    """The term of points (n, 3) mm at rest, inside the mesh at `places`, that were measured to move by (n, 3) mm.
+
+    file: what is stated of their errors; cells (n, k): what the points of one mean have in common, by default each
+    stands alone.
+    """
+    number = np.arange(len(points)) if cells is None else np.unique(cells, axis=0, return_inverse=True)[1].ravel()
+    mean, mixed = _means(points, number, file.correlation_mm)
+    interpolation = sparse.csr_matrix(mean @ point_interpolation(space, places))
+    seen = np.unique(interpolation.indices)
+    shown = sparse.csr_matrix(sparse.kron(interpolation[:, seen], sparse.eye_array(3)))
+    measured, n = np.asarray(mean @ moved).ravel(), mean.shape[0]
+    apart = np.eye(3)
+    if file.covariance_mm2 is not None:
+        apart = file.sd_mm * np.linalg.inv(np.linalg.cholesky(file.covariance_mm2))
+    independent = sparse.csr_matrix(sparse.kron(mixed, apart))
+    stated = NoiseModel(np.array([file.sd_mm**2]), np.array([ALONE]))
+    return PointDisplacement(
+        kind=kind,
+        description=description,
+        name=file.name or kind,
+        dofs=(3 * seen[:, None] + np.arange(3)).ravel(),
+        operator=sparse.csr_matrix(independent @ shown),
+        data=np.asarray(independent @ measured),
+        shown=shown,
+        measured=measured,
+        material=np.repeat(np.asarray(mean @ points), 3, axis=0),
+        axes=np.tile(np.eye(3), (n, 1)),
+        observed_share=1.0,
+        stated=stated,
+        noise_model=stated,
+        weighting=Weighting(3 * n / file.sd_mm**2, Tukey()),
+    )
+
+
+def _means(
+    points: NDArray[np.float64], number: NDArray[np.int64], length: float
+) -> tuple[sparse.csr_matrix[np.float64], sparse.csr_matrix[np.float64]]:
+    """Means (n_cells, n) of points (n, 3) mm by the number (n,) of their cell, and what makes these independent.
+
+    Of errors that are alike over a length (mm) some points of each cell say nearly what all of them do.
+    """
+    counts = np.bincount(number)
+    if length <= 0.0:
+        shares = (1.0 / counts[number], (number, np.arange(len(number))))
+        alone = sparse.csr_matrix(sparse.diags_array(np.sqrt(counts.astype(np.float64))))
+        return sparse.csr_matrix(shares, shape=(len(counts), len(points))), alone
+    order, k = np.argsort(number, kind="stable"), min(TOGETHER, int(counts.max()))
+    starts = np.cumsum(counts) - counts
+    spread = np.arange(k) / max(k - 1, 1)  # over the points of the cell in their order; with fewer some stand twice
+    groups = order[starts[:, None] + np.rint(spread * (counts[:, None] - 1)).astype(np.int64)]
+    entries = (np.full(groups.size, 1.0 / k), (np.repeat(np.arange(len(groups)), k), groups.ravel()))
+    return sparse.csr_matrix(entries, shape=(len(groups), len(points))), whitener(points[groups], length)

@@ -1,0 +1,212 @@
+"""Landmarks and displacement fields: read as written, refused where they cannot be what they are taken for."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import SimpleITK
+
+from palpate.errors import InputDataError
+from palpate.experiments.verification.structured_meshes import box_mesh
+from palpate.images.alignment import RigidMotion
+from palpate.images.label_image import VoxelGrid
+from palpate.images.readers.nifti import write_displacement_field
+from palpate.images.segmentation import Segmentation
+from palpate.images.tissue import Role, Tissue
+from palpate.mesh.space import lagrange_space
+from palpate.observation.contract import DataFile
+from palpate.observation.displacement_field import read_displacement_field
+from palpate.observation.landmarks import read_landmarks
+
+LPS = np.array([-1.0, -1.0, 1.0])
+MOTION = np.array([[0.0, 0.1, 0.0], [-0.1, 0.0, 0.02], [0.0, -0.02, 0.0]])
+
+
+def away(mesh, by):
+    return replace(mesh, nodes=mesh.nodes + by)
+
+
+@pytest.fixture(scope="module")
+def space():
+    """A box of two tissues."""
+    return lagrange_space(away(box_mesh(2, size=30.0), 7.0), "P2")
+
+
+@pytest.fixture
+def points(space):
+    low, high = space.points.min(axis=0), space.points.max(axis=0)
+    return np.random.default_rng(1).uniform(low + 0.05 * (high - low), high - 0.05 * (high - low), (25, 3))
+
+
+def moved(points):
+    return points + points @ MOTION.T + 0.01
+
+
+def markups(points, labels, *, system="LPS"):
+    sign = LPS if system == "LPS" else np.ones(3)
+    controls = [{"label": n, "position": (sign * p).tolist()} for n, p in zip(labels, points, strict=True)]
+    return {"markups": [{"type": "Fiducial", "coordinateSystem": system, "controlPoints": controls}]}
+
+
+def csv_of(path, before, after, *, columns="before_x,before_y,before_z,after_x,after_y,after_z"):
+    rows = [",".join(f"{x:.9g}" for x in row) for row in np.concatenate([before, after], axis=1)]
+    path.write_text("\n".join([columns, *rows]) + "\n")
+    return path
+
+
+def read(path, *others, kind="landmarks", **more):
+    file = DataFile(kind, (path, *others), 1, 0.3, **more)
+    return read_landmarks(file) if kind == "landmarks" else read_displacement_field(file)
+
+
+@pytest.mark.parametrize("system", ["LPS", "RAS"])
+@pytest.mark.parametrize("order", ["labels", "order"])
+def test_two_markups_are_paired_by_label_or_else_by_order(tmp_path, points, system, order):
+    labels = [f"F-{i}" for i in range(len(points))] if order == "labels" else [""] * len(points)
+    shuffled = np.random.default_rng(2).permutation(len(points)) if order == "labels" else np.arange(len(points))
+    (tmp_path / "a.mrk.json").write_text(json.dumps(markups(points, labels, system=system)))
+    later = markups(moved(points)[shuffled], [labels[i] for i in shuffled], system=system)
+    (tmp_path / "b.mrk.json").write_text(json.dumps(later))
+    table = read(tmp_path / "a.mrk.json", tmp_path / "b.mrk.json").table
+    np.testing.assert_allclose(table.before, points, atol=1e-9)
+    np.testing.assert_allclose(table.after, moved(points), atol=1e-9)
+
+
+@pytest.mark.parametrize("system", ["LPS", "RAS", "0", "1"])
+def test_fcsv_says_its_coordinate_system(tmp_path, points, system):
+    sign = LPS if system in ("LPS", "1") else np.ones(3)
+    for name, places in (("a", points), ("b", moved(points))):
+        rows = [f"{i},{','.join(map(repr, map(float, sign * p)))},0,0,0,1,1,1,0,F-{i},," for i, p in enumerate(places)]
+        head = ["# Markups fiducial file version = 4.11", f"# CoordinateSystem = {system}"]
+        head += ["# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID"]
+        (tmp_path / f"{name}.fcsv").write_text("\n".join([*head, *rows]) + "\n")
+    table = read(tmp_path / "a.fcsv", tmp_path / "b.fcsv").table
+    np.testing.assert_allclose(table.before, points, atol=1e-9)
+    np.testing.assert_allclose(table.after, moved(points), atol=1e-9)
+
+
+def test_the_term_is_zero_where_the_body_moves_as_measured(tmp_path, space, points):
+    source = read(csv_of(tmp_path / "m.csv", points, moved(points)))
+    term, findings = source.on(space)
+    motion = (moved(space.points) - space.points).ravel()[term.dofs]
+    assert findings == ()
+    assert np.abs(term.residuals(motion).values).max() < 1e-7
+    assert term.fit(term.residuals(0.0 * motion)).rms_mm == pytest.approx(
+        float(np.sqrt(np.mean(np.sum((moved(points) - points) ** 2, axis=1)))), rel=1e-6
+    )
+
+
+def test_points_move_with_the_alignment(tmp_path, points):
+    """What the whole body moved by before it was brought back is no displacement."""
+    rigid = RigidMotion(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([3.0, -2.0, 5.0]))
+    source = read(csv_of(tmp_path / "m.csv", points, rigid.apply(moved(points)))).brought(rigid)
+    np.testing.assert_allclose(source.table.after, moved(points), atol=1e-7)
+
+
+def test_points_outside_are_named_and_left_out(tmp_path, space, points):
+    far = np.concatenate([points, points[:1] + 500.0])
+    term, (finding,) = read(csv_of(tmp_path / "m.csv", far, moved(far))).on(space)
+    assert len(term.data) == 3 * len(points)
+    assert finding.code == "points-outside"
+    assert "number 26" in finding.message
+
+
+@pytest.mark.parametrize(("scale", "words"), [(1e-3, "metres"), (1e3, "micrometres")])
+def test_another_unit_is_recognised(tmp_path, space, points, scale, words):
+    source = read(csv_of(tmp_path / "m.csv", scale * points, scale * moved(points)))
+    with pytest.raises(InputDataError, match=words):
+        source.on(space)
+
+
+def test_lps_read_as_ras_is_recognised(tmp_path, space, points):
+    with pytest.raises(InputDataError, match="LPS"):
+        read(csv_of(tmp_path / "m.csv", LPS * points, LPS * moved(points))).on(space)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("x,y,z\n1,2,3\n", "lacks the column"),
+        ("before_x,before_y,before_z,after_x,after_y,after_z\n", "no pair of points"),
+        ("before_x,before_y,before_z,after_x,after_y,after_z\n1,2,nan,1,2,3\n", "no number"),
+        ("before_x,before_y,before_z,after_x,after_y,after_z\n1,2,three,1,2,3\n", "line 2"),
+        ("before_x,before_y,before_z,after_x,after_y,after_z\n1,2,3,1,2,3\n", "where they lay before"),
+        ("before_x,before_y,before_z,after_x,after_y,after_z\n1,2\n", "no number"),
+    ],
+)
+def test_a_table_that_is_none_is_refused(tmp_path, text, words):
+    (tmp_path / "m.csv").write_text(text)
+    with pytest.raises(InputDataError, match=words):
+        read(tmp_path / "m.csv")
+
+
+@pytest.mark.parametrize(
+    "content", ["{}", "[", '{"markups": 3}', '{"markups": [{"controlPoints": [{"position": [1]}]}]}']
+)
+def test_a_markups_file_that_is_none_is_refused(tmp_path, content):
+    (tmp_path / "m.mrk.json").write_text(content)
+    with pytest.raises(InputDataError):
+        read(tmp_path / "m.mrk.json", tmp_path / "m.mrk.json")
+
+
+def grid_and_field(space):
+    low, high = space.points.min(axis=0), space.points.max(axis=0)
+    affine = np.diag([*((high - low) / 11.0), 1.0])
+    affine[:3, 3] = low
+    grid = VoxelGrid((12, 12, 12), affine)
+    centres = grid.world(np.indices(grid.shape).reshape(3, -1).T.astype(float))
+    return grid, (moved(centres) - centres).reshape(*grid.shape, 3)
+
+
+@pytest.mark.parametrize("ending", [".nii.gz", ".nrrd", ".mha", ".h5"])
+def test_a_field_is_read_from_what_itk_writes(tmp_path, space, ending):
+    grid, field = grid_and_field(space)
+    field[:3] = 0.0  # says nothing there
+    path = tmp_path / f"field{ending}"
+    write_displacement_field(tmp_path / "own.nii.gz", field, grid)
+    if ending == ".nii.gz":
+        path = tmp_path / "own.nii.gz"
+    else:
+        image = SimpleITK.ReadImage(str(tmp_path / "own.nii.gz"), SimpleITK.sitkVectorFloat64)
+        if ending == ".h5":
+            whole = SimpleITK.CompositeTransform([SimpleITK.DisplacementFieldTransform(image)])
+            SimpleITK.WriteTransform(whole, str(path))
+        else:
+            SimpleITK.WriteImage(image, str(path))
+    source = read(path, kind="displacement-field", correlation_mm=2.0)
+    assert len(source.table.before) == 9 * 12 * 12
+    np.testing.assert_allclose(source.table.after, moved(source.table.before), atol=1e-4)
+    term, _ = source.on(space)
+    motion = (moved(space.points) - space.points).ravel()[term.dofs]
+    assert np.abs(term.residuals(motion).values).max() < 1e-3
+
+
+def images(shift):
+    """A ball in a box, and later a ball elsewhere."""
+    grid = VoxelGrid((40, 40, 40), np.eye(4))
+    centres = np.moveaxis(np.indices(grid.shape), 0, -1)
+    tissues = (Tissue("ball", (1,), Role.ESTIMATE), Tissue("rest", (), Role.KNOWN, 0.45, 10.0))
+    return [
+        Segmentation((np.linalg.norm(centres - c, axis=-1) > 9.0).astype(np.int16), grid, tissues)
+        for c in (np.full(3, 19.5), 19.5 + shift)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("signs", "words"), [(np.ones(3), None), (-np.ones(3), "from the later image"), (LPS, "LPS where RAS")]
+)
+def test_a_field_that_leads_the_other_way_is_refused(tmp_path, signs, words):
+    shift = np.array([4.0, 2.0, 1.0])
+    rng = np.random.default_rng(3)
+    points = rng.uniform(5.0, 35.0, (4000, 3))
+    near = np.linalg.norm(points - 19.5, axis=1) < 12.0
+    points = points[near]
+    source = read(csv_of(tmp_path / "m.csv", points, points + signs * shift), kind="displacement-field")
+    if words is None:
+        source.against(*images(shift))
+        return
+    with pytest.raises(InputDataError, match=words):
+        source.against(*images(shift))

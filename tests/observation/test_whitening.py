@@ -1,0 +1,50 @@
+"""Correlated errors made independent: W C W^T is nearly 1, at a cost that grows with the number of points."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from palpate.observation.whitening import NEIGHBOURS, correlation, whitener
+
+
+def covariance_of(groups, length):
+    """Covariance (n, n) of the means, in full."""
+    apart = np.linalg.norm(groups[:, None, :, None] - groups[None, :, None, :], axis=-1)
+    return correlation(apart, length).mean(axis=(2, 3))
+
+
+@pytest.fixture(params=[1, 4])
+def groups(request):
+    rng = np.random.default_rng(3)
+    centres = rng.uniform(0.0, 30.0, (300, 1, 3))
+    return centres + 0.7 * rng.standard_normal((300, request.param, 3))
+
+
+@pytest.mark.parametrize("length", [2.0, 8.0])
+def test_what_is_whitened_is_nearly_independent(groups, length):
+    """In the sense of Kullback and Leibler: 1/2 (tr(W C W^T) - n - ln det) a point."""
+    mixed = whitener(groups, length).toarray()
+    whole = mixed @ covariance_of(groups, length) @ mixed.T
+    n = len(groups)
+    divergence = 0.5 * (np.trace(whole) - n - np.linalg.slogdet(whole)[1]) / n
+    assert np.diag(whole) == pytest.approx(np.ones(n), abs=1e-6)
+    assert 0.0 <= divergence < 0.03
+
+
+def test_plain_errors_would_not_be(groups):
+    """The law above can fail: unmixed errors of 8 mm are far from independent."""
+    whole = covariance_of(groups, 8.0)
+    n = len(groups)
+    assert 0.5 * (np.trace(whole) - n - np.linalg.slogdet(whole)[1]) / n > 0.3
+
+
+def test_independent_errors_are_scaled_by_how_many_are_averaged(groups):
+    mixed = whitener(groups, 0.0)
+    assert mixed.diagonal() == pytest.approx(np.full(len(groups), np.sqrt(groups.shape[1])))
+    assert abs(mixed - np.diag(mixed.diagonal())).max() < 1e-9
+
+
+def test_its_size_grows_with_the_number_of_points():
+    groups = np.random.default_rng(4).uniform(0.0, 60.0, (4000, 1, 3))
+    assert whitener(groups, 5.0).nnz <= len(groups) * (NEIGHBOURS + 1)

@@ -1,0 +1,168 @@
+"""Markers and displacement fields beside the images: they narrow what surfaces leave open, and hold."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.errors import ConfigurationError, InputDataError
+from palpate.images.label_image import LabelImage, VoxelGrid
+from palpate.images.readers import write_label_image
+from palpate.images.readers.nifti import write_displacement_field
+from palpate.mesh.locate import located, point_interpolation
+from palpate.study.case import CaseData
+from palpate.study.case_file import read_case
+from palpate.study.check import check_case
+from palpate.study.run import estimate, simulate
+
+CASE = """
+[images]
+before = "before.nii.gz"
+align = "none"
+
+[tissues.core]
+label = 1
+role = "estimate"
+youngs_modulus_kpa = 20.0
+
+[tissues.shell]
+label = 2
+role = "known"
+youngs_modulus_kpa = 10.0
+
+[tissues.tube]
+label = 3
+role = "driver"
+
+[motion]
+filling_mm = 4.0
+
+[mechanics]
+law = "linear"
+
+[domain]
+outer_boundary = "fixed"
+
+[mesh]
+edge_length_mm = 6.0
+
+[discrepancy]
+heterogeneity_sd = 0.0
+poisson_sd = 0.0
+
+[noise]
+surface_sd_mm = 0.3
+"""
+TRUTH = 20.0
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A core in a shell beside a tube that fills, with its simulated later image."""
+    folder = tmp_path_factory.mktemp("core")
+    grid = VoxelGrid((44, 44, 44), np.diag([1.25, 1.25, 1.25, 1.0]))
+    x, y, z = 1.25 * np.moveaxis(np.indices(grid.shape).astype(float), 0, 0)
+    labels = np.full(grid.shape, 2)
+    labels[(x - 24.0) ** 2 + (y - 34.0) ** 2 + (z - 27.0) ** 2 < 10.0**2] = 1
+    labels[((x - 27.0) ** 2 + (y - 14.0) ** 2 < 6.0**2) & (np.abs(z - 27.0) < 17.0)] = 3
+    write_label_image(folder / "before.nii.gz", LabelImage(labels.astype(np.int32), grid, {}))
+    (folder / "case.toml").write_text(CASE)
+    made = simulate(read_case(folder / "case.toml"), progress=lambda _: None)
+    write_label_image(folder / "after.nii.gz", made.after)
+    rng = np.random.default_rng(1)
+    points = rng.uniform(4.0, 50.0, (4000, 3))
+    points = points[located(made.space.mesh, points).inside]
+    moved = point_interpolation(made.space, located(made.space.mesh, points)) @ made.displacements[-1]
+    few = slice(0, 60)
+    table(folder / "markers.csv", points[few], moved[few] + 0.1 * rng.standard_normal((60, 3)))
+    table(folder / "back.csv", points + moved, -moved)
+    centres = grid.world(np.indices(grid.shape).reshape(3, -1).T.astype(float))
+    places = located(made.space.mesh, centres)
+    field = np.zeros((len(centres), 3))
+    inside = replace(places, tet=places.tet[places.inside], barycentric=places.barycentric[places.inside])
+    field[places.inside] = point_interpolation(made.space, inside) @ made.displacements[-1]
+    field[places.inside] += 0.2 * rng.standard_normal(field[places.inside].shape)
+    write_displacement_field(folder / "field.nii.gz", field.reshape(*grid.shape, 3), grid)
+    return folder
+
+
+def table(path: Path, points, moved):
+    head = "before_x,before_y,before_z,after_x,after_y,after_z"
+    np.savetxt(path, np.concatenate([points, points + moved], axis=1), delimiter=",", header=head, comments="")
+
+
+@pytest.fixture(scope="module")
+def case(folder):
+    case = read_case(folder / "case.toml", ["images.after=['after.nii.gz']"])
+    return replace(case, motion=None)
+
+
+@pytest.fixture(scope="module")
+def results(case, folder):
+    """The estimate by surfaces alone, with markers, and with a field."""
+    markers = CaseData("landmarks", folder / "markers.csv", sd_mm=0.1)
+    field = CaseData("displacement-field", folder / "field.nii.gz", sd_mm=0.2)
+    every = {"surfaces": (), "markers": (markers,), "field": (field,)}
+    return {name: estimate(replace(case, data=data)) for name, data in every.items()}
+
+
+@pytest.mark.parametrize("name", ["surfaces", "markers", "field"])
+def test_the_truth_lies_in_the_interval(results, name):
+    (core,) = results[name].estimation.estimates
+    assert results[name].estimation.status == "converged"
+    assert core.interval95[0] < TRUTH < core.interval95[1]
+
+
+def test_what_is_seen_inside_narrows_what_surfaces_leave_open(results):
+    widths = {name: np.diff(np.log(r.estimation.estimates[0].interval95))[0] for name, r in results.items()}
+    assert widths["markers"] < 0.9 * widths["surfaces"]
+    assert widths["field"] < 0.7 * widths["surfaces"]
+
+
+def test_the_result_says_what_each_kind_of_data_tells(results):
+    document = results["field"].to_dict()
+    shares = document["information_shares"]["core"]
+    assert sum(shares.values()) == pytest.approx(1.0)
+    assert shares["displacement field"] > 0.5
+    far = document["fit"][0]["tissues"]["displacement-field"]["end"]["rms_mm"]  # of means of up to four
+    assert 0.5 * 0.2 * 3**0.5 < far < 0.2 * 3**0.5
+    assert json.dumps(document, allow_nan=False)
+    assert "data[0]" in results["field"].provenance.inputs
+
+
+@pytest.mark.usefixtures("case")
+def test_check_says_what_was_read(folder):
+    path = folder / "with_data.toml"
+    text = CASE.replace('align = "none"', 'align = "none"\nafter = ["after.nii.gz"]')
+    more = '\n[[data]]\nkind = "landmarks"\nfile = "markers.csv"\nsd_mm = 0.1\n'
+    path.write_text(text.replace("[motion]\nfilling_mm = 4.0", "") + more)
+    report = check_case(path, [], progress=lambda _: None)
+    assert report.exit_code == 0
+    assert "landmarks: 60 pairs of points" in report.text()
+
+
+def test_a_field_that_leads_back_is_refused(case, folder):
+    back = CaseData("displacement-field", folder / "back.csv", sd_mm=0.2)
+    with pytest.raises(InputDataError, match="from the later image"):
+        estimate(replace(case, data=(back,)))
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("data=[{kind='landmarks', file='markers.csv'}]", "nothing of its errors"),
+        ("data=[{kind='landmarks', file='markers.csv', sd_mm=0.1, state=2}]", "has 1 later state"),
+        ("data=[{kind='landmark', file='markers.csv', sd_mm=0.1}]", "did you mean"),
+        (
+            "data=[{kind='landmarks', file='m.csv', covariance_mm2=[[1,0,0],[0,1,0],[0,0,-1]]}]",
+            "positive definite",
+        ),
+    ],
+)
+def test_data_that_make_no_sense_are_refused_by_their_key(folder, override, words):
+    with pytest.raises(ConfigurationError, match=words):
+        read_case(folder / "case.toml", ["images.after=['after.nii.gz']", override])
