@@ -28,7 +28,7 @@ class PointMotion:
     kind: str = "point motion"
     description: str = "the displacement of points that were seen in both images"
     of_driver: bool = False
-    has_offset: bool = True
+    unit: str = "mm"
     observed_share: float = 1.0
 
     @property

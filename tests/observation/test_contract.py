@@ -16,10 +16,12 @@ from palpate.images.distance import distance_map
 from palpate.images.label_image import VoxelGrid
 from palpate.mesh.locate import located
 from palpate.mesh.space import lagrange_space
-from palpate.observation.contract import DataFile, Observation, Rematched
+from palpate.observation.contract import DataFile, Observation, OfMaterial, Rematched, Weighting
+from palpate.observation.force import Force
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.observed_surface import ObservedSurface
 from palpate.observation.point_displacement import PointDisplacement, point_displacement
+from palpate.observation.robust_loss import Tukey
 from palpate.observation.surface_distance import SurfaceDistance, surface_distance
 from palpate.observation.target import surface_target, target_from
 from palpate.phantoms.shapes import Ellipsoid, rotation_about
@@ -102,7 +104,31 @@ def of_means(sphere, point_motion):
     return of_points(sphere, point_motion, cells=np.arange(40)[:, None] // 4)
 
 
+@dataclass(frozen=True)
+class Spring:
+    """A force that is k_r u of the moduli k_r, as a reaction is to first order."""
+
+    dofs: np.ndarray
+    centre: np.ndarray
+
+    def combined(self, _fields):
+        return self
+
+    def at(self, displacement, moduli, coefficients):
+        stretch = displacement[2] - displacement[5]
+        slope = moduli.sum() * np.eye(len(displacement))[2] - moduli.sum() * np.eye(len(displacement))[5]
+        return moduli.sum() * stretch, slope, np.concatenate([moduli * stretch, 0.0 * coefficients])
+
+
+def of_force(_sphere, _point_motion):
+    noise = NoiseModel(np.array([0.04]), np.array([1e-3]))
+    spring = Spring(np.arange(6), np.zeros(3))
+    term = Force("force", spring, np.eye(3)[2], 1.5, noise, noise, Weighting(25.0, Tukey()))
+    return term.under(np.array([2.0, 3.0]), np.zeros(2))
+
+
 MAKERS = {
+    Force: {"spring": of_force},
     SurfaceDistance: {"smooth surfaces": of_smooth_surfaces, "voxels": of_voxels},
     PointDisplacement: {"field": of_points, "markers": of_markers, "means": of_means},
 }
@@ -146,7 +172,7 @@ def test_residuals_have_the_shapes_that_are_promised(case):
     assert 0.0 < case.seen.observed_share <= 1.0
 
 
-@pytest.mark.parametrize("make", [of_smooth_surfaces, of_point, of_points, of_markers, of_means])
+@pytest.mark.parametrize("make", [of_smooth_surfaces, of_point, of_points, of_markers, of_means, of_force])
 def test_the_exact_jacobian_leaves_a_remainder_of_second_order(make, sphere, point_motion, rng):
     """Of nine residuals in ten: of the others the closest point jumps to another triangle."""
     seen = make(sphere, point_motion)
@@ -238,3 +264,20 @@ def test_a_bias_of_both_distance_maps_changes_nothing(make, sphere, point_motion
     assert biased.reweighted(found[1]).weighting.precision == pytest.approx(
         plain.reweighted(found[0]).weighting.precision, rel=1e-6
     )
+
+
+def test_what_depends_on_the_moduli_says_how(sphere, point_motion):
+    """Taylor by ln E at a held displacement, and nothing before moduli are known."""
+    seen = of_force(sphere, point_motion)
+    assert isinstance(seen, OfMaterial)
+    place, change = np.linspace(0.1, 0.9, 6), np.array([0.3, -0.2])
+    start = seen.residuals(place)
+    remainders = [
+        abs(
+            seen.under(np.array([2.0, 3.0]) * np.exp(h * change), np.zeros(2)).residuals(place).values[0]
+            - start.values[0]
+            - h * (start.direct[0, :2] @ change)
+        )
+        for h in STEPS
+    ]
+    assert np.all(np.diff(np.log(remainders)) / np.diff(np.log(STEPS)) > 1.9)

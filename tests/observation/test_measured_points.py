@@ -45,6 +45,10 @@ def moved(points):
     return points + points @ MOTION.T + 0.01
 
 
+def no_force(_name, _direction):
+    raise AssertionError("points need no force")
+
+
 def markups(points, labels, *, system="LPS"):
     sign = LPS if system == "LPS" else np.ones(3)
     controls = [{"label": n, "position": (sign * p).tolist()} for n, p in zip(labels, points, strict=True)]
@@ -90,7 +94,7 @@ def test_fcsv_says_its_coordinate_system(tmp_path, points, system):
 
 def test_the_term_is_zero_where_the_body_moves_as_measured(tmp_path, space, points):
     source = read(csv_of(tmp_path / "m.csv", points, moved(points)))
-    term, findings = source.on(space)
+    term, findings = source.on(space, no_force)
     motion = (moved(space.points) - space.points).ravel()[term.dofs]
     assert findings == ()
     assert np.abs(term.residuals(motion).values).max() < 1e-7
@@ -108,7 +112,7 @@ def test_points_move_with_the_alignment(tmp_path, points):
 
 def test_points_outside_are_named_and_left_out(tmp_path, space, points):
     far = np.concatenate([points, points[:1] + 500.0])
-    term, (finding,) = read(csv_of(tmp_path / "m.csv", far, moved(far))).on(space)
+    term, (finding,) = read(csv_of(tmp_path / "m.csv", far, moved(far))).on(space, no_force)
     assert len(term.data) == 3 * len(points)
     assert finding.code == "points-outside"
     assert "number 26" in finding.message
@@ -118,12 +122,12 @@ def test_points_outside_are_named_and_left_out(tmp_path, space, points):
 def test_another_unit_is_recognised(tmp_path, space, points, scale, words):
     source = read(csv_of(tmp_path / "m.csv", scale * points, scale * moved(points)))
     with pytest.raises(InputDataError, match=words):
-        source.on(space)
+        source.on(space, no_force)
 
 
 def test_lps_read_as_ras_is_recognised(tmp_path, space, points):
     with pytest.raises(InputDataError, match="LPS"):
-        read(csv_of(tmp_path / "m.csv", LPS * points, LPS * moved(points))).on(space)
+        read(csv_of(tmp_path / "m.csv", LPS * points, LPS * moved(points))).on(space, no_force)
 
 
 @pytest.mark.parametrize(
@@ -179,7 +183,7 @@ def test_a_field_is_read_from_what_itk_writes(tmp_path, space, ending):
     source = read(path, kind="displacement-field", correlation_mm=2.0)
     assert len(source.table.before) == 9 * 12 * 12
     np.testing.assert_allclose(source.table.after, moved(source.table.before), atol=1e-4)
-    term, _ = source.on(space)
+    term, _ = source.on(space, no_force)
     motion = (moved(space.points) - space.points).ravel()[term.dofs]
     assert np.abs(term.residuals(motion).values).max() < 1e-3
 

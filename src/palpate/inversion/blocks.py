@@ -26,6 +26,7 @@ __all__ = [
     "Acts",
     "Block",
     "frame_blocks",
+    "instrument_block",
     "joined",
     "material_blocks",
     "offset_block",
@@ -166,6 +167,11 @@ def offset_block(observation: Observation, state: int, *, sd: float) -> Block:
         return Block(*own, considered=True)
     alternatives = tuple((np.full((1, 1), (share * sd) ** 2),) for share in (DRAWN_ALIKE, 1.0))
     return Block(*own, alternatives, amplitudes=(1.0, 1.0), odds=(0.0, float(np.log(SELDOM))))
+
+
+def instrument_block(name: str, state: int, *, sd: float) -> Block:
+    """By how much the instrument of an observation is off in a later state; sd in the unit of its residuals."""
+    return Block(name, "instrument", Acts.RESIDUALS, (state,), np.full((1, 1), sd**-2.0))
 
 
 def material_blocks(

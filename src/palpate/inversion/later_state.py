@@ -14,7 +14,7 @@ from palpate.inversion.parameters import ParameterMap
 from palpate.mechanics.finite_strain import FiniteStrainModel
 from palpate.mechanics.forward import ForwardModel
 from palpate.mechanics.linear_model import LinearModel
-from palpate.observation.contract import Observation
+from palpate.observation.contract import Observation, OfMaterial
 from palpate.observation.noise_model import NoiseModel
 
 __all__ = ["InverseProblem", "LaterState"]
@@ -60,7 +60,9 @@ class LaterState:
         material = self.model.material.combined(fields)
         conditions = replace(self.model.conditions, constraint=constraint)
         finite = self.finite_strain and replace(self.finite_strain.under(conditions), material=material)
-        return replace(self, model=replace(self.model.under(conditions), material=material), finite_strain=finite)
+        model = replace(self.model.under(conditions), material=material)
+        seen = tuple(o.combined(fields) if isinstance(o, OfMaterial) else o for o in self.observations)
+        return replace(self, model=model, observations=seen, finite_strain=finite)
 
     def with_approximation(self, approximation: Approximation) -> LaterState:
         """The same state with another approximation of its model."""

@@ -14,7 +14,7 @@ from palpate.inversion.approximation import Approximation, Derivatives, Place
 from palpate.inversion.later_state import LaterState
 from palpate.inversion.parameters import ParameterMap
 from palpate.mechanics.forward import Equilibrium
-from palpate.observation.contract import Observation, Rematched, Residuals
+from palpate.observation.contract import Observation, OfMaterial, Rematched, Residuals
 from palpate.observation.jacobian import Jacobian, jacobian_of
 from palpate.parallel import mapped
 
@@ -176,9 +176,14 @@ class Objective:
             seen = self._residuals(s, solution.values, unknowns)
             value += sum(_misfit(*of) for of in seen)
             by_region = solution.adjoint(np.concatenate([_pull(*of) for of in seen]))[None]
-            known = len(self.parameters.offsets(unknowns, s)) > 0
-            by_offset = [_weighted(*of).sum() for of in seen if known and of[0].has_offset]
-            own = np.concatenate([self.parameters.by_unknowns(by_region, unknowns)[0], by_offset])
+            pulls = {observation.name: _weighted(observation, residuals).sum() for observation, residuals in seen}
+            by_offset = [pulls[name] for name in self.parameters.offset_names(s)]
+            by_model = self.parameters.by_unknowns(by_region, unknowns)[0]
+            for observation, residuals in seen:
+                if residuals.direct is not None:
+                    pull = residuals.direct.T @ _weighted(observation, residuals)
+                    by_model = by_model + self._by_material(s, unknowns).T @ pull
+            own = np.concatenate([by_model, by_offset])
             gradient[self.parameters.unknowns_of(s)] += own
         return value, gradient
 
@@ -213,34 +218,57 @@ class Objective:
         self, s: int, values: NDArray[np.float64], unknowns: NDArray[np.float64]
     ) -> list[tuple[Observation, Residuals]]:
         """Each observation of a state with its residuals at displacements (n_observed,) mm and its offset."""
-        every = zip(self._seen(s, values), self._offsets(s, unknowns), strict=True)
-        return mapped(lambda of: (of[0][0], of[0][0].residuals(of[0][1], of[1])), every)
+        material = self._material(s, unknowns)
+
+        def seen(of: tuple[tuple[Observation, NDArray[np.float64]], float]) -> tuple[Observation, Residuals]:
+            """One observation with its residuals."""
+            (observation, motion), offset = of
+            here = observation.under(*material) if isinstance(observation, OfMaterial) else observation
+            return observation, here.residuals(motion, offset)
+
+        return mapped(seen, zip(self._seen(s, values), self._offsets(s, unknowns), strict=True))
+
+    def _material(self, s: int, unknowns: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Moduli (n_regions,) kPa and coefficients (n_material,) of the material of a state."""
+        n_boundary = self.states[s].model.constraint.n_modes
+        return self.parameters.moduli(unknowns), self.parameters.coefficients(unknowns)[s][n_boundary:]
+
+    def _by_material(self, s: int, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivatives (n_regions + n_material, k) of ln E and the material of a state by theta and coefficients."""
+        n, n_boundary = len(self.parameters.base), self.states[s].model.constraint.n_modes
+        n_modes = len(self.parameters.coefficients(unknowns)[s])
+        kept = np.r_[np.arange(n), np.arange(n + n_boundary, n + n_modes)]
+        return self.parameters.by_unknowns(np.eye(n + n_modes)[kept], unknowns)
 
     def _offsets(self, s: int, unknowns: NDArray[np.float64]) -> list[float]:
         """The offset of each observation of a state, 0 of those that have none."""
-        known = iter(self.parameters.offsets(unknowns, s).tolist())
-        return [next(known, 0.0) if o.has_offset else 0.0 for o in self.states[s].observations]
+        known = dict(zip(self.parameters.offset_names(s), self.parameters.offsets(unknowns, s).tolist(), strict=True))
+        return [known.get(o.name, 0.0) for o in self.states[s].observations]
 
     def _linearised(self, s: int, unknowns: NDArray[np.float64]) -> list[Linearisation]:
         state, solution = self.states[s], self._equilibrium(s, unknowns)
         tangent = self.parameters.by_unknowns(solution.tangent(), unknowns)
         columns, n_offsets = self.parameters.unknowns_of(s), len(self.parameters.offsets(unknowns, s))
         seen = self._residuals(s, solution.values, unknowns)
-        of_offset = np.cumsum([0, *(o.has_offset for o in state.observations[:-1])]).tolist()
+        numbers = {name: number for number, name in enumerate(self.parameters.offset_names(s))}
 
-        def line(of: tuple[int, slice, tuple[Observation, Residuals]]) -> Linearisation:
+        def line(of: tuple[slice, tuple[Observation, Residuals]]) -> Linearisation:
             """One observation's residuals with their derivative."""
-            number, rows, (observation, residuals) = of
+            rows, (observation, residuals) = of
+            number = numbers.get(observation.name)
             weights = residuals.weights * observation.weighting.loss.weight(residuals.values)
             smooth, seen_by = residuals.smooth_jacobian, tangent[rows]
-            own_number = number if observation.has_offset else None
-            jacobian = jacobian_of(smooth, seen_by, number=own_number, n_offsets=n_offsets)
+            direct = None if residuals.direct is None else (residuals.direct, self._by_material(s, unknowns))
+            jacobian = jacobian_of(smooth, seen_by, number=number, n_offsets=n_offsets, direct=direct)
             weighted = _weighted(observation, residuals)
-            own = observation.has_offset * np.eye(1, n_offsets, number)[0] * weighted.sum()
-            gradient = np.concatenate([seen_by.T @ (residuals.jacobian.T @ weighted), own])
+            own = np.zeros(n_offsets)
+            own[[] if number is None else number] = weighted.sum()
+            by_model = seen_by.T @ (residuals.jacobian.T @ weighted)
+            by_model = by_model if direct is None else by_model + direct[1].T @ (direct[0].T @ weighted)
+            gradient = np.concatenate([by_model, own])
             return Linearisation(observation, s, residuals, columns, jacobian, weights, gradient)
 
-        return mapped(line, zip(of_offset, state.slices, seen, strict=True))
+        return mapped(line, zip(state.slices, seen, strict=True))
 
 
 @dataclass(frozen=True, slots=True)

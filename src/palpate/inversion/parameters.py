@@ -188,8 +188,12 @@ class ParameterMap:
         return [unknowns[self._model_columns(state)] for state in range(self.n_states)]
 
     def offsets(self, unknowns: NDArray[np.float64], state: int) -> NDArray[np.float64]:
-        """What is added to the residuals of each observation of a state (n_observations,), or none (0,)."""
+        """What is added to the residuals of those observations of a state that have an offset (n_offsets,)."""
         return np.asarray(unknowns[self.acting(Acts.RESIDUALS, state)])
+
+    def offset_names(self, state: int) -> list[str]:
+        """Names of the observations of a state that have an offset, in the order of these."""
+        return [b.of for b in self.blocks if b.acts is Acts.RESIDUALS and state in b.states]
 
     def unknowns_of(self, state: int) -> NDArray[np.int64]:
         """Numbers (n_own,) of the unknowns that a state depends on: theta, its model's coefficients, its offsets."""

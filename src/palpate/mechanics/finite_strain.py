@@ -149,6 +149,29 @@ class FiniteStrainModel:
         """Derivatives of every element's Lame constants with respect to its nu, as `moduli_of`."""
         return self._spread(moduli, material, lame_parts_by_poisson)
 
+    def material_forces(
+        self,
+        values: NDArray[np.float64],
+        moduli: NDArray[np.float64],
+        material: NDArray[np.float64],
+        directions: NDArray[np.float64] | None = None,
+    ) -> NDArray[np.float64]:
+        """Derivatives of the internal forces (n_dof, k), mN, by the material's coefficients (n_material,).
+
+        At u (n_dof,) mm and moduli (n_regions,) kPa; directions (n_material, k), by default each coefficient alone.
+        """
+        if not self.material.n_modes:
+            return np.zeros((len(values), 0 if directions is None else directions.shape[1]))
+        return material_forces(
+            self.elements,
+            self.material,
+            values,
+            self.moduli_of(moduli, material),
+            by_poisson=self.moduli_by_poisson(moduli, material),
+            tissue=np.array(self.regions)[self.element_region],
+            directions=directions,
+        )
+
     def under(self, conditions: Conditions) -> FiniteStrainModel:
         """The same body with other loads, modes and offset of the same prescribed points.
 
@@ -344,20 +367,8 @@ class FiniteStrainEquilibrium:
 
     def _material_forces(self, directions: Array | None = None) -> Array:
         """Derivatives of R (n_dof, k), mN, along directions (n_material, k) of the material modes, or by each alone."""
-        model = self.model
-        if not model.material.n_modes:
-            return np.zeros((len(self.values), 0 if directions is None else directions.shape[1]))
-        slopes = model.moduli_by_poisson(self.moduli, self.coefficients[model.constraint.n_modes :])
-        tissue = np.array(model.regions)[model.element_region]
-        return material_forces(
-            model.elements,
-            model.material,
-            self.values,
-            self.balance.moduli,
-            by_poisson=slopes,
-            tissue=tissue,
-            directions=directions,
-        )
+        material = self.coefficients[self.model.constraint.n_modes :]
+        return self.model.material_forces(self.values, self.moduli, material, directions)
 
     def _poisson_forces(self) -> Array:
         """F^T dR / d nu_r (n_free, n_regions), mN."""

@@ -6,7 +6,7 @@ belongs together (`Rematched`), to be shown by a segmented image (`Imaged`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, Self, runtime_checkable
@@ -29,6 +29,10 @@ __all__ = [
     "Imaged",
     "ImagedBody",
     "Observation",
+    "OfInstrument",
+    "OfMaterial",
+    "Reaction",
+    "ReactionOf",
     "Rematched",
     "Residuals",
     "Weighting",
@@ -54,11 +58,12 @@ class ImagedBody:
 class Residuals:
     """Residuals of one observation at one displacement.
 
-    values (n,) mm; weights (n,), dimensionless, their sum 1; places (n, 3) mm in the deformed body and normals (n, 3):
-    where each was taken and along which direction; material (n, 3) mm: the same places at rest. jacobian (n, n_dofs):
-    the exact d values / d displacement of the unknowns that the observation sees. smooth_jacobian: the same without
-    what only image noise makes of it (that of the exact one where there is no such thing). distances (m,) mm: of what
-    is compared, where the residuals are not these themselves.
+    values (n,) mm, or the observation's unit; weights (n,), dimensionless, their sum 1; places (n, 3) mm in the
+    deformed body and normals (n, 3): where each was taken and along which direction; material (n, 3) mm: the same
+    places at rest. jacobian (n, n_dofs): the exact d values / d displacement of the unknowns that the observation sees.
+    smooth_jacobian: the same without what only image noise makes of it (that of the exact one where there is no such
+    thing). distances (m,) mm: of what is compared, where the residuals are not these themselves. direct (n, n_regions +
+    n_material): their derivatives by ln E and the material's coefficients at a held displacement, where they have any.
     """
 
     values: NDArray[np.float64]
@@ -69,6 +74,7 @@ class Residuals:
     jacobian: sparse.csr_matrix[np.float64]
     smooth_jacobian: sparse.csr_matrix[np.float64]
     distances: NDArray[np.float64] | None = None
+    direct: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +118,11 @@ class Observation(Protocol):
         ...
 
     @property
+    def unit(self) -> str:
+        """Unit of its residuals: "mm", or that of another output of the model."""
+        ...
+
+    @property
     def dofs(self) -> NDArray[np.int64]:
         """Numbers (n_dofs,) of the displacement's unknowns that it sees, 3 point + axis."""
         ...
@@ -119,11 +130,6 @@ class Observation(Protocol):
     @property
     def of_driver(self) -> bool:
         """Whether it shows a wall whose motion is prescribed: its residuals then tell nothing of the noise."""
-        ...
-
-    @property
-    def has_offset(self) -> bool:
-        """Whether all its residuals may be off by one unknown amount, as those of a surface that is drawn too large."""
         ...
 
     @property
@@ -189,6 +195,65 @@ class Rematched(Protocol):
 
 
 @runtime_checkable
+class OfMaterial(Protocol):
+    """An observation that depends on the moduli directly, not through the displacement alone, as a force does."""
+
+    def under(self, moduli: NDArray[np.float64], material: NDArray[np.float64]) -> Self:
+        """The same at moduli (n_regions,) kPa and coefficients (n_material,) of the material modes."""
+        ...
+
+    def combined(self, fields: NDArray[np.float64]) -> Self:
+        """The same where the unknowns are combinations (n_fields, k) of the material's fields."""
+        ...
+
+
+@runtime_checkable
+class OfInstrument(Protocol):
+    """An observation whose instrument may be off by one unknown amount, as a load cell is."""
+
+    @property
+    def offset_sd(self) -> float:
+        """Standard deviation of that amount, in the residuals' unit; 0: it is known to be none."""
+        ...
+
+    @property
+    def measured(self) -> float:
+        """What it showed, in the same unit."""
+        ...
+
+
+class Reaction(Protocol):
+    """The force that holds a surface of a model, along one direction; N."""
+
+    @property
+    def dofs(self) -> NDArray[np.int64]:
+        """Numbers (n,) of the displacement's unknowns on which it depends."""
+        ...
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """Middle (3,) mm of the surface."""
+        ...
+
+    def combined(self, fields: NDArray[np.float64]) -> Self:
+        """The same by combinations (n_fields, k) of the material's fields."""
+        ...
+
+    def at(
+        self, displacement: NDArray[np.float64], moduli: NDArray[np.float64], coefficients: NDArray[np.float64]
+    ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+        """Force, its derivatives by u (n,) and by ln E and the material (n_regions + n_material,).
+
+        At displacements (n,) mm, moduli (n_regions,) kPa and coefficients (n_material,).
+        """
+        ...
+
+
+ReactionOf = Callable[[str, NDArray[np.float64]], Reaction]
+"""That on a named surface along a direction (3,)."""
+
+
+@runtime_checkable
 class Imaged(Protocol):
     """An observation of a tissue that segmented images show: it errs as voxels do, and as the tissue is drawn."""
 
@@ -215,17 +280,23 @@ class DataFile:
 
     state: number of the later state, from 1; sd_mm: standard deviation of each component's errors; covariance_mm2 (3,
     3): of a point's error instead; correlation_mm: length over which errors of a field are alike, exp(-d / length);
-    axes: of the vectors of a field that is an image, "LPS" as ITK has them, or "RAS".
+    axes: of the vectors of a field that is an image, "LPS" as ITK has them, or "RAS"; force_n on a surface along a
+    direction, with its standard deviation and that of the load cell's offset, N.
     """
 
     kind: str
     paths: tuple[Path, ...]
     state: int
-    sd_mm: float
+    sd_mm: float = 1.0
     name: str = ""
     covariance_mm2: NDArray[np.float64] | None = None
     correlation_mm: float = 0.0
     axes: str = "LPS"
+    surface: str = ""
+    force_n: float = 0.0
+    direction: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    sd_n: float = 1.0
+    offset_sd_n: float = 0.0
 
 
 class DataSource(Protocol):
@@ -254,6 +325,9 @@ class DataSource(Protocol):
         """Raise `InputDataError` where the images say that it is another's, or was written otherwise than stated."""
         ...
 
-    def on(self, space: LagrangeSpace) -> tuple[Observation, tuple[Finding, ...]]:
-        """The data term on a meshed body, and what the user should know of it; raises `InputDataError`."""
+    def on(self, space: LagrangeSpace, reaction_of: ReactionOf) -> tuple[Observation, tuple[Finding, ...]]:
+        """The data term on a meshed body, and what the user should know of it; raises `InputDataError`.
+
+        reaction_of: the forces that hold its surfaces.
+        """
         ...

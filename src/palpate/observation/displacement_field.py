@@ -18,7 +18,7 @@ from palpate.images.input_file import open_input
 from palpate.images.segmentation import Segmentation
 from palpate.mesh.locate import located
 from palpate.mesh.space import LagrangeSpace
-from palpate.observation.contract import DataFile
+from palpate.observation.contract import DataFile, ReactionOf
 from palpate.observation.direction import refuse_direction
 from palpate.observation.landmarks import PointTable, read_point_table, refuse_slips
 from palpate.observation.point_displacement import PointDisplacement, point_displacement
@@ -58,11 +58,12 @@ class DisplacementField:
         table = self.table
         refuse_direction(table.before, table.after - table.before, before, after, self.file.paths[0])
 
-    def on(self, space: LagrangeSpace) -> tuple[PointDisplacement, tuple[Finding, ...]]:
+    def on(self, space: LagrangeSpace, reaction_of: ReactionOf) -> tuple[PointDisplacement, tuple[Finding, ...]]:
         """The term of the points in the mesh, in means of some that are near each other; raises `InputDataError`.
 
         What is nearer than half a correlation length, or a third of an element, says the same.
         """
+        del reaction_of
         places = located(space.mesh, self.table.before)
         inside = places.inside
         if self.file.paths[0].suffix.lower() == ".csv":

@@ -14,13 +14,16 @@ from scipy import sparse
 
 __all__ = ["Jacobian", "jacobian_of"]
 
+MANY = 4  # residuals a displacement, from which on the products of the sparse factor cost less than J itself
+
 
 @dataclass(frozen=True, slots=True)
 class Jacobian:
     """J = S T (n, n_columns) of one observation, mm per unit of each unknown.
 
-    by_displacement: S (n, n_dofs + 1), dimensionless, its last column 1: the derivative by an offset of all residuals;
-    tangent: T (n_dofs + 1, n_columns) mm, the derivatives of displacements, and of the offset, by the unknowns.
+    by_displacement: S (n, n_dofs + 1 + n_direct), dimensionless, its column n_dofs 1: the derivative by an offset of
+    all residuals; then those by ln E and the material at held displacements, where there are any; tangent: T, one row a
+    column of S, the derivatives of displacements (mm), offset, ln E and material by the unknowns.
     """
 
     by_displacement: sparse.csr_matrix[np.float64]
@@ -42,6 +45,9 @@ class Jacobian:
     def gram(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
         """J^T W J (n_columns, n_columns) for W = diag(weights (n,)), none negative."""
         matrix = self.by_displacement
+        if matrix.shape[0] < MANY * matrix.shape[1]:
+            formed = np.sqrt(weights)[:, None] * np.asarray(matrix @ self.tangent)
+            return np.asarray(formed.T @ formed)
         scaled = np.repeat(np.sqrt(weights), np.diff(matrix.indptr)) * matrix.data
         root = sparse.csr_matrix((scaled, matrix.indices, matrix.indptr), shape=matrix.shape)
         return np.asarray(self.tangent.T @ (sparse.csr_matrix(root.T @ root) @ self.tangent))
@@ -66,7 +72,7 @@ class Jacobian:
     def under(self, tangent: NDArray[np.float64]) -> Jacobian:
         """The same with other derivatives of the displacements (n_dofs, k) by the first k unknowns."""
         whole = self.tangent.copy()
-        whole[:-1, : tangent.shape[1]] = tangent
+        whole[: len(tangent), : tangent.shape[1]] = tangent
         return replace(self, tangent=whole)
 
     @property
@@ -76,7 +82,12 @@ class Jacobian:
 
 
 def jacobian_of(
-    smooth: sparse.csr_matrix[np.float64], tangent: NDArray[np.float64], *, number: int | None, n_offsets: int
+    smooth: sparse.csr_matrix[np.float64],
+    tangent: NDArray[np.float64],
+    *,
+    number: int | None,
+    n_offsets: int,
+    direct: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
 ) -> Jacobian:
     """Of residuals with derivatives smooth (n, n_dofs) by displacements, these with tangent (n_dofs, k) by unknowns.
 
@@ -86,5 +97,7 @@ def jacobian_of(
     below = np.zeros((1, tangent.shape[1] + n_offsets))
     if n_offsets and number is not None:
         below[0, tangent.shape[1] + number] = 1.0
-    whole = np.concatenate([np.pad(tangent, ((0, 0), (0, n_offsets))), below])
-    return Jacobian(sparse.csr_matrix(sparse.hstack([smooth, ones], format="csr")), whole)
+    held = direct or (np.zeros((smooth.shape[0], 0)), np.zeros((0, tangent.shape[1])))
+    rows = [np.pad(tangent, ((0, 0), (0, n_offsets))), below, np.pad(held[1], ((0, 0), (0, n_offsets)))]
+    seen = sparse.hstack([smooth, ones, sparse.csr_matrix(held[0])], format="csr")
+    return Jacobian(sparse.csr_matrix(seen), np.concatenate(rows))

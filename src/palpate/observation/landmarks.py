@@ -20,7 +20,7 @@ from palpate.images.input_file import read_input
 from palpate.images.segmentation import Segmentation
 from palpate.mesh.locate import located
 from palpate.mesh.space import LagrangeSpace
-from palpate.observation.contract import DataFile
+from palpate.observation.contract import DataFile, ReactionOf
 from palpate.observation.direction import refuse_direction
 from palpate.observation.point_displacement import PointDisplacement, point_displacement
 
@@ -73,8 +73,9 @@ class Landmarks:
         table = self.table
         refuse_direction(table.before, table.after - table.before, before, after, self.file.paths[0])
 
-    def on(self, space: LagrangeSpace) -> tuple[PointDisplacement, tuple[Finding, ...]]:
+    def on(self, space: LagrangeSpace, reaction_of: ReactionOf) -> tuple[PointDisplacement, tuple[Finding, ...]]:
         """The term of the pairs that lie in the mesh; raises `InputDataError` where none does."""
+        del reaction_of
         table, places = self.table, located(space.mesh, self.table.before)
         refuse_slips(space, table.before, places.inside, self.file.paths[0])
         inside, findings = places.inside, list[Finding]()

@@ -50,13 +50,13 @@ class PointDisplacement:
     weighting: Weighting
 
     @property
-    def of_driver(self) -> bool:
-        """It shows no wall."""
-        return False
+    def unit(self) -> str:
+        """Millimetre."""
+        return "mm"
 
     @property
-    def has_offset(self) -> bool:
-        """A motion of the whole is the frame's."""
+    def of_driver(self) -> bool:
+        """It shows no wall."""
         return False
 
     def residuals(self, displacement: NDArray[np.float64], offset: float = 0.0) -> Residuals:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from palpate.observation.contract import DataFile, DataSource
 from palpate.observation.displacement_field import read_displacement_field
+from palpate.observation.force import read_force
 from palpate.observation.landmarks import read_landmarks
 
 __all__ = ["SOURCES", "read_source"]
@@ -13,6 +14,7 @@ __all__ = ["SOURCES", "read_source"]
 SOURCES: dict[str, Callable[[DataFile], DataSource]] = {
     "landmarks": read_landmarks,
     "displacement-field": read_displacement_field,
+    "force": read_force,
 }
 
 

@@ -87,9 +87,9 @@ class SurfaceDistance:
         return self.target.surface.tissue
 
     @property
-    def has_offset(self) -> bool:
-        """It may be drawn larger or smaller than it is."""
-        return True
+    def unit(self) -> str:
+        """Millimetre."""
+        return "mm"
 
     @property
     def of_driver(self) -> bool:

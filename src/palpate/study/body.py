@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.findings import Finding
@@ -21,6 +22,7 @@ from palpate.inversion import (
     InverseProblem,
     LaterState,
     frame_blocks,
+    instrument_block,
     material_blocks,
     offset_block,
     parameter_map,
@@ -33,11 +35,14 @@ from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_model
 from palpate.mechanics.linear_model import LinearModel, linear_model
+from palpate.mechanics.loads import boundary_named
 from palpate.mechanics.material import MaterialModes, material_modes
 from palpate.mechanics.newton import NewtonSettings
+from palpate.mechanics.reaction import SurfaceReaction, surface_reaction
 from palpate.mesh.quality import MeshQuality
 from palpate.mesh.space import LagrangeSpace, lagrange_space
-from palpate.observation.contract import DataSource, ImagedBody, Observation
+from palpate.mesh.tet_mesh import TetMesh
+from palpate.observation.contract import DataSource, Imaged, ImagedBody, Observation, OfInstrument
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.prescribed_motion import FrameMotion, PrescribedMotion, prescribed_motion
 from palpate.observation.registry import observations
@@ -237,7 +242,20 @@ def make_body(states: ImagedStates, case: Case, *, progress: Progress) -> Body:
         f" {found.quality.min_dihedral_deg:.1f} degrees"
     )
     grids = (states.before.grid, *(image.grid for image in states.after))
-    terms = [(source.file.state, *source.on(space)) for source in states.data]
+    mechanics = case.mechanics
+
+    def reaction_of(name: str, direction: NDArray[np.float64]) -> SurfaceReaction:
+        """The force that holds a named surface."""
+        return surface_reaction(
+            space,
+            boundary_named(space.mesh, name),
+            direction,
+            mechanics.material_law,
+            dilatation=choose_element(mechanics.element).dilatation,
+            material=_material(space.mesh, case),
+        )
+
+    terms = [(source.file.state, *source.on(space, reaction_of)) for source in states.data]
     findings = (*found.findings, *(finding for _, _, of_term in terms for finding in of_term))
     measured = tuple((state, term) for state, term, _ in terms)
     return Body(states, space, found.quality, observation_width(*grids), found.edge_length, findings, measured)
@@ -262,7 +280,7 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
     numbers = np.cumsum([0, *(len(body.states.after) for body in bodies)]).tolist()
     pairs = [pair for body, first in zip(bodies, numbers, strict=False) for pair in _models(body, case, first)]
     models = tuple(model for model, _ in pairs)
-    if not case.loads and not any(motion.walls or model.constraint.offset.any() for model, motion in pairs):
+    if not case.known_force and not any(motion.walls or model.constraint.offset.any() for model, motion in pairs):
         raise ConfigurationError(  # at rest every modulus explains the images equally badly
             'nothing moves this body: no tissue has role = "driver" and no `rigid` tissue moves between the images, so'
             " no modulus can be estimated; give the role driver to the hollow organ whose wall deforms the others"
@@ -276,8 +294,8 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
         bodies[0].space.mesh.tissues,
         models[0].regions,
         _blocks(case, pairs, seen),
-        loaded=bool(case.loads),
-        open_poisson=_open_poisson(case, bodies[0]),
+        loaded=case.known_force,
+        open_poisson=_open_poisson(case, bodies[0].space.mesh),
         dilatation=choose_element(case.mechanics.element).dilatation,
     )
     return InverseProblem(states, with_stated_priors(parameters, case))
@@ -294,7 +312,11 @@ def _blocks(
         blocks += [b for wall in motion.walls for b in wall_blocks(wall, s, learned=case.driver.learn_prior)]
         blocks += frame_blocks(motion, s)
         if case.discrepancy.surface_offset_mm:
-            blocks += [offset_block(o, s, sd=case.discrepancy.surface_offset_mm) for o in observed if o.has_offset]
+            sd = case.discrepancy.surface_offset_mm
+            blocks += [offset_block(o, s, sd=sd) for o in observed if isinstance(o, Imaged)]
+        for o in observed:
+            if isinstance(o, OfInstrument) and o.offset_sd:
+                blocks.append(instrument_block(o.name, s, sd=o.offset_sd))
     references = [reference for reference, _ in seen]
     for reference in dict.fromkeys(references):
         states = tuple(s for s, own in enumerate(references) if own == reference)
@@ -309,9 +331,9 @@ def _blocks(
     return tuple(blocks) or unit_blocks(*(0 for _ in pairs))
 
 
-def _open_poisson(case: Case, body: Body) -> tuple[str, ...]:
+def _open_poisson(case: Case, mesh: TetMesh) -> tuple[str, ...]:
     """The tissues whose Poisson's ratio the case seeks."""
-    estimated = [t.name for t in body.space.mesh.tissues if t.role is Role.ESTIMATE]
+    estimated = [t.name for t in mesh.tissues if t.role is Role.ESTIMATE]
     return tuple(estimated) if case.estimate.seeks_poisson_ratios else ()
 
 
@@ -359,17 +381,17 @@ def _models(body: Body, case: Case, first: int) -> list[tuple[LinearModel, Presc
                 dilatation=dilatation,
                 loads=loads,
                 solver=case.mechanics.solver,
-                open_poisson=_open_poisson(case, body),
-                material=_material(body, case),
+                open_poisson=_open_poisson(case, body.space.mesh),
+                material=_material(body.space.mesh, case),
             )
         )
         models.append((made, motion))
     return models
 
 
-def _material(body: Body, case: Case) -> MaterialModes:
+def _material(mesh: TetMesh, case: Case) -> MaterialModes:
     """How the tissues of a body may differ from homogeneous ones with the Poisson's ratios that the case gives."""
-    mesh, sought = body.space.mesh, _open_poisson(case, body)
+    sought = _open_poisson(case, mesh)
     meshed = [i for i, tissue in enumerate(mesh.tissues) if tissue.meshed]
     return material_modes(
         mesh,

@@ -21,7 +21,7 @@ from palpate.inversion import (
     ratio_of_eta,
 )
 from palpate.mesh.voxelise import voxelise
-from palpate.observation.contract import Fit, Imaged
+from palpate.observation.contract import Fit, Imaged, OfInstrument
 from palpate.progress import Progress, silent
 from palpate.study.discrepancy import FoundDiscrepancy, discrepancy_findings, discrepancy_of
 from palpate.study.estimate_findings import data_findings, fold_findings, inversion_findings, pair_findings
@@ -44,6 +44,7 @@ from palpate.uncertainty import (
 
 __all__ = [
     "Estimation",
+    "ForceFit",
     "Iteration",
     "ModulusEstimate",
     "Observed",
@@ -128,6 +129,17 @@ class TissueFit:
 
 
 @dataclass(frozen=True, slots=True)
+class ForceFit:
+    """A measured and the fitted force of a later state (its number, from 0), N, with its standard deviation."""
+
+    name: str
+    state: int
+    measured_n: float
+    fitted_n: float
+    sd_n: float
+
+
+@dataclass(frozen=True, slots=True)
 class Estimation:
     """Result of one inversion.
 
@@ -139,8 +151,8 @@ class Estimation:
     directions of the log-moduli by how well they are known; information_shares: by tissue, of each kind of data, and of
     what was believed before; discrepancy: what the images say of frame, drawing and
     material; combinations: what is known where single moduli are not;
-    regions: joint ones of two moduli; image_pairs: what each of several later images says alone; samples: of the
-    moduli's posterior, where the case asks for them and the estimate converged.
+    regions: joint ones of two moduli; forces: measured and fitted; image_pairs: what each of several later images says
+    alone; samples: of the moduli's posterior, where the case asks for them and the estimate converged.
     """
 
     status: str
@@ -162,6 +174,7 @@ class Estimation:
     image_pairs: ImagePairs | None = None
     samples: ModulusSamples | None = None
     poisson_ratios: tuple[PoissonRatioEstimate, ...] = ()
+    forces: tuple[ForceFit, ...] = ()
 
     @property
     def correlation(self) -> NDArray[np.float64]:
@@ -229,6 +242,7 @@ def conclude(
         covariance=covariance,
         starts=tuple(_start(inversion, start) for start in inversion.starts),
         fits=_fits(inversion, observed),
+        forces=_forces(inversion),
         displacements=tuple(state.displacement for state in observed.states),
         counts=asdict(inversion.counts) | {"evaluations": inversion.evaluations},
         outer_loop=tuple(_iteration(inversion, iterate) for iterate in minimum.history),
@@ -436,6 +450,19 @@ def _fit(line: Linearisation, modelled: NDArray[np.int16], image: NDArray[np.int
     return replace(found, dice=overlap)
 
 
+def _forces(inversion: Inversion) -> tuple[ForceFit, ...]:
+    """The readings of instruments beside what the fitted model says."""
+    found = []
+    for line in inversion.minimum.evaluation.lines:
+        seen = line.observation
+        if isinstance(seen, OfInstrument):
+            fitted = seen.measured + float(line.residuals.values[0])
+            found.append(
+                ForceFit(line.observation.name, line.state, seen.measured, fitted, line.observation.noise_model.sd)
+            )
+    return tuple(found)
+
+
 def _information_shares(inversion: Inversion) -> dict[str, dict[str, float]]:
     """Share of each kind of data in what is known of each log-modulus, 0 to 1, and of what was believed before.
 
@@ -461,7 +488,7 @@ def _fits(inversion: Inversion, observed: Observed) -> tuple[tuple[TissueFit, ..
         motions = (np.zeros_like(fitted.displacement), fitted.displacement)
         modelled = [voxelise(fitted.space, motion, fitted.after, crossing=True) for motion in motions]
         seen = zip(inversion.rest.lines, inversion.minimum.evaluation.lines, strict=True)
-        of_state = [pair for pair in seen if pair[0].state == s]
+        of_state = [pair for pair in seen if pair[0].state == s and pair[0].observation.unit == "mm"]
         fits.append(
             tuple(
                 TissueFit(

@@ -163,5 +163,5 @@ def _read_pair(
         inputs |= {f"{name}.{part}" if part else name: digest for part, digest in digests.items()}
     data, digests = measured(case, states, first=first)
     for source in data:
-        progress(f"'{source.file.paths[0].name}': {source.in_words}")
+        progress(f"{source.file.name}: {source.in_words}")
     return replace(states, inputs=inputs | digests, data=data)

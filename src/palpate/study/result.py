@@ -159,6 +159,10 @@ class CaseResult:
             "samples": drawn and drawn.to_dict(),
             "alignment": [found.row(name) for name, found in zip(names, self.every_alignment, strict=False)],
             "fit": [_fit(name, fits) for name, fits in zip(names, estimation.fits, strict=False)],
+            "forces": [
+                {"after": names[force.state], **{k: v for k, v in _plain(force).items() if k != "state"}}
+                for force in estimation.forces
+            ],
             "starts": [
                 {
                     "start": dict(start.start),
@@ -273,7 +277,7 @@ def stated_unit(case: Case) -> str:
 
 def _unit(case: Case, tissues: Sequence[Tissue | CaseTissue]) -> str:
     known = any(tissue.role is Role.KNOWN for tissue in tissues) or case.phantom is not None  # whose surroundings are
-    return "kPa" if known or case.loads else "ratio"
+    return "kPa" if known or case.known_force else "ratio"
 
 
 def json_object(mapping: Mapping[str, Any]) -> dict[str, Any]:

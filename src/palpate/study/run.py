@@ -218,7 +218,7 @@ def refuse_what_cannot_be_estimated(case: Case) -> None:
             "the key 'after' is missing in [images]; an estimate needs one or more later states of the body"
         )
     movers = [tissue for tissue in case.tissues if tissue.role in (Role.DRIVER, Role.RIGID)]
-    if case.tissues and case.phantom is None and not movers and not case.loads:
+    if case.tissues and case.phantom is None and not movers and not case.loads and not case.data:
         raise ConfigurationError(
             'nothing moves this body: no tissue has role = "driver" (or "rigid", and moves between the images), so no'
             " modulus can be estimated; give the role driver to the hollow organ whose wall deforms the others"

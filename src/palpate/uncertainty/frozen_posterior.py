@@ -121,19 +121,27 @@ def frozen_posterior(
                 f"the posterior is frozen on reduced models; state {s} has a {type(model).__name__}"
             )
         answer = np.concatenate([reduced.output_basis, reduced.output_modes, reduced.output_material], axis=1)
-        expanded = None
+        lines = [line for line in evaluation.lines if line.state == s]
+        expanded = moduli if any(line.residuals.direct is not None for line in lines) else None
+        if expanded is not None:
+            answer = np.pad(answer, ((0, 0), (0, len(moduli))))
         if isinstance(model, CurvedModel):
             rest, expanded = model.expansion.derivatives - model.straight.derivatives, model.expansion.moduli
-            answer[:, reduced.n_basis :] += rest[:, model.n_regions :]
-            answer = np.concatenate([answer, rest[:, : model.n_regions]], axis=1)
+            modes = slice(reduced.n_basis, reduced.n_basis + model.n_modes)
+            answer[:, modes] += rest[:, model.n_regions :]
+            answer = np.concatenate([answer[:, : modes.stop], rest[:, : model.n_regions]], axis=1)
         offsets = parameters.offsets(unknowns, s)
         bare = FrozenState(reduced.at(np.zeros(0, dtype=np.int64)), expanded, np.zeros((0, 0)))
         z = bare.coordinates(moduli, coefficients[s], offsets)
         form = np.zeros((len(z), len(z)))
-        lines = [line for line in evaluation.lines if line.state == s]
         for rows, line in zip(objective.states[s].slices, lines, strict=True):
             of_offsets = line.jacobian.tangent[:, line.jacobian.shape[1] - len(offsets) :]
-            moved = np.concatenate([np.pad(answer[rows], ((0, 1), (0, 0))), of_offsets], axis=1)
+            below = np.zeros((len(of_offsets) - len(answer[rows]), answer.shape[1]))
+            if line.residuals.direct is not None:  # z holds the material's coefficients, then ln E - ln E_0
+                n_regions, first = len(moduli), reduced.n_basis + reduced.n_boundary
+                below[1 : 1 + n_regions, -n_regions:] = np.eye(n_regions)
+                below[1 + n_regions :, first : first + len(below) - 1 - n_regions] = np.eye(len(below) - 1 - n_regions)
+            moved = np.concatenate([np.concatenate([answer[rows], below]), of_offsets], axis=1)
             by_z = replace(line.jacobian, tangent=moved)
             weights, rest = line.precision * line.weights, line.residuals.values - by_z.times(z[:-1])
             side = by_z.transposed_times(weights * rest)[:, None]

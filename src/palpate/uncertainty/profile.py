@@ -56,7 +56,9 @@ class FixedCorrespondence:
             tangent = mapping.by_unknowns(there.tangent(), unknowns)
             offset = mapping.offsets(unknowns - self.unknowns, s)
             for rows, (line, before) in zip(state.slices, left, strict=False):
-                moved = np.append(there.values[rows] - before, line.jacobian.tangent[-1, tangent.shape[1] :] @ offset)
+                n_dofs, by_offset = len(before), line.jacobian.tangent[len(before), tangent.shape[1] :] @ offset
+                material = line.jacobian.tangent[n_dofs + 1 :] @ (unknowns - self.unknowns)[line.columns]
+                moved = np.concatenate([there.values[rows] - before, [by_offset], material])
                 values = line.residuals.values + line.jacobian.by_displacement @ moved
                 jacobian = line.jacobian.under(tangent[rows])
                 gradient = jacobian.transposed_times(line.precision * line.weights * values)

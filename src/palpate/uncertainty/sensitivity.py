@@ -122,7 +122,11 @@ def modulus_errors(objective: Objective, unknowns: NDArray[np.float64], evaluati
     for state, place in zip(objective.states, objective.places(unknowns), strict=True):
         assert state.observed is not None, "an objective is made of states with approximations"
         tangent = state.observed.solve(place.moduli, place.coefficients).tangent()[:, : len(place.moduli)]
-        found += [np.asarray(next(lines).residuals.smooth_jacobian @ tangent[rows]) for rows in state.slices]
+        for rows in state.slices:
+            residuals = next(lines).residuals
+            by_moduli = np.asarray(residuals.smooth_jacobian @ tangent[rows])
+            held = 0.0 if residuals.direct is None else residuals.direct[:, : len(place.moduli)]
+            found.append(by_moduli + held)
     return tuple(found)
 
 

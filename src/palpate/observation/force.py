@@ -1,0 +1,165 @@
+"""A measured force on a named surface: an `Observation` that tells kilopascals by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from palpate.errors import ConfigurationError
+from palpate.findings import Finding
+from palpate.images.alignment import RigidMotion
+from palpate.images.segmentation import Segmentation
+from palpate.mesh.space import LagrangeSpace
+from palpate.observation.contract import DataFile, Fit, Reaction, ReactionOf, Residuals, Weighting
+from palpate.observation.noise_model import FitResponse, NoiseModel
+from palpate.observation.robust_loss import Tukey
+
+__all__ = ["KIND", "Force", "ForceMeasurement", "read_force"]
+
+KIND = "force"
+ALONE = 1e-3  # mm: no other residual is alike
+
+
+@dataclass(frozen=True, slots=True)
+class Force:
+    """Residual r = F(u; E) + b - f of a force f (N) on a surface, b the load cell's offset; an `Observation`.
+
+    at: moduli (n_regions,) kPa and coefficients (n_material,) of the material under which it is asked, None: none yet.
+    """
+
+    name: str
+    reaction: Reaction
+    direction: NDArray[np.float64]
+    measured: float
+    stated: NoiseModel
+    noise_model: NoiseModel
+    weighting: Weighting
+    offset_sd: float = 0.0
+    at: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+
+    @property
+    def kind(self) -> str:
+        """What is compared."""
+        return KIND
+
+    @property
+    def description(self) -> str:
+        """What the misfit is, for a methods section."""
+        return "the difference between the force that holds a surface of the model and the measured one"
+
+    @property
+    def unit(self) -> str:
+        """Newton."""
+        return "N"
+
+    @property
+    def dofs(self) -> NDArray[np.int64]:
+        """Numbers (n_dofs,) of the unknowns of the elements at the surface."""
+        return self.reaction.dofs
+
+    @property
+    def of_driver(self) -> bool:
+        """It shows no wall."""
+        return False
+
+    @property
+    def observed_share(self) -> float:
+        """The whole force."""
+        return 1.0
+
+    def under(self, moduli: NDArray[np.float64], material: NDArray[np.float64]) -> Force:
+        """The same at moduli (n_regions,) kPa and coefficients (n_material,) of the material."""
+        return replace(self, at=(moduli, material))
+
+    def combined(self, fields: NDArray[np.float64]) -> Force:
+        """The same by combinations (n_fields, k) of the material's fields."""
+        return replace(self, reaction=self.reaction.combined(fields))
+
+    def residuals(self, displacement: NDArray[np.float64], offset: float = 0.0) -> Residuals:
+        """The residual (1,) N at displacements (n_dofs,) mm and an offset (N) of the load cell, with its derivatives.
+
+        Raises `ConfigurationError` before moduli are known, see `under`.
+        """
+        if self.at is None:
+            raise ConfigurationError(f"the {self.name} depends on the moduli: ask it `under` some")
+        value, by_displacement, direct = self.reaction.at(displacement, *self.at)
+        centre, row = self.reaction.centre[None], sparse.csr_matrix(by_displacement[None])
+        values = np.array([value + offset - self.measured])
+        along = self.direction[None]
+        return Residuals(values, np.ones(1), centre, along, centre, row, row, direct=direct[None])
+
+    def with_noise(self, noise: NoiseModel) -> Force:
+        """The same, counting by the variance of the noise."""
+        return replace(self, noise_model=noise, weighting=Weighting(1.0 / noise.sd**2, Tukey()))
+
+    def reweighted(self, residuals: Residuals, beyond_modes: NDArray[np.float64] | None = None) -> Force:
+        """The same: there is no second force that would tell of an outlier."""
+        del residuals, beyond_modes
+        return self
+
+    def first_noise(self, peers: Sequence[Force]) -> NoiseModel:
+        """What is stated, the mean of those of one state."""
+        variance = float(np.mean([peer.stated.sd**2 for peer in peers]))
+        return NoiseModel(np.array([variance]), np.array([ALONE]))
+
+    def fitted_noise(self, residuals: Sequence[Residuals], response: FitResponse | None = None) -> NoiseModel:
+        """What is stated."""
+        del residuals, response
+        return self.noise_model
+
+    def fit(self, residuals: Residuals) -> Fit:
+        """How far the model's force is off, N."""
+        off = float(np.abs(residuals.values[0]))
+        return Fit(off, off, off, None)
+
+
+@dataclass(frozen=True, slots=True)
+class ForceMeasurement:
+    """A force as a case states it; implements `DataSource`."""
+
+    file: DataFile
+
+    @property
+    def digests(self) -> tuple[str, ...]:
+        """There is no file."""
+        return ()
+
+    @property
+    def in_words(self) -> str:
+        """The force, and where it acts."""
+        return f"{self.file.force_n:g} N on '{self.file.surface}' along {list(self.file.direction)}"
+
+    def brought(self, motion: RigidMotion) -> ForceMeasurement:
+        """The same with its direction turned back by the rigid motion of the later state."""
+        turned = motion.rotation.T @ np.array(self.file.direction)
+        return replace(self, file=replace(self.file, direction=(float(turned[0]), float(turned[1]), float(turned[2]))))
+
+    def against(self, before: Segmentation, after: Segmentation) -> None:
+        """No image contradicts a force."""
+
+    def on(self, space: LagrangeSpace, reaction_of: ReactionOf) -> tuple[Force, tuple[Finding, ...]]:
+        """The term on a meshed body; raises `ConfigurationError` for a surface that it has not."""
+        del space
+        file, direction = self.file, np.array(self.file.direction)
+        stated = NoiseModel(np.array([file.sd_n**2]), np.array([ALONE]))
+        reaction = reaction_of(file.surface, direction)
+        term = Force(
+            file.name or KIND,
+            reaction,
+            direction / np.linalg.norm(direction),
+            file.force_n,
+            stated,
+            stated,
+            Weighting(1.0 / file.sd_n**2, Tukey()),
+            offset_sd=file.offset_sd_n,
+        )
+        return term, ()
+
+
+def read_force(file: DataFile) -> ForceMeasurement:
+    """The force that a case states."""
+    return ForceMeasurement(file)
