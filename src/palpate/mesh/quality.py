@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from palpate.mesh.places import in_words, largest_difference
 from palpate.mesh.tet_mesh import FACES, TetMesh
 from palpate.parallel import mapped
 
-__all__ = ["MeshQuality", "check_mesh", "dihedral_angles", "level_set_volumes", "mesh_quality"]
+__all__ = ["MeshQuality", "check_mesh", "dihedral_angles", "level_set_volumes", "mesh_figures", "mesh_quality"]
 
 MIN_DIHEDRAL_DEG = 5.0
 P5_DIHEDRAL_DEG = 25.0
@@ -62,14 +62,19 @@ def mesh_quality(mesh: TetMesh, anatomy: Anatomy, *, voxel_volumes: Mapping[str,
 
     `voxel_volumes`: tissue name -> mm^3 inside the box.
     """
+    found = mesh_figures(mesh)
+    errors = _errors(found.volume, level_set_volumes(anatomy))
+    return replace(found, volume_error=errors, voxel_volume_error=_errors(found.volume, voxel_volumes or {}))
+
+
+def mesh_figures(mesh: TetMesh) -> MeshQuality:
+    """Measure a mesh by itself."""
     angles = dihedral_angles(mesh)
     smallest = angles.min(axis=1)
     worst = int(smallest.argmin())
     place = mesh.nodes[mesh.tets[worst]].mean(axis=0)
     sums = np.bincount(mesh.region, mesh.volumes, minlength=len(mesh.tissues))
     volume = {tissue.name: float(sums[i]) for i, tissue in enumerate(mesh.tissues) if tissue.meshed}
-    target = level_set_volumes(anatomy)
-    counted = voxel_volumes or {}
     piece, with_face = face_pieces(mesh.tets)
     return MeshQuality(
         nodes=len(mesh.nodes),
@@ -81,8 +86,7 @@ def mesh_quality(mesh: TetMesh, anatomy: Anatomy, *, voxel_volumes: Mapping[str,
         worst_tissue=mesh.tissues[mesh.region[worst]].name,
         min_volume=float(mesh.volumes.min()),
         volume=volume,
-        volume_error=_errors(volume, target),
-        voxel_volume_error=_errors(volume, counted),
+        volume_error={},
         components=int(piece.max()) + 1,
         overfull_faces=int(np.count_nonzero(with_face > 2)),
     )

@@ -39,7 +39,7 @@ from palpate.mechanics.loads import boundary_named
 from palpate.mechanics.material import MaterialModes, material_modes
 from palpate.mechanics.newton import NewtonSettings
 from palpate.mechanics.reaction import SurfaceReaction, surface_reaction
-from palpate.mesh.quality import MeshQuality
+from palpate.mesh.quality import MeshQuality, mesh_figures
 from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.observation.contract import DataSource, Imaged, ImagedBody, Observation, OfInstrument
@@ -51,7 +51,7 @@ from palpate.study.case import Case
 from palpate.study.case_loads import case_loads
 from palpate.study.contacts import every_finding
 from palpate.study.edge_length import EdgeLength
-from palpate.study.meshing import mesh_reference
+from palpate.study.meshing import ReferenceMesh, mesh_reference
 from palpate.study.poisson_ratios import with_stated_priors
 from palpate.study.refusals import refuse_lost, refuse_unmeshable
 
@@ -82,7 +82,7 @@ class ImagedStates:
 
     `inputs`: SHA-256 of each file that was read for them, by its key in `result.json`; `alignments`: how each later
     state lay before it was brought to the first; none where nothing was aligned; `data`: measurements beside the
-    images.
+    images; `mesh`: where the body is given as one, and no later state is imaged.
     """
 
     before: Segmentation
@@ -92,6 +92,12 @@ class ImagedStates:
     inputs: Mapping[str, str] = field(default_factory=dict)
     data: tuple[DataSource, ...] = ()
     alignments: tuple[Registration, ...] = ()
+    mesh: TetMesh | None = None
+
+    @property
+    def n_later(self) -> int:
+        """Number of later states, imaged or not."""
+        return len(self.bones)
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,8 +241,12 @@ def _quoted(names: Sequence[str]) -> str:
 
 def make_body(states: ImagedStates, case: Case, *, progress: Progress) -> Body:
     """Mesh the reference state of the images (see `mesh_reference`); raises as that does."""
-    found = mesh_reference(states.before, states.after, case, progress=progress)
-    space = lagrange_space(found.mesh, choose_element(case.mechanics.element).space)
+    element = choose_element(case.mechanics.element).space
+    if states.mesh is not None:
+        found = ReferenceMesh(states.mesh, mesh_figures(states.mesh))
+    else:
+        found = mesh_reference(states.before, states.after, case, progress=progress)
+    space = lagrange_space(found.mesh, element)
     progress(
         f"{found.quality.tets} tetrahedra, {3 * len(space.points)} unknowns, smallest dihedral angle"
         f" {found.quality.min_dihedral_deg:.1f} degrees"
@@ -273,11 +283,11 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
     """
     progress("distances to the surfaces of all images")
     noise = stated_noise(case)
-    imaged = [(r, o) for r, body in enumerate(bodies) for o in observations(body.imaged(noise))]
+    imaged = [(r, o) for r, body in enumerate(bodies) for o in _seen(body, noise)]
     measured = [of for body in bodies for of in body.measured]
     seen = [(r, (*o, *(term for s, term in measured if s == n))) for n, (r, o) in enumerate(imaged, start=1)]
     progress("assembling one stiffness matrix a tissue")
-    numbers = np.cumsum([0, *(len(body.states.after) for body in bodies)]).tolist()
+    numbers = np.cumsum([0, *(body.states.n_later for body in bodies)]).tolist()
     pairs = [pair for body, first in zip(bodies, numbers, strict=False) for pair in _models(body, case, first)]
     models = tuple(model for model, _ in pairs)
     if not case.known_force and not any(motion.walls or model.constraint.offset.any() for model, motion in pairs):
@@ -299,6 +309,11 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
         dilatation=choose_element(case.mechanics.element).dilatation,
     )
     return InverseProblem(states, with_stated_priors(parameters, case))
+
+
+def _seen(body: Body, noise: NoiseModel | None) -> tuple[tuple[Observation, ...], ...]:
+    """What each later image shows; nothing of states that are not imaged."""
+    return observations(body.imaged(noise)) if body.states.after else tuple(() for _ in body.states.bones)
 
 
 def _blocks(

@@ -24,6 +24,7 @@ __all__ = [
     "Case",
     "CaseData",
     "CaseLoad",
+    "CaseSurface",
     "CaseTissue",
     "Discrepancy",
     "Domain",
@@ -31,6 +32,7 @@ __all__ = [
     "Estimate",
     "Images",
     "Mechanics",
+    "MeshBody",
     "MeshSettings",
     "Motion",
     "Noise",
@@ -111,6 +113,30 @@ class Images:
     def __post_init__(self) -> None:
         if self.body_from_ct and self.intensities_before is None:
             raise ConfigurationError("[images] body_from_ct needs the CT of the reference state: intensities_before")
+
+
+@dataclass(frozen=True, slots=True)
+class MeshBody:
+    """A body that is given as a mesh, RAS mm; `tissue_data`: the cell data that tell the tissue."""
+
+    mesh: Path
+    tissue_data: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class CaseSurface:
+    """A named surface of a mesh: `where` is a group of its triangles, or "x_min" ... "z_max" within `within_mm`.
+
+    `boundary` "moving": its motion is an unknown; "fixed": it is held; "free": nothing holds it, loads may act.
+    """
+
+    name: str
+    where: str
+    boundary: str = field(default="moving", metadata=rule(choices=("moving", "fixed", "free")))
+    within_mm: float = field(default=1.0, metadata=rule(between=(1e-6, 1e4)))
+
+    def __post_init__(self) -> None:
+        refuse_name(self.name, "the name of a surface")
 
 
 @dataclass(frozen=True, slots=True)
@@ -460,6 +486,8 @@ class Case:
     seed: int = field(default=0, metadata=SEED)
     images: Images | None = None
     pairs: tuple[Pair, ...] = ()
+    body: MeshBody | None = None
+    surfaces: tuple[CaseSurface, ...] = ()
     phantom: Phantom | None = None
     motion: Motion | None = None
     tissues: tuple[CaseTissue, ...] = ()
@@ -478,10 +506,22 @@ class Case:
         object.__setattr__(self, "patient", self.patient or self.id)
         refuse_name(self.id, "the case's id")
         refuse_name(self.patient, "the case's patient")
-        if (self.images is None) == (self.phantom is None):
+        if sum(part is not None for part in (self.images, self.body, self.phantom)) != 1:
             raise ConfigurationError(
-                f"case '{self.id}' needs either [images] (with before and after) or [phantom], and not both"
+                f"case '{self.id}' needs [images] (with before and after), or a [body] with its mesh, or a [phantom],"
+                " and not two of them"
             )
+        if self.body is not None and not self.data:
+            raise ConfigurationError(
+                f"case '{self.id}' has a [body] and no [[data]]: without images measurements tell how it moved"
+            )
+        if self.surfaces and self.body is None:
+            raise ConfigurationError(
+                f"case '{self.id}' has [[surfaces]] without a [body]: images have none but organs'"
+            )
+        names = [tissue.name for tissue in self.tissues] + [surface.name for surface in self.surfaces]
+        if len(set(names)) < len(names):
+            raise ConfigurationError(f"case '{self.id}' gives two tissues or surfaces one name, of {shown(names)}")
         if self.images is not None and not self.images.after and self.motion is None and not self.loads:
             raise ConfigurationError(
                 "the key 'after' is missing in [images]; name one or more later states of the body (only a simulation"
@@ -522,6 +562,8 @@ class Case:
     @property
     def n_states(self) -> int:
         """Number of later states: of the later images of all pairs, or the one that is simulated."""
+        if self.body is not None:
+            return max([1, *(data.state for data in self.data), *(load.state or 1 for load in self.loads)])
         further = sum(len(pair.after) for pair in self.pairs)
         return max(len(self.images.after) if self.images else 0, 1) + further
 

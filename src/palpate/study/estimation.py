@@ -186,10 +186,10 @@ class Estimation:
 
 @dataclass(frozen=True, slots=True)
 class Observed:
-    """The fitted later states, and each image's tissue index (nx, ny, nz)."""
+    """The fitted later states, and each image's tissue index (nx, ny, nz), None of a state that is not imaged."""
 
     states: tuple[FittedState, ...]
-    images: tuple[NDArray[np.int16], ...]
+    images: tuple[NDArray[np.int16] | None, ...]
 
 
 def conclude(
@@ -440,10 +440,10 @@ def _moduli(inversion: Inversion, theta: NDArray[np.float64]) -> dict[str, float
     return dict(zip(mapping.tissues, moduli.tolist(), strict=True))
 
 
-def _fit(line: Linearisation, modelled: NDArray[np.int16], image: NDArray[np.int16]) -> Fit:
+def _fit(line: Linearisation, modelled: NDArray[np.int16] | None, image: NDArray[np.int16] | None) -> Fit:
     """The fit of one observation; of a tissue that images show with Dice's 2 |A and B| / (|A| + |B|)."""
     found, seen = line.observation.fit(line.residuals), line.observation
-    if not isinstance(seen, Imaged):
+    if not isinstance(seen, Imaged) or modelled is None or image is None:
         return found
     both = modelled == seen.tissue, image == seen.tissue
     overlap = 2.0 * int((both[0] & both[1]).sum()) / max(sum(int(of.sum()) for of in both), 1)
@@ -486,7 +486,7 @@ def _fits(inversion: Inversion, observed: Observed) -> tuple[tuple[TissueFit, ..
     fits = []
     for s, (fitted, image) in enumerate(zip(observed.states, observed.images, strict=True)):
         motions = (np.zeros_like(fitted.displacement), fitted.displacement)
-        modelled = [voxelise(fitted.space, motion, fitted.after, crossing=True) for motion in motions]
+        modelled = [None if image is None else voxelise(fitted.space, u, fitted.after, crossing=True) for u in motions]
         seen = zip(inversion.rest.lines, inversion.minimum.evaluation.lines, strict=True)
         of_state = [pair for pair in seen if pair[0].state == s and pair[0].observation.unit == "mm"]
         fits.append(

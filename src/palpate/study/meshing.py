@@ -29,11 +29,14 @@ THIN_VOXELS = 4  # along some axis
 
 @dataclass(frozen=True, slots=True)
 class ReferenceMesh:
-    """A mesh that has passed its gate, its edge length at the organs with its reason, and what is found of it."""
+    """A mesh that has passed its gate, its edge length at the organs with its reason, and what is found of it.
+
+    One that is given has no edge length of ours.
+    """
 
     mesh: TetMesh
     quality: MeshQuality
-    edge_length: EdgeLength
+    edge_length: EdgeLength | None = None
     findings: tuple[Finding, ...] = ()
 
 

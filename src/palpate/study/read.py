@@ -24,6 +24,7 @@ from palpate.phantoms.spheres import SpheresOptions, spheres, spheres_anatomy
 from palpate.progress import Progress, silent
 from palpate.study.body import ImagedStates, aligned
 from palpate.study.case import Case, CaseTissue
+from palpate.study.meshed_body import mesh_states
 from palpate.study.provenance import file_digest
 from palpate.study.schema import nearest, shown
 
@@ -39,6 +40,8 @@ def read_states(case: Case, *, progress: Progress = silent) -> ImagedStates:
         scene = phantom_scene(case)
         after = (segment(scene.after, scene.tissues),)
         return aligned(segment(scene.before, scene.tissues), after, method=case.align, loaded=bool(case.loads))
+    if case.body is not None:
+        return _with_measured(mesh_states(case, progress=progress), case, first=0, progress=progress)
     if case.images is None:
         raise ConfigurationError(f"case '{case.id}' has neither [images] nor [phantom]")
     return _read_pair(case, case.images.before, case.images.after, key="", first=0, progress=progress)
@@ -136,13 +139,14 @@ def measured(case: Case, states: ImagedStates, *, first: int) -> tuple[tuple[Dat
     found, digests = [], {}
     for number, file in enumerate(case.data_files):
         place = file.state - first - 1
-        if not 0 <= place < len(states.after):
+        if not 0 <= place < states.n_later:
             continue
         source = read_source(file)
         for part, digest in enumerate(source.digests):
             digests[f"data[{number}]" + (f".{part}" if part else "")] = digest
         source = source.brought(states.alignments[place].motion) if states.alignments else source
-        source.against(states.before, states.after[place])
+        if states.after:
+            source.against(states.before, states.after[place])
         found.append(source)
     return tuple(found), digests
 
@@ -161,7 +165,12 @@ def _read_pair(
     for name, image, path in zip(keys, (reference, *later), (before, *after), strict=True):
         digests = image.digests or {"": file_digest(path)}  # a reader from elsewhere may not say what it read
         inputs |= {f"{name}.{part}" if part else name: digest for part, digest in digests.items()}
+    return _with_measured(replace(states, inputs=inputs), case, first=first, progress=progress)
+
+
+def _with_measured(states: ImagedStates, case: Case, *, first: int, progress: Progress) -> ImagedStates:
+    """The states with the measurements of those that are numbered after `first`."""
     data, digests = measured(case, states, first=first)
     for source in data:
         progress(f"{source.file.name}: {source.in_words}")
-    return replace(states, inputs=inputs | digests, data=data)
+    return replace(states, inputs={**states.inputs, **digests}, data=data)

@@ -374,6 +374,8 @@ def image_names(case: Case) -> list[str]:
 
 def pair_names(case: Case) -> list[tuple[str, tuple[str, ...]]]:
     """Names of the images of each pair, the reference state's and the later ones': their files', no two alike."""
+    if case.body is not None:
+        return [("body", tuple(f"state {number}" for number in range(1, case.n_states + 1)))]
     if case.images is None:
         return [("before", ("after",))]
     pairs = [(case.images.before, case.images.after), *((pair.before, pair.after) for pair in case.pairs)]

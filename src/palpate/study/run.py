@@ -100,13 +100,17 @@ def estimate_states(
     body = bodies[0]
     if progress is not silent:
         sizes = [(made.quality.tets, 3 * len(made.space.points)) for made in bodies]
-        progress(_forecast(cost_of_meshes(case, states.before, sizes, n_after=len(states.after))))
+        progress(_forecast(cost_of_meshes(case, states.before, sizes, n_after=states.n_later)))
     clock.append(time.perf_counter())
     problem = joint_problem(bodies, case, progress=during("linear law", progress))
     clock.append(time.perf_counter())
     settings = inversion_settings(case, problem.parameters)
     inversion = invert(problem, settings, progress=during("linear law", progress))
-    images = tuple(image.index for pair in bodies for image in pair.states.after)
+    images = tuple(
+        image.index if image else None
+        for pair in bodies
+        for image in pair.states.after or (None,) * pair.states.n_later
+    )
     observed = Observed(fitted_states(inversion, *bodies), images)
     stating = during("intervals", progress)
     estimation = conclude(
@@ -176,7 +180,7 @@ def fitted_states(inversion: Inversion, *bodies: Body) -> tuple[FittedState, ...
     """Displacements of the whole meshes at the estimate, with the grids that they were seen on, body after body."""
     objective, unknowns = inversion.objective, inversion.minimum.unknowns
     moduli, coefficients = objective.parameters.moduli(unknowns), objective.parameters.coefficients(unknowns)
-    images = [(body, image) for body in bodies for image in body.states.after]
+    images = [(b, image or b.states.before) for b in bodies for image in b.states.after or (None,) * b.states.n_later]
     return tuple(
         FittedState(body.space, state.displacement(moduli, q), body.states.before.grid, image.grid)
         for state, q, (body, image) in zip(objective.states, coefficients, images, strict=True)
@@ -185,11 +189,11 @@ def fitted_states(inversion: Inversion, *bodies: Body) -> tuple[FittedState, ...
 
 def _further(bodies: tuple[Body, ...], estimation: Estimation) -> tuple[PairResult, ...]:
     """The bodies after the first with their displacements."""
-    first = len(bodies[0].states.after)
+    first = bodies[0].states.n_later
     found = []
     for body in bodies[1:]:
         states = body.states
-        motions = estimation.displacements[first : first + len(states.after)]
+        motions = estimation.displacements[first : first + states.n_later]
         found.append(
             PairResult(
                 with_found_ratios(body.space, estimation.poisson_ratios),
@@ -200,14 +204,14 @@ def _further(bodies: tuple[Body, ...], estimation: Estimation) -> tuple[PairResu
                 states.alignments,
             )
         )
-        first += len(states.after)
+        first += states.n_later
     return tuple(found)
 
 
 def strain_warnings(case: Case, bodies: tuple[Body, ...], estimation: Estimation) -> tuple[Finding, ...]:
     """What `linear_strain_warnings` says of the fitted displacements, those of the first body's images first."""
     motions = iter(estimation.displacements)
-    moved = [(body.space, [next(motions) for _ in body.states.after]) for body in bodies]
+    moved = [(body.space, [next(motions) for _ in body.states.bones]) for body in bodies]
     return linear_strain_warnings(case.mechanics.material_law, *moved, images=image_names(case))
 
 
@@ -218,7 +222,7 @@ def refuse_what_cannot_be_estimated(case: Case) -> None:
             "the key 'after' is missing in [images]; an estimate needs one or more later states of the body"
         )
     movers = [tissue for tissue in case.tissues if tissue.role in (Role.DRIVER, Role.RIGID)]
-    if case.tissues and case.phantom is None and not movers and not case.loads and not case.data:
+    if case.tissues and case.images is not None and not movers and not case.loads and not case.data:
         raise ConfigurationError(
             'nothing moves this body: no tissue has role = "driver" (or "rigid", and moves between the images), so no'
             " modulus can be estimated; give the role driver to the hollow organ whose wall deforms the others"

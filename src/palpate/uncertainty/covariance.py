@@ -305,6 +305,9 @@ def imaging_errors(
     references = [state.reference for state in objective.states]
     for s, (reference, fitted) in enumerate(zip(references, states, strict=True)):
         lines: list[Linearisation] = [line for line in evaluation.lines if line.state == s]
+        if not any(isinstance(line.observation, Imaged) for line in lines):
+            errors += [np.zeros(len(line.weights)) for line in lines]
+            continue
         if reference not in rest:
             material = [line.residuals.material for line in evaluation.lines if references[line.state] == reference]
             rest[reference] = _imaged(fitted.space, np.zeros_like(fitted.displacement), fitted.before, material, rng)
