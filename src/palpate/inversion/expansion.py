@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.errors import NotConverged
+from palpate.errors import NotConverged, SolverError
 from palpate.inversion.approximation import Approximation, Derivatives, ModelError, Place
 from palpate.inversion.objective import determined
 from palpate.mechanics.equilibrium import from_start
@@ -141,10 +141,15 @@ def expansion_around(coarse: FiniteStrainEquilibrium, *, tolerance: float, progr
     that stay near. Raises `NotConverged` as `coarse_equilibrium` does.
     """
     progress("finite strain: factorising the tangent stiffness there")
-    near = coarse.refactorised()
-    progress("finite strain: the equilibrium on it")
-    full, moduli, coefficients = near.model.to_tolerance(tolerance), near.moduli, near.coefficients
-    found = from_start(full, moduli, coefficients, start=near.displacement, nearby=near.factorisation)
+    full, moduli, coefficients = coarse.model.to_tolerance(tolerance), coarse.moduli, coarse.coefficients
+    try:
+        near = coarse.refactorised()
+        progress("finite strain: the equilibrium on it")
+        found = from_start(full, moduli, coefficients, start=near.displacement, nearby=near.factorisation)
+    except SolverError:  # a slender body is stable in equilibrium, and not near it
+        progress("finite strain: not stable there, hence the equilibrium first")
+        near = from_start(full, moduli, coefficients, start=coarse.displacement, nearby=None).refactorised()
+        found = near
     progress(f"finite strain: derivatives by {len(full.names)} moduli and {len(coefficients)} modes")
     derivatives = FirstOrderModel(full.names, moduli, coefficients, found.values, near.tangent(tolerance=DERIVATIVES))
     return Expansion(derivatives, found, near.counts + near.tangent_counts + found.counts)

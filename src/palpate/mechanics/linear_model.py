@@ -57,7 +57,7 @@ class LinearModel:
     regions: indices in `space.mesh.tissues` of the meshed ones, one for each of `stiffness_parts` where the Poisson's
     ratio is open (the moduli are then E times its `lame_parts`); per region at 1 kPa: stiffness K_r (n_dof, n_dof),
     free_stiffness F^T K_r F (n_free, n_free), coupling F^T K_r [M, o] (n_free, n_modes + 1), all mN/mm.
-    load (n_dof,) mN: the nodal forces f of all dead loads. material: how the tissues may differ from homogeneous ones,
+    material: how the tissues may differ from homogeneous ones,
     to first order in its coefficients: u(E, q, c) = u(E, q) + sum_k c_k du/dc_k, coefficients being those of the
     boundary modes, then c; weights: of each region (mu, lambda at the points, in the mean) at 1 kPa.
     """
@@ -69,7 +69,6 @@ class LinearModel:
     free_stiffness: tuple[sparse.csr_matrix[np.float64], ...]
     coupling: tuple[sparse.csr_matrix[np.float64], ...]
     solver: str
-    load: NDArray[np.float64]
     weights: tuple[tuple[float, float, float], ...]
     elements: Elements | None = None
     material: MaterialModes = HOMOGENEOUS
@@ -88,7 +87,12 @@ class LinearModel:
         constraint = conditions.constraint
         given = sparse.csr_matrix(np.column_stack([constraint.modes, constraint.offset]))
         coupling = tuple(sparse.csr_matrix(constraint.free.T @ (matrix @ given)) for matrix in self.stiffness)
-        return replace(self, conditions=conditions, coupling=coupling, load=conditions.forces(self.space))
+        return replace(self, conditions=conditions, coupling=coupling)
+
+    @property
+    def load(self) -> NDArray[np.float64]:
+        """Nodal forces f (n_dof,) of all loads, mN."""
+        return self.conditions.forces(self.space)
 
     @property
     def free_load(self) -> NDArray[np.float64]:
@@ -410,10 +414,7 @@ def linear_model(
     parts = [part for of_tissue in mapped(assembled, meshed) for part in of_tissue]
     regions, weights, stiffness, free_stiffness = zip(*parts, strict=True)
     elements = elements_of(space, LINEAR, dilatation) if material.n_modes else None
-    load = np.zeros(3 * len(space.points))
-    model = LinearModel(
-        space, conditions, regions, stiffness, free_stiffness, (), solver, load, weights, elements, material
-    )
+    model = LinearModel(space, conditions, regions, stiffness, free_stiffness, (), solver, weights, elements, material)
     return model.under(conditions)
 
 

@@ -16,11 +16,12 @@ from palpate.images.input_file import open_input
 from palpate.images.tissue import Tissue
 from palpate.mesh.tet_mesh import FACES, TetMesh
 
-__all__ = ["PLANES", "MeshFile", "body_mesh", "boundary_faces", "plane_faces", "read_mesh_file"]
+__all__ = ["PLANES", "WHOLE", "MeshFile", "body_mesh", "boundary_faces", "plane_faces", "read_mesh_file"]
 
 MOST_BYTES = 4 * 2**30
 TETRAHEDRA, TRIANGLES = ("tetra", "tetra10"), ("triangle", "triangle6")
 GROUPS = ("tissue", "label", "region", "medit:ref", "gmsh:physical", "MaterialID", "material", "CellEntityIds")
+WHOLE = "boundary"
 PLANES = tuple(f"{axis}_{end}" for axis in "xyz" for end in ("min", "max"))
 SLIVER = 1e-9  # volume over the cube of the longest edge
 
@@ -134,7 +135,9 @@ def boundary_faces(tets: NDArray[np.int64]) -> NDArray[np.int64]:
 def plane_faces(
     nodes: NDArray[np.float64], faces: NDArray[np.int64], plane: str, within_mm: float
 ) -> NDArray[np.bool_]:
-    """Which faces (n_faces, 3) lie within so many mm of the outermost plane of `PLANES`."""
+    """Which faces (n_faces, 3) lie within so many mm of a plane of `PLANES`, or on the `WHOLE` boundary."""
+    if plane == WHOLE:
+        return np.ones(len(faces), dtype=bool)
     axis, end = "xyz".index(plane[0]), plane[2:]
     along = nodes[:, axis] if end == "max" else -nodes[:, axis]
     return np.asarray(along[faces].min(axis=1) >= along.max() - within_mm)

@@ -15,7 +15,7 @@ LEAST = 1e-3  # variance of what the neighbours leave open, over its own
 
 
 def correlation(distance: NDArray[np.float64], length: float) -> NDArray[np.float64]:
-    """Correlation exp(-d / length) of errors at distances d, mm; of independent ones where the length is 0.
+    """Correlation exp(-d / length) (n,), of any shape, at distances d (n,) mm; of independent errors for a length of 0.
 
     It falls at once: errors are never believed to be so smooth that what is finer than them is known without error.
     """

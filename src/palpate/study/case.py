@@ -125,9 +125,10 @@ class MeshBody:
 
 @dataclass(frozen=True, slots=True)
 class CaseSurface:
-    """A named surface of a mesh: `where` is a group of its triangles, or "x_min" ... "z_max" within `within_mm`.
+    """A named surface of a mesh: a group of triangles, an outermost plane, or all of the boundary.
 
-    `boundary` "moving": its motion is an unknown; "fixed": it is held; "free": nothing holds it, loads may act.
+    `where`: the group's name, "x_min" ... "z_max" within `within_mm`, or "boundary". `boundary` "moving": its motion is
+    an unknown; "fixed": it is held; "free": nothing holds it, loads may act.
     """
 
     name: str

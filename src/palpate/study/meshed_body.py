@@ -10,7 +10,7 @@ from palpate.images.alignment import RigidMotion
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
-from palpate.mesh.mesh_file import PLANES, MeshFile, body_mesh, boundary_faces, plane_faces, read_mesh_file
+from palpate.mesh.mesh_file import PLANES, WHOLE, MeshFile, body_mesh, boundary_faces, plane_faces, read_mesh_file
 from palpate.mesh.space import lagrange_space
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.mesh.voxelise import voxelise
@@ -71,10 +71,10 @@ def _mesh(file: MeshFile, case: Case) -> TetMesh:
 
 def _faces(file: MeshFile, faces: NDArray[np.int64], surface: CaseSurface) -> NDArray[np.bool_]:
     """Which boundary faces (n_boundary, 3) belong to a surface of the case."""
-    if surface.where in PLANES:
+    if surface.where in (WHOLE, *PLANES):
         return plane_faces(file.nodes, faces, surface.where, surface.within_mm)
     if surface.where not in file.surfaces:
-        known = nearest(surface.where, [*PLANES, *file.surfaces])
+        known = nearest(surface.where, [WHOLE, *PLANES, *file.surfaces])
         raise ConfigurationError(f"[[surfaces]] '{surface.name}': the mesh has no surface '{surface.where}': {known}")
     own = {tuple(face) for face in np.sort(file.surfaces[surface.where], axis=1).tolist()}
     return np.array([tuple(face) in own for face in np.sort(faces, axis=1).tolist()], dtype=bool)

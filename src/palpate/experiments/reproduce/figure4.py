@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import cached_property, lru_cache, partial
 from itertools import pairwise
 from typing import Any
@@ -28,6 +28,7 @@ from palpate.experiments.reproduce.ledger import Ledger
 from palpate.inversion import InverseProblem, Inversion, LaterState, invert, parameter_map, unit_blocks
 from palpate.mechanics import (
     ACCURACY,
+    Conditions,
     Dilatation,
     LinearModel,
     NewtonSettings,
@@ -208,7 +209,7 @@ class _Bench:
         blocks = unit_blocks(self.linear.n_modes)
         mapping = parameter_map(balls_tissues(moduli), self.linear.regions, blocks, loaded=True)
         settings = from_half(mapping, dict(zip(BODIES, moduli, strict=True)))
-        model = replace(self.linear, load=load.nodal)
+        model = self.linear.under(Conditions(self.constraint, (load,)))
         finite = finite_strain_model(
             self.space, self.constraint, law, loads=(load,), settings=NewtonSettings(tolerance=ACCURACY)
         )
