@@ -11,7 +11,7 @@ import pytest
 from palpate.report.collect import collect
 from palpate.report.methods import methods_text
 from palpate.report.sources import SOURCES, bibtex, reference_line
-from palpate.study.case import CaseLoad, Mechanics
+from palpate.study.case import CaseData, CaseLoad, Mechanics, MeshBody
 
 
 def test_citations_and_sources_belong_together(case_result):
@@ -64,6 +64,20 @@ def test_known_loads_are_told_in_words_and_in_numbers(case_result):
     text = " ".join(methods_text(data).paragraphs)
     assert "gravity (3, 0, -9.81) m/s^2; following pressure 1.5 kPa on air" in text
     assert ("starts", "0.5, 2, 8 (ratios)") in data.settings
+
+
+def test_measurements_and_a_mesh_are_told(case_result):
+    data = (
+        CaseData("landmarks", Path("m.csv"), sd_mm=0.3),
+        CaseData("force", surface="plate", force_n=12.5, direction=(0.0, 0.0, 1.0), sd_n=0.1),
+    )
+    case = dataclasses.replace(case_result.case, images=None, pairs=(), body=MeshBody(Path("block.vtu")), data=data)
+    collected = collect(dataclasses.replace(case_result, case=case))
+    text = " ".join(methods_text(collected).paragraphs)
+    assert "measurements of one body, given as a mesh" in text
+    assert "Mmg" not in text
+    told = [words for key, words in collected.settings if key == "measurement"]
+    assert told == ["landmarks, sd 0.3 mm, state 1", "force of 12.5 N on plate, sd 0.1 N, state 1"]
 
 
 def test_a_further_pair_has_a_mesh_that_is_told_of(two_pairs):

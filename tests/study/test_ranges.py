@@ -27,7 +27,7 @@ NEEDED = {
     "force_n": 'data=[{kind="force", surface="outer", direction=[0, 0, 1.0], sd_n=1.0, force_n=VALUE}]',
     "direction": 'data=[{kind="force", surface="outer", direction=[0, 0, VALUE], sd_n=1.0, force_n=1.0}]',
     "sd_n": 'data=[{kind="force", surface="outer", direction=[0, 0, 1.0], sd_n=VALUE, force_n=1.0}]',
-    "offset_sd_n": 'data=[{kind="force", surface="a", direction=[0, 0, 1.0], sd_n=1.0, force_n=1.0, offset_sd_n=VALUE}]',
+    "offset_sd_n": 'data=[{kind="force", surface="a", direction=[0, 0, 1.0], sd_n=1, force_n=1, offset_sd_n=VALUE}]',
     "within_mm": 'surfaces=[{name="top", where="z_max", within_mm=VALUE}]',
     "correlation_mm": 'data=[{kind="landmarks", file="m.csv", sd_mm=1.0, correlation_mm=VALUE}]',
     "state": 'loads=[{kind="gravity", state=VALUE, acceleration_m_s2=[0.0, 0.0, 1.0]}]',

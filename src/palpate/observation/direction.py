@@ -13,7 +13,7 @@ from palpate.images.segmentation import Segmentation
 __all__ = ["refuse_direction"]
 
 MOST_POINTS = 20_000
-TELLING = 40  # points whose tissue tells where they went
+TELLING = 20  # points whose tissue tells where they went
 CLEARLY = 0.25  # share of these by which another reading must agree better
 LPS = np.array([-1.0, -1.0, 1.0])
 SLIPS = {

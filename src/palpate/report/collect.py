@@ -24,6 +24,7 @@ from palpate.report.backgrounds import Grey, background, earlier_grey, later_gre
 from palpate.report.inputs import bone_distances, input_images
 from palpate.report.pairs import ImagePair, drawn_images, image_pairs
 from palpate.report.report_data import (
+    MESH,
     LaterImage,
     MeshPicture,
     Reference,
@@ -33,7 +34,7 @@ from palpate.report.report_data import (
     TriangleSurface,
 )
 from palpate.report.surfaces import MOST_TRIANGLES, carried_outline, contour_width, image_surface, model_surface
-from palpate.study.case import Case, CaseLoad
+from palpate.study.case import Case, CaseData, CaseLoad
 from palpate.study.result import CaseResult, MeshSummary, failure_document, stated_unit
 
 __all__ = ["collect", "collect_failure"]
@@ -148,7 +149,9 @@ def _settings(case: Case, mesh: MeshSummary | None = None) -> tuple[tuple[str, s
     by_load = bool(case.loads) and not any(tissue.role is Role.KNOWN for tissue in case.tissues)
     in_kpa = " kPa" if by_load else " (ratios)"
     starts, bounds = options.starts_kpa or options.start_ratios, options.bounds_kpa or options.bounds_ratio
-    loads = tuple(("known load", _load(load)) for load in case.loads)
+    loads = [("known load", _load(load)) for load in case.loads]
+    loads += [("measurement", _measured(data)) for data in case.data]
+    loads += [("body", MESH)] if case.body is not None else []
     noise = case.noise
     return (
         *loads,
@@ -172,6 +175,15 @@ def _settings(case: Case, mesh: MeshSummary | None = None) -> tuple[tuple[str, s
         ),
         ("seed", str(case.seed)),
     )
+
+
+def _measured(data: CaseData) -> str:
+    """A measurement in words, by what the case states of it; no name of a file."""
+    if data.kind == "force":
+        return f"force of {data.force_n or 0.0:g} N on {data.surface}, sd {data.sd_n or 0.0:g} N, state {data.state}"
+    error = "with a covariance" if data.sd_mm is None else f"sd {data.sd_mm:g} mm"
+    alike = f", alike over {data.correlation_mm:g} mm" if data.correlation_mm else ""
+    return f"{data.kind}, {error}{alike}, state {data.state}"
 
 
 def _load(load: CaseLoad) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.laws.registry import LAWS, law_from, law_parameters
 from palpate.report.headline import listed
-from palpate.report.report_data import ReportData
+from palpate.report.report_data import MESH, ReportData
 from palpate.report.rows import moduli_in, ratio_rows
 from palpate.report.sources import SOURCES, bibtex, reference_line
 
@@ -84,13 +84,20 @@ def _aim(data: ReportData, cite: _Citations) -> str:
     known = [f"{t.name} ({t.given_kpa:g} kPa)" for t in data.tissues if t.given_kpa is not None]
     moved = f" The motion was driven by {listed(roles['driver'])} (hollow, not meshed)." if "driver" in roles else ""
     scale = " No modulus was given, so only ratios were found."
+    forces = ["the measured forces"] if data.document.get("forces") else []
     if known or data.unit == "kPa":
-        scale = f" The scale was set by {listed(known or ['the known loads'])}."
+        scale = f" The scale was set by {listed(known or forces or ['the known loads'])}."
     return (
-        f"Young's moduli of {listed(roles.get('estimate', []))} were estimated at once from segmented images of the"
-        f" same body in two or more states with Palpate {cite('palpate')}, whose method starts from"
-        f" {cite('yang')}.{moved}{aligned}{scale}"
+        f"Young's moduli of {listed(roles.get('estimate', []))} were estimated at once from {_source(data)} with"
+        f" Palpate {cite('palpate')}, whose method starts from {cite('yang')}.{moved}{aligned}{scale}"
     )
+
+
+def _source(data: ReportData) -> str:
+    """What the estimate was made of."""
+    if dict(data.settings).get("body") == MESH:
+        return "measurements of one body, given as a mesh, in two or more states"
+    return "segmented images of the same body in two or more states"
 
 
 def _model(data: ReportData, cite: _Citations) -> str:
@@ -109,11 +116,16 @@ def _model(data: ReportData, cite: _Citations) -> str:
     ratios = sorted({f"{t.poisson_ratio:g}" for t in given})
     told = [f"Poisson's ratios of {listed(ratios)}"] if ratios else []
     told += [f"Poisson's ratios of {listed(sought)} as unknowns beside the moduli"] if sought else []
-    return (
+    made = (
         "The label images were turned into signed distance maps by Gaussian smoothing and the probit of the smoothed"
         " share."
         f" A conforming mesh{size} (edge length {settings['edge length at the organs']} at the organs) was cut along"
-        f" their zero levels and improved with Mmg {cite('mmg')}.{more} The tissues followed"
+        f" their zero levels and improved with Mmg {cite('mmg')}.{more}"
+    )
+    if settings.get("body") == MESH:
+        made = f"The mesh{size} was given."
+    return (
+        f"{made} The tissues followed"
         f" {law.description if law else 'the law ' + document['law']} in"
         f" {ELEMENTS.get(document['element'], str(document['element']))}, with {listed(told)};"
         " each was one solid, so that the modulus of an organ with a wall around a fluid, as a bladder, is an effective"

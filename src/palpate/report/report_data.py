@@ -15,6 +15,7 @@ from palpate.study.archive import read_archive, write_archive
 
 __all__ = [
     "GREY_STEPS",
+    "MESH",
     "BoneDistance",
     "InputImage",
     "LaterImage",
@@ -27,6 +28,8 @@ __all__ = [
     "TriangleSurface",
     "Volume",
 ]
+
+MESH = "a mesh"  # the setting "body" of a case without images
 
 FORMAT = "palpate.report-data/4"
 GREY_STEPS = 1023  # from the darkest to the brightest value that a volume keeps

@@ -579,6 +579,8 @@ class Case:
         As the case says; else on the rigid tissues, if any, or on all surfaces, but where the outer boundary is held:
         that states that the images lie on each other.
         """
+        if self.body is not None:
+            return "none"
         if self.images is not None and self.images.align != AUTO:
             return self.images.align
         if any(tissue.role is Role.RIGID for tissue in self.tissues):

@@ -195,11 +195,12 @@ def check_case(path: Path, overrides: Sequence[str], *, progress: Progress) -> C
     problems.attempt(lambda: require_samples(case))
     problems.warn(unit_warnings(case))
     progress("reading the images")
-    phantom = problems.attempt(lambda: read_states(case)) if case.phantom else None
-    read = _read_pairs(case, problems) if case.phantom is None else []
-    pairs = [phantom] if phantom is not None else [ImagedStates(before, after, (), ()) for before, after in read]
+    whole = case.phantom is not None or case.body is not None  # nothing to read one by one
+    states = problems.attempt(lambda: read_states(case, progress=progress)) if whole else None
+    read = [] if whole else _read_pairs(case, problems)
+    pairs = [states] if states is not None else [ImagedStates(before, after, (), ()) for before, after in read]
     pairs = [_checked_pair(problems, pair, case, number, progress) for number, pair in enumerate(pairs, start=1)]
-    firsts = np.cumsum([0, *(len(pair.after) for pair in pairs)]).tolist()
+    firsts = np.cumsum([0, *(pair.n_later or len(pair.after) for pair in pairs)]).tolist()
     pairs = [_with_data(problems, pair, case, first) for pair, first in zip(pairs, firsts, strict=False)]
     if not pairs:
         return CheckReport(case.id, problems.all())
@@ -209,6 +210,7 @@ def check_case(path: Path, overrides: Sequence[str], *, progress: Progress) -> C
     organs = tuple(
         OrganRow(t.name, str(t.role), tuple(round(image.volume(i) / 1000.0, 4) for image in (before, *after)))
         for i, t in enumerate(before.tissues)
+        if t.meshed or pairs[0].mesh is None
     )
     found = [
         (f"pair {n}: {name}" if n > 1 else name, one)
@@ -221,6 +223,8 @@ def check_case(path: Path, overrides: Sequence[str], *, progress: Progress) -> C
 
 def _with_data(problems: _Problems, pair: ImagedStates, case: Case, first: int) -> ImagedStates:
     """The pair with the measurements of its later states, which are numbered after `first`."""
+    if pair.mesh is not None:
+        return pair
     found = problems.attempt(lambda: measured(case, pair, first=first))
     return pair if found is None else replace(pair, data=found[0])
 
@@ -234,8 +238,9 @@ def _cost(problems: _Problems, pairs: Sequence[ImagedStates], case: Case, progre
     """What an estimate would cost on its very meshes; on meshes of a guessed size where something is refused."""
     first = pairs[0]
     cost = expected_cost(case, first.before, first.after, n_pairs=len(pairs))
-    edge = edge_length_of(case, first.before, first.after).mm
-    problems.attempt(lambda: refuse_edge(edge, case_domain(first.before, case)))
+    if first.mesh is None:
+        edge = edge_length_of(case, first.before, first.after).mm
+        problems.attempt(lambda: refuse_edge(edge, case_domain(first.before, case)))
     if any(problem.exit_code for problem in problems.all()):
         return cost
     if lack_of_memory(cost):
@@ -245,10 +250,11 @@ def _cost(problems: _Problems, pairs: Sequence[ImagedStates], case: Case, progre
     made = [body for body in bodies if body is not None]
     for number, body in enumerate(made, start=1):
         problems.warn(body.findings, number)
-        problems.attempt(partial(_observe, body))
+        if body.states.mesh is None:
+            problems.attempt(partial(_observe, body))
     if len(made) == len(pairs):
         sizes = [(body.quality.tets, 3 * len(body.space.points)) for body in made]
-        cost = cost_of_meshes(case, first.before, sizes, n_after=len(first.after))
+        cost = cost_of_meshes(case, first.before, sizes, n_after=max(first.n_later, len(first.after)))
     problems.found += memory_problems(cost)
     return cost
 
@@ -292,6 +298,8 @@ def _checked_pair(
 
     An organ that is absent is named, and left out of the other checks; the images are then not aligned.
     """
+    if states.mesh is not None:  # its voxels only show it
+        return states
     before, after = states.before, states.after
     names, where = later_names(len(after)), f"pair {number}: " if number > 1 else ""
     absent = _absent([("before", before), *zip(names, after, strict=True)])
@@ -301,7 +309,7 @@ def _checked_pair(
             " seen in both states: check its label in the image, or take the tissue out of the case"
         )
         problems.add(Problem(InputDataError.__name__, text, InputDataError.exit_code))
-    if case.phantom is None and not absent:
+    if case.images is not None and not absent:
         states = problems.attempt(partial(brought, before, after, method=case.align, progress=progress)) or states
         problems.warn(states.findings, number)
     in_place = bool(states.bones) or not any(tissue.role is Role.RIGID for tissue in before.tissues)

@@ -1,0 +1,190 @@
+"""A body that comes as a mesh, with measurements in place of images: the modulus that made them, in kPa by a force."""
+
+from __future__ import annotations
+
+import json
+
+import meshio
+import numpy as np
+import pytest
+
+from palpate.cli import main
+from palpate.errors import ConfigurationError, InputDataError
+from palpate.mesh.mesh_file import read_mesh_file
+from palpate.study.case_file import read_case
+from palpate.study.check import check_case
+from palpate.study.read import read_states
+from palpate.study.run import estimate
+
+SIZE, STRAIN, MODULUS, RATIO = (20.0, 20.0, 30.0), 0.04, 50.0, 0.3
+FORCE_N = 1e-3 * MODULUS * SIZE[0] * SIZE[1] * STRAIN  # Hooke's, of a bar that may narrow
+CASE = f"""
+[body]
+mesh = "bar.vtu"
+
+[[surfaces]]
+name = "floor"
+where = "z_min"
+within_mm = 0.1
+
+[[surfaces]]
+name = "grip"
+where = "z_max"
+within_mm = 0.1
+
+[tissues.bar]
+label = 1
+role = "estimate"
+poisson_ratio = {RATIO}
+
+[mechanics]
+law = "linear"
+
+[discrepancy]
+heterogeneity_sd = 0.0
+poisson_sd = 0.0
+
+[estimate]
+starts_kpa = [20.0, 200.0]
+bounds_kpa = [1.0, 5000.0]
+
+[[data]]
+kind = "displacement-field"
+file = "field.csv"
+sd_mm = 0.01
+
+[[data]]
+kind = "force"
+surface = "grip"
+force_n = {FORCE_N}
+direction = [0.0, 0.0, 1.0]
+sd_n = {0.01 * FORCE_N}
+"""
+
+
+def cells():
+    """A box of 4 x 4 x 6 cells of six tetrahedra each, some of them with their corners in another order."""
+    counts = np.array([5, 5, 7])
+    index = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, 3)
+    corner = index[(index < counts - 1).all(axis=1)]
+    tets = []
+    for order in ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)):
+        steps = np.cumsum(np.concatenate([np.zeros((1, 3), int), np.eye(3, dtype=int)[list(order)]]), axis=0)
+        tets.append(np.stack([np.ravel_multi_index((corner + step).T, counts) for step in steps], axis=1))
+    return index / (counts - 1) * SIZE, np.concatenate(tets)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The bar, its exact motion with noise, and the case."""
+    folder = tmp_path_factory.mktemp("bar")
+    nodes, tets = cells()
+    meshio.write(folder / "bar.vtu", meshio.Mesh(nodes, [("tetra", tets)]))
+    rng = np.random.default_rng(1)
+    points = rng.uniform(0.5, np.array(SIZE) - 0.5, (300, 3))
+    moved = STRAIN * points * np.array([-RATIO, -RATIO, 1.0]) + 0.01 * rng.standard_normal((300, 3))
+    head = "before_x,before_y,before_z,after_x,after_y,after_z"
+    np.savetxt(folder / "field.csv", np.c_[points, points + moved], delimiter=",", header=head, comments="")
+    (folder / "case.toml").write_text(CASE)
+    return folder
+
+
+def test_a_force_and_a_field_tell_kilopascals(folder):
+    result = estimate(read_case(folder / "case.toml"))
+    (bar,) = result.estimation.estimates
+    assert (bar.unit, bar.verdict) == ("kPa", "identified")
+    assert bar.value == pytest.approx(MODULUS, rel=0.02)
+    assert bar.interval95[0] < MODULUS < bar.interval95[1]
+    (force,) = result.estimation.forces
+    assert force.fitted_n == pytest.approx(FORCE_N, rel=1e-2)
+
+
+def test_twice_the_force_is_twice_the_modulus(folder):
+    one = estimate(read_case(folder / "case.toml"))
+    text = CASE.replace(f"force_n = {FORCE_N}", f"force_n = {2.0 * FORCE_N}")
+    (folder / "twice.toml").write_text(text.replace("[20.0, 200.0]", "[40.0, 400.0]"))
+    twice = estimate(read_case(folder / "twice.toml"))
+    assert twice.estimation.estimates[0].value == pytest.approx(2.0 * one.estimation.estimates[0].value, rel=1e-3)
+
+
+def test_the_offset_of_a_load_cell_widens_the_interval(folder):
+    """By as much as it may be off: a tenth of the force is a tenth of the modulus."""
+    (folder / "offset.toml").write_text(CASE + f"offset_sd_n = {0.1 * FORCE_N}\n")
+    (bar,) = estimate(read_case(folder / "offset.toml")).estimation.estimates
+    half = 0.5 * np.log(bar.interval95[1] / bar.interval95[0])
+    assert half == pytest.approx(1.96 * 0.1, rel=0.15)
+
+
+def test_every_file_of_an_estimate_is_written(folder, tmp_path, capsys):
+    assert main(["estimate", str(folder / "case.toml"), "--output", str(tmp_path / "out")]) == 0
+    document = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert document["forces"][0]["measured_n"] == pytest.approx(FORCE_N)
+    assert {"mesh", "data[0]"} <= set(document["inputs"])
+    assert (tmp_path / "out" / "report.html").stat().st_size > 10_000
+    assert main(["check", str(tmp_path / "out" / "case.toml")]) == 0
+    assert "force: 0.8 N on 'grip'" in capsys.readouterr().out
+
+
+def test_check_finds_no_fault(folder):
+    report = check_case(folder / "case.toml", [], progress=lambda _: None)
+    assert report.exit_code == 0
+    assert report.cost.tets == 576
+
+
+def test_groups_of_a_mesh_are_tissues_by_name_or_number(folder, tmp_path):
+    nodes, tets = cells()
+    upper = nodes[tets].mean(axis=1)[:, 2] > 15.0
+    mesh = meshio.Mesh(nodes, [("tetra", tets)], cell_data={"tissue": [np.where(upper, 7, 3)]})
+    meshio.write(tmp_path / "bar.vtu", mesh)
+    (tmp_path / "field.csv").write_text((folder / "field.csv").read_text())
+    text = (
+        CASE.replace("label = 1", "label = 7")
+        + '[tissues.below]\nlabel = 3\nrole = "known"\nyoungs_modulus_kpa = 50.0\n'
+    )
+    (tmp_path / "case.toml").write_text(text)
+    states = read_states(read_case(tmp_path / "case.toml"))
+    volumes = np.bincount(states.mesh.region, states.mesh.volumes)
+    assert volumes == pytest.approx([6000.0, 6000.0])
+    (tmp_path / "case.toml").write_text(CASE.replace("label = 1", "label = 7"))
+    with pytest.raises(ConfigurationError, match="no tissue of the case"):
+        read_states(read_case(tmp_path / "case.toml"))
+
+
+def test_tetrahedra_have_their_volume_whatever_the_order_of_their_corners(folder):
+    file = read_mesh_file(folder / "bar.vtu")
+    corners = file.nodes[file.tets]
+    volumes = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0
+    assert volumes.min() > 0.0
+    assert volumes.sum() == pytest.approx(np.prod(SIZE))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (('where = "z_max"', 'where = "z_mx"'), "did you mean"),
+        (("[mechanics]", '[tissues.hole]\nlabel = 2\nrole = "void"\n\n[mechanics]'), "solid ones alone"),
+        (('name = "grip"', 'name = "floor"'), "one name"),
+        (('[body]\nmesh = "bar.vtu"', '[phantom]\nkind = "spheres"'), "without a \\[body\\]"),
+    ],
+)
+def test_a_body_that_makes_no_sense_is_refused(folder, change, words):
+    (folder / "wrong.toml").write_text(CASE.replace(*change))
+    with pytest.raises(ConfigurationError, match=words):
+        read_states(read_case(folder / "wrong.toml"))
+
+
+@pytest.mark.parametrize("content", [b"", b"<VTKFile>", b"\x00" * 100])
+def test_a_mesh_that_is_none_is_refused(tmp_path, content):
+    (tmp_path / "m.vtu").write_bytes(content)
+    with pytest.raises(InputDataError, match="no mesh that meshio reads"):
+        read_mesh_file(tmp_path / "m.vtu")
+
+
+def test_a_surface_mesh_and_flat_tetrahedra_are_refused(tmp_path):
+    nodes, tets = cells()
+    meshio.write(tmp_path / "s.vtu", meshio.Mesh(nodes, [("triangle", tets[:, :3])]))
+    with pytest.raises(InputDataError, match="no tetrahedra"):
+        read_mesh_file(tmp_path / "s.vtu")
+    meshio.write(tmp_path / "f.vtu", meshio.Mesh(nodes * [1.0, 1.0, 0.0], [("tetra", tets)]))
+    with pytest.raises(InputDataError, match="no volume"):
+        read_mesh_file(tmp_path / "f.vtu")
