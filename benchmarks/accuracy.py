@@ -200,8 +200,12 @@ def at_truth(inversion: Inversion, problem: InverseProblem, scene: Scene) -> Inv
     rest, modes = state.model.space.points.ravel()[wall.dofs].reshape(-1, 3), state.model.constraint.modes[wall.dofs]
     motion = scene.motions[wall.name].at(rest).ravel() - state.model.constraint.offset[wall.dofs]
     coefficients = np.asarray(np.linalg.lstsq(modes, motion)[0], dtype=np.float64)
-    unknowns = np.concatenate([np.log(true_ratios(inversion.objective, scene)), coefficients])
-    exact = exact_approximation(state.model, state.finite_strain, Place(mapping.moduli(unknowns), coefficients))
+    unknowns = np.zeros(mapping.n_unknowns)  # what the model leaves out is not there
+    unknowns[: mapping.n_parameters] = np.log(true_ratios(inversion.objective, scene))
+    columns = mapping.coefficients(np.arange(mapping.n_unknowns, dtype=np.float64))[0].astype(int)
+    unknowns[columns[: len(coefficients)]] = coefficients
+    place = Place(mapping.moduli(unknowns), mapping.coefficients(unknowns)[0])
+    exact = exact_approximation(state.model, state.finite_strain, place)
     objective = Objective(problem.states, mapping).under([exact])
     objective = objective.with_observations([o.with_noise(noise[o.kind]) for o in objective.observations])
     objective = objective.rematched(unknowns)

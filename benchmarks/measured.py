@@ -1,6 +1,6 @@
 """Young's moduli of bodies whose stiffness, or its ratio, was measured otherwise: no simulation in it.
 
-    python benchmarks/measured.py NAME --data FOLDER [--fit STEPS] [--predict STEPS] [--json]
+    python benchmarks/measured.py NAME --data FOLDER [--fit STEPS] [--predict STEPS] [--json] [--plot FILE.svg]
 
 NAME is one of
 
@@ -31,6 +31,7 @@ from typing import Any
 
 import meshio
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from palpate.inversion import Inversion, invert
@@ -70,11 +71,14 @@ def main() -> int:
     parser.add_argument("--fit", default="2", help="steps, with commas")
     parser.add_argument("--predict", default="1", help="steps, with commas; '' for none")
     parser.add_argument("--json", action="store_true", help="print one JSON document")
+    parser.add_argument("--plot", type=Path, metavar="FILE.svg", help="values with their 95 %% intervals")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         steps = [[int(step) for step in text.split(",") if step] for text in (arguments.fit, arguments.predict)]
         found = EXPERIMENTS[arguments.name](arguments.data, Path(folder), *steps)
     sys.stdout.write(json.dumps(found, indent=None if arguments.json else 1) + "\n")
+    if arguments.plot:
+        _plot(arguments.name, found, arguments.plot)
     return 0
 
 
@@ -260,6 +264,37 @@ def beads(data: Path, folder: Path, fit: Sequence[int], predict: Sequence[int]) 
         "information_shares": result.information_shares,
         "status": result.status,
     }
+
+
+def _plot(name: str, found: dict[str, Any], path: Path) -> None:
+    """What was found, each value with its interval, beside what else is known of it."""
+    rows: list[tuple[str, float, Sequence[float]]] = []
+    told: list[tuple[str, float]] = []
+    if name == "tpu":
+        unit = "force (N)"
+        for item in found["predictions"]:
+            rows.append((f"step {item['step']}, predicted", item["force_n"], item["interval95"]))
+            told += [(f"step {item['step']}, measured", item["measured_n"])] if item["measured_n"] is not None else []
+    elif name == "beam":
+        unit = "Young's modulus (kPa)"
+        every = [(key, item) for key, item in found.items() if isinstance(item, dict)]
+        rows = [(key, item["youngs_modulus_kpa"], item["interval95"]) for key, item in every]
+        told = [("the authors' fit of the swinging beam", found["authors_kpa"])]
+    else:
+        unit = "modulus of the inner part over that of the rest"
+        rows, told = [("all beads", found["ratio"], found["interval95"])], [("one gel", 1.0)]
+    figure = Figure(figsize=(7.0, 1.3 + 0.4 * len(rows)), layout="constrained")
+    axes = figure.add_subplot()
+    for place, (_, value, (low, high)) in enumerate(rows):
+        axes.plot([low, high], [place, place], color="#4c78a8", linewidth=5, solid_capstyle="round", alpha=0.5)
+        axes.plot(value, place, "o", color="#1f3a5f")
+    for place, (label, value) in enumerate(told):
+        axes.axvline(value, color="#c0392b", linestyle=("--", ":")[place % 2], label=label)
+    axes.set_yticks(range(len(rows)), [label for label, _, _ in rows])
+    axes.set_ylim(len(rows) - 0.5, -0.5)
+    axes.set_xlabel(unit)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.35 if len(rows) < 3 else 1.2), frameon=False, ncols=2)
+    figure.savefig(path, metadata={"Date": None})
 
 
 EXPERIMENTS = {"tpu": tpu, "beam": beam, "beads": beads}
