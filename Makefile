@@ -6,7 +6,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: install demo test style lint check clean pardiso benchmark-setup schemas docs dist dist-test minimum report-check export-check
+.PHONY: commands install demo test style lint check clean pardiso benchmark-setup schemas docs dist dist-test minimum report-check export-check
 
 install: $(VENV)/.installed
 
@@ -90,6 +90,13 @@ minimum: install
 	$(BIN)/uv pip install --quiet --python build/minimum --resolution lowest-direct --editable ".[dev]"
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 build/minimum/bin/python -m pytest -n 2 \
 	  -W default::DeprecationWarning -W default::PendingDeprecationWarning $(addprefix tests/,$(MINIMUM))
+
+# Every command that README and docs name, in its small form: some fifteen minutes; ends with the first that fails.
+commands: install
+	rm -rf build/commands && mkdir -p build/commands
+	grep -v -e '^#' -e '^needs' benchmarks/small_forms.txt | sed 's#{folder}#build/commands#' | while read -r form; do \
+	  echo "$$form"; OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/$$form \
+	    > build/commands/last.log 2>&1 < /dev/null || { tail -5 build/commands/last.log; exit 1; }; done
 
 # What other programs make of our exports; CalculiX comes from Debian where that can be installed.
 export-check: install
