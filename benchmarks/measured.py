@@ -176,7 +176,7 @@ def _tpu_prediction(block: Block, folder: Path, step: int, fit: dict[str, Any]) 
     objective, x = inversion.objective, inversion.minimum.unknowns
     parameters = objective.parameters
     moved = objective.states[0].displacement(parameters.moduli(x), parameters.coefficients(x)[0])[: len(block.nodes)]
-    (line,) = (line for line in inversion.minimum.evaluation.lines if line.observation.kind == "force")
+    (line,) = (line for line in inversion.minimum.evaluation.lines if line.observation.name == "force")
     force = float(line.residuals.values[0])
     half = NORMAL_95 * float(np.hypot(force * sd, FOOT_N))
     inside = ~block.at_ends

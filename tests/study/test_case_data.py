@@ -48,7 +48,7 @@ law = "linear"
 outer_boundary = "fixed"
 
 [mesh]
-edge_length_mm = 6.0
+edge_length_mm = 7.0
 
 [discrepancy]
 heterogeneity_sd = 0.0
@@ -56,6 +56,9 @@ poisson_sd = 0.0
 
 [noise]
 surface_sd_mm = 0.3
+
+[estimate]
+start_ratios = [4.0]
 """
 TRUTH = 20.0
 
@@ -64,8 +67,8 @@ TRUTH = 20.0
 def folder(tmp_path_factory):
     """A core in a shell beside a tube that fills, with its simulated later image."""
     folder = tmp_path_factory.mktemp("core")
-    grid = VoxelGrid((44, 44, 44), np.diag([1.25, 1.25, 1.25, 1.0]))
-    x, y, z = 1.25 * np.moveaxis(np.indices(grid.shape).astype(float), 0, 0)
+    grid = VoxelGrid((34, 34, 34), np.diag([1.6, 1.6, 1.6, 1.0]))
+    x, y, z = 1.6 * np.moveaxis(np.indices(grid.shape).astype(float), 0, 0)
     labels = np.full(grid.shape, 2)
     labels[(x - 24.0) ** 2 + (y - 34.0) ** 2 + (z - 27.0) ** 2 < 10.0**2] = 1
     labels[((x - 27.0) ** 2 + (y - 14.0) ** 2 < 6.0**2) & (np.abs(z - 27.0) < 17.0)] = 3
@@ -127,11 +130,19 @@ def test_the_result_says_what_each_kind_of_data_tells(results):
     document = results["field"].to_dict()
     shares = document["information_shares"]["core"]
     assert sum(shares.values()) == pytest.approx(1.0)
-    assert shares["displacement field"] > 0.5
+    assert shares["displacement-field"] > 0.5
     far = document["fit"][0]["displacement-field"]["end"]["rms_mm"]  # of means of up to four
     assert 0.5 * 0.2 * 3**0.5 < far < 0.2 * 3**0.5
     assert json.dumps(document, allow_nan=False)
     assert "data[0]" in results["field"].provenance.inputs
+
+
+def test_two_files_of_one_kind_keep_their_own_errors(case, folder):
+    """The first one says nothing beside the second, whose markers are a hundred times better."""
+    vague = CaseData("landmarks", folder / "markers.csv", sd_mm=10.0)
+    sharp = CaseData("landmarks", folder / "markers.csv", sd_mm=0.1)
+    shares = estimate(replace(case, data=(vague, sharp))).estimation.information_shares["core"]
+    assert shares["landmarks"] < 1e-2 * shares["landmarks 2"]
 
 
 @pytest.mark.usefixtures("case")

@@ -143,6 +143,7 @@ def test_each_load_acts_in_the_state_that_it_is_stated_for(folder, case):
     other = replace(case, images=replace(case.images, after=()), loads=(replace(tilts[1], state=None),))
     write_label_image(folder / "other.nii.gz", simulate(other, progress=lambda _: None).after)
     both = replace(case, images=replace(case.images, after=(*case.images.after, folder / "other.nii.gz")), loads=())
+    both = replace(both, estimate=replace(case.estimate, start_ratios=(12.0,)))
     found = estimate(replace(both, loads=tuple(tilts)))
     for estimated, truth in zip(found.estimation.estimates, (16.0, 8.0), strict=True):
         assert estimated.value == pytest.approx(truth, rel=0.15)

@@ -43,8 +43,8 @@ class Force:
 
     @property
     def kind(self) -> str:
-        """What is compared."""
-        return KIND
+        """Each force has an error of its own."""
+        return self.name
 
     @property
     def description(self) -> str:

@@ -123,7 +123,7 @@ def point_displacement(
     independent = sparse.csr_matrix(sparse.kron(mixed, apart))
     stated = NoiseModel(np.array([file.sd_mm**2]), np.array([ALONE]))
     return PointDisplacement(
-        kind=kind,
+        kind=file.name or kind,
         description=description,
         name=file.name or kind,
         dofs=(3 * seen[:, None] + np.arange(3)).ravel(),

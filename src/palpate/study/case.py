@@ -554,10 +554,10 @@ class Case:
 
     @property
     def data_files(self) -> tuple[DataFile, ...]:
-        """The measurements beside the images, each with a name of its own."""
-        kinds = [data.kind for data in self.data]
+        """The measurements beside the images, each with a name of its own in its state."""
+        kinds = [(data.kind, data.state) for data in self.data]
         numbers = [kinds[: i + 1].count(kind) for i, kind in enumerate(kinds)]
-        names = [kind if n == 1 else f"{kind} {n}" for kind, n in zip(kinds, numbers, strict=True)]
+        names = [kind if n == 1 else f"{kind} {n}" for (kind, _), n in zip(kinds, numbers, strict=True)]
         return tuple(data.named(name) for data, name in zip(self.data, names, strict=True))
 
     @property

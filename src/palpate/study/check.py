@@ -217,7 +217,8 @@ def check_case(path: Path, overrides: Sequence[str], *, progress: Progress) -> C
         for n, pair in enumerate(pairs, start=1)
         for name, one in _lay(pair)
     ]
-    measured_words = {source.file.name: source.in_words for pair in pairs for source in pair.data}
+    files = [(source.file, source.in_words) for pair in pairs for source in pair.data]
+    measured_words = {f.name + (f", state {f.state}" if f.state > 1 else ""): words for f, words in files}
     return CheckReport(case.id, problems.all(), names, organs, cost, tuple(found), measured_words)
 
 
