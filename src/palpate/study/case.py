@@ -509,8 +509,8 @@ class Case:
         refuse_name(self.patient, "the case's patient")
         if sum(part is not None for part in (self.images, self.body, self.phantom)) != 1:
             raise ConfigurationError(
-                f"case '{self.id}' needs either [images] (with before and after) or [phantom], and not both; in place of"
-                " images a [body] with its mesh will do"
+                f"case '{self.id}' needs either [images] (with before and after) or [phantom], and not both; in place"
+                " of images a [body] with its mesh will do"
             )
         if self.body is not None and not self.data:
             raise ConfigurationError(
