@@ -28,7 +28,7 @@ __all__ = ["KIND", "DisplacementField", "read_displacement_field"]
 KIND = "displacement field"
 MOST_VECTORS = 2**26  # 1.6 GB as they are read
 LPS = np.array([-1.0, -1.0, 1.0])
-OF_LENGTH, OF_EDGE = 0.5, 0.35  # edge of a cell, over the correlation length and over an edge of the mesh
+OF_LENGTH, OF_EDGE = 0.5, 0.6  # edge of a cell, over the correlation length and over an edge of the mesh
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class DisplacementField:
     def on(self, space: LagrangeSpace, reaction_of: ReactionOf) -> tuple[PointDisplacement, tuple[Finding, ...]]:
         """The term of the points in the mesh, in means of some that are near each other; raises `InputDataError`.
 
-        What is nearer than half a correlation length, or a third of an element, says the same.
+        What is nearer than half a correlation length, or six tenths of an edge, says the same.
         """
         del reaction_of
         places = located(space.mesh, self.table.before)
