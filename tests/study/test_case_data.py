@@ -131,8 +131,8 @@ def test_the_result_says_what_each_kind_of_data_tells(results):
     shares = document["information_shares"]["core"]
     assert sum(shares.values()) == pytest.approx(1.0)
     assert shares["displacement-field"] > 0.5
-    far = document["fit"][0]["displacement-field"]["end"]["rms_mm"]  # of means of up to four
-    assert 0.5 * 0.2 * 3**0.5 < far < 0.2 * 3**0.5
+    far = document["fit"][0]["displacement-field"]["end"]["rms_mm"]  # of means, which err by less
+    assert 0.02 * 3**0.5 < far < 0.2 * 3**0.5
     assert json.dumps(document, allow_nan=False)
     assert "data[0]" in results["field"].provenance.inputs
 
