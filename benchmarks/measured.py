@@ -1,6 +1,7 @@
 """Young's moduli of bodies whose stiffness, or its ratio, was measured otherwise: no simulation in it.
 
-    python benchmarks/measured.py NAME --data FOLDER [--fit STEPS] [--predict STEPS] [--json] [--plot FILE.svg]
+    python benchmarks/measured.py NAME --data FOLDER [--fit STEPS] [--predict STEPS] [--foot N] [--json]
+        [--plot FILE.svg]
 
 NAME is one of
 
@@ -70,25 +71,38 @@ def main() -> int:
     parser.add_argument("--data", type=Path, required=True, metavar="FOLDER")
     parser.add_argument("--fit", default="2", help="steps, with commas")
     parser.add_argument("--predict", default="1", help="steps, with commas; '' for none")
+    parser.add_argument("--foot", type=float, default=FOOT_N, help="sd (N) of the load cell's offset of tpu; 0: none")
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     parser.add_argument("--plot", type=Path, metavar="FILE.svg", help="values with their 95 %% intervals")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        steps = [[int(step) for step in text.split(",") if step] for text in (arguments.fit, arguments.predict)]
-        found = EXPERIMENTS[arguments.name](arguments.data, Path(folder), *steps)
+        fit, predict = ([int(s) for s in text.split(",") if s] for text in (arguments.fit, arguments.predict))
+        options = Options(arguments.data, Path(folder), fit, predict, arguments.foot)
+        found = EXPERIMENTS[arguments.name](options)
     sys.stdout.write(json.dumps(found, indent=None if arguments.json else 1) + "\n")
     if arguments.plot:
         _plot(arguments.name, found, arguments.plot)
     return 0
 
 
-def tpu(data: Path, folder: Path, fit: Sequence[int], predict: Sequence[int]) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Options:
+    """Where the data are, a folder to work in, the steps, and the standard deviation (N) of a load cell's offset."""
+
+    data: Path
+    folder: Path
+    fit: Sequence[int]
+    predict: Sequence[int]
+    foot_n: float
+
+
+def tpu(options: Options) -> dict[str, Any]:
     """Fit the block's modulus and Poisson's ratio to some steps, under both laws, and predict others."""
-    block = _block(data, folder)
-    found = {law: _tpu_fit(block, folder, fit, law, "P1") for law in ("linear", "neo-hookean")}
+    block = _block(options)
+    found = {law: _tpu_fit(block, options, law, "P1") for law in ("linear", "neo-hookean")}
     law = min(found, key=lambda name: float(found[name]["field_rms_mm"]))
-    best = _tpu_fit(block, folder, fit, law, "auto")
-    predictions = [_tpu_prediction(block, folder, step, best) for step in predict]
+    best = _tpu_fit(block, options, law, "auto")
+    predictions = [_tpu_prediction(block, options, step, best) for step in options.predict]
     return {"fit": best, "linear_tetrahedra": list(found.values()), "predictions": predictions}
 
 
@@ -107,7 +121,8 @@ class Block:
         return np.asarray((z < z.min() + END_MM) | (z > z.max() - END_MM))
 
 
-def _block(data: Path, folder: Path) -> Block:
+def _block(options: Options) -> Block:
+    data, folder = options.data, options.folder
     nodes, tets = _table(data / "nodes_mm.csv"), _table(data / "tets.csv").astype(int)
     steps = {int(path.stem.split("_")[1].removeprefix("step")): path for path in data.glob("displacement_step*_mm.csv")}
     meshio.write(folder / "block.vtu", meshio.Mesh(nodes, [("tetra", tets)]))
@@ -143,8 +158,9 @@ def _tpu_data(
     )
 
 
-def _tpu_fit(block: Block, folder: Path, steps: Sequence[int], law: str, element: str) -> dict[str, Any]:
-    forces = [(block.forces[step], FORCE_SD * block.forces[step], FOOT_N) for step in steps]
+def _tpu_fit(block: Block, options: Options, law: str, element: str) -> dict[str, Any]:
+    folder, steps = options.folder, options.fit
+    forces = [(block.forces[step], FORCE_SD * block.forces[step], options.foot_n) for step in steps]
     each = enumerate(zip(steps, forces, strict=True), start=1)
     data = [_tpu_data(block, folder, step, state, force=force, ends=False) for state, (step, force) in each]
     case = _tpu_case(folder, law, element, data)
@@ -164,9 +180,12 @@ def _tpu_fit(block: Block, folder: Path, steps: Sequence[int], law: str, element
     }
 
 
-def _tpu_prediction(block: Block, folder: Path, step: int, fit: dict[str, Any]) -> dict[str, Any]:
+def _tpu_prediction(block: Block, options: Options, step: int, fit: dict[str, Any]) -> dict[str, Any]:
     """Force and field of a step by the motion of both ends, the modulus and its uncertainty those of the fit."""
-    unknown = (0.0, 1e6, 0.0)  # a force that tells nothing, whose fitted value is the prediction
+    folder, unknown = (
+        options.folder,
+        (0.0, 1e6, 0.0),
+    )  # a force that tells nothing: the fitted one is foretold
     data = [_tpu_data(block, folder, step, 1, force=unknown, ends=True)]
     case = _tpu_case(folder, fit["law"], "auto", data)
     case = replace(case, tissues=tuple(replace(t, poisson_ratio=fit["poisson_ratio"]) for t in case.tissues))
@@ -178,7 +197,7 @@ def _tpu_prediction(block: Block, folder: Path, step: int, fit: dict[str, Any]) 
     moved = objective.states[0].displacement(parameters.moduli(x), parameters.coefficients(x)[0])[: len(block.nodes)]
     (line,) = (line for line in inversion.minimum.evaluation.lines if line.observation.name == "force")
     force = float(line.residuals.values[0])
-    half = NORMAL_95 * float(np.hypot(force * sd, FOOT_N))
+    half = NORMAL_95 * float(np.hypot(force * sd, options.foot_n))
     inside = ~block.at_ends
     off = np.linalg.norm((moved - block.motion[step])[inside], axis=1)
     motion = np.linalg.norm(block.motion[step][inside] - block.motion[step][inside].mean(axis=0), axis=1)
@@ -192,9 +211,9 @@ def _tpu_prediction(block: Block, folder: Path, step: int, fit: dict[str, Any]) 
     }
 
 
-def beam(data: Path, folder: Path, fit: Sequence[int], predict: Sequence[int]) -> dict[str, Any]:
+def beam(options: Options) -> dict[str, Any]:
     """The beam's modulus from each weight, the clamp's motion unknown and held."""
-    del fit, predict
+    data, folder = options.data, options.folder
     markers = _markers(data / "static_markers_mm.csv")
     low = np.array([BEAM_AXIS[0] - 0.5 * BEAM_MM, BEAM_AXIS[1] - 0.5 * BEAM_MM, BEAM_Z[0]])
     size = np.array([BEAM_MM, BEAM_MM, BEAM_Z[1] - BEAM_Z[0]])
@@ -232,9 +251,9 @@ def beam(data: Path, folder: Path, fit: Sequence[int], predict: Sequence[int]) -
     return found
 
 
-def beads(data: Path, folder: Path, fit: Sequence[int], predict: Sequence[int]) -> dict[str, Any]:
+def beads(options: Options) -> dict[str, Any]:
     """The ratio of the moduli of two parts of one homogeneous gel, by all beads in it."""
-    del fit, predict
+    data, folder = options.data, options.folder
     with np.load(data / "beads.npz") as file:
         rest, later, partner = (file[name] for name in ("reference_um", "deformed_um", "match_extended"))
     known = partner >= 0

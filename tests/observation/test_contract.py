@@ -31,8 +31,8 @@ STEPS = np.array([1e-2, 1e-3, 1e-4])
 NOISE = NoiseModel(np.array([0.2**2]), np.array([4.0]))
 
 
-FIELD = DataFile("displacement-field", (), 1, 0.2, correlation_mm=3.0)
-MARKERS = DataFile("landmarks", (), 1, 0.2, covariance_mm2=np.diag([0.04, 0.04, 0.25]) + 0.01)
+FIELD = DataFile("displacement-field", "field", (), 1, 0.2, correlation_mm=3.0)
+MARKERS = DataFile("landmarks", "markers", (), 1, 0.2, covariance_mm2=np.diag([0.04, 0.04, 0.25]) + 0.01)
 
 
 def rematched(case):
@@ -93,7 +93,7 @@ def of_points(_sphere, _point_motion, *, file=FIELD, cells=None):
     moved = 0.5 * rng.standard_normal((40, 3))
     places = located(space.mesh, points)
     assert places.inside.all()
-    return point_displacement(space, points, moved, places, file=file, kind="points", description="points", cells=cells)
+    return point_displacement(space, points, moved, places, file=file, description="points", cells=cells)
 
 
 def of_markers(sphere, point_motion):

@@ -62,7 +62,7 @@ def csv_of(path, before, after, *, columns="before_x,before_y,before_z,after_x,a
 
 
 def read(path, *others, kind="landmarks", **more):
-    file = DataFile(kind, (path, *others), 1, 0.3, **more)
+    file = DataFile(kind, kind, (path, *others), 1, 0.3, **more)
     return read_landmarks(file) if kind == "landmarks" else read_displacement_field(file)
 
 
@@ -200,7 +200,7 @@ def images(shift):
 
 
 @pytest.mark.parametrize(
-    ("signs", "words"), [(np.ones(3), None), (-np.ones(3), "from the later image"), (LPS, "LPS where RAS")]
+    ("signs", "words"), [(np.ones(3), None), (-np.ones(3), "from the later state"), (LPS, "LPS where RAS")]
 )
 def test_a_field_that_leads_the_other_way_is_refused(tmp_path, signs, words):
     shift = np.array([4.0, 2.0, 1.0])

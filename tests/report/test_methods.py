@@ -11,7 +11,8 @@ import pytest
 from palpate.report.collect import collect
 from palpate.report.methods import methods_text
 from palpate.report.sources import SOURCES, bibtex, reference_line
-from palpate.study.case import CaseData, CaseLoad, Mechanics, MeshBody
+from palpate.study.case import CaseLoad, Mechanics, MeshBody
+from palpate.study.case_data import CaseData
 
 
 def test_citations_and_sources_belong_together(case_result):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
-from dataclasses import replace
+import sys
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +16,16 @@ from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers import write_label_image
 from palpate.images.readers.nifti import write_displacement_field
 from palpate.mesh.locate import located, point_interpolation
-from palpate.study.case import CaseData
+from palpate.observation.contract import DataFile
+from palpate.observation.sources import SOURCES, SourceKind
+from palpate.report.collect import collect
+from palpate.report.methods import methods_text
+from palpate.study.case_data import CaseData
 from palpate.study.case_file import read_case
 from palpate.study.check import check_case
 from palpate.study.run import estimate, simulate
 
+TOY = Path(__file__).parents[1] / "observation" / "point_motion.py"
 CASE = """
 [images]
 before = "before.nii.gz"
@@ -127,6 +134,44 @@ def test_what_is_seen_inside_narrows_what_surfaces_leave_open(case, folder):
     assert "data[0]" in results[2].provenance.inputs
 
 
+def point_motion(*arguments, **options):
+    """The toy observation of the contract's tests."""
+    spec = importlib.util.spec_from_file_location("point_motion", TOY)
+    module = sys.modules.setdefault(spec.name, importlib.util.module_from_spec(spec))
+    spec.loader.exec_module(module)
+    return module.point_motion(*arguments, **options)
+
+
+@dataclass(frozen=True)
+class Dot:
+    """Another kind of data, which only tests know: one node of the mesh, seen to stand still, by a toy observation."""
+
+    file: DataFile
+    digests: tuple[str, ...] = ()
+    in_words: str = "one dot"
+
+    def brought(self, _motion):
+        return self
+
+    def against(self, _before, _after):
+        pass
+
+    def on(self, space, _reaction_of):
+        point = int(np.argmin(np.linalg.norm(space.points, axis=1)))
+        return point_motion(point, space.points[point], np.zeros(3), sd_mm=self.file.sd_mm), ()
+
+
+def test_another_kind_is_one_file_and_one_line(case, monkeypatch):
+    """A corner of the held border: it tells nothing, which is said, and no layer asks what it is."""
+    monkeypatch.setitem(SOURCES, "dot", SourceKind(Dot, needs=("sd_mm",), may_have=()))
+    result = estimate(replace(case, data=(CaseData("dot", sd_mm=0.1),)))
+    assert result.estimation.information_shares["core"]["point motion"] < 1e-12
+    assert result.estimation.fits[0][-1].tissue == "landmark"
+    assert "displacement of points" in " ".join(methods_text(collect(result)).paragraphs)
+    with pytest.raises(ConfigurationError, match="has no 'force_n'"):
+        CaseData("dot", sd_mm=0.1, force_n=1.0)
+
+
 def test_two_files_of_one_kind_keep_their_own_errors(case, folder):
     """The first one says nothing beside the second, whose markers are a hundred times better."""
     vague = CaseData("landmarks", folder / "markers.csv", sd_mm=10.0)
@@ -148,7 +193,7 @@ def test_check_says_what_was_read(folder):
 
 def test_a_field_that_leads_back_is_refused(case, folder):
     back = CaseData("displacement-field", folder / "back.csv", sd_mm=0.2)
-    with pytest.raises(InputDataError, match="from the later image"):
+    with pytest.raises(InputDataError, match="from the later state"):
         estimate(replace(case, data=(back,)))
 
 

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from palpate.errors import InputDataError
 from palpate.findings import Finding
 
-__all__ = ["LabelImage", "VoxelGrid", "corners_apart"]
+__all__ = ["LPS_TO_RAS", "LabelImage", "VoxelGrid", "corners_apart"]
+
+LPS_TO_RAS = np.array([-1.0, -1.0, 1.0])  # signs of x, y and z, and back
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from palpate.mesh.anatomy import Anatomy, Box, LevelSet, anatomy_of, domain_box, margin_box
 from palpate.mesh.constraint import Constraint
+from palpate.mesh.locate import located, point_interpolation
 from palpate.mesh.quality import check_mesh
 from palpate.mesh.space import LagrangeSpace, lagrange_space, triangle_shape
 from palpate.mesh.surface import tissue_surface, triangle_normals, vertex_normals
@@ -23,7 +24,9 @@ __all__ = [
     "check_mesh",
     "domain_box",
     "lagrange_space",
+    "located",
     "margin_box",
+    "point_interpolation",
     "tetrahedralise",
     "tissue_surface",
     "triangle_normals",

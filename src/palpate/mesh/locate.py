@@ -31,6 +31,10 @@ class Places:
         """Which points (n,) lie in the mesh."""
         return np.asarray(self.tet >= 0)
 
+    def of(self, chosen: NDArray[np.bool_]) -> Places:
+        """Those of some of the points, a mask (n,)."""
+        return Places(self.tet[chosen], self.barycentric[chosen])
+
 
 def located(mesh: TetMesh, points: NDArray[np.float64]) -> Places:
     """Where points (n, 3) mm lie in the mesh."""

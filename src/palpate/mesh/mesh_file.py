@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from palpate.errors import ConfigurationError, GeometryError, InputDataError
 from palpate.images.input_file import open_input
 from palpate.images.tissue import Tissue
-from palpate.mesh.tet_mesh import FACES, TetMesh
+from palpate.mesh.tet_mesh import TetMesh
+from palpate.mesh.tetrahedralise import boundary_of
 
-__all__ = ["PLANES", "WHOLE", "MeshFile", "body_mesh", "boundary_faces", "plane_faces", "read_mesh_file"]
+__all__ = ["PLANES", "WHOLE", "MeshFile", "body_mesh", "plane_faces", "read_mesh_file"]
 
 MOST_BYTES = 4 * 2**30
 TETRAHEDRA, TRIANGLES = ("tetra", "tetra10"), ("triangle", "triangle6")
@@ -57,11 +58,11 @@ def read_mesh_file(path: Path, *, data: str | None = None) -> MeshFile:
                 raise InputDataError(f"'{path}' has {file.n_bytes / 2**30:.1f} GB; meshes of up to 4 GB are read")
             digest = file.sha256()
     except (OSError, ValueError) as error:
-        raise InputDataError(f"'{path}' cannot be read: {error}") from error
+        raise InputDataError(f"'{path}' cannot be read: {error}; check the path") from error
     try:
         mesh = meshio.read(path)
     except SystemExit as error:  # meshio ends the program for some files
-        raise InputDataError(f"'{path}' is no mesh that meshio reads") from error
+        raise InputDataError(f"'{path}' is no mesh that meshio reads; export it as .vtu or .msh") from error
     except Exception as error:  # meshio raises what its formats raise
         raise InputDataError(f"'{path}' is no mesh that meshio reads: {type(error).__name__}: {error}") from error
     nodes = np.asarray(mesh.points, dtype=np.float64)
@@ -82,10 +83,10 @@ def _groups(mesh: Any, chosen: Sequence[int], data: str | None, path: Path) -> N
     if key is None:
         return np.ones(sum(len(mesh.cells[i].data) for i in chosen), dtype=np.int64)
     if key not in known:
-        raise InputDataError(f"'{path}' has no cell data '{key}'; it has {sorted(known)}")
+        raise InputDataError(f"'{path}' has no cell data '{key}'; name one of {sorted(known)}")
     values = np.concatenate([np.asarray(known[key][i]).ravel() for i in chosen])
     if not np.array_equal(values, np.rint(values)):
-        raise InputDataError(f"the cell data '{key}' of '{path}' are no whole numbers, which tissues are told by")
+        raise InputDataError(f"the cell data '{key}' of '{path}' are no whole numbers; name others in tissue_data")
     return values.astype(np.int64)
 
 
@@ -107,11 +108,13 @@ def _sound(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Used nodes alone, and tetrahedra turned to a positive volume; `InputDataError` for what is no mesh."""
     if len(tets) == 0 or tets.min() < 0 or tets.max() >= len(nodes):
-        raise InputDataError(f"the tetrahedra of '{path}' name nodes that it has not ({len(nodes)} nodes)")
+        raise InputDataError(
+            f"the tetrahedra of '{path}' name nodes that it has not ({len(nodes)} nodes); export it again"
+        )
     used, places = np.unique(tets, return_inverse=True)
     nodes, tets = nodes[used], places.reshape(tets.shape).astype(np.int64)
     if not np.isfinite(nodes).all():
-        raise InputDataError(f"a node of '{path}' has a coordinate that is no number")
+        raise InputDataError(f"a node of '{path}' has a coordinate that is no number; export it again")
     corners = nodes[tets]
     volumes = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0
     longest = np.linalg.norm(corners[:, :, None] - corners[:, None], axis=3).max(axis=(1, 2))
@@ -123,13 +126,6 @@ def _sound(
         )
     tets = np.where(volumes[:, None] < 0.0, tets[:, [0, 2, 1, 3]], tets)
     return nodes, tets
-
-
-def boundary_faces(tets: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The faces (n_boundary, 3) of one tetrahedron alone, normals out of the mesh."""
-    every = tets[:, FACES].reshape(-1, 3)
-    _, first, counts = np.unique(np.sort(every, axis=1), axis=0, return_index=True, return_counts=True)
-    return np.asarray(every[np.sort(first[counts == 1])])
 
 
 def plane_faces(
@@ -152,14 +148,16 @@ def body_mesh(
 ) -> TetMesh:
     """The mesh of a file with tissues region (n_tets,), behind whose boundary faces hollow tissues lie.
 
-    surfaces: boundary faces (n_boundary,) by the name of the hollow tissue behind them, the first of which has a face;
-    beyond: number of that behind all others. Raises `GeometryError` for a surface without a face.
+    surfaces: boundary faces (n_boundary,) by the name of the hollow tissue behind them, the first one counts where two
+    have a face; beyond: number of that behind all others. Raises `GeometryError` for a surface without a face.
     """
-    boundary = boundary_faces(file.tets)
+    boundary = boundary_of(file.tets)
     behind = np.full(len(boundary), beyond)
     names = [tissue.name for tissue in tissues]
     for name, faces in list(surfaces.items())[::-1]:
         if not faces.any():
-            raise GeometryError(f"the surface '{name}' has no face of the mesh's boundary")
+            raise GeometryError(
+                f"the surface '{name}' has no face of the mesh's boundary; make within_mm larger, or name another"
+            )
         behind[faces] = names.index(name)
     return TetMesh(file.nodes, file.tets, region, boundary, behind, tuple(tissues))

@@ -49,6 +49,11 @@ class TetMesh:
         corner = self.nodes[self.tets]
         return np.asarray(np.linalg.det(corner[:, 1:] - corner[:, :1]) / 6.0)
 
+    @property
+    def usual_edge_mm(self) -> float:
+        """Edge of the regular tetrahedron that has the volume V of the median one, (6 sqrt(2) V)^(1/3), mm."""
+        return float(np.cbrt(6.0 * np.sqrt(2.0) * np.median(self.volumes)))
+
     def tissue_index(self, name: str) -> int:
         """Index of the tissue of that name in `tissues`; raises `GeometryError` when there is none."""
         names = [tissue.name for tissue in self.tissues]

@@ -285,10 +285,10 @@ class DataFile:
     """
 
     kind: str
+    name: str
     paths: tuple[Path, ...]
     state: int
     sd_mm: float = 1.0
-    name: str = ""
     covariance_mm2: NDArray[np.float64] | None = None
     correlation_mm: float = 0.0
     axes: str = "LPS"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -13,50 +13,23 @@ from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.findings import Finding
-from palpate.images.alignment import RigidMotion
 from palpate.images.input_file import open_input
-from palpate.images.segmentation import Segmentation
+from palpate.images.label_image import LPS_TO_RAS
 from palpate.mesh.locate import located
 from palpate.mesh.space import LagrangeSpace
 from palpate.observation.contract import DataFile, ReactionOf
-from palpate.observation.direction import refuse_direction
-from palpate.observation.landmarks import PointTable, read_point_table, refuse_slips
+from palpate.observation.measured_points import MeasuredPoints, PointTable, read_point_table, refuse_slips
 from palpate.observation.point_displacement import PointDisplacement, point_displacement
 
-__all__ = ["KIND", "DisplacementField", "read_displacement_field"]
+__all__ = ["DisplacementField", "read_displacement_field"]
 
-KIND = "displacement field"
 MOST_VECTORS = 2**26  # 1.6 GB as they are read
-LPS = np.array([-1.0, -1.0, 1.0])
 OF_LENGTH, OF_EDGE = 0.5, 0.6  # edge of a cell, over the correlation length and over an edge of the mesh
 
 
 @dataclass(frozen=True, slots=True)
-class DisplacementField:
-    """Points with their displacements as they were read; implements `DataSource`."""
-
-    file: DataFile
-    table: PointTable
-
-    @property
-    def digests(self) -> tuple[str, ...]:
-        """SHA-256 of each file."""
-        return self.table.digests
-
-    @property
-    def in_words(self) -> str:
-        """Number of points, and how far they move."""
-        moved = np.linalg.norm(self.table.after - self.table.before, axis=1)
-        return f"a field at {len(moved)} points, which move by {np.sqrt(np.mean(moved**2)):.2g} mm (root mean square)"
-
-    def brought(self, motion: RigidMotion) -> DisplacementField:
-        """The same with the later points moved back by the rigid motion of the later state."""
-        return replace(self, table=replace(self.table, after=motion.inverse().apply(self.table.after)))
-
-    def against(self, before: Segmentation, after: Segmentation) -> None:
-        """Raise `InputDataError` where the points arrive in other tissues (see `refuse_direction`)."""
-        table = self.table
-        refuse_direction(table.before, table.after - table.before, before, after, self.file.paths[0])
+class DisplacementField(MeasuredPoints):
+    """Points that are many, whose errors may be alike; implements `DataSource`."""
 
     def on(self, space: LagrangeSpace, reaction_of: ReactionOf) -> tuple[PointDisplacement, tuple[Finding, ...]]:
         """The term of the points in the mesh, in means of some that are near each other; raises `InputDataError`.
@@ -70,19 +43,17 @@ class DisplacementField:
             refuse_slips(space, self.table.before, inside, self.file.paths[0])
         if not inside.any():
             raise InputDataError(
-                f"no vector of '{self.file.paths[0]}' lies in the meshed body; is the field on the grid of the first"
-                " image, and of this patient?"
+                f"no vector of '{self.file.paths[0]}' lies in the meshed body; give a field of this patient, in the"
+                " world of the first image"
             )
-        points, moved = self.table.before[inside], (self.table.after - self.table.before)[inside]
-        edge = float(np.cbrt(6.0 * np.sqrt(2.0) * np.median(space.mesh.volumes)))
-        size = max(OF_LENGTH * self.file.correlation_mm, OF_EDGE * edge)
+        points, moved = self.table.before[inside], self.table.moved[inside]
+        size = max(OF_LENGTH * self.file.correlation_mm, OF_EDGE * space.mesh.usual_edge_mm)
         term = point_displacement(
             space,
             points,
             moved,
-            replace(places, tet=places.tet[inside], barycentric=places.barycentric[inside]),
+            places.of(inside),
             file=self.file,
-            kind=KIND,
             description="the difference between the model's displacement and a measured field",
             cells=np.floor((points - points.min(axis=0)) / size).astype(np.int64),
         )
@@ -98,23 +69,23 @@ def read_displacement_field(file: DataFile) -> DisplacementField:
     """
     path = file.paths[0]
     if len(file.paths) != 1:
-        raise InputDataError(f"a displacement field is one file; {len(file.paths)} are named, '{path}' first")
+        raise InputDataError(f"a displacement field is one file; {len(file.paths)} are named; leave out file_after")
     if path.suffix.lower() == ".csv":
         return DisplacementField(file, read_point_table(path))
     reader = next((read for endings, read in READERS.items() if path.name.lower().endswith(endings)), None)
     if reader is None:
         known = ", ".join(ending for endings in READERS for ending in endings)
-        raise InputDataError(f"'{path}' is no kind of displacement field that is read: .csv, {known}")
+        raise InputDataError(f"'{path}' is no kind of displacement field that is read; export one of .csv, {known}")
     try:
         with open_input(path) as stream:
             digest = stream.sha256()
     except (OSError, ValueError) as error:
-        raise InputDataError(f"'{path}' cannot be read: {error}") from error
+        raise InputDataError(f"'{path}' cannot be read: {error}; check the path") from error
     vectors, affine = reader(path)
-    flat = vectors.reshape(-1, 3) * (LPS if file.axes == "LPS" else np.ones(3))
+    flat = vectors.reshape(-1, 3) * (LPS_TO_RAS if file.axes == "LPS" else np.ones(3))
     told = np.isfinite(flat).all(axis=1) & flat.any(axis=1)
     if not told.any():
-        raise InputDataError(f"'{path}' holds no vector but zeros; nothing moved, or it is another file")
+        raise InputDataError(f"'{path}' holds no vector but zeros; give a field that moves something")
     index = np.stack(np.unravel_index(np.flatnonzero(told), vectors.shape[:3]), axis=1).astype(np.float64)
     before = index @ affine[:3, :3].T + affine[:3, 3]
     table = PointTable(before, before + flat[told], ("",) * len(before), (digest,))
@@ -127,17 +98,15 @@ def _nifti(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         image = nibabel.load(path)
         shape = tuple(int(n) for n in image.shape)
     except Exception as error:  # nibabel raises what its formats raise
-        raise InputDataError(f"'{path}' cannot be read as NIfTI: {error}") from error
+        raise InputDataError(f"'{path}' cannot be read as NIfTI: {error}; export it again") from error
     flat = (*shape[:3], *(n for n in shape[3:] if n != 1))
     if len(shape) < 4 or len(flat) != 4 or flat[3] != 3:
-        raise InputDataError(
-            f"'{path}' has the sizes {list(shape)}; a displacement field has three axes and three components"
-        )
+        raise InputDataError(f"'{path}' has the sizes {list(shape)}; export three axes and three components")
     _refuse_many(flat[:3], path)
     try:
         values = np.asarray(image.dataobj, dtype=np.float64)
     except Exception as error:
-        raise InputDataError(f"'{path}' is damaged: {error}") from error
+        raise InputDataError(f"'{path}' is damaged: {error}; export it again") from error
     return values.reshape(flat), np.asarray(image.affine, dtype=np.float64)
 
 
@@ -150,7 +119,7 @@ def _itk(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         if reader.GetDimension() != 3 or reader.GetNumberOfComponents() != 3:
             raise InputDataError(
                 f"'{path}' has {reader.GetDimension()} axes and {reader.GetNumberOfComponents()} components; a"
-                " displacement field has three of both"
+                " displacement field has three of both: export it so"
             )
         _refuse_many(reader.GetSize(), path)
         return _of_itk(sitk, reader.Execute())
@@ -188,7 +157,7 @@ def _of_itk(sitk: Any, image: Any) -> tuple[NDArray[np.float64], NDArray[np.floa
     affine = np.eye(4)
     affine[:3, :3] = np.array(image.GetDirection()).reshape(3, 3) * np.array(image.GetSpacing())
     affine[:3, 3] = image.GetOrigin()
-    return values, np.diag([*LPS, 1.0]) @ affine
+    return values, np.diag([*LPS_TO_RAS, 1.0]) @ affine
 
 
 def _simpleitk(path: Path) -> Any:

@@ -18,9 +18,8 @@ from palpate.observation.contract import DataFile, Fit, Reaction, ReactionOf, Re
 from palpate.observation.noise_model import FitResponse, NoiseModel
 from palpate.observation.robust_loss import Tukey
 
-__all__ = ["KIND", "Force", "ForceMeasurement", "read_force"]
+__all__ = ["Force", "ForceMeasurement", "read_force"]
 
-KIND = "force"
 ALONE = 1e-3  # mm: no other residual is alike
 
 
@@ -85,7 +84,7 @@ class Force:
         Raises `ConfigurationError` before moduli are known, see `under`.
         """
         if self.at is None:
-            raise ConfigurationError(f"the {self.name} depends on the moduli: ask it `under` some")
+            raise ConfigurationError(f"the {self.name} depends on the moduli: ask for its residuals `under` some")
         value, by_displacement, direct = self.reaction.at(displacement, *self.at)
         centre, row = self.reaction.centre[None], sparse.csr_matrix(by_displacement[None])
         values = np.array([value + offset - self.measured])
@@ -102,14 +101,14 @@ class Force:
         return self
 
     def first_noise(self, peers: Sequence[Force]) -> NoiseModel:
-        """What is stated, the mean of those of one state."""
-        variance = float(np.mean([peer.stated.sd**2 for peer in peers]))
-        return NoiseModel(np.array([variance]), np.array([ALONE]))
+        """What is stated."""
+        del peers
+        return self.stated
 
     def fitted_noise(self, residuals: Sequence[Residuals], response: FitResponse | None = None) -> NoiseModel:
         """What is stated."""
         del residuals, response
-        return self.noise_model
+        return self.stated
 
     def fit(self, residuals: Residuals) -> Fit:
         """How far the model's force is off, N."""
@@ -148,7 +147,7 @@ class ForceMeasurement:
         stated = NoiseModel(np.array([file.sd_n**2]), np.array([ALONE]))
         reaction = reaction_of(file.surface, direction)
         term = Force(
-            file.name or KIND,
+            file.name,
             reaction,
             direction / np.linalg.norm(direction),
             file.force_n,

@@ -102,7 +102,6 @@ def point_displacement(
     places: Places,
     *,
     file: DataFile,
-    kind: str,
     description: str,
     cells: NDArray[np.int64] | None = None,
 ) -> PointDisplacement:
@@ -123,9 +122,9 @@ def point_displacement(
     independent = sparse.csr_matrix(sparse.kron(mixed, apart))
     stated = NoiseModel(np.array([file.sd_mm**2]), np.array([ALONE]))
     return PointDisplacement(
-        kind=file.name or kind,
+        kind=file.name,
         description=description,
-        name=file.name or kind,
+        name=file.name,
         dofs=(3 * seen[:, None] + np.arange(3)).ravel(),
         operator=sparse.csr_matrix(independent @ shown),
         data=np.asarray(independent @ measured),

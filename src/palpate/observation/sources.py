@@ -3,21 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from palpate.observation.contract import DataFile, DataSource
 from palpate.observation.displacement_field import read_displacement_field
 from palpate.observation.force import read_force
 from palpate.observation.landmarks import read_landmarks
 
-__all__ = ["SOURCES", "read_source"]
+__all__ = ["SOURCES", "SourceKind", "read_source"]
 
-SOURCES: dict[str, Callable[[DataFile], DataSource]] = {
-    "landmarks": read_landmarks,
-    "displacement-field": read_displacement_field,
-    "force": read_force,
+OF_POINTS = ("file", "file_after", "sd_mm", "covariance_mm2", "correlation_mm", "axes")
+
+
+@dataclass(frozen=True, slots=True)
+class SourceKind:
+    """How measurements of a kind are read, which keys of [[data]] they need, and which others they may have.
+
+    tells_scale: whether they tell kilopascals by themselves.
+    """
+
+    read: Callable[[DataFile], DataSource]
+    needs: tuple[str, ...] = ("file",)
+    may_have: tuple[str, ...] = OF_POINTS
+    tells_scale: bool = False
+
+
+SOURCES = {
+    "landmarks": SourceKind(read_landmarks),
+    "displacement-field": SourceKind(read_displacement_field),
+    "force": SourceKind(read_force, ("surface", "force_n", "direction", "sd_n"), ("offset_sd_n",), tells_scale=True),
 }
 
 
 def read_source(file: DataFile) -> DataSource:
     """Read a file of measurements by its kind, one of `SOURCES`; raises `InputDataError`."""
-    return SOURCES[file.kind](file)
+    return SOURCES[file.kind].read(file)

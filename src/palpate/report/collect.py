@@ -34,7 +34,8 @@ from palpate.report.report_data import (
     TriangleSurface,
 )
 from palpate.report.surfaces import MOST_TRIANGLES, carried_outline, contour_width, image_surface, model_surface
-from palpate.study.case import Case, CaseData, CaseLoad
+from palpate.study.case import Case, CaseLoad
+from palpate.study.case_data import CaseData
 from palpate.study.result import CaseResult, MeshSummary, failure_document, stated_unit
 
 __all__ = ["collect", "collect_failure"]
@@ -179,8 +180,8 @@ def _settings(case: Case, mesh: MeshSummary | None = None) -> tuple[tuple[str, s
 
 def _measured(data: CaseData) -> str:
     """A measurement in words, by what the case states of it; no name of a file."""
-    if data.kind == "force":
-        return f"force of {data.force_n or 0.0:g} N on {data.surface}, sd {data.sd_n or 0.0:g} N, state {data.state}"
+    if data.force_n is not None:
+        return f"{data.kind} of {data.force_n:g} N on {data.surface}, sd {data.sd_n or 0.0:g} N, state {data.state}"
     error = "with a covariance" if data.sd_mm is None else f"sd {data.sd_mm:g} mm"
     alike = f", alike over {data.correlation_mm:g} mm" if data.correlation_mm else ""
     return f"{data.kind}, {error}{alike}, state {data.state}"

@@ -97,7 +97,12 @@ class ImagedStates:
     @property
     def n_later(self) -> int:
         """Number of later states, imaged or not."""
-        return len(self.bones)
+        return max(len(self.bones), len(self.after))
+
+    @property
+    def later(self) -> tuple[Segmentation | None, ...]:
+        """The image of each later state, None where there is none."""
+        return self.after or (None,) * self.n_later
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
 from palpate.errors import ConfigurationError
 from palpate.images.named_labels import MAX_LABEL, MAX_NAME, computed_by_spreadsheets
 from palpate.images.tissue import Role, Tissue
@@ -15,7 +13,7 @@ from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.laws.registry import LAWS, law_from, law_parameters
 from palpate.mechanics.solvers.registry import SOLVERS
 from palpate.observation.contract import DataFile
-from palpate.observation.sources import SOURCES
+from palpate.study.case_data import CaseData
 from palpate.study.schema import Rule, nearest, rule, shown
 
 __all__ = [
@@ -45,8 +43,6 @@ REMAINING = "remaining"
 AUTO = "auto"
 HELD = ("fixed", "sliding")  # outer boundaries that leave a body no rigid motion
 LAW_NAMES = tuple(LAWS)
-Row = tuple[float, float, float]
-FORCES_N = (-1e9, 1e9)
 SOLVER_NAMES = ("auto", *SOLVERS)
 
 POSITIVE_NUMBERS = "a list of positive numbers"
@@ -293,75 +289,6 @@ class CaseLoad:
 
 
 @dataclass(frozen=True, slots=True)
-class CaseData:
-    """Measurements beside the images, of the later state with the number `state`; `file_after`: of a second list.
-
-    `sd_mm`: standard deviation of each component's error, or `covariance_mm2` (3, 3) of a point's; `correlation_mm`:
-    length over which a field's errors are alike; `axes`: of the vectors of a field that is an image. A force has no
-    file: `force_n` on `surface` (see `CaseLoad`) along `direction`, with `sd_n` and that of the load cell's offset,
-    `offset_sd_n`.
-    """
-
-    kind: str = field(metadata=rule(choices=tuple(SOURCES)))
-    file: Path | None = None
-    file_after: Path | None = None
-    state: int = field(default=1, metadata=rule(between=(1, 1000)))
-    sd_mm: float | None = field(default=None, metadata=rule(between=(1e-6, 100.0)))
-    covariance_mm2: tuple[Row, Row, Row] | None = field(default=None, metadata=rule(instead_of="sd_mm"))
-    correlation_mm: float = field(default=0.0, metadata=rule(between=(0.0, 1e3)))
-    axes: str = field(default="LPS", metadata=rule(choices=("LPS", "RAS")))
-    surface: str | None = None
-    force_n: float | None = field(default=None, metadata=rule(between=FORCES_N))
-    direction: Row | None = field(default=None, metadata=rule(between=(-1e3, 1e3)))
-    sd_n: float | None = field(default=None, metadata=rule(between=(1e-9, 1e6)))
-    offset_sd_n: float = field(default=0.0, metadata=rule(between=(0.0, 1e6)))
-
-    def __post_init__(self) -> None:
-        needed = ("surface", "force_n", "direction", "sd_n") if self.kind == "force" else ("file",)
-        others = ("file",) if self.kind == "force" else ("surface", "force_n", "direction", "sd_n")
-        for key in needed:
-            if getattr(self, key) is None:
-                raise ConfigurationError(f"[[data]]: {self.kind} need the key '{key}'")
-        for key in others:
-            if getattr(self, key) is not None:
-                raise ConfigurationError(f"[[data]]: {self.kind} have no '{key}'; they have {' and '.join(needed)}")
-        if self.direction is not None and not any(self.direction):
-            raise ConfigurationError("[[data]] direction is (0, 0, 0), which is none; give the way that the force acts")
-        if self.file is not None and self.sd_mm is None and self.covariance_mm2 is None:
-            raise ConfigurationError(
-                f"[[data]] '{self.file.name}' says nothing of its errors: give sd_mm, the standard deviation of each"
-                " component (mm), by which it counts beside the images"
-            )
-        if self.covariance_mm2 is not None:
-            matrix = np.array(self.covariance_mm2)
-            if not np.allclose(matrix, matrix.T) or np.linalg.eigvalsh(matrix)[0] <= 0.0:
-                raise ConfigurationError(
-                    f"[[data]] covariance_mm2 is {matrix.tolist()}; it must be symmetric and positive definite, mm^2"
-                )
-
-    def named(self, name: str) -> DataFile:
-        """What the layers below are told of it, under a name of its term."""
-        matrix = None if self.covariance_mm2 is None else np.array(self.covariance_mm2)
-        paths = tuple(path for path in (self.file, self.file_after) if path is not None)
-        sd_mm = self.sd_mm or float(np.sqrt(np.trace(np.eye(3) if matrix is None else matrix) / 3.0))
-        return DataFile(
-            self.kind,
-            paths,
-            self.state,
-            sd_mm,
-            name,
-            matrix,
-            self.correlation_mm,
-            self.axes,
-            self.surface or "",
-            self.force_n or 0.0,
-            self.direction or (0.0, 0.0, 1.0),
-            self.sd_n or 1.0,
-            self.offset_sd_n,
-        )
-
-
-@dataclass(frozen=True, slots=True)
 class MeshSettings:
     """Edge length (mm) of the tetrahedra at the organs; None: "auto", chosen by the organs (see `edge_length_of`).
 
@@ -518,7 +445,7 @@ class Case:
             )
         if self.surfaces and self.body is None:
             raise ConfigurationError(
-                f"case '{self.id}' has [[surfaces]] without a [body]: images have none but organs'"
+                f"case '{self.id}' has [[surfaces]] without a [body]; take them out: images have their organs'"
             )
         names = [tissue.name for tissue in self.tissues] + [surface.name for surface in self.surfaces]
         if len(set(names)) < len(names):
@@ -550,7 +477,7 @@ class Case:
     @property
     def known_force(self) -> bool:
         """Whether a force is known, as a load or by a measurement: moduli then come out in kPa by themselves."""
-        return bool(self.loads) or any(data.kind == "force" for data in self.data)
+        return bool(self.loads) or any(data.tells_scale for data in self.data)
 
     @property
     def data_files(self) -> tuple[DataFile, ...]:

@@ -73,7 +73,7 @@ class CheckReport:
     """All problems of a case, its organs and what its estimate would cost (None when that cannot be told).
 
     alignments: how each later image lay, by its name; none where nothing was aligned; measured: what was read of each
-    file of [[data]], by its place in the case.
+    file of [[data]], by its name.
     """
 
     id: str
@@ -200,7 +200,7 @@ def check_case(path: Path, overrides: Sequence[str], *, progress: Progress) -> C
     read = [] if whole else _read_pairs(case, problems)
     pairs = [states] if states is not None else [ImagedStates(before, after, (), ()) for before, after in read]
     pairs = [_checked_pair(problems, pair, case, number, progress) for number, pair in enumerate(pairs, start=1)]
-    firsts = np.cumsum([0, *(pair.n_later or len(pair.after) for pair in pairs)]).tolist()
+    firsts = np.cumsum([0, *(pair.n_later for pair in pairs)]).tolist()
     pairs = [_with_data(problems, pair, case, first) for pair, first in zip(pairs, firsts, strict=False)]
     if not pairs:
         return CheckReport(case.id, problems.all())
@@ -255,7 +255,7 @@ def _cost(problems: _Problems, pairs: Sequence[ImagedStates], case: Case, progre
             problems.attempt(partial(_observe, body))
     if len(made) == len(pairs):
         sizes = [(body.quality.tets, 3 * len(body.space.points)) for body in made]
-        cost = cost_of_meshes(case, first.before, sizes, n_after=max(first.n_later, len(first.after)))
+        cost = cost_of_meshes(case, first.before, sizes, n_after=first.n_later)
     problems.found += memory_problems(cost)
     return cost
 

@@ -38,6 +38,7 @@ from palpate.uncertainty import (
     covariance_of,
     frozen_posterior,
     information,
+    information_shares,
     log_interval,
     modulus_interval,
 )
@@ -249,7 +250,7 @@ def conclude(
         remarks=findings,
         observations={observation.kind: observation.description for observation in objective.observations},
         information=information(of_moduli),
-        information_shares=_information_shares(inversion) if minimum.converged else {},
+        information_shares=_shares(inversion) if minimum.converged else {},
         discrepancy=found_discrepancy,
         combinations=combinations_of(inversion, of_moduli, within=IDENTIFIED),
         regions=regions,
@@ -457,29 +458,15 @@ def _forces(inversion: Inversion) -> tuple[ForceFit, ...]:
         seen = line.observation
         if isinstance(seen, OfInstrument):
             fitted = seen.measured + float(line.residuals.values[0])
-            found.append(
-                ForceFit(line.observation.name, line.state, seen.measured, fitted, line.observation.noise_model.sd)
-            )
+            sd = line.observation.noise_model.sd
+            found.append(ForceFit(line.observation.name, line.state, seen.measured, fitted, sd))
     return tuple(found)
 
 
-def _information_shares(inversion: Inversion) -> dict[str, dict[str, float]]:
-    """Share of each kind of data in what is known of each log-modulus, 0 to 1, and of what was believed before.
-
-    With h = H^-1 e_i the precision of theta_i is sum_k h^T J_k^T W_k J_k h / h^T H h over the kinds, and the prior's.
-    """
-    found, parameters = inversion.minimum.evaluation, inversion.objective.parameters
-    columns = found.covariance_columns(inversion.objective.n_parameters)
-    shares = dict[str, dict[str, float]]()
-    for tissue, h in zip(parameters.tissues, columns.T, strict=False):
-        parts = {"prior": float(h @ found.prior @ h)}
-        for line in found.lines:
-            moved = line.jacobian.times(h[line.columns])
-            known = parts.get(line.observation.kind, 0.0)
-            parts[line.observation.kind] = known + float(line.precision * line.weights @ moved**2)
-        total = sum(parts.values())
-        shares[tissue] = {kind: part / total for kind, part in parts.items()}
-    return shares
+def _shares(inversion: Inversion) -> dict[str, Mapping[str, float]]:
+    """By tissue, the share of each kind of data in what is known of its modulus."""
+    shares = information_shares(inversion.minimum.evaluation, inversion.objective.n_parameters)
+    return dict(zip(inversion.objective.parameters.tissues, shares, strict=False))
 
 
 def _fits(inversion: Inversion, observed: Observed) -> tuple[tuple[TissueFit, ...], ...]:

@@ -10,13 +10,14 @@ from palpate.images.alignment import RigidMotion
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
-from palpate.mesh.mesh_file import PLANES, WHOLE, MeshFile, body_mesh, boundary_faces, plane_faces, read_mesh_file
+from palpate.mesh.mesh_file import PLANES, WHOLE, MeshFile, body_mesh, plane_faces, read_mesh_file
 from palpate.mesh.space import lagrange_space
 from palpate.mesh.tet_mesh import TetMesh
+from palpate.mesh.tetrahedralise import boundary_of
 from palpate.mesh.voxelise import voxelise
 from palpate.progress import Progress
 from palpate.study.body import ImagedStates
-from palpate.study.case import Case, CaseSurface
+from palpate.study.case import Case, CaseSurface, MeshBody
 from palpate.study.schema import nearest
 
 __all__ = ["mesh_states"]
@@ -26,14 +27,13 @@ ROLES = {"moving": Role.DRIVER, "fixed": Role.RIGID, "free": Role.VOID}
 VOXELS_AN_EDGE, MOST_VOXELS, BORDER = 2.5, 4e6, 3  # of the label image that shows the mesh
 
 
-def mesh_states(case: Case, *, progress: Progress) -> ImagedStates:
-    """The reference state of [body] with as many later states as its measurements speak of, none of which is imaged.
+def mesh_states(body: MeshBody, case: Case, *, progress: Progress) -> ImagedStates:
+    """The reference state of a [body], with as many later states as the case speaks of, none of which is imaged.
 
     Raises `InputDataError` for a mesh that cannot be used, `ConfigurationError` for tissues, surfaces that it has not.
     """
-    assert case.body is not None
-    file = read_mesh_file(case.body.mesh, data=case.body.tissue_data)
-    progress(f"'{case.body.mesh.name}': {len(file.tets)} tetrahedra, {len(file.nodes)} nodes")
+    file = read_mesh_file(body.mesh, data=body.tissue_data)
+    progress(f"'{body.mesh.name}': {len(file.tets)} tetrahedra, {len(file.nodes)} nodes")
     mesh = _mesh(file, case)
     grid = _grid(mesh)
     index = voxelise(lagrange_space(mesh, "P1"), np.zeros_like(mesh.nodes), grid, crossing=True)
@@ -62,7 +62,7 @@ def _mesh(file: MeshFile, case: Case) -> TetMesh:
             f"no tissue of the case has the group(s) {[groups[n] for n in left]} of the mesh; give each a tissue,"
             ' or one label = "remaining"'
         )
-    faces = boundary_faces(file.tets)
+    faces = boundary_of(file.tets)
     surfaces = {surface.name: _faces(file, faces, surface) for surface in case.surfaces}
     tissues += [Tissue(surface.name, ROLES[surface.boundary]) for surface in case.surfaces]
     tissues.append(Tissue(OUTSIDE, Role.VOID))
@@ -83,8 +83,7 @@ def _faces(file: MeshFile, faces: NDArray[np.int64], surface: CaseSurface) -> ND
 def _grid(mesh: TetMesh) -> VoxelGrid:
     """Voxels that show the mesh: some along an edge, and a border around."""
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
-    edge = float(np.cbrt(6.0 * np.sqrt(2.0) * np.median(mesh.volumes)))
-    size = max(edge / VOXELS_AN_EDGE, float(np.cbrt(np.prod(high - low) / MOST_VOXELS)))
+    size = max(mesh.usual_edge_mm / VOXELS_AN_EDGE, float(np.cbrt(np.prod(high - low) / MOST_VOXELS)))
     shape = np.ceil((high - low) / size).astype(int) + 2 * BORDER
     affine = np.diag([size, size, size, 1.0])
     affine[:3, 3] = 0.5 * (low + high) - 0.5 * size * (shape - 1)

@@ -41,7 +41,7 @@ def read_states(case: Case, *, progress: Progress = silent) -> ImagedStates:
         after = (segment(scene.after, scene.tissues),)
         return aligned(segment(scene.before, scene.tissues), after, method=case.align, loaded=bool(case.loads))
     if case.body is not None:
-        return _with_measured(mesh_states(case, progress=progress), case, first=0, progress=progress)
+        return _with_measured(mesh_states(case.body, case, progress=progress), case, first=0, progress=progress)
     if case.images is None:
         raise ConfigurationError(f"case '{case.id}' has neither [images] nor [phantom]")
     return _read_pair(case, case.images.before, case.images.after, key="", first=0, progress=progress)

@@ -106,11 +106,7 @@ def estimate_states(
     clock.append(time.perf_counter())
     settings = inversion_settings(case, problem.parameters)
     inversion = invert(problem, settings, progress=during("linear law", progress))
-    images = tuple(
-        image.index if image else None
-        for pair in bodies
-        for image in pair.states.after or (None,) * pair.states.n_later
-    )
+    images = tuple(image.index if image else None for pair in bodies for image in pair.states.later)
     observed = Observed(fitted_states(inversion, *bodies), images)
     stating = during("intervals", progress)
     estimation = conclude(
@@ -180,7 +176,7 @@ def fitted_states(inversion: Inversion, *bodies: Body) -> tuple[FittedState, ...
     """Displacements of the whole meshes at the estimate, with the grids that they were seen on, body after body."""
     objective, unknowns = inversion.objective, inversion.minimum.unknowns
     moduli, coefficients = objective.parameters.moduli(unknowns), objective.parameters.coefficients(unknowns)
-    images = [(b, image or b.states.before) for b in bodies for image in b.states.after or (None,) * b.states.n_later]
+    images = [(b, image or b.states.before) for b in bodies for image in b.states.later]
     return tuple(
         FittedState(body.space, state.displacement(moduli, q), body.states.before.grid, image.grid)
         for state, q, (body, image) in zip(objective.states, coefficients, images, strict=True)

@@ -1,6 +1,6 @@
 """What is known of an estimate: covariance by cause, profiles, intervals, samples of the posterior, sensitivity."""
 
-from palpate.uncertainty.combinations import Combination, Information, information, known_pairs
+from palpate.uncertainty.combinations import Combination, Information, information, information_shares, known_pairs
 from palpate.uncertainty.covariance import (
     Covariance,
     FittedState,
@@ -62,6 +62,7 @@ __all__ = [
     "grid_position_shifts",
     "imaging_errors",
     "information",
+    "information_shares",
     "joint_region",
     "known_pairs",
     "log_interval",

@@ -9,9 +9,10 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.inversion.objective import Evaluation
 from palpate.uncertainty.intervals import NORMAL_95
 
-__all__ = ["Combination", "Information", "information", "known_pairs"]
+__all__ = ["Combination", "Information", "information", "information_shares", "known_pairs"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +50,21 @@ def information(covariance: NDArray[np.float64]) -> Information:
     variances, axes = np.linalg.eigh(covariance)
     signs = np.sign(axes[np.abs(axes).argmax(axis=0), np.arange(len(axes))])
     return Information(1.0 / np.sqrt(variances), (axes * signs).T)
+
+
+def information_shares(evaluation: Evaluation, n_parameters: int) -> list[dict[str, float]]:
+    """Of each of n parameters, the share of each kind of data in what is known of it, 0 to 1, and of what was believed.
+
+    With h = H^-1 e_i its precision is the sum of h^T J_k^T W_k J_k h / h^T H h over the kinds, and of the prior's part.
+    """
+    found = []
+    for h in evaluation.covariance_columns(n_parameters).T:
+        parts = {"prior": float(h @ evaluation.prior @ h)}
+        for line in evaluation.lines:
+            known = float(line.precision * line.weights @ line.jacobian.times(h[line.columns]) ** 2)
+            parts[line.observation.kind] = parts.get(line.observation.kind, 0.0) + known
+        found.append({kind: part / sum(parts.values()) for kind, part in parts.items()})
+    return found
 
 
 def known_pairs(

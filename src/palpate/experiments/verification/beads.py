@@ -17,8 +17,8 @@ from scipy.spatial import cKDTree
 from palpate.experiments.verification.conditions import all_prescribed
 from palpate.experiments.verification.problem import Check, Problem
 from palpate.experiments.verification.structured_meshes import box_mesh, known, make_mesh
-from palpate.mechanics import LAWS, Dilatation, finite_strain_model, linear_model, outer_constraint, shape_functions
-from palpate.mesh import LagrangeSpace, lagrange_space
+from palpate.mechanics import LAWS, Dilatation, finite_strain_model, linear_model, outer_constraint
+from palpate.mesh import LagrangeSpace, lagrange_space, located, point_interpolation
 
 __all__ = ["BEADS_PROBLEMS", "Beads", "best_poisson_ratio", "prediction_errors", "read_beads"]
 
@@ -73,26 +73,6 @@ def boundary_motion(space: LagrangeSpace, beads: Beads) -> Array:
     return result
 
 
-def interpolated(space: LagrangeSpace, displacement: Array, places: Array) -> Array:
-    """Displacement (n, 3) um at places (n, 3) um inside the box, from its nodal values (n_points, 3) um."""
-    mesh, size = space.mesh, (HIGH - LOW) / np.array(CELLS)
-    corner = mesh.nodes[mesh.tets]
-
-    def cell_of(points: Array) -> NDArray[np.int64]:
-        """Number (n,) of the box's cell that each of the points (n, 3) um lies in."""
-        index = np.clip(((points - LOW) / size).astype(int), 0, np.array(CELLS) - 1)
-        return np.asarray(np.ravel_multi_index(tuple(index.T), CELLS))
-
-    of_cell = np.argsort(cell_of(corner.mean(axis=1)), kind="stable").reshape(-1, 6)
-    candidates = of_cell[cell_of(places)]
-    columns = np.concatenate([np.swapaxes(corner, 1, 2), np.ones((len(corner), 1, 4))], axis=1)
-    ends = np.column_stack([places, np.ones(len(places))])
-    barycentric = np.einsum("ncij,nj->nci", np.linalg.inv(columns)[candidates], ends)
-    best = np.arange(len(places)), barycentric.min(axis=2).argmax(axis=1)
-    shape = shape_functions(space.order, barycentric[best])
-    return np.asarray(np.einsum("na,nai->ni", shape, displacement[space.cells[candidates[best]]]))
-
-
 def prediction_errors(beads: Beads, law: str, nu: float) -> Array:
     """Distances (n_inside,) um between predicted and measured motion of the beads inside, under one law."""
     space = gel_space(nu)
@@ -102,7 +82,7 @@ def prediction_errors(beads: Beads, law: str, nu: float) -> Array:
     if law != "linear":
         model = finite_strain_model(space, constraint, LAWS[law])
         linear = model.solve(np.ones(1), np.zeros(0), start=linear).displacement
-    predicted = interpolated(space, linear, beads.rest[beads.inside])
+    predicted = point_interpolation(space, located(space.mesh, beads.rest[beads.inside])) @ linear
     return np.asarray(np.linalg.norm(predicted - beads.motion[beads.inside], axis=1))
 
 

@@ -17,7 +17,7 @@ from pydicom.dataset import Dataset
 
 from palpate.errors import InputDataError
 from palpate.findings import Finding
-from palpate.images.label_image import VoxelGrid
+from palpate.images.label_image import LPS_TO_RAS, VoxelGrid
 from palpate.images.named_labels import MAX_LABEL, MAX_NAME, NamedLabel, hex_colour, printable
 from palpate.images.readers.dicom_dataset import Series, read_dataset, sentences, series_beside
 from palpate.images.readers.merged_masks import Mask, merged
@@ -92,7 +92,7 @@ def read(path: Path, grid: VoxelGrid | None) -> StoredImage:
 
 def _points(contour: Dataset) -> NDArray[np.float64]:
     """The points of a contour (n, 3), RAS mm."""
-    return np.array(contour.ContourData, dtype=np.float64).reshape(-1, 3) * [-1.0, -1.0, 1.0]
+    return np.asarray(np.array(contour.ContourData, dtype=np.float64).reshape(-1, 3) * LPS_TO_RAS)
 
 
 def _structures(dataset: Dataset, to_index: NDArray[np.float64], path: Path) -> list[_Structure]:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
 from palpate.images.input_file import open_input
+from palpate.images.label_image import LPS_TO_RAS
 from palpate.images.named_labels import printable
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
 from palpate.images.readers.text_header import beside, counts, header_line, numbers
@@ -25,7 +26,6 @@ from palpate.images.readers.voxel_stream import MAX_OFFSET, VoxelBlock, bytes_to
 
 __all__ = ["read_metaimage"]
 
-LPS_TO_RAS = np.array([-1.0, -1.0, 1.0])
 SYNONYMS = {
     "rotation": "transformmatrix",
     "orientation": "transformmatrix",

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, InputDataError, ResourceError
 from palpate.images.input_file import open_input
-from palpate.images.label_image import LabelImage, VoxelGrid, corners_apart
+from palpate.images.label_image import LPS_TO_RAS, LabelImage, VoxelGrid, corners_apart
 from palpate.images.readers.nifti_extension import extension_names
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
 from palpate.images.readers.voxel_stream import MAX_OFFSET, VoxelBlock, check_end, check_size, damaged, read_exactly
@@ -177,7 +177,7 @@ def write_displacement_field(path: Path | str, field: NDArray[np.float64], grid:
     """
     if field.shape != (*grid.shape, 3):
         raise InputDataError(f"a field of shape {field.shape} cannot be written on a grid of shape {grid.shape}")
-    lps = (field * [-1.0, -1.0, 1.0]).astype(np.float32)
+    lps = (field * LPS_TO_RAS).astype(np.float32)
     _write(Path(path), lps[:, :, :, None, :], grid, intent="vector")
 
 

@@ -1,0 +1,93 @@
+"""[[data]] of a case: measurements of a later state beside its images, or in place of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+
+import numpy as np
+
+from palpate.errors import ConfigurationError
+from palpate.observation.contract import DataFile
+from palpate.observation.sources import SOURCES
+from palpate.study.schema import rule
+
+__all__ = ["CaseData"]
+
+Row = tuple[float, float, float]
+FORCES_N = (-1e9, 1e9)
+
+
+@dataclass(frozen=True, slots=True)
+class CaseData:
+    """Measurements beside the images, of the later state with the number `state`; `file_after`: of a second list.
+
+    `sd_mm`: standard deviation of each component's error, or `covariance_mm2` (3, 3) of a point's; `correlation_mm`:
+    length over which a field's errors are alike; `axes`: of the vectors of a field that is an image. A force has no
+    file: `force_n` on `surface` (see `CaseLoad`) along `direction`, with `sd_n` and that of the load cell's offset,
+    `offset_sd_n`.
+    """
+
+    kind: str = field(metadata=rule(choices=tuple(SOURCES)))
+    file: Path | None = None
+    file_after: Path | None = None
+    state: int = field(default=1, metadata=rule(between=(1, 1000)))
+    sd_mm: float | None = field(default=None, metadata=rule(between=(1e-6, 100.0)))
+    covariance_mm2: tuple[Row, Row, Row] | None = field(default=None, metadata=rule(instead_of="sd_mm"))
+    correlation_mm: float = field(default=0.0, metadata=rule(between=(0.0, 1e3)))
+    axes: str = field(default="LPS", metadata=rule(choices=("LPS", "RAS")))
+    surface: str | None = None
+    force_n: float | None = field(default=None, metadata=rule(between=FORCES_N))
+    direction: Row | None = field(default=None, metadata=rule(between=(-1e3, 1e3)))
+    sd_n: float | None = field(default=None, metadata=rule(between=(1e-9, 1e6)))
+    offset_sd_n: float = field(default=0.0, metadata=rule(between=(0.0, 1e6)))
+
+    def __post_init__(self) -> None:
+        kind = SOURCES[self.kind]
+        missing = [key for key in kind.needs if getattr(self, key) is None]
+        if missing:
+            raise ConfigurationError(f"[[data]]: a {self.kind} needs the key '{missing[0]}'")
+        allowed = {"kind", "state", *kind.needs, *kind.may_have}
+        for item in fields(self):
+            if item.name not in allowed and getattr(self, item.name) != item.default:
+                known = " and ".join((*kind.needs, *kind.may_have))
+                raise ConfigurationError(f"[[data]]: a {self.kind} has no '{item.name}'; it has {known}")
+        if self.direction is not None and not any(self.direction):
+            raise ConfigurationError("[[data]] direction is (0, 0, 0), which is none; give the way that the force acts")
+        if self.file is not None and self.sd_mm is None and self.covariance_mm2 is None:
+            raise ConfigurationError(
+                f"[[data]] '{self.file.name}' says nothing of its errors: give sd_mm, the standard deviation of each"
+                " component (mm), by which it counts beside the images"
+            )
+        if self.covariance_mm2 is not None:
+            matrix = np.array(self.covariance_mm2)
+            if not np.allclose(matrix, matrix.T) or np.linalg.eigvalsh(matrix)[0] <= 0.0:
+                raise ConfigurationError(
+                    f"[[data]] covariance_mm2 is {matrix.tolist()}; it must be symmetric and positive definite, mm^2"
+                )
+
+    @property
+    def tells_scale(self) -> bool:
+        """Whether it tells kilopascals by itself."""
+        return SOURCES[self.kind].tells_scale
+
+    def named(self, name: str) -> DataFile:
+        """What the layers below are told of it, under a name of its term."""
+        matrix = None if self.covariance_mm2 is None else np.array(self.covariance_mm2)
+        paths = tuple(path for path in (self.file, self.file_after) if path is not None)
+        sd_mm = self.sd_mm or float(np.sqrt(np.trace(np.eye(3) if matrix is None else matrix) / 3.0))
+        return DataFile(
+            self.kind,
+            name,
+            paths,
+            self.state,
+            sd_mm,
+            matrix,
+            self.correlation_mm,
+            self.axes,
+            self.surface or "",
+            self.force_n or 0.0,
+            self.direction or (0.0, 0.0, 1.0),
+            self.sd_n or 1.0,
+            self.offset_sd_n,
+        )
