@@ -219,10 +219,14 @@ def _mirrored(before: Segmentation, after: Segmentation, observed: Sequence[int]
     """
     points = []  # of each organ at most MIRROR_SAMPLES voxel centres (n, 3), evenly picked, RAS mm
     for i in observed:
-        index = np.argwhere(before.mask(i))
-        points.append(before.grid.world(index[:: -(-len(index) // MIRROR_SAMPLES)].astype(np.float64)))
+        step = -(-int(np.count_nonzero(before.mask(i))) // MIRROR_SAMPLES)
+        picked, seen = list[NDArray[np.int64]](), 0
+        for voxels in before.voxels(i):
+            picked.append(voxels[-seen % step :: step])
+            seen += len(voxels)
+        points.append(before.grid.world(np.concatenate(picked).astype(np.float64)))
     middle = np.mean([p.mean(axis=0) for p in points], axis=0)
-    target = np.mean([_centroid(after, i) for i in observed], axis=0)
+    target = np.mean([after.middle(i) for i in observed], axis=0)
     agreement = {}
     for signs in product((1.0, -1.0), repeat=3):
         hits = []
@@ -245,14 +249,9 @@ def _mirrored(before: Segmentation, after: Segmentation, observed: Sequence[int]
     return [Finding("mirrored", text, place=f"'{name}'")]
 
 
-def _centroid(segmentation: Segmentation, tissue: int) -> NDArray[np.float64]:
-    index = np.argwhere(segmentation.mask(tissue)).mean(axis=0, keepdims=True)
-    return np.asarray(segmentation.grid.world(index)[0])
-
-
 def _shifts(before: Segmentation, after: Segmentation, observed: Sequence[int], name: str) -> list[Finding]:
     """Organs that move by more than their own size, measured against the rigid tissues where there are any."""
-    shift = {i: _centroid(after, i) - _centroid(before, i) for i in observed}
+    shift = {i: after.middle(i) - before.middle(i) for i in observed}
     rigid = [shift[i] for i in observed if before.tissues[i].role is Role.RIGID]
     common = np.mean(rigid, axis=0) if rigid else np.zeros(3)
     findings = []

@@ -121,10 +121,10 @@ def _shared_faces(segmentation: Segmentation) -> NDArray[np.float64]:
     faces = np.zeros((n, n + 1))
     for axis in range(3):
         area = float(np.prod(spacing) / spacing[axis])
-        low = np.take(index, range(index.shape[axis] - 1), axis).ravel().astype(np.int64)
-        high = np.take(index, range(1, index.shape[axis]), axis).ravel().astype(np.int64)
-        differ = low != high
-        both = np.bincount(low[differ] * n + high[differ], minlength=n * n).reshape(n, n)
+        along = np.moveaxis(index, axis, 0)
+        differ = along[1:] != along[:-1]  # few do: only theirs are counted as wide integers
+        low, high = (each[differ].astype(np.int64) for each in (along[:-1], along[1:]))
+        both = np.bincount(low * n + high, minlength=n * n).reshape(n, n)
         faces[:, :n] += area * (both + both.T)
         for end in (0, -1):
             faces[:, n] += area * np.bincount(np.take(index, end, axis).ravel(), minlength=n)
@@ -133,9 +133,12 @@ def _shared_faces(segmentation: Segmentation) -> NDArray[np.float64]:
 
 def _outside(one: Segmentation, other: Segmentation, tissue: int) -> int:
     """Number of the tissue's voxels in one image that are not its own in the other, within that one's field of view."""
-    index = np.rint(other.grid.index(one.grid.world(np.argwhere(one.mask(tissue)).astype(float)))).astype(np.int64)
-    inside = ((index >= 0) & (index < other.grid.shape)).all(axis=1)
-    return int(np.count_nonzero(other.index[tuple(index[inside].T)] != tissue))
+    count = 0
+    for voxels in one.voxels(tissue):
+        index = np.rint(other.grid.index(one.grid.world(voxels.astype(float)))).astype(np.int64)
+        inside = ((index >= 0) & (index < other.grid.shape)).all(axis=1)
+        count += int(np.count_nonzero(other.index[tuple(index[inside].T)] != tissue))
+    return count
 
 
 def _middles(segmentation: Segmentation, words: Sequence[str], *, axis: int) -> dict[str, float]:
@@ -143,8 +146,7 @@ def _middles(segmentation: Segmentation, words: Sequence[str], *, axis: int) -> 
     found = {called: float(place[axis]) for called, place in segmentation.middles.items()}
     for i, tissue in enumerate(segmentation.tissues):
         if any(word in tissue.name.lower() for word in words) and segmentation.mask(i).any():
-            voxels = np.argwhere(segmentation.mask(i)).mean(axis=0)[None]
-            found[tissue.name] = float(segmentation.grid.world(voxels)[0, axis])
+            found[tissue.name] = float(segmentation.middle(i)[axis])
     return {called: place for called, place in found.items() if any(word in called.lower() for word in words)}
 
 
