@@ -83,7 +83,7 @@ def test_check_takes_ten_bytes_a_voxel_of_an_empty_pair(tmp_path):
 def test_images_that_this_machine_cannot_hold_are_refused_with_the_numbers(monkeypatch):
     index = np.zeros((40, 40, 40), dtype=np.int16)
     index[10:30, 10:30, 10:30] = 1
-    tissues = (Tissue("rest", Role.KNOWN), Tissue("organ", Role.ESTIMATE, (1,)))
+    tissues = (Tissue("rest", Role.VOID), Tissue("organ", Role.ESTIMATE, (1,)))
     image = Segmentation(index, VoxelGrid((40, 40, 40), np.eye(4)), tissues)
     refusals.refuse_large(image, "before.nii.gz")
     monkeypatch.setattr(refusals, "machine_memory_gb", lambda: 0.005)
