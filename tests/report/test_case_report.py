@@ -240,12 +240,13 @@ def test_a_page_whose_payload_fails_is_still_a_page(case_result, tmp_path, monke
 
 
 def test_the_page_is_made_again_from_its_data(case_result, tmp_path):
-    assert redrawn_page(write_case_report(case_result, tmp_path).parent) == (tmp_path / "report.html").read_text()
+    folder = write_case_report(case_result, tmp_path).parent
+    assert redrawn_page(folder, document=case_result.to_dict()) == (tmp_path / "report.html").read_text()
 
 
 def test_a_page_cannot_be_made_from_nothing(tmp_path):
     with pytest.raises(InputDataError, match="run the estimate"):
-        redrawn_page(tmp_path)
+        redrawn_page(tmp_path, document={})
 
 
 def test_every_figure_says_what_good_and_bad_look_like(page):
