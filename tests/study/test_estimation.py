@@ -165,7 +165,8 @@ def test_an_estimate_at_its_bound_is_not_identified(twins, twin, observed):
     assert gland.value == pytest.approx(25.0)
     assert gland.verdict == "not identified"
     assert "lies at its bound" in gland.why
-    assert gland.interval95[1] is None
+    assert (gland.interval95, gland.ratio_interval95, gland.interval95_given_model) == (None, None, None)
+    assert result.regions == ()
 
 
 def test_an_imprecise_image_identifies_nothing(inversion, settings, observed):
@@ -174,9 +175,14 @@ def test_an_imprecise_image_identifies_nothing(inversion, settings, observed):
     vague = objective.with_observations(stated_noise)
     minimum = replace(inversion.minimum, evaluation=vague(inversion.minimum.unknowns))
     unknown = with_candidate(inversion, objective=vague, minimum=minimum)
-    verdicts = [e.verdict for e in stated(unknown, settings, observed).estimates]
+    found = conclude(unknown, settings, observed, truth={}, seed=1, samples=100)
+    verdicts = [e.verdict for e in found.estimates]
     assert "identified" not in verdicts
     assert "not identified" in verdicts
+    for estimate, drawn in zip(found.estimates, found.samples.interval95, strict=True):
+        assert (estimate.interval95 is None) == (estimate.verdict == "not identified")
+        assert (estimate.ratio_interval95 is None) == (estimate.interval95_given_model is None)
+        assert estimate.interval95 is not None or np.isnan(drawn).all()
 
 
 def test_without_a_known_modulus_there_is_no_kpa(twins):

@@ -42,6 +42,8 @@ def test_later_images_are_stated_in_kpa_each_alone(both, settings):
     low, high = found.mean_interval95["gland"]
     assert high / low < min(pair.interval95["gland"][1] / pair.interval95["gland"][0] for pair in found.alone)
     assert pair_findings(found) == ()
+    left = found.with_intervals_of({"sac"})
+    assert [set(of) for of in (left.mean_interval95, *(pair.interval95 for pair in left.alone))] == [{"sac"}] * 3
 
 
 def test_one_later_image_has_no_other_to_agree_with(single, settings):
@@ -82,7 +84,8 @@ def test_a_region_is_stated_in_kpa_around_the_estimate_of_both(single, settings)
     objective, minimum = single.objective, single.minimum
     fixed = fixed_correspondence(objective, minimum.unknowns, minimum.evaluation)
     covariance = sandwich_covariance(objective, minimum.evaluation)
-    (region,) = regions_of(single, fixed, covariance, settings.bounds)
+    assert regions_of(single, fixed, covariance, settings.bounds, tissues={"gland"}) == ()
+    (region,) = regions_of(single, fixed, covariance, settings.bounds, tissues={"gland", "sac"})
     assert region.tissues == objective.parameters.tissues
     assert not region.open
     estimate = objective.parameters.scale_kpa * np.exp(minimum.unknowns[:2])

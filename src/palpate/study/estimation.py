@@ -25,7 +25,7 @@ from palpate.observation.contract import Fit, Imaged, OfInstrument
 from palpate.progress import Progress, silent
 from palpate.study.discrepancy import FoundDiscrepancy, discrepancy_findings, discrepancy_of
 from palpate.study.estimate_findings import data_findings, fold_findings, inversion_findings, pair_findings
-from palpate.study.poisson_ratios import PoissonRatioEstimate, no_ratio, ratio_verdict
+from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio, ratio_verdict
 from palpate.study.samples import CHAINS, ModulusSamples, draw_moduli, sample_findings
 from palpate.study.together import ImagePairs, ModulusRegion, combinations_of, image_pairs_of, regions_of
 from palpate.uncertainty import (
@@ -97,9 +97,9 @@ class ModulusEstimate:
     """Young's modulus of one tissue, in `unit` (kPa, or a ratio to `relative_to`), with its 95 % interval.
 
     interval95: what is believed with all of the model's discrepancies unknown, by which the verdict is told;
-    interval95_given_model: what would be left if the model held. None in an interval is an open end; `value` is None in
-    ratio mode and when nothing converged. variance_shares: of
-    each cause in the variance of ln E; profile: values (kPa, or ratios) with their signed root deviances.
+    interval95_given_model: what would be left if the model held. None: no interval is stated, as of every modulus that
+    is not identified; `value` is None in ratio mode and when nothing converged. variance_shares: of each cause in the
+    variance of ln E; profile: values (kPa, or ratios) with their signed root deviances.
     """
 
     tissue: str
@@ -220,7 +220,9 @@ def conclude(
     known = _intervals(inversion, fixed, settings.bounds, covariance) if minimum.converged else ()
     estimates = _estimates(inversion, known, covariance, truth)
     of_moduli = covariance.total[: len(estimates), : len(estimates)]
-    regions = regions_of(inversion, fixed, of_moduli, settings.bounds) if minimum.converged else ()
+    stating = {e.tissue for e in estimates if e.verdict != NOT_IDENTIFIED}
+    pairs = pairs and pairs.with_intervals_of(stating)
+    regions = regions_of(inversion, fixed, of_moduli, settings.bounds, tissues=stating)
     drawn = None
     if samples and minimum.converged:
         progress(f"intervals: {samples} samples of the posterior in each of {CHAINS} chains")
@@ -272,7 +274,7 @@ def no_estimate(
         relative_to=relative_to,
         ratio=None,
         ratio_interval95=None,
-        verdict="not identified",
+        verdict=NOT_IDENTIFIED,
         why=why,
         truth=truth,
     )
@@ -294,12 +296,12 @@ def verdict(interval: Interval, *, at_bound: bool, absolute: bool) -> tuple[str,
     """
     low, high = interval
     if at_bound:
-        return "not identified", "the estimate lies at its bound; the images do not hold it back"
+        return NOT_IDENTIFIED, "the estimate lies at its bound; the images do not hold it back"
     if low is None or high is None:
-        return "not identified", "the 95 % interval is open: it reaches beyond the bounds of the search"
+        return NOT_IDENTIFIED, "the 95 % interval is open: it reaches beyond the bounds of the search"
     width = high / low
     if width > WEAK:
-        return "not identified", f"the 95 % interval spans a factor {width:.1f}"
+        return NOT_IDENTIFIED, f"the 95 % interval spans a factor {width:.1f}"
     if not absolute:
         return "ratio only", f"no modulus is known, so only the ratio is determined (within a factor {width:.2f})"
     if width <= IDENTIFIED:
@@ -367,23 +369,29 @@ def _estimates(
         word, why = verdict(of.interval, at_bound=of.at_bound, absolute=mapping.absolute)
         points = zip(unit * np.exp(of.own.profile.theta), of.own.profile.root, strict=True)
         inside = log_interval(ratio, float(np.sqrt(given[i])), lower=low or 0.0, upper=high or np.inf)
-        within = tuple(unit * end if end else None for end in (inside[0] or low, inside[1] or high))
+        within = (inside[0] or low, inside[1] or high)
         found.append(
             replace(
                 nothing,
                 interval_kind=of.own.kind,
-                interval95_given_model=(within[0], within[1]),
+                interval95_given_model=_stated(within, word, unit),
                 variance_shares=covariance.shares(i),
                 profile=tuple((float(value), float(root)) for value, root in points),
                 value=ratio * scale if mapping.absolute else None,
-                interval95=(low and low * scale, high and high * scale) if mapping.absolute else None,
+                interval95=_stated(of.interval, word, scale) if mapping.absolute else None,
                 ratio=None if mapping.by_load else ratio,
-                ratio_interval95=None if mapping.by_load else of.interval,
+                ratio_interval95=None if mapping.by_load else _stated(of.interval, word),
                 verdict=word,
                 why=why,
             )
         )
     return tuple(found)
+
+
+def _stated(interval: Interval, word: str, unit: float = 1.0) -> Interval | None:
+    """The interval, times a unit, that a verdict lets stand: of what is not identified there is none."""
+    low, high = interval
+    return None if word == NOT_IDENTIFIED else (low and low * unit, high and high * unit)
 
 
 def _ratios(inversion: Inversion, known: Sequence[_Known], covariance: Covariance) -> tuple[PoissonRatioEstimate, ...]:
@@ -402,7 +410,7 @@ def _ratios(inversion: Inversion, known: Sequence[_Known], covariance: Covarianc
             replace(
                 nothing,
                 value=open_.ratio(inversion.minimum.unknowns),
-                interval95=(low, high),
+                interval95=_stated((low, high), word),
                 interval_kind=of.own.kind,
                 verdict=word,
                 why=why,

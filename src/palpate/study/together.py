@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -53,6 +53,16 @@ class ImagePairs:
     within_cv: Mapping[str, float]
     mean: Mapping[str, float]
     mean_interval95: Mapping[str, tuple[float, float]]
+
+    def with_intervals_of(self, tissues: Collection[str]) -> ImagePairs:
+        """The same with intervals of these tissues alone: of a modulus that is not identified none is stated."""
+
+        def kept(intervals: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+            """Of intervals by tissue those that are stated."""
+            return {tissue: ends for tissue, ends in intervals.items() if tissue in tissues}
+
+        alone = tuple(replace(pair, interval95=kept(pair.interval95)) for pair in self.alone)
+        return replace(self, alone=alone, mean_interval95=kept(self.mean_interval95))
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,12 +121,21 @@ def combinations_of(inversion: Inversion, covariance: NDArray[np.float64], *, wi
 
 
 def regions_of(
-    inversion: Inversion, fixed: LeastSquares, covariance: NDArray[np.float64], bounds: Bounds
+    inversion: Inversion,
+    fixed: LeastSquares,
+    covariance: NDArray[np.float64],
+    bounds: Bounds,
+    *,
+    tissues: Collection[str],
 ) -> tuple[ModulusRegion, ...]:
-    """Of the pairs of moduli that are correlated most, `MOST_REGIONS` at the most; covariance (n, n) of ln E."""
+    """Of the pairs of `tissues` whose moduli are correlated most, `MOST_REGIONS` at the most.
+
+    covariance (n, n): of ln E. None is stated of a modulus that is not identified.
+    """
     mapping, sd = inversion.objective.parameters, np.sqrt(np.diag(covariance))
     correlated = -np.abs(covariance / np.outer(sd, sd))
-    pairs = sorted(combinations(range(len(mapping.tissues)), 2), key=lambda pair: float(correlated[pair]))
+    stated = [i for i, tissue in enumerate(mapping.tissues) if tissue in tissues]
+    pairs = sorted(combinations(stated, 2), key=lambda pair: float(correlated[pair]))
     found = []
     for pair in pairs[:MOST_REGIONS]:
         within = covariance[np.ix_(pair, pair)]
