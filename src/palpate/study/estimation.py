@@ -37,6 +37,7 @@ from palpate.uncertainty import (
     ModulusInterval,
     covariance_of,
     frozen_posterior,
+    grid_errors,
     information,
     information_shares,
     log_interval,
@@ -211,11 +212,10 @@ def conclude(
     objective, minimum = inversion.objective, inversion.minimum
     rng = np.random.default_rng(seed)
     progress(f"intervals: correlation of the residuals, and the model as {GRID_DRAWS} random voxel grids show it")
-    covariance = covariance_of(
-        objective, minimum.evaluation, observed.states, unknowns=minimum.unknowns, draws=GRID_DRAWS, rng=rng
-    )
+    errors = grid_errors(objective, minimum.evaluation, observed.states, draws=GRID_DRAWS, rng=rng)
+    covariance = covariance_of(objective, minimum.evaluation, errors, unknowns=minimum.unknowns)
     progress("intervals: profiles, and the fit of every surface before and after")
-    pairs = image_pairs_of(inversion, settings.bounds)
+    pairs = image_pairs_of(inversion, settings.bounds, errors)
     fixed = frozen_posterior(objective, minimum.unknowns, minimum.evaluation)
     known = _intervals(inversion, fixed, settings.bounds, covariance) if minimum.converged else ()
     estimates = _estimates(inversion, known, covariance, truth)

@@ -14,6 +14,7 @@ from palpate.uncertainty import (
     NORMAL_95,
     Agreement,
     Combination,
+    GridErrors,
     agreement,
     joint_region,
     known_pairs,
@@ -27,7 +28,7 @@ MOST_REGIONS = 3  # of the pairs of moduli that are correlated most
 
 @dataclass(frozen=True, slots=True)
 class PairAlone:
-    """What one later image says alone: moduli (kPa, or ratios) with their 95 % intervals.
+    """What one later image says alone: moduli (kPa, or ratios) with their 95 % intervals; nothing without a minimum.
 
     outlier: whether the others contradict it; influence: by how many standard deviations it moves the mean of all;
     noise_mm: standard deviation of its residuals' noise, by the kind of observation.
@@ -79,14 +80,19 @@ class ModulusRegion:
     open: bool
 
 
-def image_pairs_of(inversion: Inversion, bounds: Bounds) -> ImagePairs | None:
-    """Of two or more later images of a converged estimate; else None."""
+def image_pairs_of(inversion: Inversion, bounds: Bounds, errors: GridErrors) -> ImagePairs | None:
+    """Of the later images of a converged estimate, where two or more have a minimum alone; else None.
+
+    errors: of the residuals on random grids, see `grid_errors`.
+    """
     mapping = inversion.objective.parameters
     if len(inversion.objective.states) < 2 or not inversion.minimum.converged:
         return None
     scale, names = mapping.scale_kpa, mapping.tissues
-    every, n = pair_estimates(inversion.objective, inversion.minimum, bounds), len(names)
-    pairs = [replace(pair, theta=pair.theta[:n], covariance=pair.covariance[:n, :n]) for pair in every]
+    every = pair_estimates(inversion.objective, inversion.minimum, bounds, errors)
+    if np.count_nonzero(every.converged) < 2:
+        return None
+    pairs = every.of(every.converged, len(names))
     found: Agreement = agreement(pairs)
 
     def stated(
@@ -98,12 +104,15 @@ def image_pairs_of(inversion: Inversion, bounds: Bounds) -> ImagePairs | None:
         low, middle, high = (dict(zip(names, row.tolist(), strict=True)) for row in ends)
         return middle, {name: (low[name], high[name]) for name in names}
 
-    alone = []
-    every_one = zip(pairs, inversion.objective.states, found.outlier.tolist(), found.influence, strict=True)
-    for pair, state, outlier, influence in every_one:
-        values, intervals = stated(pair.theta, pair.covariance)
-        noise = {kind: noise.sd for kind, noise in state.noise.items()}
-        alone.append(PairAlone(values, intervals, outlier, dict(zip(names, influence.tolist(), strict=True)), noise))
+    alone, left = list[PairAlone](), iter(range(len(pairs.theta)))
+    for state, converged in zip(inversion.objective.states, every.converged.tolist(), strict=True):
+        own = PairAlone({}, {}, False, {}, {kind: noise.sd for kind, noise in state.noise.items()})
+        if converged:
+            s = next(left)
+            values, intervals = stated(pairs.theta[s], pairs.covariance[s, :, s])
+            influence = dict(zip(names, found.influence[s].tolist(), strict=True))
+            own = PairAlone(values, intervals, bool(found.outlier[s]), influence, own.noise_mm)
+        alone.append(own)
     mean, mean_interval = stated(found.theta, found.covariance)
     within = dict(zip(names, found.within_cv.tolist(), strict=True))
     return ImagePairs(tuple(alone), found.heterogeneity, within, mean, mean_interval)
