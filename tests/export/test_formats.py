@@ -17,8 +17,8 @@ import meshio
 import numpy as np
 import pydicom
 import pytest
-from scipy.stats import multivariate_normal
 import SimpleITK
+from scipy.stats import multivariate_normal
 
 import palpate
 from dicom_files import PLANTED, TILTED, ct_slices, save_series

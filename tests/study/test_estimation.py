@@ -299,16 +299,32 @@ def test_an_interval_of_samples_is_open_where_that_of_the_estimate_is(inversion,
     assert np.array_equal(np.isnan(found), [[False, True], [True, True]])
 
 
-@pytest.mark.parametrize(("worse_by", "counts"), [(0.01, True), (0.5, False)])
-def test_another_minimum_that_fits_as_well_is_within_the_interval(inversion, settings, observed, worse_by, counts):
-    best = inversion.candidates[0]
+@pytest.mark.parametrize("level", [0.0, 1e4])
+@pytest.mark.parametrize(("worse_by", "counts"), [(0.9, True), (1.1, False)])
+def test_another_minimum_is_within_the_interval_if_its_deviance_is_however_large_both_are(
+    inversion, settings, observed, estimation, worse_by, counts, level
+):
+    """Of the interval's own end: what a value is worth does not depend on how many residuals make it up."""
+    best, n = inversion.candidates[0], inversion.objective.n_parameters
+    own = np.diag(inversion.minimum.evaluation.covariance_columns(n)[:n])
+    end = 0.5 * 1.96**2 * (np.diag(estimation.covariance.total) / own)[0]
     far = best.minimum.unknowns + np.append(1.0, np.zeros(len(best.minimum.unknowns) - 1))
     elsewhere = replace(best.iterate, minimum=replace(best.minimum, unknowns=far))
-    other = Candidate(elsewhere, (1.0 + worse_by) * best.value)
-    both = replace(inversion, candidates=(best, other))
+    values = level + np.array([0.0, worse_by * end])
+    both = replace(inversion, candidates=(Candidate(best.iterate, values[0]), Candidate(elsewhere, values[1])))
     low, high = stated(both, settings, observed).estimates[0].interval95
     assert low < 30.0
     assert (high > 30.0 * np.e) == counts
+
+
+def test_a_minimum_that_could_not_be_followed_is_not_said_to_have_no_equilibrium(inversion, settings, observed):
+    lost = replace(inversion.minimum, outcome=Outcome.NOT_FOLLOWED)
+    result = stated(doubled(inversion, minimum=lost), settings, observed)
+    assert "no-equilibrium" not in codes(result)
+    assert "equilibrium" not in result.reason
+    assert "1 of which could not be followed" in result.reason
+    (remark,) = (remark for remark in result.remarks if remark.code == "several-minima")
+    assert "1 that could not be followed" in remark.message
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from palpate.inversion import (
     Linearisation,
     Outcome,
     StartRun,
+    as_good,
     ratio_of_eta,
 )
 from palpate.mesh.voxelise import voxelise
@@ -60,7 +61,6 @@ __all__ = [
 
 GRID_DRAWS = 8
 IDENTIFIED, WEAK = 4.0, 10.0  # largest ratio of an interval's ends: a factor of 2 to each side, and of 3.2
-AS_GOOD = 0.05  # of the objective: another minimum that is worse by less cannot be excluded
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,11 +313,13 @@ def _reason(inversion: Inversion) -> str:
     """How the estimate ended, and what became of the starts."""
     converged = sum(start.minimum.converged for start in inversion.starts)
     distinct = {s.candidate for s in inversion.starts if s.minimum.converged}
-    lost = sum(candidate.minimum.outcome is Outcome.NO_EQUILIBRIUM for candidate in inversion.candidates)
+    outcomes = [candidate.minimum.outcome for candidate in inversion.candidates]
+    lost, left = outcomes.count(Outcome.NO_EQUILIBRIUM), outcomes.count(Outcome.NOT_FOLLOWED)
     return (
         f"{inversion.minimum.outcome.value}; {converged} of {len(inversion.starts)} starts converged,"
         f" to {len(distinct)} distinct {'minimum' if len(distinct) == 1 else 'minima'}"
         + (f", {lost} of which {'has' if lost == 1 else 'have'} no equilibrium under the law" if lost else "")
+        + (f", {left} of which could not be followed under the law" if left else "")
     )
 
 
@@ -333,14 +335,14 @@ class _Known:
 def _intervals(inversion: Inversion, fixed: LeastSquares, bounds: Bounds, covariance: Covariance) -> tuple[_Known, ...]:
     n = inversion.objective.n_parameters
     found, variances, at_bound = [], np.diag(covariance.total), bounds.reached(inversion.minimum.unknowns[:n])
-    # Voxels make the objective rough by some hundredths of it: its value alone cannot choose between such minima.
     best = inversion.candidates[inversion.best]
     others = [c for c in inversion.candidates if c is not best and c.minimum.converged]
-    good = [c.minimum.unknowns for c in others if c.value <= (1.0 + AS_GOOD) * best.value]
+    scales = np.diag(inversion.minimum.evaluation.covariance_columns(n)[:n]) / variances  # of a profile's deviance
     for i in range(n):
         limits = {"lower": float(np.exp(bounds.lower[i])), "upper": float(np.exp(bounds.upper[i]))}
         own = modulus_interval(fixed, inversion.minimum, i, variance=float(variances[i]), bounds=bounds)
         sd = float(np.sqrt(variances[i]))
+        good = [c.minimum.unknowns for c in others if as_good(c.value, best.value, scale=float(scales[i]))]
         interval = hull([own.ends, *(log_interval(float(np.exp(x[i])), sd, **limits) for x in good)])
         found.append(_Known(own, interval, bool(at_bound[i])))
     return tuple(found)
