@@ -55,10 +55,12 @@ def test_one_later_image_has_no_other_to_agree_with(single, settings):
     assert pair_findings(None) == ()
 
 
-def test_a_mean_is_in_kpa_and_a_ratio_has_no_unit(single):
+def test_a_mean_is_in_kpa_and_a_ratio_has_no_unit(single, settings):
     wide = np.array([[1.0, -0.995], [-0.995, 1.0]])
-    (mean,) = combinations_of(single, wide, within=2.0)
-    (ratio,) = combinations_of(single, np.abs(wide), within=2.0)
+    minimum = single.minimum
+    fixed = fixed_correspondence(single.objective, minimum.unknowns, minimum.evaluation)
+    (mean,) = combinations_of(single, fixed, wide, settings.bounds, within=2.0)
+    (ratio,) = combinations_of(single, fixed, np.abs(wide), settings.bounds, within=2.0)
     assert (mean.kind, mean.value) == ("geometric mean", pytest.approx(np.sqrt(30.0 * 20.0), rel=0.05))
     assert (ratio.kind, ratio.value) == ("ratio", pytest.approx(1.5, rel=0.1))
 

@@ -254,7 +254,7 @@ def conclude(
         information=information(of_moduli),
         information_shares=_shares(inversion) if minimum.converged else {},
         discrepancy=found_discrepancy,
-        combinations=combinations_of(inversion, of_moduli, within=IDENTIFIED),
+        combinations=combinations_of(inversion, fixed, of_moduli, settings.bounds, within=IDENTIFIED),
         regions=regions,
         image_pairs=pairs,
         samples=drawn,

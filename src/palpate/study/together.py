@@ -118,14 +118,15 @@ def image_pairs_of(inversion: Inversion, bounds: Bounds, errors: GridErrors) -> 
     return ImagePairs(tuple(alone), found.heterogeneity, within, mean, mean_interval)
 
 
-def combinations_of(inversion: Inversion, covariance: NDArray[np.float64], *, within: float) -> tuple[Combination, ...]:
+def combinations_of(
+    inversion: Inversion, fixed: LeastSquares, covariance: NDArray[np.float64], bounds: Bounds, *, within: float
+) -> tuple[Combination, ...]:
     """Ratios (dimensionless) and geometric means (kPa, or ratios) known within a factor; covariance (n, n) of ln E."""
     mapping = inversion.objective.parameters
     if not inversion.minimum.converged:
         return ()
-    theta = inversion.minimum.unknowns[: len(mapping.tissues)]
     scale = mapping.scale_kpa
-    found = known_pairs(mapping.tissues, theta, covariance, within=within)
+    found = known_pairs(fixed, inversion.minimum, mapping.tissues, covariance, bounds=bounds, within=within)
     return tuple(pair.times(scale) if pair.kind == "geometric mean" else pair for pair in found)
 
 
