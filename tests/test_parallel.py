@@ -90,7 +90,12 @@ def test_blas_computes_on_one_thread_until_the_last_of_several_callers_has_ended
 
 
 def test_an_error_inside_lifts_the_limit(libraries):
-    with pytest.raises(ZeroDivisionError), blas_on_one_thread(), blas_on_one_thread():
-        assert libraries.threads == 1
-        raise ZeroDivisionError
+    @blas_on_one_thread()
+    def failing():
+        with blas_on_one_thread():
+            assert libraries.threads == 1
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        failing()
     assert libraries.threads == 2

@@ -28,6 +28,7 @@ __all__ = [
     "Covariance",
     "FittedState",
     "GridErrors",
+    "beyond",
     "covariance_of",
     "error_noise",
     "gain",
@@ -73,8 +74,9 @@ class Covariance:
 
     Parameters are the log-moduli, then eta = ln(lambda / mu) of Poisson's ratios that are sought. noise: of the
     residuals; prior: what is believed of all unknowns, of which `causes` are the parts by the cause of their block;
-    grid: the place of the voxels; mesh: what another mesh would make of it (of Young's moduli). given_model: all that
-    would be left if frame, drawing and material were as the model has them, and only the drivers' motion unknown.
+    grid: the place of the voxels, as far as it is not in the noise of the residuals, which voxels round; mesh: what
+    another mesh would make of it (of Young's moduli). given_model: all that would be left if frame, drawing and
+    material were as the model has them, and only the drivers' motion unknown.
     """
 
     noise: NDArray[np.float64]
@@ -102,7 +104,8 @@ def covariance_of(
 ) -> Covariance:
     """All that is known of the log-moduli's errors at unknowns (n_unknowns,).
 
-    The sandwich, what is considered or undecided, the scatter over grid positions by the `errors` there, the mesh.
+    The sandwich, what is considered or undecided, the mesh, and the scatter over grid positions by the `errors` there,
+    where that is more than the noise: residuals are rounded by voxels, too.
     """
     noise_of, mesh = error_noise(evaluation), mesh_covariance(objective)
     given = _given_model(objective, evaluation)
@@ -110,7 +113,7 @@ def covariance_of(
     def parts(of: Evaluation) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Covariances by noise, prior and grid of one set of unknowns."""
         noise, prior = _sandwich(objective, of, noise_of)
-        return noise, prior, scatter(shifts_by(of, errors, objective.n_parameters))
+        return noise, prior, beyond(scatter(shifts_by(of, errors, objective.n_parameters)), noise)
 
     noise, prior, grid = parts(evaluation)
     further = [_considered(objective, evaluation), undecided_covariance(objective, evaluation, unknowns)]
@@ -318,6 +321,15 @@ def scatter(shifts: NDArray[np.float64]) -> NDArray[np.float64]:
     degrees of freedom as draws, whose variance is draws / (draws - 2) times that mean.
     """
     return np.asarray(shifts.T @ shifts / (len(shifts) - 2))
+
+
+def beyond(covariance: NDArray[np.float64], known: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What a covariance (n, n) has in excess of what is `known` (n, n) already: the positive part of their difference.
+
+    With it the latter is at least as large as each of the two in every direction.
+    """
+    sizes, axes = np.linalg.eigh(covariance - known)
+    return np.asarray((axes * np.maximum(sizes, 0.0)) @ axes.T)
 
 
 def shifts_by(evaluation: Evaluation, errors: GridErrors, n_parameters: int) -> NDArray[np.float64]:
