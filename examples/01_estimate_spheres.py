@@ -48,7 +48,7 @@ def main() -> float:
         result = palpate.estimate(palpate.read_case(write_case(Path(folder))))
     sys.stdout.write(f"{result}\n")
     for e in result.estimation.estimates:
-        low, high = e.interval95  # None would be an open end
+        low, high = e.interval95  # None where it is not identified
         assert low < TRUTH_KPA[e.tissue] < high
     return result.estimation.estimates[0].value
 

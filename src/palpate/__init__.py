@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from palpate.export.folder import export
-    from palpate.steps.commands import check, estimate, init, make_mesh, sensitivity, simulate
+    from palpate.steps.commands import check, estimate, init, make_mesh, noise, sensitivity, simulate
     from palpate.steps.results import CaseResult
     from palpate.study.case import Case
     from palpate.study.case_file import read_case
@@ -22,6 +22,7 @@ __all__ = [
     "export",
     "init",
     "make_mesh",
+    "noise",
     "read_case",
     "sensitivity",
     "simulate",
@@ -35,6 +36,7 @@ _HOMES = {
     "export": "palpate.export.folder",
     "init": "palpate.steps.commands",
     "make_mesh": "palpate.steps.commands",
+    "noise": "palpate.steps.commands",
     "read_case": "palpate.study.case_file",
     "sensitivity": "palpate.steps.commands",
     "simulate": "palpate.steps.commands",

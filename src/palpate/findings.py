@@ -38,6 +38,7 @@ Misleading = Literal[
     "units",
     "linear-strains",
     "volume-change",
+    "void-moves",
     "drawn-otherwise",
     "several-bodies",
     "open-contours",

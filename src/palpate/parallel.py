@@ -12,7 +12,8 @@ import re
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 from typing import TypeVar
 
 import threadpoolctl
@@ -41,7 +42,15 @@ def mapped(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Re
         return list(pool.map(function, items))
 
 
-_turn = threading.RLock()
+@dataclass
+class _Callers:
+    """How many want BLAS on one thread now, and what lifts the limit."""
+
+    number: int = 0
+    limit: AbstractContextManager[object] | None = None
+
+
+_callers, _turn = _Callers(), threading.Lock()
 
 
 @functools.cache
@@ -53,17 +62,21 @@ def _libraries() -> threadpoolctl.ThreadpoolController:
 def blas_on_one_thread() -> Iterator[None]:
     """While this lasts BLAS computes each call on one thread; afterwards as before.
 
-    The limit is one for the whole process: the first of several callers side by side sets it and lifts it when it ends,
-    the others compute under it and wait for nobody, as they may be what the first one waits for.
+    The limit is one for the whole process: the first of several callers side by side sets it, the last one lifts it,
+    and none waits for another, as it may be what that one waits for.
     """
-    if not _turn.acquire(blocking=False):
-        yield
-        return
+    with _turn:
+        if _callers.number == 0:
+            _callers.limit = _libraries().limit(limits=1, user_api="blas")
+        _callers.number += 1
     try:
-        with _libraries().limit(limits=1, user_api="blas"):
-            yield
+        yield
     finally:
-        _turn.release()
+        with _turn:
+            _callers.number -= 1
+            if _callers.number == 0 and _callers.limit is not None:
+                _callers.limit.__exit__(None, None, None)
+                _callers.limit = None
 
 
 def pool_of(threads: int) -> ThreadPoolExecutor:

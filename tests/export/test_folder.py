@@ -17,9 +17,10 @@ from palpate.cli import main
 from palpate.errors import ConfigurationError, EstimationError, InputDataError
 from palpate.export.fitted_model import fitted_model
 from palpate.export.formats import FORMATS
-from palpate.export.model_file import read_model, seal_of
+from palpate.export.model_file import read_model
 from palpate.report import case_report
 from palpate.study.case import Images
+from palpate.study.earlier import seal_of
 from palpate.study.outputs import sha256_of
 from palpate.study.result import PairResult
 
@@ -225,3 +226,32 @@ def test_no_name_or_path_of_an_input_is_in_an_export(case_result, tmp_path, caps
         assert files
         assert [path.name for path in files if planted_in(path)] == []
     assert capsys.readouterr().err == ""
+
+
+def spoilt_model(folder, change):
+    """Change the arrays of model.npz, and let the result vouch for them."""
+    with np.load(folder / "model.npz") as stored:
+        arrays = {name: change(name, array) for name, array in stored.items()}
+    np.savez(folder / "model.npz", **arrays)
+    document = json.loads((folder / "result.json").read_text())
+    document["files"]["model.npz"]["sha256"] = sha256_of(folder / "model.npz")
+    (folder / "result.json").write_text(json.dumps(document))
+
+
+@pytest.mark.parametrize("place", range(6))
+def test_a_model_of_largest_integers_is_refused_with_a_sentence(folder, tmp_path, capsys, place):
+    with np.load(folder / "model.npz") as stored:
+        whole = [name for name, array in stored.items() if array.dtype.kind == "i"]
+    assert len(whole) <= 6
+    chosen = whole[place % len(whole)]
+    spoilt_model(folder, lambda name, a: np.full_like(a, np.iinfo(a.dtype).max) if name == chosen else a)
+    assert main(["export", str(folder), "--format", "abaqus", "--output", str(tmp_path / "out"), "--quiet"]) == 3
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "model.npz does not hold the data of a run" in line
+
+
+def test_a_model_with_displacements_of_other_points_is_refused(folder, tmp_path, capsys):
+    points = len(read_model(folder).bodies[0].space.points)
+    spoilt_model(folder, lambda _, a: a[:-1] if a.shape == (points, 3) else a)
+    assert main(["export", str(folder), "--format", "abaqus", "--output", str(tmp_path / "out"), "--quiet"]) == 3
+    assert "displacements of other points than its mesh has" in capsys.readouterr().err

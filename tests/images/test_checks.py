@@ -103,6 +103,22 @@ def test_a_mirrored_image_is_refused_with_its_axis(axes: tuple[int, ...], words:
         check_pair(BEFORE, replace(AFTER, index=np.flip(AFTER.index, axes)))
 
 
+def test_two_organs_that_exchanged_their_labels_are_named() -> None:
+    index = AFTER.index.copy()
+    index[AFTER.index == 1], index[AFTER.index == 2] = 2, 1
+    with pytest.raises(InputDataError, match=r"'prostate' and 'bladder' look exchanged in 'after': .* which label is"):
+        check_pair(BEFORE, replace(AFTER, index=index))
+
+
+def test_a_void_inside_the_body_whose_wall_moves_is_told() -> None:
+    tissues = tuple(replace(t, role=Role.VOID) if t.role is Role.DRIVER else t for t in TISSUES)
+    before, after = (replace(image, tissues=tissues) for image in (BEFORE, body(radii={3: 10.0})))
+    (finding,) = check_pair(before, after)
+    assert finding.code == "void-moves"
+    assert "role driver" in finding.message
+    assert "void-moves" not in codes(check_pair(before, replace(body(shift={1: (0.0, -2.0, 1.0)}), tissues=tissues)))
+
+
 def test_a_shifted_image_is_not_called_mirrored() -> None:
     affine = AFFINE.copy()
     affine[:3, 3] = [9.0, -12.0, 15.0]

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.errors import NotConverged
+from palpate.errors import EstimationError, NotConverged, SolverError
 from palpate.inversion import Outcome, continue_at_finite_strain, estimate, expansion, invert
 from palpate.inversion.approximation import Derivatives
 from palpate.mechanics.finite_strain import finite_strain_model
@@ -122,8 +122,18 @@ def test_a_motion_without_equilibrium_ends_the_estimate_where_it_is_the_best_one
         continue_at_finite_strain(linear, settings, progress=twins.silent)
 
 
-def test_a_secondary_minimum_without_equilibrium_does_not_end_a_good_estimate(twins, linear, settings, monkeypatch):
-    """It is left out of the comparison, though its linear value is the smaller one, and is said to have none."""
+@pytest.mark.parametrize(
+    ("failure", "outcome"),
+    [
+        (NotConverged("folded"), Outcome.NO_EQUILIBRIUM),
+        (SolverError("singular"), Outcome.NOT_FOLLOWED),
+        (EstimationError("nothing left to compare"), Outcome.NOT_FOLLOWED),
+    ],
+)
+def test_a_secondary_minimum_that_fails_does_not_end_a_good_estimate(
+    twins, linear, settings, monkeypatch, failure, outcome
+):
+    """It is left out of the comparison, though its linear value is the smaller one, and it is said why."""
     first = linear.candidates[0]
     away = first.minimum.unknowns + np.append(1.0, np.zeros(len(first.minimum.unknowns) - 1))
     elsewhere = replace(first.iterate, minimum=replace(first.minimum, unknowns=away))
@@ -133,14 +143,16 @@ def test_a_secondary_minimum_without_equilibrium_does_not_end_a_good_estimate(tw
 
     def only_the_best(iterate):
         if iterate is elsewhere:
-            raise NotConverged("folded")
+            raise failure
         return whole(iterate)
 
     monkeypatch.setattr(estimate, "_coarse", only_the_best)
-    found = continue_at_finite_strain(both, settings, progress=twins.silent)
+    said = list[str]()
+    found = continue_at_finite_strain(both, settings, progress=said.append)
+    assert any(str(failure) in line for line in said)
     assert found.minimum.converged
     assert np.abs(found.minimum.unknowns[:2] - twins.TRUTH).max() < 1e-3
-    assert [c.minimum.outcome is Outcome.NO_EQUILIBRIUM for c in found.candidates] == [False, True]
+    assert [c.minimum.outcome is outcome for c in found.candidates] == [False, True]
     assert [start.candidate for start in found.starts] == [0, 1]
 
 

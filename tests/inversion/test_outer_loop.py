@@ -169,6 +169,15 @@ def test_weights_that_never_agree_are_not_called_convergence(twins, voxels, monk
     assert found.minimum.outcome is Outcome.STEPS
 
 
+def test_a_model_that_is_not_exact_enough_at_the_last_iteration_is_not_called_convergence(twins, voxels):
+    """One that is never made exact, beside a demand that it cannot meet."""
+    rule = StopRule(model_error=1e-12, solve_above=np.inf, iterations=4, derivatives=False)
+    found = invert(voxels, twins.settings(0.5), progress=twins.silent, rule=rule)
+    assert found.convergence.model_error > rule.far
+    assert max(found.convergence.reweighting, found.convergence.linearisation) < rule.far
+    assert found.minimum.outcome is Outcome.STEPS
+
+
 def test_weights_that_take_turns_within_the_noise_end_an_estimate(twins, voxels, monkeypatch):
     """Two sets of weights, each of which asks for the other: an iteration of two passes ends where it began."""
     passes, agreed = [], loop._agreed

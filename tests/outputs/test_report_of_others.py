@@ -7,6 +7,8 @@ import io
 import json
 import os
 import random
+import subprocess
+import sys
 import zipfile
 
 import numpy as np
@@ -100,6 +102,34 @@ def test_data_without_a_part_are_drawn_without_it_or_refused(copy, capsys, key, 
     err = capsys.readouterr().err.strip()
     assert code in (0, 3), err
     assert ("report-data.npz" in err and len(err.splitlines()) == 1) if code else not err
+
+
+def test_a_result_whose_numbers_were_edited_is_refused(copy, capsys):
+    document = json.loads((copy / "result.json").read_text())
+    document["estimates"][0]["value"] = 12.3
+    (copy / "result.json").write_text(json.dumps(document))
+    assert "one was changed since" in refused(copy, capsys)
+
+
+def test_a_display_of_matplotlib_that_is_not_there_harms_no_page(copy):
+    command = [sys.executable, "-m", "palpate", "report", str(copy), "--quiet"]
+    environment = os.environ | {"MPLBACKEND": "nonsense"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_data_with_numbers_that_are_none_are_refused(copy, capsys):
+    with np.load(copy / "report-data.npz") as stored:
+        arrays = [name for name, array in stored.items() if array.dtype.kind == "f" and np.isfinite(array).all()]
+    kept = {name: (copy / name).read_bytes() for name in ("result.json", *NAMES)}
+    for name in (arrays[0], arrays[-1]):
+        for number in (np.nan, np.inf):
+            tampered(copy, change_arrays=lambda found, n=name, x=number: found.update({n: np.full_like(found[n], x)}))
+            assert "NaN or infinite" in refused(copy, capsys)
+            for file, content in kept.items():
+                (copy / file).write_bytes(content)
+    tampered(copy, change_value=lambda whole: whole["tissues"][0].update({"poisson_ratio": np.nan}))
+    assert "NaN is no number" in refused(copy, capsys)
 
 
 @pytest.mark.parametrize("number", [-1, 10**4, 2**31 - 1])

@@ -240,12 +240,13 @@ def test_a_page_whose_payload_fails_is_still_a_page(case_result, tmp_path, monke
 
 
 def test_the_page_is_made_again_from_its_data(case_result, tmp_path):
-    assert redrawn_page(write_case_report(case_result, tmp_path).parent) == (tmp_path / "report.html").read_text()
+    folder = write_case_report(case_result, tmp_path).parent
+    assert redrawn_page(folder, document=case_result.to_dict()) == (tmp_path / "report.html").read_text()
 
 
 def test_a_page_cannot_be_made_from_nothing(tmp_path):
     with pytest.raises(InputDataError, match="run the estimate"):
-        redrawn_page(tmp_path)
+        redrawn_page(tmp_path, document={})
 
 
 def test_every_figure_says_what_good_and_bad_look_like(page):
@@ -315,16 +316,24 @@ def test_a_grey_image_that_cannot_be_read_does_not_stop_the_report(case_result, 
     assert "could not be" not in page[: page.index("<script")]
 
 
-def test_open_intervals_and_ratios_are_shown_as_such(case_result, tmp_path):
+def test_what_is_not_identified_shows_no_range_and_ratios_are_shown_as_such(case_result, tmp_path):
     first, second = case_result.estimation.estimates
     ratio = {"unit": "ratio", "value": None, "interval95": None}
-    open_end = dataclasses.replace(first, ratio_interval95=(2.0, None), verdict="not identified", truth=None, **ratio)
+    ratio |= {"profile": ((2.5, -2.1), (3.1, 0.0), (4.0, 2.2))}
+    lost = dataclasses.replace(first, ratio_interval95=None, verdict="not identified", truth=None, **ratio)
     only = dataclasses.replace(second, verdict="ratio only", **ratio)
-    estimation = dataclasses.replace(case_result.estimation, estimates=(open_end, only))
+    corners = tuple((5.9 + np.cos(a), 3.1 + np.sin(a)) for a in np.linspace(0.0, 6.0, 16))
+    region = ModulusRegion(("prostate", "bladder"), corners, corners, open=False)
+    estimation = dataclasses.replace(case_result.estimation, estimates=(lost, only), regions=(region,))
     page = write_case_report(dataclasses.replace(case_result, estimation=estimation), tmp_path).read_text()
-    assert "&gt; 2.00" in page
     assert "ratio only" in page
     assert "only ratios can be found" in page
+    assert '<div class="banner bad"><p><b>The images do not fix the stiffness of prostate' in page
+    card = page[page.index('<span class="name">prostate') : page.index('<span class="name">bladder')]
+    assert "interval" not in card
+    assert "Profile likelihood of bladder" in page
+    assert "Profile likelihood of prostate" not in page
+    assert "Joint 95 % region" not in page
 
 
 def test_every_chart_says_what_it_shows_to_who_cannot_see_it(page):

@@ -26,7 +26,8 @@ def document(*verdicts, status="converged", warnings=0, minima=(0, 0)):
         (("ratio only", "identified"), 0, "good"),
         (("identified", "weak"), 0, "fair"),
         (("identified",), 1, "fair"),
-        (("not identified",), 0, "fair"),
+        (("not identified",), 0, "bad"),
+        (("identified", "not identified"), 0, "bad"),
     ],
 )
 def test_only_what_can_be_used_as_it_stands_is_good(verdicts, warnings, kind):
@@ -34,10 +35,23 @@ def test_only_what_can_be_used_as_it_stands_is_good(verdicts, warnings, kind):
 
 
 def test_every_tissue_is_named_once_with_what_its_verdict_means():
-    said = " ".join(headline(document("identified", "not identified", "identified")).sentences)
-    assert "fix the stiffness of organ 0 and organ 2." in said
-    assert "do not fix organ 1: do not use that number" in said
+    banner = headline(document("identified", "not identified", "identified"))
+    said = " ".join((banner.title, *banner.sentences))
+    assert "The images fix the stiffness of organ 0 and organ 2." in said
     assert said.count("organ") == 3
+
+
+@pytest.mark.parametrize(
+    ("count", "words"),
+    [
+        (1, "The images do not fix the stiffness of organ 0: do not use its number."),
+        (2, "The images do not fix the stiffness of organ 0 and organ 1: do not use their numbers."),
+    ],
+)
+def test_what_is_not_identified_is_the_title_in_one_sentence(count, words):
+    banner = headline(document(*["not identified"] * count))
+    assert banner.title == words
+    assert "found" not in " ".join((banner.title, *banner.sentences))
 
 
 @pytest.mark.parametrize("status", ["not converged", "failed"])

@@ -68,6 +68,8 @@ def test_a_result_is_printed_a_line_a_tissue_with_open_ends_in_words(result):
         "prostate: 58.9 kPa (95 %: > 47.1 kPa), identified: high / low is 1.56",
         "bladder: 3.12 x surroundings (95 %: < 5.00), identified: high / low is 1.56",
     ]
+    lost = str(with_estimates(result, {"interval95": None, "verdict": "not identified"})).splitlines()
+    assert lost[0] == "prostate: 58.9 kPa, not identified: high / low is 1.56"
     failed = str(with_estimates(result, status="not converged", reason="it stopped")).splitlines()
     assert failed[0] == "not converged: it stopped"
     assert failed[1].startswith("prostate: no value, not identified: ")

@@ -33,6 +33,7 @@ REFUSED = [
     {"estimate": {"starts_kpa": [1.0], "start_ratios": [1.0]}},
     {"loads": [{"surface": "outer"}]},
     {"overrides": []},
+    {"patient": ""},
     {"seed": 1.5},
 ]
 

@@ -59,6 +59,26 @@ def test_units_that_slipped_are_noticed(case_result, value, hint):
     assert hint in warning.message
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "hint"),
+    [
+        ("surroundings", 8000.0, "8000 Pa, write 8"),
+        ("fat", 2250.0, "2250 Pa, write 2.25"),
+        ("muscle", 3000.0, "3000 Pa, write 3"),
+        ("prostate tumour", 17000.0, "17000 Pa, write 17"),
+        ("muscle", 0.003, "0.003 MPa, write 3"),
+        ("colon wall", 5180.0, None),
+        ("muscle", 280.0, None),
+        ("surroundings", 2.6, None),
+    ],
+)
+def test_a_modulus_in_pascals_is_noticed_by_the_tissues_own_range(case_result, name, value, hint):
+    case: Case = case_result.case
+    known = dataclasses.replace(case.tissues[3], name=name, youngs_modulus_kpa=value)
+    warnings = unit_warnings(dataclasses.replace(case, tissues=(*case.tissues[:3], known)))
+    assert [hint in warning.message for warning in warnings] == ([True] if hint else [])
+
+
 def test_usual_units_pass(case_result):
     assert unit_warnings(case_result.case) == ()
 

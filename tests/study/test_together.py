@@ -31,8 +31,12 @@ def single(twins, twin, settings):
     return invert(twins.exact_problem(twin, noise=NOISE), settings, progress=twins.silent)
 
 
+def no_errors(inversion):
+    return [[np.zeros(len(line.weights)) for line in inversion.minimum.evaluation.lines]] * 8
+
+
 def test_later_images_are_stated_in_kpa_each_alone(both, settings):
-    found = image_pairs_of(both, settings.bounds)
+    found = image_pairs_of(both, settings.bounds, no_errors(both))
     assert len(found.alone) == 2
     assert [set(pair.noise_mm) for pair in found.alone] == [{"surface distance"}] * 2
     for pair in found.alone:
@@ -42,17 +46,21 @@ def test_later_images_are_stated_in_kpa_each_alone(both, settings):
     low, high = found.mean_interval95["gland"]
     assert high / low < min(pair.interval95["gland"][1] / pair.interval95["gland"][0] for pair in found.alone)
     assert pair_findings(found) == ()
+    left = found.with_intervals_of({"sac"})
+    assert [set(of) for of in (left.mean_interval95, *(pair.interval95 for pair in left.alone))] == [{"sac"}] * 3
 
 
 def test_one_later_image_has_no_other_to_agree_with(single, settings):
-    assert image_pairs_of(single, settings.bounds) is None
+    assert image_pairs_of(single, settings.bounds, no_errors(single)) is None
     assert pair_findings(None) == ()
 
 
-def test_a_mean_is_in_kpa_and_a_ratio_has_no_unit(single):
+def test_a_mean_is_in_kpa_and_a_ratio_has_no_unit(single, settings):
     wide = np.array([[1.0, -0.995], [-0.995, 1.0]])
-    (mean,) = combinations_of(single, wide, within=2.0)
-    (ratio,) = combinations_of(single, np.abs(wide), within=2.0)
+    minimum = single.minimum
+    fixed = fixed_correspondence(single.objective, minimum.unknowns, minimum.evaluation)
+    (mean,) = combinations_of(single, fixed, wide, settings.bounds, within=2.0)
+    (ratio,) = combinations_of(single, fixed, np.abs(wide), settings.bounds, within=2.0)
     assert (mean.kind, mean.value) == ("geometric mean", pytest.approx(np.sqrt(30.0 * 20.0), rel=0.05))
     assert (ratio.kind, ratio.value) == ("ratio", pytest.approx(1.5, rel=0.1))
 
@@ -82,7 +90,8 @@ def test_a_region_is_stated_in_kpa_around_the_estimate_of_both(single, settings)
     objective, minimum = single.objective, single.minimum
     fixed = fixed_correspondence(objective, minimum.unknowns, minimum.evaluation)
     covariance = sandwich_covariance(objective, minimum.evaluation)
-    (region,) = regions_of(single, fixed, covariance, settings.bounds)
+    assert regions_of(single, fixed, covariance, settings.bounds, tissues={"gland"}) == ()
+    (region,) = regions_of(single, fixed, covariance, settings.bounds, tissues={"gland", "sac"})
     assert region.tissues == objective.parameters.tissues
     assert not region.open
     estimate = objective.parameters.scale_kpa * np.exp(minimum.unknowns[:2])

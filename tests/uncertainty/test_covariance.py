@@ -16,8 +16,8 @@ from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.robust_loss import Tukey
 from palpate.phantoms.boundary_noise import smooth_field
-from palpate.uncertainty import FittedState, gain, sandwich_covariance
-from palpate.uncertainty.covariance import error_noise, grid_position_shifts, imaging_errors
+from palpate.uncertainty import NORMAL_95, FittedState, gain, sandwich_covariance
+from palpate.uncertainty.covariance import beyond, error_noise, grid_position_shifts, imaging_errors, scatter
 from palpate.uncertainty.intervals import log_interval
 
 SD = 0.3
@@ -279,3 +279,18 @@ def test_the_interval_is_symmetric_in_the_logarithm():
 def test_an_end_beyond_the_bounds_is_open(centre, open_low, open_high):
     low, high = log_interval(centre, 0.5, lower=0.02, upper=200.0)
     assert (low is None, high is None) == (open_low, open_high)
+
+
+def test_an_interval_by_few_draws_holds_as_often_as_it_says(rng):
+    """The standard deviation of eight draws is itself uncertain; 1.96 of it would hold 91 %."""
+    draws = rng.standard_normal((4000, 9))
+    held = [abs(one[8]) < NORMAL_95 * np.sqrt(scatter(one[:8, None])[0, 0]) for one in draws]
+    assert np.mean(held) == pytest.approx(0.95, abs=0.012)
+
+
+def test_what_is_beyond_a_covariance_makes_it_as_large_as_both(rng):
+    first, second = (root @ root.T for root in rng.standard_normal((2, 3, 3)))
+    together = second + beyond(first, second)
+    for part in (first, second):
+        assert np.linalg.eigvalsh(together - part).min() > -1e-12
+    assert beyond(second, 1.1 * second) == pytest.approx(np.zeros((3, 3)), abs=1e-12)

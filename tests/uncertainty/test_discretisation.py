@@ -13,7 +13,6 @@ from palpate.inversion import LaterState, Objective, parameter_map, unit_blocks
 from palpate.mesh import lagrange_space
 from palpate.uncertainty import discretisation_sd
 from palpate.uncertainty.covariance import mesh_covariance
-from palpate.uncertainty.discretisation import COEFFICIENT
 
 TISSUES = (unknown("gland"), unknown("sac"), known("fat"))
 
@@ -26,12 +25,6 @@ def halves(centroids):
 
 def space(n=8, *, element="P2", size=40.0):
     return lagrange_space(box_mesh(n, size=size, tissues=TISSUES, region=halves), element)
-
-
-def test_a_cube_of_n_cells_has_the_value_of_the_formula():
-    n = 6
-    cube = lagrange_space(box_mesh(n, size=30.0, tissues=[unknown("cube")]), "P2")
-    assert discretisation_sd(cube, [0]) == pytest.approx(COEFFICIENT * (2.0 ** (1.0 / 6.0) / n) ** 2)
 
 
 def test_half_the_edges_leave_a_quarter_and_the_unit_of_length_nothing():

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from palpate.inversion import Bounds
+from palpate.inversion import Bounds, Outcome, gauss_newton
 from palpate.uncertainty.joint_region import DIRECTIONS, LEVEL, joint_region
 from palpate.uncertainty.profile import fixed_correspondence, profile
 
@@ -62,3 +64,15 @@ def test_bounds_cut_the_region_and_it_says_so(fixed, minimum, covariance, region
 def test_the_order_of_the_two_is_that_of_the_columns(fixed, minimum, covariance, region):
     other = joint_region(fixed, minimum, (1, 0), covariance=covariance[::-1, ::-1], bounds=WIDE)
     assert other.boundary.max(axis=0) == pytest.approx(region.boundary.max(axis=0)[::-1], abs=0.08)
+
+
+def test_a_fit_that_does_not_end_leaves_the_region_open(objective, minimum, covariance, monkeypatch):
+    """With two moduli held, the drivers' motion is not."""
+
+    def ended(of, start, *, held=False, **given):
+        found = gauss_newton(of, start, held=held, **given)
+        return replace(found, evaluation=of(start), unknowns=start, outcome=Outcome.STUCK) if np.any(held) else found
+
+    monkeypatch.setattr("palpate.uncertainty.profile.gauss_newton", ended)
+    fixed = fixed_correspondence(objective, minimum.unknowns, minimum.evaluation)
+    assert joint_region(fixed, minimum, (0, 1), covariance=covariance, bounds=WIDE).open

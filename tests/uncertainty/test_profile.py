@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from palpate.inversion import Bounds, gauss_newton
+from palpate.inversion import Bounds, Outcome, gauss_newton
 from palpate.mechanics.curved import CurvedModel
 from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.first_order import expanded
@@ -61,6 +63,21 @@ def test_it_leans_as_the_posterior_does(objective, minimum, variance, rng):
         assert np.sign(np.log(lean)) == np.sign(np.log((sampled[1] - centre) / (centre - sampled[0])))
         width = found.high - found.low
         assert (found.low, found.high) == pytest.approx(tuple(sampled), abs=0.15 * width)
+
+
+def test_a_fit_that_does_not_end_makes_no_interval_narrower(objective, minimum, variance, monkeypatch):
+    """Its deviance is too large, so that the level seems to be reached too soon."""
+
+    def ended(of, start, *, held=False, **given):
+        found = gauss_newton(of, start, held=held, **given)
+        return replace(found, evaluation=of(start), unknowns=start, outcome=Outcome.STUCK) if np.any(held) else found
+
+    wholes = [profiled(objective, minimum, number, variance[number]) for number in range(2)]
+    monkeypatch.setattr("palpate.uncertainty.profile.gauss_newton", ended)
+    for number, whole in enumerate(wholes):
+        found, centre = profiled(objective, minimum, number, variance[number]), minimum.unknowns[number]
+        assert found.low is None or centre - found.low > 0.98 * (centre - whole.low)
+        assert found.high is None or found.high - centre > 0.98 * (whole.high - centre)
 
 
 def test_an_end_beyond_the_bounds_is_open(objective, minimum, variance):

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from palpate.errors import ConfigurationError
 from palpate.inversion import Bounds, gauss_newton
@@ -104,6 +105,18 @@ def test_chains_have_the_covariance_that_is_asked_and_agree_with_each_other(obje
     below = -objective.value(minimum) - found.log_density  # half of chi-squared with as many degrees as unknowns
     assert below.shape == (4, 500)
     assert below.mean() == pytest.approx(0.5 * len(minimum), rel=0.15)
+
+
+def test_no_draw_of_a_chain_leaves_the_bounds_and_they_cut_the_density_that_is_asked(objective, minimum):
+    """That of a normal law between them, which a draw that is stretched beyond them, or cut before, is none of."""
+    evaluation, wanted = objective(minimum), np.diag([0.05**2, 0.02**2])
+    frozen, upper = frozen_posterior(objective, minimum, evaluation), minimum[:2] + np.array([0.05, 1.0])
+    given = {"bounds": Bounds(WIDE.lower, upper), "chains": 4, "draws": 800, "rng": np.random.default_rng(2)}
+    theta = posterior_chains(frozen, minimum, evaluation, wanted, **given).theta[..., 0].ravel()
+    assert theta.max() <= upper[0]
+    law = stats.truncnorm(-np.inf, 1.0, loc=minimum[0], scale=0.05)
+    levels = np.array([0.1, 0.5, 0.9])
+    assert law.cdf(np.quantile(theta, levels)) == pytest.approx(levels, abs=0.06)
 
 
 def test_chains_made_in_blocks_have_every_draw_and_the_same_ones_with_a_seed(objective, minimum, monkeypatch):

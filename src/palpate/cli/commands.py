@@ -1,4 +1,4 @@
-"""The sub-commands around an estimate: init, check, mesh, simulate."""
+"""The sub-commands around an estimate: init, check, noise, mesh, simulate."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from palpate.study.case import Case
     from palpate.study.outputs import OutputFolder
 
-__all__ = ["MESH_TARGETS", "SIMULATION_TARGETS", "check", "init", "mesh", "simulate"]
+__all__ = ["MESH_TARGETS", "SIMULATION_TARGETS", "check", "init", "mesh", "noise", "simulate"]
 
 Progress = Callable[[str], None]
 
@@ -42,6 +42,24 @@ def check(arguments: argparse.Namespace, _: None, outputs: None, progress: Progr
     refused = "\n".join(problem.message for problem in found.problems if problem.exit_code)
     complaint = refused if arguments.quiet else ""  # what is refused is said even then, as by any other command
     return Outcome(found.to_dict(), found.text(), found.exit_code, complaint)
+
+
+def noise(arguments: argparse.Namespace, _: None, outputs: None, progress: Progress) -> Outcome:
+    """Say how well surfaces are drawn, from two segmentations of one state."""
+    from palpate.steps import commands
+
+    del outputs  # it writes nothing
+    found = commands.noise(
+        arguments.first, arguments.second, labels=arguments.labels, align=arguments.align, progress=progress
+    )
+    rows = [["organ", "sd of one drawing, mm", "correlation length, mm", "second larger by, mm", "95 % interval"]]
+    for each in found.organs:
+        low, high = each.offset_interval95
+        numbers = (f"{each.surface_sd_mm:.3g}", f"{each.correlation_length_mm:.2g}", f"{each.offset_mm:+.2f}")
+        rows.append([each.organ, *numbers, f"{low:+.2f} to {high:+.2f}"])
+    document = found.to_dict()
+    left = f"left out: {', '.join(found.left_out)}\n" if found.left_out else ""
+    return Outcome(document, f"{columns(rows)}\n{left}{warning_lines(document)}\n{found.toml}")
 
 
 def mesh(_: argparse.Namespace, case: Case, outputs: OutputFolder, progress: Progress) -> Outcome:

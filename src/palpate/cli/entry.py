@@ -43,6 +43,7 @@ def run(argv: Sequence[str] | None, signals: Sequence[signal.Signals], mask: Ite
 
         argcomplete.autocomplete(parser)
     arguments = parser.parse_args(argv)
+    os.environ["MPLBACKEND"] = "agg"  # no window is opened, and matplotlib does not load under a name it does not know
     written: list[str] = []  # what has taken its place, which a signal cannot undo wherever in the run it comes
     outcome = None
     try:

@@ -24,6 +24,10 @@ EXAMPLES = {
         "palpate init masks_before/ masks_after/ --output case",
     ),
     "check": ("palpate check case/case.toml", "palpate check case/case.toml --set mesh.edge_length_mm=6 --json"),
+    "noise": (
+        "palpate noise a.nii.gz b.nii.gz",
+        "palpate noise a.nii.gz b.nii.gz --labels names.json --json",
+    ),
     "mesh": ("palpate mesh case/case.toml --output mesh", "palpate mesh case/case.toml --set mesh.edge_length_mm=6"),
     "simulate": (
         "palpate simulate case/case.toml --output later",
@@ -102,7 +106,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def _add_preparations(subparsers: Any) -> None:
-    """What makes, checks and tries a case: init, check, mesh, simulate."""
+    """What makes, checks and tries a case: init, check, noise, mesh, simulate."""
     what = "write a case.toml for images, roles guessed from names"
     init = _command(subparsers, "init", commands.init, what=what)
     init.add_argument("images", type=Path, nargs="+", metavar="IMAGE", help="label images: before, then after ...")
@@ -113,6 +117,13 @@ def _add_preparations(subparsers: Any) -> None:
     check = _command(subparsers, "check", commands.check, what=what, folder=None)
     check.add_argument("case_file", type=Path, metavar="CASE.TOML", help=CASE_HELP)
     _add_set(check)
+    what = "tell how well surfaces are drawn, from two segmentations of one state: [noise] and [discrepancy] of a case"
+    noise = _command(subparsers, "noise", commands.noise, what=what, folder=None)
+    noise.add_argument("first", type=Path, metavar="A", help="label image")
+    noise.add_argument("second", type=Path, metavar="B", help="the same state again: another scan, reader or program")
+    noise.add_argument("--labels", type=Path, metavar="TABLE", help="label table: which number is which organ")
+    what = "bring B to A first; default: on all surfaces where their grids differ"
+    noise.add_argument("--align", choices=("auto", "surfaces", "none"), default="auto", help=what)
     mesh = _command(subparsers, "mesh", commands.mesh, what="make the tetrahedra of a case and write them")
     _add_case(mesh)
     mesh.set_defaults(targets=commands.MESH_TARGETS)

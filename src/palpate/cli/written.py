@@ -72,7 +72,7 @@ def report(_: argparse.Namespace, case: None, outputs: OutputFolder, progress: P
     if DATA not in files:
         raise InputDataError(f"{outputs.path / DOCUMENT} tells of a run without {DATA}; run the estimate again")
     progress("drawing the report")
-    page = redrawn_page(outputs.path, sha256=files[DATA]["sha256"])
+    page = redrawn_page(outputs.path, document=result, sha256=files[DATA]["sha256"])
     with outputs.staged() as staging:
         write_text(staging.area / PAGE, page)
         files |= staging.digests()

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from palpate.export.fitted_model import fitted_model
 from palpate.export.label_table import write_label_table
-from palpate.export.model_file import MODEL, seal_of, write_model
+from palpate.export.model_file import MODEL, write_model
 from palpate.export.netcdf import write_posterior
 from palpate.export.rasterise import region_image
 from palpate.export.vtk_xml import write_pvd, write_vtp, write_vtu
@@ -22,6 +22,7 @@ from palpate.mechanics.deformation import largest_strains
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.surface import tissue_surface
 from palpate.mesh.tet_mesh import TetMesh
+from palpate.study.earlier import seal_of
 from palpate.study.outputs import make_folder
 from palpate.study.result import CaseResult, MeshResult, Simulation
 from palpate.study.samples import POSTERIOR

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.errors import ConfigurationError, EstimationError
+from palpate.errors import ConfigurationError, EstimationError, InputDataError
 from palpate.images.label_image import VoxelGrid
 from palpate.images.tissue import Tissue
 from palpate.mechanics.laws.contract import Law
@@ -41,6 +41,11 @@ class FittedBody:
     index: NDArray[np.int16]
     grid: VoxelGrid
     loads: tuple[tuple[CaseLoad, ...], ...]
+
+    def __post_init__(self) -> None:
+        index, n = self.index, len(self.mesh.tissues)
+        if index.shape != self.grid.shape or (index.size and not 0 <= int(index.min()) <= int(index.max()) < n):
+            raise InputDataError(f"the voxels of a fitted model do not all belong to one of its {n} tissues")
 
     @property
     def tissues(self) -> tuple[Tissue, ...]:

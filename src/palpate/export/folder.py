@@ -8,7 +8,8 @@ from pathlib import Path
 from palpate.errors import ConfigurationError
 from palpate.export.fitted_model import FittedModel, fitted_model
 from palpate.export.formats import Options, format_named
-from palpate.export.model_file import read_model, seal_of
+from palpate.export.model_file import read_model
+from palpate.study.earlier import seal_of
 from palpate.study.lock import held_folder
 from palpate.study.outputs import OutputFolder, make_folder
 from palpate.study.result import CaseResult

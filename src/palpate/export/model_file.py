@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from palpate.errors import EstimationError, InputDataError
 from palpate.export.fitted_model import FittedModel
 from palpate.images.named_labels import printable
 from palpate.study.archive import read_archive, write_archive
-from palpate.study.earlier import RESULT
+from palpate.study.earlier import RESULT, seal_of
 from palpate.study.outputs import read_json, sha256_of
 from palpate.study.result import SCHEMA
 
-__all__ = ["MODEL", "read_model", "seal_of", "write_model"]
+__all__ = ["MODEL", "read_model", "write_model"]
 
 MODEL = "model.npz"
 FORMAT = "palpate.model/1"
-UNSEALED = ("files", "warnings")  # which are added when the files take their places
 
 
 def write_model(model: FittedModel, path: Path) -> None:
@@ -60,13 +55,12 @@ def read_model(folder: Path) -> FittedModel:
             f"the numbers in {path} are not those of the run that wrote {MODEL}: one was changed since; run the"
             " estimate again"
         )
+    for body in model.bodies:
+        if {len(motion) for motion in body.displacements} != {len(body.space.points)}:
+            raise InputDataError(
+                f"{folder / MODEL} holds displacements of other points than its mesh has; run the estimate again"
+            )
     return model
-
-
-def seal_of(document: Mapping[str, Any]) -> str:
-    """SHA-256 (hexadecimal) of what a result.json says, whatever files and warnings stand beside it."""
-    sealed = {key: value for key, value in document.items() if key not in UNSEALED}
-    return hashlib.sha256(json.dumps(sealed, sort_keys=True, allow_nan=False).encode()).hexdigest()
 
 
 def _refuse_other(folder: Path, name: str, sha256: str) -> None:

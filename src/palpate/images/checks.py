@@ -15,6 +15,7 @@ from palpate.findings import Finding
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
+from palpate.images.wall_motion import STILL_VOXELS, wall_motion
 
 __all__ = ["check_headers", "check_images", "check_pair", "check_segmentation", "later_names"]
 
@@ -29,6 +30,8 @@ SPACING_MM = (0.02, 20.0)  # outside of this a voxel edge is more likely in metr
 MIRROR_CERTAIN = 0.25  # gain in agreement, of 1, at which a mirrored image is refused
 MIRROR_LIKELY = 0.10
 MIRROR_SAMPLES = 4000
+VOID_INSIDE = 0.25  # of a void's surface that is a cut of the image; more has the air around a body
+VOID_STILL = 2.0  # times the motion that the voxels' own rounding makes
 DIRECTIONS = ("left-right", "front-back", "head-foot")
 SAME_SPACING, NEARLY_SAME_SPACING = 5e-4, 0.02  # relative: rounding in a header, and what no other protocol explains
 HALF_VOXEL = 0.02  # voxels, by which an offset is half of one
@@ -124,7 +127,7 @@ def check_pair(before: Segmentation, after: Segmentation, *, name: str = "after"
     """Findings on two states of one body: volumes, shifts, a mirrored image, the part that the images share.
 
     Raises `InputDataError` when the two are the same image, an organ is missing in one or has another name there, they
-    share no part of the world, or one is clearly the mirror image of the other.
+    share no part of the world, one is clearly the mirror image of the other, or two organs have exchanged their labels.
     """
     if [t.name for t in before.tissues] != [t.name for t in after.tissues]:
         raise InputDataError(f"'before' and '{name}' have been segmented into different tissues; use one list for both")
@@ -157,6 +160,8 @@ def check_pair(before: Segmentation, after: Segmentation, *, name: str = "after"
     findings += _shifts(before, after, observed, name)
     for i in observed:
         findings += _volume_change(before, after, i, name)
+    for i in range(len(before.tissues)):
+        findings += _moving_void(before, after, i, name)
     return tuple(findings)
 
 
@@ -215,24 +220,29 @@ def _mirrored(before: Segmentation, after: Segmentation, observed: Sequence[int]
     """Lay the organs of one image on the other, as they are and mirrored along one, two or three axes.
 
     The agreement is the mean over the organs of the share of voxels that find their own organ; the organs' common
-    centroids are laid on each other, so neither a shift nor the size of the field of view matters.
+    centroids are laid on each other, so neither a shift nor the size of the field of view matters. Where exchanging the
+    labels of two organs makes them agree as well, that is told instead.
     """
     points = []  # of each organ at most MIRROR_SAMPLES voxel centres (n, 3), evenly picked, RAS mm
     for i in observed:
-        index = np.argwhere(before.mask(i))
-        points.append(before.grid.world(index[:: -(-len(index) // MIRROR_SAMPLES)].astype(np.float64)))
+        step = -(-int(np.count_nonzero(before.mask(i))) // MIRROR_SAMPLES)
+        picked, seen = list[NDArray[np.int64]](), 0
+        for voxels in before.voxels(i):
+            picked.append(voxels[-seen % step :: step])
+            seen += len(voxels)
+        points.append(before.grid.world(np.concatenate(picked).astype(np.float64)))
     middle = np.mean([p.mean(axis=0) for p in points], axis=0)
-    target = np.mean([_centroid(after, i) for i in observed], axis=0)
-    agreement = {}
-    for signs in product((1.0, -1.0), repeat=3):
-        hits = []
-        for i, p in zip(observed, points, strict=True):
+    target = np.mean([after.middle(i) for i in observed], axis=0)
+    agreement, found = {}, np.zeros((len(observed),) * 2)  # share of an organ's voxels that find each organ
+    for signs in product((-1.0, 1.0), repeat=3):  # the last as it is
+        for row, p in zip(found, points, strict=True):
             index = np.rint(after.grid.index(target + (p - middle) * signs)).astype(np.int64)
             inside = index[((index >= 0) & (index < after.grid.shape)).all(axis=1)]
-            hits.append(np.count_nonzero(after.index[tuple(inside.T)] == i) / len(p))
-        agreement[signs] = float(np.mean(hits))
+            row[:] = np.mean(after.index[tuple(inside.T)][:, None] == observed, axis=0) * len(inside) / len(p)
+        agreement[signs] = float(np.trace(found)) / len(observed)
     plain = agreement.pop((1.0, 1.0, 1.0))
     signs, best = max(agreement.items(), key=lambda item: (round(item[1], 3), sum(item[0])))
+    _refuse_exchanged(found, [before.tissues[i].name for i in observed], name, at_least=len(observed) * (best - plain))
     if best - plain < MIRROR_LIKELY:
         return []
     axes = " and ".join(direction for direction, sign in zip(DIRECTIONS, signs, strict=True) if sign < 0.0)
@@ -245,14 +255,26 @@ def _mirrored(before: Segmentation, after: Segmentation, observed: Sequence[int]
     return [Finding("mirrored", text, place=f"'{name}'")]
 
 
-def _centroid(segmentation: Segmentation, tissue: int) -> NDArray[np.float64]:
-    index = np.argwhere(segmentation.mask(tissue)).mean(axis=0, keepdims=True)
-    return np.asarray(segmentation.grid.world(index)[0])
+def _refuse_exchanged(found: NDArray[np.float64], organs: Sequence[str], name: str, *, at_least: float) -> None:
+    """Raise `InputDataError` when two organs' voxels agree much better with their labels exchanged in the later image.
+
+    found (n, n): the share of each of the `organs` that finds each of them there; at_least: the gain in the sum of
+    agreements that another explanation has.
+    """
+    own = np.diag(found)
+    gain = found + found.T - own[:, None] - own
+    i, j = sorted(divmod(int(np.argmax(gain)), len(organs)))
+    if gain[i, j] >= max(2.0 * MIRROR_CERTAIN, at_least):
+        now, then = (own[i] + own[j]) / 2.0, (found[i, j] + found[j, i]) / 2.0
+        raise InputDataError(
+            f"'{organs[i]}' and '{organs[j]}' look exchanged in '{name}': {then:.0%} of their voxels lie in the other"
+            f" organ there, {now:.0%} in their own; check which label is which in that image"
+        )
 
 
 def _shifts(before: Segmentation, after: Segmentation, observed: Sequence[int], name: str) -> list[Finding]:
     """Organs that move by more than their own size, measured against the rigid tissues where there are any."""
-    shift = {i: _centroid(after, i) - _centroid(before, i) for i in observed}
+    shift = {i: after.middle(i) - before.middle(i) for i in observed}
     rigid = [shift[i] for i in observed if before.tissues[i].role is Role.RIGID]
     common = np.mean(rigid, axis=0) if rigid else np.zeros(3)
     findings = []
@@ -289,3 +311,22 @@ def _volume_change(before: Segmentation, after: Segmentation, i: int, name: str)
         text += "; so large a change is implausible for one organ: check that the label means the same in both images"
         return [Finding("volume-implausible", text, tissue.name, place)]
     return [Finding("volume-change", text, tissue.name, place)]
+
+
+def _moving_void(before: Segmentation, after: Segmentation, i: int, name: str) -> list[Finding]:
+    """A void inside the body, such as a rectum, whose wall moves: nothing of the model moves it."""
+    tissue, mask = before.tissues[i], before.mask(i)
+    if tissue.role is not Role.VOID or not mask.any() or not after.mask(i).any():
+        return []
+    faces = sum(int(np.count_nonzero(np.diff(mask, axis=axis))) for axis in range(3))
+    if _touching(mask) > VOID_INSIDE * (faces + _touching(mask)):
+        return []  # the air around the body
+    motion, voxel = wall_motion(before, after, i), float(max(before.grid.spacing.max(), after.grid.spacing.max()))
+    if motion <= VOID_STILL * STILL_VOXELS * voxel:
+        return []
+    text = (
+        f"'{tissue.name}' has the role void and lies inside the body, and its wall moves by {motion:.2g} mm from"
+        f" 'before' to '{name}': the model leaves it free, and explains what it pushes by the motion of others; give a"
+        " hollow organ that fills or moves the role driver"
+    )
+    return [Finding("void-moves", text, tissue.name, f"to '{name}' ({motion:.2g} mm)")]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from palpate.findings import Finding
 __all__ = ["LPS_TO_RAS", "LabelImage", "VoxelGrid", "corners_apart"]
 
 LPS_TO_RAS = np.array([-1.0, -1.0, 1.0])  # signs of x, y and z, and back
+NARROW = (np.uint8, np.uint16)  # an image of a whole body has half a billion voxels
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,13 +57,14 @@ class VoxelGrid:
 
 @dataclass(frozen=True, slots=True)
 class LabelImage:
-    """Labels (n_x, n_y, n_z) int on `grid`; `names`: label -> name and `colours`: label -> #rrggbb, where given.
+    """Labels (n_x, n_y, n_z) on `grid`, uint8 or uint16 where they come so, else int32.
 
+    `names`: label -> name and `colours`: label -> #rrggbb, where given;
     `digests`: SHA-256 (hexadecimal) of each file it was read from, by its part in the image (`StoredImage`);
     `findings`: what the user should know of the reading.
     """
 
-    labels: NDArray[np.int32]
+    labels: NDArray[np.integer[Any]]
     grid: VoxelGrid
     names: Mapping[int, str] = field(default_factory=dict)
     colours: Mapping[int, str] = field(default_factory=dict)
@@ -69,7 +72,8 @@ class LabelImage:
     findings: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
-        labels = np.array(self.labels, dtype=np.int32)
+        given = np.asarray(self.labels).dtype
+        labels = np.array(self.labels, dtype=given if given in NARROW else np.int32)
         if labels.shape != self.grid.shape:
             raise InputDataError(f"labels have the shape {labels.shape}, their grid {self.grid.shape}: they must agree")
         labels.setflags(write=False)

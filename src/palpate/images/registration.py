@@ -81,7 +81,9 @@ class Registration:
 def registration(before: Segmentation, after: Segmentation, fit: RigidFit, *, by: str) -> Registration:
     """What a measured motion does to the organs, and what it leaves of each surface."""
     organs = [i for i, tissue in enumerate(before.tissues) if tissue.role is Role.ESTIMATE]
-    shown = np.isin(before.index, organs)
-    voxels = np.argwhere(shown if shown.any() else before.index >= 0)
-    centre = before.grid.world(voxels.mean(axis=0)[None])[0]
+    volumes = {organ: before.volume(organ) for organ in organs if before.mask(organ).any()}
+    if volumes:
+        centre = np.average([before.middle(i) for i in volumes], axis=0, weights=list(volumes.values()))
+    else:
+        centre = before.grid.world((np.array([before.grid.shape]) - 1.0) / 2.0)[0]
     return Registration(by, fit.motion, centre, fit.rms_mm, residuals_by_tissue(before, after, fit.motion))

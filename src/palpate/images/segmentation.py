@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import count
 
@@ -40,6 +40,22 @@ class Segmentation:
     def mask(self, tissue: int) -> NDArray[np.bool_]:
         """Which voxels (n_x, n_y, n_z) belong to the tissue of that index."""
         return np.asarray(self.index == tissue)
+
+    def voxels(self, tissue: int) -> Iterator[NDArray[np.int64]]:
+        """Indices (n, 3) of the tissue's voxels in their order, those of one layer of the first axis at a time.
+
+        All at once they take up to twelve times the memory of the image.
+        """
+        for i, layer in enumerate(self.index):
+            found = np.argwhere(layer == tissue)
+            yield np.column_stack([np.full(len(found), i), found])
+
+    def middle(self, tissue: int) -> NDArray[np.float64]:
+        """Mean (3,) mm of the centres of the tissue's voxels, of which there is one at least."""
+        mask = self.mask(tissue)
+        along = [mask.sum(axis=tuple({0, 1, 2} - {axis})) for axis in range(3)]
+        place = [float(counts @ np.arange(len(counts)) / counts.sum()) for counts in along]
+        return np.asarray(self.grid.world(np.array([place]))[0])
 
     def volume(self, tissue: int) -> float:
         """Volume of the tissue by counting voxels, mm^3."""
@@ -80,7 +96,7 @@ def segment(image: LabelImage, tissues: tuple[Tissue, ...]) -> Segmentation:
     rest = [i for i, tissue in enumerate(tissues) if not tissue.labels]
     if len(rest) > 1:
         raise ConfigurationError(f"tissues {[tissues[i].name for i in rest]} are both 'remaining'; only one can be")
-    labels, inverse = np.unique(image.labels, return_inverse=True)
+    labels = np.unique(np.concatenate([np.unique(layer) for layer in image.labels]))
     orphans = [int(label) for label in labels if int(label) not in owner]
     if orphans and not rest:
         raise InputDataError(
@@ -92,9 +108,15 @@ def segment(image: LabelImage, tissues: tuple[Tissue, ...]) -> Segmentation:
         called = tuple(image.names[label] for label in tissue.labels if label in image.names)
         colour = next((image.colours[label] for label in tissue.labels if label in image.colours), None)
         described.append(replace(tissue, called=called or tissue.called, colour=tissue.colour or colour))
-    index = table[inverse].reshape(image.labels.shape)
-    counts, codes = np.bincount(inverse.ravel()), inverse.ravel()
-    places = [np.bincount(codes, voxel.ravel()) / counts for voxel in np.indices(index.shape, dtype=np.float32)]
-    world = image.grid.world(np.stack(places, axis=1))
+    index = np.empty(image.labels.shape, dtype=np.int16)
+    sums, rows = np.zeros((len(labels), 3)), np.indices(index.shape[1:]).reshape(2, -1)
+    counts = np.zeros(len(labels))
+    for i, layer in enumerate(image.labels):  # all at once these numbers would take eight times the labels' memory
+        numbers = np.searchsorted(labels, layer)
+        index[i] = table[numbers]
+        here, *sides = (np.bincount(numbers.ravel(), weights, len(labels)) for weights in (None, *rows))
+        counts += here
+        sums += np.stack([i * here, *sides], axis=1)
+    world = image.grid.world(sums / counts[:, None])
     middles = {image.names[int(n)]: place for n, place in zip(labels, world, strict=True) if int(n) in image.names}
     return Segmentation(index, image.grid, tuple(described), image.digests, image.findings, middles)

@@ -13,7 +13,7 @@ from palpate.inversion.blocks import (
     wall_blocks,
 )
 from palpate.inversion.driver_fit import fit_driver
-from palpate.inversion.estimate import Inversion, StartRun, continue_at_finite_strain, invert
+from palpate.inversion.estimate import Inversion, StartRun, as_good, continue_at_finite_strain, invert
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import Evaluation, Linearisation, LinearisedObjective, Objective
 from palpate.inversion.optimise import (
@@ -55,6 +55,7 @@ __all__ = [
     "ReducedBasis",
     "StartRun",
     "StopRule",
+    "as_good",
     "continue_at_finite_strain",
     "eta_of_ratio",
     "exact_approximation",

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.errors import ConfigurationError, EstimationError
+from palpate.errors import ConfigurationError, EstimationError, NotConverged
 from palpate.inversion.evidence import with_learned_prior
 from palpate.inversion.expansion import Expansion, coarse_equilibrium, expansion_around
 from palpate.inversion.informed_subspace import informed_problem
@@ -39,10 +39,10 @@ from palpate.mechanics.forward import SolveCounts
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Progress, during
 
-__all__ = ["Candidate", "Inversion", "StartRun", "continue_at_finite_strain", "invert"]
+__all__ = ["Candidate", "Inversion", "StartRun", "as_good", "continue_at_finite_strain", "invert"]
 
-OTHER = 1e-2  # decrement of minima that are compared: a fiftieth of what makes one lower
-LOWER = 0.5  # in units of log-likelihood: a minimum that is lower by less is as good
+OTHER = 1e-2  # decrement of minima that are compared: a two-hundredth of what tells them apart
+AS_GOOD = 1.92  # of minus the log-posterior: half the 95 % quantile of chi-squared with one degree of freedom
 REPORTED = StopRule()
 FIRST_GUESS = StopRule(
     step_sd=0.5, model_error=np.inf, derivatives=False, solve_above=0.1, passes=1, iterations=1, far=np.inf
@@ -105,6 +105,15 @@ class Inversion:
         return self.candidates[self.best].iterate.convergence
 
 
+def as_good(value: float, best: float, *, scale: float = 1.0) -> bool:
+    """Whether a minimum with a `value` of minus the log-posterior cannot be told from one with the value `best`.
+
+    By the rule of a 95 % interval: twice their difference, times a `scale` of the deviance (see `Profile`), is below
+    1.96^2. What a value is worth does not depend on how many residuals make it up.
+    """
+    return scale * (value - best) < AS_GOOD
+
+
 @blas_on_one_thread()
 def invert(
     problem: InverseProblem, settings: InversionSettings, *, progress: Progress, rule: StopRule = REPORTED
@@ -139,9 +148,9 @@ def continue_at_finite_strain(
 ) -> Inversion:
     """The estimate under the law of the states' `finite_strain` models, from the candidates of the `linear` one.
 
-    The best one is continued always, the others where they are minima; of these one without equilibrium is left out of
-    the comparison. rule: when each ends. Raises `NotConverged` when the best one's equilibrium is not found, with the
-    element and the share of the motion where it ended.
+    The best one is continued always, the others where they are minima; of these one without equilibrium, or that
+    cannot be followed for another reason, is left out of the comparison. rule: when each ends. Raises `NotConverged`
+    when the best one's equilibrium is not found, with the element and the share of the motion where it ended.
     """
     waiting = {number: candidate.iterate for number, candidate in enumerate(linear.candidates)}
     linear = replace(linear, candidates=())  # and with them their reduced bases, which are large, one by one
@@ -158,10 +167,12 @@ def continue_at_finite_strain(
             progress("finite strain: the exact equilibrium at the estimate")
             ends[number] = end = _at_equilibrium(end, minimum.history)
             spent, evaluations = spent + end.counts, evaluations + end.minimum.evaluations
-        except EstimationError:
+        except EstimationError as error:
             if number == linear.best:
                 raise
-            ends[number] = replace(ends[linear.best], minimum=replace(minimum, outcome=Outcome.NO_EQUILIBRIUM))
+            progress(f"finite strain: another minimum is left out: {error}")
+            outcome = Outcome.NO_EQUILIBRIUM if isinstance(error, NotConverged) else Outcome.NOT_FOLLOWED
+            ends[number] = replace(ends[linear.best], minimum=replace(minimum, outcome=outcome))
     found = _concluded([ends[number] for number in sorted(ends)], linear.starts, linear.rest, settings, linear.best)
     return replace(found, evaluations=found.evaluations + evaluations, counts=spent)
 
@@ -249,7 +260,7 @@ def _another(
     n = best.objective.n_parameters
     start = np.concatenate([minimum.unknowns[:n], best.minimum.unknowns[n:]])
     found = minimised(best.objective, start, settings, tolerance=OTHER)
-    if found.converged and found.evaluation.value < best.minimum.evaluation.value - LOWER:
+    if found.converged and not as_good(best.minimum.evaluation.value, found.evaluation.value):
         title = "linear law, another minimum"
         end = run_outer_loop(updated(best.objective, found, rule), settings, rule, progress=progress, title=title)
         return replace(end, checks=best.checks + end.checks)

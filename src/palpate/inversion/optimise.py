@@ -66,6 +66,7 @@ class Outcome(StrEnum):
     STUCK = "no step reduced the objective; look at the fit of the driver's surface and at the images"
     NOT_FINITE = "the objective is not a finite number; check the images and the moduli's bounds"
     NO_EQUILIBRIUM = "the body has no equilibrium there under the material law"
+    NOT_FOLLOWED = "it could not be followed under the material law; log.txt says why"
 
     @property
     def converged(self) -> bool:

@@ -107,7 +107,8 @@ class StopRule:
     which the full model is solved; passes, of weights and estimate in turn on one approximation, and
     iterations: the largest numbers of each; far: tolerances by which an estimate may still move
     where more iterations do no better: at the largest number of them, where more has not converged, and where the
-    passes of one lead back to where it began (weightings that explain the images as well take turns).
+    passes of one lead back to where it began (weightings that explain the images as well take turns); where they end
+    with more, of whichever criterion, nothing has converged.
     """
 
     step_sd: float = 0.02
@@ -181,7 +182,9 @@ def run_outer_loop(
                 break
             now, held, relearned = free, False, relearned + 1
     else:
-        if max(now.convergence.reweighting, now.convergence.linearisation) > rule.far and now.minimum.converged:
+        open_ = now.convergence
+        most = max(open_.reweighting, open_.linearisation, open_.model_error)
+        if most > rule.far and now.minimum.converged:
             now = replace(now, minimum=replace(now.minimum, outcome=Outcome.STEPS))
     return _learning(now, held=False)  # another law learns anew
 

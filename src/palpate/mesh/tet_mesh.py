@@ -43,6 +43,17 @@ class TetMesh:
                 f" with {len(self.beyond)} neighbours: give one region a tetrahedron and one neighbour a face"
             )
 
+        for what, numbers, low, count in (
+            ("a tetrahedron has a corner", self.tets, 0, len(self.nodes)),
+            ("a boundary face has a corner", self.boundary, 0, len(self.nodes)),
+            ("a tetrahedron has a region", self.region, 0, len(self.tissues)),
+            ("a boundary face has a neighbour", self.beyond, OUTER, len(self.tissues)),
+        ):
+            if numbers.size and not low <= int(numbers.min()) <= int(numbers.max()) < count:
+                raise GeometryError(
+                    f"{what} between {numbers.min()} and {numbers.max()}, and only {low} to {count - 1} are there"
+                )
+
     @property
     def volumes(self) -> NDArray[np.float64]:
         """Signed volumes of the tetrahedra, (n_tets,) mm^3."""

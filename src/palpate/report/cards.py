@@ -26,9 +26,10 @@ def result_lines(document: Mapping[str, Any]) -> str:
     for row in estimate_rows(document, {}):
         found = "no value"
         if row.value != NONE:
-            found = f"{row.value} kPa (95 %: {row.interval} kPa)"
+            found = f"{row.value} kPa" + (f" (95 %: {row.interval} kPa)" if row.interval != NONE else "")
         elif row.ratio != NONE:
-            found = f"{row.ratio} x {row.relative_to} (95 %: {row.ratio_interval})"
+            found = f"{row.ratio} x {row.relative_to}"
+            found += f" (95 %: {row.ratio_interval})" if row.ratio_interval != NONE else ""
         lines.append(f"{row.tissue}: {found}, {row.verdict}: {row.why}")
     return "\n".join(lines)
 
@@ -81,7 +82,7 @@ def _draw_item(axes: Axes, row: int, item: Mapping[str, Any], colour: str) -> No
     if value is None:
         axes.text(0.5, row, "no value", transform=axes.get_yaxis_transform(), ha="center", va="center", color=GREY)
         return
-    low, high = interval or (value, value)
+    low, high = interval or (value, value)  # a dot alone where no interval is stated
     ends = axes.get_xlim()
     axes.plot([low or ends[0], high or ends[1]], [row, row], color=colour, linewidth=5, alpha=0.55, gid="interval")
     for end, marker, place in ((low, "<", ends[0]), (high, ">", ends[1])):

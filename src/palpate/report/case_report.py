@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from palpate.errors import InputDataError, PalpateError
 from palpate.images.named_labels import printable
@@ -10,6 +12,7 @@ from palpate.report.collect import collect, collect_failure
 from palpate.report.page import render
 from palpate.report.report_data import ReportData
 from palpate.study.case import Case
+from palpate.study.earlier import RESULT, seal_of
 from palpate.study.outputs import write_text
 from palpate.study.result import CaseResult
 
@@ -32,13 +35,19 @@ def write_failure_report(case: Case, error: PalpateError, folder: Path) -> Path:
     return _write(collect_failure(case, error), folder)
 
 
-def redrawn_page(folder: Path, *, sha256: str | None = None) -> str:
+def redrawn_page(folder: Path, *, document: Mapping[str, Any], sha256: str | None = None) -> str:
     """The page made again from report-data.npz in `folder`, which must have the SHA-256 that is given.
 
-    Raises `InputDataError` when the data are missing, damaged, of another run, or cannot be drawn.
+    document: the result.json beside it. Raises `InputDataError` when the data are missing, damaged, or of another run,
+    when they cannot be drawn, and when the document says other numbers than they do.
     """
     path = folder / DATA_NAME
     data = ReportData.load(path, sha256=sha256)
+    if seal_of(data.document) != seal_of(document):
+        raise InputDataError(
+            f"the numbers in {folder / RESULT} are not those of the run that wrote {DATA_NAME}: one was changed since;"
+            " run the estimate again"
+        )
     try:
         return render(data)
     except MemoryError:

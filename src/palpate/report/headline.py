@@ -12,10 +12,10 @@ __all__ = ["Headline", "headline", "listed"]
 
 FOUND = {
     "identified": "The images fix the stiffness of {}.",
-    "weak": "They say little about {}: use the interval, not the number alone.",
-    "ratio only": "Of {} they fix the ratio to the others, not the number of kilopascals.",
-    "not identified": "They do not fix {}: do not use that number.",
+    "weak": "The images say little about the stiffness of {}: use the interval, not the number alone.",
+    "ratio only": "The images fix the stiffness of {} as a ratio to the others, not as a number of kilopascals.",
 }
+OPEN = "The images do not fix the stiffness of {}: do not use {}."
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +46,9 @@ def headline(document: Mapping[str, Any]) -> Headline:
         several = f"The search from {len(starts)} starts led to {answers} different answers; the best one is shown."
         same = f"The search led to the same answer from all {len(starts)} starts."
         sentences.append(several if answers > 1 else same)
+    if lost := verdicts.get("not identified"):
+        title = OPEN.format(listed(lost), "its number" if len(lost) == 1 else "their numbers")
+        return Headline("bad", title, tuple(sentences), warnings, reason)
     good = set(verdicts) <= {"identified", "ratio only"} and not count
     return Headline("good" if good else "fair", "A result was found.", tuple(sentences), warnings, reason)
 

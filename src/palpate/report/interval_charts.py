@@ -96,7 +96,9 @@ def repeats_svg(data: ReportData, estimate: int, *, name: str) -> str:
     """One modulus (the estimate's number) as each later image alone says it, with the joint value, as SVG."""
     item, pairs = moduli_in(data.document)[estimate], data.document["image_pairs"]
     tissue, colour = item["tissue"], _colour(data, item)
-    alone = [(pair["moduli"][tissue], pair["interval95"][tissue], pair["outlier"]) for pair in pairs["alone"]]
+    alone = [  # nothing of an image that has no minimum alone
+        (pair["moduli"].get(tissue), pair["interval95"].get(tissue), pair["outlier"]) for pair in pairs["alone"]
+    ]
     low, high = pairs["mean_interval95"][tissue]
 
     def draw(figure: Figure) -> None:
@@ -107,6 +109,8 @@ def repeats_svg(data: ReportData, estimate: int, *, name: str) -> str:
         if item["truth"] is not None:
             axes.axhline(item["truth"], color=INK, linewidth=1.0, linestyle=DASHED)
         for place, (value, ends, outlier) in enumerate(alone, start=1):
+            if value is None:
+                continue
             axes.plot([place, place], ends, color=colour, linewidth=1.6)
             inside = "none" if outlier else colour
             axes.plot([place], [value], "o", color=colour, markerfacecolor=inside, markersize=7)

@@ -84,6 +84,8 @@ def render(data: ReportData) -> str:
     live = _attempt("the moving figures", lambda: payload(data))
     scripts = _scripts() if live is not None and (data.later or data.mesh) else ()
     colours = {tissue.name: tissue.colour for tissue in data.tissues}
+    found = moduli_in(data.document) if data.document["status"] == "converged" else []
+    fixed = {item["tissue"] for item in found if item["verdict"] != "not identified"}  # of others no range is drawn
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("palpate.report"), autoescape=True, undefined=jinja2.StrictUndefined
     )
@@ -116,17 +118,17 @@ def render(data: ReportData) -> str:
         profiles=tuple(
             _picture(f"Profile of {item['tissue']}", partial(profile_svg, data, i, name=f"profile{i}"))
             for i, item in enumerate(moduli_in(data.document))
-            if data.document["status"] == "converged" and item.get("profile")
+            if item["tissue"] in fixed and item.get("profile")
         ),
         regions=tuple(
             _picture(" and ".join(region["tissues"]), partial(region_svg, data, i, name=f"region{i}"))
             for i, region in enumerate(data.document.get("regions", ()))
-            if data.document["status"] == "converged"
+            if fixed.issuperset(region["tissues"])
         ),
         repeats=tuple(
             _picture(f"Repeats of {item['tissue']}", partial(repeats_svg, data, i, name=f"repeats{i}"))
             for i, item in enumerate(moduli_in(data.document))
-            if data.document["status"] == "converged" and data.document["image_pairs"]
+            if item["tissue"] in fixed and data.document["image_pairs"]
         ),
         angles=(
             _picture("Dihedral angles of the mesh", partial(angle_svg, data.mesh.angles, name="angles"))

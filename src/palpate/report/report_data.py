@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.images.label_image import VoxelGrid
-from palpate.study.archive import read_archive, write_archive
+from palpate.study.archive import MAY_BE_NAN, read_archive, write_archive
 
 __all__ = [
     "GREY_STEPS",
@@ -72,8 +72,8 @@ class ModelSurface:
     rest: NDArray[np.float32]
     fitted: NDArray[np.float32]
     triangles: NDArray[np.int32]
-    distance_rest: NDArray[np.float32]
-    distance_fitted: NDArray[np.float32]
+    distance_rest: NDArray[np.float32] = field(metadata=MAY_BE_NAN)
+    distance_fitted: NDArray[np.float32] = field(metadata=MAY_BE_NAN)
     area: NDArray[np.float32]
 
 
@@ -206,7 +206,7 @@ class ReportData:
     tissues: tuple[ReportTissue, ...]
     unit: str
     images: tuple[InputImage, ...] = ()
-    moduli_paths: tuple[Mapping[str, tuple[float, ...]], ...] = ()
+    moduli_paths: tuple[Mapping[str, tuple[float, ...]], ...] = field(default=(), metadata=MAY_BE_NAN)
     references: tuple[Reference, ...] = ()
     later: tuple[LaterImage, ...] = ()
     mesh: MeshPicture | None = None
@@ -220,6 +220,7 @@ class ReportData:
     def load(cls, path: Path, *, sha256: str | None = None) -> ReportData:
         """Read what `save` wrote.
 
-        Raises `InputDataError` when the file is missing, damaged, too large, another, or has not the SHA-256 given.
+        Raises `InputDataError` when the file is missing, damaged, too large, another, has not the SHA-256 given, or
+        holds NaN where a number belongs.
         """
-        return read_archive(cls, path, version=FORMAT, sha256=sha256)
+        return read_archive(cls, path, version=FORMAT, sha256=sha256, finite=True)

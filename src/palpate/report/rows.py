@@ -140,7 +140,7 @@ def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tu
             why=item["why"],
             truth=number(truth),
             error=f"{100.0 * (value / truth - 1.0):+.1f} %" if shown and value and truth else NONE,
-            bar=_bar(value, interval, truth=truth, scale=scale) if scale and value else None,
+            bar=_bar(value, interval, truth=truth, scale=scale) if scale and value and interval else None,
             shares=_shares({CAUSES[cause]: share for cause, share in shares.items()}) if shown else (),
         )
         rows.append(row)
@@ -200,12 +200,12 @@ def _shares(parts: Mapping[str, float]) -> tuple[Share, ...]:
     return tuple(found)
 
 
-def _bar(value: float, interval: Interval | None, *, truth: float | None, scale: tuple[float, float]) -> Bar:
+def _bar(value: float, interval: Interval, *, truth: float | None, scale: tuple[float, float]) -> Bar:
     def place(number: float | None, otherwise: float) -> float:
         """Where a number lies along the bar; `otherwise` for an open end or a value that has no logarithm."""
         return BAR * (math.log(number) - scale[0]) / (scale[1] - scale[0]) if number and number > 0 else otherwise
 
-    low, high = interval if interval is not None else (value, value)
+    low, high = interval
     return Bar(
         low=place(low, 0.0),
         high=place(high, BAR),

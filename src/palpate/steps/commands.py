@@ -15,12 +15,13 @@ from palpate.study.case import Case
 from palpate.study.check import CheckReport, check_case
 from palpate.study.lock import held_folder
 from palpate.study.new_case import NewCase, write_new_case
+from palpate.study.null_pair import NullPair, drawing_noise
 from palpate.study.outputs import OutputFolder
 from palpate.study.result import MeshResult, Simulation
 from palpate.study.sensitivity import Kept, Sensitivity
 from palpate.study.sensitivity import sensitivity as vary
 
-__all__ = ["check", "estimate", "init", "make_mesh", "sensitivity", "simulate"]
+__all__ = ["check", "estimate", "init", "make_mesh", "noise", "sensitivity", "simulate"]
 
 PathLike = str | os.PathLike[str]
 
@@ -54,6 +55,24 @@ def check(case_file: PathLike, overrides: Sequence[str] = (), *, progress: Progr
     that is a problem of the report, too.
     """
     return check_case(Path(case_file), overrides, progress=progress)
+
+
+def noise(
+    first: PathLike,
+    second: PathLike,
+    *,
+    labels: PathLike | None = None,
+    align: str = "auto",
+    progress: Progress = silent,
+) -> NullPair:
+    """How well surfaces are drawn, from two segmentations of one state, as `palpate noise` tells.
+
+    labels: a label table; align: "surfaces", "none", or "auto": on the surfaces where the grids differ. `toml` of what
+    is given are the blocks [noise] and [discrepancy] of a case. Raises `InputDataError` for images that cannot be used,
+    are the same, or cannot be of one state.
+    """
+    table = None if labels is None else Path(labels)
+    return drawing_noise(Path(first), Path(second), labels=table, align=align, progress=progress)
 
 
 def make_mesh(case: Case, *, progress: Progress = silent) -> MeshResult:

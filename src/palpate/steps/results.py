@@ -50,8 +50,7 @@ class CaseResult(result.CaseResult):
     def to_dataframe(self) -> pd.DataFrame:
         """A row a modulus: case, tissue, value and 95 % interval in kPa and as a ratio, verdict, truth.
 
-        An open end of an interval, and a value that was not found, is NaN. Raises `ResourceError` where pandas is not
-        installed.
+        What is not stated, an interval or a value, is NaN. Raises `ResourceError` where pandas is not installed.
         """
         try:
             pandas = import_module("pandas")

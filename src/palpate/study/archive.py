@@ -22,10 +22,11 @@ from palpate.errors import InputDataError
 from palpate.images.named_labels import printable
 from palpate.study.outputs import read_regular, write_bytes
 
-__all__ = ["read_archive", "write_archive"]
+__all__ = ["MAY_BE_NAN", "read_archive", "write_archive"]
 
 T = TypeVar("T")
 
+MAY_BE_NAN = {"may be": "NaN"}  # metadata of a field
 LARGEST_FILE = 1 << 30  # bytes
 MOST_BYTES = 1 << 30  # of all arrays together, unpacked
 MOST_ARRAYS = 4096
@@ -44,9 +45,10 @@ def write_archive(value: Any, path: Path, *, version: str) -> None:
     write_bytes(path, memory.getvalue())
 
 
-def read_archive(kind: type[T], path: Path, *, version: str, sha256: str | None = None) -> T:
+def read_archive(kind: type[T], path: Path, *, version: str, sha256: str | None = None, finite: bool = False) -> T:
     """The instance of dataclass `kind` in `path`, as `write_archive` wrote it under the same `version`.
 
+    finite: whether numbers that are NaN or infinite are refused; fields with the metadata `MAY_BE_NAN` may hold NaN.
     Raises `InputDataError` when there is none to be had, or when the file has another SHA-256 than it should.
     """
     content = read_regular(path, most_bytes=LARGEST_FILE)
@@ -57,10 +59,10 @@ def read_archive(kind: type[T], path: Path, *, version: str, sha256: str | None 
         )
     try:
         arrays = _arrays(content)
-        plain = json.loads(arrays["json"].tobytes())
+        plain = json.loads(arrays["json"].tobytes(), parse_constant=_no_number)
         if plain["format"] != version:
             raise ValueError(f"its format is {str(plain['format'])[:40]!r}, not '{version}'")
-        return typing.cast("T", _decode(kind, plain["value"], arrays))
+        return typing.cast("T", _decode(kind, plain["value"], arrays, finite or None))
     except MemoryError:
         raise
     except Exception as error:  # whatever another's file makes of our reading: it is no data of ours
@@ -106,28 +108,38 @@ def _encode(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
     return (value if math.isfinite(value) else None) if isinstance(value, float) else value
 
 
-def _decode(hint: Any, value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
-    """`value` as the type `hint`."""
+def _no_number(name: str) -> float:
+    """What JSON does not know and Python's reader takes all the same: NaN, Infinity."""
+    raise ValueError(f"{name} is no number")
+
+
+def _decode(hint: Any, value: Any, arrays: Mapping[str, NDArray[Any]], finite: bool | None) -> Any:
+    """`value` as the type `hint`; finite: None where numbers may be anything, False where they may be NaN."""
     origin, arms = typing.get_origin(hint), typing.get_args(hint)
     if origin is types.UnionType:
         inner = next(arm for arm in arms if arm is not types.NoneType)
-        return None if value is None else _decode(inner, value, arrays)
+        return None if value is None else _decode(inner, value, arrays, finite)
     if origin is np.ndarray:
         array = arrays[value]
         dtype = np.dtype(typing.get_args(arms[1])[0])
         if array.dtype != dtype:
             raise ValueError(f"an array holds {array.dtype} where {dtype} belongs")
+        if finite is not None and (np.isinf(array).any() or (finite and np.isnan(array).any())):
+            raise ValueError("an array holds numbers that are NaN or infinite")
         array.setflags(write=False)
         return array
     if origin is tuple:
         inners = (arms[0],) * len(value) if arms[1:] == (...,) else arms
-        return tuple(_decode(inner, item, arrays) for inner, item in zip(inners, value, strict=True))
+        return tuple(_decode(inner, item, arrays, finite) for inner, item in zip(inners, value, strict=True))
     if dataclasses.is_dataclass(hint):
         hints = typing.get_type_hints(hint)
-        known = {key: _decode(hints[key], item, arrays) for key, item in value.items()}
+        lax = {f.name for f in dataclasses.fields(hint) if f.metadata == MAY_BE_NAN}
+        known = {key: _decode(hints[key], item, arrays, finite and key not in lax) for key, item in value.items()}
         return typing.cast("type", hint)(**known)
     if origin is not None:  # a mapping
-        return {key: _decode(arms[1], item, arrays) for key, item in value.items()}
+        return {key: _decode(arms[1], item, arrays, finite) for key, item in value.items()}
+    if finite and hint is float and value is None:
+        raise ValueError("a number is missing")
     return _scalar(hint, value)
 
 

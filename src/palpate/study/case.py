@@ -411,7 +411,7 @@ class Case:
     """
 
     id: str
-    patient: str = ""
+    patient: str = field(default="", metadata=rule(test=bool, wanted="a name, or left out, where the case's id is it"))
     stage: int | None = field(default=None, metadata=rule(between=(0, 1000)))
     seed: int = field(default=0, metadata=SEED)
     images: Images | None = None

@@ -11,13 +11,13 @@ from palpate.findings import Finding
 from palpate.images.checks import later_names
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
+from palpate.images.wall_motion import STILL_VOXELS, wall_motion
 
-__all__ = ["contact_findings", "every_finding", "front_findings", "motion_findings", "sides_findings", "wall_motion"]
+__all__ = ["contact_findings", "every_finding", "front_findings", "motion_findings", "sides_findings"]
 
 BEHIND, IN_FRONT = ("sacrum", "coccyx"), ("prostate", "bladder")  # in every pelvis
 LEAST_OBSERVED = 0.1  # below, an estimate is refused (see observation.observed_surface)
 LITTLE_OBSERVED = 0.5
-STILL_VOXELS = 0.15  # mean motion of a surface, in voxels, that the voxels' own rounding makes
 
 
 def contact_findings(segmentation: Segmentation) -> tuple[Finding, ...]:
@@ -70,21 +70,6 @@ def motion_findings(
     return (Finding("motion-below-noise", text, place=f"to '{name}'"),)
 
 
-def wall_motion(before: Segmentation, after: Segmentation, tissue: int) -> float:
-    """Mean normal motion of a tissue's surface, mm: the volume that it gains and loses, by its area.
-
-    The area is that of the voxels' faces times 2/3, its mean over all directions of a plane (Cauchy).
-    """
-    lost = _outside(before, after, tissue) * before.grid.voxel_volume
-    gained = _outside(after, before, tissue) * after.grid.voxel_volume
-    faces = 0.0
-    spacing = before.grid.spacing
-    mask = before.mask(tissue)
-    for axis in range(3):
-        faces += np.count_nonzero(np.diff(mask, axis=axis)) * float(np.prod(spacing) / spacing[axis])
-    return float((lost + gained) / max(2.0 / 3.0 * faces, 1e-9))
-
-
 def sides_findings(segmentation: Segmentation, name: str) -> tuple[Finding, ...]:
     """A finding when tissues or labels called left lie to the right (+x, RAS) of their namesakes called right."""
     middles = {called.lower(): place for called, place in _middles(segmentation, ("left", "right"), axis=0).items()}
@@ -121,21 +106,14 @@ def _shared_faces(segmentation: Segmentation) -> NDArray[np.float64]:
     faces = np.zeros((n, n + 1))
     for axis in range(3):
         area = float(np.prod(spacing) / spacing[axis])
-        low = np.take(index, range(index.shape[axis] - 1), axis).ravel().astype(np.int64)
-        high = np.take(index, range(1, index.shape[axis]), axis).ravel().astype(np.int64)
-        differ = low != high
-        both = np.bincount(low[differ] * n + high[differ], minlength=n * n).reshape(n, n)
+        along = np.moveaxis(index, axis, 0)
+        differ = along[1:] != along[:-1]  # few do: only theirs are counted as wide integers
+        low, high = (each[differ].astype(np.int64) for each in (along[:-1], along[1:]))
+        both = np.bincount(low * n + high, minlength=n * n).reshape(n, n)
         faces[:, :n] += area * (both + both.T)
         for end in (0, -1):
             faces[:, n] += area * np.bincount(np.take(index, end, axis).ravel(), minlength=n)
     return faces
-
-
-def _outside(one: Segmentation, other: Segmentation, tissue: int) -> int:
-    """Number of the tissue's voxels in one image that are not its own in the other, within that one's field of view."""
-    index = np.rint(other.grid.index(one.grid.world(np.argwhere(one.mask(tissue)).astype(float)))).astype(np.int64)
-    inside = ((index >= 0) & (index < other.grid.shape)).all(axis=1)
-    return int(np.count_nonzero(other.index[tuple(index[inside].T)] != tissue))
 
 
 def _middles(segmentation: Segmentation, words: Sequence[str], *, axis: int) -> dict[str, float]:
@@ -143,8 +121,7 @@ def _middles(segmentation: Segmentation, words: Sequence[str], *, axis: int) -> 
     found = {called: float(place[axis]) for called, place in segmentation.middles.items()}
     for i, tissue in enumerate(segmentation.tissues):
         if any(word in tissue.name.lower() for word in words) and segmentation.mask(i).any():
-            voxels = np.argwhere(segmentation.mask(i)).mean(axis=0)[None]
-            found[tissue.name] = float(segmentation.grid.world(voxels)[0, axis])
+            found[tissue.name] = float(segmentation.middle(i)[axis])
     return {called: place for called, place in found.items() if any(word in called.lower() for word in words)}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -10,7 +11,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from palpate.images.segmentation import Segmentation
+from palpate.images.surface_alignment import shown_tissues
 from palpate.images.tissue import Role
+from palpate.images.tissue_distance import REACH_MM, window_around
 from palpate.mechanics.solvers.registry import expected_of_size
 from palpate.memory import available_memory, total_memory
 from palpate.mesh import Box, SizeField
@@ -28,6 +31,7 @@ __all__ = [
     "expected_size",
     "expected_tets",
     "free_memory_gb",
+    "image_memory_gb",
     "lack_of_memory",
     "machine_memory_gb",
     "tets_by_edge_length",
@@ -47,6 +51,8 @@ SECONDS_A_CUT = 2.0e-4  # of meshing, for each tetrahedron and each tissue that 
 PARALLEL_SHARE = 0.3  # of the time, that more processors shorten
 FIXED_GB = 0.48
 GB_AN_UNKNOWN = 1.07e-5  # beside the factor, with 90 modes
+BYTES_A_VOXEL = 6.0  # of each image: the tissue of each voxel, and masks
+BYTES_A_DISTANCE = 81.0  # while the distance map of a tissue is made, for each voxel around it
 USUAL_MODES = 90
 OVERHEAD_MODES = 10  # what an unknown costs without any mode, in modes
 SERIES = 30  # right-hand sides beside the modes
@@ -98,6 +104,7 @@ def cost_of_meshes(
     count = processors()
     shorter = 1.0 - PARALLEL_SHARE + PARALLEL_SHARE / count
     took, gigabytes = {stage: FIXED_S.get(stage, 0.0) * shorter for stage in STAGES}, FIXED_GB
+    gigabytes += image_memory_gb(before, n_images=(1 + n_after) * len(meshes))
     for tets, unknowns in meshes:
         _, solving = expected_of_size(unknowns, case.driver.modes + SERIES, solver=solver)
         work = unknowns * modes * max(n_after, 1)
@@ -115,6 +122,15 @@ def cost_of_meshes(
         processors=count,
         stages=took,
     )
+
+
+def image_memory_gb(image: Segmentation, *, n_images: int) -> float:
+    """Memory (GB) that the voxels of so many images like this one take, with the distance maps of one at a time."""
+    tissues = [i for i in shown_tissues(image) if image.mask(i).any()]
+    windows = [window_around(image.mask(i), image.grid, reach_mm=REACH_MM) for i in tissues]
+    sizes = sorted(math.prod(part.stop - part.start for part in window) for window in windows)
+    maps = float(sum(sizes[-processors() :]))  # as many as are made side by side
+    return (BYTES_A_VOXEL * n_images * math.prod(image.grid.shape) + BYTES_A_DISTANCE * maps) / 1e9
 
 
 def expected_tets(case: Case, before: Segmentation, after: tuple[Segmentation, ...]) -> int:

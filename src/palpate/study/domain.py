@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy import ndimage
 
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
@@ -21,5 +22,6 @@ def case_domain(before: Segmentation, case: Case) -> Box:
     if case.domain.extent == "image":
         return box
     shown = [i for i, tissue in enumerate(before.tissues) if tissue.role in (Role.ESTIMATE, Role.DRIVER)]
-    voxels = np.argwhere(np.isin(before.index, shown)).astype(float)
-    return margin_box(box, before.grid.world(voxels), margin_mm=case.domain.margin_mm)
+    organs = np.isin(before.index, shown)
+    outer = np.argwhere(organs & ~ndimage.binary_erosion(organs)).astype(float)  # those inside would be many more
+    return margin_box(box, before.grid.world(outer), margin_mm=case.domain.margin_mm)

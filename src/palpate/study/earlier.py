@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +15,7 @@ from palpate.findings import Finding
 from palpate.study.journal import is_inside
 from palpate.study.outputs import Digests, read_json, sha256_of
 
-__all__ = ["RESULT", "Earlier", "earlier_files", "strange_files", "vouched"]
+__all__ = ["RESULT", "Earlier", "earlier_files", "seal_of", "strange_files", "vouched"]
 
 RESULT = "result.json"
 DOCUMENTS = (RESULT, "mesh.json", "simulation.json", "sensitivity.json")  # each lists the files of its run
@@ -26,6 +29,7 @@ RESULT_FILES = (
     "posterior.nc",
     "stiffness.nii.gz",
 )
+UNSEALED = ("files", "warnings")  # which are added when the files take their places
 FURTHER_MESH = re.compile(r"mesh_\d+\.vtu")
 
 
@@ -65,6 +69,12 @@ def earlier_files(folder: Path, document: str, files: Digests) -> Earlier:
             words = f"tells of an earlier run, whose {', '.join(replaced)} this run has replaced"
             warnings.append(_warning(f"{other} in the output folder {words}"))
     return Earlier(retired, aside, tuple(warnings))
+
+
+def seal_of(document: Mapping[str, Any]) -> str:
+    """SHA-256 (hexadecimal) of what a result.json says, whatever files and warnings stand beside it."""
+    sealed = {key: value for key, value in document.items() if key not in UNSEALED}
+    return hashlib.sha256(json.dumps(sealed, sort_keys=True, allow_nan=False).encode()).hexdigest()
 
 
 def vouched(folder: Path, document: str) -> tuple[str, ...]:

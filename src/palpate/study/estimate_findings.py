@@ -53,12 +53,14 @@ def inversion_findings(inversion: Inversion, covariance: NDArray[np.float64]) ->
                 " whether they are minima at all",
             )
         )
+    left = sum(c.minimum.outcome is Outcome.NOT_FOLLOWED for c in inversion.candidates)
+    unknown = f", but for {left} that could not be followed under the law (log.txt says why)" if left else ""
     if len(inversion.candidates) - len(lost) > 1:
         findings.append(
             Finding(
                 "several-minima",
                 "the starts ended in different minima; the best fit under one noise model is reported, and the"
-                " intervals reach over all that fit nearly as well",
+                f" intervals reach over all that fit nearly as well{unknown}",
             )
         )
     sd = np.sqrt(np.diag(covariance))

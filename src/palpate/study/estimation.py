@@ -18,6 +18,7 @@ from palpate.inversion import (
     Linearisation,
     Outcome,
     StartRun,
+    as_good,
     ratio_of_eta,
 )
 from palpate.mesh.voxelise import voxelise
@@ -25,7 +26,7 @@ from palpate.observation.contract import Fit, Imaged, OfInstrument
 from palpate.progress import Progress, silent
 from palpate.study.discrepancy import FoundDiscrepancy, discrepancy_findings, discrepancy_of
 from palpate.study.estimate_findings import data_findings, fold_findings, inversion_findings, pair_findings
-from palpate.study.poisson_ratios import PoissonRatioEstimate, no_ratio, ratio_verdict
+from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio, ratio_verdict
 from palpate.study.samples import CHAINS, ModulusSamples, draw_moduli, sample_findings
 from palpate.study.together import ImagePairs, ModulusRegion, combinations_of, image_pairs_of, regions_of
 from palpate.uncertainty import (
@@ -37,6 +38,7 @@ from palpate.uncertainty import (
     ModulusInterval,
     covariance_of,
     frozen_posterior,
+    grid_errors,
     information,
     information_shares,
     log_interval,
@@ -59,7 +61,6 @@ __all__ = [
 
 GRID_DRAWS = 8
 IDENTIFIED, WEAK = 4.0, 10.0  # largest ratio of an interval's ends: a factor of 2 to each side, and of 3.2
-AS_GOOD = 0.05  # of the objective: another minimum that is worse by less cannot be excluded
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,9 +98,9 @@ class ModulusEstimate:
     """Young's modulus of one tissue, in `unit` (kPa, or a ratio to `relative_to`), with its 95 % interval.
 
     interval95: what is believed with all of the model's discrepancies unknown, by which the verdict is told;
-    interval95_given_model: what would be left if the model held. None in an interval is an open end; `value` is None in
-    ratio mode and when nothing converged. variance_shares: of
-    each cause in the variance of ln E; profile: values (kPa, or ratios) with their signed root deviances.
+    interval95_given_model: what would be left if the model held. None: no interval is stated, as of every modulus that
+    is not identified; `value` is None in ratio mode and when nothing converged. variance_shares: of each cause in the
+    variance of ln E; profile: values (kPa, or ratios) with their signed root deviances.
     """
 
     tissue: str
@@ -211,16 +212,17 @@ def conclude(
     objective, minimum = inversion.objective, inversion.minimum
     rng = np.random.default_rng(seed)
     progress(f"intervals: correlation of the residuals, and the model as {GRID_DRAWS} random voxel grids show it")
-    covariance = covariance_of(
-        objective, minimum.evaluation, observed.states, unknowns=minimum.unknowns, draws=GRID_DRAWS, rng=rng
-    )
+    errors = grid_errors(objective, minimum.evaluation, observed.states, draws=GRID_DRAWS, rng=rng)
+    covariance = covariance_of(objective, minimum.evaluation, errors, unknowns=minimum.unknowns)
     progress("intervals: profiles, and the fit of every surface before and after")
-    pairs = image_pairs_of(inversion, settings.bounds)
+    pairs = image_pairs_of(inversion, settings.bounds, errors)
     fixed = frozen_posterior(objective, minimum.unknowns, minimum.evaluation)
     known = _intervals(inversion, fixed, settings.bounds, covariance) if minimum.converged else ()
     estimates = _estimates(inversion, known, covariance, truth)
     of_moduli = covariance.total[: len(estimates), : len(estimates)]
-    regions = regions_of(inversion, fixed, of_moduli, settings.bounds) if minimum.converged else ()
+    stating = {e.tissue for e in estimates if e.verdict != NOT_IDENTIFIED}
+    pairs = pairs and pairs.with_intervals_of(stating)
+    regions = regions_of(inversion, fixed, of_moduli, settings.bounds, tissues=stating)
     drawn = None
     if samples and minimum.converged:
         progress(f"intervals: {samples} samples of the posterior in each of {CHAINS} chains")
@@ -252,7 +254,7 @@ def conclude(
         information=information(of_moduli),
         information_shares=_shares(inversion) if minimum.converged else {},
         discrepancy=found_discrepancy,
-        combinations=combinations_of(inversion, of_moduli, within=IDENTIFIED),
+        combinations=combinations_of(inversion, fixed, of_moduli, settings.bounds, within=IDENTIFIED),
         regions=regions,
         image_pairs=pairs,
         samples=drawn,
@@ -272,7 +274,7 @@ def no_estimate(
         relative_to=relative_to,
         ratio=None,
         ratio_interval95=None,
-        verdict="not identified",
+        verdict=NOT_IDENTIFIED,
         why=why,
         truth=truth,
     )
@@ -294,12 +296,12 @@ def verdict(interval: Interval, *, at_bound: bool, absolute: bool) -> tuple[str,
     """
     low, high = interval
     if at_bound:
-        return "not identified", "the estimate lies at its bound; the images do not hold it back"
+        return NOT_IDENTIFIED, "the estimate lies at its bound; the images do not hold it back"
     if low is None or high is None:
-        return "not identified", "the 95 % interval is open: it reaches beyond the bounds of the search"
+        return NOT_IDENTIFIED, "the 95 % interval is open: it reaches beyond the bounds of the search"
     width = high / low
     if width > WEAK:
-        return "not identified", f"the 95 % interval spans a factor {width:.1f}"
+        return NOT_IDENTIFIED, f"the 95 % interval spans a factor {width:.1f}"
     if not absolute:
         return "ratio only", f"no modulus is known, so only the ratio is determined (within a factor {width:.2f})"
     if width <= IDENTIFIED:
@@ -311,11 +313,13 @@ def _reason(inversion: Inversion) -> str:
     """How the estimate ended, and what became of the starts."""
     converged = sum(start.minimum.converged for start in inversion.starts)
     distinct = {s.candidate for s in inversion.starts if s.minimum.converged}
-    lost = sum(candidate.minimum.outcome is Outcome.NO_EQUILIBRIUM for candidate in inversion.candidates)
+    outcomes = [candidate.minimum.outcome for candidate in inversion.candidates]
+    lost, left = outcomes.count(Outcome.NO_EQUILIBRIUM), outcomes.count(Outcome.NOT_FOLLOWED)
     return (
         f"{inversion.minimum.outcome.value}; {converged} of {len(inversion.starts)} starts converged,"
         f" to {len(distinct)} distinct {'minimum' if len(distinct) == 1 else 'minima'}"
         + (f", {lost} of which {'has' if lost == 1 else 'have'} no equilibrium under the law" if lost else "")
+        + (f", {left} of which could not be followed under the law" if left else "")
     )
 
 
@@ -331,14 +335,14 @@ class _Known:
 def _intervals(inversion: Inversion, fixed: LeastSquares, bounds: Bounds, covariance: Covariance) -> tuple[_Known, ...]:
     n = inversion.objective.n_parameters
     found, variances, at_bound = [], np.diag(covariance.total), bounds.reached(inversion.minimum.unknowns[:n])
-    # Voxels make the objective rough by some hundredths of it: its value alone cannot choose between such minima.
     best = inversion.candidates[inversion.best]
     others = [c for c in inversion.candidates if c is not best and c.minimum.converged]
-    good = [c.minimum.unknowns for c in others if c.value <= (1.0 + AS_GOOD) * best.value]
+    scales = np.diag(inversion.minimum.evaluation.covariance_columns(n)[:n]) / variances  # of a profile's deviance
     for i in range(n):
         limits = {"lower": float(np.exp(bounds.lower[i])), "upper": float(np.exp(bounds.upper[i]))}
         own = modulus_interval(fixed, inversion.minimum, i, variance=float(variances[i]), bounds=bounds)
         sd = float(np.sqrt(variances[i]))
+        good = [c.minimum.unknowns for c in others if as_good(c.value, best.value, scale=float(scales[i]))]
         interval = hull([own.ends, *(log_interval(float(np.exp(x[i])), sd, **limits) for x in good)])
         found.append(_Known(own, interval, bool(at_bound[i])))
     return tuple(found)
@@ -367,23 +371,29 @@ def _estimates(
         word, why = verdict(of.interval, at_bound=of.at_bound, absolute=mapping.absolute)
         points = zip(unit * np.exp(of.own.profile.theta), of.own.profile.root, strict=True)
         inside = log_interval(ratio, float(np.sqrt(given[i])), lower=low or 0.0, upper=high or np.inf)
-        within = tuple(unit * end if end else None for end in (inside[0] or low, inside[1] or high))
+        within = (inside[0] or low, inside[1] or high)
         found.append(
             replace(
                 nothing,
                 interval_kind=of.own.kind,
-                interval95_given_model=(within[0], within[1]),
+                interval95_given_model=_stated(within, word, unit),
                 variance_shares=covariance.shares(i),
                 profile=tuple((float(value), float(root)) for value, root in points),
                 value=ratio * scale if mapping.absolute else None,
-                interval95=(low and low * scale, high and high * scale) if mapping.absolute else None,
+                interval95=_stated(of.interval, word, scale) if mapping.absolute else None,
                 ratio=None if mapping.by_load else ratio,
-                ratio_interval95=None if mapping.by_load else of.interval,
+                ratio_interval95=None if mapping.by_load else _stated(of.interval, word),
                 verdict=word,
                 why=why,
             )
         )
     return tuple(found)
+
+
+def _stated(interval: Interval, word: str, unit: float = 1.0) -> Interval | None:
+    """The interval, times a unit, that a verdict lets stand: of what is not identified there is none."""
+    low, high = interval
+    return None if word == NOT_IDENTIFIED else (low and low * unit, high and high * unit)
 
 
 def _ratios(inversion: Inversion, known: Sequence[_Known], covariance: Covariance) -> tuple[PoissonRatioEstimate, ...]:
@@ -402,7 +412,7 @@ def _ratios(inversion: Inversion, known: Sequence[_Known], covariance: Covarianc
             replace(
                 nothing,
                 value=open_.ratio(inversion.minimum.unknowns),
-                interval95=(low, high),
+                interval95=_stated((low, high), word),
                 interval_kind=of.own.kind,
                 verdict=word,
                 why=why,

@@ -82,7 +82,7 @@ def _value(hint: Any, bounds: Rule) -> dict[str, Any]:
     if bounds.choices:
         value = {"enum": list(bounds.choices)}
     elif hint in (str, Path):
-        value["maxLength"] = MOST_LETTERS
+        value |= {"maxLength": MOST_LETTERS} | ({"minLength": 1} if bounds.test else {})
     if bounds.between:
         value |= {"minimum": bounds.between[0], "maximum": bounds.between[1]}
     return value | ({"description": bounds.wanted} if bounds.wanted and not bounds.test else {})

@@ -12,15 +12,23 @@ from palpate.mesh.space import LagrangeSpace
 from palpate.study.case import RATIO_SD, Case
 from palpate.uncertainty import Interval
 
-__all__ = ["PoissonRatioEstimate", "no_ratio", "ratio_verdict", "with_found_ratios", "with_stated_priors"]
+__all__ = [
+    "NOT_IDENTIFIED",
+    "PoissonRatioEstimate",
+    "no_ratio",
+    "ratio_verdict",
+    "with_found_ratios",
+    "with_stated_priors",
+]
 
+NOT_IDENTIFIED = "not identified"  # the verdict of what has no interval
 IDENTIFIED, WEAK = 0.05, 0.2  # largest width of an interval; soft tissue is usually given 0.40 to 0.49
 BELIEVED = 0.8  # of the prior's standard deviation: one that is not below it is the prior's
 
 
 @dataclass(frozen=True, slots=True)
 class PoissonRatioEstimate:
-    """Poisson's ratio of one tissue, dimensionless, with its 95 % interval; None in an interval is an open end.
+    """Poisson's ratio of one tissue, dimensionless, with its 95 % interval; None of what is not identified.
 
     value: None when nothing converged; variance_shares: of each cause in the variance of eta = ln(lambda / mu);
     profile: ratios with their signed root deviances.
@@ -38,7 +46,7 @@ class PoissonRatioEstimate:
 
 def no_ratio(tissue: str, *, why: str) -> PoissonRatioEstimate:
     """The entry of a tissue when nothing converged: no value that could be taken for a result."""
-    return PoissonRatioEstimate(tissue, None, None, "linearised", "not identified", why)
+    return PoissonRatioEstimate(tissue, None, None, "linearised", NOT_IDENTIFIED, why)
 
 
 def with_stated_priors(parameters: ParameterMap, case: Case) -> ParameterMap:
@@ -62,14 +70,14 @@ def ratio_verdict(interval: Interval, *, at_bound: bool, of_prior: float) -> tup
     """
     low, high = interval
     if at_bound:
-        return "not identified", "the estimate lies at the end of the search; the images do not hold it back"
+        return NOT_IDENTIFIED, "the estimate lies at the end of the search; the images do not hold it back"
     if of_prior >= BELIEVED:
-        return "not identified", "the interval is that of the stated prior: the images add little to it"
+        return NOT_IDENTIFIED, "the interval is that of the stated prior: the images add little to it"
     if low is None or high is None:
-        return "not identified", "the 95 % interval is open: it reaches beyond the ends of the search"
+        return NOT_IDENTIFIED, "the 95 % interval is open: it reaches beyond the ends of the search"
     width = f"the 95 % interval is {high - low:.2g} wide"
     if high - low > WEAK:
-        return "not identified", width
+        return NOT_IDENTIFIED, width
     if high - low > IDENTIFIED:
         return "weak", f"{width}; a larger motion, or poisson_ratio_sd where something is known, narrows it"
     return "identified", width

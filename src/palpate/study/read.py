@@ -26,6 +26,7 @@ from palpate.study.body import ImagedStates, aligned
 from palpate.study.case import Case, CaseTissue
 from palpate.study.meshed_body import mesh_states
 from palpate.study.provenance import file_digest
+from palpate.study.refusals import refuse_large
 from palpate.study.schema import nearest, shown
 
 __all__ = ["measured", "phantom_scene", "read_pairs", "read_segmentation", "read_states"]
@@ -70,7 +71,9 @@ def read_segmentation(
     grey = _grey(case, path) if format_of(path).read_on is not None else None  # for files that may lack their grid
     grid = read_intensities(grey)[1] if grey is not None else None
     image = _with_body(read_label_image(path, names=names, grid=grid), case, path)
-    return segment(image, case.resolve_tissues(image.names) if tissues is None or image.names else tissues)
+    found = segment(image, case.resolve_tissues(image.names) if tissues is None or image.names else tissues)
+    refuse_large(found, path)
+    return found
 
 
 def _grey(case: Case, path: Path) -> Path | None:
@@ -90,7 +93,8 @@ def _with_body(image: LabelImage, case: Case, path: Path) -> LabelImage:
     if grey is not None:
         body &= ~outside_body(*read_intensities(grey), image.grid)
     claimed = [label for tissue in case.resolve_tissues(image.names) for label in tissue.labels]
-    return replace(image, labels=np.where(body, 1 + max(int(image.labels.max()), *claimed), image.labels))
+    number = 1 + max(int(image.labels.max()), *claimed)
+    return replace(image, labels=np.where(body, np.int32(number), image.labels))
 
 
 def phantom_scene(case: Case) -> Scene:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from scipy import ndimage
 
-from palpate.errors import GeometryError, InputDataError
+from palpate.errors import GeometryError, InputDataError, ResourceError
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
+from palpate.study.cost import image_memory_gb, machine_memory_gb
 
-__all__ = ["refuse_lost", "refuse_unmeshable"]
+__all__ = ["refuse_large", "refuse_lost", "refuse_unmeshable"]
 
 SMALLEST_VOXELS = 50
 VOLUME_IMPLAUSIBLE = 0.30  # of an organ: no deformation, and hardly a filling, changes so much
@@ -39,6 +42,17 @@ def refuse_unmeshable(segmentation: Segmentation, name: str) -> None:
             )
 
 
+def refuse_large(segmentation: Segmentation, path: Path) -> None:
+    """Raise `ResourceError` when this machine has not the memory for two images as large as that of the file `path`."""
+    needed, has = image_memory_gb(segmentation, n_images=2), machine_memory_gb()
+    if has is not None and needed > has:
+        raise ResourceError(
+            f"'{path}' has {' x '.join(map(str, segmentation.grid.shape))} voxels: a pair of such images and the"
+            f" distances to its organs would take about {needed:.1f} GB of memory, and this machine has {has:.1f} GB;"
+            " crop the images to the organs, or resample the labels to larger voxels"
+        )
+
+
 def refuse_lost(before: Segmentation, after: Segmentation, name: str) -> None:
     """Raise `InputDataError` when an `estimate` tissue cannot be the same organ in the image called `name`.
 
@@ -55,8 +69,7 @@ def refuse_lost(before: Segmentation, after: Segmentation, name: str) -> None:
                 f" mL) to '{name}' ({after.volume(i) / 1e3:.4g} mL), which no deformation of one organ does: check"
                 " that the label means the same in both images, or give a hollow organ the role driver"
             )
-        middles = [s.grid.world(np.argwhere(s.mask(i)).mean(axis=0)[None])[0] for s in (before, after)]
-        shift = float(np.linalg.norm(middles[1] - middles[0]))
+        shift = float(np.linalg.norm(after.middle(i) - before.middle(i)))
         size = float((6.0 * before.volume(i) / np.pi) ** (1.0 / 3.0))
         if shift > size:
             raise InputDataError(

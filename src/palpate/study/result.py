@@ -22,7 +22,7 @@ from palpate.study.case import Case, CaseTissue
 from palpate.study.case_text import case_tables
 from palpate.study.discrepancy import FoundDiscrepancy
 from palpate.study.estimation import Estimation, ModulusEstimate, TissueFit, no_estimate
-from palpate.study.poisson_ratios import PoissonRatioEstimate, no_ratio
+from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio
 
 __all__ = [
     "SCHEMA",
@@ -334,7 +334,7 @@ def _estimate(item: ModulusEstimate, status: str) -> dict[str, Any]:
     document = _plain(item)
     if status != "converged":
         document |= dict.fromkeys(("value", "interval95", "interval95_given_model", "ratio", "ratio_interval95"))
-        document["verdict"] = "not identified"
+        document["verdict"] = NOT_IDENTIFIED
     return document
 
 
@@ -343,7 +343,7 @@ def _ratio(item: PoissonRatioEstimate, status: str) -> dict[str, Any]:
     document = _plain(item) | {"parameter": "poisson_ratio", "unit": "1", "relative_to": "", "truth": None}
     document |= dict.fromkeys(("ratio", "ratio_interval95"))
     if status != "converged":
-        document |= dict.fromkeys(("value", "interval95")) | {"verdict": "not identified"}
+        document |= dict.fromkeys(("value", "interval95")) | {"verdict": NOT_IDENTIFIED}
     return document
 
 

@@ -207,7 +207,10 @@ def _convert_table(kind: Any, value: object, place: _Place) -> object:
 
 def _convert_tuple(arms: tuple[Any, ...], value: object, place: _Place) -> object:
     kind = arms[0]
-    if dataclasses.is_dataclass(kind) and isinstance(value, dict):  # [tissues.NAME]: the key is the name
+    named = dataclasses.is_dataclass(kind) and "name" in {field.name for field in dataclasses.fields(kind)}
+    if dataclasses.is_dataclass(kind) and isinstance(value, dict) and not named:
+        raise ConfigurationError(f"{place} is one table, but it must be a list of them: [[{shortened(place.key)}]]")
+    if isinstance(value, dict) and named:  # [tissues.NAME]: the key is the name
         places = {name: _Place(name, place.table, place.folder) for name in value}
         tables = {name: _expect(table, dict, "a table", place=places[name]) for name, table in value.items()}
         for name, table in tables.items():

@@ -45,6 +45,7 @@ def linear_strain_warnings(
             "linear-strains",
             f"{image}: {100 * share:.1f} % of the meshed volume strains by more than {100 * LINEAR_RANGE:.0f} % (99th"
             f" percentile {100 * tail:.0f} %), beyond the range of the linear law, whose moduli can then be wrong by"
-            ' tens of per cent; set [mechanics] law = "neo-hookean"',
+            " tens of per cent and others when the images are exchanged, whatever their intervals; set [mechanics] law"
+            ' = "neo-hookean", with the state that is free of stress (the emptier one) as images.before',
         ),
     )

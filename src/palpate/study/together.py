@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -14,6 +14,7 @@ from palpate.uncertainty import (
     NORMAL_95,
     Agreement,
     Combination,
+    GridErrors,
     agreement,
     joint_region,
     known_pairs,
@@ -27,7 +28,7 @@ MOST_REGIONS = 3  # of the pairs of moduli that are correlated most
 
 @dataclass(frozen=True, slots=True)
 class PairAlone:
-    """What one later image says alone: moduli (kPa, or ratios) with their 95 % intervals.
+    """What one later image says alone: moduli (kPa, or ratios) with their 95 % intervals; nothing without a minimum.
 
     outlier: whether the others contradict it; influence: by how many standard deviations it moves the mean of all;
     noise_mm: standard deviation of its residuals' noise, by the kind of observation.
@@ -54,6 +55,16 @@ class ImagePairs:
     mean: Mapping[str, float]
     mean_interval95: Mapping[str, tuple[float, float]]
 
+    def with_intervals_of(self, tissues: Collection[str]) -> ImagePairs:
+        """The same with intervals of these tissues alone: of a modulus that is not identified none is stated."""
+
+        def kept(intervals: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+            """Of intervals by tissue those that are stated."""
+            return {tissue: ends for tissue, ends in intervals.items() if tissue in tissues}
+
+        alone = tuple(replace(pair, interval95=kept(pair.interval95)) for pair in self.alone)
+        return replace(self, alone=alone, mean_interval95=kept(self.mean_interval95))
+
 
 @dataclass(frozen=True, slots=True)
 class ModulusRegion:
@@ -69,14 +80,19 @@ class ModulusRegion:
     open: bool
 
 
-def image_pairs_of(inversion: Inversion, bounds: Bounds) -> ImagePairs | None:
-    """Of two or more later images of a converged estimate; else None."""
+def image_pairs_of(inversion: Inversion, bounds: Bounds, errors: GridErrors) -> ImagePairs | None:
+    """Of the later images of a converged estimate, where two or more have a minimum alone; else None.
+
+    errors: of the residuals on random grids, see `grid_errors`.
+    """
     mapping = inversion.objective.parameters
     if len(inversion.objective.states) < 2 or not inversion.minimum.converged:
         return None
     scale, names = mapping.scale_kpa, mapping.tissues
-    every, n = pair_estimates(inversion.objective, inversion.minimum, bounds), len(names)
-    pairs = [replace(pair, theta=pair.theta[:n], covariance=pair.covariance[:n, :n]) for pair in every]
+    every = pair_estimates(inversion.objective, inversion.minimum, bounds, errors)
+    if np.count_nonzero(every.converged) < 2:
+        return None
+    pairs = every.of(every.converged, len(names))
     found: Agreement = agreement(pairs)
 
     def stated(
@@ -88,35 +104,48 @@ def image_pairs_of(inversion: Inversion, bounds: Bounds) -> ImagePairs | None:
         low, middle, high = (dict(zip(names, row.tolist(), strict=True)) for row in ends)
         return middle, {name: (low[name], high[name]) for name in names}
 
-    alone = []
-    every_one = zip(pairs, inversion.objective.states, found.outlier.tolist(), found.influence, strict=True)
-    for pair, state, outlier, influence in every_one:
-        values, intervals = stated(pair.theta, pair.covariance)
-        noise = {kind: noise.sd for kind, noise in state.noise.items()}
-        alone.append(PairAlone(values, intervals, outlier, dict(zip(names, influence.tolist(), strict=True)), noise))
+    alone, left = list[PairAlone](), iter(range(len(pairs.theta)))
+    for state, converged in zip(inversion.objective.states, every.converged.tolist(), strict=True):
+        own = PairAlone({}, {}, False, {}, {kind: noise.sd for kind, noise in state.noise.items()})
+        if converged:
+            s = next(left)
+            values, intervals = stated(pairs.theta[s], pairs.covariance[s, :, s])
+            influence = dict(zip(names, found.influence[s].tolist(), strict=True))
+            own = PairAlone(values, intervals, bool(found.outlier[s]), influence, own.noise_mm)
+        alone.append(own)
     mean, mean_interval = stated(found.theta, found.covariance)
     within = dict(zip(names, found.within_cv.tolist(), strict=True))
     return ImagePairs(tuple(alone), found.heterogeneity, within, mean, mean_interval)
 
 
-def combinations_of(inversion: Inversion, covariance: NDArray[np.float64], *, within: float) -> tuple[Combination, ...]:
+def combinations_of(
+    inversion: Inversion, fixed: LeastSquares, covariance: NDArray[np.float64], bounds: Bounds, *, within: float
+) -> tuple[Combination, ...]:
     """Ratios (dimensionless) and geometric means (kPa, or ratios) known within a factor; covariance (n, n) of ln E."""
     mapping = inversion.objective.parameters
     if not inversion.minimum.converged:
         return ()
-    theta = inversion.minimum.unknowns[: len(mapping.tissues)]
     scale = mapping.scale_kpa
-    found = known_pairs(mapping.tissues, theta, covariance, within=within)
+    found = known_pairs(fixed, inversion.minimum, mapping.tissues, covariance, bounds=bounds, within=within)
     return tuple(pair.times(scale) if pair.kind == "geometric mean" else pair for pair in found)
 
 
 def regions_of(
-    inversion: Inversion, fixed: LeastSquares, covariance: NDArray[np.float64], bounds: Bounds
+    inversion: Inversion,
+    fixed: LeastSquares,
+    covariance: NDArray[np.float64],
+    bounds: Bounds,
+    *,
+    tissues: Collection[str],
 ) -> tuple[ModulusRegion, ...]:
-    """Of the pairs of moduli that are correlated most, `MOST_REGIONS` at the most; covariance (n, n) of ln E."""
+    """Of the pairs of `tissues` whose moduli are correlated most, `MOST_REGIONS` at the most.
+
+    covariance (n, n): of ln E. None is stated of a modulus that is not identified.
+    """
     mapping, sd = inversion.objective.parameters, np.sqrt(np.diag(covariance))
     correlated = -np.abs(covariance / np.outer(sd, sd))
-    pairs = sorted(combinations(range(len(mapping.tissues)), 2), key=lambda pair: float(correlated[pair]))
+    stated = [i for i, tissue in enumerate(mapping.tissues) if tissue in tissues]
+    pairs = sorted(combinations(stated, 2), key=lambda pair: float(correlated[pair]))
     found = []
     for pair in pairs[:MOST_REGIONS]:
         within = covariance[np.ix_(pair, pair)]

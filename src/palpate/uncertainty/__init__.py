@@ -4,8 +4,10 @@ from palpate.uncertainty.combinations import Combination, Information, informati
 from palpate.uncertainty.covariance import (
     Covariance,
     FittedState,
+    GridErrors,
     covariance_of,
     gain,
+    grid_errors,
     grid_position_shifts,
     imaging_errors,
     mesh_covariance,
@@ -14,7 +16,7 @@ from palpate.uncertainty.covariance import (
 from palpate.uncertainty.diagnostics import ChainDiagnostics, chain_diagnostics, require_arviz
 from palpate.uncertainty.discretisation import discretisation_sd
 from palpate.uncertainty.frozen_posterior import FrozenPosterior, frozen_posterior
-from palpate.uncertainty.image_pairs import Agreement, PairEstimate, agreement, pair_estimates
+from palpate.uncertainty.image_pairs import Agreement, PairEstimates, agreement, pair_estimates
 from palpate.uncertainty.intervals import NORMAL_95, Interval, ModulusInterval, log_interval, modulus_interval
 from palpate.uncertainty.joint_region import JointRegion, joint_region
 from palpate.uncertainty.profile import FixedCorrespondence, Profile, fixed_correspondence
@@ -42,11 +44,12 @@ __all__ = [
     "FittedState",
     "FixedCorrespondence",
     "FrozenPosterior",
+    "GridErrors",
     "Information",
     "Interval",
     "JointRegion",
     "ModulusInterval",
-    "PairEstimate",
+    "PairEstimates",
     "PosteriorChains",
     "Profile",
     "Shift",
@@ -59,6 +62,7 @@ __all__ = [
     "fixed_correspondence",
     "frozen_posterior",
     "gain",
+    "grid_errors",
     "grid_position_shifts",
     "imaging_errors",
     "information",

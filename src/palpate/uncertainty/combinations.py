@@ -9,8 +9,8 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inversion.objective import Evaluation
-from palpate.uncertainty.intervals import NORMAL_95
+from palpate.inversion import Bounds, Evaluation, LeastSquares, Minimum
+from palpate.uncertainty.intervals import NORMAL_95, modulus_interval
 
 __all__ = ["Combination", "Information", "information", "information_shares", "known_pairs"]
 
@@ -67,22 +67,78 @@ def information_shares(evaluation: Evaluation, n_parameters: int) -> list[dict[s
     return found
 
 
+@dataclass(frozen=True, slots=True)
+class _PairCoordinates:
+    """A least-squares problem whose log-moduli i and j are ln E_i - ln E_j and (ln E_i + ln E_j) / 2 instead."""
+
+    fixed: LeastSquares
+    pair: tuple[int, int]
+
+    @property
+    def n_parameters(self) -> int:
+        """Number of log-moduli among the unknowns."""
+        return self.fixed.n_parameters
+
+    def turn(self, n_unknowns: int) -> NDArray[np.float64]:
+        """T (n_unknowns, n_unknowns): the unknowns x = T y of others y."""
+        turn = np.eye(n_unknowns)
+        turn[np.ix_(self.pair, self.pair)] = [[0.5, 1.0], [-0.5, 1.0]]
+        return turn
+
+    def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
+        """The problem's evaluation at y (n_unknowns,), with its derivatives by y."""
+        turn = self.turn(len(unknowns))
+        there = self.fixed(turn @ unknowns)
+        return replace(
+            there,
+            gradient=turn.T @ there.gradient,
+            score=turn.T @ there.score,
+            matrix=turn.T @ there.matrix @ turn,
+            prior=turn.T @ there.prior @ turn,
+            prior_score=turn.T @ there.prior_score,
+        )
+
+    def at(self, minimum: Minimum) -> Minimum:
+        """A minimum's place y."""
+        turned = np.linalg.solve(self.turn(len(minimum.unknowns)), minimum.unknowns)
+        return replace(minimum, unknowns=np.asarray(turned, dtype=np.float64))
+
+    def between(self, bounds: Bounds) -> Bounds:
+        """The bounds of y that hold those of x."""
+        (i, j), lower, upper = self.pair, bounds.lower.copy(), bounds.upper.copy()
+        lower[i], upper[i] = bounds.lower[i] - bounds.upper[j], bounds.upper[i] - bounds.lower[j]
+        lower[j], upper[j] = 0.5 * (bounds.lower[i] + bounds.lower[j]), 0.5 * (bounds.upper[i] + bounds.upper[j])
+        return Bounds(lower, upper)
+
+
 def known_pairs(
-    names: Sequence[str], theta: NDArray[np.float64], covariance: NDArray[np.float64], *, within: float
+    fixed: LeastSquares,
+    minimum: Minimum,
+    names: Sequence[str],
+    covariance: NDArray[np.float64],
+    *,
+    bounds: Bounds,
+    within: float,
 ) -> tuple[Combination, ...]:
     """Ratios and geometric means known within a factor `within` from end to end, of pairs with a modulus that is not.
 
-    theta (n,), covariance (n, n): of the log-moduli of `names`. The factor is exp(2 1.96 s), s^2 = w^T C w with weights
-    w of (1, -1) for the ratio and (1/2, 1/2) for the mean.
+    covariance (n, n): of the log-moduli of `names`, the first unknowns of a `minimum` of `fixed`. Where the ellipse is
+    so narrow, with a standard deviation of s^2 = w^T C w and weights w of (1, -1) for the ratio and (1/2, 1/2) for the
+    mean, the interval is that of the combination's profile: where one of the moduli is wide, the ellipse is least true.
+    Raises `SolverError` and `EstimationError` as `gauss_newton` does.
     """
     found, widest = [], np.log(within) / (2.0 * NORMAL_95)
     for i, j in combinations(range(len(names)), 2):
         if max(covariance[i, i], covariance[j, j]) <= widest**2:
             continue
-        for kind, weights in (("ratio", np.array([1.0, -1.0])), ("geometric mean", np.array([0.5, 0.5]))):
-            sd = float(np.sqrt(weights @ covariance[np.ix_([i, j], [i, j])] @ weights))
-            if sd <= widest:
-                middle = float(weights @ theta[[i, j]])
-                low, high = (float(np.exp(middle + sign * NORMAL_95 * sd)) for sign in (-1.0, 1.0))
-                found.append(Combination((names[i], names[j]), kind, float(np.exp(middle)), (low, high)))
+        pair = _PairCoordinates(fixed, (i, j))
+        for number, kind, weights in ((i, "ratio", [1.0, -1.0]), (j, "geometric mean", [0.5, 0.5])):
+            variance = float(weights @ covariance[np.ix_([i, j], [i, j])] @ weights)
+            if variance > widest**2:
+                continue
+            there, limits = pair.at(minimum), pair.between(bounds)
+            low, high = modulus_interval(pair, there, number, variance=variance, bounds=limits).ends
+            if low is not None and high is not None and high / low <= within:
+                value = float(np.exp(there.unknowns[number]))
+                found.append(Combination((names[i], names[j]), kind, value, (low, high)))
     return tuple(found)

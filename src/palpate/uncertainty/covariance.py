@@ -27,14 +27,23 @@ from palpate.uncertainty.discretisation import discretisation_sd
 __all__ = [
     "Covariance",
     "FittedState",
+    "GridErrors",
+    "beyond",
     "covariance_of",
     "error_noise",
     "gain",
+    "grid_errors",
     "grid_position_shifts",
     "imaging_errors",
     "mesh_covariance",
+    "noise_covariance",
     "sandwich_covariance",
+    "scatter",
+    "shifts_by",
 ]
+
+GridErrors = Sequence[Sequence[NDArray[np.float64]]]
+"""Errors (n,) mm of the residuals of each observation, of each draw of a grid."""
 
 ROUNDING = 1e-9  # of a variance
 MARGIN_MM, MARGIN_VOXELS = 12.0, 8.0  # around the residuals' places, further than a distance map there is smoothed
@@ -65,8 +74,9 @@ class Covariance:
 
     Parameters are the log-moduli, then eta = ln(lambda / mu) of Poisson's ratios that are sought. noise: of the
     residuals; prior: what is believed of all unknowns, of which `causes` are the parts by the cause of their block;
-    grid: the place of the voxels; mesh: what another mesh would make of it (of Young's moduli). given_model: all that
-    would be left if frame, drawing and material were as the model has them, and only the drivers' motion unknown.
+    grid: the place of the voxels, as far as it is not in the noise of the residuals, which voxels round; mesh: what
+    another mesh would make of it (of Young's moduli). given_model: all that would be left if frame, drawing and
+    material were as the model has them, and only the drivers' motion unknown.
     """
 
     noise: NDArray[np.float64]
@@ -90,27 +100,20 @@ class Covariance:
 
 
 def covariance_of(
-    objective: Objective,
-    evaluation: Evaluation,
-    states: tuple[FittedState, ...],
-    *,
-    unknowns: NDArray[np.float64],
-    draws: int,
-    rng: np.random.Generator,
+    objective: Objective, evaluation: Evaluation, errors: GridErrors, *, unknowns: NDArray[np.float64]
 ) -> Covariance:
     """All that is known of the log-moduli's errors at unknowns (n_unknowns,).
 
-    The sandwich, what is considered or undecided, the scatter over so many grid positions, the mesh.
+    The sandwich, what is considered or undecided, the mesh, and the scatter over grid positions by the `errors` there,
+    where that is more than the noise: residuals are rounded by voxels, too.
     """
     noise_of, mesh = error_noise(evaluation), mesh_covariance(objective)
-    errors = mapped(lambda own: imaging_errors(objective, evaluation, states, rng=own), rng.spawn(draws))
     given = _given_model(objective, evaluation)
 
     def parts(of: Evaluation) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Covariances by noise, prior and grid of one set of unknowns."""
         noise, prior = _sandwich(objective, of, noise_of)
-        shifts = _shifts(of, errors, objective.n_parameters)
-        return noise, prior, shifts.T @ shifts / len(shifts)
+        return noise, prior, beyond(scatter(shifts_by(of, errors, objective.n_parameters)), noise)
 
     noise, prior, grid = parts(evaluation)
     further = [_considered(objective, evaluation), undecided_covariance(objective, evaluation, unknowns)]
@@ -211,9 +214,22 @@ def _sandwich(
     """Its two parts, (n_parameters, n_parameters) each: by the residuals, and by the prior."""
     n = objective.n_parameters
     inverse = evaluation.covariance_columns(n)
+    data = noise_covariance(objective, list(zip(evaluation.lines, gain(evaluation, n), strict=True)), noise_of)
+    return data, np.asarray(inverse.T @ evaluation.prior @ inverse)
+
+
+def noise_covariance(
+    objective: Objective,
+    pairs: Sequence[tuple[Linearisation, NDArray[np.float64]]],
+    noise_of: Mapping[tuple[int, str], NoiseModel],
+) -> NDArray[np.float64]:
+    """G C G^T (n, n) by the residuals' errors, of observations with their gains G (n, n_residuals), 1/mm.
+
+    See `sandwich_covariance`.
+    """
+    n = len(pairs[0][1])
     data = np.zeros((n, n))
-    pairs = list(zip(evaluation.lines, gain(evaluation, n), strict=True))
-    for kind in dict.fromkeys(line.observation.kind for line in evaluation.lines):
+    for kind in dict.fromkeys(line.observation.kind for line, _ in pairs):
         of_kind = [(line, row) for line, row in pairs if line.observation.kind == kind]
         later = [line.state for line, _ in of_kind]
         for groups, at_rest in ((later, False), ([objective.states[s].reference for s in later], True)):
@@ -221,7 +237,7 @@ def _sandwich(
                 group = [pair for pair, own in zip(of_kind, groups, strict=True) if own == key]
                 noise = mean_noise([noise_of[line.state, kind] for line, _ in group])
                 data += 0.5 * _propagated(noise, group, at_rest=at_rest)
-    return data, np.asarray(inverse.T @ evaluation.prior @ inverse)
+    return data
 
 
 def error_noise(evaluation: Evaluation) -> dict[tuple[int, str], NoiseModel]:
@@ -277,16 +293,46 @@ def grid_position_shifts(
 ) -> NDArray[np.float64]:
     """Shifts (draws, n_parameters) of the estimated log-moduli when an exact model is imaged on random grids.
 
-    The errors e of the residuals (see `imaging_errors`) go through the gain of one Gauss-Newton step, -G e. Every draw
-    has a generator of its own, so that they can be made side by side.
+    The errors e of the residuals (see `grid_errors`) go through the gain of one Gauss-Newton step, -G e.
     """
-    errors = mapped(lambda own: imaging_errors(objective, evaluation, states, rng=own), rng.spawn(draws))
-    return _shifts(evaluation, errors, objective.n_parameters)
+    errors = grid_errors(objective, evaluation, states, draws=draws, rng=rng)
+    return shifts_by(evaluation, errors, objective.n_parameters)
 
 
-def _shifts(
-    evaluation: Evaluation, errors: Sequence[Sequence[NDArray[np.float64]]], n_parameters: int
-) -> NDArray[np.float64]:
+def grid_errors(
+    objective: Objective,
+    evaluation: Evaluation,
+    states: tuple[FittedState, ...],
+    *,
+    draws: int,
+    rng: np.random.Generator,
+) -> GridErrors:
+    """Errors e (n,) mm of the residuals of each observation, on so many random grids (see `imaging_errors`).
+
+    Every draw has a generator of its own, so that they can be made side by side.
+    """
+    return mapped(lambda own: imaging_errors(objective, evaluation, states, rng=own), rng.spawn(draws))
+
+
+def scatter(shifts: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Covariance (n, n) by the grid's place of shifts (draws, n) that are errors themselves: about 0, not their mean.
+
+    A mean of few squares is a variance that is itself uncertain: an error under it has Student's law, with as many
+    degrees of freedom as draws, whose variance is draws / (draws - 2) times that mean.
+    """
+    return np.asarray(shifts.T @ shifts / (len(shifts) - 2))
+
+
+def beyond(covariance: NDArray[np.float64], known: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What a covariance (n, n) has in excess of what is `known` (n, n) already: the positive part of their difference.
+
+    With it the latter is at least as large as each of the two in every direction.
+    """
+    sizes, axes = np.linalg.eigh(covariance - known)
+    return np.asarray((axes * np.maximum(sizes, 0.0)) @ axes.T)
+
+
+def shifts_by(evaluation: Evaluation, errors: GridErrors, n_parameters: int) -> NDArray[np.float64]:
     """Shifts -G e (draws, n_parameters) of the log-moduli by errors e (n,) mm of each surface, of each draw."""
     rows = gain(evaluation, n_parameters)
     moved = [-sum((row @ e for row, e in zip(rows, of, strict=True)), np.zeros(n_parameters)) for of in errors]

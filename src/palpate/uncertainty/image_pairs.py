@@ -1,4 +1,8 @@
-"""What every image pair of a joint estimate says alone: whether they agree, which one does not, how they scatter."""
+"""What every image pair of a joint estimate says alone: whether they agree, which one does not, how they scatter.
+
+Pairs of one patient are not independent: later images that share a rest image share its noise and its mesh, and all
+share the prior of what they have in common. So their estimates have one covariance, and one that is joint.
+"""
 
 from __future__ import annotations
 
@@ -9,23 +13,46 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from palpate.inversion import Bounds, Minimum, Objective, gauss_newton
-from palpate.uncertainty.covariance import sandwich_covariance
+from palpate.inversion import Bounds, Evaluation, Minimum, Objective, gauss_newton
+from palpate.observation.noise_model import NoiseModel
+from palpate.uncertainty.covariance import (
+    GridErrors,
+    beyond,
+    error_noise,
+    gain,
+    mesh_covariance,
+    noise_covariance,
+    scatter,
+    shifts_by,
+)
+from palpate.uncertainty.intervals import NORMAL_95
 from palpate.uncertainty.profile import fixed_correspondence
 
-__all__ = ["Agreement", "PairEstimate", "agreement", "pair_estimates"]
+__all__ = ["Agreement", "PairEstimates", "agreement", "pair_estimates"]
 
 OUTLIER = 0.01  # probability, over all pairs together, of calling one an outlier that is none
+MOST_OUTLIERS = 4  # one of so many: where more contradict the others the pairs differ, and none is wrong
 LEAST_PAIRS = 3  # of two that differ nobody can say which is wrong
+BETWEEN_GRIDS = (
+    0.5  # of what few draws say of two pairs together: all of it would leave combinations without a variance
+)
 
 
 @dataclass(frozen=True, slots=True)
-class PairEstimate:
-    """Log-moduli theta (n,) with covariance (n, n) from one later image alone; converged: whether it has a minimum."""
+class PairEstimates:
+    """Log-moduli theta (n_pairs, n) from each later image alone, and whether each has a minimum, converged (n_pairs,).
+
+    covariance (n_pairs, n, n_pairs, n): of all of them together.
+    """
 
     theta: NDArray[np.float64]
     covariance: NDArray[np.float64]
-    converged: bool
+    converged: NDArray[np.bool_]
+
+    def of(self, pairs: NDArray[np.bool_], n: int) -> PairEstimates:
+        """Those of some pairs (n_pairs,) of the first n parameters."""
+        covariance = self.covariance[pairs][:, :n][:, :, pairs][..., :n]
+        return PairEstimates(self.theta[pairs, :n], covariance, self.converged[pairs])
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,87 +73,162 @@ class Agreement:
     covariance: NDArray[np.float64]
 
 
-def pair_estimates(objective: Objective, minimum: Minimum, bounds: Bounds) -> tuple[PairEstimate, ...]:
+def pair_estimates(objective: Objective, minimum: Minimum, bounds: Bounds, errors: GridErrors) -> PairEstimates:
     """The estimate of each later state alone, near the joint `minimum`: with its closest points, weights and prior.
 
-    Nothing is solved; the approximations of the joint estimate stand. Raises `EstimationError` where a state alone
-    leaves a driver's motion open.
+    errors: of the residuals on random grids (see `grid_errors`). Nothing is solved; the approximations of the joint
+    estimate stand. Raises `EstimationError` where a state alone leaves a driver's motion open.
     """
-    n, estimates = objective.n_parameters, []
+    n, found, owns = objective.n_parameters, list[Minimum](), list[NDArray[np.int64]]()
     for s, state in enumerate(objective.states):
         parameters, own = objective.parameters.alone(s)
-        alone = Objective((state,), parameters)
         seen = [line for line in minimum.evaluation.lines if line.state == s]
         lines = tuple(replace(line, state=0, columns=np.searchsorted(own, line.columns)) for line in seen)
         start = minimum.unknowns[own]
-        fixed = fixed_correspondence(alone, start, replace(minimum.evaluation, lines=lines))
-        found = gauss_newton(fixed, start, bounds=bounds, tolerance=1e-4)
-        covariance = sandwich_covariance(alone, found.evaluation)
-        estimates.append(PairEstimate(found.unknowns[:n], covariance, found.converged))
-    return tuple(estimates)
+        evaluation = replace(minimum.evaluation, lines=lines)
+        fixed = fixed_correspondence(Objective((state,), parameters), start, evaluation)
+        found.append(gauss_newton(fixed, start, bounds=bounds, tolerance=1e-4))
+        owns.append(own)
+    covariance = _joint_covariance(objective, [of.evaluation for of in found], owns, errors)
+    theta = np.stack([of.unknowns[:n] for of in found])
+    return PairEstimates(theta, covariance, np.array([of.converged for of in found]))
 
 
-def agreement(pairs: Sequence[PairEstimate]) -> Agreement:
+def _joint_covariance(
+    objective: Objective, alone: Sequence[Evaluation], owns: Sequence[NDArray[np.int64]], errors: GridErrors
+) -> NDArray[np.float64]:
+    """Covariance (n_pairs, n, n_pairs, n) of the estimates of each state alone, by their evaluations.
+
+    owns: numbers (n_own,) of each one's unknowns among all. With the gains G_s of the residuals and H_s^-1 of each: by
+    the noise, of which half is the rest image's, which those of one reference share, G_s C_st G_t^T; by the prior,
+    H_s^-1 P_st H_t^-1, which counts once of what they have in common; by what is considered; by the place of the grid,
+    where that is more than the noise; and by the mesh, which those of one reference share.
+    """
+    n, n_pairs, mapping = objective.n_parameters, len(alone), objective.parameters
+    size, pairs, noise = n * n_pairs, [], dict[tuple[int, str], NoiseModel]()
+    answers = np.zeros((mapping.n_unknowns, size))  # H_s^-1 e_i, side by side
+    considered = np.zeros((mapping.n_unknowns, size))  # J_b^T W J H_s^-1 e_i
+    shifts, mesh = list[NDArray[np.float64]](), np.zeros((n_pairs, n, n_pairs, n))
+    references = [state.reference for state in objective.states]
+    for s, (evaluation, own) in enumerate(zip(alone, owns, strict=True)):
+        inverse, columns = evaluation.covariance_columns(n), slice(s * n, (s + 1) * n)
+        answers[own, columns] = inverse
+        considered[own, columns] = (evaluation.matrix - evaluation.prior) @ inverse
+        noise |= {(s, kind): model for (_, kind), model in error_noise(evaluation).items()}
+        for line, rows in zip(evaluation.lines, gain(evaluation, n), strict=True):
+            placed = np.zeros((size, rows.shape[1]))
+            placed[columns] = rows
+            pairs.append((replace(line, state=s), placed))
+        seen = [i for i, line in enumerate(_lines(objective)) if line == s]
+        shifts.append(shifts_by(evaluation, [[draw[i] for i in seen] for draw in errors], n))
+        of_mesh = mesh_covariance(replace(objective, states=(objective.states[s],)))
+        for t in range(n_pairs):
+            mesh[s, :, t] += of_mesh if references[s] == references[t] else 0.0
+    by_noise = noise_covariance(objective, pairs, noise)
+    total = by_noise + answers.T @ mapping.prior_matrix @ answers
+    for i, block in enumerate(mapping.blocks):
+        if block.considered:
+            of_block = considered[mapping.columns(i)]
+            total += of_block.T @ np.linalg.solve(block.precision, of_block)
+    itself = np.kron(np.eye(n_pairs), np.ones((n, n)))
+    grid = scatter(np.concatenate(shifts, axis=1)) * (BETWEEN_GRIDS + (1.0 - BETWEEN_GRIDS) * itself)
+    return np.asarray((total + beyond(grid, by_noise)).reshape(mesh.shape) + mesh)
+
+
+def _lines(objective: Objective) -> list[int]:
+    """The number of each observation's state, in their order."""
+    return [s for s, state in enumerate(objective.states) for _ in state.observations]
+
+
+def agreement(pairs: PairEstimates) -> Agreement:
     """Outliers, influence, heterogeneity and repeatability of two or more pairs.
 
-    A pair is an outlier when its squared Mahalanobis distance from the weighted mean of the others exceeds the
-    chi-squared quantile of 1 - 0.01 / n_pairs; the worst one goes first, then the rest is asked again, down to two.
-    Heterogeneity: Cochran's Q = sum_p (t_p - t)^T V_p^-1 (t_p - t) against chi-squared with (n_pairs - 1) n degrees of
-    freedom. The mean's covariance is widened by the variance between pairs (DerSimonian & Laird, Controlled Clinical
-    Trials 7 (1986) 177-188, here for each modulus). Within-subject variation: the standard deviation of ln E over pairs
-    as exp(s) - 1 (Bland & Altman, BMJ 313 (1996) 106).
+    The mean is that of generalised least squares under the covariance V of all pairs together. A pair is an outlier
+    when its squared Mahalanobis distance from the mean of the others exceeds the chi-squared quantile of
+    1 - 0.01 / n_pairs; the worst one goes first, then the rest is asked again, down to two; where more than a quarter
+    of them (one at the least) would go, none does. Heterogeneity: Cochran's Q, (t - A m)^T V^-1 (t - A m), against
+    chi-squared with (n_pairs - 1) n degrees of freedom. The mean's covariance is widened by the variance between pairs
+    (DerSimonian & Laird, Controlled Clinical Trials 7 (1986) 177-188, here for each modulus and with V) and, where
+    there is one, so that 1.96 standard deviations reach as far as Student's quantile of so few pairs (Hartung & Knapp,
+    Stat. Med. 20 (2001) 1771-1782). Within-subject variation: the standard deviation of ln E over pairs as exp(s) - 1
+    (Bland & Altman, BMJ 313 (1996) 106).
     """
-    theta, covariance = np.stack([p.theta for p in pairs]), np.stack([p.covariance for p in pairs])
-    kept = np.ones(len(pairs), dtype=bool)
-    limit = special.chdtri(theta.shape[1], OUTLIER / len(pairs))
+    n_pairs, n = pairs.theta.shape
+    theta, joint = pairs.theta.ravel(), pairs.covariance.reshape(n_pairs * n, n_pairs * n)
+    every, kept = np.ones(n_pairs, dtype=bool), np.ones(n_pairs, dtype=bool)
+    limit = special.chdtri(n, OUTLIER / n_pairs)
     while kept.sum() >= LEAST_PAIRS:
-        distances = np.array([_distance(theta, covariance, kept, p) if kept[p] else 0.0 for p in range(len(pairs))])
+        distances = np.array([_distance(theta, joint, kept, p) if kept[p] else 0.0 for p in range(n_pairs)])
         if distances.max() <= limit:
             break
         kept[int(distances.argmax())] = False
-    mean, spread = _mean(theta, covariance, np.ones(len(pairs), dtype=bool))
-    influence = np.stack([(mean - _mean(theta, covariance, _without(p, len(pairs)))[0]) for p in range(len(pairs))])
-    good, own = theta[kept], covariance[kept]
-    centre, _ = _mean(theta, covariance, kept)
-    away = good - centre
-    q = float(np.einsum("pi,pij,pj->", away, np.linalg.inv(own), away))
-    between = _between(good, own)
-    robust, robust_covariance = _mean(good, own + np.diag(between), np.ones(len(good), dtype=bool))
+    if np.count_nonzero(~kept) > max(n_pairs // MOST_OUTLIERS, 1):
+        kept = every
+    weights, spread = _mean(joint, every)
+    without = [_mean(joint, every & _without(p, n_pairs))[0] @ theta for p in range(n_pairs)]
+    good = pairs.of(kept, n)
+    between = _between(good)
+    about = _about_the_mean(good.covariance.reshape(good.theta.size, -1), np.tile(np.eye(n), (len(good.theta), 1)))
+    q = float(good.theta.ravel() @ about @ good.theta.ravel())
+    robust, covariance = _mean(joint + np.diag(np.tile(between, n_pairs)), kept)
+    few = np.where(between > 0.0, special.stdtrit(len(good.theta) - 1, special.ndtr(NORMAL_95)) / NORMAL_95, 1.0)
     return Agreement(
         outlier=~kept,
-        influence=influence / np.sqrt(np.diag(spread)),
-        heterogeneity=float(special.chdtrc(max(good.size - good.shape[1], 1), q)),
-        within_cv=np.expm1(np.std(good, axis=0, ddof=1)),
-        theta=robust,
-        covariance=robust_covariance,
+        influence=(weights @ theta - np.stack(without)) / np.sqrt(np.diag(spread)),
+        heterogeneity=float(special.chdtrc(max(good.theta.size - n, 1), q)),
+        within_cv=np.expm1(np.std(good.theta, axis=0, ddof=1)),
+        theta=robust @ theta,
+        covariance=covariance * np.outer(few, few),
     )
 
 
-def _mean(
-    theta: NDArray[np.float64], covariance: NDArray[np.float64], kept: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Weighted mean (n,) of theta (n_pairs, n) by the inverse of their covariances, and its own, of the pairs kept."""
-    precisions = np.linalg.inv(covariance[kept])
-    spread = np.linalg.inv(precisions.sum(axis=0))
-    return np.asarray(spread @ np.einsum("pij,pj->i", precisions, theta[kept])), np.asarray(spread)
+def _mean(joint: NDArray[np.float64], kept: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Weights (n, n_pairs n) of the generalised least squares mean of the pairs that are kept, its covariance (n, n).
+
+    joint (n_pairs n, n_pairs n): covariance of all pairs together.
+    """
+    n = len(joint) // len(kept)
+    rows = np.repeat(kept, n)
+    design = np.tile(np.eye(n), (int(kept.sum()), 1))
+    pulled = np.linalg.solve(joint[np.ix_(rows, rows)], design).T
+    spread = np.asarray(np.linalg.inv(pulled @ design), dtype=np.float64)
+    weights = np.zeros((n, len(joint)))
+    weights[:, rows] = spread @ pulled
+    return weights, spread
 
 
-def _distance(theta: NDArray[np.float64], covariance: NDArray[np.float64], kept: NDArray[np.bool_], pair: int) -> float:
-    """Squared Mahalanobis distance of a pair from the weighted mean of the others that are kept."""
-    mean, spread = _mean(theta, covariance, kept & _without(pair, len(theta)))
-    away = theta[pair] - mean
-    return float(away @ np.linalg.solve(covariance[pair] + spread, away))
+def _about_the_mean(joint: NDArray[np.float64], design: NDArray[np.float64]) -> NDArray[np.float64]:
+    """P (k, k) of Q = t^T P t, the squared Mahalanobis distance of estimates t (k,) from their mean.
+
+    joint (k, k): their covariance V; design (k, n): A, which of n log-moduli each is; P = V^-1 - V^-1 A (A^T V^-1 A)^-1
+    A^T V^-1.
+    """
+    pulled = np.linalg.solve(joint, design)
+    return np.asarray(np.linalg.inv(joint) - pulled @ np.linalg.solve(design.T @ pulled, pulled.T))
+
+
+def _distance(theta: NDArray[np.float64], joint: NDArray[np.float64], kept: NDArray[np.bool_], pair: int) -> float:
+    """Squared Mahalanobis distance of a pair from the mean of the others that are kept."""
+    away = -_mean(joint, kept & _without(pair, len(kept)))[0]
+    n = len(away)
+    away[:, pair * n : (pair + 1) * n] += np.eye(n)
+    off = away @ theta
+    return float(off @ np.linalg.solve(away @ joint @ away.T, off))
 
 
 def _without(pair: int, n_pairs: int) -> NDArray[np.bool_]:
     return np.asarray(np.arange(n_pairs) != pair)
 
 
-def _between(theta: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Variance (n,) between pairs of each log-modulus, by the method of moments; none below zero."""
-    weights = 1.0 / np.diagonal(covariance, axis1=1, axis2=2)
-    total = weights.sum(axis=0)
-    mean = (weights * theta).sum(axis=0) / total
-    q = (weights * (theta - mean) ** 2).sum(axis=0)
-    scale = total - (weights**2).sum(axis=0) / total
-    return np.asarray(np.maximum((q - (len(theta) - 1)) / scale, 0.0))
+def _between(pairs: PairEstimates) -> NDArray[np.float64]:
+    """Variance (n,) between pairs of each log-modulus, by the method of moments; none below zero.
+
+    Q = t^T P t of one modulus, P = V^-1 - V^-1 1 1^T V^-1 / 1^T V^-1 1, has the mean n_pairs - 1 + variance tr P.
+    """
+    n_pairs, n = pairs.theta.shape
+    found = np.zeros(n)
+    for i in range(n):
+        about = _about_the_mean(pairs.covariance[:, i, :, i], np.ones((n_pairs, 1)))
+        q = float(pairs.theta[:, i] @ about @ pairs.theta[:, i])
+        found[i] = max((q - (n_pairs - 1)) / float(np.trace(about)), 0.0)
+    return found

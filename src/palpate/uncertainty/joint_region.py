@@ -22,7 +22,7 @@ class JointRegion:
     """Boundaries (n_directions, 2) of ln E of the two log-moduli with these `numbers`, once around the estimate.
 
     boundary: by the profile likelihood; ellipse: of the covariance, in the same directions; open: whether the bounds of
-    the search cut the former.
+    the search, or a place that cannot be solved, cut the former.
     """
 
     numbers: tuple[int, int]

@@ -20,6 +20,7 @@ from palpate.mechanics.forward import ForwardModel
 __all__ = ["FixedCorrespondence", "Profile", "Ray", "fixed_correspondence", "profile"]
 
 TRIALS = 12  # points on a ray from the estimate
+TRIES = 3  # at a point, of as many steps as a minimum has
 NEAR = 0.05  # of the level, to which an end is found before a line to the estimate corrects it
 FURTHEST = 2.0  # times the distance of the last point: more is not extrapolated
 
@@ -95,7 +96,8 @@ class Profile:
 
     r^2 = 2 (min J(theta) - min J) / s with the ratio s of its variance to that of the Gauss-Newton matrix: what is
     known of correlated residuals and of the voxels' place counts as in the ellipse, at whose ends r = 1.96 where J is a
-    parabola. low, high: ln E where |r| is the level; None where the search's bound is reached before.
+    parabola. low, high: ln E where |r| is the level; None where the search's bound, or what cannot be solved, is
+    reached before.
     """
 
     theta: NDArray[np.float64]
@@ -147,28 +149,41 @@ class Ray:
         limits = np.where(self.direction > 0.0, self.bounds.upper, self.bounds.lower)
         return float(np.min((limits - theta)[along] / self.direction[along]))
 
+    def _at_its_best(self, start: NDArray[np.float64]) -> Minimum:
+        """All that is not held at its best, sought from unknowns (n,), and once more from where that did not end."""
+        for _ in range(TRIES):
+            found = gauss_newton(self.fixed, start, bounds=self.bounds, held=self.held, tolerance=1e-4)
+            if found.converged:
+                break
+            start = found.unknowns
+        return found
+
     def to_level(self, level: float, *, first: float) -> tuple[list[tuple[float, float]], float | None]:
         """Points (distance, r) on the ray, from the `first` distance on, and where r is the level; None at the bound.
 
         The root deviance is nearly straight: the next point is where a line through the minimum and the last one, or
         through the last two around the level, meets it. A place at which the model cannot be solved ends the search as
-        a bound does.
+        a bound does; so does one where the other unknowns did not come to a minimum and the deviance is above the
+        level, for it may be less there, and the end further off. Where not even the estimate is a minimum under what is
+        held, nothing is known of any end.
         """
         bound, n = self.bound, len(self.direction)
         unknowns, points, inside, outside = self.least.unknowns, list[tuple[float, float]](), (0.0, 0.0), None
         distance = first
-        if bound <= 0.0:
+        if bound <= 0.0 or not self.least.converged:
             return [], None
         for _ in range(TRIALS):
             at_bound, distance = distance >= bound, min(distance, bound)
             start, there = unknowns.copy(), self.least.unknowns[:n] + distance * self.direction
             start[:n][self.held] = there[self.held]
             try:
-                found = gauss_newton(self.fixed, start, bounds=self.bounds, held=self.held, tolerance=1e-4)
+                found = self._at_its_best(start)
             except SolverError:
                 return points, None
             deviance = 2.0 * self.scale * (found.evaluation.value - self.least.evaluation.value)
             root = float(np.sqrt(max(deviance, 0.0)))
+            if not (found.converged or root < (1.0 - NEAR) * level):
+                return points, None
             points.append((distance, root))
             if abs(root - level) < NEAR * level:
                 return points, distance * level / root

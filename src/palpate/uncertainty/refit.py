@@ -6,6 +6,8 @@ an estimate to first order, too: with the weights held it would be foretold too 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from palpate.inversion import (
@@ -13,6 +15,7 @@ from palpate.inversion import (
     LinearisedObjective,
     Minimum,
     Objective,
+    Outcome,
     gauss_newton,
     posterior_sd,
     reweighted,
@@ -32,8 +35,9 @@ def refitted(
     """The estimate that the residuals in a `minimum`'s evaluation lead to, and what it is the minimum of.
 
     Reweighted (noise, robust losses, drivers' prior) and minimised in turn, until no log-modulus moves by 0.02 of its
-    standard deviation, ten times at the most. No model is solved. Raises `EstimationError` where the residuals leave an
-    unknown open, `SolverError` where the approximation has no answer.
+    standard deviation, ten times at the most: where it still does, the minimum has the outcome `STEPS`. No model is
+    solved. Raises `EstimationError` where the residuals leave an unknown open, `SolverError` where the approximation
+    has no answer.
     """
     n, now = objective.n_parameters, minimum
     for _ in range(PASSES):
@@ -42,5 +46,5 @@ def refitted(
         fixed = fixed_correspondence(objective, now.unknowns, weighed)
         before, now = now, gauss_newton(fixed, now.unknowns, bounds=bounds, tolerance=TOLERANCE, max_steps=max_steps)
         if np.all(np.abs(now.unknowns - before.unknowns)[:n] < SETTLED * posterior_sd(now, n)):
-            break
-    return now, fixed
+            return now, fixed
+    return (replace(now, outcome=Outcome.STEPS) if now.converged else now), fixed

@@ -23,6 +23,7 @@ __all__ = [
 
 STEP = 0.35  # of a proposal, in standard deviations of the posterior
 THIN = 10  # steps of a draw that is kept
+SHRUNK = 1.0 - 1e-9  # of a start's distance: one at a bound lies inside whatever rounding does
 SPREAD = 1.5  # standard deviations, by which chains start apart
 BETWEEN_CHECKS = 4000  # evaluations
 GAP = 1.0  # of log-likelihood, that the frozen posterior may be off; re-chosen closest points alone make some tenths
@@ -106,34 +107,36 @@ def posterior_chains(
     draws: int,
     rng: np.random.Generator,
 ) -> PosteriorChains:
-    """Chains of so many draws of a frozen posterior, the log-moduli spread as all that is known of them is.
+    """Chains of so many draws of a frozen posterior p, the log-moduli spread as all that is known of them is.
 
-    evaluation: of the objective at the minimum `start` (n,); covariance (n_parameters, n_parameters): of the log-moduli
-    by correlated residuals, prior and grid, to which the samples are stretched about the minimum, as their own spread
-    at the minimum is that of the Gauss-Newton matrix (the open-faced sandwich: Shaby, J. Comput. Graph. Stat. 23 (2014)
-    853-876). Every chain starts elsewhere, at 1.5 standard deviations, and leaves out a tenth of its draws; a draw is
-    the last of ten steps. Raises `EstimationError` where a modulus moves nothing.
+    The density that is sampled is p(c + A^-1 (theta - c), q) of log-moduli theta between the bounds and all other
+    unknowns q, with the minimum c: A = L M^-1 stretches the log-moduli, M M^T their covariance by the Gauss-Newton
+    matrix, L L^T = `covariance` (n_parameters, n_parameters), that by correlated residuals, prior and grid (the
+    open-faced sandwich: Shaby, J. Comput. Graph. Stat. 23 (2014) 853-876). evaluation: of the objective at the minimum
+    `start` (n,). Every chain starts elsewhere, at 1.5 standard deviations, and leaves out a tenth of its draws; a draw
+    is the last of ten steps. Raises `EstimationError` where a modulus moves nothing.
     """
     n = frozen.objective.n_parameters
     laplace = _laplace(start, evaluation)
     with determined():
         own = np.linalg.cholesky(evaluation.covariance_columns(n)[:n])
-        stretch = np.linalg.cholesky(covariance) @ np.linalg.inv(own)
+        stretch = np.asarray(np.linalg.cholesky(covariance) @ np.linalg.inv(own), dtype=np.float64)
     warm, steps = THIN * (draws // 10), THIN * draws
     found = []
     for generator in rng.spawn(chains):
         now = start + SPREAD * laplace.draws(1, generator)[0]
-        now[:n] = np.clip(now[:n], bounds.lower, bounds.upper)
+        inside = np.clip(start[:n] + stretch @ (now[:n] - start[:n]), bounds.lower, bounds.upper)
+        now[:n] = start[:n] + SHRUNK * np.linalg.solve(stretch, inside - start[:n])
         parts = []
         for done in range(0, warm + steps, BETWEEN_CHECKS):  # proposals of all steps at once would take gigabytes
             several = min(BETWEEN_CHECKS, warm + steps - done)
-            parts.append(_chain(frozen, laplace, now, bounds=bounds, steps=several, rng=generator))
+            parts.append(_chain(frozen, laplace, now, bounds=bounds, steps=several, rng=generator, stretch=stretch))
             now = parts[-1].end
         kept = slice(warm + THIN - 1, None, THIN)
         theta = np.concatenate([part.theta for part in parts])[kept]
         density = -np.concatenate([part.energy for part in parts])[kept]
         accepted = sum(part.accepted for part in parts) / (warm + steps)
-        found.append((start[:n] + (theta - start[:n]) @ stretch.T, density, accepted))
+        found.append((theta, density, accepted))
     thetas, densities, shares = zip(*found, strict=True)
     return PosteriorChains(np.stack(thetas), np.stack(densities), np.array(shares))
 
@@ -168,9 +171,9 @@ class _Laplace:
 
 @dataclass(frozen=True, slots=True)
 class _Stretch:
-    """Of a chain: its log-moduli (steps, n_parameters), the frozen posterior's values there (steps,), its end (n,).
+    """Of a chain: its log-moduli (steps, n_parameters), minus their log-density (steps,), its end (n,) before it.
 
-    accepted: how many proposals it took.
+    That is before log-moduli are stretched; accepted: how many proposals it took.
     """
 
     theta: NDArray[np.float64]
@@ -187,18 +190,23 @@ def _chain(
     bounds: Bounds,
     steps: int,
     rng: np.random.Generator,
+    stretch: NDArray[np.float64] | None = None,
 ) -> _Stretch:
+    """So many steps from unknowns (n,); `stretch` (n_parameters, n_parameters): A of `posterior_chains`, or none."""
     n = frozen.objective.n_parameters
+    centre = laplace.centre[:n]
+    stretch = np.eye(n) if stretch is None else stretch
     theta, energy, accepted = np.empty((steps, n)), np.empty(steps), 0
     now, value = start, frozen.value(start)
     level = value - laplace.energy(start)
     draws, thresholds = laplace.draws(steps, rng), np.log(rng.random(steps))
     for k in range(steps):
         trial = laplace.centre + np.sqrt(1.0 - STEP**2) * (now - laplace.centre) + STEP * draws[k]
-        if np.all((trial[:n] >= bounds.lower) & (trial[:n] <= bounds.upper)):
+        stretched = centre + stretch @ (trial[:n] - centre)
+        if np.all((stretched >= bounds.lower) & (stretched <= bounds.upper)):
             there = frozen.value(trial)
             above = there - laplace.energy(trial)
             if thresholds[k] < level - above:
                 now, value, level, accepted = trial, there, above, accepted + 1
-        theta[k], energy[k] = now[:n], value
+        theta[k], energy[k] = centre + stretch @ (now[:n] - centre), value
     return _Stretch(theta, energy, now, accepted)

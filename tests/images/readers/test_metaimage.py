@@ -114,6 +114,7 @@ BAD_HEADERS = {
     "text": (header(BinaryData="False"), "only"),
     "flag": (header(CompressedData="maybe"), "not True or False"),
     "no direction": (header(TransformMatrix=None), "left and right are unknown"),
+    "negative spacing": (header(ElementSpacing="1 -1 1"), "must be positive"),
     "no spacing": (header(ElementSpacing=None), "scale is unknown"),
     "NaN": (header(Offset="nan 0 0"), "numbers under"),
     "too large": (header(TransformMatrix="1 0 0 1e308 1 0 0 0 1"), "numbers under"),

@@ -139,6 +139,11 @@ def _affine(header: Mapping[str, str], path: Path) -> NDArray[np.float64]:
             f"the header of '{path}' has no 'ElementSpacing', so its scale is unknown; export it again"
         )
     spacing = numbers(sizes, 3, path, field="ElementSpacing")
+    if not (spacing > 0.0).all():
+        raise InputDataError(
+            f"the header of '{path}' has the ElementSpacing {spacing.tolist()}, which must be positive: programs take a"
+            " sign there for a mirror or not; turn the axis in TransformMatrix, or export the image again"
+        )
     affine = np.eye(4)
     affine[:3, :3] = LPS_TO_RAS[:, None] * rows.T * spacing
     affine[:3, 3] = LPS_TO_RAS * numbers(header.get("offset", "0 0 0"), 3, path, field="Offset")
