@@ -12,6 +12,7 @@ from scipy import special
 from palpate.inversion import Bounds, Minimum, Objective, gauss_newton
 from palpate.uncertainty.covariance import sandwich_covariance
 from palpate.uncertainty.profile import fixed_correspondence
+from palpate.uncertainty.repeatability import within_subject_cv
 
 __all__ = ["Agreement", "PairEstimate", "agreement", "pair_estimates"]
 
@@ -73,8 +74,7 @@ def agreement(pairs: Sequence[PairEstimate]) -> Agreement:
     chi-squared quantile of 1 - 0.01 / n_pairs; the worst one goes first, then the rest is asked again, down to two.
     Heterogeneity: Cochran's Q = sum_p (t_p - t)^T V_p^-1 (t_p - t) against chi-squared with (n_pairs - 1) n degrees of
     freedom. The mean's covariance is widened by the variance between pairs (DerSimonian & Laird, Controlled Clinical
-    Trials 7 (1986) 177-188, here for each modulus). Within-subject variation: the standard deviation of ln E over pairs
-    as exp(s) - 1 (Bland & Altman, BMJ 313 (1996) 106).
+    Trials 7 (1986) 177-188, here for each modulus). Within-subject variation: `within_subject_cv` of ln E over pairs.
     """
     theta, covariance = np.stack([p.theta for p in pairs]), np.stack([p.covariance for p in pairs])
     kept = np.ones(len(pairs), dtype=bool)
@@ -96,7 +96,7 @@ def agreement(pairs: Sequence[PairEstimate]) -> Agreement:
         outlier=~kept,
         influence=influence / np.sqrt(np.diag(spread)),
         heterogeneity=float(special.chdtrc(max(good.size - good.shape[1], 1), q)),
-        within_cv=np.expm1(np.std(good, axis=0, ddof=1)),
+        within_cv=within_subject_cv(np.var(good, axis=0, ddof=1)),
         theta=robust,
         covariance=robust_covariance,
     )
