@@ -27,6 +27,7 @@ from palpate.uncertainty.covariance import (
 )
 from palpate.uncertainty.intervals import NORMAL_95
 from palpate.uncertainty.profile import fixed_correspondence
+from palpate.uncertainty.repeatability import within_subject_cv
 
 __all__ = ["Agreement", "PairEstimates", "agreement", "pair_estimates"]
 
@@ -150,8 +151,7 @@ def agreement(pairs: PairEstimates) -> Agreement:
     chi-squared with (n_pairs - 1) n degrees of freedom. The mean's covariance is widened by the variance between pairs
     (DerSimonian & Laird, Controlled Clinical Trials 7 (1986) 177-188, here for each modulus and with V) and, where
     there is one, so that 1.96 standard deviations reach as far as Student's quantile of so few pairs (Hartung & Knapp,
-    Stat. Med. 20 (2001) 1771-1782). Within-subject variation: the standard deviation of ln E over pairs as exp(s) - 1
-    (Bland & Altman, BMJ 313 (1996) 106).
+    Stat. Med. 20 (2001) 1771-1782). Within-subject variation: `within_subject_cv` of ln E over pairs.
     """
     n_pairs, n = pairs.theta.shape
     theta, joint = pairs.theta.ravel(), pairs.covariance.reshape(n_pairs * n, n_pairs * n)
@@ -176,7 +176,7 @@ def agreement(pairs: PairEstimates) -> Agreement:
         outlier=~kept,
         influence=(weights @ theta - np.stack(without)) / np.sqrt(np.diag(spread)),
         heterogeneity=float(special.chdtrc(max(good.theta.size - n, 1), q)),
-        within_cv=np.expm1(np.std(good.theta, axis=0, ddof=1)),
+        within_cv=within_subject_cv(np.var(good.theta, axis=0, ddof=1)),
         theta=robust @ theta,
         covariance=covariance * np.outer(few, few),
     )
