@@ -87,12 +87,6 @@ def test_of_two_pairs_none_is_called_an_outlier():
     assert found.heterogeneity < 1e-6
 
 
-def test_the_variation_within_a_patient_is_standard_deviation_over_mean_of_its_moduli(rng):
-    wide = TRUTH + 0.6 * rng.standard_normal((400, 2))
-    moduli = np.exp(wide)
-    assert agreement(of(wide)).within_cv == pytest.approx(moduli.std(axis=0) / moduli.mean(axis=0), rel=0.15)
-
-
 @pytest.fixture(scope="module")
 def joint(twins):
     """Two motions of one body, through noise."""
