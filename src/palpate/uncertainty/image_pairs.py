@@ -17,9 +17,9 @@ from palpate.inversion import Bounds, Evaluation, Minimum, Objective, gauss_newt
 from palpate.observation.noise_model import NoiseModel
 from palpate.uncertainty.covariance import (
     GridErrors,
-    beyond,
     error_noise,
     gain,
+    grid_covariance,
     mesh_covariance,
     noise_covariance,
     scatter,
@@ -102,8 +102,8 @@ def _joint_covariance(
 
     owns: numbers (n_own,) of each one's unknowns among all. With the gains G_s of the residuals and H_s^-1 of each: by
     the noise, of which half is the rest image's, which those of one reference share, G_s C_st G_t^T; by the prior,
-    H_s^-1 P_st H_t^-1, which counts once of what they have in common; by what is considered; by the place of the grid,
-    where that is more than the noise; and by the mesh, which those of one reference share.
+    H_s^-1 P_st H_t^-1, which counts once of what they have in common; by what is considered; by the place of the grid
+    (see `grid_covariance`); and by the mesh, which those of one reference share.
     """
     n, n_pairs, mapping = objective.n_parameters, len(alone), objective.parameters
     size, pairs, noise = n * n_pairs, [], dict[tuple[int, str], NoiseModel]()
@@ -133,7 +133,7 @@ def _joint_covariance(
             total += of_block.T @ np.linalg.solve(block.precision, of_block)
     itself = np.kron(np.eye(n_pairs), np.ones((n, n)))
     grid = scatter(np.concatenate(shifts, axis=1)) * (BETWEEN_GRIDS + (1.0 - BETWEEN_GRIDS) * itself)
-    return np.asarray((total + beyond(grid, by_noise)).reshape(mesh.shape) + mesh)
+    return np.asarray((total + grid_covariance(alone[0], grid, by_noise)).reshape(mesh.shape) + mesh)
 
 
 def _lines(objective: Objective) -> list[int]:
