@@ -8,22 +8,33 @@ import math
 import numpy as np
 import pytest
 
+from palpate.cohort.mark import write_mark
 from palpate.cohort.page import cohort_page
-from palpate.cohort.records import Modulus, Record
-from palpate.cohort.statistics.association import association
+from palpate.cohort.plan import Plan
+from palpate.cohort.records import Modulus, Record, records_of
 from palpate.cohort.statistics.document import statistics_document
-from palpate.cohort.statistics.models import combined, mixed_model, repeatability, weighted_regression
-from palpate.cohort.statistics.scans import inside_fences, usable_scans
-from palpate.cohort.task import Row
+from palpate.cohort.statistics.models import combined, repeatability
+from palpate.cohort.statistics.scans import UNFIT, inside_fences, usable_scans
+from palpate.cohort.tables import columns_of
+from palpate.cohort.task import Outcome, Row
+from palpate.findings import MISLEADING
+from palpate.study.outputs import write_json
 
 NAME = "</script><img src=x onerror=alert(1)>"
 
 
-def record(number, patient, stage, value, sd=0.1, *, verdict="identified", unit="kPa", covariates=None):
+def record(number, patient, stage, value, sd=0.1, *, verdict="identified", unit="kPa", covariates=None, **others):
     ends = (value * math.exp(-1.959964 * sd), value * math.exp(1.959964 * sd))
     modulus = Modulus("prostate", unit, value, *ends, verdict)
     row = Row(f"r{number}", patient, str(number), stage, covariates=covariates or {})
-    return Record(row, "done", moduli=(modulus,))
+    return Record(row, "done", moduli=(modulus,), **others)
+
+
+def opened(found, low95=25.0):
+    """The same where the modulus is not identified: bounded from below, and still with a value."""
+    (modulus,) = found.moduli
+    ends = {"low95": low95, "high95": None, "verdict": "not identified"}
+    return dataclasses.replace(found, moduli=(dataclasses.replace(modulus, **ends),))
 
 
 @pytest.fixture(scope="module")
@@ -54,22 +65,24 @@ def test_the_unit_of_analysis_is_named_and_counted(document):
         48,
         True,
     )
-    assert organ["per_scan"]["p"] < organ["per_patient"]["p"]
-    assert organ["left_out"] == {"failed": 1, "waiting": 1, "not identified": 0, "other unit": 0}
+    assert organ["left_out"] == {"failed": 1, "waiting": 1, "not identified": 0, "unfit": 0, "other unit": 0}
     assert {"patients", "organs", "paper", "notes"} <= set(document)
     first = document["patients"][0]
     assert (first["patient"], first["stage"], len(first["kpa"]["prostate"])) == ("P0", 1, 4)
     assert [row["n_patients"] for row in organ["by_stage"]] == [3, 3, 3, 3]
 
 
-def test_all_models_find_the_growth_that_was_put_in(document):
+def test_the_growth_that_was_put_in_is_found_and_tested_once(document):
     organ = document["organs"]["prostate"]
-    for name in ("weighted", "mixed_model", "mixed_model_adjusted"):
+    for name in ("regression", "regression_adjusted"):
         low, high = organ[name]["interval95"]
         assert low < 1.3 < high
-        assert organ[name]["p"] < 0.01
-    assert organ["mixed_model_adjusted"]["covariates"] == ["age"]
-    assert organ["mixed_model"]["sd_within_patients"] == pytest.approx(0.2, rel=0.25)
+    assert organ["regression"]["p"] < 0.01
+    assert organ["regression_adjusted"]["covariates"] == ["age"]
+    assert math.hypot(organ["regression"]["sd_within_patients"], 0.1) == pytest.approx(0.2, rel=0.25)
+    tests = [name for name, part in organ.items() if isinstance(part, dict) and "p" in part]
+    assert tests == ["regression"]
+    assert "p" not in document["paper"]["prostate"]
     assert organ["repeatability"]["within_patient_cv"] == pytest.approx(0.2, rel=0.25)
     low, high = organ["repeatability"]["icc_interval95"]
     assert low < organ["repeatability"]["icc"] < high
@@ -100,12 +113,114 @@ def test_scans_that_agree_no_better_than_their_intervals_are_not_made_certain():
     assert found.high95 > 40.0
 
 
-def test_what_is_not_identified_is_left_out_and_counted(records):
-    changed = [dataclasses.replace(records[0], moduli=(dataclasses.replace(records[0].moduli[0], high95=None),))]
-    changed += [record(1, "P0", 1, 1e6, verdict="not identified"), record(2, "P0", 1, 3.0, unit="ratio"), records[3]]
+def test_a_patients_scans_vary_by_standard_deviation_over_mean():
+    rng = np.random.default_rng(8)
+    values = np.exp(3.0 + 0.6 * rng.standard_normal((2000, 2)))
+    rows = [record(2 * i + j, f"P{i}", 1, values[i, j]) for i in range(len(values)) for j in range(2)]
+    found = repeatability(usable_scans(rows, "prostate"))["within_patient_cv"]
+    assert found == pytest.approx(values.std() / values.mean(), rel=0.06)
+
+
+def test_what_is_not_identified_enters_by_its_ends_or_is_left_out_and_named(records):
+    nothing = record(1, "P0", 1, 1e6, verdict="not identified")
+    nothing = dataclasses.replace(nothing, moduli=(dataclasses.replace(nothing.moduli[0], low95=None, high95=None),))
+    changed = [opened(records[0]), nothing, record(2, "P0", 1, 3.0, unit="ratio"), records[3]]
     usable = usable_scans(changed, "prostate")
-    assert [scan.id for scan in usable.scans] == ["r3"]
-    assert usable.left_out == {"failed": 0, "waiting": 0, "not identified": 2, "other unit": 1}
+    assert (usable.scans[0].value, usable.scans[0].high) == (None, math.inf)
+    assert [scan.id for scan in usable.scans] == ["r0", "r3"]
+    assert usable.left_out == {"failed": 0, "waiting": 0, "not identified": 1, "unfit": 0, "other unit": 1}
+    document = statistics_document([*records[4:], *changed])
+    organ = document["organs"]["prostate"]
+    assert organ["left_out_rows"]["not identified"] == ["r1"]
+    assert organ["used"]["censored"] == organ["regression"]["n_censored"] == 1
+    assert organ["per_patient"]["n_censored"] == 1
+    assert organ["by_stage"][0]["n_censored"] == 1
+    page = cohort_page(changed, document, created="now", version="0")
+    assert "not identified, no end known: left out" in page
+
+
+def test_what_is_not_identified_has_no_number_in_the_table_or_on_the_page(records):
+    held = [opened(dataclasses.replace(records[0], moduli=(dataclasses.replace(records[0].moduli[0], value=987.6),)))]
+    columns = columns_of(held)
+    assert [columns[f"prostate_{name}"] for name in ("kpa", "low95", "high95")] == [[None]] * 3
+    assert columns["prostate_verdict"] == ["not identified"]
+    document = statistics_document([*held, *records[1:]])
+    assert document["patients"][0]["kpa"]["prostate"] == [one.moduli[0].value for one in records[1:4]]
+    assert "987.6" not in str(document)
+    assert ">988<" not in cohort_page(held, document, created="now", version="0")
+
+
+def test_a_stage_of_which_no_scan_has_a_value_is_drawn_by_its_ends(records):
+    changed = [opened(one) if one.row.stage == 4 else one for one in records]
+    document = statistics_document(changed)
+    last = next(patient for patient in document["patients"] if patient["stage"] == 4)["summary"]["prostate"]
+    assert (last["median"], last["combined"], last["censored"]) == (None, None, [[25.0, None]] * 4)
+    assert document["organs"]["prostate"]["by_stage"][-1]["median"] is None
+    assert cohort_page(changed, document, created="now", version="0").count("<svg") == 3
+
+
+def test_warnings_of_scans_are_counted_and_those_that_make_them_unfit_leave_them_out(records):
+    codes = [("linear-strains", "finer-mesh"), ("units",), ("linear-strains",)]
+    changed = [dataclasses.replace(one, warnings=of) for one, of in zip(records, codes, strict=False)]
+    changed += records[3:]
+    document = statistics_document(changed)
+    organ = document["organs"]["prostate"]
+    assert organ["warnings"] == {"linear-strains": 2, "finer-mesh": 1}
+    assert organ["left_out"]["unfit"] == 1
+    assert organ["left_out_rows"]["unfit"] == {"r1": ["units"]}
+    assert organ["used"]["scans"] == len(records) - 1
+    assert organ["regression_without_warned"]["n_scans"] == len(records) - 3
+    assert "p" not in organ["regression_without_warned"]
+    page = cohort_page(changed, document, created="now", version="0")
+    assert "used with the warning linear-strains" in page
+    assert "r1 (units)" in page
+    assert statistics_document(records)["organs"]["prostate"]["regression_without_warned"] is None
+
+
+def test_only_warnings_that_may_cost_the_answer_make_a_scan_unfit():
+    assert set(UNFIT) <= set(MISLEADING)
+    assert "implausible-stiffness" not in UNFIT  # that would leave out by what was found
+
+
+def test_the_same_image_in_two_patients_is_named(records):
+    images = [
+        {"before": "a" * 64, "after[0]": "b" * 64},
+        {"before": "a" * 64},
+        {"before": "c" * 64, "after[0]": "b" * 64},
+    ]
+    held = [dataclasses.replace(records[i], images=of) for i, of in zip((0, 1, 4), images, strict=True)]
+    document = statistics_document(held)
+    (same,) = document["identical_images"]  # rows of one patient share their rest state
+    assert same["patients"] == ["P0", "P1"]
+    assert same["rows"] == [{"id": "r0", "image": "after[0]"}, {"id": "r4", "image": "after[0]"}]
+    assert "after[0] of r0, after[0] of r4" in cohort_page(held, document, created="now", version="0")
+
+
+def test_what_a_result_says_of_a_row_is_read_from_its_file(tmp_path):
+    """A modulus without interval is censored where its profile ends; a table of labels is no image."""
+    profile = [[20.0, -1.95], [40.0, -1.0], [80.0, 0.0], [2000.0, 0.9]]
+    common = {"parameter": "youngs_modulus", "interval95": None, "ratio_interval95": None, "ratio": 8.0}
+    known = common | {
+        "tissue": "prostate",
+        "unit": "kPa",
+        "value": 80.0,
+        "verdict": "not identified",
+        "profile": profile,
+    }
+    sought = common | {"tissue": "core", "unit": "ratio", "value": None, "verdict": "not identified", "profile": []}
+    warnings = [{"code": "units", "message": "."}, {"code": "units", "message": "!"}]
+    inputs = {"before": {"sha256": "1"}, "before.voxels": {"sha256": "2"}, "names": {"sha256": "3"}}
+    place = tmp_path / "cases/r0"
+    place.mkdir(parents=True)
+    write_json(place / "result.json", {"estimates": [known, sought], "warnings": warnings, "inputs": inputs})
+    write_mark(place, Outcome("r0", "done", "0" * 64))
+    (found,) = records_of(Plan((Row("r0", "P", stage=1),), ("0" * 64,)), tmp_path)
+    prostate, core = found.moduli
+    assert prostate.low95 == pytest.approx(20.0, rel=0.01)
+    assert (prostate.high95, prostate.stated) == (None, (None, None, None))
+    assert (core.unit, core.low95, core.high95) == ("ratio", None, None)
+    assert found.warnings == ("units",)
+    assert found.images == {"before.voxels": "2"}
 
 
 def test_the_papers_mean_leaves_out_what_box_plots_draw_as_outliers():
@@ -129,37 +244,22 @@ def test_what_is_undefined_is_said_in_words(records, chosen, words):
     organ = document["organs"]["prostate"]
     assert words in organ["per_patient"]["undefined"]
     assert organ["per_patient"]["r"] is None
-    assert "undefined" in organ["weighted"]
-    assert "undefined" in organ["mixed_model"]
+    assert words in organ["regression"]["undefined"]
     assert "undefined" in cohort_page(chosen(records), document, created="now", version="0")
 
 
-def test_single_scans_have_no_mixed_model(records):
-    usable = usable_scans(records[::4], "prostate")
-    assert "no patient has two scans" in mixed_model(usable, {})["undefined"]
-    assert weighted_regression(usable)["factor_per_stage"] > 1.0
-    assert "two scans" in repeatability(usable)["undefined"]
+def test_single_scans_tell_no_repeatability(records):
+    organ = statistics_document(records[::4])["organs"]["prostate"]
+    assert "two scans" in organ["repeatability"]["undefined"]
+    assert organ["regression"]["factor_per_stage"] > 1.0
+    assert organ["regression"]["sd_within_patients"] is None
 
 
-def test_a_patient_with_several_stages_enters_the_mixed_model_alone(records):
+def test_a_patient_with_several_stages_enters_nothing_by_stage(records):
     changed = [*records[:-1], dataclasses.replace(records[-1], row=dataclasses.replace(records[-1].row, stage=1))]
     organ = statistics_document(changed)["organs"]["prostate"]
-    assert organ["per_patient"]["n"] == 11
-    assert organ["mixed_model"]["n_patients"] == 12
+    assert organ["per_patient"]["n"] == organ["regression"]["n_patients"] == 11
     assert "several stages" in organ["remarks"][0]
-
-
-def test_intervals_of_correlations_cover_them(records):
-    usable = usable_scans(records, "prostate")
-    values = [np.array([scan.value for scan in usable.of(patient)]) for patient in usable.patients]
-    stages = np.array([float(usable.stage_of(patient)) for patient in usable.patients])
-    found = association(values, stages, seed=0).per_patient
-    for value, (low, high) in (
-        (found.r, found.interval95),
-        (found.rho, found.rho_interval95),
-        (found.tau, found.tau_interval95),
-    ):
-        assert low < value < high <= 1.0
 
 
 def test_the_page_loads_nothing_and_escapes_every_name(records, document):

@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 
 from palpate.cli import main
-from palpate.cohort.statistics.association import association, pearson_p, points_behind
+from palpate.cohort.statistics.association import pearson_p, points_behind
 from palpate.errors import ConfigurationError, GeometryError, ResourceError
 from palpate.experiments.reproduce.cohort import ORGANS, PatientResult
 from palpate.experiments.reproduce.figure4 import LAW, Figure4, Point
@@ -22,7 +22,7 @@ from palpate.experiments.reproduce.ledger import Ledger
 from palpate.experiments.reproduce.paper import PAPER_STAGING, PAPER_TABLE1, PAPER_TABLE2
 from palpate.experiments.reproduce.real_pelvis import grid_within
 from palpate.experiments.reproduce.run import reproduce
-from palpate.experiments.reproduce.staging import Staging, paper_remark
+from palpate.experiments.reproduce.staging import Staging, paper_remark, with_stage
 from palpate.experiments.reproduce.table import COLUMNS, Entry, Table, TableRow
 from palpate.mesh.anatomy import Box
 
@@ -52,7 +52,7 @@ def cohort():
         PatientResult(f"P{i}", int(stage), dict.fromkeys(ORGANS, 20.0), dict.fromkeys(ORGANS, v.tolist()), 0, 9, 0.1)
         for i, (stage, v) in enumerate(zip(STAGES, values, strict=True))
     )
-    return Staging(patients, dict.fromkeys(ORGANS, association(values, STAGES, seed=1)))
+    return Staging(patients, dict.fromkeys(ORGANS, with_stage(values, STAGES)))
 
 
 def test_the_papers_own_errors_follow_from_its_moduli():
@@ -176,10 +176,10 @@ def test_the_patient_is_the_unit(cohort):
         found = document["organs"][organ]
         assert found["per_scan"]["n"] == 72
         assert found["per_patient"]["n"] == 8
-        assert {"r", "rho", "interval95", "n"} <= set(found["per_patient"])
-        low, high = found["per_patient"]["interval95"]
-        assert low < found["per_patient"]["r"] <= high
-        assert found["per_scan"]["p"] < found["per_patient"]["p"]  # scans taken for patients look surer than they are
+        assert {"r", "rho", "tau", "n"} <= set(found["per_patient"])
+        low, high = found["regression"]["interval95"]
+        assert low < found["regression"]["factor_per_stage"] < high
+        assert found["per_scan"]["p"] < found["regression"]["p"]  # scans taken for patients look surer than they are
 
 
 def test_pearson_p_is_that_of_scipy():
@@ -189,13 +189,15 @@ def test_pearson_p_is_that_of_scipy():
     assert pearson_p(found.statistic, 17) == pytest.approx(found.pvalue)
 
 
-def test_repeating_every_scan_does_not_narrow_the_patients_interval():
+def test_repeating_every_scan_makes_patients_no_more():
     rng = np.random.default_rng(4)
     values = [20.0 * stage * np.exp(0.3 * rng.standard_normal(5)) for stage in STAGES]
-    once, often = (association([np.tile(v, n) for v in values], STAGES, seed=1) for n in (1, 10))
-    assert often.per_scan.p < once.per_scan.p
-    assert often.per_patient == once.per_patient
-    assert often.per_scan.interval95 == pytest.approx(once.per_scan.interval95)
+    once, often = (with_stage([np.tile(v, n) for v in values], STAGES) for n in (1, 10))
+    assert often["per_scan"]["p"] < once["per_scan"]["p"]
+    assert often["per_patient"] == once["per_patient"]
+    low, high = (np.log(found["regression"]["interval95"]) for found in (once, often))
+    assert np.ptp(high) == pytest.approx(np.ptp(low), rel=0.2)
+    assert often["regression"]["p"] > 0.5 * once["regression"]["p"]
 
 
 def points(law, errors):

@@ -17,7 +17,7 @@ from palpate.observation.noise_model import NoiseModel
 from palpate.observation.robust_loss import Tukey
 from palpate.phantoms.boundary_noise import smooth_field
 from palpate.uncertainty import NORMAL_95, FittedState, gain, sandwich_covariance
-from palpate.uncertainty.covariance import beyond, error_noise, grid_position_shifts, imaging_errors, scatter
+from palpate.uncertainty.covariance import error_noise, grid_covariance, grid_position_shifts, imaging_errors, scatter
 from palpate.uncertainty.intervals import log_interval
 
 SD = 0.3
@@ -288,9 +288,16 @@ def test_an_interval_by_few_draws_holds_as_often_as_it_says(rng):
     assert np.mean(held) == pytest.approx(0.95, abs=0.012)
 
 
-def test_what_is_beyond_a_covariance_makes_it_as_large_as_both(rng):
-    first, second = (root @ root.T for root in rng.standard_normal((2, 3, 3)))
-    together = second + beyond(first, second)
-    for part in (first, second):
+def test_the_grid_adds_to_stated_noise_and_to_what_residuals_tell_what_that_lacks(imaged, rng):
+    """With it that is as large as both in every direction, and no larger where it was so already."""
+    grid, noise = (root @ root.T for root in rng.standard_normal((2, 3, 3)))
+    _, told = imaged
+    together = noise + grid_covariance(told, grid, noise)
+    for part in (grid, noise):
         assert np.linalg.eigvalsh(together - part).min() > -1e-12
-    assert beyond(second, 1.1 * second) == pytest.approx(np.zeros((3, 3)), abs=1e-12)
+    assert grid_covariance(told, noise, 1.1 * noise) == pytest.approx(np.zeros((3, 3)), abs=1e-12)
+    lines = [
+        replace(line, observation=replace(line.observation, stated_noise=NoiseModel(np.ones(1), np.ones(1))))
+        for line in told.lines
+    ]
+    assert np.array_equal(grid_covariance(replace(told, lines=tuple(lines)), grid, noise), grid)

@@ -140,14 +140,19 @@ def _told(records: Sequence[Record], folder: Path) -> Outcome:
 
 
 def _associations(document: dict[str, Any]) -> str:
-    """A line a tissue: what its modulus has to do with the stage, with the unit of analysis."""
-    rows = [["tissue", "unit", "n", "r", "95 % (patients drawn)", "p", "rank rho"]]
-    for tissue, found in document["organs"].items():
-        for name, unit in (("patient", found["per_patient"]), ("scan", found["per_scan"])):
-            cells = [unit.get("undefined") or "undefined", "", "", ""]
-            if unit["r"] is not None:
-                interval, rho = unit["interval95"], unit.get("rho")
-                text = f"{interval[0]:.2f} to {interval[1]:.2f}" if interval else "undefined"
-                cells = [f"{unit['r']:.3f}", text, f"{unit['p']:.2g}", "" if rho is None else f"{rho:.3f}"]
-            rows.append([tissue, name, str(unit["n"]), *cells])
-    return columns(rows)
+    """What each tissue's modulus has to do with the stage, a line each, and images that patients share."""
+    from palpate.report.rows import interval_text, number
+
+    rows = [["tissue", "patients", "scans", "without a value", "factor a stage", "95 %", "p"]]
+    for tissue, organ in document["organs"].items():
+        found, used = organ["regression"], organ["used"]
+        cells = [found.get("undefined", ""), "", ""]
+        if "p" in found:
+            low, high = found["interval95"]
+            cells = [number(found["factor_per_stage"]), interval_text((low, high)), number(found["p"], digits=2)]
+        rows.append([tissue, *(str(used[name]) for name in ("patients", "scans", "censored")), *cells])
+    same = [
+        f"the same image, to the byte, in several patients: {', '.join(row['id'] for row in image['rows'])}"
+        for image in document["identical_images"]
+    ]
+    return "\n".join([columns(rows), *same])

@@ -20,6 +20,7 @@ ROW = 0.2  # inches of a patient in the forest
 MOST_IN_FOREST = 150
 COLOUR = "#0072b2"
 LINE = "#d55e00"
+OPEN = "#777777"  # what is known of a scan without a value
 SPREAD = 0.18  # of points beside each other at a stage
 
 Patients = Sequence[Mapping[str, Any]]
@@ -28,7 +29,8 @@ Patients = Sequence[Mapping[str, Any]]
 def boxes_svg(patients: Patients, tissue: str, unit: str, *, name: str) -> str:
     """Quartiles of all scans of each stage, and the medians of its patients as points, with both numbers, as SVG.
 
-    Raises `ValueError` when nobody has a stage.
+    Where scans of a stage have no value there is no box, which would leave them out: their ends stand among the others'
+    values, as arrows to where they may lie. Raises `ValueError` when nobody has a stage.
     """
     stages = _stages(patients, tissue)
 
@@ -41,19 +43,25 @@ def boxes_svg(patients: Patients, tissue: str, unit: str, *, name: str) -> str:
             scans = [
                 value for patient in own for value in patient["kpa"].get(tissue) or patient["ratio"].get(tissue) or []
             ]
-            axes.boxplot(
-                scans,
-                positions=[stage],
-                widths=0.55,
-                showfliers=False,
-                boxprops={"color": INK},
-                medianprops={"color": LINE},
-                whiskerprops={"color": INK},
-                capprops={"color": INK},
-            )
-            medians = [patient["summary"][tissue]["median"] for patient in own]
+            censored = [ends for patient in own for ends in patient["summary"][tissue]["censored"]]
+            if censored:
+                axes.plot([stage] * len(scans), scans, "_", color=INK)
+                for ends in censored:
+                    _draw_ends(axes, stage, ends)
+            else:
+                axes.boxplot(
+                    scans,
+                    positions=[stage],
+                    widths=0.55,
+                    showfliers=False,
+                    boxprops={"color": INK},
+                    medianprops={"color": LINE},
+                    whiskerprops={"color": INK},
+                    capprops={"color": INK},
+                )
+            medians = [found for patient in own if (found := patient["summary"][tissue]["median"]) is not None]
             axes.plot(stage + _beside(len(medians)), medians, "o", color=COLOUR, markersize=4.5, alpha=0.85)
-            labels.append(f"{stage}\n{len(own)} patients\n{len(scans)} scans")
+            labels.append(f"{stage}\n{len(own)} patients\n{len(scans) + len(censored)} scans")
         axes.set_xticks(stages, labels)
         axes.set_xlim(min(stages) - 0.6, max(stages) + 0.6)
         _label(axes, unit)
@@ -63,9 +71,10 @@ def boxes_svg(patients: Patients, tissue: str, unit: str, *, name: str) -> str:
 
 
 def scatter_svg(patients: Patients, tissue: str, unit: str, line: Mapping[str, Any], *, name: str) -> str:
-    """Each patient's combined modulus with its 95 % interval against the stage, and the weighted line, as SVG.
+    """Each patient's combined modulus with its 95 % interval against the stage, and the regression's line, as SVG.
 
-    line: `weighted` of statistics.json. Raises `ValueError` when nobody has a stage.
+    Arrows are ends of scans without a value. line: `regression` of statistics.json. Raises `ValueError` when nobody has
+    a stage.
     """
     stages = _stages(patients, tissue)
 
@@ -74,10 +83,13 @@ def scatter_svg(patients: Patients, tissue: str, unit: str, line: Mapping[str, A
         axes = figure.add_axes(PLACE)
         axes.set_yscale("log")
         for stage in stages:
-            own = [p["summary"][tissue]["combined"] for p in patients if p["stage"] == stage and tissue in p["summary"]]
-            for place, found in zip(stage + _beside(len(own)), own, strict=True):
-                axes.plot([place, place], [found["low95"], found["high95"]], color=COLOUR, linewidth=1.4, alpha=0.6)
-                axes.plot(place, found["value"], "o", color=COLOUR, markersize=4.5)
+            own = [p["summary"][tissue] for p in patients if p["stage"] == stage and tissue in p["summary"]]
+            for place, summary in zip(stage + _beside(len(own)), own, strict=True):
+                if (found := summary["combined"]) is not None:
+                    axes.plot([place, place], [found["low95"], found["high95"]], color=COLOUR, linewidth=1.4, alpha=0.6)
+                    axes.plot(place, found["value"], "o", color=COLOUR, markersize=4.5)
+                for ends in summary["censored"]:
+                    _draw_ends(axes, place, ends)
         factor = line.get("factor_per_stage")
         if factor is not None:
             ends = np.array([min(stages), max(stages)], dtype=float)
@@ -96,7 +108,7 @@ def scatter_svg(patients: Patients, tissue: str, unit: str, line: Mapping[str, A
 def forest_svg(patients: Patients, tissue: str, unit: str, *, name: str) -> str:
     """Each patient's combined modulus with its 95 % interval, a line each, by stage, as SVG.
 
-    Raises `ValueError` when there are none, or too many to be drawn.
+    Arrows are ends of scans without a value. Raises `ValueError` when there are none, or too many to be drawn.
     """
     own = [patient for patient in patients if tissue in patient["summary"]]
     if not 0 < len(own) <= MOST_IN_FOREST:
@@ -109,9 +121,11 @@ def forest_svg(patients: Patients, tissue: str, unit: str, *, name: str) -> str:
         axes = figure.add_axes((0.32, 0.5 / height, 0.65, (height - 0.55) / height))
         axes.set_xscale("log")
         for number, patient in enumerate(own):
-            found = patient["summary"][tissue]["combined"]
-            axes.plot([found["low95"], found["high95"]], [number, number], color=COLOUR, linewidth=2.5, alpha=0.6)
-            axes.plot(found["value"], number, "s", color=COLOUR, markersize=4.0)
+            if (found := patient["summary"][tissue]["combined"]) is not None:
+                axes.plot([found["low95"], found["high95"]], [number, number], color=COLOUR, linewidth=2.5, alpha=0.6)
+                axes.plot(found["value"], number, "s", color=COLOUR, markersize=4.0)
+            for ends in patient["summary"][tissue]["censored"]:
+                _draw_ends(axes, number, ends, along=True)
         stages = ["" if p["stage"] is None else f", stage {p['stage']}" for p in own]
         axes.set_yticks(
             range(len(own)), [f"{p['patient'][:24]}{stage}" for p, stage in zip(own, stages, strict=True)], fontsize=7.5
@@ -124,6 +138,14 @@ def forest_svg(patients: Patients, tissue: str, unit: str, *, name: str) -> str:
 
     says = f"{tissue}: each patient's {_axis(unit)} with its 95 % interval, by stage"
     return draw_svg(draw, size=(SIZE[0], height), name=name, says=says)
+
+
+def _draw_ends(axes: Axes, place: float, ends: Sequence[float | None], *, along: bool = False) -> None:
+    """Arrows at the ends that are known of a scan, to where its modulus may lie; `along` the horizontal axis."""
+    for end, marker in zip(ends, "><" if along else "^v", strict=True):
+        if end is not None:
+            x, y = (end, place) if along else (place, end)
+            axes.plot(x, y, marker, color=OPEN, markersize=5.0, fillstyle="none")
 
 
 def _stages(patients: Patients, tissue: str) -> list[int]:

@@ -58,7 +58,7 @@ def _charts(document: Mapping[str, Any], tissue: str, place: int) -> tuple[_Char
     organ, patients = document["organs"][tissue], document["patients"]
     drawings = {
         "Scans by stage, patients as points": partial(boxes_svg, patients, tissue, organ["unit"]),
-        "Patients against the stage": partial(scatter_svg, patients, tissue, organ["unit"], organ["weighted"]),
+        "Patients against the stage": partial(scatter_svg, patients, tissue, organ["unit"], organ["regression"]),
         "Patients": partial(forest_svg, patients, tissue, organ["unit"]),
     }
     charts = []

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from palpate.cohort.mark import document_of
 from palpate.cohort.plan import CASES, Plan
@@ -15,21 +17,39 @@ from palpate.parallel import mapped
 __all__ = ["Modulus", "Record", "records_of", "tissues_of"]
 
 
+AT_END = 1.96  # signed root deviance of a profile at an end of the 95 % interval
+NEARLY = 0.95  # of that: a profile that comes so far has reached the end
+NOT_IMAGES = ("names", "mesh")  # inputs that two patients may well share
+
+End = float | None
+
+
 @dataclass(frozen=True, slots=True)
 class Modulus:
-    """A tissue's modulus in one row: `unit` "kPa" or "ratio", 95 % interval with None for an open end, verdict."""
+    """A tissue's modulus in one row: `unit` "kPa" or "ratio", 95 % interval with None for an open end, verdict.
+
+    Of one that is not identified the ends only censor it; what may be shown of a modulus is `stated`.
+    """
 
     tissue: str
     unit: str
-    value: float | None
-    low95: float | None
-    high95: float | None
+    value: End
+    low95: End
+    high95: End
     verdict: str
+
+    @property
+    def stated(self) -> tuple[End, End, End]:
+        """Value and both ends, all None where the modulus is not identified."""
+        return (None, None, None) if self.verdict == "not identified" else (self.value, self.low95, self.high95)
 
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """A row with what it came to: `state` "done", "failed" or "waiting"."""
+    """A row with what it came to: `state` "done", "failed" or "waiting".
+
+    warnings: codes that its result carries, each once; images: key of an input ("before", "after[0]") -> SHA-256.
+    """
 
     row: Row
     state: str
@@ -39,6 +59,8 @@ class Record:
     seconds: float = 0.0
     peak_gb: float | None = None
     page: str = ""  # of its report, from the cohort's folder
+    warnings: tuple[str, ...] = ()
+    images: Mapping[str, str] = field(default_factory=dict)
 
     def modulus(self, tissue: str) -> Modulus | None:
         """That of a tissue, None where it was not asked for or not found."""
@@ -68,12 +90,36 @@ def _record(plan: Plan, folder: Path, marks: Sequence[Outcome | None], number: i
     document = document_of(place, mark)
     if document is None:
         return Record(row, "waiting")
-    moduli = []
-    for item in document["estimates"]:
-        if item["parameter"] != "youngs_modulus":
-            continue
-        in_kpa = item["value"] is not None
-        low, high = (item["interval95"] if in_kpa else item["ratio_interval95"]) or (None, None)
-        value = item["value"] if in_kpa else item["ratio"]
-        moduli.append(Modulus(item["tissue"], "kPa" if in_kpa else "ratio", value, low, high, item["verdict"]))
-    return Record(row, "done", "", mark.message, tuple(moduli), *took)
+    moduli = tuple(_modulus(item) for item in document["estimates"] if item["parameter"] == "youngs_modulus")
+    codes = tuple(dict.fromkeys(warning["code"] for warning in document.get("warnings", ())))
+    return Record(row, "done", "", mark.message, moduli, *took, codes, _images(document.get("inputs", {})))
+
+
+def _modulus(item: Mapping[str, Any]) -> Modulus:
+    """That of an entry of `estimates`.
+
+    Where no interval is stated, its ends are those of the profile likelihood, as far as that reaches them.
+    """
+    unit = item.get("unit") or ("ratio" if item["value"] is None else "kPa")
+    in_kpa = unit == "kPa"
+    ends = item["interval95"] if in_kpa else item["ratio_interval95"]
+    low, high = ends or _ends_of_profile(item.get("profile") or ())
+    return Modulus(item["tissue"], unit, item["value"] if in_kpa else item["ratio"], low, high, item["verdict"])
+
+
+def _ends_of_profile(profile: Sequence[Sequence[float]]) -> tuple[End, End]:
+    """Where a profile [value, signed root deviance] meets -1.96 and 1.96, by a line; None where it ends before."""
+    centre = min(profile, key=lambda point: abs(point[1]), default=(1.0, 0.0))[0]
+    ends: list[End] = []
+    for sign in (-1.0, 1.0):
+        reached = [(value, sign * root) for value, root in profile if sign * root >= NEARLY * AT_END]
+        value, root = min(reached, key=lambda point: abs(point[1] - AT_END), default=(centre, 0.0))
+        ends.append(centre * math.exp(math.log(value / centre) * AT_END / root) if reached else None)
+    return ends[0], ends[1]
+
+
+def _images(inputs: Mapping[str, Mapping[str, str]]) -> dict[str, str]:
+    """Digests of a result's images; of one that lies beside its header, that of its voxels alone."""
+    return {
+        key: found["sha256"] for key, found in inputs.items() if key not in NOT_IMAGES and f"{key}.voxels" not in inputs
+    }

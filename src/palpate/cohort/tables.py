@@ -1,4 +1,7 @@
-"""cohort.csv and cohort.parquet: a line a row, its state, and value, interval and verdict of every tissue."""
+"""cohort.csv and cohort.parquet: a line a row, its state, and value, interval and verdict of every tissue.
+
+What is not identified has no number there: its verdict says so.
+"""
 
 from __future__ import annotations
 
@@ -37,9 +40,12 @@ def columns_of(records: Sequence[Record]) -> dict[str, list[Any]]:
         moduli = [record.modulus(tissue) for record in records]
         for unit, name in UNITS.items():
             if any(modulus is not None and modulus.unit == unit for modulus in moduli):
-                columns[f"{tissue}_{name}"] = [m.value if m is not None and m.unit == unit else None for m in moduli]
-        for end in ("low95", "high95", "verdict"):
-            columns[f"{tissue}_{end}"] = [None if modulus is None else getattr(modulus, end) for modulus in moduli]
+                columns[f"{tissue}_{name}"] = [
+                    m.stated[0] if m is not None and m.unit == unit else None for m in moduli
+                ]
+        for place, end in enumerate(("low95", "high95"), start=1):
+            columns[f"{tissue}_{end}"] = [None if modulus is None else modulus.stated[place] for modulus in moduli]
+        columns[f"{tissue}_verdict"] = [None if modulus is None else modulus.verdict for modulus in moduli]
     for name in dict.fromkeys(name for record in records for name in record.row.covariates):
         columns.setdefault(name, [record.row.covariates.get(name) for record in records])
     return columns

@@ -28,10 +28,10 @@ __all__ = [
     "Covariance",
     "FittedState",
     "GridErrors",
-    "beyond",
     "covariance_of",
     "error_noise",
     "gain",
+    "grid_covariance",
     "grid_errors",
     "grid_position_shifts",
     "imaging_errors",
@@ -74,7 +74,7 @@ class Covariance:
 
     Parameters are the log-moduli, then eta = ln(lambda / mu) of Poisson's ratios that are sought. noise: of the
     residuals; prior: what is believed of all unknowns, of which `causes` are the parts by the cause of their block;
-    grid: the place of the voxels, as far as it is not in the noise of the residuals, which voxels round; mesh: what
+    grid: the place of the voxels, as far as it is not in noise that the residuals tell, which voxels round; mesh: what
     another mesh would make of it (of Young's moduli). given_model: all that would be left if frame, drawing and
     material were as the model has them, and only the drivers' motion unknown.
     """
@@ -104,8 +104,8 @@ def covariance_of(
 ) -> Covariance:
     """All that is known of the log-moduli's errors at unknowns (n_unknowns,).
 
-    The sandwich, what is considered or undecided, the mesh, and the scatter over grid positions by the `errors` there,
-    where that is more than the noise: residuals are rounded by voxels, too.
+    The sandwich, what is considered or undecided, the mesh, and what the scatter over grid positions, by the `errors`
+    there, adds (see `grid_covariance`).
     """
     noise_of, mesh = error_noise(evaluation), mesh_covariance(objective)
     given = _given_model(objective, evaluation)
@@ -113,7 +113,7 @@ def covariance_of(
     def parts(of: Evaluation) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Covariances by noise, prior and grid of one set of unknowns."""
         noise, prior = _sandwich(objective, of, noise_of)
-        return noise, prior, beyond(scatter(shifts_by(of, errors, objective.n_parameters)), noise)
+        return noise, prior, grid_covariance(evaluation, scatter(shifts_by(of, errors, objective.n_parameters)), noise)
 
     noise, prior, grid = parts(evaluation)
     further = [_considered(objective, evaluation), undecided_covariance(objective, evaluation, unknowns)]
@@ -323,12 +323,18 @@ def scatter(shifts: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(shifts.T @ shifts / (len(shifts) - 2))
 
 
-def beyond(covariance: NDArray[np.float64], known: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What a covariance (n, n) has in excess of what is `known` (n, n) already: the positive part of their difference.
+def grid_covariance(
+    evaluation: Evaluation, grid: NDArray[np.float64], noise: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """What the place of the `grid` (n, n) adds to the `noise` (n, n), the covariances of the log-moduli by each.
 
-    With it the latter is at least as large as each of the two in every direction.
+    All of it to noise that is stated. Noise that the residuals tell has it already, as they are rounded by voxels, and
+    is the less only where it is no kernel's: then the positive part of the difference, with which the noise is at least
+    as large as each of the two in every direction.
     """
-    sizes, axes = np.linalg.eigh(covariance - known)
+    if any(getattr(line.observation, "stated_noise", None) is not None for line in evaluation.lines):
+        return grid
+    sizes, axes = np.linalg.eigh(grid - noise)
     return np.asarray((axes * np.maximum(sizes, 0.0)) @ axes.T)
 
 

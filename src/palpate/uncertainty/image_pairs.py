@@ -17,9 +17,9 @@ from palpate.inversion import Bounds, Evaluation, Minimum, Objective, gauss_newt
 from palpate.observation.noise_model import NoiseModel
 from palpate.uncertainty.covariance import (
     GridErrors,
-    beyond,
     error_noise,
     gain,
+    grid_covariance,
     mesh_covariance,
     noise_covariance,
     scatter,
@@ -27,6 +27,7 @@ from palpate.uncertainty.covariance import (
 )
 from palpate.uncertainty.intervals import NORMAL_95
 from palpate.uncertainty.profile import fixed_correspondence
+from palpate.uncertainty.repeatability import within_subject_cv
 
 __all__ = ["Agreement", "PairEstimates", "agreement", "pair_estimates"]
 
@@ -101,8 +102,8 @@ def _joint_covariance(
 
     owns: numbers (n_own,) of each one's unknowns among all. With the gains G_s of the residuals and H_s^-1 of each: by
     the noise, of which half is the rest image's, which those of one reference share, G_s C_st G_t^T; by the prior,
-    H_s^-1 P_st H_t^-1, which counts once of what they have in common; by what is considered; by the place of the grid,
-    where that is more than the noise; and by the mesh, which those of one reference share.
+    H_s^-1 P_st H_t^-1, which counts once of what they have in common; by what is considered; by the place of the grid
+    (see `grid_covariance`); and by the mesh, which those of one reference share.
     """
     n, n_pairs, mapping = objective.n_parameters, len(alone), objective.parameters
     size, pairs, noise = n * n_pairs, [], dict[tuple[int, str], NoiseModel]()
@@ -132,7 +133,7 @@ def _joint_covariance(
             total += of_block.T @ np.linalg.solve(block.precision, of_block)
     itself = np.kron(np.eye(n_pairs), np.ones((n, n)))
     grid = scatter(np.concatenate(shifts, axis=1)) * (BETWEEN_GRIDS + (1.0 - BETWEEN_GRIDS) * itself)
-    return np.asarray((total + beyond(grid, by_noise)).reshape(mesh.shape) + mesh)
+    return np.asarray((total + grid_covariance(alone[0], grid, by_noise)).reshape(mesh.shape) + mesh)
 
 
 def _lines(objective: Objective) -> list[int]:
@@ -150,8 +151,7 @@ def agreement(pairs: PairEstimates) -> Agreement:
     chi-squared with (n_pairs - 1) n degrees of freedom. The mean's covariance is widened by the variance between pairs
     (DerSimonian & Laird, Controlled Clinical Trials 7 (1986) 177-188, here for each modulus and with V) and, where
     there is one, so that 1.96 standard deviations reach as far as Student's quantile of so few pairs (Hartung & Knapp,
-    Stat. Med. 20 (2001) 1771-1782). Within-subject variation: the standard deviation of ln E over pairs as exp(s) - 1
-    (Bland & Altman, BMJ 313 (1996) 106).
+    Stat. Med. 20 (2001) 1771-1782). Within-subject variation: `within_subject_cv` of ln E over pairs.
     """
     n_pairs, n = pairs.theta.shape
     theta, joint = pairs.theta.ravel(), pairs.covariance.reshape(n_pairs * n, n_pairs * n)
@@ -176,7 +176,7 @@ def agreement(pairs: PairEstimates) -> Agreement:
         outlier=~kept,
         influence=(weights @ theta - np.stack(without)) / np.sqrt(np.diag(spread)),
         heterogeneity=float(special.chdtrc(max(good.theta.size - n, 1), q)),
-        within_cv=np.expm1(np.std(good.theta, axis=0, ddof=1)),
+        within_cv=within_subject_cv(np.var(good.theta, axis=0, ddof=1)),
         theta=robust @ theta,
         covariance=covariance * np.outer(few, few),
     )

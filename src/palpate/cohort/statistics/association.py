@@ -1,13 +1,13 @@
-"""How modulus and stage go together: correlations with their unit of analysis.
+"""How modulus and stage go together: correlations of patients, and of scans beside them, described and not tested.
 
-Scans of one patient are not independent: a p-value over scans counts each patient many times. So the patient is the
-unit, its modulus the median of its scans, and the interval comes from drawing whole patients (cluster bootstrap;
-Davison & Hinkley, Bootstrap Methods and their Application, 1997, section 3.8).
+Scans of one patient are not independent: what is said over scans counts each patient many times. So the patient is the
+unit, its modulus the median of its scans. The test of a cohort is that of its regression, which takes each scan with
+its interval.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,46 +16,33 @@ from scipy import stats
 
 __all__ = ["Association", "PerPatient", "PerScan", "association", "pearson_p", "points_behind"]
 
-DRAWS = 2000
-TAU_DRAWS = 500  # of them, for Kendall's tau, which takes long
 MOST_POINTS = 2000
 FEWEST = 3  # points of a correlation
 
 Array = NDArray[np.float64]
-Interval = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class PerScan:
-    """Pearson's r with its p, as if all n scans were independent; `interval95`: of r when whole patients are drawn.
-
-    undefined: why there is none, in words; everything else is None then.
-    """
+    """Pearson's r of n scans as if they were independent; `undefined`: why there is none, in words."""
 
     r: float | None
-    p: float | None
     n: int
-    interval95: Interval | None
     undefined: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class PerPatient:
-    """Pearson's r, Spearman's rho and Kendall's tau-b of the patients' medians, n patients, with intervals.
+    """Pearson's r, Spearman's rho and Kendall's tau-b of n patients' medians; `undefined`: why there are none.
 
-    Each p takes patients as independent; each interval comes from drawing patients. `undefined` as above.
+    Where medians are known by an interval only (`n_censored`), there is tau alone: r and rho would leave them out.
     """
 
     r: float | None
-    p: float | None
     rho: float | None
-    rho_p: float | None
-    interval95: Interval | None
+    tau: float | None
     n: int
-    tau: float | None = None
-    tau_p: float | None = None
-    rho_interval95: Interval | None = None
-    tau_interval95: Interval | None = None
+    n_censored: int = 0
     undefined: str = ""
 
 
@@ -67,41 +54,28 @@ class Association:
     per_patient: PerPatient
 
 
-def association(values: Sequence[Array], stages: Array, *, seed: int) -> Association:
-    """The association of stages (n_patients,) with moduli, an array (n_scans,) of at least one for each patient."""
-    medians = np.array([np.median(part) for part in values])
-    scans, of_scans = np.concatenate([np.zeros(0), *values]), np.repeat(stages, [len(part) for part in values])
-    words = _undefined(stages, medians, "patient"), _undefined(of_scans, scans, "scan")
-    draws = [] if words[0] or words[1] else _draws(stages, medians, seed)
+def association(lows: Sequence[Array], highs: Sequence[Array], stages: Array) -> Association:
+    """The association of stages (n_patients,) with moduli, given by their ends: two arrays (n_scans,) a patient.
 
-    def interval(of: Callable[[Array, Array], float], most: int = DRAWS) -> Interval | None:
-        """Of a statistic of the patients' stages and medians."""
-        return _middle([of(stages[d], medians[d]) for d in draws[:most]])
-
-    of_all = [
-        _r(np.repeat(stages[d], [len(values[i]) for i in d]), np.concatenate([values[i] for i in d])) for d in draws
-    ]
-    per_scan = PerScan(None, None, len(scans), None, words[1])
-    if not words[1]:
-        by_scan = stats.pearsonr(of_scans, scans)
-        per_scan = PerScan(float(by_scan.statistic), float(by_scan.pvalue), len(scans), _middle(of_all))
-    if words[0]:
-        return Association(per_scan, PerPatient(None, None, None, None, None, len(values), undefined=words[0]))
-    by_patient, ranked = stats.pearsonr(stages, medians), stats.spearmanr(stages, medians)
-    ordered = stats.kendalltau(stages, medians)
-    per_patient = PerPatient(
-        r=float(by_patient.statistic),
-        p=float(by_patient.pvalue),
-        rho=float(ranked.statistic),
-        rho_p=float(ranked.pvalue),
-        interval95=interval(_r),
-        n=len(values),
-        tau=float(ordered.statistic),
-        tau_p=float(ordered.pvalue),
-        rho_interval95=interval(lambda x, y: _r(stats.rankdata(x), stats.rankdata(y))),
-        tau_interval95=interval(lambda x, y: float(stats.kendalltau(x, y).statistic), TAU_DRAWS),
-    )
-    return Association(per_scan, per_patient)
+    Both ends are the value where it is known; 0 and infinity are open. A median's ends are the medians of the ends.
+    """
+    below, above = (np.array([np.median(part) for part in ends]) for ends in (lows, highs))
+    scans = np.concatenate([np.zeros(0), *lows])
+    of_scans = np.repeat(stages, [len(part) for part in lows])
+    open_scans = int((scans != np.concatenate([np.zeros(0), *highs])).sum())
+    words = f"undefined: {open_scans} scans are known by an interval only" if open_scans else ""
+    words = words or _undefined(of_scans, len(np.unique(scans)) < 2, "scan")
+    per_scan = PerScan(None if words else _r(of_scans, scans), len(scans), words)
+    n, open_medians = len(stages), int((below != above).sum())
+    words = _undefined(stages, not _signs(below, above).any(), "patient")
+    if words:
+        return Association(per_scan, PerPatient(None, None, None, n, open_medians, words))
+    signs, order = _signs(below, above), _signs(stages, stages)
+    tau = float((signs * order).sum() / np.sqrt(float((signs**2).sum()) * float((order**2).sum())))
+    if open_medians:
+        return Association(per_scan, PerPatient(None, None, tau, n, open_medians))
+    rho = _r(stats.rankdata(stages), stats.rankdata(below))
+    return Association(per_scan, PerPatient(_r(stages, below), rho, tau, n))
 
 
 def pearson_p(r: float, n: int) -> float:
@@ -116,31 +90,26 @@ def points_behind(r: float, p: float) -> int:
     return min(counts, key=lambda n: abs(np.log(max(pearson_p(r, n), 1e-300) / p)))
 
 
-def _undefined(stages: Array, values: Array, unit: str) -> str:
-    """Why no correlation can be stated, in words; empty where it can."""
-    if len(values) < FEWEST:
+def _signs(below: Array, above: Array) -> Array:
+    """Of each pair (n, n): 1 where the first is larger, -1 where it is smaller, 0 where the ends do not tell.
+
+    So Kendall's tau-b takes pairs that censoring leaves open as ties (Brown, Hollander & Korwar 1974).
+    """
+    larger = below[:, None] > above[None, :]
+    return larger.astype(float) - larger.T
+
+
+def _undefined(stages: Array, same: bool, unit: str) -> str:
+    """Why no correlation can be stated, in words; empty where it can. `same`: all values are, or nobody can tell."""
+    if len(stages) < FEWEST:
         return (
-            f"undefined: {len(values)} {unit}{'' if len(values) == 1 else 's'} with a stage and a modulus, and a"
+            f"undefined: {len(stages)} {unit}{'' if len(stages) == 1 else 's'} with a stage and a modulus, and a"
             f" correlation needs {FEWEST}"
         )
     if len(np.unique(stages)) < 2:
         return f"undefined: all {unit}s have the stage {stages[0]:g}, and a correlation needs two"
-    return "" if len(np.unique(values)) > 1 else f"undefined: all {unit}s have the same modulus"
-
-
-def _draws(stages: Array, medians: Array, seed: int) -> list[NDArray[np.int64]]:
-    """Draws of whole patients, of which a correlation can be taken."""
-    rng = np.random.default_rng(seed)
-    draws = rng.integers(len(medians), size=(DRAWS, len(medians)))
-    return [d for d in draws if len(np.unique(stages[d])) > 1 and len(np.unique(d)) > 2 and np.ptp(medians[d]) > 0.0]
+    return f"undefined: no two {unit}s have moduli that can be told apart" if same else ""
 
 
 def _r(x: Array, y: Array) -> float:
     return float(np.corrcoef(x, y)[0, 1])
-
-
-def _middle(values: Sequence[float]) -> Interval | None:
-    if not len(values):
-        return None
-    low, high = np.percentile(values, [2.5, 97.5])
-    return float(low), float(high)

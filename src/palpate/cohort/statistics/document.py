@@ -9,13 +9,14 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from palpate.cohort.records import Record, tissues_of
 from palpate.cohort.statistics.association import association
-from palpate.cohort.statistics.models import combined, mixed_model, repeatability, weighted_regression
-from palpate.cohort.statistics.scans import RULE, Usable, inside_fences, usable_scans
+from palpate.cohort.statistics.models import combined, repeatability
+from palpate.cohort.statistics.regression import stage_regression
+from palpate.cohort.statistics.scans import RULES, Scan, Usable, inside_fences, usable_scans
 from palpate.cohort.task import Row
+from palpate.findings import MISLEADING
 from palpate.study.result import json_object
 
 __all__ = ["SCHEMA", "statistics_document"]
@@ -23,18 +24,19 @@ __all__ = ["SCHEMA", "statistics_document"]
 SCHEMA = "palpate.statistics/1"
 SEED = 0
 NOTES = [
-    RULE,
-    "The unit of analysis is the patient; its modulus is the median of its scans (per_patient).",
+    *RULES,
+    "The unit of analysis is the patient. One test is made of each organ: that of `regression`. All else describes.",
+    "regression: ln E of each scan on its patient's stage; patients scatter about the line, and scans about patients.",
+    "A censored scan counts there by the probability of its interval.",
+    "p: of all arrangements of the stages among up to 8 patients, else of 9999 seeded ones and the one that was seen.",
+    "Interval of the factor: the slopes that this test does not reject.",
+    "regression_adjusted: the same beside the table's further numeric columns, without a test.",
+    "regression_without_warned: without scans whose warnings say that a modulus can be off by more than its interval.",
+    "per_patient: correlations of the patients' medians; Kendall's tau takes pairs that intervals leave open as ties.",
     "What is said per scan takes all scans of a few patients for as many patients; it stands there for comparison.",
-    "Intervals of correlations come from drawing whole patients, 2000 times (Kendall's tau: 500).",
-    "p-values of correlations take patients as independent.",
-    "paper: mean, and Pearson's r, of all scans within 1.5 interquartile ranges of their patient's quartiles.",
+    "paper: mean, and Pearson's r, of scans with a value within 1.5 interquartile ranges of their patient's quartiles.",
     "The paper states no rule for outliers; this is the one that box plots draw them by.",
-    "weighted: ln E of each patient on the stage, its scans combined by their intervals.",
-    "mixed_model: ln E of each scan on the stage, with a random intercept for each patient.",
-    "Its p, of the normal law, is too small for few patients.",
-    "mixed_model_adjusted: the same beside the table's further numeric columns.",
-    "Association is no cause, and with few patients intervals are wide: read them before the p-values.",
+    "Association is no cause, and with few patients intervals are wide: read them before the p.",
 ]
 
 
@@ -48,6 +50,7 @@ def statistics_document(records: Sequence[Record]) -> dict[str, Any]:
         "unit_of_analysis": "patient",
         "rows": {"in": len(records), **{state: states[state] for state in ("done", "failed", "waiting")}},
         "failed_by_class": dict(classes),
+        "identical_images": _identical_images(records),
         "patients": _patients(records, tissues),
         "organs": {usable.tissue: _organ(usable, records) for usable in tissues},
         "paper": {usable.tissue: _as_the_paper(usable) for usable in tissues},
@@ -58,27 +61,53 @@ def statistics_document(records: Sequence[Record]) -> dict[str, Any]:
 
 def _organ(usable: Usable, records: Sequence[Record]) -> dict[str, Any]:
     staged = [patient for patient in usable.patients if usable.stage_of(patient) is not None]
-    values = [np.array([scan.value for scan in usable.of(patient)]) for patient in staged]
+    lows, highs = ([np.array([getattr(s, end) for s in usable.of(p)]) for p in staged] for end in ("low", "high"))
     stages = np.array([float(usable.stage_of(patient) or 0) for patient in staged])
     several = [p for p in usable.patients if len({scan.stage for scan in usable.of(p)}) > 1]
-    remarks = (
-        [f"{len(several)} patients have rows of several stages: only the mixed model uses them"] if several else []
-    )
+    remarks = [f"{len(several)} patients have rows of several stages: nothing by stage uses them"] if several else []
     without = len(usable.patients) - len(staged) - len(several)
     remarks += [f"{without} patients have no stage"] if without else []
     covariates = _numeric_covariates(records)
+    clean = [scan for scan in usable.scans if not set(scan.warnings) & set(MISLEADING)]
+    warned = len(clean) < len(usable.scans)
+    censored = sum(scan.value is None for scan in usable.scans)
+    adjusted = stage_regression(usable.scans, covariates=covariates, seed=SEED) if covariates else None
     return {
         "unit": usable.unit,
-        "used": {"scans": len(usable.scans), "patients": len(usable.patients)},
+        "used": {"scans": len(usable.scans), "patients": len(usable.patients), "censored": censored},
         "left_out": usable.left_out,
+        "left_out_rows": {"not identified": usable.unknown, "unfit": usable.unfit},
+        "warnings": usable.warnings(),
         "remarks": remarks,
-        **asdict(association(values, stages, seed=SEED)),
-        "weighted": weighted_regression(usable),
-        "mixed_model": mixed_model(usable, {}),
-        "mixed_model_adjusted": mixed_model(usable, covariates) if covariates else None,
+        **asdict(association(lows, highs, stages)),
+        "regression": stage_regression(usable.scans, seed=SEED),
+        "regression_adjusted": adjusted if adjusted is None or adjusted.get("covariates", True) else None,
+        "regression_without_warned": _untested(stage_regression(clean, seed=SEED)) if warned else None,
         "repeatability": repeatability(usable),
         "by_stage": _by_stage(usable),
     }
+
+
+def _untested(regression: dict[str, Any]) -> dict[str, Any]:
+    """A regression that is there to be compared, without its test."""
+    return {key: value for key, value in regression.items() if key not in ("p", "arrangements", "exact")}
+
+
+def _identical_images(records: Sequence[Record]) -> list[dict[str, Any]]:
+    """Images that rows of several patients share to the byte: an image that was copied, or one patient twice."""
+    holders: dict[str, list[tuple[Row, str]]] = {}
+    for record in records:
+        for key, digest in record.images.items():
+            holders.setdefault(digest, []).append((record.row, key))
+    return [
+        {
+            "sha256": digest,
+            "patients": patients,
+            "rows": [{"id": row.id, "image": key} for row, key in held],
+        }
+        for digest, held in holders.items()
+        if len(patients := list(dict.fromkeys(row.patient for row, _ in held))) > 1
+    ]
 
 
 def _patients(records: Sequence[Record], tissues: Sequence[Usable]) -> list[dict[str, Any]]:
@@ -90,32 +119,41 @@ def _patients(records: Sequence[Record], tissues: Sequence[Usable]) -> list[dict
         entry: dict[str, Any] = {"patient": patient, "stage": stages.pop() if len(stages) == 1 else None}
         entry |= {"sessions": [row.session for row in rows], "kpa": {}, "ratio": {}, "summary": {}}
         for usable in tissues:
-            scans = usable.of(patient)
-            if not scans:
-                continue
-            values = np.array([scan.value for scan in scans])
-            entry["kpa" if usable.unit == "kPa" else "ratio"][usable.tissue] = values.tolist()
-            inside = inside_fences(values)
-            means = {"median": float(np.median(values)), "mean_as_the_paper": float(values[inside].mean())}
-            outliers = {"n": len(values), "outliers": int((~inside).sum())}
-            entry["summary"][usable.tissue] = outliers | means | {"combined": asdict(combined(scans))}
+            if scans := usable.of(patient):
+                values = [scan.value for scan in scans if scan.value is not None]
+                entry["kpa" if usable.unit == "kPa" else "ratio"][usable.tissue] = values
+                entry["summary"][usable.tissue] = _summary(scans)
         found.append(entry)
     return found
 
 
+def _summary(scans: Sequence[Scan]) -> dict[str, Any]:
+    """A patient's scans of one tissue together; null is what their values alone do not tell."""
+    valued = [scan for scan in scans if scan.value is not None]
+    values = np.array([scan.low for scan in valued])
+    inside = inside_fences(values) if valued else np.zeros(0, dtype=bool)
+    return {
+        "n": len(scans),
+        "outliers": int((~inside).sum()),
+        "median": _quantiles(scans)[1],
+        "mean_as_the_paper": float(values[inside].mean()) if valued else None,
+        "combined": asdict(combined(valued)) if valued else None,
+        "censored": [[scan.low95, scan.high95] for scan in scans if scan.value is None],
+    }
+
+
 def _as_the_paper(usable: Usable) -> dict[str, Any]:
-    """Pearson's r over scans without outliers, with the p of as many patients: what the paper computes."""
-    kept = []
+    """Pearson's r over scans without outliers, as if they were patients: what the paper computes, but for its p."""
+    stages, values = list[float](), list[float]()
     for patient in usable.patients:
-        scans = [scan for scan in usable.of(patient) if scan.stage is not None]
+        scans = [scan for scan in usable.valued(patient) if scan.stage is not None]
         if scans:
-            inside = inside_fences(np.array([scan.value for scan in scans]))
-            kept += [scan for scan, there in zip(scans, inside, strict=True) if there]
-    stages, values = [float(scan.stage or 0) for scan in kept], [scan.value for scan in kept]
-    if len(kept) < 3 or len(set(stages)) < 2 or len(set(values)) < 2:
-        return {"r": None, "p": None, "n": len(kept), "undefined": "undefined: too few scans, or all of one stage"}
-    found = stats.pearsonr(stages, values)
-    return {"r": float(found.statistic), "p": float(found.pvalue), "n": len(kept)}
+            inside = inside_fences(np.array([scan.low for scan in scans]))
+            stages += [float(scan.stage or 0) for scan, there in zip(scans, inside, strict=True) if there]
+            values += [scan.low for scan, there in zip(scans, inside, strict=True) if there]
+    if len(values) < 3 or len(set(stages)) < 2 or len(set(values)) < 2:
+        return {"r": None, "n": len(values), "undefined": "undefined: too few scans, or all of one stage"}
+    return {"r": float(np.corrcoef(stages, values)[0, 1]), "n": len(values)}
 
 
 def _by_stage(usable: Usable) -> list[dict[str, Any]]:
@@ -123,10 +161,18 @@ def _by_stage(usable: Usable) -> list[dict[str, Any]]:
     found = []
     for stage in sorted({scan.stage for scan in usable.scans if scan.stage is not None}):
         scans = [scan for scan in usable.scans if scan.stage == stage]
-        low, middle, high = np.percentile([scan.value for scan in scans], [25.0, 50.0, 75.0])
+        low, middle, high = _quantiles(scans)
         counts = {"n_patients": len({scan.patient for scan in scans}), "n_scans": len(scans)}
+        counts["n_censored"] = sum(scan.value is None for scan in scans)
         found.append({"stage": stage, **counts, "q25": low, "median": middle, "q75": high})
     return found
+
+
+def _quantiles(scans: Sequence[Scan]) -> list[float | None]:
+    """Quartiles of the scans; None where they would be others at another end of what is censored."""
+    with np.errstate(invalid="ignore"):
+        ends = [np.percentile([getattr(scan, end) for scan in scans], [25.0, 50.0, 75.0]) for end in ("low", "high")]
+    return [float(low) if low == high else None for low, high in zip(*ends, strict=True)]
 
 
 def _numeric_covariates(records: Sequence[Record]) -> Mapping[str, Mapping[str, float]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,12 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.cohort.records import Record
+from palpate.findings import Misleading
 
-__all__ = ["RULE", "Scan", "Usable", "inside_fences", "usable_scans"]
+__all__ = ["RULES", "UNFIT", "Scan", "Usable", "inside_fences", "usable_scans"]
 
-RULE = (
-    "A scan counts when its row is done and its modulus is identified or weak; one that is not identified has no upper"
-    " or lower end, and is left out and counted as such."
+UNFIT: tuple[Misleading, ...] = ("mirrored", "voxel-size", "units", "large-shift", "volume-implausible", "fold-over")
+RULES = (
+    "A scan enters when its row is done. One that is not identified has no value: it enters as censored, by its ends.",
+    "Of a scan that is not identified and has no end, nothing is known: it is left out, counted and named.",
+    f"So is one with a warning that its images or its case are wrong: {', '.join(UNFIT)}.",
+    "None of these warnings looks at the modulus that was found. Scans with other warnings enter and are counted.",
 )
 HALF_WIDTH = 1.959963984540054  # of a 95 % interval, in standard deviations
 LEAST_SD = 1e-3  # of ln E: nothing is known better
@@ -26,67 +31,100 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """One row's modulus of one tissue, `sd` the standard deviation of its logarithm from the 95 % interval."""
+    """One row's modulus of one tissue; `value` None where it is censored: all that is known are its ends.
+
+    low95, high95: of the 95 % interval, None for an open end; warnings: codes that the row's result carries.
+    """
 
     id: str
     patient: str
     session: str
     stage: int | None
-    value: float
-    low95: float
-    high95: float
-    sd: float
-    verdict: str
+    value: float | None
+    low95: float | None
+    high95: float | None
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def low(self) -> float:
+        """The smallest that its modulus can be: its value, or the lower end, 0 where that is open."""
+        return self.value or self.low95 or 0.0
+
+    @property
+    def high(self) -> float:
+        """The largest that its modulus can be: its value, or the upper end, infinity where that is open."""
+        return self.value or self.high95 or math.inf
+
+    @property
+    def sd(self) -> float:
+        """Standard deviation of its logarithm by its 95 % interval; of a scan with a value."""
+        return max(math.log((self.high95 or 1.0) / (self.low95 or 1.0)) / (2.0 * HALF_WIDTH), LEAST_SD)
 
 
 @dataclass(frozen=True, slots=True)
 class Usable:
-    """The scans of a tissue that count, in `unit` ("kPa" or "ratio"), and how many do not: why -> number.
+    """The scans of a tissue that enter, in `unit` ("kPa" or "ratio"), and how many do not: why -> number.
 
-    groups: the same scans by patient.
+    unfit: id of a row -> the warnings that leave it out; unknown: ids of those that no end is known of; groups: the
+    scans by patient.
     """
 
     tissue: str
     unit: str
     scans: tuple[Scan, ...]
     left_out: dict[str, int]
+    unfit: dict[str, list[str]]
+    unknown: list[str]
     groups: dict[str, list[Scan]]
 
     @property
     def patients(self) -> tuple[str, ...]:
-        """Patients with a scan that counts, in the table's order."""
+        """Patients with a scan that enters, in the table's order."""
         return tuple(self.groups)
 
     def of(self, patient: str) -> tuple[Scan, ...]:
         """The scans of a patient."""
         return tuple(self.groups.get(patient, ()))
 
+    def valued(self, patient: str) -> tuple[Scan, ...]:
+        """Those that have a value."""
+        return tuple(scan for scan in self.of(patient) if scan.value is not None)
+
     def stage_of(self, patient: str) -> int | None:
         """The stage of a patient; None where its rows name none, or several."""
         stages = {scan.stage for scan in self.of(patient)}
         return stages.pop() if len(stages) == 1 else None
 
+    def warnings(self) -> dict[str, int]:
+        """Code of a warning -> number of the scans that enter with it."""
+        return dict(Counter(code for scan in self.scans for code in scan.warnings))
+
 
 def usable_scans(records: Sequence[Record], tissue: str) -> Usable:
-    """The scans of a tissue that count by `RULE`; where rows in kPa and ratios are mixed, those in kPa."""
-    found = [(record.row, modulus) for record in records if (modulus := record.modulus(tissue)) is not None]
+    """The scans of a tissue that enter by `RULES`; where rows in kPa and ratios are mixed, those in kPa."""
+    found = [(record, modulus) for record in records if (modulus := record.modulus(tissue)) is not None]
     unit = "kPa" if any(modulus.unit == "kPa" for _, modulus in found) else "ratio"
-    scans: list[Scan] = []
-    left_out = {"failed": sum(record.state == "failed" for record in records)}
-    left_out |= {"waiting": sum(record.state == "waiting" for record in records), "not identified": 0, "other unit": 0}
-    for row, modulus in found:
+    wrong: frozenset[str] = frozenset(UNFIT)
+    scans, unfit, unknown, other = list[Scan](), dict[str, list[str]](), list[str](), 0
+    for record, modulus in found:
+        row, codes = record.row, [code for code in record.warnings if code in wrong]
         if modulus.unit != unit:
-            left_out["other unit"] += 1
-        elif modulus.verdict == "not identified" or not (modulus.value and modulus.low95 and modulus.high95):
-            left_out["not identified"] += 1
+            other += 1
+        elif codes:
+            unfit[row.id] = codes
+        elif not (modulus.low95 or modulus.high95):
+            unknown.append(row.id)
         else:
-            sd = max(math.log(modulus.high95 / modulus.low95) / (2.0 * HALF_WIDTH), LEAST_SD)
-            who = (row.id, row.patient, row.session, row.stage)
-            scans.append(Scan(*who, modulus.value, modulus.low95, modulus.high95, sd, modulus.verdict))
+            who, ends = (row.id, row.patient, row.session, row.stage), (modulus.low95, modulus.high95)
+            value = modulus.value if all(modulus.stated) else None
+            scans.append(Scan(*who, value, *ends, record.warnings))
+    states = Counter(record.state for record in records)
+    left_out = {"failed": states["failed"], "waiting": states["waiting"]}
+    left_out |= {"not identified": len(unknown), "unfit": len(unfit), "other unit": other}
     groups: dict[str, list[Scan]] = {}
     for scan in scans:
         groups.setdefault(scan.patient, []).append(scan)
-    return Usable(tissue, unit, tuple(scans), left_out, groups)
+    return Usable(tissue, unit, tuple(scans), left_out, unfit, unknown, groups)
 
 
 def inside_fences(values: Array) -> NDArray[np.bool_]:

@@ -2,34 +2,40 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from palpate.cohort.statistics.association import Association, association, pearson_p, points_behind
+from palpate.cohort.statistics.association import association, pearson_p, points_behind
+from palpate.cohort.statistics.regression import stage_regression
+from palpate.cohort.statistics.scans import Scan
 from palpate.experiments.reproduce.cohort import ORGANS, CohortSettings, PatientResult, estimate_patient
 from palpate.experiments.reproduce.jobs import Job, Progress, compute
 from palpate.experiments.reproduce.ledger import Ledger
 from palpate.experiments.reproduce.paper import PAPER_STAGING
+from palpate.report.rows import interval_text, number
 
-__all__ = ["Staging", "paper_remark", "staging"]
+__all__ = ["Staging", "paper_remark", "staging", "with_stage"]
 
+KEYS = ("per_scan", "per_patient", "regression")
 NOTES = (
     "All patients are simulated: random pelves, moduli made to grow with the stage, noisy surfaces, no voxels.",
     "Data and estimates share one mesh a patient: this shows the statistics, not the accuracy of the method.",
     "A scan is not a patient: the p over scans takes all pairs of a few bodies for as many bodies.",
-    "The patient is the unit here, with the median of its scans; the intervals come from drawing whole patients.",
+    "The patient is the unit here: its test takes all arrangements of the stages among the patients.",
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Staging:
-    """All patients with their estimates, and each organ's association with the stage."""
+    """All patients with their estimates, and each organ's association with the stage (`with_stage`)."""
 
     patients: tuple[PatientResult, ...]
-    organs: dict[str, Association]
+    organs: Mapping[str, Mapping[str, Any]]
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON."""
@@ -37,23 +43,21 @@ class Staging:
             "schema": "palpate.reproduce/1",
             "experiment": "staging",
             "patients": [asdict(patient) for patient in self.patients],
-            "organs": {organ: asdict(found) for organ, found in self.organs.items()},
+            "organs": dict(self.organs),
             "paper": {organ: {"r": r, "p": p} for organ, (r, p) in PAPER_STAGING.items()},
             "notes": [*NOTES, paper_remark()],
         }
 
     def text(self) -> list[list[str]]:
         """Rows of cells for a terminal."""
-        rows = [["organ", "unit", "n", "r", "95 % (patients drawn)", "p", "rank rho", "the paper"]]
+        rows = [["organ", "unit", "n", "r", "p", "rank rho", "factor a stage", "95 %", "the paper"]]
         for organ, found in self.organs.items():
-            scan, patient, (r, p) = found.per_scan, found.per_patient, PAPER_STAGING[organ]
+            scan, patient, line, (r, p) = *(found[key] for key in KEYS), PAPER_STAGING[organ]
             theirs = f"r {r:g}, p {p:.2e}"
-            rows.append(
-                [organ, "scan", str(scan.n), f"{scan.r:.3f}", _range(scan.interval95), f"{scan.p:.2e}", "", theirs]
-            )
-            interval = _range(patient.interval95)
-            rho = f"{patient.rho:.3f}"
-            rows.append([organ, "patient", str(patient.n), f"{patient.r:.3f}", interval, f"{patient.p:.2e}", rho, ""])
+            rows.append([organ, "scan", str(scan["n"]), f"{scan['r']:.3f}", f"{scan['p']:.2e}", "", "", "", theirs])
+            numbers = [f"{patient['r']:.3f}", f"{line['p']:.2e}", f"{patient['rho']:.3f}"]
+            factor = [number(line["factor_per_stage"]), interval_text(tuple(line["interval95"]))]
+            rows.append([organ, "patient", str(patient["n"]), *numbers, *factor, ""])
         return rows
 
 
@@ -67,10 +71,23 @@ def staging(settings: CohortSettings, ledger: Ledger, *, progress: Progress, wor
     parts = compute(jobs[::-1], ledger, workers=workers, progress=progress)  # the patients with most pairs first
     patients = tuple(PatientResult(**parts[key]) for key in keys)
     stages = np.array([patient.stage for patient in patients], dtype=float)
-    organs = {
-        organ: association([np.array(p.kpa[organ]) for p in patients], stages, seed=settings.seed) for organ in ORGANS
-    }
-    return Staging(patients, organs)
+    return Staging(patients, {organ: with_stage([p.kpa[organ] for p in patients], stages) for organ in ORGANS})
+
+
+def with_stage(kpa: Sequence[Sequence[float]], stages: NDArray[np.float64]) -> dict[str, Any]:
+    """What the moduli (kPa) of each patient have to do with stages (n_patients,), per scan and per patient.
+
+    Estimates have no intervals here: they scatter as they do.
+    """
+    values = [np.array(part) for part in kpa]
+    found = asdict(association(values, values, stages))
+    found["per_scan"]["p"] = pearson_p(found["per_scan"]["r"], found["per_scan"]["n"])
+    scans = [
+        Scan(f"{i}-{j}", f"{i}", "", int(stage), value, value, value)
+        for i, (part, stage) in enumerate(zip(kpa, stages, strict=True))
+        for j, value in enumerate(part)
+    ]
+    return found | {"regression": stage_regression(scans)}
 
 
 def paper_remark() -> str:
@@ -88,7 +105,3 @@ def paper_remark() -> str:
 def _part(settings: CohortSettings, number: int, key: str, progress: Progress) -> dict[str, Any]:
     progress(f"staging: {key} of {len(settings.stages)}, {settings.pairs[number]} pairs of images")
     return asdict(estimate_patient(settings, number, progress))
-
-
-def _range(interval: tuple[float, float] | None) -> str:
-    return "undefined" if interval is None else f"{interval[0]:.2f} to {interval[1]:.2f}"
