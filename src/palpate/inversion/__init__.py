@@ -13,7 +13,14 @@ from palpate.inversion.blocks import (
     wall_blocks,
 )
 from palpate.inversion.driver_fit import fit_driver
-from palpate.inversion.estimate import Inversion, StartRun, as_good, continue_at_finite_strain, invert
+from palpate.inversion.estimate import (
+    Inversion,
+    StartRun,
+    as_good,
+    continue_at_finite_strain,
+    invert,
+    with_released,
+)
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import Evaluation, Linearisation, LinearisedObjective, Objective
 from palpate.inversion.optimise import (
@@ -77,4 +84,5 @@ __all__ = [
     "unit_blocks",
     "wall_blocks",
     "with_first_noise",
+    "with_released",
 ]

@@ -63,7 +63,8 @@ class Block:
     odds of the alternatives, of which the likeliest is taken; none: of alternatives that are alike the widest.
     considered: the images cannot tell them, so that they are held at 0, and what they may be counts in the covariance
     (Schmidt 1966). last: its prior is learned where the estimate has converged under those of the others; before it
-    would take what they explain. regions: numbers of the model's regions to whose ln E it is added, one unknown for all
+    would take what they explain. released: held at 0 as well while an estimate is sought, and free under P where its
+    interval is. regions: numbers of the model's regions to whose ln E it is added, one unknown for all
     of them, where it acts on moduli. Raises `ConfigurationError` for terms of another size.
     """
 
@@ -77,6 +78,7 @@ class Block:
     odds: tuple[float, ...] = ()
     considered: bool = False
     last: bool = False
+    released: bool = False
     unit_mm: float = 1.0
     regions: tuple[int, ...] = ()
 
@@ -92,7 +94,7 @@ class Block:
     @property
     def first_precision(self) -> NDArray[np.float64]:
         """Precision (n, n) with which an estimate begins."""
-        return CONSIDERED * self.precision if self.considered else self.precision
+        return CONSIDERED * self.precision if self.considered or self.released else self.precision
 
     @property
     def size(self) -> int:
@@ -219,10 +221,11 @@ def layer_blocks(
     """By how much ln E of the layer of elements round each organ differs from that of its tissue: one unknown each.
 
     layers: of each organ its name and the numbers of the model's regions. A capsule, a film of fat or a plane on which
-    an organ slides is seen as little by its surface as it changes what is found of the organ much.
+    an organ slides is hardly seen by its surface, while the organ's modulus hangs on it: as an unknown of the estimate
+    it costs accuracy where there is none, and an interval that leaves it out does not hold where there is one.
     """
     return tuple(
-        Block(organ, "layer", Acts.MODULI, states, np.full((1, 1), sd**-2.0), regions=regions)
+        Block(organ, "layer", Acts.MODULI, states, np.full((1, 1), sd**-2.0), released=True, regions=regions)
         for organ, regions in layers
     )
 

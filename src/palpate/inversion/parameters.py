@@ -248,6 +248,15 @@ class ParameterMap:
     def _model_columns(self, state: int) -> NDArray[np.int64]:
         return np.concatenate([self.acting(Acts.BOUNDARY, state), self.acting(Acts.MATERIAL, state)])
 
+    def released(self) -> ParameterMap:
+        """The same with those blocks free that are held while an estimate is sought (see `Block.released`)."""
+        precision, n = self.nuisance_precision.copy(), self.n_parameters
+        for i, block in enumerate(self.blocks):
+            if block.released:
+                own = self.columns(i) - n
+                precision[np.ix_(own, own)] = block.precision
+        return replace(self, nuisance_precision=precision)
+
     def with_prior(self, mean: NDArray[np.float64], sd: NDArray[np.float64]) -> ParameterMap:
         """The same with a normal prior of theta: mean and standard deviation (n_parameters,), inf where it is flat.
 

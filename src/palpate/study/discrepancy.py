@@ -18,7 +18,6 @@ __all__ = [
     "FoundDiscrepancy",
     "FrameFound",
     "HeterogeneityFound",
-    "LayerFound",
     "OffsetFound",
     "discrepancy_findings",
     "discrepancy_of",
@@ -66,34 +65,19 @@ class HeterogeneityFound:
 
 
 @dataclass(frozen=True, slots=True)
-class LayerFound:
-    """Young's modulus of the layer of elements round an organ over that of their tissue, with a 95 % interval."""
-
-    tissue: str
-    ratio: float
-    interval95: tuple[float, float]
-
-    @property
-    def told(self) -> bool:
-        """Whether it is surely another than 1."""
-        return not self.interval95[0] <= 1.0 <= self.interval95[1]
-
-
-@dataclass(frozen=True, slots=True)
 class FoundDiscrepancy:
-    """All of it: the frame of each later state (None: it is held), offsets, tissues that are not alike everywhere."""
+    """All of it: the frame of each later state (None: it is held), offsets, tissues that are not homogeneous."""
 
     frame: tuple[FrameFound | None, ...] = ()
     offsets: tuple[OffsetFound, ...] = ()
     heterogeneity: tuple[HeterogeneityFound, ...] = ()
-    layers: tuple[LayerFound, ...] = ()
 
 
 def discrepancy_of(inversion: Inversion, states: Sequence[FittedState]) -> FoundDiscrepancy:
     """What the blocks of unknowns of a converged inversion say, with the fitted later states."""
     parameters, unknowns = inversion.objective.parameters, inversion.minimum.unknowns
     n = parameters.n_parameters
-    offsets, heterogeneity, layers = list[OffsetFound](), list[HeterogeneityFound](), list[LayerFound]()
+    offsets, heterogeneity = list[OffsetFound](), list[HeterogeneityFound]()
     smooth = dict[int, float]()
     rows = np.linalg.inv(inversion.minimum.evaluation.matrix)
     for number, block in enumerate(parameters.blocks):
@@ -107,14 +91,10 @@ def discrepancy_of(inversion: Inversion, states: Sequence[FittedState]) -> Found
         elif block.cause == "heterogeneity":
             patchy = max(float(term[0, 0]) for terms in block.alternatives for term in terms)
             heterogeneity.append(HeterogeneityFound(block.of, learned, float(np.sqrt(patchy))))
-        elif block.cause == "layer":
-            value, half = float(unknowns[own[0]]), NORMAL_95 * float(np.sqrt(rows[own[0], own[0]]))
-            low, ratio, high = np.exp([value - half, value, value + half]).tolist()
-            layers.append(LayerFound(block.of, ratio, (low, high)))
         elif block.cause == "frame":
             smooth.setdefault(block.states[0], learned * block.unit_mm)
     frames = tuple(None if s not in smooth else _frame(fitted, smooth[s]) for s, fitted in enumerate(states))
-    return FoundDiscrepancy(frames, tuple(offsets), tuple(heterogeneity), tuple(layers))
+    return FoundDiscrepancy(frames, tuple(offsets), tuple(heterogeneity))
 
 
 def _frame(fitted: FittedState, prior_mm: float) -> FrameFound:

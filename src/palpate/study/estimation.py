@@ -17,9 +17,11 @@ from palpate.inversion import (
     LeastSquares,
     Linearisation,
     Outcome,
+    OuterIterate,
     StartRun,
     as_good,
     ratio_of_eta,
+    with_released,
 )
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit, Imaged, OfInstrument
@@ -217,7 +219,8 @@ def conclude(
     progress("intervals: profiles, and the fit of every surface before and after")
     pairs = image_pairs_of(inversion, settings.bounds, errors)
     fixed = frozen_posterior(objective, minimum.unknowns, minimum.evaluation)
-    known = _intervals(inversion, fixed, settings.bounds, covariance) if minimum.converged else ()
+    released = with_released(inversion, settings, progress=progress)
+    known = _intervals(inversion, fixed, settings.bounds, covariance, released) if minimum.converged else ()
     estimates = _estimates(inversion, known, covariance, truth)
     of_moduli = covariance.total[: len(estimates), : len(estimates)]
     stating = {e.tissue for e in estimates if e.verdict != NOT_IDENTIFIED}
@@ -332,20 +335,36 @@ class _Known:
     at_bound: bool
 
 
-def _intervals(inversion: Inversion, fixed: LeastSquares, bounds: Bounds, covariance: Covariance) -> tuple[_Known, ...]:
+def _intervals(
+    inversion: Inversion,
+    fixed: LeastSquares,
+    bounds: Bounds,
+    covariance: Covariance,
+    released: OuterIterate | None,
+) -> tuple[_Known, ...]:
+    """Of each parameter its interval; it holds that of the `released` minimum as well."""
     n = inversion.objective.n_parameters
     found, variances, at_bound = [], np.diag(covariance.total), bounds.reached(inversion.minimum.unknowns[:n])
     best = inversion.candidates[inversion.best]
     others = [c for c in inversion.candidates if c is not best and c.minimum.converged]
-    scales = np.diag(inversion.minimum.evaluation.covariance_columns(n)[:n]) / variances  # of a profile's deviance
+    least = np.diag(inversion.minimum.evaluation.covariance_columns(n)[:n])
+    scales = least / variances  # of a profile's deviance
     for i in range(n):
         limits = {"lower": float(np.exp(bounds.lower[i])), "upper": float(np.exp(bounds.upper[i]))}
         own = modulus_interval(fixed, inversion.minimum, i, variance=float(variances[i]), bounds=bounds)
         sd = float(np.sqrt(variances[i]))
         good = [c.minimum.unknowns for c in others if as_good(c.value, best.value, scale=float(scales[i]))]
-        interval = hull([own.ends, *(log_interval(float(np.exp(x[i])), sd, **limits) for x in good)])
+        wider = [] if released is None else [_released_interval(released, i, float(variances[i] - least[i]), bounds)]
+        interval = hull([own.ends, *(log_interval(float(np.exp(x[i])), sd, **limits) for x in good), *wider])
         found.append(_Known(own, interval, bool(at_bound[i])))
     return tuple(found)
+
+
+def _released_interval(released: OuterIterate, number: int, beyond: float, bounds: Bounds) -> Interval:
+    """The interval of a parameter where released blocks are free; beyond: its variance by what is no least squares."""
+    free = frozen_posterior(released.objective, released.minimum.unknowns, released.minimum.evaluation)
+    variance = float(released.minimum.evaluation.covariance_columns(number + 1)[number, number]) + beyond
+    return modulus_interval(free, released.minimum, number, variance=variance, bounds=bounds).ends
 
 
 def _estimates(
