@@ -22,6 +22,7 @@ from palpate.mesh.dihedral import tet_dihedrals
 from palpate.parallel import mapped
 from palpate.report.backgrounds import Grey, background, earlier_grey, later_grey, whole_box, whole_images
 from palpate.report.inputs import bone_distances, input_images
+from palpate.report.measured import measured_states
 from palpate.report.pairs import ImagePair, drawn_images, image_pairs
 from palpate.report.report_data import (
     MESH,
@@ -97,6 +98,8 @@ def collect(result: CaseResult) -> ReportData:
     ]
     references = tuple(_reference(drawing) for drawing in drawings)
     later = tuple(_later(drawings[number], after, references[number]) for number, after in drawn)
+    by_place = dict(zip(drawn, later, strict=True))
+    measured = attempt.part("points", lambda: measured_states(result, pairs, references, by_place, most=MOST_LATER), ())
     mesh = attempt.part("mesh", lambda: _mesh(result), None)
     names = [estimate.tissue for estimate in result.estimation.estimates]
     histories = [*(start.history for start in result.estimation.starts), result.estimation.outer_loop]
@@ -113,6 +116,7 @@ def collect(result: CaseResult) -> ReportData:
         ),
         references=references,
         later=later,
+        measured=measured,
         mesh=mesh,
         missing=attempt.missing,
     )
