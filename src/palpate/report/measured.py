@@ -48,7 +48,7 @@ def measured_states(
     """
     counts = [len(names) for _, names in pair_names(result.case)]
     first = [0, *accumulate(counts)]
-    found = []
+    found = list[MeasuredState]()
     for state, fits in groupby(sorted(result.estimation.points, key=STATE), key=STATE):
         pair = int(np.searchsorted(first, state, side="right")) - 1
         if pair < len(references) and len(found) < most:
@@ -68,14 +68,16 @@ def measured_points(fit: PointFit) -> MeasuredPoints:
     worst = int(left.argmax())
     shown = np.union1d(evenly(motions.rest, MOST_ARROWS - 1), [worst])
     places = motions.rest[shown]
-    apart = cKDTree(places).query(places, k=2)[0][:, 1] if len(places) > 1 else np.array([ALONE_MM])
+    apart = np.asarray(
+        cKDTree(places).query(places, k=[2])[0]
+    )  # of the nearest other one; infinite where there is none
     return MeasuredPoints(
         name=fit.name,
         total=len(motions.rest),
         rest=places.astype(np.float32),
         observed=motions.observed[shown].astype(np.float32),
         fitted=motions.fitted[shown].astype(np.float32),
-        near_mm=float(np.median(apart)),
+        near_mm=float(np.median(apart)) if len(places) > 1 else ALONE_MM,
         moved_rms_mm=float(np.sqrt(np.mean(np.sum(motions.observed**2, axis=1)))),
         left_rms_mm=float(np.sqrt(np.mean(left**2))),
         misfit=fit.misfit,

@@ -112,7 +112,8 @@ def _quantum(data: ReportData) -> tuple[NDArray[np.float64], float]:
     """Corner (3,) mm and step (mm) of a lattice that holds every point."""
     images: list[Reference | LaterImage] = [*data.references, *data.later]
     clouds = [surface.points for image in images for surface in image.surfaces]
-    clouds += [surface.points for state in (*data.later, *data.measured) for surface in state.outlines]
+    clouds += [surface.points for later in data.later for surface in later.outlines]
+    clouds += [surface.points for state in data.measured for surface in state.outlines]
     clouds += [p for later in data.later for m in later.model for p in (m.rest, m.fitted)]
     clouds += [data.mesh.nodes] if data.mesh else []
     clouds = [cloud for cloud in clouds if len(cloud)]

@@ -18,7 +18,7 @@ WIDTH, HEIGHT = 620, 460
 BESIDE = Camera.looking((-1.0, 0.3, 0.15))  # the patient's left side, a little from the front
 AT_THE_SIDE = Camera.looking((-1.0, 0.35, 0.25))  # of the sagittal cut, whose far half is kept
 BESIDE_FRONT = Camera.looking((-1.0, 0.6, 0.35))
-SEEN, FITTED = ("#b57a00", 1.7), ("#0050b0", 0.9)  # colour of arrows on white, and how thick
+SEEN, FITTED = ("#c98b00", 1.7), ("#1f6fd6", 0.9)  # colour of arrows on white and on black, and how thick
 HEAD, SHAFT, BRIM, SIDES = 0.05, 0.18, 0.42, 6  # head over the body's radius, shaft and brim over the head
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 
@@ -54,13 +54,16 @@ def points_png(data: ReportData, state: MeasuredState) -> bytes:
     clouds = np.concatenate([rest, *(surface.points.astype(np.float64) for surface in walls)])
     radius = 0.5 * float(np.linalg.norm(np.ptp(clouds, axis=0)))
     for surface in walls:
-        inwards = surface.points.astype(np.float64)[surface.triangles[:, ::-1]]  # what faces the viewer is not drawn
-        corners.append(inwards)
+        wall = surface.points.astype(np.float64)[surface.triangles]
+        a, b, c = np.moveaxis(wall - wall.reshape(-1, 3).mean(axis=0), 1, 0)
+        outwards = float(np.sum(a * np.cross(b, c))) > 0.0
+        corners.append(wall[:, ::-1] if outwards else wall)  # inwards, so that what faces the viewer is not drawn
         colours.append(0.45 + 0.55 * np.array(to_rgb(data.tissues[surface.tissue].colour)))
-    for style, motion in ((SEEN, "observed"), (FITTED, "fitted")):
+    for (colour, wide), motion, ahead in ((SEEN, "observed", 0.0), (FITTED, "fitted", radius)):
         ways = state.motion_factor * np.concatenate([getattr(of, motion) for of in state.points]).astype(np.float64)
-        corners.append(arrow_triangles(rest, ways, radius=radius, wide=style[1]))
-        colours.append(np.array(to_rgb(style[0])))
+        arrows = arrow_triangles(rest, ways, radius=radius, wide=wide)
+        corners.append(arrows + ahead * BESIDE_FRONT.back)  # so that the thin one is seen before the broad one
+        colours.append(np.array(to_rgb(colour)))
     every = np.concatenate(corners)
     shades = np.concatenate([np.broadcast_to(c, of.shape) for c, of in zip(colours, corners, strict=True)])
     triangles = Triangles(every, shades, np.repeat(_normals(every)[:, None], 3, axis=1))

@@ -114,12 +114,14 @@ Palpate.PointBodies = class {
           const along = new THREE.Vector3().fromArray(way, i).multiplyScalar(factor);
           Palpate.arrow(new THREE.Vector3().fromArray(p.rest, i), along, this.radius, places, wide[kind]);
         }
-        const geometry = Palpate.geometry(new Float32Array(places)), seen = kind === "seen";
+        const geometry = Palpate.geometry(new Float32Array(places)), over = kind === "fitted"; // the thin over the broad
         geometry.computeVertexNormals();
-        const material = new THREE.MeshLambertMaterial({ // the thin one shows through the broad one
-          color: Palpate.css(`--${kind}`), side: THREE.DoubleSide, transparent: seen, opacity: seen ? 0.5 : 1, depthWrite: !seen,
+        const material = new THREE.MeshLambertMaterial({
+          color: Palpate.css(`--${kind}`), side: THREE.DoubleSide, transparent: over, depthTest: !over,
         });
-        this.arrows.add(new THREE.Mesh(geometry, material));
+        const mesh = new THREE.Mesh(geometry, material);
+        mesh.renderOrder = over ? 1 : 0;
+        this.arrows.add(mesh);
       }
     }
     this.viewer.draw();
