@@ -24,7 +24,7 @@ from palpate.inversion import (
     with_released,
 )
 from palpate.mesh.voxelise import voxelise
-from palpate.observation.contract import Fit, Imaged, OfInstrument
+from palpate.observation.contract import Fit, Imaged, OfInstrument, OfPoints, PointMotions
 from palpate.progress import Progress, silent
 from palpate.study.discrepancy import FoundDiscrepancy, discrepancy_findings, discrepancy_of
 from palpate.study.estimate_findings import data_findings, fold_findings, inversion_findings, pair_findings
@@ -53,6 +53,7 @@ __all__ = [
     "Iteration",
     "ModulusEstimate",
     "Observed",
+    "PointFit",
     "Start",
     "TissueFit",
     "conclude",
@@ -144,6 +145,19 @@ class ForceFit:
 
 
 @dataclass(frozen=True, slots=True)
+class PointFit:
+    """Points whose motion was measured in a later state (its number, from 0), beside the fitted model's.
+
+    misfit: root mean square of the residuals that count, over the standard deviation stated, dimensionless.
+    """
+
+    name: str
+    state: int
+    motions: PointMotions
+    misfit: float
+
+
+@dataclass(frozen=True, slots=True)
 class Estimation:
     """Result of one inversion.
 
@@ -153,10 +167,10 @@ class Estimation:
     outer_loop: the steps from the best start's minimum to the estimate, which all starts of that minimum share;
     counts: of all starts and minima together; observations: what was compared, in words, by its kind; information: the
     directions of the log-moduli by how well they are known; information_shares: by tissue, of each kind of data, and of
-    what was believed before; discrepancy: what the images say of frame, drawing and
-    material; combinations: what is known where single moduli are not;
-    regions: joint ones of two moduli; forces: measured and fitted; image_pairs: what each of several later images says
-    alone; samples: of the moduli's posterior, where the case asks for them and the estimate converged.
+    what was believed before; discrepancy: what the images say of frame, drawing and material; combinations: what is
+    known where single moduli are not; regions: joint ones of two moduli; forces, points: measured and fitted;
+    image_pairs: what each of several later images says alone; samples: of the moduli's posterior,
+    where the case asks for them and the estimate converged.
     """
 
     status: str
@@ -179,6 +193,7 @@ class Estimation:
     samples: ModulusSamples | None = None
     poisson_ratios: tuple[PoissonRatioEstimate, ...] = ()
     forces: tuple[ForceFit, ...] = ()
+    points: tuple[PointFit, ...] = ()
 
     @property
     def correlation(self) -> NDArray[np.float64]:
@@ -249,6 +264,7 @@ def conclude(
         starts=tuple(_start(inversion, start) for start in inversion.starts),
         fits=_fits(inversion, observed),
         forces=_forces(inversion),
+        points=_points(inversion, observed),
         displacements=tuple(state.displacement for state in observed.states),
         counts=asdict(inversion.counts) | {"evaluations": inversion.evaluations},
         outer_loop=tuple(_iteration(inversion, iterate) for iterate in minimum.history),
@@ -489,6 +505,19 @@ def _forces(inversion: Inversion) -> tuple[ForceFit, ...]:
             fitted = seen.measured + float(line.residuals.values[0])
             sd = line.observation.noise_model.sd
             found.append(ForceFit(line.observation.name, line.state, seen.measured, fitted, sd))
+    return tuple(found)
+
+
+def _points(inversion: Inversion, observed: Observed) -> tuple[PointFit, ...]:
+    """The points of every observation that has some, as measured and as the fitted states move them."""
+    found = []
+    for line in inversion.minimum.evaluation.lines:
+        seen = line.observation
+        if isinstance(seen, OfPoints):
+            motions = seen.point_motions(observed.states[line.state].displacement.ravel()[line.observation.dofs])
+            stated = line.observation.first_noise((line.observation,)).sd
+            misfit = float(np.sqrt(np.mean(line.residuals.values**2))) / stated
+            found.append(PointFit(line.observation.name, line.state, motions, misfit))
     return tuple(found)
 
 
