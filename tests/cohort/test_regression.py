@@ -60,15 +60,15 @@ def test_censored_scans_recover_a_growth_that_dropping_them_loses(regressions):
 
 
 def test_without_an_effect_the_p_of_all_arrangements_is_uniform():
-    """Of the 24 ways in which stages could have met these patients, exactly the share p has no larger p."""
+    """Of the 12 ways in which stages could have met these patients, exactly the share p has no larger p."""
     scans = [
         (20.0, 19.0, 21.0),
         (31.0, 25.0, 40.0),
         (17.0, 12.0, 20.0),
-        (None, 30.0, None) if censored else (50, 45, 60),
+        (None, 30.0, None),
     ]
     found = []
-    for order in permutations((1, 2, 3, 7)):
+    for order in sorted(set(permutations((1, 1, 2, 4)))):
         rows = [scan(f"r{i}", f"P{i}", stage, *scans[i]) for i, stage in enumerate(order)]
         found.append(stage_regression(rows)["p"])
     assert [np.mean(np.array(found) <= p + 1e-12) for p in sorted(found)] == pytest.approx(sorted(found))

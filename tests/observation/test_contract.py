@@ -16,7 +16,7 @@ from palpate.images.distance import distance_map
 from palpate.images.label_image import VoxelGrid
 from palpate.mesh.locate import located
 from palpate.mesh.space import lagrange_space
-from palpate.observation.contract import DataFile, Observation, OfMaterial, Rematched, Weighting
+from palpate.observation.contract import DataFile, Observation, OfMaterial, OfPoints, Rematched, Weighting
 from palpate.observation.force import Force
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.observed_surface import ObservedSurface
@@ -264,6 +264,22 @@ def test_a_bias_of_both_distance_maps_changes_nothing(make, sphere, point_motion
     assert biased.reweighted(found[1]).weighting.precision == pytest.approx(
         plain.reweighted(found[0]).weighting.precision, rel=1e-6
     )
+
+
+@pytest.mark.parametrize("make", [of_points, of_markers, of_means])
+def test_points_that_are_drawn_move_as_their_residuals_say(make, sphere, point_motion, rng):
+    """Displacements that the points were measured to have leave none."""
+    seen = make(sphere, point_motion)
+    assert isinstance(seen, OfPoints)
+    place = 0.3 * rng.standard_normal(len(seen.dofs))
+    motions, found = seen.point_motions(place), seen.residuals(place)
+    n = len(motions.rest)
+    assert motions.rest.shape == motions.observed.shape == motions.fitted.shape == (n, 3)
+    assert np.linalg.norm(motions.fitted - motions.observed, axis=1) == pytest.approx(found.distances)
+    shift = np.array([0.3, -0.1, 0.2])
+    uniform = seen.point_motions(np.tile(shift, len(seen.dofs) // 3)).fitted
+    assert uniform == pytest.approx(np.tile(shift, (n, 1)))
+    assert not isinstance(of_smooth_surfaces(sphere, point_motion), OfPoints)
 
 
 def test_what_depends_on_the_moduli_says_how(sphere, point_motion):

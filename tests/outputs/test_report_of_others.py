@@ -94,7 +94,7 @@ def test_a_folder_that_is_not_there_is_refused_and_not_made(tmp_path, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("key", ["document", "tissues", "references", "later", "mesh"])
+@pytest.mark.parametrize("key", ["document", "tissues", "references", "later", "measured", "mesh"])
 @pytest.mark.parametrize("value", [None, [], {}, 3, "x", [[]], [{}]])
 def test_data_without_a_part_are_drawn_without_it_or_refused(copy, capsys, key, value):
     tampered(copy, change_value=lambda whole: whole.update({key: value}))

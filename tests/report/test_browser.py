@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 from palpate.images.readers import write_scalar_image
+from palpate.observation.contract import PointMotions
 from palpate.report.case_report import write_case_report
+from palpate.study.estimation import PointFit
 
 playwright = pytest.importorskip("playwright.sync_api", reason="no playwright; pip install palpate[browser]")
 
@@ -175,6 +177,37 @@ def test_layers_and_states_can_be_told_apart(opened):
     figure.locator(".modes label", has_text="after.nii.gz").click()
     figure.locator(".t-model").uncheck()
     assert changed(after, pixels(canvas)) > 0.002
+
+
+def test_arrows_of_measured_points_are_drawn_asked_for_and_found(browser, case_result, tmp_path):
+    rest = np.random.default_rng(1).uniform(6.0, 34.0, (60, 3))
+    observed = np.tile([0.0, 3.0, 0.0], (60, 1))
+    fitted = observed.copy()
+    fitted[7] += [1.0, 0.0, 0.5]
+    fit = PointFit("landmarks", 0, PointMotions(rest, observed, fitted), 1.0)
+    estimation = dataclasses.replace(case_result.estimation, points=(fit,))
+    complaints = []
+    page = browser.new_page(viewport={"width": 390, "height": 900})
+    page.on("console", lambda message: complaints.append(message.text))
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.goto(write_case_report(dataclasses.replace(case_result, estimation=estimation), tmp_path).as_uri())
+    figure = page.locator("section.points")
+    for part in ("in-slices", "in-space"):
+        figure.locator(f".{part}").scroll_into_view_if_needed()
+        page.wait_for_selector(f"section.points .{part}[data-state=live]")
+    canvases = [figure.locator("canvas").nth(i) for i in (0, 1, 2, 3)]
+    motion = [drawn(canvas) for canvas in canvases]
+    figure.locator(".what").select_option("left")
+    page.wait_for_timeout(300)
+    for before, canvas in zip(motion, canvases, strict=True):
+        assert changed(before, drawn(canvas)) > 0.002
+    figure.locator("[data-place]").focus()
+    page.keyboard.press("Enter")
+    sliders = [float(figure.locator(".in-slices input[type=range]").nth(i).input_value()) for i in (2, 1, 0)]
+    assert sliders == pytest.approx(rest[7].tolist(), abs=0.3)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    page.close()
+    assert not complaints
 
 
 def test_the_slices_of_a_second_pair_lie_in_its_own_body(browser, two_pairs, tmp_path):

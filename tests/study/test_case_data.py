@@ -167,6 +167,7 @@ def test_another_kind_is_one_file_and_one_line(case, monkeypatch):
     result = estimate(replace(case, data=(CaseData("dot", sd_mm=0.1),)))
     assert result.estimation.information_shares["core"]["point motion"] < 1e-12
     assert result.estimation.fits[0][-1].tissue == "landmark"
+    assert result.estimation.points == ()  # it has nothing that could be drawn
     assert "displacement of points" in " ".join(methods_text(collect(result)).paragraphs)
     with pytest.raises(ConfigurationError, match="has no 'force_n'"):
         CaseData("dot", sd_mm=0.1, force_n=1.0)

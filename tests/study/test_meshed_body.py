@@ -11,6 +11,7 @@ import pytest
 from palpate.cli import main
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.mesh.mesh_file import read_mesh_file
+from palpate.report.collect import collect
 from palpate.study.case_file import read_case
 from palpate.study.check import check_case
 from palpate.study.read import read_states
@@ -97,6 +98,15 @@ def test_a_force_and_a_field_tell_kilopascals(folder):
     assert bar.interval95[0] < MODULUS < bar.interval95[1]
     (force,) = result.estimation.forces
     assert force.fitted_n == pytest.approx(FORCE_N, rel=1e-2)
+    (field,) = result.estimation.points
+    left = np.linalg.norm(field.motions.fitted - field.motions.observed, axis=1)
+    assert np.sqrt(np.mean(left**2)) == pytest.approx(result.estimation.fits[0][0].end.rms_mm, rel=1e-3)
+    assert field.misfit == pytest.approx(1.0, abs=0.15)
+    means = STRAIN * field.motions.rest * np.array([-RATIO, -RATIO, 1.0])
+    assert np.abs(field.motions.observed - means).max() < 5 * 0.01
+    (drawn,) = collect(result).measured  # though no image is
+    assert (drawn.name, drawn.points[0].total) == ("state 1", len(left))
+    assert {surface.tissue for surface in drawn.outlines} == {0}  # the bar, not what its surfaces are called
 
 
 def test_twice_the_force_is_twice_the_modulus(folder):

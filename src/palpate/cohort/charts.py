@@ -37,6 +37,7 @@ def boxes_svg(patients: Patients, tissue: str, unit: str, *, name: str) -> str:
     def draw(figure: Figure) -> None:
         """A box and points a stage."""
         axes = figure.add_axes(PLACE)
+        axes.set_yscale("log")
         labels = []
         for stage in stages:
             own = [patient for patient in patients if patient["stage"] == stage and tissue in patient["summary"]]
@@ -96,9 +97,6 @@ def scatter_svg(patients: Patients, tissue: str, unit: str, line: Mapping[str, A
             axes.plot(ends, line["at_mean_stage"] * factor ** (ends - line["mean_stage"]), color=LINE, linewidth=1.4)
         axes.set_xticks(stages)
         axes.set_xlim(min(stages) - 0.6, max(stages) + 0.6)
-        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-        axes.yaxis.set_minor_formatter(NullFormatter())
         _label(axes, unit)
 
     says = f"{tissue}: each patient's {_axis(unit)} with its 95 % interval against the stage, and a line through them"
@@ -166,3 +164,6 @@ def _axis(unit: str) -> str:
 def _label(axes: Axes, unit: str) -> None:
     axes.set_xlabel("stage")
     axes.set_ylabel(_axis(unit))
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())

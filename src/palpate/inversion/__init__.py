@@ -6,13 +6,21 @@ from palpate.inversion.blocks import (
     Block,
     frame_blocks,
     instrument_block,
+    layer_blocks,
     material_blocks,
     offset_block,
     unit_blocks,
     wall_blocks,
 )
 from palpate.inversion.driver_fit import fit_driver
-from palpate.inversion.estimate import Inversion, StartRun, as_good, continue_at_finite_strain, invert
+from palpate.inversion.estimate import (
+    Inversion,
+    StartRun,
+    as_good,
+    continue_at_finite_strain,
+    invert,
+    with_released,
+)
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import Evaluation, Linearisation, LinearisedObjective, Objective
 from palpate.inversion.optimise import (
@@ -64,6 +72,7 @@ __all__ = [
     "gauss_newton",
     "instrument_block",
     "invert",
+    "layer_blocks",
     "material_blocks",
     "offset_block",
     "parameter_map",
@@ -75,4 +84,5 @@ __all__ = [
     "unit_blocks",
     "wall_blocks",
     "with_first_noise",
+    "with_released",
 ]

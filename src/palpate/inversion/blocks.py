@@ -28,6 +28,7 @@ __all__ = [
     "frame_blocks",
     "instrument_block",
     "joined",
+    "layer_blocks",
     "material_blocks",
     "offset_block",
     "unit_blocks",
@@ -47,6 +48,7 @@ class Acts(Enum):
 
     BOUNDARY = "the displacement of what is prescribed"
     MATERIAL = "the material of the elements"
+    MODULI = "the logarithms of the moduli of regions"
     RESIDUALS = "the residuals of the observations, one unknown each"
 
 
@@ -61,7 +63,9 @@ class Block:
     odds of the alternatives, of which the likeliest is taken; none: of alternatives that are alike the widest.
     considered: the images cannot tell them, so that they are held at 0, and what they may be counts in the covariance
     (Schmidt 1966). last: its prior is learned where the estimate has converged under those of the others; before it
-    would take what they explain. Raises `ConfigurationError` for terms of another size.
+    would take what they explain. released: held at 0 as well while an estimate is sought, and free under P where its
+    interval is. regions: numbers of the model's regions to whose ln E it is added, one unknown for all
+    of them, where it acts on moduli. Raises `ConfigurationError` for terms of another size.
     """
 
     of: str
@@ -74,7 +78,9 @@ class Block:
     odds: tuple[float, ...] = ()
     considered: bool = False
     last: bool = False
+    released: bool = False
     unit_mm: float = 1.0
+    regions: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         shape = (len(self.precision),) * 2
@@ -88,7 +94,7 @@ class Block:
     @property
     def first_precision(self) -> NDArray[np.float64]:
         """Precision (n, n) with which an estimate begins."""
-        return CONSIDERED * self.precision if self.considered else self.precision
+        return CONSIDERED * self.precision if self.considered or self.released else self.precision
 
     @property
     def size(self) -> int:
@@ -207,6 +213,21 @@ def material_blocks(
         precision = np.eye(len(modes.poisson)) / poisson_sd**2
         blocks.append(Block("all tissues", "poisson", Acts.MATERIAL, states, precision))
     return tuple(blocks)
+
+
+def layer_blocks(
+    layers: Sequence[tuple[str, tuple[int, ...]]], states: tuple[int, ...], *, sd: float
+) -> tuple[Block, ...]:
+    """By how much ln E of the layer of elements round each organ differs from that of its tissue: one unknown each.
+
+    layers: of each organ its name and the numbers of the model's regions. A capsule, a film of fat or a plane on which
+    an organ slides is hardly seen by its surface, while the organ's modulus hangs on it: as an unknown of the estimate
+    it costs accuracy where there is none, and an interval that leaves it out does not hold where there is one.
+    """
+    return tuple(
+        Block(organ, "layer", Acts.MODULI, states, np.full((1, 1), sd**-2.0), released=True, regions=regions)
+        for organ, regions in layers
+    )
 
 
 def joined(blocks: Sequence[Block]) -> NDArray[np.float64]:

@@ -39,7 +39,7 @@ from palpate.mechanics.forward import SolveCounts
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Progress, during
 
-__all__ = ["Candidate", "Inversion", "StartRun", "as_good", "continue_at_finite_strain", "invert"]
+__all__ = ["Candidate", "Inversion", "StartRun", "as_good", "continue_at_finite_strain", "invert", "with_released"]
 
 OTHER = 1e-2  # decrement of minima that are compared: a two-hundredth of what tells them apart
 AS_GOOD = 1.92  # of minus the log-posterior: half the 95 % quantile of chi-squared with one degree of freedom
@@ -47,6 +47,7 @@ REPORTED = StopRule()
 FIRST_GUESS = StopRule(
     step_sd=0.5, model_error=np.inf, derivatives=False, solve_above=0.1, passes=1, iterations=1, far=np.inf
 )
+RELEASED = StopRule(step_sd=0.2, passes=2, iterations=5)  # an interval, to a tenth of its half-width
 EQUILIBRIUM = 1e-5  # of the forces, while the estimate moves
 
 
@@ -175,6 +176,25 @@ def continue_at_finite_strain(
             ends[number] = replace(ends[linear.best], minimum=replace(minimum, outcome=outcome))
     found = _concluded([ends[number] for number in sorted(ends)], linear.starts, linear.rest, settings, linear.best)
     return replace(found, evaluations=found.evaluations + evaluations, counts=spent)
+
+
+def with_released(
+    inversion: Inversion, settings: InversionSettings, *, progress: Progress, rule: StopRule = RELEASED
+) -> OuterIterate | None:
+    """The best minimum followed on with those blocks free that were held while it was sought (see `Block.released`).
+
+    None where it did not converge, has no such block, or cannot be followed.
+    """
+    best = inversion.candidates[inversion.best].iterate
+    if not best.minimum.converged or not any(block.released for block in inversion.objective.parameters.blocks):
+        return None
+    objective, evaluation = best.objective.released(best.minimum.evaluation, best.minimum.unknowns)
+    start = replace(best, objective=objective, minimum=replace(best.minimum, evaluation=evaluation))
+    try:
+        return run_outer_loop(start, settings, rule, progress=progress, title="layers round organs free")
+    except EstimationError as error:
+        progress(f"with layers round organs free there is no estimate: {error}")
+        return None
 
 
 def _with_reduced_bases(

@@ -135,6 +135,21 @@ class Objective:
         pairs = zip(self.states, approximations, strict=True)
         return replace(self, states=tuple(state.with_approximation(model) for state, model in pairs))
 
+    def released(self, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> tuple[Objective, Evaluation]:
+        """The objective with those blocks free that were held, and its evaluation at unknowns (n_unknowns,)."""
+        objective = replace(self, parameters=self.parameters.released())
+        before, (value, pull) = _prior(self.parameters, unknowns)[0], _prior(objective.parameters, unknowns)
+        prior, moved = objective.parameters.prior_matrix, pull - evaluation.prior_score
+        return objective, replace(
+            evaluation,
+            value=evaluation.value - before + value,
+            gradient=evaluation.gradient + moved,
+            score=evaluation.score + moved,
+            matrix=evaluation.matrix - evaluation.prior + prior,
+            prior=prior,
+            prior_score=pull,
+        )
+
     def with_observations(self, observations: Sequence[Observation]) -> Objective:
         """The same with each observation otherwise weighted or matched, in the order of `observations`."""
         left = iter(observations)
@@ -143,7 +158,7 @@ class Objective:
 
     def value(self, unknowns: NDArray[np.float64]) -> float:
         """J alone at unknowns (n_unknowns,), for trial steps."""
-        total, _ = self._prior(unknowns)
+        total, _ = _prior(self.parameters, unknowns)
         for s in range(len(self.states)):
             pairs = self._residuals(s, self._equilibrium(s, unknowns).values, unknowns)
             total += sum(mapped(lambda of: _misfit(*of), pairs))
@@ -156,7 +171,7 @@ class Objective:
 
     def assembled(self, unknowns: NDArray[np.float64], lines: Sequence[Linearisation]) -> Evaluation:
         """The evaluation at `unknowns` (n_unknowns,) from all observations' residuals there, with their derivatives."""
-        value, pull = self._prior(unknowns)
+        value, pull = _prior(self.parameters, unknowns)
         prior = self.parameters.prior_matrix
         gradient, score, matrix = pull.copy(), pull.copy(), prior.copy()
         misfit = 0.0
@@ -170,7 +185,7 @@ class Objective:
 
     def value_and_gradient(self, unknowns: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         """J and its exact gradient (n_unknowns,) by one adjoint solve a state, without the Gauss-Newton system."""
-        value, gradient = self._prior(unknowns)
+        value, gradient = _prior(self.parameters, unknowns)
         for s in range(len(self.states)):
             solution = self._equilibrium(s, unknowns)
             seen = self._residuals(s, solution.values, unknowns)
@@ -202,12 +217,6 @@ class Objective:
         observed = self.states[s].observed
         assert observed is not None, "an objective is made of states with approximations"
         return observed.solve(self.parameters.moduli(unknowns), self.parameters.coefficients(unknowns)[s])
-
-    def _prior(self, unknowns: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        """1/2 (x - m)^T P (x - m) and its gradient (n_unknowns,)."""
-        away = unknowns - self.parameters.prior_centre
-        pull = self.parameters.prior_matrix @ away
-        return 0.5 * float(away @ pull), pull
 
     def _seen(self, s: int, values: NDArray[np.float64]) -> list[tuple[Observation, NDArray[np.float64]]]:
         """Each observation of a state with its displacements (n_dofs,) mm."""
@@ -343,3 +352,10 @@ def _pull(observation: Observation, residuals: Residuals) -> NDArray[np.float64]
 def _mean_loss(observation: Observation, residuals: Residuals) -> float:
     """Weighted sum of rho(r), mm^2."""
     return float(residuals.weights @ observation.weighting.loss.rho(residuals.values))
+
+
+def _prior(parameters: ParameterMap, unknowns: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+    """1/2 (x - m)^T P (x - m) and its gradient (n_unknowns,)."""
+    away = unknowns - parameters.prior_centre
+    pull = parameters.prior_matrix @ away
+    return 0.5 * float(away @ pull), pull

@@ -171,17 +171,36 @@ class ParameterMap:
 
         Young's, or those of the parts of the stiffness where Poisson's ratio is open.
         """
-        moduli = np.asarray(self.base * np.exp(self.selection @ unknowns[: self.n_parameters]))
+        logarithms = self.selection @ unknowns[: self.n_parameters]
+        if len(unknowns) > self.n_parameters:
+            logarithms = logarithms + self._of_layers @ unknowns[self.acting_on_moduli]
+        moduli = np.asarray(self.base * np.exp(logarithms))
         for open_ in self.poisson:
             moduli[list(open_.regions)] *= open_.weights(unknowns)[0]
         return moduli
 
     def derivatives(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives (n_regions, n_parameters) of the moduli's logarithms by theta at unknowns (n_unknowns,)."""
+        """Derivatives (n_regions, n) of the moduli's logarithms at unknowns (n_unknowns,).
+
+        By theta, then by the blocks' unknowns that act on moduli.
+        """
         by_theta = self.selection.copy()
         for open_ in self.poisson:
             by_theta[list(open_.regions), open_.column] = open_.weights(unknowns)[1]
-        return by_theta
+        return np.concatenate([by_theta, self._of_layers], axis=1)
+
+    @property
+    def acting_on_moduli(self) -> NDArray[np.int64]:
+        """Numbers (n,) of the blocks' unknowns that are added to ln E of regions, in every later state."""
+        own = [self.columns(i) for i, block in enumerate(self.blocks) if block.acts is Acts.MODULI]
+        return np.concatenate([np.zeros(0, dtype=np.int64), *own])
+
+    @property
+    def _of_layers(self) -> NDArray[np.float64]:
+        """1 where an unknown that acts on moduli is added to a region's ln E, (n_regions, n)."""
+        blocks = [block for block in self.blocks if block.acts is Acts.MODULI]
+        columns = [np.isin(np.arange(len(self.base)), block.regions) for block in blocks]
+        return np.array(columns, dtype=np.float64).reshape(len(columns), len(self.base)).T
 
     def coefficients(self, unknowns: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         """What the model of each state takes beside the moduli (n_modes,): boundary modes, then material modes."""
@@ -196,12 +215,15 @@ class ParameterMap:
         return [b.of for b in self.blocks if b.acts is Acts.RESIDUALS and state in b.states]
 
     def unknowns_of(self, state: int) -> NDArray[np.int64]:
-        """Numbers (n_own,) of the unknowns that a state depends on: theta, its model's coefficients, its offsets."""
-        residuals = self.acting(Acts.RESIDUALS, state)
-        return np.concatenate([np.arange(self.n_parameters), self._model_columns(state), residuals])
+        """Numbers (n_own,) of the unknowns that a state depends on.
+
+        Theta, what else acts on moduli, its model's coefficients, its offsets.
+        """
+        residuals, theta = self.acting(Acts.RESIDUALS, state), np.arange(self.n_parameters)
+        return np.concatenate([theta, self.acting_on_moduli, self._model_columns(state), residuals])
 
     def by_unknowns(self, tangent: NDArray[np.float64], unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives (n, n_parameters + n_modes) by theta and coefficients, from those by (ln E, q), at `unknowns`."""
+        """Derivatives (n, k + n_modes) by what acts on moduli and the coefficients, from those by (ln E, q)."""
         n_regions = len(self.base)
         return np.concatenate([tangent[:, :n_regions] @ self.derivatives(unknowns), tangent[:, n_regions:]], axis=1)
 
@@ -225,6 +247,15 @@ class ParameterMap:
 
     def _model_columns(self, state: int) -> NDArray[np.int64]:
         return np.concatenate([self.acting(Acts.BOUNDARY, state), self.acting(Acts.MATERIAL, state)])
+
+    def released(self) -> ParameterMap:
+        """The same with those blocks free that are held while an estimate is sought (see `Block.released`)."""
+        precision, n = self.nuisance_precision.copy(), self.n_parameters
+        for i, block in enumerate(self.blocks):
+            if block.released:
+                own = self.columns(i) - n
+                precision[np.ix_(own, own)] = block.precision
+        return replace(self, nuisance_precision=precision)
 
     def with_prior(self, mean: NDArray[np.float64], sd: NDArray[np.float64]) -> ParameterMap:
         """The same with a normal prior of theta: mean and standard deviation (n_parameters,), inf where it is flat.

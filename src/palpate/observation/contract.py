@@ -1,7 +1,7 @@
 """What a data term of a later state owes the inversion: residuals with their derivatives, noise, fit.
 
 What only some kinds have is a capability, a protocol of its own, which the layers above ask for: to choose anew what
-belongs together (`Rematched`), to be shown by a segmented image (`Imaged`).
+belongs together (`Rematched`), to be shown by a segmented image (`Imaged`), to be drawn as arrows (`OfPoints`).
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ __all__ = [
     "Observation",
     "OfInstrument",
     "OfMaterial",
+    "OfPoints",
+    "PointMotions",
     "Reaction",
     "ReactionOf",
     "Rematched",
@@ -219,6 +221,28 @@ class OfInstrument(Protocol):
     @property
     def measured(self) -> float:
         """What it showed, in the same unit."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class PointMotions:
+    """How points of the body move, which lie at `rest` (n, 3) RAS mm: `observed` and `fitted` displacements (n, 3) mm.
+
+    labels (n,): what the points are called; () where they have no names.
+    """
+
+    rest: NDArray[np.float64]
+    observed: NDArray[np.float64]
+    fitted: NDArray[np.float64]
+    labels: tuple[str, ...] = ()
+
+
+@runtime_checkable
+class OfPoints(Protocol):
+    """An observation of single points of the body, whose motion can be drawn beside the model's."""
+
+    def point_motions(self, displacement: NDArray[np.float64]) -> PointMotions:
+        """The points that are compared, with the model's motion at displacements (n_dofs,) mm of what it sees."""
         ...
 
 

@@ -44,8 +44,9 @@ class Landmarks(MeasuredPoints):
         table, places = self.table, located(space.mesh, self.table.before)
         refuse_slips(space, table.before, places.inside, self.file.paths[0])
         inside, findings = places.inside, list[Finding]()
+        names = [name or f"number {number}" for number, name in enumerate(table.names, start=1)]
         if not inside.all():
-            out = [table.names[i] or f"number {i + 1}" for i in np.flatnonzero(~inside)]
+            out = [names[i] for i in np.flatnonzero(~inside)]
             shown = ", ".join(out[:MOST_NAMED]) + (" ..." if len(out) > MOST_NAMED else "")
             text = (
                 f"{len(out)} of {len(inside)} landmarks of '{self.file.paths[0].name}' lie outside of the meshed body"
@@ -59,6 +60,7 @@ class Landmarks(MeasuredPoints):
             places.of(inside),
             file=self.file,
             description="the distance between landmarks of the model and where they were measured",
+            labels=tuple(names[i] for i in np.flatnonzero(inside)),
         )
         return term, tuple(findings)
 

@@ -11,7 +11,7 @@ from scipy import sparse
 
 from palpate.mesh.locate import Places, point_interpolation
 from palpate.mesh.space import LagrangeSpace
-from palpate.observation.contract import DataFile, Fit, Residuals, Weighting
+from palpate.observation.contract import DataFile, Fit, PointMotions, Residuals, Weighting
 from palpate.observation.noise_model import FitResponse, NoiseModel
 from palpate.observation.robust_loss import Tukey
 from palpate.observation.whitening import whitener
@@ -31,7 +31,8 @@ class PointDisplacement:
 
     operator: W N (n, n_dofs) with the interpolation N to the points, or to means of several, and W, which makes their
     errors independent, each with the standard deviation stated; data: W d (n,) mm. shown: N (3 n_shown, n_dofs),
-    measured: d (3 n_shown,) mm; material (n, 3) mm: the point that a residual is of; axes (n, 3): along which.
+    measured: d (3 n_shown,) mm; material (n, 3) mm: the point that a residual is of; axes (n, 3): along which;
+    labels (n_shown,): names of the points, () where they have none.
     """
 
     kind: str
@@ -48,6 +49,7 @@ class PointDisplacement:
     stated: NoiseModel
     noise_model: NoiseModel
     weighting: Weighting
+    labels: tuple[str, ...] = ()
 
     @property
     def unit(self) -> str:
@@ -64,8 +66,14 @@ class PointDisplacement:
         n = len(self.data)
         values = self.operator @ displacement - self.data + offset
         weights = np.full(n, 1.0 / n)
-        away = np.linalg.norm((self.shown @ displacement - self.measured).reshape(-1, 3), axis=1)
+        motions = self.point_motions(displacement)
+        away = np.linalg.norm(motions.fitted - motions.observed, axis=1)
         return Residuals(values, weights, self.material, self.axes, self.material, self.operator, self.operator, away)
+
+    def point_motions(self, displacement: NDArray[np.float64]) -> PointMotions:
+        """The points, or means of some, as measured and at displacements (n_dofs,) mm."""
+        fitted = np.asarray(self.shown @ displacement).reshape(-1, 3)
+        return PointMotions(self.material[::3], self.measured.reshape(-1, 3), fitted, self.labels)
 
     def with_noise(self, noise: NoiseModel) -> PointDisplacement:
         """All points count, by the variance of the noise."""
@@ -104,11 +112,12 @@ def point_displacement(
     file: DataFile,
     description: str,
     cells: NDArray[np.int64] | None = None,
+    labels: tuple[str, ...] = (),
 ) -> PointDisplacement:
     """The term of points (n, 3) mm at rest, inside the mesh at `places`, that were measured to move by (n, 3) mm.
 
     file: what is stated of their errors; cells (n, k): what the points of one mean have in common, by default each
-    stands alone.
+    stands alone; labels (n,): names of points that stand alone.
     """
     number = np.arange(len(points)) if cells is None else np.unique(cells, axis=0, return_inverse=True)[1].ravel()
     mean, mixed = _means(points, number, file.correlation_mm)
@@ -136,6 +145,7 @@ def point_displacement(
         stated=stated,
         noise_model=stated,
         weighting=Weighting(3 * n / file.sd_mm**2, Tukey()),
+        labels=labels,
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
@@ -10,10 +12,12 @@ from numpy.typing import NDArray
 from palpate.report.report_data import ModelSurface, ReportData
 from palpate.report.rows import number
 from palpate.report.svg import INK, draw_svg
+from palpate.uncertainty import NORMAL_95
 
 __all__ = [
     "START_COLOURS",
     "angle_svg",
+    "forces_svg",
     "modulus_svg",
     "objective_svg",
     "residual_svg",
@@ -23,6 +27,9 @@ __all__ = [
 SIZE = (3.9, 2.5)
 DASHED = (0, (4, 3))
 BINS = 41
+BROAD: dict[str, Any] = {"color": "#c98b00", "linewidth": 7.0, "alpha": 0.6, "solid_capstyle": "butt"}
+FITTED = "#3d8be0"
+ROW_INCHES, MOST_LETTERS = 0.3, 24
 START_COLOURS = ("#3b7dd8", "#d9822b", "#3a9d5d", "#b0559b", "#8a6d3b", "#4aa3a3", "#c0504d", "#7f7fd0")
 
 
@@ -57,6 +64,32 @@ def residual_svg(data: ReportData, model: ModelSurface, *, voxel_mm: float, name
         axes.yaxis.set_major_locator(MaxNLocator(4))
 
     return draw_svg(draw, size=SIZE, name=name, says=says)
+
+
+def forces_svg(data: ReportData, *, name: str) -> str:
+    """Each measured force (N) with its 95 % interval as a bar, the fitted one as a dot, one below the other, as SVG."""
+    forces = data.document["forces"]
+    told = [
+        f"{force['name']} measured {force['measured_n']:.4g} N, fitted {force['fitted_n']:.4g} N" for force in forces
+    ]
+    several = len({force["after"] for force in forces}) > 1
+    labels = [f"{force['name']}, {force['after']}" if several else force["name"] for force in forces]
+
+    def draw(figure: Figure) -> None:
+        """A row for each force, the first one on top."""
+        axes = figure.add_axes((0.34, 0.42 / figure.get_figheight(), 0.62, 1.0 - 0.62 / figure.get_figheight()))
+        for row, force in enumerate(forces):
+            half = NORMAL_95 * force["sd_n"]
+            axes.plot(force["measured_n"] + half * np.array([-1.0, 1.0]), [row, row], **BROAD)
+            axes.plot([force["fitted_n"]], [row], "o", color=FITTED, markersize=5.5, markeredgecolor="white")
+        axes.set_yticks(range(len(forces)), [label[:MOST_LETTERS] for label in labels])
+        axes.set_ylim(len(forces) - 0.4, -0.6)
+        axes.margins(x=0.12)
+        axes.set_xlabel("force (N)")
+        axes.xaxis.set_major_locator(MaxNLocator(5))
+
+    size = (SIZE[0], ROW_INCHES * len(forces) + 0.75)
+    return draw_svg(draw, size=size, name=name, says=f"Forces: {'; '.join(told)}.")
 
 
 def objective_svg(data: ReportData, *, name: str) -> str:

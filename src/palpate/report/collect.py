@@ -22,10 +22,12 @@ from palpate.mesh.dihedral import tet_dihedrals
 from palpate.parallel import mapped
 from palpate.report.backgrounds import Grey, background, earlier_grey, later_grey, whole_box, whole_images
 from palpate.report.inputs import bone_distances, input_images
+from palpate.report.measured import measured_states
 from palpate.report.pairs import ImagePair, drawn_images, image_pairs
 from palpate.report.report_data import (
     MESH,
     LaterImage,
+    MeasuredState,
     MeshPicture,
     Reference,
     ReportData,
@@ -51,6 +53,7 @@ SHOWN = (*MOVING, Role.RIGID)
 RIGID_TRIANGLES = 12_000
 ALL_TRIANGLES = 300_000  # of all surfaces of the images, so that the page stays small
 NONE: tuple[TriangleSurface, ...] = ()
+NOT_MEASURED: tuple[MeasuredState, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +100,10 @@ def collect(result: CaseResult) -> ReportData:
     ]
     references = tuple(_reference(drawing) for drawing in drawings)
     later = tuple(_later(drawings[number], after, references[number]) for number, after in drawn)
+    by_place = dict(zip(drawn, later, strict=True))
+    measured = attempt.part(
+        "points", lambda: measured_states(result, pairs, references, by_place, most=MOST_LATER), NOT_MEASURED
+    )
     mesh = attempt.part("mesh", lambda: _mesh(result), None)
     names = [estimate.tissue for estimate in result.estimation.estimates]
     histories = [*(start.history for start in result.estimation.starts), result.estimation.outer_loop]
@@ -113,6 +120,7 @@ def collect(result: CaseResult) -> ReportData:
         ),
         references=references,
         later=later,
+        measured=measured,
         mesh=mesh,
         missing=attempt.missing,
     )
@@ -234,10 +242,11 @@ def _with_grey(drawing: _Drawing) -> _Drawing:
 def _reference(drawing: _Drawing) -> Reference:
     pair, attempt = drawing.pair, drawing.attempt
     result, name = pair.result, pair.before
+    image = result.before if result.after else _of_mesh(result.before)
     box = attempt.part(f"slices of {name}", lambda: _slice_box(result), None)
     shown = attempt.part(
         f"background of {name}",
-        lambda: None if box is None else background(result, drawing.grey, result.before, box, labels=drawing.unread),
+        lambda: None if box is None else background(result, drawing.grey, image, box, labels=drawing.unread),
         None,
     )
     return Reference(
@@ -245,7 +254,7 @@ def _reference(drawing: _Drawing) -> Reference:
         voxel_mm=float(max(image.grid.spacing.max() for image in (result.before, *result.after))),
         slices=box,
         background=shown,
-        surfaces=attempt.part(f"surfaces of {name}", lambda: _surfaces(drawing, result.before), NONE),
+        surfaces=attempt.part(f"surfaces of {name}", lambda: _surfaces(drawing, image), NONE),
         whole=whole_box(result.before, None if box is None else box.position),
     )
 
@@ -255,7 +264,8 @@ def _surfaces(drawing: _Drawing, image: Segmentation) -> tuple[TriangleSurface, 
     result = drawing.pair.result
     width = contour_width(result)
     found = []
-    for i in sorted(_indices(result, SHOWN), key=lambda i: result.tissues[i].role is Role.RIGID):
+    shown = SHOWN if result.after else (Role.ESTIMATE, Role.KNOWN)  # of a body that comes as a mesh: all of it
+    for i in sorted(_indices(result, shown), key=lambda i: result.tissues[i].role is Role.RIGID):
         most = RIGID_TRIANGLES if result.tissues[i].role is Role.RIGID else MOST_TRIANGLES
         found.append(image_surface(image, i, smoothing_mm=width, most_triangles=min(most, drawing.most_triangles)))
     return tuple(surface for surface in found if len(surface.triangles))
@@ -318,7 +328,14 @@ def _slice_box(result: CaseResult) -> SliceBox:
     low = np.maximum(np.min([pair[0] for pair in boxes], axis=0) - MARGIN_MM, border[:, 0])
     high = np.minimum(np.max([pair[1] for pair in boxes], axis=0) + MARGIN_MM, border[:, 1])
     before = _thinned(result.before)
-    return SliceBox(low, high, np.array([_richest(before, moving, axis) for axis in range(3)]))
+    position = np.array([_richest(before, moving, axis) for axis in range(3)])
+    return SliceBox(low, high, position) if result.after else whole_box(result.before, position)
+
+
+def _of_mesh(image: Segmentation) -> Segmentation:
+    """The voxels that show a mesh, without those of hollow tissues, which stand behind its surfaces only by name."""
+    meshed = np.array([tissue.meshed for tissue in image.tissues])
+    return Segmentation(np.where(meshed[image.index], image.index, -1).astype(np.int16), image.grid, image.tissues)
 
 
 def _extent(image: Segmentation, tissues: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

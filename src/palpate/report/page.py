@@ -20,6 +20,7 @@ from palpate.parallel import mapped
 from palpate.report.charts import (
     START_COLOURS,
     angle_svg,
+    forces_svg,
     modulus_svg,
     objective_svg,
     residual_svg,
@@ -29,18 +30,19 @@ from palpate.report.headline import headline
 from palpate.report.interval_charts import profile_svg, region_svg, repeats_svg
 from palpate.report.methods import methods_text
 from palpate.report.payload import payload
-from palpate.report.pictures import mesh_png, organs_png
-from palpate.report.report_data import LaterImage, Reference, ReportData, SliceBox
+from palpate.report.pictures import mesh_png, organs_png, points_png
+from palpate.report.report_data import LaterImage, MeasuredState, Reference, ReportData, SliceBox
 from palpate.report.rows import estimate_rows, moduli_in, number, ratio_rows, scale_marks
 from palpate.report.scales import Scale, angle_scale, distance_scale, modulus_scale, strain_scale
 from palpate.report.section import VIEWS
-from palpate.report.slices import alignment_svg, contour_names, first_planes, slice_svg
+from palpate.report.slices import alignment_svg, contour_names, first_planes, points_svg, slice_svg
 
 __all__ = ["Picture", "render"]
 
 T = TypeVar("T")
 LOGGER = logging.getLogger(__name__)
 SCRIPTS = ("three.min.js", "report.js", "slices.js", "alignment.js", "viewer.js", "organs.js", "mesh.js", "start.js")
+OF_POINTS = "points.js"  # before the last, where points were measured
 COSTS: tuple[tuple[str, Callable[[str], bool]], ...] = (  # a code that is not ours may cost as much as any
     (
         "The result stands, but each of these can move a modulus by more than its interval.",
@@ -79,10 +81,21 @@ class _Later:
     widths: str
 
 
+@dataclass(frozen=True, slots=True)
+class _Measured:
+    """The figures of the points that were measured in one later state."""
+
+    state: MeasuredState
+    reference: Reference
+    slices: tuple[Picture, ...]
+    space: tuple[Picture, ...]
+    widths: str
+
+
 def render(data: ReportData) -> str:
     """The whole page of a report; a figure that cannot be drawn leaves a sentence in its place."""
     live = _attempt("the moving figures", lambda: payload(data))
-    scripts = _scripts() if live is not None and (data.later or data.mesh) else ()
+    scripts = _scripts(data) if live is not None and (data.later or data.measured or data.mesh) else ()
     colours = {tissue.name: tissue.colour for tissue in data.tissues}
     found = moduli_in(data.document) if data.document["status"] == "converged" else []
     fixed = {item["tissue"] for item in found if item["verdict"] != "not identified"}  # of others no range is drawn
@@ -112,6 +125,12 @@ def render(data: ReportData) -> str:
         warnings=_warnings(data),
         contours=contour_names(data),
         later=tuple(_later(data, k, later) for k, later in enumerate(data.later)),
+        measured=tuple(_measured(data, k, state) for k, state in enumerate(data.measured)),
+        forces=(
+            _picture("Measured and fitted forces", partial(forces_svg, data, name="forces"))
+            if data.document.get("forces")
+            else None
+        ),
         mesh_pictures=_mesh_pictures(data),
         moduli=_attempt("the scale of the moduli", lambda: modulus_scale(data)) if data.mesh else None,
         curves=_curves(data),
@@ -145,10 +164,11 @@ def render(data: ReportData) -> str:
     return str(page)
 
 
-def _scripts() -> tuple[Markup, ...]:
+def _scripts(data: ReportData) -> tuple[Markup, ...]:
     """The page's scripts, ours and three.js, as they stand in the package."""
     folder = resources.files("palpate.report") / "assets"
-    return tuple(Markup((folder / name).read_text(encoding="utf-8")) for name in SCRIPTS)  # noqa: S704 - our own files
+    names = (*SCRIPTS[:-1], OF_POINTS, SCRIPTS[-1]) if data.measured else SCRIPTS
+    return tuple(Markup((folder / name).read_text(encoding="utf-8")) for name in names)  # noqa: S704 - our own files
 
 
 def _policy(scripts: tuple[Markup, ...]) -> Markup:
@@ -201,6 +221,19 @@ def _later(data: ReportData, k: int, later: LaterImage) -> _Later:
         scale=distance_scale(reference.voxel_mm),
         reference=reference,
         widths=_widths(reference.slices),
+    )
+
+
+def _measured(data: ReportData, k: int, state: MeasuredState) -> _Measured:
+    return _Measured(
+        state=state,
+        reference=data.references[state.reference],
+        slices=tuple(
+            _picture(plane.view.name, partial(points_svg, data, plane, state, name=f"p{k}{plane.view.name}"))
+            for plane in first_planes(state.box)
+        ),
+        space=_photographs({f"motion to {state.name}": partial(points_png, data, state)}),
+        widths=_widths(state.box),
     )
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from palpate.report.report_data import (
     GREY_STEPS,
     LaterImage,
+    MeasuredState,
     MeshPicture,
     Reference,
     ReportData,
@@ -89,6 +90,7 @@ def payload(data: ReportData) -> Payload:
             for reference in data.references
         ],
         "later": [_later(data, later, packer) for later in data.later],
+        "measured": [_measured(state, packer) for state in data.measured],
         "mesh": _mesh(data.mesh, packer),
         "angles": _scale(angle_scale()),
         "strains": _scale(strain_scale()),
@@ -111,6 +113,7 @@ def _quantum(data: ReportData) -> tuple[NDArray[np.float64], float]:
     images: list[Reference | LaterImage] = [*data.references, *data.later]
     clouds = [surface.points for image in images for surface in image.surfaces]
     clouds += [surface.points for later in data.later for surface in later.outlines]
+    clouds += [surface.points for state in data.measured for surface in state.outlines]
     clouds += [p for later in data.later for m in later.model for p in (m.rest, m.fitted)]
     clouds += [data.mesh.nodes] if data.mesh else []
     clouds = [cloud for cloud in clouds if len(cloud)]
@@ -170,6 +173,26 @@ def _later(data: ReportData, later: LaterImage, packer: _Packer) -> dict[str, An
             for model in later.model
         ],
         "scale": _scale(distance_scale(data.references[later.reference].voxel_mm)),
+    }
+
+
+def _measured(state: MeasuredState, packer: _Packer) -> dict[str, Any]:
+    return {
+        "name": state.name,
+        "reference": state.reference,
+        "box": _box(state.box),
+        "outlines": [_surface(surface, packer) for surface in state.outlines],
+        "motionFactor": state.motion_factor,
+        "leftFactor": state.left_factor,
+        "points": [
+            {
+                "near": of.near_mm,
+                "rest": packer.add(of.rest),
+                "observed": packer.add(of.observed),
+                "fitted": packer.add(of.fitted),
+            }
+            for of in state.points
+        ],
     }
 
 

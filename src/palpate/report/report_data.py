@@ -16,9 +16,12 @@ from palpate.study.archive import MAY_BE_NAN, read_archive, write_archive
 __all__ = [
     "GREY_STEPS",
     "MESH",
+    "MOST_ARROWS",
     "BoneDistance",
     "InputImage",
     "LaterImage",
+    "MeasuredPoints",
+    "MeasuredState",
     "MeshPicture",
     "ModelSurface",
     "Reference",
@@ -32,6 +35,7 @@ __all__ = [
 MESH = "a mesh"  # the setting "body" of a case without images
 
 FORMAT = "palpate.report-data/4"
+MOST_ARROWS = 400  # of one kind of data in a later state: more hide each other
 GREY_STEPS = 1023  # from the darkest to the brightest value that a volume keeps
 
 
@@ -160,6 +164,58 @@ class LaterImage:
 
 
 @dataclass(frozen=True, slots=True)
+class MeasuredPoints:
+    """Points whose motion was measured, of which those that are drawn lie at `rest` (n, 3) RAS mm.
+
+    observed, fitted (n, 3) mm: their motion as measured and as the fitted model has it; near_mm: how near to a slice an
+    arrow begins that it shows; total: number of points that were compared, of which these are about one measure:
+    moved_rms_mm, left_rms_mm: root mean square of the measured motion, and of what the fit leaves; misfit: the latter
+    over the errors stated; largest_mm, largest_at (3,) RAS mm, largest_label: the longest that is left, and whose.
+    Raises `ValueError` for arrays that are not of one size, are no numbers, or more than a page draws.
+    """
+
+    name: str
+    total: int
+    rest: NDArray[np.float32]
+    observed: NDArray[np.float32]
+    fitted: NDArray[np.float32]
+    near_mm: float
+    moved_rms_mm: float
+    left_rms_mm: float
+    misfit: float
+    largest_mm: float
+    largest_at: NDArray[np.float64]
+    largest_label: str = ""
+
+    def __post_init__(self) -> None:
+        arrays, n = (self.rest, self.observed, self.fitted), len(self.rest)
+        numbers = (self.near_mm, self.moved_rms_mm, self.left_rms_mm, self.misfit, self.largest_mm)
+        if not 0 < n <= min(self.total, MOST_ARROWS) or any(array.shape != (n, 3) for array in arrays):
+            raise ValueError(f"{n} points of {self.total} are to be drawn, of at most {MOST_ARROWS}")
+        if self.largest_at.shape != (3,) or not all(
+            np.isfinite(of).all() for of in (*arrays, self.largest_at, numbers)
+        ):
+            raise ValueError("the motion of a point is no number")
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredState:
+    """The points that were measured in one later state, over its reference state (a number); `box`: of its slices.
+
+    outlines: as those of a `LaterImage`; motion_factor, left_factor: how many times longer than it is an arrow of the
+    motion, and of what the fit leaves, is drawn.
+    """
+
+    name: str
+    reference: int
+    box: SliceBox
+    points: tuple[MeasuredPoints, ...]
+    outlines: tuple[TriangleSurface, ...]
+    motion_factor: float
+    left_factor: float
+
+
+@dataclass(frozen=True, slots=True)
 class InputImage:
     """One label image of the case: its name, number of its pair, its voxels and their edges (mm), SHA-256 of its file.
 
@@ -196,8 +252,9 @@ class ReportData:
 
     document: that of result.json; unit: of the moduli, "kPa" or "ratio"; images: every label image, pair after pair;
     moduli_paths: of each start, and last of the outer loop, tissue -> moduli by iteration; references: the reference
-    states, that of the mesh first; later: their later images; missing: part of the page ("mesh", or "slices",
-    "surfaces", "background", "distances", "outlines", "alignment" of an image) -> why it is not there.
+    states, that of the mesh first; later: their later images; measured: the later states in which points were measured;
+    missing: part of the page ("mesh", or "slices",
+    "surfaces", "background", "distances", "outlines", "alignment", "points" of an image) -> why it is not there.
     """
 
     document: Mapping[str, Any]
@@ -209,6 +266,7 @@ class ReportData:
     moduli_paths: tuple[Mapping[str, tuple[float, ...]], ...] = field(default=(), metadata=MAY_BE_NAN)
     references: tuple[Reference, ...] = ()
     later: tuple[LaterImage, ...] = ()
+    measured: tuple[MeasuredState, ...] = ()
     mesh: MeshPicture | None = None
     missing: Mapping[str, str] = field(default_factory=dict)
 

@@ -12,6 +12,7 @@ from palpate.uncertainty import Interval
 __all__ = ["NONE", "Bar", "EstimateRow", "estimate_rows", "interval_text", "main_numbers", "number", "scale_marks"]
 
 NONE = "–"
+BELIEVED = "what was believed before"
 BAR = 200.0  # width of a bar, in its own units
 CAUSES = {
     "noise": "the surfaces' noise",
@@ -19,6 +20,7 @@ CAUSES = {
     "frame": "the frame's motion",
     "offset": "how surfaces are drawn",
     "heterogeneity": "tissues that are not homogeneous",
+    "layer": "a soft or stiff layer round an organ",
     "poisson": "Poisson's ratios",
     "prior": "what is believed of parameters",
     "grid": "the voxels' place",
@@ -41,7 +43,7 @@ class Bar:
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """A cause's part of a variance, as text, and its place and width on a bar from 0 to BAR, with an opacity."""
+    """A part of a whole by its cause, as text, and its place and width on a bar from 0 to BAR, with an opacity."""
 
     cause: str
     percent: str
@@ -52,7 +54,10 @@ class Share:
 
 @dataclass(frozen=True, slots=True)
 class EstimateRow:
-    """One tissue of the result table, all texts; shares: of each cause in the variance of ln E."""
+    """One tissue of the result table, all texts; shares: of each cause in the variance of ln E.
+
+    sources: of each kind of data in what is known of it, where a case has more than images.
+    """
 
     tissue: str
     colour: str
@@ -68,6 +73,7 @@ class EstimateRow:
     error: str
     bar: Bar | None
     shares: tuple[Share, ...]
+    sources: tuple[Share, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +132,8 @@ def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tu
     for item in items:
         value, interval = main_numbers(item)
         truth, shares = item["truth"], item.get("variance_shares") or {}
+        sources = document.get("information_shares", {}).get(item["tissue"], {}) if document["case"].get("data") else {}
+        told = sorted(sources.items(), key=lambda source: -source[1])
         row = EstimateRow(
             tissue=item["tissue"],
             colour=colours.get(item["tissue"], "#888888"),
@@ -141,6 +149,7 @@ def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tu
             error=f"{100.0 * (value / truth - 1.0):+.1f} %" if shown and value and truth else NONE,
             bar=_bar(value, interval, truth=truth, scale=scale) if scale and value and interval else None,
             shares=_shares({CAUSES[cause]: share for cause, share in shares.items()}) if shown else (),
+            sources=_shares({BELIEVED if kind == "prior" else kind: share for kind, share in told}) if shown else (),
         )
         rows.append(row)
     return tuple(rows)

@@ -12,13 +12,22 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from palpate.report.report_data import LaterImage, ReportData, SliceBox, TriangleSurface, Volume
+from palpate.report.report_data import (
+    LaterImage,
+    MeasuredPoints,
+    MeasuredState,
+    ReportData,
+    SliceBox,
+    TriangleSurface,
+    Volume,
+)
 from palpate.report.section import VIEWS, Plane, cut_image, joined
 from palpate.report.svg import draw_svg
 
-__all__ = ["alignment_svg", "contour_names", "first_planes", "slice_svg"]
+__all__ = ["alignment_svg", "contour_names", "first_planes", "points_svg", "slice_svg"]
 
 WIDTH_INCHES = 4.6
+SEEN, FITTED = ("#f0e442", 0.045), ("#4da3ff", 0.018)  # colour and width (inches) of arrows on black
 ROLE_LEVELS = {"rigid": 1.0, "estimate": 0.6, "driver": 0.4, "known": 0.2, "void": 0.0}  # bones are what is aligned
 OUTLINE = (withStroke(linewidth=1.5, foreground="#000000", alpha=0.7),)  # letters stay readable on bright bone
 
@@ -40,10 +49,7 @@ def slice_svg(data: ReportData, plane: Plane, later: LaterImage, *, name: str) -
 
     def draw(figure: Figure) -> None:
         """Grey values, contours and furniture, one over the other."""
-        axes = figure.add_axes((0, 0, 1, 1))
-        across, up = plane.axes
-        shades = np.zeros((2, 2, 3)) if reference.background is None else _shades(data, reference.background, plane)
-        axes.imshow(shades, extent=(across[0], across[-1], up[0], up[-1]), origin="lower", interpolation="none")
+        axes = _backed(figure, data, reference.background, plane)
         for surface in later.surfaces:
             _lines(axes, data, plane, surface, gid="layer-after", linewidth=4.0, alpha=0.5)
         for surface in reference.surfaces:
@@ -54,6 +60,30 @@ def slice_svg(data: ReportData, plane: Plane, later: LaterImage, *, name: str) -
 
     where = f"{plane.view.name.capitalize()} slice at {'xyz'[plane.view.normal]} = {plane.position:.0f} mm"
     says = f"{where}: {reference.name} under the outlines of {reference.name}, {later.name} and the fitted model."
+    return draw_svg(draw, size=_size(plane), name=name, says=says)
+
+
+def points_svg(data: ReportData, plane: Plane, state: MeasuredState, *, name: str) -> str:
+    """One slice as SVG: the outlines at rest and fitted, and arrows of the measured and the fitted motion near it."""
+    reference, near = data.references[state.reference], 0
+    for of in state.points:
+        near += int(np.count_nonzero(_near(of, plane)))
+
+    def draw(figure: Figure) -> None:
+        """Grey values, contours, arrows and furniture, one over the other."""
+        axes = _backed(figure, data, reference.background, plane)
+        for surface in reference.surfaces:
+            _lines(axes, data, plane, surface, gid="layer-before", linewidth=1.0, linestyle=(0, (1, 1.6)))
+        for outline in state.outlines:
+            _lines(axes, data, plane, outline, gid="layer-model", colors=["white"], linewidth=1.0)
+        for of in state.points:
+            here = _near(of, plane)
+            _arrows(axes, plane, of.rest[here], state.motion_factor * of.observed[here], SEEN, "layer-seen")
+            _arrows(axes, plane, of.rest[here], state.motion_factor * of.fitted[here], FITTED, "layer-fitted")
+        _furnish(axes, plane)
+
+    where = f"{plane.view.name.capitalize()} slice at {'xyz'[plane.view.normal]} = {plane.position:.0f} mm"
+    says = f"{where}: measured and fitted motion of {near} points near it, as arrows."
     return draw_svg(draw, size=_size(plane), name=name, says=says)
 
 
@@ -104,6 +134,35 @@ def _furnish(axes: Axes, plane: Plane) -> None:
     axes.plot(ends, [bottom] * 2, color="white", linewidth=2.0, solid_capstyle="butt", path_effects=stroke)
     place = (left, bottom + 0.015 * width)
     axes.text(*place, f"{bar:g} mm", color="white", ha="left", va="bottom", fontsize=8, path_effects=OUTLINE)
+
+
+def _backed(figure: Figure, data: ReportData, volume: Volume | None, plane: Plane) -> Axes:
+    """Axes that fill the figure, with a volume on the plane, or black."""
+    axes = figure.add_axes((0, 0, 1, 1))
+    across, up = plane.axes
+    shades = np.zeros((2, 2, 3)) if volume is None else _shades(data, volume, plane)
+    axes.imshow(shades, extent=(across[0], across[-1], up[0], up[-1]), origin="lower", interpolation="none")
+    return axes
+
+
+def _near(of: MeasuredPoints, plane: Plane) -> NDArray[np.bool_]:
+    """Which of the points that are drawn (n,) the slice shows."""
+    return np.asarray(np.abs(of.rest[:, plane.view.normal] - plane.position) <= of.near_mm)
+
+
+def _arrows(
+    axes: Axes,
+    plane: Plane,
+    rest: NDArray[np.float32],
+    way: NDArray[np.float32],
+    style: tuple[str, float],
+    gid: str,
+) -> None:
+    """Arrows from points (n, 3) mm along (n, 3) mm, as they lie in the plane."""
+    if len(rest):
+        places = [of[:, axis] for of in (rest, way) for axis in (plane.view.across, plane.view.up)]
+        options = {"angles": "xy", "scale_units": "xy", "scale": 1.0, "units": "inches", "minlength": 0.5}
+        axes.quiver(*places, color=style[0], width=style[1], zorder=3.0, **options).set_gid(gid)
 
 
 def _shades(data: ReportData, volume: Volume, plane: Plane) -> NDArray[np.float64]:

@@ -96,6 +96,9 @@ def _arrays(content: bytes) -> dict[str, NDArray[Any]]:
 def _encode(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
     """`value` in JSON's types; its arrays go to `arrays` under a number."""
     if isinstance(value, np.ndarray):
+        for name, stored in arrays.items():
+            if stored is value:  # what stands in two places is kept once
+                return name
         name = f"a{len(arrays)}"
         arrays[name] = value
         return name

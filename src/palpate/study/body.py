@@ -23,6 +23,7 @@ from palpate.inversion import (
     LaterState,
     frame_blocks,
     instrument_block,
+    layer_blocks,
     material_blocks,
     offset_block,
     parameter_map,
@@ -39,6 +40,7 @@ from palpate.mechanics.loads import boundary_named
 from palpate.mechanics.material import MaterialModes, material_modes
 from palpate.mechanics.newton import NewtonSettings
 from palpate.mechanics.reaction import SurfaceReaction, surface_reaction
+from palpate.mesh.layers import Layer, layered_space, layers_round_organs
 from palpate.mesh.quality import MeshQuality, mesh_figures
 from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.tet_mesh import TetMesh
@@ -110,8 +112,8 @@ class Body:
     """A meshed reference state with its images.
 
     `measured`: the data terms beside the images, by the number of their later state among all; `smoothing_mm`: the
-    width of every distance map that is compared; `edge_length`: the mesh's at the organs with its
-    reason, None where it was made otherwise; `findings`: of the mesh.
+    width of every distance map that is compared; `edge_length`: the mesh's at the organs with its reason, None where it
+    was made otherwise; `findings`: of the mesh; `layers`: regions that models have besides.
     """
 
     states: ImagedStates
@@ -121,6 +123,12 @@ class Body:
     edge_length: EdgeLength | None = None
     findings: tuple[Finding, ...] = ()
     measured: tuple[tuple[int, Observation], ...] = ()
+    layers: tuple[Layer, ...] = ()
+
+    @property
+    def layered(self) -> LagrangeSpace:
+        """The space that models are made on: layers round organs are regions of their own."""
+        return layered_space(self.space, self.layers)
 
     def imaged(self, stated_noise: NoiseModel | None = None) -> ImagedBody:
         """What observations are made of, under the noise that a case states."""
@@ -256,13 +264,15 @@ def make_body(states: ImagedStates, case: Case, *, progress: Progress) -> Body:
         f"{found.quality.tets} tetrahedra, {3 * len(space.points)} unknowns, smallest dihedral angle"
         f" {found.quality.min_dihedral_deg:.1f} degrees"
     )
+    layers = layers_round_organs(found.mesh) if case.discrepancy.layer_sd else ()
+    layered = layered_space(space, layers)
     grids = (states.before.grid, *(image.grid for image in states.after))
     mechanics = case.mechanics
 
     def reaction_of(name: str, direction: NDArray[np.float64]) -> SurfaceReaction:
         """The force that holds a named surface."""
         return surface_reaction(
-            space,
+            layered,
             boundary_named(space.mesh, name),
             direction,
             mechanics.material_law,
@@ -273,7 +283,8 @@ def make_body(states: ImagedStates, case: Case, *, progress: Progress) -> Body:
     terms = [(source.file.state, *source.on(space, reaction_of)) for source in states.data]
     findings = (*found.findings, *(finding for _, _, of_term in terms for finding in of_term))
     measured = tuple((state, term) for state, term, _ in terms)
-    return Body(states, space, found.quality, observation_width(*grids), found.edge_length, findings, measured)
+    width = observation_width(*grids)
+    return Body(states, space, found.quality, width, found.edge_length, findings, measured, layers)
 
 
 def inverse_problem(body: Body, case: Case, *, progress: Progress) -> InverseProblem:
@@ -292,6 +303,8 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
     measured = [of for body in bodies for of in body.measured]
     seen = [(r, (*o, *(term for s, term in measured if s == n))) for n, (r, o) in enumerate(imaged, start=1)]
     progress("assembling one stiffness matrix a tissue")
+    shared = tuple(layer for layer in bodies[0].layers if all(layer in body.layers for body in bodies))
+    bodies = [replace(body, layers=shared) for body in bodies]
     numbers = np.cumsum([0, *(body.states.n_later for body in bodies)]).tolist()
     pairs = [pair for body, first in zip(bodies, numbers, strict=False) for pair in _models(body, case, first)]
     models = tuple(model for model, _ in pairs)
@@ -306,9 +319,9 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
         for model, law, (reference, observations) in zip(models, finite, seen, strict=True)
     )
     parameters = parameter_map(
-        bodies[0].space.mesh.tissues,
+        models[0].space.mesh.tissues,
         models[0].regions,
-        _blocks(case, pairs, seen),
+        (*_blocks(case, pairs, seen), *_layer_blocks(case, shared, models)),
         loaded=case.known_force,
         open_poisson=_open_poisson(case, bodies[0].space.mesh),
         dilatation=choose_element(case.mechanics.element).dilatation,
@@ -351,6 +364,19 @@ def _blocks(
     return tuple(blocks) or unit_blocks(*(0 for _ in pairs))
 
 
+def _layer_blocks(case: Case, layers: Sequence[Layer], models: Sequence[LinearModel]) -> tuple[Block, ...]:
+    """One unknown an organ, of all layers round it."""
+    tissues, regions = models[0].space.mesh.tissues, models[0].regions
+    first = len(tissues) - len(layers)
+    of = {
+        tissues[organ].name: tuple(
+            regions.index(first + number) for number, layer in enumerate(layers) if layer.organ == organ
+        )
+        for organ in dict.fromkeys(layer.organ for layer in layers)
+    }
+    return layer_blocks(tuple(of.items()), tuple(range(len(models))), sd=case.discrepancy.layer_sd)
+
+
 def _open_poisson(case: Case, mesh: TetMesh) -> tuple[str, ...]:
     """The tissues whose Poisson's ratio the case seeks."""
     estimated = [t.name for t in mesh.tissues if t.role is Role.ESTIMATE]
@@ -373,7 +399,7 @@ def _models(body: Body, case: Case, first: int) -> list[tuple[LinearModel, Presc
     models: list[tuple[LinearModel, PrescribedMotion]] = []
     moving, domain = case.domain.outer_boundary == "moving", case.domain
     frame = FrameMotion(domain.outer_motion_mm, domain.outer_kernel_mm) if moving else None
-    dilatation = choose_element(case.mechanics.element).dilatation
+    dilatation, layered = choose_element(case.mechanics.element).dilatation, body.layered
     for state, bones in enumerate(body.states.bones, start=first + 1):
         motion = prescribed_motion(
             body.space,
@@ -396,7 +422,7 @@ def _models(body: Body, case: Case, first: int) -> list[tuple[LinearModel, Presc
             models[0][0].under(Conditions(constraint, loads))
             if models
             else linear_model(
-                body.space,
+                layered,
                 constraint,
                 dilatation=dilatation,
                 loads=loads,

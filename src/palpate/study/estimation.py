@@ -17,12 +17,14 @@ from palpate.inversion import (
     LeastSquares,
     Linearisation,
     Outcome,
+    OuterIterate,
     StartRun,
     as_good,
     ratio_of_eta,
+    with_released,
 )
 from palpate.mesh.voxelise import voxelise
-from palpate.observation.contract import Fit, Imaged, OfInstrument
+from palpate.observation.contract import Fit, Imaged, OfInstrument, OfPoints, PointMotions
 from palpate.progress import Progress, silent
 from palpate.study.discrepancy import FoundDiscrepancy, discrepancy_findings, discrepancy_of
 from palpate.study.estimate_findings import data_findings, fold_findings, inversion_findings, pair_findings
@@ -51,6 +53,7 @@ __all__ = [
     "Iteration",
     "ModulusEstimate",
     "Observed",
+    "PointFit",
     "Start",
     "TissueFit",
     "conclude",
@@ -142,6 +145,19 @@ class ForceFit:
 
 
 @dataclass(frozen=True, slots=True)
+class PointFit:
+    """Points whose motion was measured in a later state (its number, from 0), beside the fitted model's.
+
+    misfit: root mean square of the residuals that count, over the standard deviation stated, dimensionless.
+    """
+
+    name: str
+    state: int
+    motions: PointMotions
+    misfit: float
+
+
+@dataclass(frozen=True, slots=True)
 class Estimation:
     """Result of one inversion.
 
@@ -151,10 +167,10 @@ class Estimation:
     outer_loop: the steps from the best start's minimum to the estimate, which all starts of that minimum share;
     counts: of all starts and minima together; observations: what was compared, in words, by its kind; information: the
     directions of the log-moduli by how well they are known; information_shares: by tissue, of each kind of data, and of
-    what was believed before; discrepancy: what the images say of frame, drawing and
-    material; combinations: what is known where single moduli are not;
-    regions: joint ones of two moduli; forces: measured and fitted; image_pairs: what each of several later images says
-    alone; samples: of the moduli's posterior, where the case asks for them and the estimate converged.
+    what was believed before; discrepancy: what the images say of frame, drawing and material; combinations: what is
+    known where single moduli are not; regions: joint ones of two moduli; forces, points: measured and fitted;
+    image_pairs: what each of several later images says alone; samples: of the moduli's posterior,
+    where the case asks for them and the estimate converged.
     """
 
     status: str
@@ -177,6 +193,7 @@ class Estimation:
     samples: ModulusSamples | None = None
     poisson_ratios: tuple[PoissonRatioEstimate, ...] = ()
     forces: tuple[ForceFit, ...] = ()
+    points: tuple[PointFit, ...] = ()
 
     @property
     def correlation(self) -> NDArray[np.float64]:
@@ -217,7 +234,8 @@ def conclude(
     progress("intervals: profiles, and the fit of every surface before and after")
     pairs = image_pairs_of(inversion, settings.bounds, errors)
     fixed = frozen_posterior(objective, minimum.unknowns, minimum.evaluation)
-    known = _intervals(inversion, fixed, settings.bounds, covariance) if minimum.converged else ()
+    released = with_released(inversion, settings, progress=progress)
+    known = _intervals(inversion, fixed, settings.bounds, covariance, released) if minimum.converged else ()
     estimates = _estimates(inversion, known, covariance, truth)
     of_moduli = covariance.total[: len(estimates), : len(estimates)]
     stating = {e.tissue for e in estimates if e.verdict != NOT_IDENTIFIED}
@@ -246,6 +264,7 @@ def conclude(
         starts=tuple(_start(inversion, start) for start in inversion.starts),
         fits=_fits(inversion, observed),
         forces=_forces(inversion),
+        points=_points(inversion, observed),
         displacements=tuple(state.displacement for state in observed.states),
         counts=asdict(inversion.counts) | {"evaluations": inversion.evaluations},
         outer_loop=tuple(_iteration(inversion, iterate) for iterate in minimum.history),
@@ -332,20 +351,36 @@ class _Known:
     at_bound: bool
 
 
-def _intervals(inversion: Inversion, fixed: LeastSquares, bounds: Bounds, covariance: Covariance) -> tuple[_Known, ...]:
+def _intervals(
+    inversion: Inversion,
+    fixed: LeastSquares,
+    bounds: Bounds,
+    covariance: Covariance,
+    released: OuterIterate | None,
+) -> tuple[_Known, ...]:
+    """Of each parameter its interval; it holds that of the `released` minimum as well."""
     n = inversion.objective.n_parameters
     found, variances, at_bound = [], np.diag(covariance.total), bounds.reached(inversion.minimum.unknowns[:n])
     best = inversion.candidates[inversion.best]
     others = [c for c in inversion.candidates if c is not best and c.minimum.converged]
-    scales = np.diag(inversion.minimum.evaluation.covariance_columns(n)[:n]) / variances  # of a profile's deviance
+    least = np.diag(inversion.minimum.evaluation.covariance_columns(n)[:n])
+    scales = least / variances  # of a profile's deviance
     for i in range(n):
         limits = {"lower": float(np.exp(bounds.lower[i])), "upper": float(np.exp(bounds.upper[i]))}
         own = modulus_interval(fixed, inversion.minimum, i, variance=float(variances[i]), bounds=bounds)
         sd = float(np.sqrt(variances[i]))
         good = [c.minimum.unknowns for c in others if as_good(c.value, best.value, scale=float(scales[i]))]
-        interval = hull([own.ends, *(log_interval(float(np.exp(x[i])), sd, **limits) for x in good)])
+        wider = [] if released is None else [_released_interval(released, i, float(variances[i] - least[i]), bounds)]
+        interval = hull([own.ends, *(log_interval(float(np.exp(x[i])), sd, **limits) for x in good), *wider])
         found.append(_Known(own, interval, bool(at_bound[i])))
     return tuple(found)
+
+
+def _released_interval(released: OuterIterate, number: int, beyond: float, bounds: Bounds) -> Interval:
+    """The interval of a parameter where released blocks are free; beyond: its variance by what is no least squares."""
+    free = frozen_posterior(released.objective, released.minimum.unknowns, released.minimum.evaluation)
+    variance = float(released.minimum.evaluation.covariance_columns(number + 1)[number, number]) + beyond
+    return modulus_interval(free, released.minimum, number, variance=variance, bounds=bounds).ends
 
 
 def _estimates(
@@ -470,6 +505,19 @@ def _forces(inversion: Inversion) -> tuple[ForceFit, ...]:
             fitted = seen.measured + float(line.residuals.values[0])
             sd = line.observation.noise_model.sd
             found.append(ForceFit(line.observation.name, line.state, seen.measured, fitted, sd))
+    return tuple(found)
+
+
+def _points(inversion: Inversion, observed: Observed) -> tuple[PointFit, ...]:
+    """The points of every observation that has some, as measured and as the fitted states move them."""
+    found = []
+    for line in inversion.minimum.evaluation.lines:
+        seen = line.observation
+        if isinstance(seen, OfPoints):
+            motions = seen.point_motions(observed.states[line.state].displacement.ravel()[line.observation.dofs])
+            stated = line.observation.first_noise((line.observation,)).sd
+            misfit = float(np.sqrt(np.mean(line.residuals.values**2))) / stated
+            found.append(PointFit(line.observation.name, line.state, motions, misfit))
     return tuple(found)
 
 

@@ -202,7 +202,8 @@ def _inputs(
 ) -> tuple[_Input, ...]:
     """Poisson's ratio of each tissue and of all, each observed surface, known moduli where several set the scale."""
     objective, minimum = inversion.objective, inversion.minimum
-    regions = [tissues[region] for region in objective.states[0].model.regions]
+    model = objective.states[0].model
+    regions = [model.space.mesh.tissues[region] for region in model.regions]
     by_poisson = poisson_errors(objective, minimum.unknowns, minimum.evaluation, dilatation)
     found = []
     for number, tissue in enumerate(regions):

@@ -2,7 +2,7 @@
 // Both images whole, the later one over the earlier: bones must stand still while one fades into the other.
 Palpate.Alignment = class extends Palpate.Planes {
   constructor(facts, number, section) {
-    super(facts, number, section, facts.references[facts.later[number].reference].whole);
+    super(facts, facts.later[number], section, facts.references[facts.later[number].reference].whole);
     this.fade = section.querySelector(".fade");
     this.button = section.querySelector(".play");
     this.fade.addEventListener("input", () => { this.play(false); this.draw(); });

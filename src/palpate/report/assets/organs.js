@@ -136,15 +136,16 @@ Palpate.Organs = class {
   }
 };
 
-// Triangles of an arrow along `way` (mm), as thick as suits a body of that radius; none for what is too short to be seen.
-Palpate.arrow = (from, way, radius, places) => {
+// Triangles of an arrow along `way` (mm), as thick as suits a body of that radius, or `wide` times that; none for what is
+// too short to be seen.
+Palpate.arrow = (from, way, radius, places, wide = 1) => {
   const length = way.length();
   if (length < 0.004 * radius) return;
   const along = way.clone().normalize(), side = new THREE.Vector3(Math.abs(along.x) < 0.8 ? 1 : 0, Math.abs(along.x) < 0.8 ? 0 : 1, 0);
   const u = side.cross(along).normalize(), v = along.clone().cross(u), head = Math.min(0.05 * radius, 0.6 * length);
   const ring = (thick, up) => Array.from({ length: SIDES }, (_, i) => from.clone().addScaledVector(along, up)
     .addScaledVector(u, thick * Math.cos((2 * Math.PI * i) / SIDES)).addScaledVector(v, thick * Math.sin((2 * Math.PI * i) / SIDES)));
-  const thick = 0.18 * head, foot = ring(thick, 0), neck = ring(thick, length - head), brim = ring(0.42 * head, length - head);
+  const thick = 0.18 * wide * head, foot = ring(thick, 0), neck = ring(thick, length - head), brim = ring(0.42 * wide * head, length - head);
   const tip = from.clone().add(way), face = (...corners) => { for (const corner of corners) places.push(corner.x, corner.y, corner.z); };
   for (let i = 0; i < SIDES; i++) {
     const j = (i + 1) % SIDES;

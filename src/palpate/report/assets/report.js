@@ -43,6 +43,10 @@ Palpate.load = async () => {
       distanceRest: array(m.distanceRest), distanceFitted: array(m.distanceFitted),
     }));
   }
+  for (const state of facts.measured) {
+    state.outlines = state.outlines.map(surface);
+    state.points = state.points.map((p) => ({ near: p.near, rest: array(p.rest), observed: array(p.observed), fitted: array(p.fitted) }));
+  }
   if (facts.mesh) {
     const m = facts.mesh;
     facts.mesh = {

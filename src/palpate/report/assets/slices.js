@@ -88,9 +88,9 @@ Palpate.layer = (volume, view, position, greys, colours) => {
 
 // Three linked planes through a box; those who extend it say what they show: `volumes` and `paintPlane`.
 Palpate.Planes = class {
-  constructor(facts, number, section, box) {
+  constructor(facts, later, section, box) {
     this.facts = facts;
-    this.later = facts.later[number];
+    this.later = later;
     this.reference = facts.references[this.later.reference];
     this.section = section;
     this.box = box;
@@ -115,15 +115,22 @@ Palpate.Planes = class {
     return { canvas, slider, view, layers: new Map() };
   }
 
+  // All planes through a place, mm.
+  go(place) {
+    this.position = [...place];
+    for (const figure of this.figures) figure.slider.value = this.position[figure.view.normal];
+    this.draw();
+  }
+
   // A click takes the two other planes through the point.
   point(event, view, canvas) {
     const { low, high } = this.box, frame = canvas.getBoundingClientRect();
     const x = Math.min(Math.max((event.clientX - frame.left) / frame.width, 0), 1);
     const y = Math.min(Math.max((event.clientY - frame.top) / frame.height, 0), 1);
-    this.position[view.across] = high[view.across] - x * (high[view.across] - low[view.across]);
-    this.position[view.up] = high[view.up] - y * (high[view.up] - low[view.up]);
-    for (const figure of this.figures) figure.slider.value = this.position[figure.view.normal];
-    this.draw();
+    const place = [...this.position];
+    place[view.across] = high[view.across] - x * (high[view.across] - low[view.across]);
+    place[view.up] = high[view.up] - y * (high[view.up] - low[view.up]);
+    this.go(place);
   }
 
   // Window and level of the grey values, where there are some: one for all images of the section.
@@ -235,7 +242,7 @@ Palpate.Planes = class {
 // The organs' outlines over the image of one state or the other.
 Palpate.Slices = class extends Palpate.Planes {
   constructor(facts, number, section) {
-    super(facts, number, section, facts.references[facts.later[number].reference].box);
+    super(facts, facts.later[number], section, facts.references[facts.later[number].reference].box);
     this.phase = "after";
     for (const input of section.querySelectorAll(".legend input")) input.addEventListener("change", () => this.draw());
     for (const input of section.querySelectorAll(".modes input")) input.addEventListener("change", () => this.flicker());

@@ -30,7 +30,10 @@
     const number = Number(section.dataset.later);
     if (facts.later[number].both.length) soon(section, () => new Palpate.Alignment(facts, number, section));
   }
+  const measured = [...document.querySelectorAll("section.points")].map((section) => [section, facts.measured[Number(section.dataset.measured)]]);
+  for (const [section, state] of measured) soon(section.querySelector(".in-slices"), () => new Palpate.PointSlices(facts, state, section));
   if (!Palpate.supportsWebGL()) return;
+  for (const [section, state] of measured) soon(section.querySelector(".in-space"), () => new Palpate.PointBodies(facts, state, section));
   for (const section of document.querySelectorAll("section.organs")) {
     const number = Number(section.dataset.later);
     if (facts.later[number].model.length) soon(section, () => new Palpate.Organs(facts, number, section));
