@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import palpate.inversion
-from palpate.inversion import Objective, reduced_basis
+from palpate.images.tissue import Role
+from palpate.inversion import Objective, layer_blocks, reduced_basis
 from palpate.inversion.objective import LinearisedObjective
 from palpate.observation.contract import Weighting
 from palpate.observation.robust_loss import Tukey
@@ -173,3 +174,20 @@ def test_the_gradient_alone_is_that_of_the_whole_evaluation(objective, rng):
     whole = objective(unknowns)
     assert value == pytest.approx(whole.value, rel=1e-12)
     assert gradient == pytest.approx(whole.gradient, rel=1e-9, abs=1e-9 * np.abs(whole.gradient).max())
+
+
+def test_a_known_tissue_released_as_a_whole_is_a_prior_of_the_scale(twins, twin):
+    """Moduli scaled together leave u unchanged: ln E of all organs then varies by as much as that of the tissue."""
+    problem, sd = twins.voxel_problem(twin), 0.4
+    tissues, regions = twin.scene.tissues, problem.states[0].model.regions
+    region = next(i for i, number in enumerate(regions) if tissues[number].role is Role.KNOWN)
+    blocks = (*problem.parameters.blocks, *layer_blocks((("organ", (region,)),), (0,), sd=sd))
+    parameters = replace(problem.parameters, blocks=blocks, nuisance_precision=np.zeros((0, 0)))
+    held = objective_of(replace(problem, parameters=parameters))
+    unknowns = np.concatenate([twin.unknowns, [0.0]])
+    free, seen = held.released(held(unknowns), unknowns)
+    anew = free(unknowns)
+    for name in ("value", "gradient", "score", "matrix"):
+        assert getattr(seen, name) == pytest.approx(getattr(anew, name), rel=1e-6, abs=1e-5)  # 1e8 of what is held
+    before, after = (of.covariance_columns(2)[:2] for of in (held(unknowns), seen))
+    assert after - before == pytest.approx(np.full((2, 2), sd**2), rel=0.02)

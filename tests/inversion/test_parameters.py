@@ -9,7 +9,7 @@ import pytest
 
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role, Tissue
-from palpate.inversion import Bounds, gauss_newton, invert, parameter_map, unit_blocks
+from palpate.inversion import Bounds, gauss_newton, invert, layer_blocks, parameter_map, unit_blocks
 from palpate.inversion.optimise import posterior_sd
 from palpate.observation.noise_model import NoiseModel
 
@@ -60,6 +60,19 @@ def test_the_chain_of_a_state_is_that_of_its_own_unknowns(rng, tied, state):
     mapping = mapping_of(2, 3, tied=tied)
     unknowns, own = rng.normal(size=mapping.n_unknowns), mapping.unknowns_of(state)
     assert mapping.chain(state, unknowns) == pytest.approx(chain_of(mapping, state, unknowns)[:, own], abs=1e-8)
+
+
+def test_an_unknown_of_a_region_is_added_to_its_modulus_in_every_state(rng):
+    """It enters moduli and their derivatives as theta does, between theta and the coefficients."""
+    blocks = (*unit_blocks(2, 3), *layer_blocks((("gland", (1, 3)),), (0, 1), sd=1.5))
+    mapping = parameter_map((GLAND, FAT, SAC, MUSCLE), (0, 1, 2, 3), blocks)
+    unknowns = rng.normal(size=mapping.n_unknowns)
+    changed = unknowns + 0.7 * np.eye(mapping.n_unknowns)[-1]
+    assert mapping.moduli(changed) / mapping.moduli(unknowns) == pytest.approx(np.exp([0.0, 0.7, 0.0, 0.7]))
+    for state in (0, 1):
+        own, chain = mapping.unknowns_of(state), chain_of(mapping, state, unknowns)
+        assert mapping.chain(state, unknowns) == pytest.approx(chain[:, own], abs=1e-8)
+        assert not np.delete(chain, own, axis=1).any()
 
 
 def chain_of(mapping, state, unknowns):
