@@ -179,7 +179,11 @@ def _table(demo: Mapping[str, Any], rows: list[dict[str, Any]]) -> str:
 
 
 def _line(name: str, estimates: Mapping[str, Any], row: Mapping[str, Any]) -> str:
-    moduli = [f"{e['value']:.2f} ({e['interval'][0]:.1f} to {e['interval'][1]:.1f})" for e in estimates.values()]
+    ends = [e["interval"] or ("none", "none") for e in estimates.values()]
+    moduli = [
+        f"{e['value']:.2f} ({low:.3g} to {high:.3g})" if low != "none" else f"{e['value']:.2f} (no interval)"
+        for e, (low, high) in zip(estimates.values(), ends, strict=True)
+    ]
     judged = ["", "", *moduli, ""]
     if row:
         places = [f"{100.0 * row['volume']:.3f} %", f"{row['centroid_mm']:.3f} mm"]

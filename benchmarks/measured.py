@@ -189,6 +189,8 @@ def _tpu_prediction(block: Block, options: Options, step: int, fit: dict[str, An
     data = [_tpu_data(block, folder, step, 1, force=unknown, ends=True)]
     case = _tpu_case(folder, fit["law"], "auto", data)
     case = replace(case, tissues=tuple(replace(t, poisson_ratio=fit["poisson_ratio"]) for t in case.tissues))
+    if None in fit["interval95"]:
+        raise SystemExit(f"steps {fit['steps']} do not identify the modulus: there is nothing to foretell with")
     low, high = (np.log(end) for end in fit["interval95"])
     sd = float(high - low) / (2.0 * NORMAL_95)
     inversion = _inverted(case, prior=(float(np.log(1e3 * fit["youngs_modulus_mpa"])), sd))
