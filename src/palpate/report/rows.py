@@ -20,7 +20,6 @@ CAUSES = {
     "frame": "the frame's motion",
     "offset": "how surfaces are drawn",
     "heterogeneity": "tissues that are not homogeneous",
-    "layer": "a soft or stiff layer round an organ",
     "poisson": "Poisson's ratios",
     "prior": "what is believed of parameters",
     "grid": "the voxels' place",

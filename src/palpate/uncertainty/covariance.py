@@ -133,6 +133,8 @@ def _causes(
     for cause, part in (item for of in further for item in of.items()):
         found[cause] = found.get(cause, np.zeros_like(part)) + part
     for i, block in enumerate(objective.parameters.blocks):
+        if block.released:  # its share is not in this covariance, but in the ends of the interval
+            continue
         own = objective.parameters.columns(i)
         part = inverse[own].T @ evaluation.prior[np.ix_(own, own)] @ inverse[own]
         found[block.cause] = found.get(block.cause, np.zeros_like(part)) + part
