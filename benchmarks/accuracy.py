@@ -38,8 +38,9 @@ from palpate.mesh import LagrangeSpace, triangle_normals
 from palpate.observation import NoiseModel, fit_noise_model, observed_surface
 from palpate.phantoms import Noise, Scene
 from palpate.study import Body, Observed, conclude, fitted_states
-from palpate.study.estimation import GRID_DRAWS
 from palpate.uncertainty import FittedState, grid_position_shifts, imaging_errors
+
+GRID_DRAWS = 8  # of the voxels' place, as an estimate has them
 
 Array = NDArray[np.float64]
 Result = dict[str, Any]  # a line of JSON

@@ -92,7 +92,9 @@ def test_bones_are_as_far_off_as_they_were_shifted(case_result, shift):
     affine = before.grid.affine.copy()
     affine[0, 3] += shift
     later = Segmentation(before.index, VoxelGrid(before.grid.shape, affine), rigid)
-    mesh = dataclasses.replace(case_result.space.mesh, tissues=rigid)
+    mesh, most = case_result.space.mesh, len(rigid) - 1
+    numbers = {"region": np.minimum(mesh.region, most), "beyond": np.minimum(mesh.beyond, most)}
+    mesh = dataclasses.replace(mesh, tissues=rigid, **numbers)
     space = dataclasses.replace(case_result.space, mesh=mesh)
     result = dataclasses.replace(case_result, space=space, before=before, after=(later,))
     surfaces = [(image_surface(image, 1, smoothing_mm=1.2),) for image in (before, later)]

@@ -8,10 +8,13 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from palpate.report.cards import moduli_figure, result_cards, result_lines
     from palpate.report.case_report import write_case_report, write_failure_report
+    from palpate.report.rows import interval_text, number
     from palpate.report.sensitivity_report import sensitivity_page
 
 __all__ = [
+    "interval_text",
     "moduli_figure",
+    "number",
     "result_cards",
     "result_lines",
     "sensitivity_page",
@@ -20,6 +23,8 @@ __all__ = [
 ]
 
 _HOMES = {
+    "interval_text": "palpate.report.rows",
+    "number": "palpate.report.rows",
     "moduli_figure": "palpate.report.cards",
     "result_cards": "palpate.report.cards",
     "result_lines": "palpate.report.cards",

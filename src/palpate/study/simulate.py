@@ -115,7 +115,7 @@ def _steps(body: Body, case: Case, steps: int, progress: Progress) -> tuple[NDAr
     shares = [step / steps for step in range(1, steps + 1)]
     if case.motion is None and body.states.after:
         problem = inverse_problem(body, case, progress=progress)
-        return fit_driver(problem, _moduli(body.space.mesh.tissues), shares=shares)[-1]
+        return fit_driver(problem, _moduli(problem.states[0].model.space.mesh.tissues), shares=shares)[-1]
     if not case.mechanics.material_law.finite:
         whole = _moved(body, case, 1.0)
         return tuple(whole * share for share in shares)

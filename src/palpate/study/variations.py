@@ -206,11 +206,12 @@ def _inputs(
     regions = [model.space.mesh.tissues[region] for region in model.regions]
     by_poisson = poisson_errors(objective, minimum.unknowns, minimum.evaluation, dilatation)
     found = []
-    for number, tissue in enumerate(regions):
-        steps = _poisson_steps(tissue.poisson_ratio)
-        words = tuple((step, f"{tissue.poisson_ratio + step:.3g}") for step in steps)
-        found.append(_Input("poisson_ratio", tissue.name, "", tuple(e[:, number] for e in by_poisson), words))
-    if len(regions) > 1:
+    numbers = {name: [i for i, t in enumerate(regions) if t.name == name] for name in (t.name for t in regions)}
+    for name, own in numbers.items():  # layers round organs are regions of their tissue
+        given = regions[own[0]].poisson_ratio
+        words = tuple((step, f"{given + step:.3g}") for step in _poisson_steps(given))
+        found.append(_Input("poisson_ratio", name, "", tuple(e[:, own].sum(axis=1) for e in by_poisson), words))
+    if len(numbers) > 1:
         steps = _poisson_steps(max(tissue.poisson_ratio for tissue in regions))
         words = tuple((step, f"{step:+.3g}") for step in steps)
         found.append(_Input("poisson_ratio", ALL, "", tuple(e.sum(axis=1) for e in by_poisson), words))
@@ -222,9 +223,9 @@ def _inputs(
         step = float(np.log(KNOWN_FACTOR))
         amounts = ((-step, f"/ {KNOWN_FACTOR:g}"), (step, f"x {KNOWN_FACTOR:g}"))
         found += [
-            _Input("known_modulus", tissue.name, "ln E", tuple(e[:, number] for e in by_modulus), amounts)
-            for number, tissue in enumerate(regions)
-            if tissue.role is Role.KNOWN
+            _Input("known_modulus", name, "ln E", tuple(e[:, own].sum(axis=1) for e in by_modulus), amounts)
+            for name, own in numbers.items()
+            if regions[own[0]].role is Role.KNOWN
         ]
     return tuple(found)
 

@@ -17,7 +17,7 @@ from palpate.experiments.reproduce.cohort import ORGANS, CohortSettings, Patient
 from palpate.experiments.reproduce.jobs import Job, Progress, compute
 from palpate.experiments.reproduce.ledger import Ledger
 from palpate.experiments.reproduce.paper import PAPER_STAGING
-from palpate.report.rows import interval_text, number
+from palpate.report import interval_text, number
 
 __all__ = ["Staging", "paper_remark", "staging", "with_stage"]
 
