@@ -120,8 +120,8 @@ def test_what_is_seen_inside_narrows_what_surfaces_leave_open(case, folder):
     field = CaseData("displacement-field", folder / "field.nii.gz", sd_mm=0.2)
     results = [estimate(replace(case, data=data)) for data in ((), (markers,), (field,))]
     ends = [result.estimation.estimates[0].interval95 for result in results]
-    assert all(low < TRUTH < high for low, high in ends)
-    surfaces, with_markers, with_field = (np.log(high / low) for low, high in ends)
+    assert all(end is None or end[0] < TRUTH < end[1] for end in ends)  # none where surfaces alone do not identify it
+    surfaces, with_markers, with_field = (np.inf if end is None else np.log(end[1] / end[0]) for end in ends)
     assert with_markers < 0.9 * surfaces
     assert with_field < 0.7 * surfaces
     document = results[2].to_dict()
