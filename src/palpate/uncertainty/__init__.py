@@ -2,6 +2,7 @@
 
 from palpate.uncertainty.combinations import Combination, Information, information, information_shares, known_pairs
 from palpate.uncertainty.covariance import (
+    GRID_DRAWS,
     Covariance,
     FittedState,
     GridErrors,
@@ -34,6 +35,7 @@ from palpate.uncertainty.sensitivity import (
 from palpate.uncertainty.sobol import SobolIndices, require_salib, sobol_indices
 
 __all__ = [
+    "GRID_DRAWS",
     "NORMAL_95",
     "Agreement",
     "ChainDiagnostics",
