@@ -129,6 +129,9 @@ def test_what_is_seen_inside_narrows_what_surfaces_leave_open(case, folder):
     shares = document["information_shares"]["core"]
     assert sum(shares.values()) == pytest.approx(1.0)
     assert shares["displacement-field"] > 0.5
+    changes = {(change["cause"], change["setting"]): change["changes"] for change in document["variations"]}
+    assert changes["known_modulus", "x 1.2"]["core"] == pytest.approx(np.log(1.2))
+    assert {cause for cause, _ in changes} >= {"poisson_ratio", "segmentation", "law"}
     far = document["fit"][0]["displacement-field"]["end"]["rms_mm"]  # of means, which err by less
     assert 0.02 * 3**0.5 < far < 0.2 * 3**0.5
     assert json.dumps(document, allow_nan=False)

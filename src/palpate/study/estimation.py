@@ -32,6 +32,7 @@ from palpate.study.estimate_findings import data_findings, fold_findings, invers
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio, ratio_verdict
 from palpate.study.samples import CHAINS, ModulusSamples, draw_moduli, sample_findings
 from palpate.study.together import ImagePairs, ModulusRegion, combinations_of, image_pairs_of, regions_of
+from palpate.study.variations import Variation
 from palpate.uncertainty import (
     GRID_DRAWS,
     Combination,
@@ -171,7 +172,7 @@ class Estimation:
     what was believed before; discrepancy: what the images say of frame, drawing and material; combinations: what is
     known where single moduli are not; regions: joint ones of two moduli; forces, points: measured and fitted;
     image_pairs: what each of several later images says alone; samples: of the moduli's posterior,
-    where the case asks for them and the estimate converged.
+    where the case asks for them and the estimate converged; variations: what would change the answer.
     """
 
     status: str
@@ -195,6 +196,7 @@ class Estimation:
     poisson_ratios: tuple[PoissonRatioEstimate, ...] = ()
     forces: tuple[ForceFit, ...] = ()
     points: tuple[PointFit, ...] = ()
+    variations: tuple[Variation, ...] = ()
 
     @property
     def correlation(self) -> NDArray[np.float64]:
