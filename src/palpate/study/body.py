@@ -23,6 +23,7 @@ from palpate.inversion import (
     LaterState,
     frame_blocks,
     instrument_block,
+    known_modulus_blocks,
     layer_blocks,
     material_blocks,
     offset_block,
@@ -321,7 +322,11 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
     parameters = parameter_map(
         models[0].space.mesh.tissues,
         models[0].regions,
-        (*_blocks(case, pairs, seen), *_layer_blocks(case, shared, models)),
+        (
+            *_blocks(case, pairs, seen),
+            *known_modulus_blocks(models[0].space.mesh.tissues, models[0].regions, tuple(range(len(models)))),
+            *_layer_blocks(case, shared, models),
+        ),
         loaded=case.known_force,
         open_poisson=_open_poisson(case, bodies[0].space.mesh),
         dilatation=choose_element(case.mechanics.element).dilatation,

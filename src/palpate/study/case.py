@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +16,7 @@ from palpate.mechanics.solvers.registry import SOLVERS
 from palpate.observation.contract import DataFile
 from palpate.study.case_data import CaseData
 from palpate.study.schema import Rule, nearest, rule, shown
+from palpate.uncertainty.intervals import NORMAL_95
 
 __all__ = [
     "REMAINING",
@@ -181,7 +183,8 @@ class CaseTissue:
     """A tissue as the case names it: `label` is a tuple of labels, a name of the label table, or "remaining".
 
     `poisson_ratio` None: 0.45, or what a phantom draws; `poisson_ratio_sd`: standard deviation of what is believed of
-    it where it is sought, None: 0.03.
+    it where it is sought, None: 0.03. `youngs_modulus_kpa`: a number, or the 95 % range of what is believed of a
+    `known` one.
     """
 
     name: str
@@ -194,7 +197,7 @@ class CaseTissue:
             wanted="an isotropic elastic solid needs -1 < nu < 0.5; soft tissue is usually given 0.40 to 0.49",
         ),
     )
-    youngs_modulus_kpa: float | None = field(
+    youngs_modulus_kpa: float | tuple[float, float] | None = field(
         default=None,
         metadata=rule(between=KILOPASCALS, wanted="a positive number in kPa (soft tissue: 0.5 to 1000 kPa)"),
     )
@@ -210,12 +213,35 @@ class CaseTissue:
             )
         if isinstance(self.label, str):
             refuse_name(self.label, f"the label of tissue '{self.name}'")
+        if isinstance(self.youngs_modulus_kpa, tuple):
+            if self.role is not Role.KNOWN:
+                raise ConfigurationError(
+                    f"tissue '{self.name}': youngs_modulus_kpa is a range, which is what is believed of a `known`"
+                    f" modulus, but its role is '{self.role}'; give a number, or leave it out"
+                )
+            if not self.youngs_modulus_kpa[0] < self.youngs_modulus_kpa[1]:
+                raise ConfigurationError(
+                    f"tissue '{self.name}': youngs_modulus_kpa is {shown(self.youngs_modulus_kpa)}; a range begins with"
+                    " its smaller end"
+                )
         self.with_labels(())  # a tissue's constants are checked by the tissue itself
 
     def with_labels(self, labels: tuple[int, ...]) -> Tissue:
         """The tissue with its labels; raises `ConfigurationError` when its constants are impossible."""
         ratio = POISSON_RATIO if self.poisson_ratio is None else self.poisson_ratio
-        return Tissue(self.name, self.role, labels, ratio, self.youngs_modulus_kpa)
+        return Tissue(self.name, self.role, labels, ratio, self.modulus_kpa, modulus_sd=self.modulus_sd)
+
+    @property
+    def modulus_kpa(self) -> float | None:
+        """Young's modulus, kPa: the number that is given, or the geometric mean of a range's ends."""
+        given = self.youngs_modulus_kpa
+        return math.sqrt(given[0] * given[1]) if isinstance(given, tuple) else given
+
+    @property
+    def modulus_sd(self) -> float:
+        """Standard deviation of ln E, by the 95 % range that is given; 0 of a number."""
+        given = self.youngs_modulus_kpa
+        return math.log(given[1] / given[0]) / (2.0 * NORMAL_95) if isinstance(given, tuple) else 0.0
 
     def resolve(self, names: Mapping[int, str]) -> Tissue:
         """The tissue with the labels that `names` (label -> name) gives to its label's name.

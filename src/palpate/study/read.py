@@ -111,7 +111,7 @@ def phantom_scene(case: Case) -> Scene:
         options,
         law=case.phantom.law or case.mechanics.law,
         law_parameters=case.mechanics.law_parameters,
-        moduli_kpa={t.name: t.youngs_modulus_kpa for t in meshed if t.youngs_modulus_kpa is not None},
+        moduli_kpa={t.name: t.modulus_kpa for t in meshed if t.modulus_kpa is not None},
         poisson_ratio={t.name: t.poisson_ratio for t in meshed if t.poisson_ratio is not None},
     )
     if isinstance(options, PelvisOptions):

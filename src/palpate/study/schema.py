@@ -174,9 +174,10 @@ def _check_value(bounds: Rule, value: object, place: _Place) -> None:
 def _convert(hint: Any, value: object, place: _Place) -> object:
     """`value` as the type `hint`, which is one of those that the schema uses."""
     origin = typing.get_origin(hint)
-    if origin is types.UnionType:  # X | None
-        inner = next(arm for arm in typing.get_args(hint) if arm is not types.NoneType)
-        return _convert(inner, value, place)
+    if origin is types.UnionType:  # X | None, or a number or several: X | tuple[X, X] | None
+        arms = [arm for arm in typing.get_args(hint) if arm is not types.NoneType]
+        listed = [arm for arm in arms if typing.get_origin(arm) is tuple]
+        return _convert(listed[0] if listed and isinstance(value, list) else arms[0], value, place)
     if origin is tuple:
         return _convert_tuple(typing.get_args(hint), value, place)
     if dataclasses.is_dataclass(hint):
