@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 
 from palpate.cli import main
-from palpate.errors import ConfigurationError, InputDataError
+from palpate.errors import ConfigurationError, GeometryError, InputDataError
+from palpate.mechanics.deformation import largest_strains
+from palpate.mechanics.loads import boundary_named
 from palpate.mesh.mesh_file import read_mesh_file
 from palpate.report.collect import collect
+from palpate.study.body import inverse_problem, make_body
 from palpate.study.case_file import read_case
 from palpate.study.check import check_case
 from palpate.study.read import read_states
@@ -198,3 +201,112 @@ def test_a_surface_mesh_and_flat_tetrahedra_are_refused(tmp_path):
     meshio.write(tmp_path / "f.vtu", meshio.Mesh(nodes * [1.0, 1.0, 0.0], [("tetra", tets)]))
     with pytest.raises(InputDataError, match="no volume"):
         read_mesh_file(tmp_path / "f.vtu")
+
+
+SLIDING = """
+[[surfaces]]
+name = "floor"
+where = "z_min"
+within_mm = 0.1
+boundary = "sliding"
+
+[[surfaces]]
+name = "grip"
+where = "z_max"
+within_mm = 0.1
+boundary = "prescribed"
+
+[[surfaces]]
+name = "walls"
+where = "boundary"
+boundary = "sliding"
+"""
+
+
+def body_of(folder, case, moved, *, surfaces=SLIDING, spread=0.0):
+    """The model of the bar under a case whose surfaces are `surfaces` and whose field is `moved` of points."""
+    points = np.random.default_rng(2).uniform(0.0, SIZE, (200, 3))
+    head = "before_x,before_y,before_z,after_x,after_y,after_z"
+    noise = spread * np.random.default_rng(3).standard_normal(points.shape)
+    np.savetxt(folder / "exact.csv", np.c_[points, moved(points) + noise], delimiter=",", header=head, comments="")
+    head, tail = case.split("[[surfaces]]")[0], case[case.index("[tissues.bar]") :]
+    (folder / "walls.toml").write_text((head + surfaces + tail).replace("field.csv", "exact.csv"))
+    return problem_of(read_case(folder / "walls.toml"))
+
+
+def problem_of(case):
+    body = make_body(read_states(case), case, progress=lambda _: None)
+    return body, inverse_problem(body, case, progress=lambda _: None)
+
+
+def displacement_of(problem):
+    state = problem.states[0]
+    model = state.finite_strain or state.model
+    found = model.solve(np.array([MODULUS]), np.zeros(model.n_modes))
+    return found.values.reshape(-1, 3)
+
+
+@pytest.mark.parametrize("law", ["linear", "neo-hookean"])
+def test_a_block_pressed_between_sliding_walls_is_strained_uniformly_along_one_axis(folder, law):
+    """Under any law: u = (0, 0, s z), for nothing may narrow."""
+    case = CASE.replace('law = "linear"', f'law = "{law}"')
+    body, problem = body_of(folder, case, lambda x: x * np.array([1.0, 1.0, 1.0 - STRAIN]))
+    exact = -STRAIN * body.space.points * np.array([0.0, 0.0, 1.0])
+    assert displacement_of(problem) == pytest.approx(exact, abs=1e-9)
+
+
+@pytest.mark.parametrize("law", ["linear", "neo-hookean"])
+def test_a_surface_prescribed_to_move_rigidly_strains_nothing(folder, law):
+    angle = 0.3 if law == "neo-hookean" else 0.0  # to the linear law a turn is a strain
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
+    surfaces = '[[surfaces]]\nname = "grip"\nwhere = "boundary"\nboundary = "prescribed"\n'
+    case = CASE.replace('law = "linear"', f'law = "{law}"')
+    body, problem = body_of(folder, case, lambda x: x @ turn.T + [1.0, -2.0, 0.5], surfaces=surfaces)
+    assert np.abs(displacement_of(problem)).max() > 0.5
+    assert largest_strains(body.space, displacement_of(problem)).max() < 1e-9
+
+
+def test_the_motion_of_a_prescribed_surface_is_smoother_than_the_field_that_tells_it(folder):
+    surfaces = '[[surfaces]]\nname = "grip"\nwhere = "z_max"\nboundary = "prescribed"\n'
+    case = CASE.replace("sd_mm = 0.01", "sd_mm = 0.2")
+
+    def bent(x):
+        return x + np.stack([0.0 * x[:, 0], 0.0 * x[:, 0], 2.0 * np.sin(x[:, 0] / 20.0)], axis=1)
+
+    body, problem = body_of(folder, case, bent, surfaces=surfaces, spread=0.2)
+    grip = np.unique(body.space.facets(boundary_named(body.space.mesh, "grip")))
+    points = body.space.points[grip]
+    off = displacement_of(problem)[grip] - (bent(points) - points)
+    assert np.sqrt(np.mean(off**2)) < 0.75 * 0.2
+
+
+HELD_BY_ONE = 'name = "grip"\nwhere = "x_min"\nboundary = "sliding"\n'
+PRESSURE = '[[loads]]\nkind = "pressure"\npressure_kpa = 1.0\nsurface = '
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "words"),
+    [
+        (('boundary = "prescribed"', 'boundary = "glued"'), ConfigurationError, "did you mean"),
+        (("[mechanics]", PRESSURE + '"walls"\n[mechanics]'), ConfigurationError, "boundary free if"),
+        (("[mechanics]", PRESSURE + '"grip"\n[mechanics]'), ConfigurationError, "the boundary free"),
+        (("[mechanics]", "[driver]\nkernel_mm = 0.5\n[mechanics]"), InputDataError, "further than 0.5 mm"),
+        (('where = "z_min"', 'where = "boundary"'), GeometryError, "named before it"),
+        ((f"state = 1\nforce_n = {FORCE_N}", f"state = 2\nforce_n = {FORCE_N}"), ConfigurationError, "where points"),
+        ((SLIDING, SLIDING[: SLIDING.index('name = "grip"')] + HELD_BY_ONE), GeometryError, "floats"),
+    ],
+)
+def test_a_surface_that_makes_no_sense_is_refused_in_a_sentence(folder, change, error, words):
+    case = CASE.replace("force_n", "state = 1\nforce_n")
+    body_of(folder, case, lambda x: 0.9 * x)
+    text = (folder / "walls.toml").read_text()
+    assert change[0] in text
+    (folder / "wrong.toml").write_text(text.replace(*change, 1))
+    with pytest.raises(error, match=words):
+        problem_of(read_case(folder / "wrong.toml"))
+
+
+def test_a_sliding_role_is_of_surfaces_alone(folder):
+    (folder / "wrong.toml").write_text(CASE.replace('role = "estimate"', 'role = "sliding"'))
+    with pytest.raises(ConfigurationError, match="did you mean"):
+        read_case(folder / "wrong.toml")

@@ -124,7 +124,7 @@ def fitted_model(result: CaseResult, *, seal: str) -> FittedModel:
             " export: nothing that did not converge is passed on"
         )
     pairs: list[tuple[CaseResult | PairResult, tuple[NDArray[np.float64], ...]]] = []
-    pairs += [(result, estimation.displacements[: len(result.after)])]
+    pairs += [(result, result.displacements)]
     pairs += [(pair, pair.displacements) for pair in result.further]
     numbers = np.cumsum([1, *(len(motions) for _, motions in pairs)]).tolist()
     loads = [tuple(case.loads_in(n) for n in range(*ends)) for ends in pairwise(numbers)]

@@ -309,7 +309,7 @@ def _later(drawing: _Drawing, after: int, reference: Reference) -> LaterImage:
 def _mesh(result: CaseResult) -> MeshPicture:
     """The mesh of the first reference state with its largest strain in any of its later images."""
     mesh = result.space.mesh
-    motions = result.estimation.displacements[: len(result.after)]
+    motions = result.displacements
     strains = [largest_strains(result.space, motion) for motion in motions]
     return MeshPicture(
         nodes=mesh.nodes.astype(np.float32),

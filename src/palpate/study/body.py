@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.findings import Finding
-from palpate.images.alignment import Alignment, RigidMotion, align, moved
+from palpate.images.alignment import Alignment, Motion, align, moved
 from palpate.images.checks import check_headers, check_images, later_names
 from palpate.images.distance import observation_width
 from palpate.images.registration import ON, Registration, registration
@@ -89,7 +89,7 @@ class ImagedStates:
 
     before: Segmentation
     after: tuple[Segmentation, ...]
-    bones: tuple[Mapping[int, RigidMotion], ...]
+    bones: tuple[Mapping[int, Motion], ...]
     findings: tuple[Finding, ...]
     inputs: Mapping[str, str] = field(default_factory=dict)
     data: tuple[DataSource, ...] = ()
@@ -173,7 +173,7 @@ def brought(
             progress(f"looking for a motion of the whole in '{name}'")
             findings += check_headers(before.grid, image.grid, name)
             findings += _unaligned_findings(before, image, name)
-        return ImagedStates(before, after, tuple(dict[int, RigidMotion]() for _ in after), tuple(findings))
+        return ImagedStates(before, after, tuple(dict[int, Motion]() for _ in after), tuple(findings))
     rigid = {i: t.name for i, t in enumerate(before.tissues) if t.role is Role.RIGID}
     for name, image in zip(later_names(len(after)), after, strict=True):
         progress(f"aligning '{name}' on {ON[method]}")

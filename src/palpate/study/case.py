@@ -41,7 +41,15 @@ __all__ = [
 
 REMAINING = "remaining"
 AUTO = "auto"
+TISSUE_ROLES = tuple(str(role) for role in Role if role is not Role.SLIDING)
 HELD = ("fixed", "sliding")  # outer boundaries that leave a body no rigid motion
+SURFACE_ROLES = {  # of what lies behind a surface of a mesh
+    "moving": Role.DRIVER,
+    "fixed": Role.RIGID,
+    "sliding": Role.SLIDING,
+    "free": Role.VOID,
+    "prescribed": Role.RIGID,
+}
 LAW_NAMES = tuple(LAWS)
 SOLVER_NAMES = ("auto", *SOLVERS)
 
@@ -124,16 +132,22 @@ class CaseSurface:
     """A named surface of a mesh: a group of triangles, an outermost plane, or all of the boundary.
 
     `where`: the group's name, "x_min" ... "z_max" within `within_mm`, or "boundary". `boundary` "moving": its motion is
-    an unknown; "fixed": it is held; "free": nothing holds it, loads may act.
+    an unknown; "fixed": it is held; "sliding": it moves within itself alone; "free": nothing holds it, loads may act;
+    "prescribed": it moves as the measured points of its state say.
     """
 
     name: str
     where: str
-    boundary: str = field(default="moving", metadata=rule(choices=("moving", "fixed", "free")))
+    boundary: str = field(default="moving", metadata=rule(choices=tuple(SURFACE_ROLES)))
     within_mm: float = field(default=1.0, metadata=rule(between=(1e-6, 1e4)))
 
     def __post_init__(self) -> None:
         refuse_name(self.name, "the name of a surface")
+
+    @property
+    def behind(self) -> Tissue:
+        """The hollow tissue that stands behind it in a mesh."""
+        return Tissue(self.name, SURFACE_ROLES[self.boundary])
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +200,7 @@ class CaseTissue:
 
     name: str
     label: tuple[int, ...] | str = field(metadata=rule(convert=_label))
-    role: Role
+    role: Role = field(metadata=rule(choices=TISSUE_ROLES))
     poisson_ratio: float | None = field(
         default=None,
         metadata=rule(
