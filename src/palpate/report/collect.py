@@ -197,7 +197,8 @@ def _measured(data: CaseData) -> str:
 
 def _load(load: CaseLoad) -> str:
     """A known load in words."""
-    where = (f" on {load.surface}" if load.surface else "") + (f", in later state {load.state}" if load.state else "")
+    when = "" if load.state is None else f", in later state {load.state}" if load.state else ", in the reference state"
+    where = (f" on {load.surface}" if load.surface else "") + when
     if load.acceleration_m_s2 is not None:
         return f"gravity {_vector(load.acceleration_m_s2)} m/s^2{where}"
     if load.traction_kpa is not None:

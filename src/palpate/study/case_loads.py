@@ -17,7 +17,9 @@ __all__ = ["case_loads", "loads_on"]
 
 
 def case_loads(case: Case, space: LagrangeSpace, state: int, *, share: float = 1.0) -> tuple[Load, ...]:
-    """The loads of `case` in the later state with a number, from 1, on `space`, or a `share` of them.
+    """What `case` adds in the later state with a number, from 1, to the loads of the reference, or a `share` of it.
+
+    Those of the reference itself for the number 0.
 
     Raises `ConfigurationError` for a surface that the mesh has not, or whose motion is prescribed.
     """

@@ -18,6 +18,7 @@ from palpate.study.body import Body, ImagedStates, joint_problem, make_body
 from palpate.study.case import SOUGHT_RATIOS, Case
 from palpate.study.cost import ExpectedCost, cost_of_meshes, expected_cost
 from palpate.study.estimation import Estimation, Observed, conclude
+from palpate.study.loaded_reference import invert_from_rest
 from palpate.study.plausibility import estimate_warnings, unit_warnings
 from palpate.study.poisson_ratios import with_found_ratios
 from palpate.study.provenance import input_digests, software_versions
@@ -105,7 +106,10 @@ def estimate_states(
     problem = joint_problem(bodies, case, progress=during("linear law", progress))
     clock.append(time.perf_counter())
     settings = inversion_settings(case, problem.parameters)
-    inversion = invert(problem, settings, progress=during("linear law", progress))
+    if case.strained_reference:
+        bodies, inversion = invert_from_rest(bodies, problem, case, settings, progress=progress)
+    else:
+        inversion = invert(problem, settings, progress=during("linear law", progress))
     images = tuple(image.index if image else None for pair in bodies for image in pair.states.later)
     observed = Observed(fitted_states(inversion, *bodies), images)
     stating = during("intervals", progress)

@@ -17,7 +17,9 @@ from palpate.inversion import fit_driver
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.equilibrium import equilibrium
+from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.loads import Load
+from palpate.mechanics.rest_state import unloaded_displacement
 from palpate.mesh.dihedral import tet_dihedrals
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
@@ -78,11 +80,13 @@ def filled(
     outer: str,
     mechanics: Mechanics,
     loads: tuple[Load, ...] = (),
+    borne: tuple[Load, ...] = (),
 ) -> NDArray[np.float64]:
     """Displacement (n_points, 3) mm of a body whose drivers fill by `filling_mm`, whose bones are held.
 
-    segmentation: the labels that the drivers' walls come from; outer: see `outer_constraint`; loads: those that act,
-    too. The tissues of the space's mesh state their moduli. Raises `NotConverged` as `equilibrium` does.
+    segmentation: the labels that the drivers' walls come from; outer: see `outer_constraint`; loads: what is added to
+    those that the body bears as it is segmented, `borne`. The tissues of the space's mesh state their
+    moduli. Raises `NotConverged` as `equilibrium` does.
     """
     tissues = space.mesh.tissues
     _refuse_unknown(tissues)
@@ -99,13 +103,13 @@ def filled(
     constraint = outer_constraint(
         space, outer=outer, modes=no_modes, offset=offset.ravel(), prescribed=motion.prescribed
     )
+    law, dilatation = mechanics.material_law, choose_element(mechanics.element).dilatation
+    strained = None
+    if borne and law.finite:
+        model = finite_strain_model(space, constraint, law, dilatation=dilatation)
+        strained = unloaded_displacement(model, _moduli(tissues), np.zeros(0), borne)
     found = equilibrium(
-        space,
-        constraint,
-        _moduli(tissues),
-        law=mechanics.material_law,
-        dilatation=choose_element(mechanics.element).dilatation,
-        loads=loads,
+        space, constraint, _moduli(tissues), law=law, dilatation=dilatation, loads=loads, strained=strained
     )
     return found.displacement
 
@@ -131,6 +135,7 @@ def _moved(body: Body, case: Case, share: float) -> NDArray[np.float64]:
         outer=case.domain.outer_boundary,
         mechanics=case.mechanics,
         loads=case_loads(case, body.space, 1, share=share),
+        borne=case_loads(case, body.space, 0),
     )
 
 
