@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import meshio
 import numpy as np
@@ -17,6 +18,7 @@ from palpate.report.collect import collect
 from palpate.study.body import inverse_problem, make_body
 from palpate.study.case_file import read_case
 from palpate.study.check import check_case
+from palpate.study.cost import expected_cost
 from palpate.study.read import read_states
 from palpate.study.run import estimate
 
@@ -142,6 +144,18 @@ def test_check_finds_no_fault(folder):
     report = check_case(folder / "case.toml", [], progress=lambda _: None)
     assert report.exit_code == 0
     assert report.cost.tets == 576
+
+
+def test_the_cost_of_a_mesh_is_told_by_its_own_tetrahedra_and_states(folder):
+    """Before anything is assembled; another state costs more."""
+    case = read_case(folder / "case.toml")
+    states = read_states(case)
+    cost = expected_cost(case, states.before, (), n_pairs=1, mesh=states.mesh)
+    assert cost.tets == 576
+    assert cost.unknowns == pytest.approx(3159, rel=0.3)
+    assert cost.stages["meshing"] == 0.0
+    again = replace(case, data=(*case.data, replace(case.data[0], state=2)))
+    assert expected_cost(again, states.before, (), n_pairs=1, mesh=states.mesh).seconds > cost.seconds
 
 
 def test_groups_of_a_mesh_are_tissues_by_name_or_number(folder, tmp_path):

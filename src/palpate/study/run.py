@@ -11,14 +11,14 @@ import numpy as np
 from palpate.errors import ConfigurationError
 from palpate.findings import Finding, of_pair
 from palpate.images.tissue import Role
-from palpate.inversion import Bounds, Inversion, InversionSettings, ParameterMap, eta_of_ratio, invert
+from palpate.inversion import Bounds, Inversion, InversionSettings, ParameterMap, eta_of_ratio
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Forecast, Progress, about, during, silent
 from palpate.study.body import Body, ImagedStates, joint_problem, make_body
 from palpate.study.case import SOUGHT_RATIOS, Case
 from palpate.study.cost import ExpectedCost, cost_of_meshes, expected_cost
 from palpate.study.estimation import Estimation, Observed, conclude
-from palpate.study.loaded_reference import invert_from_rest
+from palpate.study.inverted import inverted
 from palpate.study.plausibility import estimate_warnings, unit_warnings
 from palpate.study.poisson_ratios import with_found_ratios
 from palpate.study.provenance import input_digests, software_versions
@@ -68,7 +68,7 @@ def estimate(
     reading = during("reading", progress)
     states, further = read_states(case, progress=reading), read_pairs(case, progress=reading)
     if progress is not silent or condition is not unconditional:
-        cost = expected_cost(case, states.before, states.after, n_pairs=1 + len(further))
+        cost = expected_cost(case, states.before, states.after, n_pairs=1 + len(further), mesh=states.mesh)
         condition(cost)
         progress(_forecast(cost))
     if case.phantom:
@@ -106,10 +106,7 @@ def estimate_states(
     problem = joint_problem(bodies, case, progress=during("linear law", progress))
     clock.append(time.perf_counter())
     settings = inversion_settings(case, problem.parameters)
-    if case.strained_reference:
-        bodies, inversion = invert_from_rest(bodies, problem, case, settings, progress=progress)
-    else:
-        inversion = invert(problem, settings, progress=during("linear law", progress))
+    inversion = inverted(bodies, problem, case, settings, progress=progress)
     images = tuple(image.index if image else None for pair in bodies for image in pair.states.later)
     observed = Observed(fitted_states(inversion, *bodies), images)
     stating = during("intervals", progress)

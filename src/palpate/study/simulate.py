@@ -25,7 +25,7 @@ from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.phantoms.wall_filling import wall_filling
-from palpate.study.body import Body, inverse_problem, make_body
+from palpate.study.body import Body, inverse_problem, make_body, strained_body
 from palpate.study.case import Case, Mechanics
 from palpate.study.case_loads import case_loads
 from palpate.study.provenance import input_digests, software_versions
@@ -119,7 +119,13 @@ def _steps(body: Body, case: Case, steps: int, progress: Progress) -> tuple[NDAr
     shares = [step / steps for step in range(1, steps + 1)]
     if case.motion is None and body.states.after:
         problem = inverse_problem(body, case, progress=progress)
-        return fit_driver(problem, _moduli(problem.states[0].model.space.mesh.tissues), shares=shares)[-1]
+        moduli = _moduli(problem.states[0].model.space.mesh.tissues)
+        model = problem.states[0].finite_strain
+        if model is not None and case.strained_reference:
+            given = np.zeros(model.material.n_modes)
+            strained = unloaded_displacement(model, moduli, given, case_loads(case, body.space, 0))
+            problem = inverse_problem(strained_body(body, strained, case), case, progress=progress)
+        return fit_driver(problem, moduli, shares=shares)[-1]
     if not case.mechanics.material_law.finite:
         whole = _moved(body, case, 1.0)
         return tuple(whole * share for share in shares)

@@ -1,4 +1,4 @@
-"""An estimate from a reference state that bears loads: the moduli, and the state without stress that they tell."""
+"""The inversion of a case, whose reference state may bear loads: the state without stress is then found with it."""
 
 from __future__ import annotations
 
@@ -9,45 +9,55 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
-from palpate.inversion import InverseProblem, Inversion, InversionSettings, invert
+from palpate.inversion import InverseProblem, Inversion, InversionSettings, StopRule, invert
+from palpate.inversion.estimate import REPORTED
 from palpate.mechanics.rest_state import unloaded_displacement
 from palpate.progress import Progress, during
 from palpate.study.body import Body, joint_problem, strained_body
 from palpate.study.case import Case
 from palpate.study.case_loads import case_loads
 
-__all__ = ["invert_from_rest"]
+__all__ = ["inverted"]
 
 PASSES = 10
 SETTLED = 1e-3  # of ln E: what the next pass would change is less, by the strain of the reference
 
 
-def invert_from_rest(
-    bodies: Sequence[Body], problem: InverseProblem, case: Case, settings: InversionSettings, *, progress: Progress
-) -> tuple[tuple[Body, ...], Inversion]:
-    """The estimate of a problem whose reference states bear loads, and the bodies as these strain them.
+def inverted(
+    bodies: Sequence[Body],
+    problem: InverseProblem,
+    case: Case,
+    settings: InversionSettings,
+    *,
+    progress: Progress,
+    rule: StopRule = REPORTED,
+) -> Inversion:
+    """The estimate of a problem, that of the bodies of a case; where their reference states bear loads, as these do.
 
-    The linear law begins, under which only what is added to the loads matters. In turn the state without stress is then
+    The linear law begins then, under which only what is added to the loads matters. In turn the state without stress is
     found at the moduli, and the moduli from there; each pass leaves of the last one's change a share of about the
     reference's strain. Starts are those of the last pass. Raises `NotConverged` where this does not settle, or no such
     state is found.
     """
-    found, bodies = invert(problem.linear(), settings, progress=during("linear law", progress)), tuple(bodies)
+    linear = during("linear law", progress)
+    if not case.strained_reference:
+        return invert(problem, settings, progress=linear, rule=rule)
+    found = invert(problem.linear(), settings, progress=linear, rule=rule)
     there, change = during("finite strain", progress), np.inf
     for number in range(1, PASSES + 1):
         if not found.minimum.converged:
-            return bodies, found
+            return found
         there(f"the reference without its loads, pass {number}")
         theta = _theta(found)
-        bodies = tuple(
+        strained = [
             strained_body(body, _unloaded(body, reference, problem, found, case), case)
             for reference, body in enumerate(bodies)
-        )
-        problem = joint_problem(bodies, case, progress=there)
-        found = invert(problem, replace(settings, starts=(theta,)), progress=there)
+        ]
+        problem = joint_problem(strained, case, progress=there)
+        found = invert(problem, replace(settings, starts=(theta,)), progress=there, rule=rule)
         change = float(np.abs(_theta(found) - theta).max())
         if change < SETTLED:
-            return bodies, found
+            return found
     raise NotConverged(
         f"moduli and the reference's state without loads do not settle: after {PASSES} passes moduli still change by"
         f" {100.0 * change:.2g} %; check the loads of state 0, or state the increment of loads instead"
