@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
+from xml.etree import ElementTree as ET
 
 import meshio
 import numpy as np
 import pytest
 
+import palpate
 from palpate.cli import main
 from palpate.errors import ConfigurationError, GeometryError, InputDataError
+from palpate.export.fitted_model import fitted_model
 from palpate.mechanics.deformation import largest_strains
 from palpate.mechanics.loads import boundary_named
 from palpate.mesh.mesh_file import read_mesh_file
@@ -324,3 +328,41 @@ def test_a_sliding_role_is_of_surfaces_alone(folder):
     (folder / "wrong.toml").write_text(CASE.replace('role = "estimate"', 'role = "sliding"'))
     with pytest.raises(ConfigurationError, match="did you mean"):
         read_case(folder / "wrong.toml")
+
+
+def test_exports_repeat_each_states_motion_and_loads(folder, tmp_path):
+    """A bar that is pulled in its first later state and pressed, by half as much, in its second."""
+    loads = "".join(
+        f'[[loads]]\nkind = "traction"\nsurface = "grip"\nstate = {state}\ntraction_kpa = [0.0, 0.0, {kpa}]\n'
+        for state, kpa in ((1, STRAIN * MODULUS), (2, -0.5 * STRAIN * MODULUS))
+    )
+    before = np.random.default_rng(4).uniform(0.5, np.array(SIZE) - 0.5, (300, 3))
+    head = "before_x,before_y,before_z,after_x,after_y,after_z"
+    moved = STRAIN * before * np.array([-RATIO, -RATIO, 1.0])
+    data = ""
+    for state, share in ((1, 1.0), (2, -0.5)):
+        table = np.c_[before, before + share * moved]
+        np.savetxt(folder / f"state{state}.csv", table, delimiter=",", header=head, comments="")
+        data += f'[[data]]\nkind = "displacement-field"\nfile = "state{state}.csv"\nsd_mm = 0.01\nstate = {state}\n'
+    text = (
+        CASE.split("[[data]]", maxsplit=1)[0].replace('name = "grip"', 'boundary = "free"\nname = "grip"')
+        + loads
+        + data
+    )
+    (folder / "two.toml").write_text(text)
+    result = estimate(read_case(folder / "two.toml"))
+    assert result.estimation.estimates[0].value == pytest.approx(MODULUS, rel=0.02)
+    model = fitted_model(result, seal="")
+    (body,) = model.bodies
+    top = body.space.points[:, 2] > SIZE[2] - 1e-9
+    means = [motion[top, 2].mean() for motion in body.displacements]
+    assert means == pytest.approx([STRAIN * SIZE[2], -0.5 * STRAIN * SIZE[2]], rel=0.02)
+    assert [load.traction_kpa[2] for of in body.loads for load in of] == [STRAIN * MODULUS, -0.5 * STRAIN * MODULUS]
+    palpate.export(result, tmp_path, format="abaqus", linear=True)
+    pulls = []
+    for step in (tmp_path / "palpate.inp").read_text().split("*STEP")[1:]:
+        (rows,) = re.findall(r"\*CLOAD[^\n]*\n([^*]+)\*", step)
+        pulls.append(sum(float(row.split(",")[2]) for row in rows.splitlines()))
+    assert pulls == pytest.approx([1e3 * FORCE_N, -0.5e3 * FORCE_N], rel=1e-6)  # mN
+    palpate.export(result, tmp_path / "febio", format="febio", linear=True)
+    assert len(ET.parse(tmp_path / "febio" / "palpate.feb").findall("Step/step")) == 2
