@@ -18,7 +18,7 @@ __all__ = ["unloaded_displacement"]
 
 TOLERANCE = 1e-8  # of the body's size, by which the loaded body may miss what was seen
 FORCES = 1e-10  # of the forces: to which each equilibrium is found on the way
-MOST = 40
+MOST = 60
 
 
 def unloaded_displacement(
@@ -29,7 +29,8 @@ def unloaded_displacement(
 ) -> NDArray[np.float64]:
     """Displacement w (n_points, 3) mm from the body free of stress, at x - w, to where it was seen under loads.
 
-    At moduli (n_regions,) kPa and coefficients (n_material,) of the material; what the model prescribes stays where it
+    At moduli (n_regions,) kPa and coefficients (n_material,) of the material, beginning where the model was strained
+    before; what the model prescribes stays where it
     is, what slides does so. With u(X) the displacement of X under the loads: w <- u(x - w), which is
     X <- X - (X + u(X) - x) (Sellier, Mechanics Research Communications 38 (2011), 46-48). Forces are those on the body
     as it was seen. Raises `NotConverged` where this leads nowhere.
@@ -39,7 +40,8 @@ def unloaded_displacement(
     points = model.space.points
     dead = DeadLoad(Conditions(still, loads).forces(model.space))
     seen = replace(model.to_tolerance(FORCES), conditions=Conditions(still, (dead,)))
-    size, strained = float(np.linalg.norm(np.ptp(points, axis=0))), np.zeros_like(points)
+    size = float(np.linalg.norm(np.ptp(points, axis=0)))
+    strained = np.zeros_like(points) if model.elements.strained is None else model.elements.strained
     step, reason = np.inf, f"{MOST} steps were not enough"
     for _ in range(MOST):
         try:
