@@ -92,7 +92,8 @@ def test_what_lies_beyond_a_range_is_refused_with_the_range(place, end, tmp_path
     key = place.rpartition(".")[2]
     whole = isinstance(NUMBERS[place].default, int) or key == "stage"
     value = str(bound + (1, -1)[end == 0]) if whole else repr(beyond)
-    override = NEEDED.get(place) or NEEDED.get(key, f"{place.replace('*', 'prostate')}=VALUE").replace("VALUE", value)
+    template = NEEDED.get(place) or NEEDED.get(key, f"{place.replace('*', 'prostate')}=VALUE")
+    override = template.replace("VALUE", value)
     more = {"phantom.seed": ["phantom.kind=spheres"]}.get(place, [])
     with pytest.raises(ConfigurationError, match=f"'{key}' in .* must be a number from"):
         read_case(path, [override, *more])
