@@ -11,13 +11,14 @@ __all__ = ["Role", "Tissue"]
 
 
 class Role(StrEnum):
-    """What a tissue does in the model."""
+    """What a tissue does in the model; `SLIDING`: the body glides along it, which a mesh's surfaces alone can say."""
 
     ESTIMATE = "estimate"
     KNOWN = "known"
     DRIVER = "driver"
     RIGID = "rigid"
     VOID = "void"
+    SLIDING = "sliding"
 
 
 @dataclass(frozen=True, slots=True)

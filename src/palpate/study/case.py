@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from palpate.errors import ConfigurationError
@@ -43,7 +43,15 @@ __all__ = [
 
 REMAINING = "remaining"
 AUTO = "auto"
+TISSUE_ROLES = tuple(str(role) for role in Role if role is not Role.SLIDING)
 HELD = ("fixed", "sliding")  # outer boundaries that leave a body no rigid motion
+SURFACE_ROLES = {  # of what lies behind a surface of a mesh
+    "moving": Role.DRIVER,
+    "fixed": Role.RIGID,
+    "sliding": Role.SLIDING,
+    "free": Role.VOID,
+    "prescribed": Role.RIGID,
+}
 LAW_NAMES = tuple(LAWS)
 SOLVER_NAMES = ("auto", *SOLVERS)
 
@@ -126,16 +134,22 @@ class CaseSurface:
     """A named surface of a mesh: a group of triangles, an outermost plane, or all of the boundary.
 
     `where`: the group's name, "x_min" ... "z_max" within `within_mm`, or "boundary". `boundary` "moving": its motion is
-    an unknown; "fixed": it is held; "free": nothing holds it, loads may act.
+    an unknown; "fixed": it is held; "sliding": it moves within itself alone; "free": nothing holds it, loads may act;
+    "prescribed": it moves as the measured points of its state say.
     """
 
     name: str
     where: str
-    boundary: str = field(default="moving", metadata=rule(choices=("moving", "fixed", "free")))
+    boundary: str = field(default="moving", metadata=rule(choices=tuple(SURFACE_ROLES)))
     within_mm: float = field(default=1.0, metadata=rule(between=(1e-6, 1e4)))
 
     def __post_init__(self) -> None:
         refuse_name(self.name, "the name of a surface")
+
+    @property
+    def behind(self) -> Tissue:
+        """The hollow tissue that stands behind it in a mesh."""
+        return Tissue(self.name, SURFACE_ROLES[self.boundary])
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +203,7 @@ class CaseTissue:
 
     name: str
     label: tuple[int, ...] | str = field(metadata=rule(convert=_label))
-    role: Role
+    role: Role = field(metadata=rule(choices=TISSUE_ROLES))
     poisson_ratio: float | None = field(
         default=None,
         metadata=rule(
@@ -289,16 +303,28 @@ class CaseLoad:
     `surface`: a hollow tissue whose wall moves freely (role `void`), or "outer", the cut of the image; a pressure of
     `pressure_kpa` pushes into the body, on the surface as it moves or (`following` false) as it was; `traction_kpa`
     (3,) is per area at rest; `acceleration_m_s2` (3,) acts on the tissues' `density_kg_m3`. `state`: number, from 1, of
-    the later image in which it acts, those of further [[pairs]] after those of [images]; None: it acts in all.
+    the later image in which it acts, those of further [[pairs]] after those of [images]; None: it acts in all of them;
+    0: it acts in the reference state, whose shape the images, or the mesh, show under it.
     """
 
     kind: str = field(metadata=rule(choices=("pressure", "traction", "gravity")))
-    state: int | None = field(default=None, metadata=rule(between=(1, 1000)))
+    state: int | None = field(default=None, metadata=rule(between=(0, 1000)))
     surface: str | None = None
     pressure_kpa: float | None = field(default=None, metadata=rule(between=STRESSES_KPA))
     following: bool = True
     traction_kpa: tuple[float, float, float] | None = field(default=None, metadata=rule(between=STRESSES_KPA))
     acceleration_m_s2: tuple[float, float, float] | None = field(default=None, metadata=rule(between=(-100.0, 100.0)))
+
+    @property
+    def taken(self) -> CaseLoad:
+        """What takes the load off a body that bears it: its forces, turned round."""
+        return replace(
+            self,
+            following=False,
+            pressure_kpa=None if self.pressure_kpa is None else -self.pressure_kpa,
+            traction_kpa=_turned(self.traction_kpa),
+            acceleration_m_s2=_turned(self.acceleration_m_s2),
+        )
 
     def __post_init__(self) -> None:
         needed = {
@@ -314,6 +340,10 @@ class CaseLoad:
         for key in given:
             if key not in needed:
                 raise ConfigurationError(f"[[loads]]: a {self.kind} has no '{key}'; it has {' and '.join(needed)}")
+
+
+def _turned(vector: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+    return None if vector is None else (-vector[0], -vector[1], -vector[2])
 
 
 @dataclass(frozen=True, slots=True)
@@ -524,8 +554,16 @@ class Case:
         return max(len(self.images.after) if self.images else 0, 1) + further
 
     def loads_in(self, state: int) -> tuple[CaseLoad, ...]:
-        """The known loads that act in the later state with a number, from 1."""
-        return tuple(load for load in self.loads if load.state in (None, state))
+        """The known loads of the reference state, 0, or what changes from them to the later state with a number."""
+        borne = tuple(load for load in self.loads if load.state == 0)
+        if state == 0:
+            return borne
+        return tuple(load for load in self.loads if load.state in (None, state)) + tuple(load.taken for load in borne)
+
+    @property
+    def strained_reference(self) -> bool:
+        """Whether the reference state bears loads that the law cannot simply take off: its rest state is found."""
+        return self.mechanics.material_law.finite and bool(self.loads_in(0))
 
     @property
     def align(self) -> str:

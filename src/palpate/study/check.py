@@ -243,7 +243,7 @@ def _lay(pair: ImagedStates) -> list[tuple[str, Registration]]:
 def _cost(problems: _Problems, pairs: Sequence[ImagedStates], case: Case, progress: Progress) -> ExpectedCost:
     """What an estimate would cost on its very meshes; on meshes of a guessed size where something is refused."""
     first = pairs[0]
-    cost = expected_cost(case, first.before, first.after, n_pairs=len(pairs))
+    cost = expected_cost(case, first.before, first.after, n_pairs=len(pairs), mesh=first.mesh)
     if first.mesh is None:
         edge = edge_length_of(case, first.before, first.after).mm
         problems.attempt(lambda: refuse_edge(edge, case_domain(first.before, case)))

@@ -78,7 +78,7 @@ def _value(hint: Any, bounds: Rule) -> dict[str, Any]:
     if dataclasses.is_dataclass(hint):
         return _table(hint)
     if isinstance(hint, type) and issubclass(hint, StrEnum):
-        return {"enum": [str(member) for member in hint]}
+        return {"enum": list(bounds.choices) or [str(member) for member in hint]}
     value: dict[str, Any] = {"type": PLAIN[hint]}
     if bounds.choices:
         value = {"enum": list(bounds.choices)}

@@ -113,6 +113,8 @@ def read_table(kind: type[T], table: Mapping[str, object], *, where: str, folder
             values[key] = None
             continue
         _check_range(bounds, value, place)
+        if isinstance(value, str):  # before an enumeration names all of its words
+            _check_choice(bounds, value, place)
         converted = bounds.convert(value) if bounds.convert else _convert(hints[key], value, place)
         _check_value(bounds, converted, place)
         values[key] = converted
@@ -165,10 +167,14 @@ def _check_range(bounds: Rule, value: object, place: _Place) -> None:
 
 def _check_value(bounds: Rule, value: object, place: _Place) -> None:
     for item in value if isinstance(value, tuple) else (value,):
-        if bounds.choices and item not in bounds.choices:
-            raise ConfigurationError(f"{place} is {shown(item)}: {nearest(str(item), bounds.choices)}")
+        _check_choice(bounds, item, place)
     if bounds.test is not None and value is not None and not bounds.test(value):
         raise ConfigurationError(f"{place} is {shown(value)}, but it must be {bounds.wanted}")
+
+
+def _check_choice(bounds: Rule, value: object, place: _Place) -> None:
+    if bounds.choices and value not in bounds.choices:
+        raise ConfigurationError(f"{place} is {shown(value)}: {nearest(str(value), bounds.choices)}")
 
 
 def _convert(hint: Any, value: object, place: _Place) -> object:
