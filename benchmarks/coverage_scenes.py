@@ -119,10 +119,10 @@ def _solved(
     return Scene(space, displacement, before, after, motion.walls, seed)
 
 
-def _balls(seed: int, law: str, edge_mm: float, *, kind: str) -> Scene:
-    """Balls in balls: a tumour out of its organ's centre in a frame that is squeezed, or a shell whose cavity grows."""
+def _balls(seed: int, law: str, edge_mm: float) -> Scene:
+    """A ball with a tumour out of its centre, in a frame that is squeezed."""
     del edge_mm
-    return spheres(SpheresOptions(seed=seed, kind=kind, law=law, truth_edge_mm=3.0))
+    return spheres(SpheresOptions(seed=seed, kind="tumour", law=law, truth_edge_mm=3.0))
 
 
 @dataclass(frozen=True)
@@ -167,8 +167,7 @@ TRUTHS: dict[str, Callable[[int, str, float], Scene]] = {
     "small": partial(_pelvis, filling_mm=3.0),
     "moving": partial(_pelvis, moving=True),
     "patchy": partial(_pelvis, patchy=True),
-    "balls": partial(_balls, kind="tumour"),
-    "cavity": partial(_balls, kind="pushed"),
+    "balls": _balls,
     "liver": _liver,
 }
 
@@ -354,7 +353,6 @@ ROWS = {
         Row("patchy", "patchy", "gauss-0.1"),
         Row("moving", "moving", "gauss-0.1", limit=_normal(0.1)),
         Row("balls", "balls", "gauss-0.1"),
-        Row("cavity", "cavity", "gauss-0.1"),
         Row("liver", "liver", "gauss-0.1"),
         Row("other-law", "small", "gauss-0.1", truth_law="neo-hookean"),
         Row("finite", "pelvis", "gauss-0.1", law="neo-hookean", truth_law="neo-hookean"),
