@@ -1,14 +1,16 @@
-"""Whether intervals hold: random pelves, noise on exact surfaces of another mesh, the same outer loop and intervals.
+"""Whether intervals hold that are stated where the model is wrong, and how wide they are beside the Cramer-Rao limit.
 
-    python benchmarks/coverage.py [--settings gauss-0.3-6,...] [--pelves N] [--draws N] [--laws linear,neo-hookean]
-                                  [--first-seed S] [--edge MM] [--output FILE] [--plot FILE.svg] [--json]
+    python benchmarks/coverage.py [--rows gauss-0.3,bumps,...] [--bodies N] [--draws N] [--first-seed S] [--edge MM]
+                                  [--output FILE] [--minutes N] [--json]
 
-For each pelvis one whole estimate from the clean surfaces of a finer mesh. Then each draw moves both images' surfaces
-along their normals by a random field of its own, and the product's outer loop goes from the clean estimate, on its
-approximation of the model, which is updated where the draw leads, to its end: what is spared are starts, factorisation
-and first derivatives. Whole estimates of the same draws differ by 0.05 standard deviations at the most (13 of them
-looked at). Intervals are the product's; surfaces have no voxels, whose place is no part of them. A line of JSON a
-pelvis and setting, as soon as it is done; another run with the same file adds to it. Truths are known: simulated data.
+Simulated data. A row (coverage_scenes.py) is a kind of body, of errors of its drawing, and of what is measured
+besides. Of each body one whole estimate from the exact surfaces of a finer mesh, with all that the program's defaults
+leave unknown: frame, layers, patchy tissues, Poisson's ratios, offsets. Then each draw moves both images' surfaces, and
+is estimated on that estimate's approximation of the model, which is updated where the draw leads: noise, weights,
+closest points, and what is believed of frame, walls and tissues are found anew; what is spared are the model's first
+responses and two of three starts. It ends within a fifth of a standard deviation. Intervals are those that the program
+states. Surfaces have no voxels, whose place is no part of them. A line of JSON a body and row, as soon as it is done;
+another run with the same file adds to it.
 """
 
 from __future__ import annotations
@@ -16,312 +18,371 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from accuracy import true_ratios
-from accuracy_rows import ROWS, posed
-from cramer_rao import cramer_rao
-from matplotlib.figure import Figure
+from coverage_scenes import NOISES, POINTS, ROWS, TRUTHS, Row, measured_points, skins_of
+from cramer_rao import fisher_information
 from numpy.typing import NDArray
 from scipy import stats
 
-from palpate.errors import EstimationError
-from palpate.inversion import (
-    InversionSettings,
-    LaterState,
-    OuterIterate,
-    StopRule,
-    invert,
-    reweighted,
-    run_outer_loop,
+from palpate.errors import EstimationError, PalpateError
+from palpate.images import segment
+from palpate.inversion import InverseProblem, Inversion, InversionSettings, StopRule, invert
+from palpate.mesh import LagrangeSpace
+from palpate.observation import NoiseModel, Observation, ObservedSurface, SurfaceDistance, surface_distance
+from palpate.phantoms import Scene, target_of_truth
+from palpate.study import (
+    Case,
+    Mechanics,
+    MeshSettings,
+    Phantom,
+    aligned,
+    estimates_of,
+    intervals_of,
+    inverse_problem,
+    inversion_settings,
+    make_body,
 )
-from palpate.mesh import vertex_normals
-from palpate.observation import NoiseModel, SurfaceDistance, observed_surface, surface_distance
-from palpate.phantoms import Scene, smooth_field, target_of_truth
-from palpate.uncertainty import fixed_correspondence, mesh_covariance, modulus_interval, sandwich_covariance
+from palpate.uncertainty import covariance_of, frozen_posterior, gain
+from palpate.uncertainty.covariance import noise_covariance
 
 Array = NDArray[np.float64]
-Shift = Callable[[Array, Array, np.random.Generator, bool], Array]  # of places and normals, in the later image or not
+Result = dict[str, Any]  # a line of JSON
+BodyKey = tuple[str, bool, str, str]  # truth, whether points are measured, the estimate's law and the truth's
 
-LEVELS = (0.50, 0.68, 0.80, 0.90, 0.95, 0.99)
-FAR = 3.0  # half-widths
-SLICE_MM = 2.5
-FEATURES = 400  # waves of a random field, which are drawn anew for each
-
-
-@dataclass(frozen=True)
-class Setting:
-    """A kind of segmentation error: how far (n,) mm surfaces at places (n, 3) move along their normals (n, 3)."""
-
-    name: str
-    shift: Shift
-    noise: NoiseModel | None = None  # of a residual, where it is normal
-
-
-def gauss(sd_mm: float, correlation_mm: float) -> Setting:
-    """Both images' surfaces moved by fields of their own."""
-
-    def shift(places: Array, normals: Array, rng: np.random.Generator, later: bool) -> Array:
-        del later
-        field = smooth_field(rng, sd_mm=sd_mm, correlation_mm=correlation_mm, features=FEATURES)
-        return np.asarray(np.einsum("ni,ni->n", field.at(places), normals))
-
-    noise = NoiseModel(np.array([2.0 * sd_mm**2]), np.array([correlation_mm]))
-    return Setting(f"gauss-{sd_mm}-{correlation_mm:g}", shift, noise)
-
-
-def _one_sided(places: Array, normals: Array, rng: np.random.Generator, later: bool) -> Array:
-    """Over-segmentation: outwards only, by 0.3 mm times the absolute value of a normal field."""
-    del later
-    field = smooth_field(rng, sd_mm=0.3, correlation_mm=6.0, features=FEATURES)
-    return np.asarray(np.abs(np.einsum("ni,ni->n", field.at(places), normals)))
-
-
-def _missing_slice(places: Array, normals: Array, rng: np.random.Generator, later: bool) -> Array:
-    """The later image's uppermost slice of 2.5 mm is missing, beside a normal field of 0.2 mm."""
-    moved = gauss(0.2, 6.0).shift(places, normals, rng, later)
-    if not later:
-        return moved
-    top = places[:, 2].max() - SLICE_MM
-    return np.asarray(moved - np.maximum(places[:, 2] - top, 0.0) * np.maximum(normals[:, 2], 0.0))
-
-
-def _shrunk(places: Array, normals: Array, rng: np.random.Generator, later: bool) -> Array:
-    """Every organ of the later image is smaller by 0.2 mm all around, beside a normal field of 0.2 mm."""
-    return np.asarray(gauss(0.2, 6.0).shift(places, normals, rng, later) - (0.2 if later else 0.0))
-
-
-SETTINGS = {
-    setting.name: setting
-    for setting in (
-        *(gauss(sd, 6.0) for sd in (0.1, 0.2, 0.3, 0.5)),
-        gauss(0.3, 3.0),
-        gauss(0.3, 12.0),
-        Setting("one-sided", _one_sided),
-        Setting("missing-slice", _missing_slice),
-        Setting("shrunk", _shrunk),
-    )
-}
+OUT = 2.0  # half-widths
+NEARLY = StopRule(step_sd=0.2, passes=3)  # what an estimate may still move is little beside what noise does
+CLEAN = NoiseModel(np.array([2.0 * 0.05**2]), np.array([3.0]))  # of the clean estimate: smaller than any row's
+MOST_TELLING = "field-0.2"  # by whose clean estimate all points are followed: it sees what the others see
+NO_GRID = 3  # draws of a voxel grid, in which nothing is off
+HALF = 1.959964
 
 
 @dataclass(frozen=True)
 class Body:
-    """A pelvis, the estimate from its clean surfaces, the truth (n,): ln of the true ratios."""
+    """What a row's draws of one body share: its problem on the approximations of the clean estimate, and the truth.
+
+    surfaces: those that are compared; truth (n,): ln of the true ratios; clean (n,): the clean estimate's errors.
+    """
 
     scene: Scene
-    clean: OuterIterate
+    space: LagrangeSpace
+    surfaces: tuple[ObservedSurface, ...]
+    problem: InverseProblem
     settings: InversionSettings
     truth: Array
+    clean: Array
 
 
 def main() -> int:
     """Run what was asked for and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--settings", default=",".join(SETTINGS))
-    parser.add_argument("--laws", default="linear", help="with commas")
-    parser.add_argument("--pelves", type=int, default=10)
-    parser.add_argument("--draws", type=int, default=20)
+    parser.add_argument("--rows", default=",".join(ROWS), help=f"of {', '.join(ROWS)}")
+    parser.add_argument("--bodies", type=int, default=3)
+    parser.add_argument("--draws", type=int, default=8)
     parser.add_argument("--first-seed", type=int, default=501)
-    parser.add_argument("--edge", type=float, default=8.0, help="edge length (mm) of the estimate's mesh")
+    parser.add_argument("--edge", type=float, default=10.0, help="edge length (mm) of the estimate's mesh")
+    parser.add_argument("--minutes", type=float, default=np.inf, help="after which no other body is begun")
     parser.add_argument("--output", type=Path, default=Path("coverage.jsonl"))
-    parser.add_argument("--plot", type=Path, help="SVG of the share of intervals that hold, by what they state")
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     asked = parser.parse_args()
-    rows = [json.loads(line) for line in asked.output.read_text().splitlines()] if asked.output.exists() else []
-    done = {(row["law"], row["seed"], row["setting"]) for row in rows}
-    for law in asked.laws.split(","):
-        for seed in range(asked.first_seed, asked.first_seed + asked.pelves):
-            open_ = [name for name in asked.settings.split(",") if (law, seed, name) not in done]
-            if not open_:
+    began, results = time.monotonic(), _read(asked.output)
+    done = {(result["row"], result["seed"]) for result in results}
+    for seed in range(asked.first_seed, asked.first_seed + asked.bodies):
+        scenes = dict[tuple[str, str], Scene]()
+        bodies = dict[BodyKey, Body]()
+        for name in asked.rows.split(","):
+            if (name, seed) in done or time.monotonic() - began > 60.0 * asked.minutes:
                 continue
-            body = _body(law, seed, asked.edge)
-            for name in open_:
-                found = [_drawn(body, SETTINGS[name], seed, draw) for draw in range(asked.draws)]
-                limit = _limit(body, SETTINGS[name].noise)
-                rows.append({"law": law, "seed": seed, "setting": name, "limit": limit, "draws": found})
-                with asked.output.open("a") as file:
-                    file.write(json.dumps(rows[-1]) + "\n")
-                print(f"{law} {seed} {name}: {_line(rows[-1:])}", file=sys.stderr, flush=True)
-    groups: dict[tuple[str, str], list[dict[str, Any]]] = {(row["law"], row["setting"]): [] for row in rows}
-    for row in rows:
-        groups[row["law"], row["setting"]].append(row)
-    if asked.plot:
-        _plot(groups, asked.plot)
-    table = {f"{law} {name}": _summary(of) for (law, name), of in groups.items()}
-    print(json.dumps(table, indent=1) if asked.json else "\n".join(f"{name}: {_line(of)}" for name, of in _by(groups)))
+            try:
+                results.append(_result(ROWS[name], seed, asked.draws, asked.edge, scenes, bodies))
+            except PalpateError as error:  # of a body that cannot be made; the next one can
+                print(f"{name} {seed}: {error}", file=sys.stderr, flush=True)
+                continue
+            with asked.output.open("a") as file:
+                file.write(json.dumps(results[-1]) + "\n")
+            print(f"{name} {seed}: {json.dumps(summary([results[-1]]))}", file=sys.stderr, flush=True)
+    names = [name for name in ROWS if any(result["row"] == name for result in results)]
+    table = {name: summary([result for result in results if result["row"] == name]) for name in names}
+    table["all"] = summary(results)
+    print(json.dumps({"simulated": True, "rows": table}, indent=1) if asked.json else _table(table))
     return 0
 
 
-def _by(groups: dict[tuple[str, str], list[dict[str, Any]]]) -> list[tuple[str, list[dict[str, Any]]]]:
-    return [(f"{law:12} {name:14}", rows) for (law, name), rows in groups.items()]
+def _read(path: Path) -> list[Result]:
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
-def _body(law: str, seed: int, edge_mm: float) -> Body:
-    row = replace(ROWS["other-mesh"], law=law, edge_mm=edge_mm, truth_edge_mm=0.68 * edge_mm)
-    case = posed(row, seed, 0, {})
-    problem = case.problem.linear() if law == "linear" else case.problem
-    found = invert(problem, case.settings, progress=lambda _: None)
-    clean, truth = found.candidates[found.best].iterate, np.log(true_ratios(found.objective, case.scene))
-    return Body(case.scene, clean, case.settings, truth)
-
-
-def _limit(body: Body, noise: NoiseModel | None) -> list[float] | None:
-    """The Cramer-Rao limit of the standard deviations under normal noise, by the derivatives at the clean estimate."""
-    if noise is None:
-        return None
-    limit = cramer_rao(body.clean.minimum.evaluation, noise, len(body.truth), cell_mm=float(noise.lengths[0]))
-    return [float(sd) for sd in np.sqrt(np.diag(limit))]
-
-
-def _drawn(body: Body, setting: Setting, seed: int, draw: int) -> dict[str, Any]:
-    """What one draw leads to; an estimate that fails says so, and counts as not converged."""
-    rng = np.random.default_rng([seed, draw, *setting.name.encode()])
-    (state,), unknowns = body.clean.objective.states, body.clean.minimum.unknowns
-    objective = body.clean.objective.with_observations(_observations(body.scene, state, setting, rng))
-    try:
-        objective = objective.rematched(unknowns)
-        first = replace(body.clean.minimum, evaluation=objective(unknowns))
-        objective = reweighted(objective, first)
-        start = OuterIterate(objective, replace(first, evaluation=objective(unknowns)))
-        found = run_outer_loop(start, body.settings, StopRule(), progress=lambda _: None, title="")
-    except EstimationError as error:
-        return {"converged": False, "failure": str(error), "organs": []}
-    return {"converged": found.minimum.converged, "organs": _organs(found, body)}
-
-
-def _observations(scene: Scene, state: LaterState, setting: Setting, rng: np.random.Generator) -> list[SurfaceDistance]:
-    """Those of a later state, with the surfaces of both images moved; one field an image, across all organs."""
-    surfaces = [o.target.surface for o in state.observations if isinstance(o, SurfaceDistance)]
-    truths = [observed_surface(scene.space, surface.tissue) for surface in surfaces]
-    ends, drawn = np.cumsum([len(truth.rest) for truth in truths])[:-1], []
-    for later in (False, True):
-        places = [truth.rest + (scene.displacement[truth.points] if later else 0.0) for truth in truths]
-        normals = [vertex_normals(p, truth.triangles) for p, truth in zip(places, truths, strict=True)]
-        errors = setting.shift(np.concatenate(places), np.concatenate(normals), rng, later)
-        drawn.append(np.split(errors[:, None] * np.concatenate(normals), ends))
-    return [
-        surface_distance(
-            target_of_truth(scene.space, scene.displacement, surface, warps=(before.__add__, after.__add__))
-        )
-        for surface, before, after in zip(surfaces, *drawn, strict=True)
-    ]
-
-
-def _organs(found: OuterIterate, body: Body) -> list[dict[str, Any]]:
-    """Errors of ln E, standard deviations, interval ends and the root deviance at the truth, by organ."""
-    objective, minimum = found.objective, found.minimum
-    covariance = sandwich_covariance(objective, minimum.evaluation) + mesh_covariance(objective)
-    fixed = fixed_correspondence(objective, minimum.unknowns, minimum.evaluation)
-    organs = []
-    for i, truth in enumerate(body.truth):
-        variance = float(covariance[i, i])
-        interval = modulus_interval(fixed, minimum, i, variance=variance, bounds=body.settings.bounds)
-        low, high = (None if end is None else float(np.log(end) - truth) for end in interval.ends)
-        organs.append(
-            {
-                "error": float(minimum.unknowns[i] - truth),
-                "sd": float(np.sqrt(variance)),
-                "low": low,
-                "high": high,
-                "kind": interval.kind,
-                "root": _root(interval.profile.theta, interval.profile.root, float(truth)),
-            }
-        )
-    return organs
-
-
-def _root(theta: Array, root: Array, truth: float) -> float:
-    """Signed root deviance at the truth, between the points of a profile and on their chords beyond them."""
-    if theta[0] <= truth <= theta[-1] or len(theta) < 2:
-        return float(np.interp(truth, theta, root))
-    (a, b), (c, d) = (theta[:2], root[:2]) if truth < theta[0] else (theta[-2:], root[-2:])
-    return float(c + (truth - a) * (d - c) / (b - a))
-
-
-def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Coverage of the 95 % intervals, calibration, and widths beside the spread of the estimates."""
-    organs = [organ for row in rows for draw in row["draws"] if draw["converged"] for organ in draw["organs"]]
-    lows = np.array([-np.inf if o["low"] is None else o["low"] for o in organs])
-    highs = np.array([np.inf if o["high"] is None else o["high"] for o in organs])
-    held, roots = (lows <= 0.0) & (highs >= 0.0), np.abs([o["root"] for o in organs])
-    bodies = [[draw for draw in row["draws"] if draw["converged"]] for row in rows]
-    spread = [
-        np.std([draw["organs"][i]["error"] for draw in draws], ddof=1)
-        / np.median([draw["organs"][i]["sd"] for draw in draws])
-        for draws in bodies
-        for i in range(len(draws[0]["organs"]))
-    ]
-    widths = [
-        np.median([_width(draw["organs"][i]) for draw in draws])
-        / np.std([draw["organs"][i]["error"] for draw in draws], ddof=1)
-        for draws in bodies
-        for i in range(len(draws[0]["organs"]))
-    ]
-    interval = stats.binomtest(int(held.sum()), len(held)).proportion_ci()
-    half = np.array([1.96 * o["sd"] for o in organs])
-    over_limit = [
-        organ["sd"] / limit
-        for row in rows
-        for draw in row["draws"]
-        for organ, limit in zip(draw["organs"], row["limit"] or [], strict=False)
-    ]
+def _result(
+    row: Row,
+    seed: int,
+    draws: int,
+    edge_mm: float,
+    scenes: dict[tuple[str, str], Scene],
+    bodies: dict[BodyKey, Body],
+) -> Result:
+    """A row's draws of one body; scenes and bodies are kept for the next row, the last body alone."""
+    began = time.perf_counter()
+    if (row.truth, row.truth_law) not in scenes:
+        scenes[row.truth, row.truth_law] = TRUTHS[row.truth](seed, row.truth_law, edge_mm)
+    scene, key = scenes[row.truth, row.truth_law], (row.truth, bool(row.points), row.law, row.truth_law)
+    if key not in bodies:
+        bodies.clear()  # its approximation is large
+        bodies[key] = _body(scene, row, edge_mm)
+    body, spent = bodies[key], time.perf_counter() - began
+    began = time.perf_counter()
+    found = [_drawn(body, row, draw) for draw in range(draws)]
     return {
-        "intervals": len(organs),
-        "not_converged": sum(not draw["converged"] for row in rows for draw in row["draws"]),
-        "coverage95": float(held.mean()),
-        "coverage95_interval": [float(interval.low), float(interval.high)],
-        "calibration": {str(level): float(np.mean(roots <= stats.norm.ppf(0.5 + level / 2))) for level in LEVELS},
-        "sd_over_spread": float(1.0 / np.median(spread)),
-        "width_over_spread": width if np.isfinite(width := float(np.median(widths))) else None,
-        "sd_over_cramer_rao": float(np.median(over_limit)) if over_limit else None,
-        "mean_error_over_sd": float(np.mean([o["error"] / o["sd"] for o in organs])),
-        "beyond_three_half_widths": int(np.sum(np.abs([o["error"] for o in organs]) > FAR * half)),
-        "profile_share": float(np.mean([o["kind"] == "profile" for o in organs])),
-        "median_error_percent": float(100.0 * np.median(np.abs(np.expm1([o["error"] for o in organs])))),
+        "row": row.name,
+        "seed": seed,
+        "clean_error": body.clean.tolist(),
+        "body_seconds": round(spent, 1),
+        "draw_seconds": round((time.perf_counter() - began) / max(draws, 1), 1),
+        "draws": found,
     }
 
 
-def _width(organ: Mapping[str, Any]) -> float:
-    """Width of a 95 % interval of ln E, in standard deviations' worth: over 2 x 1.96; infinite where an end is open."""
-    return np.inf if organ["low"] is None or organ["high"] is None else (organ["high"] - organ["low"]) / 3.92
-
-
-def _plot(groups: Mapping[tuple[str, str], Sequence[dict[str, Any]]], path: Path) -> None:
-    """Calibration: nominal against found, a line a setting, beside the scatter of as many intervals that hold."""
-    figure = Figure(figsize=(8.0, 5.5), layout="constrained")
-    axes = figure.add_subplot()
-    levels = np.linspace(LEVELS[0], LEVELS[-1], 60)
-    n = min(sum(len(draw["organs"]) for row in rows for draw in row["draws"]) for rows in groups.values())
-    low, high = (stats.binom.ppf(q, n, levels) / n for q in (0.025, 0.975))
-    axes.fill_between(100 * levels, 100 * low, 100 * high, color="0.9", label=f"95 % of {n} true intervals")
-    axes.plot(100 * levels, 100 * levels, color="0.5", linewidth=1)
-    for (law, name), rows in groups.items():
-        found = list(_summary(rows)["calibration"].values())
-        style = "-" if law == "linear" else "--"
-        axes.plot(
-            100 * np.array(LEVELS), 100 * np.array(found), style, marker="o", markersize=3, label=f"{law}, {name}"
-        )
-    axes.set(xlabel="stated, %", ylabel="found, %")
-    figure.legend(fontsize="small", loc="outside right upper")
-    figure.savefig(path, metadata={"Date": None})
-
-
-def _line(rows: Sequence[dict[str, Any]]) -> str:
-    of = _summary(rows)
-    low, high = of["coverage95_interval"]
-    calibration = " ".join(f"{float(level):.0%}:{found:.0%}" for level, found in of["calibration"].items())
-    limit = "" if of["sd_over_cramer_rao"] is None else f"; sd / limit {of['sd_over_cramer_rao']:.2f}"
-    width = "open" if of["width_over_spread"] is None else f"{of['width_over_spread']:.2f}"
-    return (
-        f"{of['coverage95']:.1%} [{low:.1%}, {high:.1%}] of {of['intervals']} held; {calibration}; sd / spread"
-        f" {of['sd_over_spread']:.2f}, width / spread {width}{limit}; beyond 3 half-widths"
-        f" {of['beyond_three_half_widths']}; profiles {of['profile_share']:.0%}; median error"
-        f" {of['median_error_percent']:.1f} %; not converged {of['not_converged']}"
+def _body(scene: Scene, row: Row, edge_mm: float) -> Body:
+    """One whole estimate from what the truth shows without errors."""
+    case = Case("coverage", phantom=Phantom("pelvis"), mesh=MeshSettings(edge_mm), mechanics=Mechanics(row.law, "auto"))
+    before, after = (segment(image, scene.tissues) for image in (scene.before, scene.after))
+    meshed = make_body(aligned(before, (after,), method="none"), case, progress=_silent)
+    problem = inverse_problem(meshed, case, progress=_silent)
+    seen = problem.states[0].observations
+    surfaces = tuple(o.target.surface for o in seen if isinstance(o, SurfaceDistance))
+    exact = [surface_distance(target_of_truth(scene.space, scene.displacement, surface)) for surface in surfaces]
+    exact = [o.with_noise(o.first_noise((o,))) for o in (replace(o, stated_noise=CLEAN) for o in exact)]
+    points = [measured_points(scene, meshed.space, POINTS[MOST_TELLING], None)] if row.points else []
+    state = problem.states[0].with_observations([*exact, *points])
+    settings = inversion_settings(case, problem.parameters)
+    linear = invert(InverseProblem((state,), problem.parameters).linear(), settings, progress=_silent, rule=NEARLY)
+    theta, n = linear.minimum.unknowns[: problem.parameters.n_parameters], problem.parameters.n_parameters
+    known = linear.objective.states[0]
+    if state.finite_strain is not None:
+        finite = state.finite_strain.under(known.model.conditions)
+        known = replace(known, finite_strain=replace(finite, material=known.model.material))
+    parameters = replace(linear.objective.parameters, nuisance_precision=np.zeros((0, 0)))  # to be learned anew
+    truth = np.log(true_ratios(linear.objective, scene))
+    return Body(
+        scene,
+        meshed.space,
+        surfaces,
+        InverseProblem((known,), parameters),
+        replace(settings, starts=(theta[:n],)),
+        truth,
+        theta[:n] - truth,
     )
+
+
+def _silent(message: str) -> None:
+    del message
+
+
+def _drawn(body: Body, row: Row, draw: int) -> Result:
+    """What one draw leads to; an estimate that fails says so, and counts as not converged."""
+    rng = np.random.default_rng([body.scene.seed, draw, *row.name.encode()])
+    state = body.problem.states[0].with_observations(_observations(body, row, rng))
+    assert state.approximation is not None
+    problem = replace(body.problem, states=(state.with_approximation(state.approximation),))
+    try:
+        inversion = invert(problem, body.settings, progress=_silent, rule=NEARLY)
+    except EstimationError as error:
+        return {"converged": False, "failure": str(error), "moduli": []}
+    converged = inversion.minimum.converged
+    noise = {o.kind: (o.noise_model.sd, o.noise_model.correlation_area) for o in inversion.objective.observations}
+    return {"converged": converged, "noise": noise, "moduli": _moduli(inversion, body, row) if converged else []}
+
+
+def _observations(body: Body, row: Row, rng: np.random.Generator) -> list[Observation]:
+    """Those of one draw: the surfaces of both images moved along their normals, and points that err."""
+    tissues, drawn = [surface.tissue for surface in body.surfaces], []
+    for later in (False, True):
+        skins = skins_of(body.scene, tissues, later=later)
+        errors = NOISES[row.noise](skins, rng, later)
+        drawn.append([error[:, None] * skin.normals for error, skin in zip(errors, skins, strict=True)])
+    space, displacement = body.scene.space, body.scene.displacement
+    found: list[Observation] = [
+        surface_distance(target_of_truth(space, displacement, surface, warps=(before.__add__, after.__add__)))
+        for surface, before, after in zip(body.surfaces, *drawn, strict=True)
+    ]
+    if row.points:
+        found.append(measured_points(body.scene, body.space, POINTS[row.points], rng))
+    return found
+
+
+def _moduli(inversion: Inversion, body: Body, row: Row) -> list[Result]:
+    """By tissue: the error of ln E, its standard deviation, the ends of its intervals less the truth, the verdict."""
+    objective, minimum = inversion.objective, inversion.minimum
+    errors = [[np.zeros(len(line.weights)) for line in minimum.evaluation.lines]] * NO_GRID
+    covariance = covariance_of(objective, minimum.evaluation, errors, unknowns=minimum.unknowns)
+    fixed = frozen_posterior(objective, minimum.unknowns, minimum.evaluation)
+    known, _ = intervals_of(inversion, body.settings, fixed, covariance)
+    estimates = estimates_of(inversion, known, covariance, truth={})
+    limits = _limits(inversion, row)
+    of_noise = None if row.limit is None else _by_true_noise(inversion, row.limit)
+    scale, found = objective.parameters.scale_kpa, []
+    for i, (estimate, of) in enumerate(zip(estimates, known, strict=True)):
+        given = estimate.interval95_given_model
+        found.append(
+            {
+                "tissue": estimate.tissue,
+                "error": float(minimum.unknowns[i] - body.truth[i]),
+                "sd": float(np.sqrt(covariance.total[i, i])),
+                "sd_true_noise": None
+                if of_noise is None
+                else float(np.sqrt(covariance.total[i, i] - covariance.noise[i, i] + of_noise[i, i])),
+                "shares": {name: round(share, 4) for name, share in covariance.shares(i).items()},
+                "verdict": estimate.verdict,
+                "interval": _ends(of.interval, body.truth[i]),
+                "own": _ends(of.own.ends, body.truth[i]),
+                "given_model": _ends(given, body.truth[i] + np.log(scale)) if given else None,
+                **{name: limit[i] for name, limit in limits.items()},
+            }
+        )
+    return found
+
+
+def _ends(interval: tuple[float | None, float | None], truth: float) -> list[float | None]:
+    """The ends of an interval in ln E, less the truth."""
+    return [None if end is None else float(np.log(end) - truth) for end in interval]
+
+
+def _by_true_noise(inversion: Inversion, noise: NoiseModel) -> Array:
+    """Covariance (n, n) of the log-moduli that errors as they were drawn make through the estimate's own weights."""
+    evaluation, n = inversion.minimum.evaluation, inversion.objective.n_parameters
+    seen = [(line.state, line.observation) for line in evaluation.lines]
+    models = {(s, o.kind): noise if isinstance(o, SurfaceDistance) else o.first_noise((o,)) for s, o in seen}
+    pairs = list(zip(evaluation.lines, gain(evaluation, n), strict=True))
+    return noise_covariance(inversion.objective, pairs, models)
+
+
+def _limits(inversion: Inversion, row: Row) -> dict[str, list[float]]:
+    """The Cramer-Rao limits of the standard deviations: with the draw's priors, layers held; these free; the widest.
+
+    The widest priors are those that mixtures have for frames, offsets and patchy tissues that are not what is usual:
+    which of them holds is left undecided, and counts in an interval.
+    """
+    if row.limit is None:
+        return {}
+    evaluation, parameters = inversion.minimum.evaluation, inversion.objective.parameters
+    known, found = fisher_information(evaluation, row.limit, cell_mm=float(row.limit.lengths[0])), {}
+    for name in ("limit", "limit_layers", "limit_widest"):
+        prior = evaluation.prior.copy()
+        for i, block in enumerate(parameters.blocks):
+            own = np.ix_(parameters.columns(i), parameters.columns(i))
+            if block.considered or (block.released and name == "limit_layers"):  # is unknown to a limit as well
+                prior[own] = block.precision
+            elif block.odds and name == "limit_widest":
+                prior[own] = np.linalg.inv(max((terms[0] for terms in block.alternatives), key=np.trace))
+        variances = np.diag(np.linalg.inv(known + prior))
+        found[name] = np.sqrt(variances[: parameters.n_parameters]).tolist()
+    return found
+
+
+def summary(results: Sequence[Result]) -> Result:
+    """Of the bodies of one row: how many intervals hold, of how many, and how wide they are."""
+    draws = [draw for result in results for draw in result["draws"]]
+    moduli = [modulus for draw in draws for modulus in draw["moduli"]]
+    stated = [modulus for modulus in moduli if modulus["verdict"] != "not identified"]
+    held = sum(_holds(modulus["interval"]) for modulus in stated)
+    given = [modulus for modulus in stated if modulus["given_model"] is not None]
+    interval = stats.binomtest(held, len(stated)).proportion_ci() if stated else None
+    verdicts = [modulus["verdict"] for modulus in moduli]
+    out = [modulus for modulus in stated if _half_widths(modulus) > OUT]
+    return {
+        "bodies": len(results),
+        "draws": len(draws),
+        "not_converged": sum(not draw["converged"] for draw in draws),
+        "moduli": len(moduli),
+        "stated": len(stated),
+        "holds": held / len(stated) if stated else None,
+        "holds_interval": [float(interval.low), float(interval.high)] if interval else None,
+        "holds_given_model": float(np.mean([_holds(m["given_model"]) for m in given])) if given else None,
+        "holds_without_layers": float(np.mean([_holds(modulus["own"]) for modulus in moduli])) if moduli else None,
+        "holds_all": float(np.mean([_holds(modulus["interval"]) for modulus in moduli])) if moduli else None,
+        "verdicts": {name: verdicts.count(name) for name in sorted(set(verdicts))},
+        "out": len(out),
+        "out_identified": sum(modulus["verdict"] == "identified" for modulus in out),
+        "median_error": _median([abs(m["error"]) for m in moduli]),
+        "mean_error_over_sd": float(np.mean([m["error"] / m["sd"] for m in moduli])) if moduli else None,
+        "sd": _median([m["sd"] for m in moduli]),
+        "sd_over_spread": _median(_over_spread(results)),
+        "true_noise_over_limit": _median([m["sd_true_noise"] / m["limit"] for m in moduli if "limit" in m]),
+        "sd_over_limit": _median([m["sd"] / m["limit"] for m in moduli if "limit" in m]),
+        "sd_over_widest": _median([m["sd"] / m["limit_widest"] for m in moduli if "limit_widest" in m]),
+        "width_over_limit": _median([_width(m) / m["limit_layers"] for m in moduli if "limit_layers" in m]),
+        "draw_seconds": float(np.mean([result["draw_seconds"] for result in results])),
+        "body_seconds": float(np.mean([result["body_seconds"] for result in results])),
+    }
+
+
+def _holds(interval: list[float | None]) -> bool:
+    """Whether an interval less the truth holds it; an open end does."""
+    low, high = interval
+    return (low is None or low <= 0.0) and (high is None or high >= 0.0)
+
+
+def _half_widths(modulus: Result) -> float:
+    """Distance of the truth from the estimate in half-widths of its interval."""
+    low, high = modulus["interval"]
+    return 0.0 if low is None or high is None else float(abs(modulus["error"]) / (0.5 * (high - low)))
+
+
+def _width(modulus: Result) -> float:
+    """Width of the interval in standard deviations' worth, over 2 x 1.96; infinite where an end is open."""
+    low, high = modulus["interval"]
+    return np.inf if low is None or high is None else float((high - low) / (2.0 * HALF))
+
+
+def _over_spread(results: Sequence[Result]) -> list[float]:
+    """By body and tissue, the median standard deviation over the spread of the draws' estimates."""
+    found = []
+    for result in results:
+        every = [draw["moduli"] for draw in result["draws"] if draw["moduli"]]
+        for of_tissue in zip(*every, strict=True) if len(every) > 1 else ():
+            spread = np.std([modulus["error"] for modulus in of_tissue], ddof=1)
+            found.append(float(np.median([modulus["sd"] for modulus in of_tissue]) / spread))
+    return found
+
+
+def _median(values: Sequence[float]) -> float | None:
+    middle = float(np.median(values)) if len(values) else np.inf
+    return middle if np.isfinite(middle) else None
+
+
+def _table(rows: dict[str, Result]) -> str:
+    """The rows as they stand in the docs."""
+    head = "row | bodies, moduli | stated | of these hold | given the model | of all moduli, without layers"
+    head += " | identified, weak, not | out (identified)"
+    head += " | median ln-error | sd | sd, that by the widest priors, width over the limit"
+    lines = [f"| {head} |", "|" + "---|" * 11]
+    for name, row in rows.items():
+        low, high = row["holds_interval"] or (np.nan, np.nan)
+        verdicts = [row["verdicts"].get(word, 0) for word in ("identified", "weak", "not identified")]
+        held = f"{_percent(row['holds'])} ({100 * low:.0f}-{100 * high:.0f})" if row["stated"] else "-"
+        cells = [f"`{name}`", f"{row['bodies']}, {row['moduli']}", str(row["stated"]), held]
+        cells += [_percent(row["holds_given_model"])]
+        cells += [f"{_percent(row['holds_all'])}, {_percent(row['holds_without_layers'])}"]
+        cells += [", ".join(map(str, verdicts)), f"{row['out']} ({row['out_identified']})"]
+        cells += [_number(row["median_error"]), _number(row["sd"])]
+        over = ", ".join(_number(row[key]) for key in ("sd_over_limit", "sd_over_widest", "width_over_limit"))
+        cells.append(over if row["sd_over_limit"] is not None else "-")
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.0f} %"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The Cramer-Rao limit of what surfaces tell of moduli: what noise leaves open, whatever the method."""
+"""The Cramer-Rao limit of what surfaces and points tell of moduli: what noise leaves open, whatever the method."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from scipy.spatial.distance import cdist
 
 from palpate.inversion import Evaluation, Linearisation
 from palpate.observation import NoiseModel, Observation, SurfaceDistance, SurfaceTarget
+from palpate.observation.point_displacement import PointDisplacement
 
-__all__ = ["cramer_rao", "efficient_gain", "model_to_image", "target_of"]
+__all__ = ["cramer_rao", "efficient_gain", "fisher_information", "model_to_image", "target_of"]
 
 RIDGE = 1e-4  # of the variance of a residual, on the cells' covariance
 ROWS = 64  # cells whose pairs are in memory at once
@@ -23,15 +24,21 @@ def cramer_rao(evaluation: Evaluation, noise: NoiseModel, n_parameters: int, *, 
     """Smallest covariance (n_parameters, n_parameters) of the log-moduli that any unbiased estimate can have.
 
     Inverse of the Fisher information F = sum_states J^T C^-1 J + P of the model -> image residuals' means over cells of
-    the surfaces, with the prior P of the driver's motion. Of several later states each is taken with a first image of
-    its own.
+    the surfaces, with the prior P of the other unknowns. Points whose motion was measured add theirs, by the covariance
+    stated, which makes their residuals independent. Of several later states each is taken with a first image of its
+    own.
 
     `cell_mm`: the noise's correlation length. Within it a smooth model leaves next to no noise, so that single
     faces would tell moduli from the differences of neighbours, which are rounding that no such model describes: a limit
     that its own weights miss by far (benchmarks/noise_limit.py).
     """
-    inverse = np.linalg.inv(_information(evaluation, _whitened_states(evaluation, noise, cell_mm)))
+    inverse = np.linalg.inv(fisher_information(evaluation, noise, cell_mm=cell_mm) + evaluation.prior)
     return np.asarray(inverse[:n_parameters, :n_parameters])
+
+
+def fisher_information(evaluation: Evaluation, noise: NoiseModel, *, cell_mm: float) -> NDArray[np.float64]:
+    """sum_states J^T C^-1 J (n_unknowns, n_unknowns) of the data alone, as `cramer_rao` has it."""
+    return _information(evaluation, _whitened_states(evaluation, noise, cell_mm)) + _of_points(evaluation)
 
 
 def efficient_gain(
@@ -43,7 +50,7 @@ def efficient_gain(
     noise of this model, G C G^T with the prior's part is the limit of `cramer_rao`.
     """
     states = _whitened_states(evaluation, noise, cell_mm)
-    inverse = np.linalg.inv(_information(evaluation, states))[:n_parameters]
+    inverse = np.linalg.inv(_information(evaluation, states) + _of_points(evaluation) + evaluation.prior)[:n_parameters]
     found: list[NDArray[np.float64]] = []
     for state in states:
         rows = np.asarray(inverse[:, state.lines[0].columns] @ state.weighted.T @ state.means)
@@ -73,13 +80,24 @@ def model_to_image(line: Linearisation) -> slice:
 
 
 def _whitened_states(evaluation: Evaluation, noise: NoiseModel, cell_mm: float) -> list[_Whitened]:
-    states = dict.fromkeys(line.state for line in evaluation.lines)
-    return [_whitened([line for line in evaluation.lines if line.state == s], noise, cell_mm) for s in states]
+    seen = [line for line in evaluation.lines if isinstance(line.observation, SurfaceDistance)]
+    states = dict.fromkeys(line.state for line in seen)
+    return [_whitened([line for line in seen if line.state == s], noise, cell_mm) for s in states]
+
+
+def _of_points(evaluation: Evaluation) -> NDArray[np.float64]:
+    """J^T J / sd^2 (n, n) of all unknowns by the residuals of points, which have one standard deviation and no more."""
+    information = np.zeros_like(evaluation.prior)
+    for line in evaluation.lines:
+        if isinstance(line.observation, PointDisplacement):
+            weights = np.full(len(line.weights), line.observation.stated.sd**-2.0)
+            information[np.ix_(line.columns, line.columns)] += line.jacobian.gram(weights)
+    return information
 
 
 def _information(evaluation: Evaluation, states: Sequence[_Whitened]) -> NDArray[np.float64]:
-    """F (n, n) of all unknowns."""
-    information = evaluation.prior.copy()
+    """That of the surfaces (n, n), of all unknowns."""
+    information = np.zeros_like(evaluation.prior)
     for state in states:
         columns = state.lines[0].columns
         seen = np.asarray(state.means @ _jacobian(state.lines))

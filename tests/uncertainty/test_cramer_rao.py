@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from palpate.experiments.verification.structured_meshes import box_mesh
 from palpate.inversion import Evaluation, LaterState, Objective, ParameterMap, unit_blocks
 from palpate.inversion.objective import Linearisation
-from palpate.observation.contract import Residuals, Weighting
+from palpate.mesh import lagrange_space, located, point_interpolation
+from palpate.observation.contract import DataFile, Residuals, Weighting
 from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import NoiseModel
+from palpate.observation.point_displacement import point_displacement
 from palpate.observation.robust_loss import Tukey
 from palpate.observation.surface_distance import SurfaceDistance
 from palpate.phantoms.boundary_noise import smooth_field
@@ -107,3 +111,21 @@ def test_roughness_of_single_faces_hardly_lowers_the_limit_of_cells(limits, smoo
     )
     assert np.all(cells > 0.8 * smooth_limit)
     assert np.all(single < 0.4 * smooth_limit)
+
+
+def test_points_tell_what_their_stated_covariance_leaves(limits, smooth):
+    """J^T C^-1 J of all points, whatever noise the fit believes; beside surfaces informations add."""
+    rng, space = np.random.default_rng(7), lagrange_space(box_mesh(2, size=30.0), "P2")
+    points, tangent = rng.uniform(2.0, 28.0, (20, 3)), rng.normal(size=(3 * len(space.points), 5))
+    root = rng.normal(size=(3, 3))
+    file = DataFile("landmarks", "landmarks", (), 1, 0.4, covariance_mm2=root @ root.T + 0.1 * np.eye(3))
+    places = located(space.mesh, points)
+    term = point_displacement(space, points, np.zeros((20, 3)), places, file=file, description="")
+    seen_by = Jacobian.of(term.operator @ tangent[term.dofs])
+    doubtful = term.with_noise(NoiseModel(np.array([4.0]), np.array([1.0])))
+    line = Linearisation(doubtful, 0, None, np.arange(5), seen_by, np.full(60, 1.0 / 60.0), None)
+    evaluation = replace(smooth[1], lines=(*smooth[1].lines, line))
+    whole = np.kron(point_interpolation(space, places).toarray(), np.eye(3)) @ tangent
+    expected = whole.T @ np.linalg.solve(np.kron(np.eye(20), file.covariance_mm2), whole)
+    alone, together = (limits.fisher_information(of, NOISE, cell_mm=5.0) for of in (smooth[1], evaluation))
+    assert together - alone == pytest.approx(expected, rel=1e-9)

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from palpate.study.cost import ExpectedCost, expected_cost
     from palpate.study.earlier import strange_files
     from palpate.study.edge_length import EdgeLength, edge_length_of
-    from palpate.study.estimation import Observed, conclude, verdict
+    from palpate.study.estimation import Observed, conclude, estimates_of, intervals_of, verdict
     from palpate.study.journal import recover
     from palpate.study.lock import held_folder, own_file
     from palpate.study.outputs import make_folder, read_json, staged, write_json, write_text
@@ -41,11 +41,13 @@ __all__ = [
     "edge_length_of",
     "estimate",
     "estimate_states",
+    "estimates_of",
     "expected_cost",
     "failure_document",
     "filled",
     "fitted_states",
     "held_folder",
+    "intervals_of",
     "inverse_problem",
     "inversion_settings",
     "make_body",
@@ -83,11 +85,13 @@ _HOMES = {
     "edge_length_of": "palpate.study.edge_length",
     "estimate": "palpate.study.run",
     "estimate_states": "palpate.study.run",
+    "estimates_of": "palpate.study.estimation",
     "expected_cost": "palpate.study.cost",
     "failure_document": "palpate.study.result",
     "filled": "palpate.study.simulate",
     "fitted_states": "palpate.study.run",
     "held_folder": "palpate.study.lock",
+    "intervals_of": "palpate.study.estimation",
     "inverse_problem": "palpate.study.body",
     "inversion_settings": "palpate.study.run",
     "make_body": "palpate.study.body",

@@ -55,13 +55,16 @@ __all__ = [
     "Estimation",
     "ForceFit",
     "Iteration",
+    "Known",
     "ModulusEstimate",
     "Observed",
     "PointFit",
     "Start",
     "TissueFit",
     "conclude",
+    "estimates_of",
     "hull",
+    "intervals_of",
     "no_estimate",
     "verdict",
 ]
@@ -238,9 +241,8 @@ def conclude(
     progress("intervals: profiles, and the fit of every surface before and after")
     pairs = image_pairs_of(inversion, settings.bounds, errors)
     fixed = frozen_posterior(objective, minimum.unknowns, minimum.evaluation)
-    released, remark = _released(inversion, settings, progress)
-    known = _intervals(inversion, fixed, settings.bounds, covariance, released) if minimum.converged else ()
-    estimates = _estimates(inversion, known, covariance, truth)
+    known, remark = intervals_of(inversion, settings, fixed, covariance, progress=progress)
+    estimates = estimates_of(inversion, known, covariance, truth=truth)
     of_moduli = covariance.total[: len(estimates), : len(estimates)]
     stating = {e.tissue for e in estimates if e.verdict != NOT_IDENTIFIED}
     pairs = pairs and pairs.with_intervals_of(stating)
@@ -348,7 +350,7 @@ def _reason(inversion: Inversion) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class _Known:
+class Known:
     """Of one parameter: its own interval, one that holds all minima that fit as well, both of e^theta; at a bound."""
 
     own: ModulusInterval
@@ -356,14 +358,21 @@ class _Known:
     at_bound: bool
 
 
-def _intervals(
+def intervals_of(
     inversion: Inversion,
+    settings: InversionSettings,
     fixed: LeastSquares,
-    bounds: Bounds,
     covariance: Covariance,
-    released: OuterIterate | None,
-) -> tuple[_Known, ...]:
-    """Of each parameter its interval; it holds that of the `released` minimum as well."""
+    *,
+    progress: Progress = silent,
+) -> tuple[tuple[Known, ...], tuple[Finding, ...]]:
+    """Of each parameter its interval, none where nothing converged; it holds that with released blocks free as well.
+
+    fixed: the posterior of which profiles are taken. With them a finding where the latter was not found.
+    """
+    if not inversion.minimum.converged:
+        return (), ()
+    (released, remark), bounds = _released(inversion, settings, progress), settings.bounds
     n = inversion.objective.n_parameters
     found, variances, at_bound = [], np.diag(covariance.total), bounds.reached(inversion.minimum.unknowns[:n])
     best = inversion.candidates[inversion.best]
@@ -378,8 +387,8 @@ def _intervals(
         good = [c.minimum.unknowns for c in others if as_good(c.value, best.value, scale=float(scales[i]))]
         ellipses = (log_interval(float(np.exp(x[i])), sd, **limits) for x in good)
         interval = hull([own.ends, *ellipses, *wider[i : i + 1]])
-        found.append(_Known(own, interval, bool(at_bound[i])))
-    return tuple(found)
+        found.append(Known(own, interval, bool(at_bound[i])))
+    return tuple(found), remark
 
 
 def _released(
@@ -410,9 +419,10 @@ def _released_intervals(released: OuterIterate, beyond: NDArray[np.float64], bou
     return [modulus_interval(free, minimum, i, variance=float(variances[i]), bounds=bounds).ends for i in range(n)]
 
 
-def _estimates(
-    inversion: Inversion, known: Sequence[_Known], covariance: Covariance, truth: Mapping[str, float]
+def estimates_of(
+    inversion: Inversion, known: Sequence[Known], covariance: Covariance, *, truth: Mapping[str, float]
 ) -> tuple[ModulusEstimate, ...]:
+    """What is stated of the moduli whose intervals are `known`; `truth`: true moduli (kPa) by tissue, where known."""
     mapping, scale = inversion.objective.parameters, inversion.objective.parameters.scale_kpa
     none = [
         no_estimate(
@@ -477,7 +487,7 @@ def _stated(interval: Interval, word: str, unit: float = 1.0) -> Interval | None
     return None if word == NOT_IDENTIFIED else (low and low * unit, high and high * unit)
 
 
-def _ratios(inversion: Inversion, known: Sequence[_Known], covariance: Covariance) -> tuple[PoissonRatioEstimate, ...]:
+def _ratios(inversion: Inversion, known: Sequence[Known], covariance: Covariance) -> tuple[PoissonRatioEstimate, ...]:
     mapping, found = inversion.objective.parameters, list[PoissonRatioEstimate]()
     for open_ in mapping.poisson:
         i, nothing = open_.column, no_ratio(open_.tissue, why=_not_converged(inversion))
