@@ -181,7 +181,7 @@ def test_a_known_tissue_released_as_a_whole_is_a_prior_of_the_scale(twins, twin)
     problem, sd = twins.voxel_problem(twin), 0.4
     tissues, regions = twin.scene.tissues, problem.states[0].model.regions
     region = next(i for i, number in enumerate(regions) if tissues[number].role is Role.KNOWN)
-    blocks = (*problem.parameters.blocks, *layer_blocks((("organ", (region,)),), (0,), sd=sd))
+    blocks = (*problem.parameters.blocks, *layer_blocks((("organ", (region,), 1.0),), (0,), sd=sd, thickness_mm=1.0))
     parameters = replace(problem.parameters, blocks=blocks, nuisance_precision=np.zeros((0, 0)))
     held = objective_of(replace(problem, parameters=parameters))
     unknowns = np.concatenate([twin.unknowns, [0.0]])

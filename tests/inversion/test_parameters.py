@@ -64,7 +64,7 @@ def test_the_chain_of_a_state_is_that_of_its_own_unknowns(rng, tied, state):
 
 def test_an_unknown_of_a_region_is_added_to_its_modulus_in_every_state(rng):
     """It enters moduli and their derivatives as theta does, between theta and the coefficients."""
-    blocks = (*unit_blocks(2, 3), *layer_blocks((("gland", (1, 3)),), (0, 1), sd=1.5))
+    blocks = (*unit_blocks(2, 3), *layer_blocks((("gland", (1, 3), 2.0),), (0, 1), sd=1.5, thickness_mm=3.0))
     mapping = parameter_map((GLAND, FAT, SAC, MUSCLE), (0, 1, 2, 3), blocks)
     unknowns = rng.normal(size=mapping.n_unknowns)
     changed = unknowns + 0.7 * np.eye(mapping.n_unknowns)[-1]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial import Delaunay
 
 from palpate.images.tissue import Role, Tissue
-from palpate.mesh.layers import Layer, layered_space, layers_round_organs
+from palpate.mesh.layers import Layer, layer_thickness_mm, layered_space, layers_round_organs
 from palpate.mesh.space import lagrange_space
 from palpate.mesh.tet_mesh import TetMesh
 
@@ -45,3 +47,12 @@ def test_a_layer_is_what_touches_the_organ(space):
 
 def test_without_layers_a_space_is_itself(space):
     assert layered_space(space, ()) is space
+
+
+def test_a_layer_is_as_thick_as_its_elements(space):
+    """Elements that touch a ball in a lattice of unit cubes: about the cube that a face belongs to, or two."""
+    layers = layers_round_organs(space.mesh)
+    assert 0.8 < layer_thickness_mm(layered_space(space, layers).mesh, layers, 0) < 2.5
+    wide = replace(space, mesh=replace(space.mesh, nodes=3.0 * space.mesh.nodes))
+    thick = layer_thickness_mm(layered_space(wide, layers).mesh, layers, 0)
+    assert thick == pytest.approx(3.0 * layer_thickness_mm(layered_space(space, layers).mesh, layers, 0))

@@ -219,17 +219,28 @@ def material_blocks(
 
 
 def layer_blocks(
-    layers: Sequence[tuple[str, tuple[int, ...]]], states: tuple[int, ...], *, sd: float
+    layers: Sequence[tuple[str, tuple[int, ...], float]], states: tuple[int, ...], *, sd: float, thickness_mm: float
 ) -> tuple[Block, ...]:
     """By how much ln E of the layer of elements round each organ differs from that of its tissue: one unknown each.
 
-    layers: of each organ its name and the numbers of the model's regions. A capsule, a film of fat or a plane on which
-    an organ slides is hardly seen by its surface, while the organ's modulus hangs on it: as an unknown of the estimate
-    it costs accuracy where there is none, and an interval that leaves it out does not hold where there is one.
+    layers: of each organ its name, the numbers of the model's regions, and how thick its elements are there, h mm. What
+    is believed is of a layer of t = `thickness_mm`, or of the elements where these are thinner: in series with the rest
+    of them, a share s = min(t / h, 1) that is softer by e^sd makes them softer by 1 + s (e^sd - 1). A capsule, a film
+    of fat or a plane on which an organ slides is hardly seen by its surface, while the organ's modulus hangs on it: as
+    an unknown of the estimate it costs accuracy where there is none, and an interval that leaves it out does not hold
+    where there is one.
     """
     return tuple(
-        Block(organ, "layer", Acts.MODULI, states, np.full((1, 1), sd**-2.0), released=True, regions=regions)
-        for organ, regions in layers
+        Block(
+            organ,
+            "layer",
+            Acts.MODULI,
+            states,
+            np.full((1, 1), np.log1p(min(thickness_mm / h, 1.0) * np.expm1(sd)) ** -2.0),
+            released=True,
+            regions=regions,
+        )
+        for organ, regions, h in layers
     )
 
 

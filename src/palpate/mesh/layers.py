@@ -9,9 +9,10 @@ import numpy as np
 
 from palpate.images.tissue import Role
 from palpate.mesh.space import LagrangeSpace
+from palpate.mesh.surface import tissue_surface
 from palpate.mesh.tet_mesh import TetMesh
 
-__all__ = ["Layer", "layered_space", "layers_round_organs"]
+__all__ = ["Layer", "layer_thickness_mm", "layered_space", "layers_round_organs"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,3 +46,13 @@ def layered_space(space: LagrangeSpace, layers: Sequence[Layer]) -> LagrangeSpac
         region[at_organ[mesh.tets].any(axis=1) & (region == layer.tissue)] = number
     tissues = (*mesh.tissues, *(mesh.tissues[layer.tissue] for layer in layers))
     return replace(space, mesh=replace(mesh, region=region, tissues=tissues))
+
+
+def layer_thickness_mm(mesh: TetMesh, layers: Sequence[Layer], organ: int) -> float:
+    """Mean thickness, mm, of the layers round an organ in a mesh that has them last: their volume over its surface."""
+    first = len(mesh.tissues) - len(layers)
+    own = [number for number, layer in enumerate(layers, start=first) if layer.organ == organ]
+    surface = tissue_surface(mesh, organ)
+    corner = mesh.nodes[surface.triangles[np.isin(surface.other, own)]]
+    areas = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+    return float(mesh.volumes[np.isin(mesh.region, own)].sum() / areas.sum())

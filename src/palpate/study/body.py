@@ -41,7 +41,7 @@ from palpate.mechanics.loads import boundary_named
 from palpate.mechanics.material import MaterialModes, material_modes
 from palpate.mechanics.newton import NewtonSettings
 from palpate.mechanics.reaction import SurfaceReaction, surface_reaction
-from palpate.mesh.layers import Layer, layered_space, layers_round_organs
+from palpate.mesh.layers import Layer, layer_thickness_mm, layered_space, layers_round_organs
 from palpate.mesh.quality import MeshQuality, mesh_figures
 from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.tet_mesh import TetMesh
@@ -386,15 +386,18 @@ def _blocks(
 
 def _layer_blocks(case: Case, layers: Sequence[Layer], models: Sequence[LinearModel]) -> tuple[Block, ...]:
     """One unknown an organ, of all layers round it."""
-    tissues, regions = models[0].space.mesh.tissues, models[0].regions
-    first = len(tissues) - len(layers)
-    of = {
-        tissues[organ].name: tuple(
-            regions.index(first + number) for number, layer in enumerate(layers) if layer.organ == organ
+    mesh, regions = models[0].space.mesh, models[0].regions
+    numbered = list(enumerate(layers, start=len(mesh.tissues) - len(layers)))
+    of = [
+        (
+            mesh.tissues[organ].name,
+            tuple(regions.index(number) for number, layer in numbered if layer.organ == organ),
+            layer_thickness_mm(mesh, layers, organ),
         )
         for organ in dict.fromkeys(layer.organ for layer in layers)
-    }
-    return layer_blocks(tuple(of.items()), tuple(range(len(models))), sd=case.discrepancy.layer_sd)
+    ]
+    believed = {"sd": case.discrepancy.layer_sd, "thickness_mm": case.discrepancy.layer_mm}
+    return layer_blocks(of, tuple(range(len(models))), **believed)
 
 
 def _open_poisson(case: Case, mesh: TetMesh) -> tuple[str, ...]:

@@ -182,14 +182,15 @@ class Discrepancy:
     heterogeneity_sd: of ln E inside a patchy tissue, with a Gaussian kernel of heterogeneity_length_mm, and a third of
     it inside one that is nearly homogeneous, of which the images choose; poisson_sd: of each Poisson's ratio that is
     given; surface_offset_mm: of how much larger each surface, and each driver's wall, is drawn in each later image;
-    layer_sd: of ln E of the layer of elements between each organ and what is known round it, over that tissue's own.
+    layer_sd: of ln E of a layer of layer_mm between each organ and what is known round it, over that tissue's own.
     """
 
     heterogeneity_sd: float = field(default=0.3, metadata=rule(between=(0.0, 3.0)))
     heterogeneity_length_mm: float = field(default=25.0, metadata=rule(between=(1.0, 1e3)))
     poisson_sd: float = field(default=0.02, metadata=rule(between=(0.0, 0.2)))
     surface_offset_mm: float = field(default=0.5, metadata=rule(between=(0.0, 100.0)))
-    layer_sd: float = field(default=1.0, metadata=rule(between=(0.0, 5.0)))
+    layer_sd: float = field(default=1.5, metadata=rule(between=(0.0, 5.0)))
+    layer_mm: float = field(default=3.0, metadata=rule(between=(0.01, 1000.0)))
 
 
 @dataclass(frozen=True, slots=True)
