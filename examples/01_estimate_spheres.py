@@ -16,6 +16,7 @@ from palpate.phantoms import SpheresOptions, spheres
 TRUTH_KPA = {"core": 60.0, "shell": 30.0}
 CASE = """
 mechanics.law = "linear"  # as this phantom; leave it out for real images
+discrepancy.layer_sd = 0.0  # nothing soft lies between these balls; leave it out where you do not know that
 [images]
 before = "before.nii.gz"
 after = ["after.nii.gz"]
