@@ -40,8 +40,6 @@ from palpate.phantoms import Noise, Scene
 from palpate.study import Body, Observed, conclude, fitted_states
 from palpate.uncertainty import FittedState, grid_position_shifts, imaging_errors
 
-GRID_DRAWS = 8  # of the voxels' place, as an estimate has them
-
 Array = NDArray[np.float64]
 Result = dict[str, Any]  # a line of JSON
 
@@ -172,7 +170,7 @@ def _uncertainty(
     observed = Observed(fitted_states(inversion, body), images)
     estimation = conclude(inversion, settings, observed, truth=scene.moduli_kpa, seed=scene.seed)
     at, rng = inversion.minimum.evaluation, np.random.default_rng(scene.seed)
-    moved = grid_position_shifts(inversion.objective, at, observed.states, draws=GRID_DRAWS, rng=rng)
+    moved = grid_position_shifts(inversion.objective, at, observed.states, rng=rng)
     found: Result = {
         "interval95": [e.ratio_interval95 for e in estimation.estimates],
         "verdict": [e.verdict for e in estimation.estimates],

@@ -15,6 +15,7 @@ from palpate.mechanics.linear_model import linear_model
 from palpate.mechanics.material import MaterialModes, material_modes
 from palpate.mechanics.newton import NewtonSettings
 from palpate.mesh.anatomy import Anatomy, Box
+from palpate.mesh.layers import layered_space, layers_round_organs
 from palpate.mesh.space import lagrange_space
 from palpate.mesh.tetrahedralise import tetrahedralise
 from palpate.observation.prescribed_motion import prescribed_motion
@@ -41,7 +42,7 @@ def body():
 
 @pytest.fixture(scope="module")
 def modes(body):
-    return material_modes(body[0].mesh, (0, 2), length_mm=15.0, poisson=(0, 2))
+    return material_modes(body[0].mesh, (0, 2), length_mm=15.0, poisson=((0,), (2,)))
 
 
 @pytest.fixture
@@ -125,3 +126,26 @@ def test_the_linear_law_is_the_small_strain_limit_of_a_patchy_body(body, modes, 
     assert np.linalg.norm(by_material - expected) < 5e-3 * np.linalg.norm(expected)
     gradient = np.random.default_rng(1).normal(size=len(small.values))
     assert small.adjoint(gradient) == pytest.approx(small.tangent().T @ gradient, rel=1e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize("law", ["linear", "neo-hookean"])
+def test_layers_that_are_as_stiff_as_their_tissue_change_nothing(body, modes, coefficients, law):
+    """Nor do they where the tissue is patchy and its Poisson's ratio another than the stated one."""
+    space, constraint = body
+    layered = layered_space(space, layers_round_organs(space.mesh))
+    split = MaterialModes(modes.fields, ((0,), (2, 3)), modes.sizes)
+    every = np.concatenate([1e-1 * coefficients[0], coefficients[1]])
+    found = []
+    for on, material, moduli in ((space, modes, MODULI), (layered, split, np.append(MODULI, MODULI[1]))):
+        model = (
+            linear_model(on, constraint, material=material)
+            if law == "linear"
+            else finite_strain_model(
+                on, constraint, NeoHookean(), material=material, settings=NewtonSettings(tolerance=1e-11)
+            )
+        )
+        there = model.solve(moduli, every)
+        found.append((there.values, there.tangent()[:, len(moduli) :]))
+    assert layered.mesh.region.max() == 3
+    assert found[1][0] == pytest.approx(found[0][0], abs=1e-8)
+    assert found[1][1] == pytest.approx(found[0][1], abs=1e-6)

@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from palpate.errors import NotConverged
 from palpate.inversion import Inversion, Outcome, OuterIterate, gauss_newton, invert
 from palpate.inversion.estimate import Candidate
 from palpate.inversion.outer_loop import Convergence
 from palpate.mechanics.forward import SolveCounts
 from palpate.observation.noise_model import NoiseModel
-from palpate.study.estimation import GRID_DRAWS, Observed, conclude, hull, verdict
+from palpate.study.estimation import Observed, conclude, hull, verdict
 from palpate.study.samples import draw_moduli
 from palpate.uncertainty import FittedState, grid_position_shifts, mesh_covariance, sandwich_covariance
 from palpate.uncertainty.covariance import scatter
@@ -95,9 +96,7 @@ def test_the_place_of_the_grid_is_in_the_interval_once(twins, twin, voxels, sett
     found = Inversion((Candidate(OuterIterate(objective, minimum), 0.0),), 0, (), minimum.evaluation, 0, SolveCounts())
     estimation = stated(found, settings, observed)
     residuals = sandwich_covariance(objective, minimum.evaluation)
-    moved = grid_position_shifts(
-        objective, minimum.evaluation, observed.states, draws=GRID_DRAWS, rng=np.random.default_rng(1)
-    )
+    moved = grid_position_shifts(objective, minimum.evaluation, observed.states, rng=np.random.default_rng(1))
     alone = scatter(moved)
     assert np.all(np.diag(alone) > 1e-3 * np.diag(residuals))
     rest = estimation.covariance.total - mesh_covariance(objective)
@@ -237,6 +236,21 @@ def test_an_estimate_whose_outer_loop_ran_out_says_what_is_open(estimation, inve
     (remark,) = (remark for remark in result.remarks if remark.code == "unsettled")
     assert "still change each other" in remark.message
     assert "linearised anew" not in remark.message
+
+
+def test_an_interval_that_holds_no_layer_says_so(inversion, settings, observed, monkeypatch):
+    """Where the estimate with the layers free cannot be followed, or ends before it has converged."""
+
+    def lost(*_arguments, **_options):
+        raise NotConverged("no equilibrium")
+
+    best = inversion.candidates[inversion.best].iterate
+    open_ = replace(best, minimum=replace(best.minimum, outcome=Outcome.STEPS))
+    for ending in (lost, lambda *_arguments, **_options: open_):
+        monkeypatch.setattr("palpate.study.estimation.with_released", ending)
+        result = stated(inversion, settings, observed)
+        (remark,) = (remark for remark in result.remarks if remark.code == "unsettled")
+        assert "layers round organs" in remark.message
 
 
 def test_the_same_seed_gives_the_same_statement(inversion, settings, observed, estimation):

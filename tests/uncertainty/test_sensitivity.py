@@ -15,7 +15,15 @@ from palpate.mechanics.linear_model import linear_model, poisson_tangents
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.surface_distance import surface_distance
 from palpate.observation.target import surface_target
-from palpate.uncertainty import fast_path, modulus_errors, poisson_errors, sobol_indices, surface_errors
+from palpate.uncertainty import (
+    exact_equilibria,
+    fast_path,
+    law_errors,
+    modulus_errors,
+    poisson_errors,
+    sobol_indices,
+    surface_errors,
+)
 
 NOISE = NoiseModel(np.array([0.3**2]), np.array([3.0]))
 VOXEL = 1.5  # mm, of the twin
@@ -85,11 +93,25 @@ def test_what_is_not_changed_moves_nothing(path, found):
 
 def test_another_poissons_ratio_of_all_moves_the_estimate_as_foretold(twins, twin, found, path):
     minimum = found.minimum
-    errors = poisson_errors(found.objective, minimum.unknowns, minimum.evaluation, Dilatation.POINTWISE)
+    there = exact_equilibria(found.objective, minimum.unknowns)
+    errors = poisson_errors(minimum.evaluation, there, Dilatation.POINTWISE)
     foretold = path.under(tuple(0.01 * error.sum(axis=1) for error in errors)).theta
     exact = moved(twins, found, model=with_poisson(twin, dict.fromkeys(("gland", "sac", "rest"), 0.46)))
     assert np.abs(exact).max() > 0.05
     assert foretold == pytest.approx(exact, abs=0.2 * np.abs(exact).max())
+
+
+def test_a_step_to_another_law_ends_at_its_equilibrium(found):
+    evaluation, law = found.minimum.evaluation, law_named("neo-hookean")
+    (there,) = exact_equilibria(found.objective, found.minimum.unknowns)
+    model = there.system.model
+    finite = finite_strain_model(model.space, model.constraint, law, dilatation=Dilatation.POINTWISE)
+    exact = finite.solve(there.system.moduli, there.coefficients).values - there.values
+    errors = law_errors(evaluation, (there,), law, Dilatation.POINTWISE)
+    expected = [line.residuals.smooth_jacobian @ exact[line.observation.dofs] for line in evaluation.lines]
+    largest = np.abs(np.concatenate(expected)).max()
+    assert largest > 0.05
+    assert np.concatenate(errors) == pytest.approx(np.concatenate(expected), abs=0.02 * largest)
 
 
 def test_a_known_modulus_moves_all_others_in_proportion(found, path):

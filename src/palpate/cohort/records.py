@@ -13,11 +13,11 @@ from palpate.cohort.mark import document_of
 from palpate.cohort.plan import CASES, Plan
 from palpate.cohort.task import Outcome, Row
 from palpate.parallel import mapped
+from palpate.uncertainty import NORMAL_95
 
 __all__ = ["Modulus", "Record", "records_of", "tissues_of"]
 
 
-AT_END = 1.96  # signed root deviance of a profile at an end of the 95 % interval
 NEARLY = 0.95  # of that: a profile that comes so far has reached the end
 NOT_IMAGES = ("names", "mesh")  # inputs that two patients may well share
 
@@ -112,9 +112,9 @@ def _ends_of_profile(profile: Sequence[Sequence[float]]) -> tuple[End, End]:
     centre = min(profile, key=lambda point: abs(point[1]), default=(1.0, 0.0))[0]
     ends: list[End] = []
     for sign in (-1.0, 1.0):
-        reached = [(value, sign * root) for value, root in profile if sign * root >= NEARLY * AT_END]
-        value, root = min(reached, key=lambda point: abs(point[1] - AT_END), default=(centre, 0.0))
-        ends.append(centre * math.exp(math.log(value / centre) * AT_END / root) if reached else None)
+        reached = [(value, sign * root) for value, root in profile if sign * root >= NEARLY * NORMAL_95]
+        value, root = min(reached, key=lambda point: abs(point[1] - NORMAL_95), default=(centre, 0.0))
+        ends.append(centre * math.exp(math.log(value / centre) * NORMAL_95 / root) if reached else None)
     return ends[0], ends[1]
 
 

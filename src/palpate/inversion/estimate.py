@@ -178,23 +178,22 @@ def continue_at_finite_strain(
     return replace(found, evaluations=found.evaluations + evaluations, counts=spent)
 
 
+@blas_on_one_thread()
 def with_released(
     inversion: Inversion, settings: InversionSettings, *, progress: Progress, rule: StopRule = RELEASED
 ) -> OuterIterate | None:
     """The best minimum followed on with those blocks free that were held while it was sought (see `Block.released`).
 
-    None where it did not converge, has no such block, or cannot be followed.
+    None where there is no such block, or no minimum to follow. Raises `EstimationError`s of solving; one that did not
+    converge says so in its minimum's outcome.
     """
     best = inversion.candidates[inversion.best].iterate
-    if not best.minimum.converged or not any(block.released for block in inversion.objective.parameters.blocks):
+    causes = dict.fromkeys(block.cause for block in inversion.objective.parameters.blocks if block.released)
+    if not best.minimum.converged or not causes:
         return None
     objective, evaluation = best.objective.released(best.minimum.evaluation, best.minimum.unknowns)
     start = replace(best, objective=objective, minimum=replace(best.minimum, evaluation=evaluation))
-    try:
-        return run_outer_loop(start, settings, rule, progress=progress, title="layers round organs free")
-    except EstimationError as error:
-        progress(f"with layers round organs free there is no estimate: {error}")
-        return None
+    return run_outer_loop(start, settings, rule, progress=progress, title=f"with {' and '.join(causes)} free")
 
 
 def _with_reduced_bases(

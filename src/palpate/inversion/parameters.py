@@ -173,7 +173,7 @@ class ParameterMap:
         """
         logarithms = self.selection @ unknowns[: self.n_parameters]
         if len(unknowns) > self.n_parameters:
-            logarithms = logarithms + self._of_layers @ unknowns[self.acting_on_moduli]
+            logarithms = logarithms + self._by_blocks @ unknowns[self.acting_on_moduli]
         moduli = np.asarray(self.base * np.exp(logarithms))
         for open_ in self.poisson:
             moduli[list(open_.regions)] *= open_.weights(unknowns)[0]
@@ -187,7 +187,7 @@ class ParameterMap:
         by_theta = self.selection.copy()
         for open_ in self.poisson:
             by_theta[list(open_.regions), open_.column] = open_.weights(unknowns)[1]
-        return np.concatenate([by_theta, self._of_layers], axis=1)
+        return np.concatenate([by_theta, self._by_blocks], axis=1)
 
     @property
     def acting_on_moduli(self) -> NDArray[np.int64]:
@@ -196,7 +196,7 @@ class ParameterMap:
         return np.concatenate([np.zeros(0, dtype=np.int64), *own])
 
     @property
-    def _of_layers(self) -> NDArray[np.float64]:
+    def _by_blocks(self) -> NDArray[np.float64]:
         """1 where an unknown that acts on moduli is added to a region's ln E, (n_regions, n)."""
         blocks = [block for block in self.blocks if block.acts is Acts.MODULI]
         columns = [np.isin(np.arange(len(self.base)), block.regions) for block in blocks]

@@ -22,12 +22,12 @@ SHARE, MOST = 0.95, 120  # of the variance of a tissue's ln E that its modes hol
 class MaterialModes:
     """Element e of a tissue t has ln E_e = ln E_t + sum_k fields[e, k] c_k, and Poisson's ratio nu_t + c_t.
 
-    fields (n_tets, n_fields) dimensionless; poisson: numbers of the tissues whose ratio may differ, one coefficient
-    each, after those of the fields; sizes: tissue and number of the fields of each tissue that has any, in order.
+    fields (n_tets, n_fields) dimensionless; poisson: groups of tissues, by number, whose ratios may differ, one
+    coefficient each, after those of the fields; sizes: tissue and number of the fields of each tissue that has any.
     """
 
     fields: sparse.csr_matrix[np.float64]
-    poisson: tuple[int, ...] = ()
+    poisson: tuple[tuple[int, ...], ...] = ()
     sizes: tuple[tuple[int, int], ...] = ()
 
     @property
@@ -49,16 +49,17 @@ class MaterialModes:
 
     def poisson_shifts(self, coefficients: NDArray[np.float64]) -> dict[int, float]:
         """By how much the Poisson's ratio of each tissue differs, dimensionless, at coefficients (n_modes,)."""
-        return dict(zip(self.poisson, coefficients[self.fields.shape[1] :].tolist(), strict=True))
+        groups = zip(self.poisson, coefficients[self.fields.shape[1] :].tolist(), strict=True)
+        return {tissue: shift for tissues, shift in groups for tissue in tissues}
 
 
 HOMOGENEOUS = MaterialModes(sparse.csr_matrix((0, 0)))
 
 
 def material_modes(
-    mesh: TetMesh, tissues: Sequence[int], *, length_mm: float, poisson: Sequence[int] = ()
+    mesh: TetMesh, tissues: Sequence[int], *, length_mm: float, poisson: Sequence[tuple[int, ...]] = ()
 ) -> MaterialModes:
-    """Modes of ln E in each of the meshed `tissues` (numbers), and of the Poisson's ratios of those of `poisson`.
+    """Modes of ln E in each of the meshed `tissues` (numbers), and one of the Poisson's ratio of each of `poisson`.
 
     Fields are Karhunen-Loeve modes of a Gaussian kernel of length_mm and standard deviation 1, less their mean by
     volume: the modulus of a tissue is the geometric mean over it.
@@ -106,6 +107,6 @@ def material_forces(
     if n_fields:
         total += summed(elements.forces(nodal, moduli), np.asarray(modes.fields @ along[:n_fields]))
     if modes.poisson:
-        own = np.stack([tissue == number for number in modes.poisson], axis=1).astype(np.float64)
+        own = np.stack([np.isin(tissue, group) for group in modes.poisson], axis=1).astype(np.float64)
         total += summed(elements.forces(nodal, by_poisson), own @ along[n_fields:])
     return total

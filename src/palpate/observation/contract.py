@@ -286,6 +286,11 @@ class Imaged(Protocol):
         """Index of the tissue whose voxels it is made of."""
         ...
 
+    @property
+    def stated_noise(self) -> NoiseModel | None:
+        """The noise of the images' drawing that a case states; None where the residuals are to tell."""
+        ...
+
     def imaging_error(self, residuals: Residuals, before: Segmentation, after: Segmentation) -> NDArray[np.float64]:
         """Errors (n,) mm of the residuals when the model itself is imaged: `before` at rest, `after` deformed."""
         ...

@@ -15,12 +15,13 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from palpate.report.report_data import ReportData
 from palpate.report.rows import interval_text, main_numbers, moduli_in, number
 from palpate.report.svg import INK, draw_svg
+from palpate.uncertainty import NORMAL_95
 
 __all__ = ["profile_svg", "region_svg", "repeats_svg"]
 
 SIZE = (3.9, 2.5)
 DASHED = (0, (4, 3))
-LIMIT = 1.96**2  # deviance at the ends of a 95 % interval
+LIMIT = NORMAL_95**2  # deviance at the ends of a 95 % interval
 
 
 def profile_svg(data: ReportData, estimate: int, *, name: str) -> str:

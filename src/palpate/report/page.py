@@ -36,6 +36,7 @@ from palpate.report.rows import estimate_rows, moduli_in, number, ratio_rows, sc
 from palpate.report.scales import Scale, angle_scale, distance_scale, modulus_scale, strain_scale
 from palpate.report.section import VIEWS
 from palpate.report.slices import alignment_svg, contour_names, first_planes, points_svg, slice_svg
+from palpate.report.tornado import tornado_svg
 
 __all__ = ["Picture", "render"]
 
@@ -143,6 +144,11 @@ def render(data: ReportData) -> str:
             _picture(" and ".join(region["tissues"]), partial(region_svg, data, i, name=f"region{i}"))
             for i, region in enumerate(data.document.get("regions", ()))
             if fixed.issuperset(region["tissues"])
+        ),
+        tornados=tuple(
+            _picture(item["tissue"], partial(tornado_svg, data.document, item["tissue"], name=f"change{i}"))
+            for i, item in enumerate(moduli_in(data.document))
+            if item["tissue"] in fixed and data.document.get("variations")
         ),
         repeats=tuple(
             _picture(f"Repeats of {item['tissue']}", partial(repeats_svg, data, i, name=f"repeats{i}"))

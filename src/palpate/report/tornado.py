@@ -21,6 +21,7 @@ NAMES = {
     "segmentation": "surface of {}",
     "driver_prior": "prior of the drivers' motion",
     "driver_modes": "modes of the drivers' motion",
+    "frame": "motion of the frame",
     "law": "material law",
     "outer_boundary": "outer boundary",
     "edge_length": "edge length of the mesh",
@@ -59,7 +60,7 @@ class TornadoRow:
 
 
 def tornado_rows(document: Mapping[str, Any], tissue: str) -> tuple[TornadoRow, ...]:
-    """Those of one tissue of a document sensitivity.json, the largest effect first."""
+    """Those of one tissue of a document sensitivity.json or result.json, the largest effect first."""
     groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for variation in document["variations"]:
         groups.setdefault((variation["cause"], variation["subject"]), []).append(variation)

@@ -277,7 +277,7 @@ def make_body(states: ImagedStates, case: Case, *, progress: Progress) -> Body:
             direction,
             mechanics.material_law,
             dilatation=choose_element(mechanics.element).dilatation,
-            material=_material(space.mesh, case),
+            material=_material(space.mesh, layers, case),
         )
 
     terms = [(source.file.state, *source.on(space, reaction_of)) for source in states.data]
@@ -428,22 +428,28 @@ def _models(body: Body, case: Case, first: int) -> list[tuple[LinearModel, Presc
                 loads=loads,
                 solver=case.mechanics.solver,
                 open_poisson=_open_poisson(case, body.space.mesh),
-                material=_material(body.space.mesh, case),
+                material=_material(body.space.mesh, body.layers, case),
             )
         )
         models.append((made, motion))
     return models
 
 
-def _material(mesh: TetMesh, case: Case) -> MaterialModes:
-    """How the tissues of a body may differ from homogeneous ones with the Poisson's ratios that the case gives."""
+def _material(mesh: TetMesh, layers: Sequence[Layer], case: Case) -> MaterialModes:
+    """How the tissues of a body may differ from homogeneous ones with the Poisson's ratios that the case gives.
+
+    The layers of a tissue have its Poisson's ratio.
+    """
     sought = _open_poisson(case, mesh)
     meshed = [i for i, tissue in enumerate(mesh.tissues) if tissue.meshed]
+    of_layers = [(n, layer.tissue) for n, layer in enumerate(layers, start=len(mesh.tissues))]
+    free = [i for i in meshed if mesh.tissues[i].name not in sought]
+    parts = [(i, *(n for n, tissue in of_layers if tissue == i)) for i in free]
     return material_modes(
         mesh,
         meshed if case.discrepancy.heterogeneity_sd else (),
         length_mm=case.discrepancy.heterogeneity_length_mm,
-        poisson=[i for i in meshed if mesh.tissues[i].name not in sought] if case.discrepancy.poisson_sd else (),
+        poisson=parts if case.discrepancy.poisson_sd else (),
     )
 
 

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.errors import EstimationError
 from palpate.findings import Finding
 from palpate.inversion import (
     Bounds,
@@ -31,7 +32,9 @@ from palpate.study.estimate_findings import data_findings, fold_findings, invers
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio, ratio_verdict
 from palpate.study.samples import CHAINS, ModulusSamples, draw_moduli, sample_findings
 from palpate.study.together import ImagePairs, ModulusRegion, combinations_of, image_pairs_of, regions_of
+from palpate.study.variations import Variation
 from palpate.uncertainty import (
+    GRID_DRAWS,
     Combination,
     Covariance,
     FittedState,
@@ -62,7 +65,6 @@ __all__ = [
     "verdict",
 ]
 
-GRID_DRAWS = 8
 IDENTIFIED, WEAK = 4.0, 10.0  # largest ratio of an interval's ends: a factor of 2 to each side, and of 3.2
 
 
@@ -170,7 +172,7 @@ class Estimation:
     what was believed before; discrepancy: what the images say of frame, drawing and material; combinations: what is
     known where single moduli are not; regions: joint ones of two moduli; forces, points: measured and fitted;
     image_pairs: what each of several later images says alone; samples: of the moduli's posterior,
-    where the case asks for them and the estimate converged.
+    where the case asks for them and the estimate converged; variations: what would change the answer.
     """
 
     status: str
@@ -194,6 +196,7 @@ class Estimation:
     poisson_ratios: tuple[PoissonRatioEstimate, ...] = ()
     forces: tuple[ForceFit, ...] = ()
     points: tuple[PointFit, ...] = ()
+    variations: tuple[Variation, ...] = ()
 
     @property
     def correlation(self) -> NDArray[np.float64]:
@@ -229,12 +232,12 @@ def conclude(
     objective, minimum = inversion.objective, inversion.minimum
     rng = np.random.default_rng(seed)
     progress(f"intervals: correlation of the residuals, and the model as {GRID_DRAWS} random voxel grids show it")
-    errors = grid_errors(objective, minimum.evaluation, observed.states, draws=GRID_DRAWS, rng=rng)
+    errors = grid_errors(objective, minimum.evaluation, observed.states, rng=rng)
     covariance = covariance_of(objective, minimum.evaluation, errors, unknowns=minimum.unknowns)
     progress("intervals: profiles, and the fit of every surface before and after")
     pairs = image_pairs_of(inversion, settings.bounds, errors)
     fixed = frozen_posterior(objective, minimum.unknowns, minimum.evaluation)
-    released = with_released(inversion, settings, progress=progress)
+    released, remark = _released(inversion, settings, progress)
     known = _intervals(inversion, fixed, settings.bounds, covariance, released) if minimum.converged else ()
     estimates = _estimates(inversion, known, covariance, truth)
     of_moduli = covariance.total[: len(estimates), : len(estimates)]
@@ -249,6 +252,7 @@ def conclude(
     found_discrepancy = discrepancy_of(inversion, observed.states) if minimum.converged else FoundDiscrepancy()
     findings = (
         *inversion_findings(inversion, covariance.total),
+        *remark,
         *pair_findings(pairs),
         *fold_findings(observed.states),
         *data_findings(inversion),
@@ -365,22 +369,44 @@ def _intervals(
     others = [c for c in inversion.candidates if c is not best and c.minimum.converged]
     least = np.diag(inversion.minimum.evaluation.covariance_columns(n)[:n])
     scales = least / variances  # of a profile's deviance
+    wider = [] if released is None else _released_intervals(released, variances - least, bounds)
     for i in range(n):
         limits = {"lower": float(np.exp(bounds.lower[i])), "upper": float(np.exp(bounds.upper[i]))}
         own = modulus_interval(fixed, inversion.minimum, i, variance=float(variances[i]), bounds=bounds)
         sd = float(np.sqrt(variances[i]))
         good = [c.minimum.unknowns for c in others if as_good(c.value, best.value, scale=float(scales[i]))]
-        wider = [] if released is None else [_released_interval(released, i, float(variances[i] - least[i]), bounds)]
-        interval = hull([own.ends, *(log_interval(float(np.exp(x[i])), sd, **limits) for x in good), *wider])
+        ellipses = (log_interval(float(np.exp(x[i])), sd, **limits) for x in good)
+        interval = hull([own.ends, *ellipses, *wider[i : i + 1]])
         found.append(_Known(own, interval, bool(at_bound[i])))
     return tuple(found)
 
 
-def _released_interval(released: OuterIterate, number: int, beyond: float, bounds: Bounds) -> Interval:
-    """The interval of a parameter where released blocks are free; beyond: its variance by what is no least squares."""
-    free = frozen_posterior(released.objective, released.minimum.unknowns, released.minimum.evaluation)
-    variance = float(released.minimum.evaluation.covariance_columns(number + 1)[number, number]) + beyond
-    return modulus_interval(free, released.minimum, number, variance=variance, bounds=bounds).ends
+def _released(
+    inversion: Inversion, settings: InversionSettings, progress: Progress
+) -> tuple[OuterIterate | None, tuple[Finding, ...]]:
+    """The minimum with released blocks free, where there is one, and what is told where there should be."""
+    try:
+        found = with_released(inversion, settings, progress=progress)
+    except EstimationError as error:
+        found, why = None, str(error)
+    else:
+        if found is None or found.minimum.converged:
+            return found, ()
+        why = found.minimum.outcome.value
+    text = (
+        f"with the stiffness of layers round organs free the estimate did not end ({why}), so that the intervals do not"
+        " hold what a soft or stiff layer would do; another [mesh] edge_length_mm may help, or [discrepancy]"
+        " layer_sd = 0 where there is none"
+    )
+    return found, (Finding("unsettled", text),)
+
+
+def _released_intervals(released: OuterIterate, beyond: NDArray[np.float64], bounds: Bounds) -> list[Interval]:
+    """Of each parameter where released blocks are free; beyond (n,): its variance by what is no least squares."""
+    minimum, n = released.minimum, len(beyond)
+    free = frozen_posterior(released.objective, minimum.unknowns, minimum.evaluation)
+    variances = np.diag(minimum.evaluation.covariance_columns(n)[:n]) + beyond
+    return [modulus_interval(free, minimum, i, variance=float(variances[i]), bounds=bounds).ends for i in range(n)]
 
 
 def _estimates(

@@ -27,13 +27,13 @@ from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import FitResponse, NoiseModel, fit_noise_model
 from palpate.progress import Progress, silent
 from palpate.study.schema import nearest
+from palpate.uncertainty import NORMAL_95
 
 __all__ = ["ALIGNMENTS", "DrawnSurface", "NullPair", "drawing_noise", "noise_of_drawings"]
 
 ALIGNMENTS = ("auto", "surfaces", "none")
 MOST_POINTS = 20_000  # of a surface
 LEAST_POINTS = 100
-USUAL = 1.96  # standard deviations of a 95 % interval
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +163,7 @@ def noise_of_drawings(first: LabelImage, second: LabelImage, *, align: str = "au
         offset = float(share @ residual)
         noise = _fitted([residual - offset], [surface], centre, aligned=aligned)
         variance = float(noise.covariance(share[None], surface.places, surface.normals)[0, 0])
-        half = USUAL * float(np.sqrt(variance))
+        half = NORMAL_95 * float(np.sqrt(variance))
         one, interval = _one_drawing(noise), (offset - half, offset + half)
         found.append(DrawnSurface(name, *one, offset, interval, len(residual)))
         deviations.append(residual - offset)

@@ -153,6 +153,7 @@ class CaseResult:
             "correlation": estimation.correlation.tolist(),
             "information": known and _plain(known),
             "information_shares": {tissue: dict(of) for tissue, of in estimation.information_shares.items()},
+            "variations": [_plain(variation) for variation in estimation.variations],
             "combinations": [_plain(pair) for pair in estimation.combinations],
             "regions": [_plain(region) for region in estimation.regions],
             "image_pairs": pairs and _plain(pairs) | {"alone": alone},

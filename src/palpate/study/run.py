@@ -8,14 +8,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from palpate.errors import ConfigurationError
+from palpate.errors import ConfigurationError, EstimationError
 from palpate.findings import Finding, of_pair
 from palpate.images.tissue import Role
 from palpate.inversion import Bounds, Inversion, InversionSettings, ParameterMap, eta_of_ratio, invert
+from palpate.mechanics.dilatation import choose_element
+from palpate.mechanics.laws.registry import law_named
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Forecast, Progress, about, during, silent
 from palpate.study.body import Body, ImagedStates, joint_problem, make_body
-from palpate.study.case import SOUGHT_RATIOS, Case
+from palpate.study.case import LAW_NAMES, SOUGHT_RATIOS, Case, Mechanics
 from palpate.study.cost import ExpectedCost, cost_of_meshes, expected_cost
 from palpate.study.estimation import Estimation, Observed, conclude
 from palpate.study.plausibility import estimate_warnings, unit_warnings
@@ -27,6 +29,7 @@ from palpate.study.samples import require_samples
 from palpate.study.simulate import simulate
 from palpate.study.strain_range import linear_strain_warnings
 from palpate.study.summary import mesh_summary
+from palpate.study.variations import Variation, voxel_mm, what_would_change
 from palpate.uncertainty import FittedState
 
 __all__ = [
@@ -118,6 +121,9 @@ def estimate_states(
         samples=case.estimate.samples,
         progress=stating,
     )
+    if inversion.minimum.converged:
+        stating("what would change the answer: surfaces, constants, frame and law by a step each")
+        estimation = replace(estimation, variations=_what_would_change(inversion, settings, case, bodies))
     clock.append(time.perf_counter())
     stages = np.diff(clock)
     seconds = {"read": read_seconds, "mesh": stages[0], "assemble": stages[1], "estimate": stages[2]}
@@ -150,6 +156,28 @@ def mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
     seconds = {"total": round(time.perf_counter() - began, 3)}
     provenance = Provenance(seconds, inputs, software_versions())
     return MeshResult(case, body.space, mesh_summary(body), states.before, provenance, _remarks(case, body))
+
+
+def _what_would_change(
+    inversion: Inversion, settings: InversionSettings, case: Case, bodies: tuple[Body, ...]
+) -> tuple[Variation, ...]:
+    """What the estimate of a case rests on; nothing where not even the estimate itself can be followed.
+
+    Laws at finite strain differ from each other by less than from the linear one, which is held against one of them.
+    """
+    mechanics, later = case.mechanics, [image for body in bodies for image in body.states.after]
+    names = LAW_NAMES if mechanics.material_law.finite else (Mechanics().law,)
+    try:
+        return what_would_change(
+            inversion,
+            settings,
+            bodies[0].layered.mesh.tissues,
+            [law_named(name) for name in names if name != mechanics.law],
+            dilatation=choose_element(mechanics.element).dilatation,
+            voxel_mm=voxel_mm(later),
+        )
+    except EstimationError:
+        return ()
 
 
 def _forecast(cost: ExpectedCost) -> Forecast:

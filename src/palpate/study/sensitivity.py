@@ -41,7 +41,7 @@ from palpate.study.provenance import input_digests, software_versions
 from palpate.study.read import read_pairs, read_states
 from palpate.study.result import Provenance, closing, json_object
 from palpate.study.run import fitted_states, inversion_settings, refuse_what_cannot_be_estimated
-from palpate.study.variations import SobolResult, Variation, fast_variations, sobol_result
+from palpate.study.variations import SobolResult, Variation, fast_variations, sobol_result, voxel_mm
 from palpate.uncertainty import require_salib
 
 __all__ = ["KEPT", "Kept", "Sensitivity", "sensitivity"]
@@ -216,7 +216,7 @@ def _estimated(case: Case, bodies: Bodies, sobol: int, progress: Progress) -> di
     estimation = conclude(inversion, settings, observed, truth={}, seed=case.seed, progress=progress)
     given: dict[str, Any] = {
         "dilatation": choose_element(case.mechanics.element).dilatation,
-        "voxel_mm": float(np.mean([image.grid.voxel_volume ** (1.0 / 3.0) for image in later])),
+        "voxel_mm": voxel_mm(later),
     }
     tissues = bodies[0].space.mesh.tissues
     progress("constants, surfaces, modes and prior changed on the fast path")

@@ -2,28 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import EstimationError, SolverError
+from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.inversion import Inversion, InversionSettings
 from palpate.mechanics.dilatation import Dilatation
+from palpate.mechanics.laws.contract import Law
+from palpate.observation.contract import Imaged
 from palpate.parallel import mapped
 from palpate.uncertainty import (
+    Equilibria,
     Errors,
     FastPath,
+    Shift,
+    exact_equilibria,
     fast_path,
+    law_errors,
     modulus_errors,
     poisson_errors,
     sobol_indices,
     surface_errors,
 )
 
-__all__ = ["Range", "SobolResult", "Variation", "fast_variations", "sobol_result"]
+__all__ = ["Range", "SobolResult", "Variation", "fast_variations", "sobol_result", "voxel_mm", "what_would_change"]
 
 POISSON_STEP = 0.02
 KNOWN_FACTOR = 1.2
@@ -96,6 +104,11 @@ class _Input:
         return Range(self.cause, self.subject, min(ends), max(ends), self.unit)
 
 
+def voxel_mm(later: Sequence[Segmentation]) -> float:
+    """Mean edge, mm, of the voxels of later images; 1 where there are none."""
+    return float(np.mean([image.grid.voxel_volume ** (1.0 / 3.0) for image in later])) if later else 1.0
+
+
 def fast_variations(
     inversion: Inversion,
     settings: InversionSettings,
@@ -110,27 +123,62 @@ def fast_variations(
     `EstimationError`, `SolverError` where the estimate itself cannot be changed at all.
     """
     path = fast_path(inversion.objective, inversion.minimum, settings.bounds)
-    names = inversion.objective.parameters.tissues
-    jobs: list[tuple[_Input, float, str]] = [
-        (each, amount, words)
-        for each in _inputs(inversion, tissues, dilatation, voxel_mm)
-        for amount, words in each.amounts
+    names, equilibria = inversion.objective.parameters.tissues, _equilibria(inversion)
+    found = [
+        *_exact(inversion, tissues),
+        *_varied(path, names, _inputs(inversion, equilibria, tissues, dilatation, voxel_mm)),
+    ]
+    if inversion.objective.parameters.n_coefficients:
+        for width in PRIOR_WIDTHS:
+            change = partial(path.shift, width=width)
+            found.append(_stated(names, ("driver_prior", "", f"{width:g} times as wide"), change))
+        fewer = partial(path.shift, dropped=_finer_half(inversion))
+        found.append(_stated(names, ("driver_modes", "", "the smoother half alone"), fewer))
+    return tuple(found)
+
+
+def what_would_change(
+    inversion: Inversion,
+    settings: InversionSettings,
+    tissues: tuple[Tissue, ...],
+    laws: Sequence[Law],
+    *,
+    dilatation: Dilatation,
+    voxel_mm: float,
+) -> tuple[Variation, ...]:
+    """What an estimate rests on, in few lines: known modulus, surfaces by half a voxel, Poisson's ratios, frame, law.
+
+    A surface whose offset is an unknown of the estimate is none of them: no step from there says what another offset
+    would be found. laws: others than that of the estimate, which none has that seeks Poisson's ratios; otherwise as
+    `fast_variations`.
+    """
+    path, minimum = fast_path(inversion.objective, inversion.minimum, settings.bounds), inversion.minimum
+    names, equilibria = inversion.objective.parameters.tissues, _equilibria(inversion)
+    blocks = inversion.objective.parameters.blocks
+    offsets = {block.of for block in blocks if block.cause == "offset" and not block.considered}
+    inputs = [
+        replace(each, amounts=(each.amounts[0], each.amounts[-1]))
+        for each in _inputs(inversion, equilibria, tissues, dilatation, voxel_mm)
+        if not (each.cause == "segmentation" and each.subject in offsets)
+        if each.cause != "poisson_ratio" or each.subject == ALL
     ]
 
-    def vary(job: tuple[_Input, float, str]) -> Variation:
-        """One of them."""
-        each, amount, words = job
-        return _found(path, names, each.cause, each.subject, words, tuple(amount * error for error in each.errors))
+    def shifted(each: _Input, amount: float, words: str) -> Variation:
+        """Under the estimate's weights."""
+        change = partial(path.shift, tuple(amount * error for error in each.errors))
+        return _stated(names, (each.cause, each.subject, words), change)
 
-    found = [*_exact(inversion, tissues), *mapped(vary, jobs)]
-    if inversion.objective.parameters.n_coefficients:
-        found += [
-            _found(path, names, "driver_prior", "", f"{width:g} times as wide", None, width=width)
-            for width in PRIOR_WIDTHS
-        ]
-        dropped = _finer_half(inversion)
-        found.append(_found(path, names, "driver_modes", "", "the smoother half alone", None, dropped=dropped))
-    return tuple(found)
+    found = [*_exact(inversion, tissues), *(shifted(each, *amount) for each in inputs for amount in each.amounts)]
+    frame = np.concatenate([np.zeros(0, dtype=bool), *(np.full(b.size, b.cause == "frame") for b in blocks)])
+    if frame.any():
+        found.append(_stated(names, ("frame", "", "held still"), partial(path.shift, dropped=frame)))
+
+    def under(law: Law) -> Callable[[], Shift]:
+        """What a step to another law's equilibrium does."""
+        return lambda: path.shift(law_errors(minimum.evaluation, equilibria, law, dilatation))
+
+    sought = inversion.objective.parameters.poisson
+    return (*found, *(_stated(names, ("law", "", law.name), under(law)) for law in laws if not sought))
 
 
 def sobol_result(
@@ -149,7 +197,8 @@ def sobol_result(
     """
     path = fast_path(inversion.objective, inversion.minimum, settings.bounds)
     mapping = inversion.objective.parameters
-    inputs = [each for each in _inputs(inversion, tissues, dilatation, voxel_mm) if each.subject != ALL]
+    of = _inputs(inversion, _equilibria(inversion), tissues, dilatation, voxel_mm)
+    inputs = [each for each in of if each.subject != ALL]
     ranges = [*(each.range for each in inputs), *_ranges(inversion, tissues)]
     causes = [each.cause for each in ranges[len(inputs) :]]
 
@@ -188,7 +237,7 @@ def _ranges(inversion: Inversion, tissues: tuple[Tissue, ...]) -> list[Range]:
     """Those of what changes no residual: a known modulus that alone sets the scale, and the drivers' prior."""
     found = []
     if _exact(inversion, tissues):
-        (known,) = (tissue.name for tissue in tissues if tissue.role is Role.KNOWN)
+        (known,) = {tissue.name for tissue in tissues if tissue.role is Role.KNOWN}
         scale = float(np.log(KNOWN_FACTOR))
         found.append(Range("known_modulus", known, -scale, scale, "ln E"))
     if inversion.objective.parameters.n_coefficients:
@@ -197,14 +246,31 @@ def _ranges(inversion: Inversion, tissues: tuple[Tissue, ...]) -> list[Range]:
     return found
 
 
+def _equilibria(inversion: Inversion) -> Equilibria:
+    return exact_equilibria(inversion.objective, inversion.minimum.unknowns)
+
+
+def _varied(path: FastPath, names: tuple[str, ...], inputs: Sequence[_Input]) -> list[Variation]:
+    """Every input changed by each of its amounts."""
+    jobs = [(each, amount, words) for each in inputs for amount, words in each.amounts]
+
+    def vary(job: tuple[_Input, float, str]) -> Variation:
+        """One of them."""
+        each, amount, words = job
+        errors = tuple(amount * error for error in each.errors)
+        return _stated(names, (each.cause, each.subject, words), partial(path.under, errors))
+
+    return mapped(vary, jobs)
+
+
 def _inputs(
-    inversion: Inversion, tissues: tuple[Tissue, ...], dilatation: Dilatation, voxel_mm: float
+    inversion: Inversion, equilibria: Equilibria, tissues: tuple[Tissue, ...], dilatation: Dilatation, voxel_mm: float
 ) -> tuple[_Input, ...]:
     """Poisson's ratio of each tissue and of all, each observed surface, known moduli where several set the scale."""
     objective, minimum = inversion.objective, inversion.minimum
     model = objective.states[0].model
     regions = [model.space.mesh.tissues[region] for region in model.regions]
-    by_poisson = poisson_errors(objective, minimum.unknowns, minimum.evaluation, dilatation)
+    by_poisson = poisson_errors(minimum.evaluation, equilibria, dilatation)
     found = []
     numbers = {name: [i for i, t in enumerate(regions) if t.name == name] for name in (t.name for t in regions)}
     for name, own in numbers.items():  # layers round organs are regions of their tissue
@@ -215,7 +281,7 @@ def _inputs(
         steps = _poisson_steps(max(tissue.poisson_ratio for tissue in regions))
         words = tuple((step, f"{step:+.3g}") for step in steps)
         found.append(_Input("poisson_ratio", ALL, "", tuple(e.sum(axis=1) for e in by_poisson), words))
-    for name in dict.fromkeys(observation.name for observation in objective.observations):
+    for name in dict.fromkeys(o.name for o in objective.observations if isinstance(o, Imaged)):
         amounts = tuple((voxel_mm * share, f"{share:+g} voxel") for share in VOXELS)
         found.append(_Input("segmentation", name, "mm", surface_errors(minimum.evaluation, name), amounts))
     if not _exact(inversion, tissues):
@@ -238,7 +304,7 @@ def _poisson_steps(ratio: float) -> tuple[float, float]:
 def _exact(inversion: Inversion, tissues: tuple[Tissue, ...]) -> list[Variation]:
     """The known modulus, where it alone sets the scale: every other one is proportional to it."""
     mapping = inversion.objective.parameters
-    known = [tissue.name for tissue in tissues if tissue.role is Role.KNOWN]
+    known = list(dict.fromkeys(tissue.name for tissue in tissues if tissue.role is Role.KNOWN))  # layers are of theirs
     loaded = any(state.model.load.any() for state in inversion.objective.states)
     if len(known) != 1 or loaded or not mapping.absolute:
         return []
@@ -258,24 +324,14 @@ def _finer_half(inversion: Inversion) -> NDArray[np.bool_]:
     return np.concatenate(dropped)
 
 
-def _found(
-    path: FastPath,
-    names: tuple[str, ...],
-    cause: str,
-    subject: str,
-    setting: str,
-    errors: Errors | None,
-    *,
-    width: float = 1.0,
-    dropped: NDArray[np.bool_] | None = None,
-) -> Variation:
-    """One variation on the fast path; an estimate that is none says why."""
+def _stated(names: tuple[str, ...], what: tuple[str, str, str], change: Callable[[], Shift]) -> Variation:
+    """A variation of cause, subject and setting by its shift on the fast path; one without an estimate says why."""
     try:
-        shift = path.under(errors) if errors is not None else path.shift(width=width, dropped=dropped)
+        shift = change()
     except (SolverError, EstimationError) as error:
-        return Variation(cause, subject, setting, "linearised", None, reason=str(error))
+        return Variation(*what, "linearised", None, reason=str(error))
     if not shift.converged:
-        return Variation(cause, subject, setting, "linearised", None, reason="the estimate did not converge")
-    changes = dict(zip(names, shift.theta.tolist(), strict=True))
-    at_bound = tuple(name for name, ended in zip(names, shift.at_bound, strict=True) if ended)
-    return Variation(cause, subject, setting, "linearised", changes, at_bound)
+        return Variation(*what, "linearised", None, reason="the estimate did not converge")
+    changes = dict(zip(names, shift.theta.tolist(), strict=False))
+    at_bound = tuple(name for name, ended in zip(names, shift.at_bound, strict=False) if ended)
+    return Variation(*what, "linearised", changes, at_bound)

@@ -2,6 +2,7 @@
 
 from palpate.uncertainty.combinations import Combination, Information, information, information_shares, known_pairs
 from palpate.uncertainty.covariance import (
+    GRID_DRAWS,
     Covariance,
     FittedState,
     GridErrors,
@@ -23,10 +24,13 @@ from palpate.uncertainty.profile import FixedCorrespondence, Profile, fixed_corr
 from palpate.uncertainty.refit import refitted
 from palpate.uncertainty.sampling import PosteriorChains, posterior_chains, sample_posterior
 from palpate.uncertainty.sensitivity import (
+    Equilibria,
     Errors,
     FastPath,
     Shift,
+    exact_equilibria,
     fast_path,
+    law_errors,
     modulus_errors,
     poisson_errors,
     surface_errors,
@@ -34,11 +38,13 @@ from palpate.uncertainty.sensitivity import (
 from palpate.uncertainty.sobol import SobolIndices, require_salib, sobol_indices
 
 __all__ = [
+    "GRID_DRAWS",
     "NORMAL_95",
     "Agreement",
     "ChainDiagnostics",
     "Combination",
     "Covariance",
+    "Equilibria",
     "Errors",
     "FastPath",
     "FittedState",
@@ -58,6 +64,7 @@ __all__ = [
     "chain_diagnostics",
     "covariance_of",
     "discretisation_sd",
+    "exact_equilibria",
     "fast_path",
     "fixed_correspondence",
     "frozen_posterior",
@@ -69,6 +76,7 @@ __all__ = [
     "information_shares",
     "joint_region",
     "known_pairs",
+    "law_errors",
     "log_interval",
     "mesh_covariance",
     "modulus_errors",

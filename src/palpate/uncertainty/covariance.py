@@ -25,6 +25,7 @@ from palpate.parallel import mapped
 from palpate.uncertainty.discretisation import discretisation_sd
 
 __all__ = [
+    "GRID_DRAWS",
     "Covariance",
     "FittedState",
     "GridErrors",
@@ -45,6 +46,7 @@ __all__ = [
 GridErrors = Sequence[Sequence[NDArray[np.float64]]]
 """Errors (n,) mm of the residuals of each observation, of each draw of a grid."""
 
+GRID_DRAWS = 8
 ROUNDING = 1e-9  # of a variance
 MARGIN_MM, MARGIN_VOXELS = 12.0, 8.0  # around the residuals' places, further than a distance map there is smoothed
 
@@ -290,7 +292,7 @@ def grid_position_shifts(
     evaluation: Evaluation,
     states: tuple[FittedState, ...],
     *,
-    draws: int,
+    draws: int = GRID_DRAWS,
     rng: np.random.Generator,
 ) -> NDArray[np.float64]:
     """Shifts (draws, n_parameters) of the estimated log-moduli when an exact model is imaged on random grids.
@@ -306,7 +308,7 @@ def grid_errors(
     evaluation: Evaluation,
     states: tuple[FittedState, ...],
     *,
-    draws: int,
+    draws: int = GRID_DRAWS,
     rng: np.random.Generator,
 ) -> GridErrors:
     """Errors e (n,) mm of the residuals of each observation, on so many random grids (see `imaging_errors`).
@@ -334,7 +336,8 @@ def grid_covariance(
     is the less only where it is no kernel's: then the positive part of the difference, with which the noise is at least
     as large as each of the two in every direction.
     """
-    if any(getattr(line.observation, "stated_noise", None) is not None for line in evaluation.lines):
+    seen = [line.observation for line in evaluation.lines]
+    if any(isinstance(o, Imaged) and o.stated_noise is not None for o in seen):
         return grid
     sizes, axes = np.linalg.eigh(grid - noise)
     return np.asarray((axes * np.maximum(sizes, 0.0)) @ axes.T)

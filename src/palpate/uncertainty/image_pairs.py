@@ -34,9 +34,7 @@ __all__ = ["Agreement", "PairEstimates", "agreement", "pair_estimates"]
 OUTLIER = 0.01  # probability, over all pairs together, of calling one an outlier that is none
 MOST_OUTLIERS = 4  # one of so many: where more contradict the others the pairs differ, and none is wrong
 LEAST_PAIRS = 3  # of two that differ nobody can say which is wrong
-BETWEEN_GRIDS = (
-    0.5  # of what few draws say of two pairs together: all of it would leave combinations without a variance
-)
+BETWEEN_GRIDS = 0.5  # of what few draws say of two pairs together: all of it leaves combinations without variance
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ foretells. The drivers' prior and their modes are changed under the estimate's o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,19 +17,35 @@ from numpy.typing import NDArray
 from palpate.inversion import Bounds, Evaluation, Linearisation, Minimum, Objective, gauss_newton
 from palpate.inversion.expansion import Expansion
 from palpate.mechanics.dilatation import Dilatation
-from palpate.mechanics.finite_strain import FiniteStrainEquilibrium
+from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, finite_strain_model
+from palpate.mechanics.hyperelastic import elements_of
+from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.linear_model import LinearEquilibrium, poisson_tangents
+from palpate.mechanics.newton import NewtonSettings
 from palpate.observation.contract import Imaged
 from palpate.uncertainty.profile import FixedCorrespondence, fixed_correspondence
 from palpate.uncertainty.refit import refitted
 
-__all__ = ["Errors", "FastPath", "Shift", "fast_path", "modulus_errors", "poisson_errors", "surface_errors"]
+__all__ = [
+    "Equilibria",
+    "Errors",
+    "FastPath",
+    "Shift",
+    "exact_equilibria",
+    "fast_path",
+    "law_errors",
+    "modulus_errors",
+    "poisson_errors",
+    "surface_errors",
+]
 
 TOLERANCE = 1e-6  # decrement of a minimum
 STEPS = 120  # at the most: a modulus that runs away has far to go
+COARSE = NewtonSettings(tolerance=2e-3, step_tolerance=1e-2)  # of the forces, under another law
 DROPPED = 1e10  # precision of a coefficient that is held at 0: its own is 1
 
 Errors = tuple[NDArray[np.float64], ...]  # changes (n,) mm of each observation's residuals
+Equilibria = Sequence[LinearEquilibrium | FiniteStrainEquilibrium]  # of each later state
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,27 +110,76 @@ def fast_path(objective: Objective, minimum: Minimum, bounds: Bounds) -> FastPat
     return FastPath(fixed, gauss_newton(fixed, minimum.unknowns, bounds=bounds, tolerance=TOLERANCE), bounds)
 
 
+def exact_equilibria(objective: Objective, unknowns: NDArray[np.float64]) -> Equilibria:
+    """The equilibrium of each later state at unknowns (n_unknowns,), with its factorisation; raises `SolverError`."""
+    found: list[LinearEquilibrium | FiniteStrainEquilibrium] = []
+    for state, of, place in zip(objective.states, objective.approximations, objective.places(unknowns), strict=True):
+        found.append(
+            of.equilibrium if isinstance(of, Expansion) else state.model.solve(place.moduli, place.coefficients)
+        )
+    return tuple(found)
+
+
 def poisson_errors(
-    objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation, dilatation: Dilatation
+    evaluation: Evaluation,
+    equilibria: Equilibria,
+    dilatation: Dilatation,
 ) -> Errors:
     """Derivatives (n, n_regions) mm of each observation's residuals by the Poisson's ratios of the regions.
 
-    At unknowns (n_unknowns,) and held moduli and coefficients; dilatation: that of the element. Raises `SolverError`.
+    At the equilibria of the later states, held moduli and coefficients; dilatation: that of the element.
     """
-    tangents = []
-    places = objective.places(unknowns)
-    for state, approximation, place in zip(objective.states, objective.approximations, places, strict=True):
-        there: FiniteStrainEquilibrium | LinearEquilibrium
-        if isinstance(approximation, Expansion):
-            there = approximation.equilibrium
-            tangents.append(there.poisson_tangents())
-        else:
-            there = state.model.solve(place.moduli, place.coefficients)
-            tangents.append(poisson_tangents(there, dilatation))
+    tangents = [
+        there.poisson_tangents() if isinstance(there, FiniteStrainEquilibrium) else poisson_tangents(there, dilatation)
+        for there in equilibria
+    ]
+    return _of_displacements(evaluation, tangents)
+
+
+def law_errors(
+    evaluation: Evaluation,
+    equilibria: Equilibria,
+    law: Law,
+    dilatation: Dilatation,
+) -> Errors:
+    """Changes (n,) mm of each observation's residuals when the bodies follow another law at the same moduli.
+
+    Newton's method leads from each equilibrium to that of the other law, with the factorisation that is there. Raises
+    `NotConverged` where there is none.
+    """
+    return _of_displacements(evaluation, [_under_law(there, law, dilatation) for there in equilibria])
+
+
+def _of_displacements(evaluation: Evaluation, changes: Sequence[NDArray[np.float64]]) -> Errors:
+    """Changes of each observation's residuals, mm, by changes (n_dof, ...) mm of the states' displacements."""
     return tuple(
-        np.asarray(line.residuals.smooth_jacobian @ tangents[line.state][line.observation.dofs])
+        np.asarray(line.residuals.smooth_jacobian @ changes[line.state][line.observation.dofs])
         for line in evaluation.lines
     )
+
+
+def _under_law(
+    there: LinearEquilibrium | FiniteStrainEquilibrium, law: Law, dilatation: Dilatation
+) -> NDArray[np.float64]:
+    """By how much (n_dof,) mm a body moves further under another law."""
+    if isinstance(there, FiniteStrainEquilibrium):
+        exact = there if there.factorisation else there.refactorised()
+        other = replace(exact.model, elements=elements_of(exact.model.space, law, dilatation))
+        moduli, factorisation = exact.moduli, exact.factorisation
+    else:
+        model, moduli, factorisation = there.system.model, there.system.moduli, there.system.factorisation
+        other = finite_strain_model(
+            model.space,
+            model.constraint,
+            law,
+            dilatation=dilatation,
+            loads=model.conditions.loads,
+            material=model.material,
+        )
+    found = replace(other, settings=COARSE).solve(
+        moduli, there.coefficients, start=there.displacement, nearby=factorisation
+    )
+    return np.asarray(found.values - there.values)
 
 
 def modulus_errors(objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation) -> Errors:

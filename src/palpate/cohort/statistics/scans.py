@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from palpate.cohort.records import Record
 from palpate.findings import Misleading
+from palpate.uncertainty import NORMAL_95
 
 __all__ = ["RULES", "UNFIT", "Scan", "Usable", "inside_fences", "usable_scans"]
 
@@ -22,7 +23,6 @@ RULES = (
     f"So is one with a warning that its images or its case are wrong: {', '.join(UNFIT)}.",
     "None of these warnings looks at the modulus that was found. Scans with other warnings enter and are counted.",
 )
-HALF_WIDTH = 1.959963984540054  # of a 95 % interval, in standard deviations
 LEAST_SD = 1e-3  # of ln E: nothing is known better
 FENCE = 1.5  # Tukey's, which box plots draw their outliers by (Exploratory Data Analysis, 1977)
 
@@ -58,7 +58,7 @@ class Scan:
     @property
     def sd(self) -> float:
         """Standard deviation of its logarithm by its 95 % interval; of a scan with a value."""
-        return max(math.log((self.high95 or 1.0) / (self.low95 or 1.0)) / (2.0 * HALF_WIDTH), LEAST_SD)
+        return max(math.log((self.high95 or 1.0) / (self.low95 or 1.0)) / (2.0 * NORMAL_95), LEAST_SD)
 
 
 @dataclass(frozen=True, slots=True)
