@@ -14,6 +14,7 @@ import pytest
 
 from palpate.findings import Finding
 from palpate.images.label_image import LabelImage, VoxelGrid
+from palpate.images.readers import read
 from palpate.images.segmentation import segment
 from palpate.images.tissue import Role
 from palpate.mesh.space import lagrange_space
@@ -173,8 +174,18 @@ TESTS = Path(__file__).parent
 
 
 def pytest_collection_modifyitems(items):
-    """The demo first, which takes a minute: one processor would wait for it at the end."""
-    items.sort(key=lambda item: item.path.name != "test_demo.py")
+    """Files with slow tests first, the demo before all: at the end one processor would wait for them."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: (item.path.name != "test_demo.py", item.path not in slow))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def images_read_here(request):
+    """Images are read in this process, not in one of their own, where reading is not what is tested."""
+    with pytest.MonkeyPatch.context() as patch:
+        if request.path.relative_to(TESTS).parts[0] in ("steps", "study"):
+            patch.setattr(read, "read_stored", lambda path, _kind, form, _limits, grid: form.stored(path, grid))
+        yield
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -54,7 +54,7 @@ def inputs(tmp_path_factory) -> Path:
     """Two pairs of images of balls with the same moduli, squeezed in different ways, on different grids."""
     folder = tmp_path_factory.mktemp("pairs")
     (folder / "other").mkdir()
-    for seed, place, voxel_mm in ((2, folder, 2.0), (3, folder / "other", 1.8)):
+    for seed, place, voxel_mm in ((2, folder, 1.5), (3, folder / "other", 1.4)):
         scene = coarse_balls(seed, voxel_mm)
         write_label_image(place / f"before_{seed}.nii.gz", scene.before)
         write_label_image(place / "after.nii.gz", scene.after)
