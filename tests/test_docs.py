@@ -12,12 +12,14 @@ import pytest
 import palpate
 from palpate.findings import CODES, HARMLESS, MISLEADING, WIDENING
 from palpate.mechanics.laws.registry import law_parameters
-from palpate.study.case import Domain, DriverMotion, Estimate, Mechanics, MeshSettings
+from palpate.study.case import CaseSurface, Domain, DriverMotion, Estimate, Mechanics, MeshSettings
 from palpate.study.case_file import read_case
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
-EXAMPLE, LOADS, *_ = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "case-file.md").read_text(), flags=re.DOTALL)
+EXAMPLE, LOADS, BORNE, DATA, BODY, *_ = re.findall(
+    r"```toml\n(.*?)```", (ROOT / "docs" / "case-file.md").read_text(), flags=re.DOTALL
+)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -48,6 +50,16 @@ def test_the_loads_in_the_docs_can_be_read(tmp_path):
     path = tmp_path / "case.toml"
     path.write_text(f"{EXAMPLE}\n{LOADS}")
     assert [load.kind for load in read_case(path).loads] == ["pressure", "traction", "gravity"]
+    path.write_text(f"{EXAMPLE}\n{BORNE}")
+    assert [load.state for load in read_case(path).loads] == [0, 1]
+
+
+def test_the_measurements_and_the_mesh_in_the_docs_can_be_read(tmp_path):
+    path = tmp_path / "case.toml"
+    path.write_text(f"{EXAMPLE}\n{DATA}")
+    assert [data.kind for data in read_case(path).data] == ["landmarks", "force"]
+    path.write_text(f'{BODY}\n[[data]]\nkind = "landmarks"\nfile = "markers.csv"\nsd_mm = 0.1\n')
+    assert read_case(path).surfaces == (CaseSurface("grip", "z_max"),)
 
 
 def test_the_reference_of_python_has_every_public_name():

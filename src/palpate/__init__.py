@@ -9,14 +9,15 @@ if TYPE_CHECKING:
     from typing import Any
 
     from palpate.export.folder import export
-    from palpate.steps.commands import check, estimate, init, make_mesh, noise, sensitivity, simulate
-    from palpate.steps.results import CaseResult
+    from palpate.steps.commands import check, estimate, init, make_mesh, noise, read_result, sensitivity, simulate
+    from palpate.steps.results import CaseResult, SavedResult
     from palpate.study.case import Case
     from palpate.study.case_file import read_case
 
 __all__ = [
     "Case",
     "CaseResult",
+    "SavedResult",
     "check",
     "estimate",
     "export",
@@ -24,6 +25,7 @@ __all__ = [
     "make_mesh",
     "noise",
     "read_case",
+    "read_result",
     "sensitivity",
     "simulate",
 ]
@@ -31,6 +33,7 @@ __all__ = [
 _HOMES = {
     "Case": "palpate.study.case",
     "CaseResult": "palpate.steps.results",
+    "SavedResult": "palpate.steps.results",
     "check": "palpate.steps.commands",
     "estimate": "palpate.steps.commands",
     "export": "palpate.export.folder",
@@ -38,6 +41,7 @@ _HOMES = {
     "make_mesh": "palpate.steps.commands",
     "noise": "palpate.steps.commands",
     "read_case": "palpate.study.case_file",
+    "read_result": "palpate.steps.commands",
     "sensitivity": "palpate.steps.commands",
     "simulate": "palpate.steps.commands",
 }
@@ -45,6 +49,13 @@ _HOMES = {
 
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first used: the command line answers before numpy is loaded."""
+    if name == "__version__":
+        return import_module("importlib.metadata").version("palpate")
     if name not in _HOMES:
         raise AttributeError(f"module 'palpate' has no attribute '{name}'")
     return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    """The public names, before any of them is used."""
+    return [*__all__, "__version__"]

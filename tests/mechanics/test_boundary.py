@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from palpate.errors import ConfigurationError, GeometryError
+from palpate.images.tissue import Role, Tissue
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mesh.space import lagrange_space
 from palpate.mesh.tet_mesh import TetMesh
@@ -125,6 +128,25 @@ def test_a_sliding_plane_alone_is_no_support_along_it(meshes):
         outer_constraint(space, outer="sliding", **nothing(meshes, space))
     assert "z (superior)" in str(caught.value)  # it may turn about the normal
     assert "translation along z" not in str(caught.value)  # but not leave the plane
+
+
+def test_a_body_glides_along_a_curved_surface_in_its_tangent_planes(meshes):
+    """A roof whose facets lie at 8 degrees to each other is one surface, and its edges with the walls are edges."""
+    roof = Tissue("rail", Role.SLIDING)
+    mesh = meshes.box_mesh(
+        4, tissues=[meshes.known("fat"), meshes.VOID, roof], beyond=lambda c: np.where(c[:, 2] > 1 - 1e-9, 2, -1)
+    )
+    nodes = mesh.nodes.copy()
+    nodes[:, 2] *= 1.0 - 0.3 * (nodes[:, 0] - 0.5) ** 2
+    space = lagrange_space(replace(mesh, nodes=nodes), "P1")
+    constraint = outer_constraint(space, outer="fixed", **nothing(meshes, space))
+    on_roof = np.unique(mesh.boundary[mesh.beyond == 2])
+    inside = on_roof[np.all((nodes[on_roof, :2] > 1e-9) & (nodes[on_roof, :2] < 1 - 1e-9), axis=1)]
+    assert set(free_directions(constraint)[inside]) == {2}
+    rows = constraint.free.toarray().reshape(-1, 3, constraint.free.shape[1])[inside]
+    slope = 0.6 * (nodes[inside, 0] - 0.5)
+    normals = np.stack([slope, np.zeros_like(slope), np.ones_like(slope)], axis=1)
+    assert np.abs(np.einsum("pic,pi->pc", rows, normals)).max() < 0.03
 
 
 def test_an_island_without_support_is_refused_even_when_the_rest_is_held(meshes):

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,7 @@ import pytest
 
 import palpate
 from palpate.cli import main
-from palpate.errors import ConfigurationError, ResourceError
+from palpate.errors import ConfigurationError, InputDataError, ResourceError
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers import write_label_image
 from palpate.study import run
@@ -61,6 +63,7 @@ def test_a_check_is_that_of_the_command(folder, capfd, kind):
     code = main(["check", str(case.path), "--json", "--set", "mesh.edge_length_mm=400"])
     report = palpate.check(kind(case.path), ["mesh.edge_length_mm=400"])
     assert (report.exit_code, code) == (4, 4)
+    assert palpate.check(palpate.read_case(kind(case.path), ["mesh.edge_length_mm=400"])).problems == report.problems
     told = json.loads(capfd.readouterr().out)
     assert [problem["message"] for problem in told["problems"]] == [problem.message for problem in report.problems]
 
@@ -122,5 +125,23 @@ def test_an_estimate_can_be_saved_and_holds_its_folder(tmp_path, monkeypatch, ca
     assert {"result.json", "report.html", "mesh.vtu", "case.toml"} <= {path.name for path in paths}
     (told,) = result.to_dict()["warnings"]
     assert json.loads((tmp_path / "out" / "result.json").read_text())["warnings"] == [told]
+    read = palpate.read_result(tmp_path / "out")
+    assert repr(read) == repr(result)
+    assert read._repr_html_().count("<article") == result._repr_html_().count("<article")
+    assert read.to_dataframe().equals(result.to_dataframe())
     with folder_lock(tmp_path / "out"), pytest.raises(ResourceError, match="another run"):
         result.save(tmp_path / "out")
+
+
+def test_the_package_tells_what_it_has_before_anything_is_loaded():
+    code = "import palpate; assert set(palpate.__all__) <= set(dir(palpate)); print(palpate.__version__)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == metadata.version("palpate")
+
+
+def test_a_folder_that_holds_no_result_is_told(tmp_path):
+    with pytest.raises(InputDataError, match=r"result\.json"):
+        palpate.read_result(tmp_path)
+    (tmp_path / "result.json").write_text('{"schema": "palpate.check/1"}')
+    with pytest.raises(InputDataError, match="no result of an estimate"):
+        palpate.read_result(tmp_path)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from palpate.errors import NotConverged
-from palpate.inversion import Inversion, Outcome, OuterIterate, gauss_newton, invert
+from palpate.images.tissue import Role
+from palpate.inversion import Inversion, Outcome, OuterIterate, gauss_newton, invert, known_modulus_blocks
 from palpate.inversion.estimate import Candidate
 from palpate.inversion.outer_loop import Convergence
 from palpate.mechanics.forward import SolveCounts
@@ -236,6 +237,38 @@ def test_an_estimate_whose_outer_loop_ran_out_says_what_is_open(estimation, inve
     (remark,) = (remark for remark in result.remarks if remark.code == "unsettled")
     assert "still change each other" in remark.message
     assert "linearised anew" not in remark.message
+
+
+def with_range(twins, twin, settings, *, sd):
+    """The twin's estimate where ln E of the known tissue is believed to be within sd."""
+    tissues = tuple(replace(t, modulus_sd=sd * (t.role is Role.KNOWN)) for t in twin.scene.tissues)
+    problem = twins.exact_problem(twin, noise=NOISE)
+    blocks = (*problem.parameters.blocks, *known_modulus_blocks(tissues, twin.model.regions, (0,)))
+    mapping = replace(problem.parameters, blocks=blocks, nuisance_precision=np.zeros((0, 0)))
+    return invert(replace(problem, parameters=mapping), settings, progress=twins.silent)
+
+
+def test_a_range_of_the_known_modulus_is_in_kilopascals_and_not_in_ratios(
+    twins, twin, inversion, settings, observed, estimation
+):
+    """All moduli scaled together move nothing: no image tells more of the known one than was believed before."""
+    found = with_range(twins, twin, settings, sd=0.2)
+    result = stated(found, settings, observed)
+    assert found.minimum.unknowns[:2] == pytest.approx(inversion.minimum.unknowns[:2], abs=1e-3)
+    added = np.diag(result.covariance.total) - np.diag(estimation.covariance.total)
+    assert added == pytest.approx(0.2**2, rel=0.02)
+    for of_range, of_number in zip(result.estimates, estimation.estimates, strict=True):
+        assert of_range.ratio_interval95 == pytest.approx(of_number.ratio_interval95, rel=0.02)
+        assert np.divide(*of_range.interval95[::-1]) > np.exp(3.92 * 0.2)
+        assert of_range.variance_shares["known modulus"] == pytest.approx(0.04 / result.covariance.total[0, 0], rel=0.5)
+
+
+def test_what_a_range_leaves_open_is_told_as_a_ratio(twins, twin, settings, observed):
+    found = with_range(twins, twin, settings, sd=0.5)
+    for estimate in stated(found, settings, observed).estimates:
+        assert estimate.verdict == "ratio only"
+        assert "range of the known modulus" in estimate.why
+        assert np.divide(*estimate.ratio_interval95[::-1]) < 4.0 < np.divide(*estimate.interval95[::-1])
 
 
 def test_an_interval_that_holds_no_layer_says_so(inversion, settings, observed, monkeypatch):

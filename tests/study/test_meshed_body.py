@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import replace
+from xml.etree import ElementTree as ET
 
 import meshio
 import numpy as np
 import pytest
 
+import palpate
 from palpate.cli import main
-from palpate.errors import ConfigurationError, InputDataError
+from palpate.errors import ConfigurationError, GeometryError, InputDataError
+from palpate.export.fitted_model import fitted_model
+from palpate.mechanics.deformation import largest_strains
+from palpate.mechanics.loads import boundary_named
 from palpate.mesh.mesh_file import read_mesh_file
 from palpate.report.collect import collect
+from palpate.study.body import inverse_problem, make_body
 from palpate.study.case_file import read_case
 from palpate.study.check import check_case
+from palpate.study.cost import expected_cost
 from palpate.study.read import read_states
 from palpate.study.run import estimate
 
@@ -141,6 +150,18 @@ def test_check_finds_no_fault(folder):
     assert report.cost.tets == 576
 
 
+def test_the_cost_of_a_mesh_is_told_by_its_own_tetrahedra_and_states(folder):
+    """Before anything is assembled; another state costs more."""
+    case = read_case(folder / "case.toml")
+    states = read_states(case)
+    cost = expected_cost(case, states.before, (), n_pairs=1, mesh=states.mesh)
+    assert cost.tets == 576
+    assert cost.unknowns == pytest.approx(3159, rel=0.3)
+    assert cost.stages["meshing"] == 0.0
+    again = replace(case, data=(*case.data, replace(case.data[0], state=2)))
+    assert expected_cost(again, states.before, (), n_pairs=1, mesh=states.mesh).seconds > cost.seconds
+
+
 def test_groups_of_a_mesh_are_tissues_by_name_or_number(folder, tmp_path):
     nodes, tets = cells()
     upper = nodes[tets].mean(axis=1)[:, 2] > 15.0
@@ -198,3 +219,150 @@ def test_a_surface_mesh_and_flat_tetrahedra_are_refused(tmp_path):
     meshio.write(tmp_path / "f.vtu", meshio.Mesh(nodes * [1.0, 1.0, 0.0], [("tetra", tets)]))
     with pytest.raises(InputDataError, match="no volume"):
         read_mesh_file(tmp_path / "f.vtu")
+
+
+SLIDING = """
+[[surfaces]]
+name = "floor"
+where = "z_min"
+within_mm = 0.1
+boundary = "sliding"
+
+[[surfaces]]
+name = "grip"
+where = "z_max"
+within_mm = 0.1
+boundary = "prescribed"
+
+[[surfaces]]
+name = "walls"
+where = "boundary"
+boundary = "sliding"
+"""
+
+
+def body_of(folder, case, moved, *, surfaces=SLIDING, spread=0.0):
+    """The model of the bar under a case whose surfaces are `surfaces` and whose field is `moved` of points."""
+    points = np.random.default_rng(2).uniform(0.0, SIZE, (200, 3))
+    head = "before_x,before_y,before_z,after_x,after_y,after_z"
+    noise = spread * np.random.default_rng(3).standard_normal(points.shape)
+    np.savetxt(folder / "exact.csv", np.c_[points, moved(points) + noise], delimiter=",", header=head, comments="")
+    head, tail = case.split("[[surfaces]]")[0], case[case.index("[tissues.bar]") :]
+    (folder / "walls.toml").write_text((head + surfaces + tail).replace("field.csv", "exact.csv"))
+    return problem_of(read_case(folder / "walls.toml"))
+
+
+def problem_of(case):
+    body = make_body(read_states(case), case, progress=lambda _: None)
+    return body, inverse_problem(body, case, progress=lambda _: None)
+
+
+def displacement_of(problem):
+    state = problem.states[0]
+    model = state.finite_strain or state.model
+    found = model.solve(np.array([MODULUS]), np.zeros(model.n_modes))
+    return found.values.reshape(-1, 3)
+
+
+@pytest.mark.parametrize("law", ["linear", "neo-hookean"])
+def test_a_block_pressed_between_sliding_walls_is_strained_uniformly_along_one_axis(folder, law):
+    """Under any law: u = (0, 0, s z), for nothing may narrow."""
+    case = CASE.replace('law = "linear"', f'law = "{law}"')
+    body, problem = body_of(folder, case, lambda x: x * np.array([1.0, 1.0, 1.0 - STRAIN]))
+    exact = -STRAIN * body.space.points * np.array([0.0, 0.0, 1.0])
+    assert displacement_of(problem) == pytest.approx(exact, abs=1e-9)
+
+
+@pytest.mark.parametrize("law", ["linear", "neo-hookean"])
+def test_a_surface_prescribed_to_move_rigidly_strains_nothing(folder, law):
+    angle = 0.3 if law == "neo-hookean" else 0.0  # to the linear law a turn is a strain
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
+    surfaces = '[[surfaces]]\nname = "grip"\nwhere = "boundary"\nboundary = "prescribed"\n'
+    case = CASE.replace('law = "linear"', f'law = "{law}"')
+    body, problem = body_of(folder, case, lambda x: x @ turn.T + [1.0, -2.0, 0.5], surfaces=surfaces)
+    assert np.abs(displacement_of(problem)).max() > 0.5
+    assert largest_strains(body.space, displacement_of(problem)).max() < 1e-9
+
+
+def test_the_motion_of_a_prescribed_surface_is_smoother_than_the_field_that_tells_it(folder):
+    surfaces = '[[surfaces]]\nname = "grip"\nwhere = "z_max"\nboundary = "prescribed"\n'
+    case = CASE.replace("sd_mm = 0.01", "sd_mm = 0.2")
+
+    def bent(x):
+        return x + np.stack([0.0 * x[:, 0], 0.0 * x[:, 0], 2.0 * np.sin(x[:, 0] / 20.0)], axis=1)
+
+    body, problem = body_of(folder, case, bent, surfaces=surfaces, spread=0.2)
+    grip = np.unique(body.space.facets(boundary_named(body.space.mesh, "grip")))
+    points = body.space.points[grip]
+    off = displacement_of(problem)[grip] - (bent(points) - points)
+    assert np.sqrt(np.mean(off**2)) < 0.75 * 0.2
+
+
+HELD_BY_ONE = 'name = "grip"\nwhere = "x_min"\nboundary = "sliding"\n'
+PRESSURE = '[[loads]]\nkind = "pressure"\npressure_kpa = 1.0\nsurface = '
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "words"),
+    [
+        (('boundary = "prescribed"', 'boundary = "glued"'), ConfigurationError, "did you mean"),
+        (("[mechanics]", PRESSURE + '"walls"\n[mechanics]'), ConfigurationError, "boundary free if"),
+        (("[mechanics]", PRESSURE + '"grip"\n[mechanics]'), ConfigurationError, "the boundary free"),
+        (("[mechanics]", "[driver]\nkernel_mm = 0.5\n[mechanics]"), InputDataError, "further than 0.5 mm"),
+        (('where = "z_min"', 'where = "boundary"'), GeometryError, "named before it"),
+        ((f"state = 1\nforce_n = {FORCE_N}", f"state = 2\nforce_n = {FORCE_N}"), ConfigurationError, "where points"),
+        ((SLIDING, SLIDING[: SLIDING.index('name = "grip"')] + HELD_BY_ONE), GeometryError, "floats"),
+    ],
+)
+def test_a_surface_that_makes_no_sense_is_refused_in_a_sentence(folder, change, error, words):
+    case = CASE.replace("force_n", "state = 1\nforce_n")
+    body_of(folder, case, lambda x: 0.9 * x)
+    text = (folder / "walls.toml").read_text()
+    assert change[0] in text
+    (folder / "wrong.toml").write_text(text.replace(*change, 1))
+    with pytest.raises(error, match=words):
+        problem_of(read_case(folder / "wrong.toml"))
+
+
+def test_a_sliding_role_is_of_surfaces_alone(folder):
+    (folder / "wrong.toml").write_text(CASE.replace('role = "estimate"', 'role = "sliding"'))
+    with pytest.raises(ConfigurationError, match="did you mean"):
+        read_case(folder / "wrong.toml")
+
+
+def test_exports_repeat_each_states_motion_and_loads(folder, tmp_path):
+    """A bar that is pulled in its first later state and pressed, by half as much, in its second."""
+    loads = "".join(
+        f'[[loads]]\nkind = "traction"\nsurface = "grip"\nstate = {state}\ntraction_kpa = [0.0, 0.0, {kpa}]\n'
+        for state, kpa in ((1, STRAIN * MODULUS), (2, -0.5 * STRAIN * MODULUS))
+    )
+    before = np.random.default_rng(4).uniform(0.5, np.array(SIZE) - 0.5, (300, 3))
+    head = "before_x,before_y,before_z,after_x,after_y,after_z"
+    moved = STRAIN * before * np.array([-RATIO, -RATIO, 1.0])
+    data = ""
+    for state, share in ((1, 1.0), (2, -0.5)):
+        table = np.c_[before, before + share * moved]
+        np.savetxt(folder / f"state{state}.csv", table, delimiter=",", header=head, comments="")
+        data += f'[[data]]\nkind = "displacement-field"\nfile = "state{state}.csv"\nsd_mm = 0.01\nstate = {state}\n'
+    text = (
+        CASE.split("[[data]]", maxsplit=1)[0].replace('name = "grip"', 'boundary = "free"\nname = "grip"')
+        + loads
+        + data
+    )
+    (folder / "two.toml").write_text(text)
+    result = estimate(read_case(folder / "two.toml"))
+    assert result.estimation.estimates[0].value == pytest.approx(MODULUS, rel=0.02)
+    model = fitted_model(result, seal="")
+    (body,) = model.bodies
+    top = body.space.points[:, 2] > SIZE[2] - 1e-9
+    means = [motion[top, 2].mean() for motion in body.displacements]
+    assert means == pytest.approx([STRAIN * SIZE[2], -0.5 * STRAIN * SIZE[2]], rel=0.02)
+    assert [load.traction_kpa[2] for of in body.loads for load in of] == [STRAIN * MODULUS, -0.5 * STRAIN * MODULUS]
+    palpate.export(result, tmp_path, format="abaqus", linear=True)
+    pulls = []
+    for step in (tmp_path / "palpate.inp").read_text().split("*STEP")[1:]:
+        (rows,) = re.findall(r"\*CLOAD[^\n]*\n([^*]+)\*", step)
+        pulls.append(sum(float(row.split(",")[2]) for row in rows.splitlines()))
+    assert pulls == pytest.approx([1e3 * FORCE_N, -0.5e3 * FORCE_N], rel=1e-6)  # mN
+    palpate.export(result, tmp_path / "febio", format="febio", linear=True)
+    assert len(ET.parse(tmp_path / "febio" / "palpate.feb").findall("Step/step")) == 2

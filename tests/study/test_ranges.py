@@ -30,6 +30,7 @@ NEEDED = {
     "offset_sd_n": 'data=[{kind="force", surface="a", direction=[0, 0, 1.0], sd_n=1, force_n=1, offset_sd_n=VALUE}]',
     "within_mm": 'surfaces=[{name="top", where="z_max", within_mm=VALUE}]',
     "correlation_mm": 'data=[{kind="landmarks", file="m.csv", sd_mm=1.0, correlation_mm=VALUE}]',
+    "data.state": 'data=[{kind="landmarks", file="x.csv", sd_mm=1.0, state=VALUE}]',
     "state": 'loads=[{kind="gravity", state=VALUE, acceleration_m_s2=[0.0, 0.0, 1.0]}]',
     "pressure_kpa": 'loads=[{kind="pressure", surface="outer", pressure_kpa=VALUE}]',
     "traction_kpa": 'loads=[{kind="traction", surface="outer", traction_kpa=[VALUE, 0.0, 0.0]}]',
@@ -91,7 +92,8 @@ def test_what_lies_beyond_a_range_is_refused_with_the_range(place, end, tmp_path
     key = place.rpartition(".")[2]
     whole = isinstance(NUMBERS[place].default, int) or key == "stage"
     value = str(bound + (1, -1)[end == 0]) if whole else repr(beyond)
-    override = NEEDED.get(key, f"{place.replace('*', 'prostate')}=VALUE").replace("VALUE", value)
+    template = NEEDED.get(place) or NEEDED.get(key, f"{place.replace('*', 'prostate')}=VALUE")
+    override = template.replace("VALUE", value)
     more = {"phantom.seed": ["phantom.kind=spheres"]}.get(place, [])
     with pytest.raises(ConfigurationError, match=f"'{key}' in .* must be a number from"):
         read_case(path, [override, *more])

@@ -14,8 +14,10 @@ import palpate
 from palpate.cli import main
 from palpate.errors import EstimationError
 from palpate.images.readers import write_label_image
+from palpate.inversion.estimate import REPORTED
 from palpate.report.sensitivity_report import sensitivity_page
 from palpate.report.tornado import effect_text, sensitivity_table, tornado_rows
+from palpate.study import inverted
 from palpate.study import sensitivity as study
 from palpate.study.case_file import read_case
 from palpate.study.json_schema import SCHEMAS
@@ -77,7 +79,7 @@ def interrupted(case_file, tmp_path_factory):
 
     Of the variants two are left; that under a law without equilibrium is refused.
     """
-    folder, told, real = tmp_path_factory.mktemp("out"), [], study.invert
+    folder, told, real = tmp_path_factory.mktemp("out"), [], inverted.invert
     case = read_case(case_file)
     calls = []
 
@@ -99,11 +101,13 @@ def interrupted(case_file, tmp_path_factory):
     ]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(study, "_variants", lambda *_: iter(few))
-        patch.setattr(study, "invert", again)
+        patch.setattr(inverted, "invert", again)
         with pytest.raises(KeyboardInterrupt):
             palpate.sensitivity(case, sobol=8, output=folder)
         before = len(calls)
-        assert calls[0] == (len(case.estimate.start_ratios), {}), "the case itself, from every start to full accuracy"
+        assert calls[0] == (len(case.estimate.start_ratios), {"rule": REPORTED}), (
+            "the case itself, from every start to full accuracy"
+        )
         assert calls[1:] == [(1, {"rule": study.VARIED})] * (before - 1)
         found = palpate.sensitivity(case, sobol=8, output=folder, progress=told.append)
         assert len(calls) == before + 1, "what was finished is not computed again"

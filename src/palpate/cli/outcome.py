@@ -32,13 +32,16 @@ def estimates_table(document: Mapping[str, Any]) -> str:
     rows = [["tissue", "Young's modulus", "95 % interval", "ratio", "verdict", "truth"]]
     for item in moduli_in(document):
         interval, ratio = item["interval95"], number(item["ratio"])
-        unit = " kPa"
+        value, unit = number(item["value"]) + (" kPa" if item["value"] is not None else ""), " kPa"
+        if item["verdict"] == "ratio only" and item["value"] is not None:  # whose scale is known within a range
+            value += f" if {item['relative_to']} has {number(item['value'] / item['ratio'])}"
+            interval, unit = item["ratio_interval95"], " (ratio)"
         if interval is None and item["ratio_interval95"] is not None:
             interval, unit = item["ratio_interval95"], " (ratio)"
         rows.append(
             [
                 item["tissue"],
-                number(item["value"]) + (" kPa" if item["value"] is not None else ""),
+                value,
                 interval_text(interval) + (unit if interval else ""),
                 f"{ratio} to {item['relative_to']}" if item["ratio"] is not None else "–",
                 item["verdict"],

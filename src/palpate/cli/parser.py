@@ -8,11 +8,12 @@ import sys
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from palpate.cli import cohorts, commands, exports, studies, verification, written
 from palpate.cli.outcome import Outcome
 from palpate.export.formats import FORMATS
+from palpate.study.schema import nearest, shown
 
 __all__ = ["make_parser", "version"]
 
@@ -78,9 +79,23 @@ class _PrintCompletion(argparse.Action):
         parser.exit()
 
 
+class _Parser(argparse.ArgumentParser):
+    """One that says what was meant by a mistyped command, and what there is where none is given."""
+
+    def error(self, message: str) -> NoReturn:
+        """End with the usage and a sentence; exit code 2."""
+        if message.endswith("required: COMMAND"):
+            self.print_help(sys.stderr)
+            self.exit(2, "\npalpate: give a command, `palpate demo` first of all\n")
+        mistyped = re.search(r"COMMAND: invalid choice: '(.*)' \(choose", message, re.DOTALL)
+        if mistyped:
+            message = f"there is no command {shown(mistyped[1])}: {nearest(mistyped[1], EXAMPLES)}"
+        super().error(message)
+
+
 def make_parser() -> argparse.ArgumentParser:
     """The parser of the whole command line."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="palpate",
         description="How stiff each organ is, from segmented images of the same body in two or more states.",
         epilog="Exit codes: 0 done, 2 usage or configuration, 3 input data, 4 geometry or meshing, 5 solver or"

@@ -40,7 +40,7 @@ def write_estimate_files(result: CaseResult, folder: Path) -> tuple[Path, ...]:
     """
     make_folder(folder)
     paths = [folder / "mesh.vtu", folder / "stiffness.nii.gz"]
-    _write_fitted(paths[0], result, result.space, result.estimation.displacements[: len(result.after)])
+    _write_fitted(paths[0], result, result.space, result.displacements)
     stiffness = np.append(result.stiffness, np.nan)  # region -1 takes the last entry, NaN
     region = region_image(result.space.mesh, result.before.grid)
     write_scalar_image(paths[1], stiffness[region], result.before.grid)

@@ -70,7 +70,7 @@ class FittedModel:
     moduli (n_tissues,) in `unit`, "kPa" or "ratio" to `relative_to`; NaN of hollow tissues; covariance (n, n) of the
     natural logarithms of the `estimates`; law_parameters, element, outer_boundary, densities (n_tissues,), in
     kg/m^3: as the case has them; seal: SHA-256 of the numbers of the result.json beside it; samples: chains of the
-    moduli's posterior, where the case asked for them.
+    moduli's posterior, where the case asked for them; strained: whether the reference state is not free of stress.
     """
 
     bodies: tuple[FittedBody, ...]
@@ -86,6 +86,7 @@ class FittedModel:
     densities: NDArray[np.float64]
     seal: str
     samples: ModulusSamples | None = None
+    strained: bool = False
 
     @property
     def material_law(self) -> Law:
@@ -93,7 +94,15 @@ class FittedModel:
         return law_from(self.law, self.law_parameters)
 
     def law_among(self, *written: type[Law]) -> Law:
-        """The law, where it is one of those that a format can write; raises `ConfigurationError` for another."""
+        """The law, where it is one of those that a format can write.
+
+        Raises `ConfigurationError` for another, and where the mesh is not free of stress.
+        """
+        if self.strained:
+            raise ConfigurationError(
+                "the reference bears loads, and the mesh shows it strained by them: another program would take it for"
+                " free of stress; export to vtu, whose fields are those of the estimate"
+            )
         law = self.material_law
         if not isinstance(law, written):
             names = " and ".join(f"'{kind().name}'" for kind in written)
@@ -124,7 +133,7 @@ def fitted_model(result: CaseResult, *, seal: str) -> FittedModel:
             " export: nothing that did not converge is passed on"
         )
     pairs: list[tuple[CaseResult | PairResult, tuple[NDArray[np.float64], ...]]] = []
-    pairs += [(result, estimation.displacements[: len(result.after)])]
+    pairs += [(result, result.displacements)]
     pairs += [(pair, pair.displacements) for pair in result.further]
     numbers = np.cumsum([1, *(len(motions) for _, motions in pairs)]).tolist()
     loads = [tuple(case.loads_in(n) for n in range(*ends)) for ends in pairwise(numbers)]
@@ -145,6 +154,7 @@ def fitted_model(result: CaseResult, *, seal: str) -> FittedModel:
         np.array([density.get(tissue.name, 1000.0) for tissue in result.tissues]),
         seal,
         estimation.samples,
+        case.strained_reference,
     )
 
 

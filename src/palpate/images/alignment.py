@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from palpate.parallel import mapped
 __all__ = [
     "TUKEY",
     "Alignment",
+    "Motion",
     "RigidFit",
     "RigidMotion",
     "align",
@@ -41,6 +43,14 @@ TUKEY = 4.685  # 95 % efficiency for Gaussian residuals
 EXTRA_SMOOTHING = 0.8  # voxels; a rigid surface keeps its shape, so a wide Gaussian takes its stairs and biases nothing
 LOOSE_VOXELS = 0.5  # a piece that lies further off the motion of the whole moves by itself
 UNDETERMINED = 4e-3  # (lever / radius)^2 of a turn; the stairs left on a ball give 2e-3 at any radius
+
+
+class Motion(Protocol):
+    """A motion of points of the body."""
+
+    def apply(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Where points (n, 3) mm go, (n, 3) mm."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,13 +11,14 @@ __all__ = ["Role", "Tissue"]
 
 
 class Role(StrEnum):
-    """What a tissue does in the model."""
+    """What a tissue does in the model; `SLIDING`: the body glides along it, which a mesh's surfaces alone can say."""
 
     ESTIMATE = "estimate"
     KNOWN = "known"
     DRIVER = "driver"
     RIGID = "rigid"
     VOID = "void"
+    SLIDING = "sliding"
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +27,7 @@ class Tissue:
 
     `labels` empty means "remaining": every voxel that no other tissue names.
     `youngs_modulus_kpa` is required for `known`, the truth of a simulation for `estimate`, else None.
+    `modulus_sd`: standard deviation of what is believed of ln E of a `known` tissue, dimensionless; 0: it is certain.
     Where the image or its table has them, `colour`: #rrggbb, and `called`: the names of the labels there.
     """
 
@@ -36,6 +38,7 @@ class Tissue:
     youngs_modulus_kpa: float | None = None
     colour: str | None = None
     called: tuple[str, ...] = ()
+    modulus_sd: float = 0.0
 
     def __post_init__(self) -> None:
         if not -1.0 < self.poisson_ratio < 0.5:

@@ -2,10 +2,12 @@
 
 from palpate.inversion.approximation import Approximation, ExactApproximation, Place, exact_approximation
 from palpate.inversion.blocks import (
+    KNOWN_MODULUS,
     Acts,
     Block,
     frame_blocks,
     instrument_block,
+    known_modulus_blocks,
     layer_blocks,
     material_blocks,
     offset_block,
@@ -39,6 +41,7 @@ from palpate.inversion.reduced_basis import ReducedBasis, reduced_basis
 from palpate.inversion.reweighting import reweighted, with_first_noise
 
 __all__ = [
+    "KNOWN_MODULUS",
     "Acts",
     "Approximation",
     "Block",
@@ -72,6 +75,7 @@ __all__ = [
     "gauss_newton",
     "instrument_block",
     "invert",
+    "known_modulus_blocks",
     "layer_blocks",
     "material_blocks",
     "offset_block",

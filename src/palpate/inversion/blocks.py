@@ -16,18 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError
-from palpate.images.tissue import Tissue
+from palpate.images.tissue import Role, Tissue
 from palpate.mechanics.material import MaterialModes
 from palpate.observation.contract import Observation
 from palpate.observation.prescribed_motion import PrescribedMotion
 from palpate.observation.wall_modes import Wall
 
 __all__ = [
+    "KNOWN_MODULUS",
     "Acts",
     "Block",
     "frame_blocks",
     "instrument_block",
     "joined",
+    "known_modulus_blocks",
     "layer_blocks",
     "material_blocks",
     "offset_block",
@@ -39,6 +41,7 @@ AMPLITUDES = (0.005, 2.0)  # times the coefficients' own standard deviation
 STILL, MOVES = 0.02, (1.0, 2.0)  # amplitudes of a frame that stands still, times what is stated; of one that moves
 STILL_RIGID, MOVED_RIGID = 0.005, 0.2
 DRAWN_ALIKE, SELDOM = 0.1, 0.01  # an offset of a surface that is drawn alike, over that of others; how often not
+KNOWN_MODULUS = "known modulus"
 CONSIDERED = 1e8  # times its precision: an unknown that is considered does not move
 HOMOGENEOUS_SHARE, PATCHY = 1.0 / 3.0, 0.3  # sd of ln E in a tissue that is nearly homogeneous, over that stated; odds
 
@@ -227,6 +230,27 @@ def layer_blocks(
     return tuple(
         Block(organ, "layer", Acts.MODULI, states, np.full((1, 1), sd**-2.0), released=True, regions=regions)
         for organ, regions in layers
+    )
+
+
+def known_modulus_blocks(
+    tissues: Sequence[Tissue], regions: tuple[int, ...], states: tuple[int, ...]
+) -> tuple[Block, ...]:
+    """By how much ln E of each `known` tissue differs from what is given, where that is a range.
+
+    tissues: the mesh's, whose number in `regions` is each of the model's; layers of a tissue are called as it is.
+    """
+    believed = {t.name: t.modulus_sd for t in tissues if t.role is Role.KNOWN and t.modulus_sd}
+    return tuple(
+        Block(
+            name,
+            KNOWN_MODULUS,
+            Acts.MODULI,
+            states,
+            np.full((1, 1), sd**-2.0),
+            regions=tuple(i for i, number in enumerate(regions) if tissues[number].name == name),
+        )
+        for name, sd in believed.items()
     )
 
 

@@ -11,7 +11,7 @@ from scipy import linalg
 
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role, Tissue
-from palpate.inversion.blocks import Acts, Block, joined
+from palpate.inversion.blocks import KNOWN_MODULUS, Acts, Block, joined
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.stiffness import lame_parts, lame_parts_by_poisson
 
@@ -111,6 +111,11 @@ class ParameterMap:
     def scale_kpa(self) -> float:
         """Modulus (kPa) of the tissue that holds the scale; 1 when none is known."""
         return float(self.base[self.selection[:, 0] > 0.0][0])
+
+    def reference_shift(self, unknowns: NDArray[np.float64]) -> float:
+        """By how much ln E of the tissue that holds the scale differs from what is given at unknowns (n_unknowns,)."""
+        own = [i for i, b in enumerate(self.blocks) if b.cause == KNOWN_MODULUS and b.of == self.relative_to]
+        return sum(float(unknowns[self.columns(i)].sum()) for i in own)
 
     @property
     def names(self) -> tuple[str, ...]:

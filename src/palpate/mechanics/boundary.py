@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from palpate.errors import ConfigurationError
+from palpate.images.tissue import Role
 from palpate.mechanics.rigid import refuse_floating
 from palpate.mesh.constraint import Constraint
 from palpate.mesh.space import LagrangeSpace
@@ -15,7 +16,7 @@ from palpate.mesh.surface import cut_faces, triangle_normals
 __all__ = ["outer_constraint"]
 
 OUTER_KINDS = ("moving", "fixed", "sliding", "free")
-SAME_PLANE = 1e-3  # share of the normals' second moment: directions that differ by less than 2 deg are one plane
+SAME_PLANE = 0.07  # share of the normals' second moment: faces at less than 30 deg are of one smooth surface
 
 
 def outer_constraint(
@@ -31,6 +32,7 @@ def outer_constraint(
     modes (n_dof, n_modes) mm and offset (n_dof,) mm must vanish elsewhere. outer holds the points on the cut of the
     image: "moving" (held where nothing else is prescribed, for modes of the frame are prescriptions), "fixed",
     "sliding" (not along the normals of the cut's faces: one on a face, two on an edge, three in a corner) or "free".
+    A body glides in any case along what is `sliding`, at each point in the plane of its faces' mean normal.
     The cut faces of `estimate` tissues are free in any case; a point that is also on the cut face of a `known` tissue
     is held; a prescribed point follows its prescription. Raises `GeometryError` when nothing opposes some rigid motion,
     `ConfigurationError` for another `outer` or for arrays that do not fit.
@@ -38,22 +40,26 @@ def outer_constraint(
     if outer not in OUTER_KINDS:
         raise ConfigurationError(f"outer_boundary is '{outer}'; it must be one of {list(OUTER_KINDS)}")
     _check_prescription(space, modes, offset, prescribed)
-    faces = cut_faces(space.mesh)
-    held = np.zeros((len(space.points), 3, 3))
+    cut, behind = cut_faces(space.mesh), [tissue.role is Role.SLIDING for tissue in space.mesh.tissues]
+    named = space.mesh.boundary[np.isin(space.mesh.beyond, np.flatnonzero(behind))]
+    held = _held_normals(space, np.concatenate([named, cut]) if outer == "sliding" else named)
     if outer in ("fixed", "moving"):
-        held[np.unique(space.facets(faces))] = np.eye(3)
-    elif outer == "sliding":
-        # the sum of n (x) n over the unit normals n of the faces at each point
-        normals = triangle_normals(space.mesh.nodes, faces)
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        dyads = np.einsum("fi,fj->fij", normals, normals)
-        held = np.zeros((len(space.points), 3, 3))
-        for column in space.facets(faces).T:
-            np.add.at(held, column, dyads)
+        held[np.unique(space.facets(cut))] = np.eye(3)
     held[prescribed] = np.eye(3)
     free = _free_directions(held)
     refuse_floating(space, free)
     return Constraint(free=free, modes=np.array(modes, dtype=float), offset=np.array(offset, dtype=float))
+
+
+def _held_normals(space: LagrangeSpace, triangles: NDArray[np.int64]) -> NDArray[np.float64]:
+    """The sum (n_points, 3, 3) of n (x) n over the unit normals n of the triangles (n_faces, 3) at each point."""
+    normals = triangle_normals(space.mesh.nodes, triangles)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    dyads = np.einsum("fi,fj->fij", normals, normals)
+    held = np.zeros((len(space.points), 3, 3))
+    for column in space.facets(triangles).T:
+        np.add.at(held, column, dyads)
+    return held
 
 
 def _check_prescription(

@@ -29,17 +29,21 @@ def equilibrium(
     law: Law,
     dilatation: Dilatation,
     loads: tuple[Load, ...] = (),
+    strained: NDArray[np.float64] | None = None,
 ) -> Equilibrium:
     """Equilibrium of all meshed tissues at moduli (n_regions,) kPa; the constraint's modes do not move.
 
-    Raises `NotConverged` with the element and the share of the motion where a finite-strain path ended.
+    strained: see `finite_strain_model`. Raises `NotConverged` with the element and the share of the motion where a
+    finite-strain path ended.
     """
     still = np.zeros(constraint.n_modes)
     system = linear_model(space, constraint, dilatation=dilatation, loads=loads).system(moduli)
     if not law.finite:
         return system.solve(still)
     settings = NewtonSettings(tolerance=ACCURACY)
-    model = finite_strain_model(space, constraint, law, dilatation=dilatation, loads=loads, settings=settings)
+    model = finite_strain_model(
+        space, constraint, law, dilatation=dilatation, loads=loads, settings=settings, strained=strained
+    )
     return from_linear(model, system, still)
 
 

@@ -385,21 +385,25 @@ def finite_strain_model(
     loads: tuple[Load, ...] = (),
     material: MaterialModes = HOMOGENEOUS,
     settings: NewtonSettings | None = None,
+    strained: NDArray[np.float64] | None = None,
 ) -> FiniteStrainModel:
     """The model of all meshed tissues of `space.mesh` under `law`, with their Poisson's ratios.
 
-    Raises `ConfigurationError` when the constraint is of another space, `GeometryError` for tetrahedra without positive
-    volume.
+    strained (n_points, 3) mm: where the body was seen, less where it is free of stress (see `unloaded_displacement`);
+    displacements, forces and loads then are what is added to those of the state that was seen. Raises
+    `ConfigurationError` when the constraint is of another space, `GeometryError` for tetrahedra without
+    positive volume.
     """
     conditions, tissues = Conditions(constraint, loads), space.mesh.tissues
     conditions.require_space(space)
     regions = tuple(number for number, tissue in enumerate(tissues) if tissue.meshed)
     pattern = block_pattern(space.cells, len(space.points))
     blocks = np.ones((space.cells.size * space.cells.shape[1], 9))
+    elements = elements_of(space, law, dilatation)
     return FiniteStrainModel(
         space=space,
         conditions=conditions,
-        elements=elements_of(space, law, dilatation),
+        elements=elements if strained is None else elements.unloaded(strained),
         regions=regions,
         element_region=np.searchsorted(regions, space.mesh.region),
         poisson_ratios=np.array([tissues[region].poisson_ratio for region in regions]),

@@ -8,11 +8,12 @@ Nonlinear Continuum Mechanics, 2nd ed. 2008, sections 8.6 and 9.4).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.errors import NotConverged
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.element import quadrature, shape_derivatives
 from palpate.mechanics.laws.contract import Law
@@ -44,7 +45,9 @@ class Moduli:
 class Elements:
     """Elements of one law: cells (n_cells, n_a), shape gradients (n_cells, n_q, n_a, 3) 1/mm, volumes (n_cells,) mm^3.
 
-    weights (n_q,) of the quadrature points sum to 1.
+    weights (n_cells, n_q) of the quadrature points sum to 1 in each element. strained (n_points, 3) mm: how far what is
+    described, free of stress, has moved to where displacements are counted from; forces are then what is added to
+    those there. None: it has not.
     """
 
     law: Law
@@ -53,10 +56,38 @@ class Elements:
     gradients: Array
     volumes: Array
     weights: Array
+    strained: Array | None = None
+
+    def unloaded(self, strained: Array) -> Elements:
+        """The same elements, of a body that is free of stress at x - w, w = `strained` (n_points, 3) mm.
+
+        With X = x - w the gradients are dN/dX = dN/dx (I - dw/dx)^-1 and volumes det(I - dw/dx) dV at the quadrature
+        points. Raises `NotConverged` where that turns an element inside out.
+        """
+        change = strained if self.strained is None else strained - self.strained
+        nodal = np.swapaxes(change[self.cells], 1, 2)
+        slope = np.eye(3) - nodal[:, None] @ self.gradients
+        volume = np.linalg.det(slope)
+        if volume.min() <= 0.0:
+            raise NotConverged(
+                f"the state without stress turns {int((volume.min(axis=1) <= 0.0).sum())} elements inside out: the"
+                " loads are too large for these moduli"
+            )
+        weights = self.weights * volume
+        total = weights.sum(axis=1)
+        gradients = self.gradients @ np.linalg.inv(slope)
+        return replace(
+            self,
+            gradients=gradients,
+            volumes=self.volumes * total,
+            weights=weights / total[:, None],
+            strained=strained,
+        )
 
     def deformation(self, displacement: Array, part: slice = slice(None)) -> Array:
-        """F = I + grad u (n, n_q, 3, 3) of the elements `part`, u (n_points, 3) mm."""
-        nodal = np.swapaxes(displacement[self.cells[part]], 1, 2)
+        """F = I + grad (w + u) (n, n_q, 3, 3) of the elements `part`, u (n_points, 3) mm, w = `strained`."""
+        moved = displacement if self.strained is None else self.strained + displacement
+        nodal = np.swapaxes(moved[self.cells[part]], 1, 2)
         return np.asarray(np.eye(3) + nodal[:, None] @ self.gradients[part])
 
     def smallest_volume(self, displacement: Array) -> tuple[float, int]:
@@ -73,21 +104,29 @@ class Elements:
         volume = self.law.volume(flat).reshape(shape)
         density = moduli.mu[:, None] * self.law.shear_energy(flat).reshape(shape)
         density += moduli.pointwise[:, None] * self.law.bulk_energy(volume.ravel()).reshape(shape)
-        mean = moduli.mean * self.law.bulk_energy(volume @ self.weights)
-        return float(self.volumes @ (density @ self.weights + mean))
+        mean = moduli.mean * self.law.bulk_energy(self._mean(volume))
+        return float(self.volumes @ (self._mean(density) + mean))
 
     def forces(self, displacement: Array, moduli: Moduli) -> Array:
-        """Internal forces (n_cells, n_a, 3), mN, of each element at u (n_points, 3) mm: derivatives of its energy."""
+        """Internal forces (n_cells, n_a, 3), mN, of each element at u (n_points, 3) mm: derivatives of its energy.
+
+        Less those at u = 0 where that is a strained state.
+        """
+        forces = self._forces(displacement, moduli)
+        return forces if self.strained is None else forces - self._forces(np.zeros_like(displacement), moduli)
+
+    def _forces(self, displacement: Array, moduli: Moduli) -> Array:
+        """Derivatives (n_cells, n_a, 3), mN, of each element's energy at u (n_points, 3) mm."""
         result = np.empty((len(self.cells), self.cells.shape[1], 3))
 
         def fill(part: slice) -> None:
             """Those of the elements `part`."""
             F = self.deformation(displacement, part)
             flat, (n, n_q) = F.reshape(-1, 3, 3), F.shape[:2]
-            pressure = self._pressure(self.law.volume(flat).reshape(n, n_q), moduli.part(part))
+            pressure = self._pressure(self.law.volume(flat).reshape(n, n_q), moduli.part(part), self.weights[part])
             stress = np.repeat(moduli.mu[part], n_q)[:, None, None] * self.law.shear_stress(flat)
             stress += pressure.reshape(-1, 1, 1) * self.law.volume_gradient(flat)
-            weighted = stress.reshape(n, n_q, 3, 3) * (self.volumes[part, None] * self.weights)[:, :, None, None]
+            weighted = stress.reshape(n, n_q, 3, 3) * (self.volumes[part, None] * self.weights[part])[:, :, None, None]
             result[part] = (self._stacked(part) @ np.swapaxes(weighted, 2, 3).reshape(n, -1, 3)).reshape(n, -1, 3)
 
         mapped(fill, self._parts())
@@ -97,10 +136,10 @@ class Elements:
         """Mean pressures lambda_m (u' + u'' dJ_mean) (n_cells,) kPa, with dJ_mean linear in du (n_points, 3) mm."""
         F = self.deformation(displacement)
         flat = F.reshape(-1, 3, 3)
-        mean = self.law.volume(flat).reshape(F.shape[:2]) @ self.weights
+        mean = self._mean(self.law.volume(flat).reshape(F.shape[:2]))
         slope = np.swapaxes(change[self.cells], 1, 2)[:, None] @ self.gradients
         growth = np.einsum("nij,nij->n", self.law.volume_gradient(flat), slope.reshape(-1, 3, 3)).reshape(F.shape[:2])
-        pressure = self.law.bulk_pressure(mean) + self.law.bulk_stiffness(mean) * (growth @ self.weights)
+        pressure = self.law.bulk_pressure(mean) + self.law.bulk_stiffness(mean) * self._mean(growth)
         return np.asarray(moduli.mean * pressure)
 
     def stiffness(self, displacement: Array, moduli: Moduli, *, pressure: Array | None = None) -> Array:
@@ -127,9 +166,13 @@ class Elements:
         gradients = np.swapaxes(self.gradients[part], 1, 2)
         return np.ascontiguousarray(gradients).reshape(len(gradients), gradients.shape[1], -1)
 
-    def _pressure(self, volume: Array, moduli: Moduli, foreseen: Array | None = None) -> Array:
+    def _mean(self, values: Array) -> Array:
+        """Means (n_cells,) over each element of values (n_cells, n_q) at its quadrature points."""
+        return np.asarray((values * self.weights).sum(axis=1))
+
+    def _pressure(self, volume: Array, moduli: Moduli, weights: Array, foreseen: Array | None = None) -> Array:
         """dW/dJ (n, n_q) kPa at J (n, n_q), or with other mean pressures (n,)."""
-        mean = moduli.mean * self.law.bulk_pressure(volume @ self.weights) if foreseen is None else foreseen
+        mean = moduli.mean * self.law.bulk_pressure((volume * weights).sum(axis=1)) if foreseen is None else foreseen
         if not np.any(moduli.pointwise):
             return np.broadcast_to(mean[:, None], volume.shape)
         points = self.law.bulk_pressure(volume.ravel()).reshape(volume.shape)
@@ -140,8 +183,9 @@ class Elements:
         F = self.deformation(displacement, part)
         flat, (n, n_q) = F.reshape(-1, 3, 3), F.shape[:2]
         volume, gradient = self.law.volume(flat).reshape(n, n_q), self.law.volume_gradient(flat)
-        tangent = self._tangent(flat, gradient, moduli, volume, self._pressure(volume, moduli, foreseen))
-        tangent *= (self.volumes[part, None] * self.weights).reshape(-1, 1)
+        weights = self.weights[part]
+        tangent = self._tangent(flat, gradient, moduli, volume, self._pressure(volume, moduli, weights, foreseen))
+        tangent *= (self.volumes[part, None] * weights).reshape(-1, 1)
         stacked, n_a = self._stacked(part), self.cells.shape[1]
         by_second = tangent.reshape(n, n_q, 3, 3, 3, 3).transpose(0, 1, 3, 2, 4, 5).reshape(n, n_q, 27, 3)
         half = by_second @ np.swapaxes(self.gradients[part], 2, 3)
@@ -149,10 +193,10 @@ class Elements:
         blocks = blocks.reshape(n, n_a, 3, 3, n_a).transpose(0, 1, 4, 2, 3)
         if not np.any(moduli.mean):
             return np.asarray(blocks)
-        slope = stacked @ np.swapaxes(gradient.reshape(n, n_q, 3, 3) * self.weights[:, None, None], 2, 3).reshape(
+        slope = stacked @ np.swapaxes(gradient.reshape(n, n_q, 3, 3) * weights[:, :, None, None], 2, 3).reshape(
             n, -1, 3
         )
-        size = self.volumes[part] * moduli.mean * self.law.bulk_stiffness(volume @ self.weights)
+        size = self.volumes[part] * moduli.mean * self.law.bulk_stiffness((volume * weights).sum(axis=1))
         return np.asarray(blocks + np.einsum("n,nai,nbk->nabik", size, slope, slope, optimize=True))
 
     def _tangent(self, flat: Array, gradient: Array, moduli: Moduli, volume: Array, pressure: Array) -> Array:
@@ -172,4 +216,6 @@ def elements_of(space: LagrangeSpace, law: Law, dilatation: Dilatation) -> Eleme
     points, weights = quadrature(2 if space.order == 2 else 1)
     gradients, volumes = checked_gradients(space, np.ones(len(space.cells), dtype=np.bool_))
     derivatives = shape_derivatives(space.order, points)
-    return Elements(law, dilatation, space.cells, derivatives @ gradients[:, None], volumes, weights)
+    return Elements(
+        law, dilatation, space.cells, derivatives @ gradients[:, None], volumes, np.tile(weights, (len(volumes), 1))
+    )

@@ -65,10 +65,12 @@ def surface_reaction(
     *,
     dilatation: Dilatation = Dilatation.BLENDED,
     material: MaterialModes = HOMOGENEOUS,
+    strained: NDArray[np.float64] | None = None,
 ) -> SurfaceReaction:
     """The force on boundary triangles (n_faces, 3) along a direction (3,), positive where it pulls the body that way.
 
-    Under `law`, with the tissues' own Poisson's ratios; raises as `finite_strain_model` does.
+    Under `law`, with the tissues' own Poisson's ratios, in addition to that in the reference where this is `strained`
+    (see `finite_strain_model`); raises as that does.
     """
     points = np.unique(space.facets(triangles))
     near = np.flatnonzero(np.isin(space.cells, points).any(axis=1))
@@ -77,7 +79,7 @@ def surface_reaction(
     n_dof = 3 * len(space.points)
     held = Constraint(sparse.csr_matrix((n_dof, 0)), np.zeros((n_dof, 0)), np.zeros(n_dof))
     modes = replace(material, fields=sparse.csr_matrix(material.fields[near])) if material.n_modes else material
-    model = finite_strain_model(beside, held, law, dilatation=dilatation, material=modes)
+    model = finite_strain_model(beside, held, law, dilatation=dilatation, material=modes, strained=strained)
     unit = np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
     virtual = np.zeros((len(space.points), 3))
     virtual[points] = unit

@@ -52,6 +52,6 @@ def refuse_floating(space: LagrangeSpace, free: sparse.csr_matrix[np.float64]) -
             centre = np.round(space.points[points].mean(axis=0), 1).tolist()
             raise GeometryError(
                 f"the body floats: a part of {len(points)} points around {centre} mm (RAS) has no support against"
-                f" {', '.join(loose)}; hold it with outer_boundary = 'fixed', or with a `rigid` or `driver` tissue,"
-                " or remove it from the labels"
+                f" {', '.join(loose)}; hold it with outer_boundary = 'fixed', with a `rigid` or `driver` tissue or a"
+                " held surface of its mesh, or remove it from the labels"
             )

@@ -160,4 +160,10 @@ def body_mesh(
                 f"the surface '{name}' has no face of the mesh's boundary; make within_mm larger, or name another"
             )
         behind[faces] = names.index(name)
+    covered = [name for name in surfaces if not np.any(behind == names.index(name))]
+    if covered:
+        raise GeometryError(
+            f"all faces of the surface '{covered[0]}' belong to surfaces that are named before it; name it first, or"
+            " leave it out"
+        )
     return TetMesh(file.nodes, file.tets, region, boundary, behind, tuple(tissues))

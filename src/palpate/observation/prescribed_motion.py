@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.images.alignment import RigidMotion
+from palpate.images.alignment import Motion
 from palpate.images.tissue import Role
 from palpate.mesh.gaussian_process import karhunen_loeve, kernel_factor
 from palpate.mesh.space import LagrangeSpace
@@ -56,7 +56,7 @@ class FrameMotion:
 
 def prescribed_motion(
     space: LagrangeSpace,
-    bones: Mapping[int, RigidMotion],
+    bones: Mapping[int, Motion],
     *,
     n_modes: int,
     kernel_mm: float,

@@ -25,7 +25,10 @@ def result_lines(document: Mapping[str, Any]) -> str:
     lines = [] if document["status"] == "converged" else [f"{document['status']}: {document['reason']}"]
     for row in estimate_rows(document, {}):
         found = "no value"
-        if row.value != NONE:
+        if row.value != NONE and row.verdict == "ratio only":  # whose scale is known within a range
+            found = f"{row.ratio} x {row.relative_to} (95 %: {row.ratio_interval}), {row.value} kPa if it has"
+            found += f" {row.reference} kPa"
+        elif row.value != NONE:
             found = f"{row.value} kPa" + (f" (95 %: {row.interval} kPa)" if row.interval != NONE else "")
         elif row.ratio != NONE:
             found = f"{row.ratio} x {row.relative_to}"

@@ -197,7 +197,8 @@ def _measured(data: CaseData) -> str:
 
 def _load(load: CaseLoad) -> str:
     """A known load in words."""
-    where = (f" on {load.surface}" if load.surface else "") + (f", in later state {load.state}" if load.state else "")
+    when = "" if load.state is None else f", in later state {load.state}" if load.state else ", in the reference state"
+    where = (f" on {load.surface}" if load.surface else "") + when
     if load.acceleration_m_s2 is not None:
         return f"gravity {_vector(load.acceleration_m_s2)} m/s^2{where}"
     if load.traction_kpa is not None:
@@ -309,7 +310,7 @@ def _later(drawing: _Drawing, after: int, reference: Reference) -> LaterImage:
 def _mesh(result: CaseResult) -> MeshPicture:
     """The mesh of the first reference state with its largest strain in any of its later images."""
     mesh = result.space.mesh
-    motions = result.estimation.displacements[: len(result.after)]
+    motions = result.displacements
     strains = [largest_strains(result.space, motion) for motion in motions]
     return MeshPicture(
         nodes=mesh.nodes.astype(np.float32),

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from palpate.inversion import KNOWN_MODULUS
 from palpate.uncertainty import Interval
 
 __all__ = ["NONE", "Bar", "EstimateRow", "estimate_rows", "interval_text", "main_numbers", "number", "scale_marks"]
@@ -21,6 +22,8 @@ CAUSES = {
     "offset": "how surfaces are drawn",
     "heterogeneity": "tissues that are not homogeneous",
     "poisson": "Poisson's ratios",
+    "instrument": "the instruments' offsets",
+    KNOWN_MODULUS: "the range of the known modulus",
     "prior": "what is believed of parameters",
     "grid": "the voxels' place",
     "mesh": "the mesh",
@@ -55,7 +58,8 @@ class Share:
 class EstimateRow:
     """One tissue of the result table, all texts; shares: of each cause in the variance of ln E.
 
-    sources: of each kind of data in what is known of it, where a case has more than images.
+    sources: of each kind of data in what is known of it, where a case has more than images. reference: the modulus of
+    `relative_to`, kPa.
     """
 
     tissue: str
@@ -66,6 +70,7 @@ class EstimateRow:
     ratio: str
     ratio_interval: str
     relative_to: str
+    reference: str
     verdict: str
     why: str
     truth: str
@@ -142,6 +147,7 @@ def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tu
             ratio=number(item["ratio"] if shown else None),
             ratio_interval=interval_text(item["ratio_interval95"] if shown else None),
             relative_to=item["relative_to"],
+            reference=number(item["value"] / item["ratio"] if shown and item["value"] and item["ratio"] else None),
             verdict=item["verdict"] if shown else "not identified",
             why=item["why"],
             truth=number(truth),

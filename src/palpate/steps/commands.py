@@ -7,21 +7,23 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
+from palpate.errors import ConfigurationError, InputDataError
 from palpate.progress import Progress, silent
-from palpate.steps.results import CaseResult
+from palpate.steps.results import CaseResult, SavedResult
 from palpate.steps.saving import save_sensitivity
 from palpate.study import run
 from palpate.study.case import Case
 from palpate.study.check import CheckReport, check_case
+from palpate.study.earlier import RESULT
 from palpate.study.lock import held_folder
 from palpate.study.new_case import NewCase, write_new_case
 from palpate.study.null_pair import NullPair, drawing_noise
-from palpate.study.outputs import OutputFolder
-from palpate.study.result import MeshResult, Simulation
+from palpate.study.outputs import OutputFolder, read_json
+from palpate.study.result import SCHEMA, MeshResult, Simulation
 from palpate.study.sensitivity import Kept, Sensitivity
 from palpate.study.sensitivity import sensitivity as vary
 
-__all__ = ["check", "estimate", "init", "make_mesh", "noise", "sensitivity", "simulate"]
+__all__ = ["check", "estimate", "init", "make_mesh", "noise", "read_result", "sensitivity", "simulate"]
 
 PathLike = str | os.PathLike[str]
 
@@ -48,13 +50,29 @@ def init(
         )
 
 
-def check(case_file: PathLike, overrides: Sequence[str] = (), *, progress: Progress = silent) -> CheckReport:
-    """Every problem of a case file at once, its organs and what an estimate would cost, as `palpate check` tells.
+def check(case: Case | PathLike, overrides: Sequence[str] = (), *, progress: Progress = silent) -> CheckReport:
+    """Every problem of a case or its file at once, its organs and what an estimate costs, as `palpate check` tells.
 
-    overrides: as for `read_case`; progress: is called with a sentence at each stage. Raises nothing for a bad case:
-    that is a problem of the report, too.
+    overrides: of a file, as for `read_case`; progress: is called with a sentence at each stage. Raises nothing
+    for a bad case, which is a problem of the report; `ConfigurationError` for overrides of a case that is read.
     """
-    return check_case(Path(case_file), overrides, progress=progress)
+    if isinstance(case, Case):
+        if overrides:
+            raise ConfigurationError("overrides are for a case file: palpate.read_case(file, overrides) reads it so")
+        return check_case(case, (), progress=progress)
+    return check_case(Path(case), overrides, progress=progress)
+
+
+def read_result(folder: PathLike) -> SavedResult:
+    """What an estimate left in its output folder: numbers, verdicts and warnings, as `palpate.estimate` gave them.
+
+    Raises `InputDataError` where there is no result.json of an estimate.
+    """
+    path = Path(folder)
+    document = read_json(path / RESULT)
+    if document.get("schema") != SCHEMA:
+        raise InputDataError(f"{path / RESULT} is no result of an estimate (its schema is {document.get('schema')!r})")
+    return SavedResult(document, path)
 
 
 def noise(

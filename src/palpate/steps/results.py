@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from palpate import report
 from palpate.errors import ResourceError
 from palpate.export.notebook import notebook_viewer
+from palpate.images.tissue import Role, Tissue
 from palpate.images.tissue_colours import tissue_colours
 from palpate.report.rows import moduli_in
 from palpate.steps.saving import save_estimate
@@ -23,29 +25,24 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-__all__ = ["CaseResult"]
+__all__ = ["CaseResult", "SavedResult"]
 
 COLUMNS = ("patient", "id", "stage", "status")
 
 
-@dataclass(frozen=True, slots=True)
-class CaseResult(result.CaseResult):
-    """The outcome of `palpate.estimate`: what the study found, and what a person does with it.
+class _Shown:
+    """What a person does with the document of a result: text, cards for notebooks, a table, a figure."""
 
-    Everything in it is described in `palpate.study.CaseResult`, whose fields it has.
-    """
+    __slots__ = ()
 
-    def save(self, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-        """Write result.json, report.html, mesh.vtu ... into `folder`, as `palpate estimate` does, all or none of them.
+    def to_dict(self) -> dict[str, Any]:
+        """The document result.json."""
+        raise NotImplementedError
 
-        Gives the paths that were written. Raises `ConfigurationError` where the folder holds another case.toml of
-        somebody's own, `ResourceError` where another run works there or the disk refuses.
-        """
-        outputs = OutputFolder(Path(folder))
-        with held_folder(outputs.path):
-            refuse_other_case(self.case, outputs)
-            save_estimate(self, outputs)
-        return tuple(outputs.path / name for name in outputs.written)
+    @property
+    def colours(self) -> dict[str, str]:
+        """Colour (#rrggbb) of each tissue."""
+        raise NotImplementedError
 
     def to_dataframe(self) -> pd.DataFrame:
         """A row a modulus: case, tissue, value and 95 % interval in kPa and as a ratio, verdict, truth.
@@ -79,7 +76,63 @@ class CaseResult(result.CaseResult):
 
         A figure of its own, which no display is needed for: `figure.savefig("moduli.png")`.
         """
-        return report.moduli_figure(self.to_dict(), self._colours())
+        return report.moduli_figure(self.to_dict(), self.colours)
+
+    def __repr__(self) -> str:
+        """A line a tissue: value, interval, verdict and why."""
+        return report.result_lines(self.to_dict())
+
+    def _repr_html_(self) -> str:
+        """The verdict of each tissue as a card, for notebooks."""
+        return report.result_cards(self.to_dict(), self.colours)
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class SavedResult(_Shown):
+    """What an earlier estimate left in a folder: its document result.json."""
+
+    document: Mapping[str, Any]
+    folder: Path
+
+    def to_dict(self) -> dict[str, Any]:
+        """The document result.json."""
+        return dict(self.document)
+
+    @property
+    def colours(self) -> dict[str, str]:
+        """Colour (#rrggbb) of each tissue that was estimated; those of label tables are not kept."""
+        names = [item["tissue"] for item in moduli_in(self.document)]
+        tissues = tuple(Tissue(name, Role.ESTIMATE) for name in names)
+        return dict(zip(names, tissue_colours(tissues), strict=True))
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class CaseResult(_Shown, result.CaseResult):
+    """The outcome of `palpate.estimate`: what the study found, and what a person does with it.
+
+    Everything in it is described in `palpate.study.CaseResult`, whose fields it has.
+    """
+
+    def to_dict(self) -> dict[str, Any]:
+        """The document result.json."""
+        return result.CaseResult.to_dict(self)
+
+    @property
+    def colours(self) -> dict[str, str]:
+        """Colour (#rrggbb) of each tissue."""
+        return {t.name: colour for t, colour in zip(self.tissues, tissue_colours(self.tissues), strict=True)}
+
+    def save(self, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
+        """Write result.json, report.html, mesh.vtu ... into `folder`, as `palpate estimate` does, all or none of them.
+
+        Gives the paths that were written. Raises `ConfigurationError` where the folder holds another case.toml of
+        somebody's own, `ResourceError` where another run works there or the disk refuses.
+        """
+        outputs = OutputFolder(Path(folder))
+        with held_folder(outputs.path):
+            refuse_other_case(self.case, outputs)
+            save_estimate(self, outputs)
+        return tuple(outputs.path / name for name in outputs.written)
 
     def view(self, background: str | os.PathLike[str] | None = None, *, opacity: float = 0.6) -> Any:
         """A widget for notebooks: slices and volume of the first image, Young's modulus over it.
@@ -88,14 +141,3 @@ class CaseResult(result.CaseResult):
         1. Raises `ResourceError` without ipyniivue: pip install 'palpate[notebook]'.
         """
         return notebook_viewer(self, background=None if background is None else Path(background), opacity=opacity)
-
-    def __str__(self) -> str:
-        """A line a tissue: value, interval, verdict and why."""
-        return report.result_lines(self.to_dict())
-
-    def _repr_html_(self) -> str:
-        """The verdict of each tissue as a card, for notebooks."""
-        return report.result_cards(self.to_dict(), self._colours())
-
-    def _colours(self) -> dict[str, str]:
-        return {t.name: colour for t, colour in zip(self.tissues, tissue_colours(self.tissues), strict=True)}

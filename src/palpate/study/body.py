@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.findings import Finding
-from palpate.images.alignment import Alignment, RigidMotion, align, moved
+from palpate.images.alignment import Alignment, Motion, align, moved
 from palpate.images.checks import check_headers, check_images, later_names
 from palpate.images.distance import observation_width
 from palpate.images.registration import ON, Registration, registration
@@ -23,6 +23,7 @@ from palpate.inversion import (
     LaterState,
     frame_blocks,
     instrument_block,
+    known_modulus_blocks,
     layer_blocks,
     material_blocks,
     offset_block,
@@ -66,6 +67,7 @@ __all__ = [
     "joint_problem",
     "make_body",
     "stated_noise",
+    "strained_body",
 ]
 
 SMALL_FRAME_MOTION = 1.0 / 3.0  # of what the organs do against each other: a smaller one is not worth a word
@@ -89,7 +91,7 @@ class ImagedStates:
 
     before: Segmentation
     after: tuple[Segmentation, ...]
-    bones: tuple[Mapping[int, RigidMotion], ...]
+    bones: tuple[Mapping[int, Motion], ...]
     findings: tuple[Finding, ...]
     inputs: Mapping[str, str] = field(default_factory=dict)
     data: tuple[DataSource, ...] = ()
@@ -113,7 +115,9 @@ class Body:
 
     `measured`: the data terms beside the images, by the number of their later state among all; `smoothing_mm`: the
     width of every distance map that is compared; `edge_length`: the mesh's at the organs with its reason, None where it
-    was made otherwise; `findings`: of the mesh; `layers`: regions that models have besides.
+    was made otherwise; `findings`: of the mesh; `layers`: regions that models have besides;
+    `strained` (n_points, 3) mm: how far the loads of the reference state have moved it from where it is free of stress,
+    see `unloaded_displacement`; None: not at all, or that is not known yet.
     """
 
     states: ImagedStates
@@ -124,6 +128,7 @@ class Body:
     findings: tuple[Finding, ...] = ()
     measured: tuple[tuple[int, Observation], ...] = ()
     layers: tuple[Layer, ...] = ()
+    strained: NDArray[np.float64] | None = None
 
     @property
     def layered(self) -> LagrangeSpace:
@@ -173,7 +178,7 @@ def brought(
             progress(f"looking for a motion of the whole in '{name}'")
             findings += check_headers(before.grid, image.grid, name)
             findings += _unaligned_findings(before, image, name)
-        return ImagedStates(before, after, tuple(dict[int, RigidMotion]() for _ in after), tuple(findings))
+        return ImagedStates(before, after, tuple(dict[int, Motion]() for _ in after), tuple(findings))
     rigid = {i: t.name for i, t in enumerate(before.tissues) if t.role is Role.RIGID}
     for name, image in zip(later_names(len(after)), after, strict=True):
         progress(f"aligning '{name}' on {ON[method]}")
@@ -265,26 +270,36 @@ def make_body(states: ImagedStates, case: Case, *, progress: Progress) -> Body:
         f" {found.quality.min_dihedral_deg:.1f} degrees"
     )
     layers = layers_round_organs(found.mesh) if case.discrepancy.layer_sd else ()
-    layered = layered_space(space, layers)
-    grids = (states.before.grid, *(image.grid for image in states.after))
-    mechanics = case.mechanics
+    width = observation_width(states.before.grid, *(image.grid for image in states.after))
+    body = Body(states, space, found.quality, width, found.edge_length, found.findings, layers=layers)
+    measured, findings = _measured(body, case)
+    return replace(body, measured=measured, findings=(*body.findings, *findings))
+
+
+def strained_body(body: Body, strained: NDArray[np.float64], case: Case) -> Body:
+    """The body whose reference state lies `strained` (n_points, 3) mm from where it is free of stress."""
+    found = replace(body, strained=strained)
+    return replace(found, measured=_measured(found, case)[0])
+
+
+def _measured(body: Body, case: Case) -> tuple[tuple[tuple[int, Observation], ...], tuple[Finding, ...]]:
+    """The data terms beside the images, by the number of their state, and what is to be said of them."""
+    mechanics, space = case.mechanics, body.space
 
     def reaction_of(name: str, direction: NDArray[np.float64]) -> SurfaceReaction:
         """The force that holds a named surface."""
         return surface_reaction(
-            layered,
+            body.layered,
             boundary_named(space.mesh, name),
             direction,
             mechanics.material_law,
             dilatation=choose_element(mechanics.element).dilatation,
-            material=_material(space.mesh, layers, case),
+            material=_material(space.mesh, body.layers, case),
+            strained=body.strained,
         )
 
-    terms = [(source.file.state, *source.on(space, reaction_of)) for source in states.data]
-    findings = (*found.findings, *(finding for _, _, of_term in terms for finding in of_term))
-    measured = tuple((state, term) for state, term, _ in terms)
-    width = observation_width(*grids)
-    return Body(states, space, found.quality, width, found.edge_length, findings, measured, layers)
+    terms = [(source.file.state, *source.on(space, reaction_of)) for source in body.states.data]
+    return tuple((state, term) for state, term, _ in terms), tuple(f for _, _, of_term in terms for f in of_term)
 
 
 def inverse_problem(body: Body, case: Case, *, progress: Progress) -> InverseProblem:
@@ -313,7 +328,8 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
             'nothing moves this body: no tissue has role = "driver" and no `rigid` tissue moves between the images, so'
             " no modulus can be estimated; give the role driver to the hollow organ whose wall deforms the others"
         )
-    finite = _finite_strain(models, case)
+    strained = [body.strained for body in bodies for _ in range(body.states.n_later)]
+    finite = _finite_strain(models, strained, case)
     states = tuple(
         LaterState(model, observations, law, reference)
         for model, law, (reference, observations) in zip(models, finite, seen, strict=True)
@@ -321,7 +337,11 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
     parameters = parameter_map(
         models[0].space.mesh.tissues,
         models[0].regions,
-        (*_blocks(case, pairs, seen), *_layer_blocks(case, shared, models)),
+        (
+            *_blocks(case, pairs, seen),
+            *known_modulus_blocks(models[0].space.mesh.tissues, models[0].regions, tuple(range(len(models)))),
+            *_layer_blocks(case, shared, models),
+        ),
         loaded=case.known_force,
         open_poisson=_open_poisson(case, bodies[0].space.mesh),
         dilatation=choose_element(case.mechanics.element).dilatation,
@@ -453,15 +473,17 @@ def _material(mesh: TetMesh, layers: Sequence[Layer], case: Case) -> MaterialMod
     )
 
 
-def _finite_strain(models: tuple[LinearModel, ...], case: Case) -> Sequence[FiniteStrainModel | None]:
-    """The same bodies under the case's law; None where that is the linear one."""
+def _finite_strain(
+    models: tuple[LinearModel, ...], strained: Sequence[NDArray[np.float64] | None], case: Case
+) -> Sequence[FiniteStrainModel | None]:
+    """The same bodies under the case's law, each `strained` in its reference; None where that is the linear one."""
     law = case.mechanics.material_law
     if not law.finite:
         return [None] * len(models)
     dilatation = choose_element(case.mechanics.element).dilatation
     settings = NewtonSettings(tolerance=ACCURACY, solver=case.mechanics.solver)
     found: list[FiniteStrainModel] = []
-    for model in models:
+    for model, of_reference in zip(models, strained, strict=True):
         space, conditions = model.space, model.conditions
         like = next((other for other in found if other.space is space), None)
         if like:
@@ -477,6 +499,7 @@ def _finite_strain(models: tuple[LinearModel, ...], case: Case) -> Sequence[Fini
                 loads=loads,
                 material=material,
                 settings=settings,
+                strained=of_reference,
             )
         )
     return found

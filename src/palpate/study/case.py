@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from palpate.errors import ConfigurationError
@@ -15,6 +16,7 @@ from palpate.mechanics.solvers.registry import SOLVERS
 from palpate.observation.contract import DataFile
 from palpate.study.case_data import CaseData
 from palpate.study.schema import Rule, nearest, rule, shown
+from palpate.uncertainty.intervals import NORMAL_95
 
 __all__ = [
     "REMAINING",
@@ -41,7 +43,15 @@ __all__ = [
 
 REMAINING = "remaining"
 AUTO = "auto"
+TISSUE_ROLES = tuple(str(role) for role in Role if role is not Role.SLIDING)
 HELD = ("fixed", "sliding")  # outer boundaries that leave a body no rigid motion
+SURFACE_ROLES = {  # of what lies behind a surface of a mesh
+    "moving": Role.DRIVER,
+    "fixed": Role.RIGID,
+    "sliding": Role.SLIDING,
+    "free": Role.VOID,
+    "prescribed": Role.RIGID,
+}
 LAW_NAMES = tuple(LAWS)
 SOLVER_NAMES = ("auto", *SOLVERS)
 
@@ -124,16 +134,22 @@ class CaseSurface:
     """A named surface of a mesh: a group of triangles, an outermost plane, or all of the boundary.
 
     `where`: the group's name, "x_min" ... "z_max" within `within_mm`, or "boundary". `boundary` "moving": its motion is
-    an unknown; "fixed": it is held; "free": nothing holds it, loads may act.
+    an unknown; "fixed": it is held; "sliding": it moves within itself alone; "free": nothing holds it, loads may act;
+    "prescribed": it moves as the measured points of its state say.
     """
 
     name: str
     where: str
-    boundary: str = field(default="moving", metadata=rule(choices=("moving", "fixed", "free")))
+    boundary: str = field(default="moving", metadata=rule(choices=tuple(SURFACE_ROLES)))
     within_mm: float = field(default=1.0, metadata=rule(between=(1e-6, 1e4)))
 
     def __post_init__(self) -> None:
         refuse_name(self.name, "the name of a surface")
+
+    @property
+    def behind(self) -> Tissue:
+        """The hollow tissue that stands behind it in a mesh."""
+        return Tissue(self.name, SURFACE_ROLES[self.boundary])
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,12 +197,13 @@ class CaseTissue:
     """A tissue as the case names it: `label` is a tuple of labels, a name of the label table, or "remaining".
 
     `poisson_ratio` None: 0.45, or what a phantom draws; `poisson_ratio_sd`: standard deviation of what is believed of
-    it where it is sought, None: 0.03.
+    it where it is sought, None: 0.03. `youngs_modulus_kpa`: a number, or the 95 % range of what is believed of a
+    `known` one.
     """
 
     name: str
     label: tuple[int, ...] | str = field(metadata=rule(convert=_label))
-    role: Role
+    role: Role = field(metadata=rule(choices=TISSUE_ROLES))
     poisson_ratio: float | None = field(
         default=None,
         metadata=rule(
@@ -194,7 +211,7 @@ class CaseTissue:
             wanted="an isotropic elastic solid needs -1 < nu < 0.5; soft tissue is usually given 0.40 to 0.49",
         ),
     )
-    youngs_modulus_kpa: float | None = field(
+    youngs_modulus_kpa: float | tuple[float, float] | None = field(
         default=None,
         metadata=rule(between=KILOPASCALS, wanted="a positive number in kPa (soft tissue: 0.5 to 1000 kPa)"),
     )
@@ -210,12 +227,35 @@ class CaseTissue:
             )
         if isinstance(self.label, str):
             refuse_name(self.label, f"the label of tissue '{self.name}'")
+        if isinstance(self.youngs_modulus_kpa, tuple):
+            if self.role is not Role.KNOWN:
+                raise ConfigurationError(
+                    f"tissue '{self.name}': youngs_modulus_kpa is a range, which is what is believed of a `known`"
+                    f" modulus, but its role is '{self.role}'; give a number, or leave it out"
+                )
+            if not self.youngs_modulus_kpa[0] < self.youngs_modulus_kpa[1]:
+                raise ConfigurationError(
+                    f"tissue '{self.name}': youngs_modulus_kpa is {shown(self.youngs_modulus_kpa)}; a range begins with"
+                    " its smaller end"
+                )
         self.with_labels(())  # a tissue's constants are checked by the tissue itself
 
     def with_labels(self, labels: tuple[int, ...]) -> Tissue:
         """The tissue with its labels; raises `ConfigurationError` when its constants are impossible."""
         ratio = POISSON_RATIO if self.poisson_ratio is None else self.poisson_ratio
-        return Tissue(self.name, self.role, labels, ratio, self.youngs_modulus_kpa)
+        return Tissue(self.name, self.role, labels, ratio, self.modulus_kpa, modulus_sd=self.modulus_sd)
+
+    @property
+    def modulus_kpa(self) -> float | None:
+        """Young's modulus, kPa: the number that is given, or the geometric mean of a range's ends."""
+        given = self.youngs_modulus_kpa
+        return math.sqrt(given[0] * given[1]) if isinstance(given, tuple) else given
+
+    @property
+    def modulus_sd(self) -> float:
+        """Standard deviation of ln E, by the 95 % range that is given; 0 of a number."""
+        given = self.youngs_modulus_kpa
+        return math.log(given[1] / given[0]) / (2.0 * NORMAL_95) if isinstance(given, tuple) else 0.0
 
     def resolve(self, names: Mapping[int, str]) -> Tissue:
         """The tissue with the labels that `names` (label -> name) gives to its label's name.
@@ -263,16 +303,28 @@ class CaseLoad:
     `surface`: a hollow tissue whose wall moves freely (role `void`), or "outer", the cut of the image; a pressure of
     `pressure_kpa` pushes into the body, on the surface as it moves or (`following` false) as it was; `traction_kpa`
     (3,) is per area at rest; `acceleration_m_s2` (3,) acts on the tissues' `density_kg_m3`. `state`: number, from 1, of
-    the later image in which it acts, those of further [[pairs]] after those of [images]; None: it acts in all.
+    the later image in which it acts, those of further [[pairs]] after those of [images]; None: it acts in all of them;
+    0: it acts in the reference state, whose shape the images, or the mesh, show under it.
     """
 
     kind: str = field(metadata=rule(choices=("pressure", "traction", "gravity")))
-    state: int | None = field(default=None, metadata=rule(between=(1, 1000)))
+    state: int | None = field(default=None, metadata=rule(between=(0, 1000)))
     surface: str | None = None
     pressure_kpa: float | None = field(default=None, metadata=rule(between=STRESSES_KPA))
     following: bool = True
     traction_kpa: tuple[float, float, float] | None = field(default=None, metadata=rule(between=STRESSES_KPA))
     acceleration_m_s2: tuple[float, float, float] | None = field(default=None, metadata=rule(between=(-100.0, 100.0)))
+
+    @property
+    def taken(self) -> CaseLoad:
+        """What takes the load off a body that bears it: its forces, turned round."""
+        return replace(
+            self,
+            following=False,
+            pressure_kpa=None if self.pressure_kpa is None else -self.pressure_kpa,
+            traction_kpa=_turned(self.traction_kpa),
+            acceleration_m_s2=_turned(self.acceleration_m_s2),
+        )
 
     def __post_init__(self) -> None:
         needed = {
@@ -288,6 +340,10 @@ class CaseLoad:
         for key in given:
             if key not in needed:
                 raise ConfigurationError(f"[[loads]]: a {self.kind} has no '{key}'; it has {' and '.join(needed)}")
+
+
+def _turned(vector: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+    return None if vector is None else (-vector[0], -vector[1], -vector[2])
 
 
 @dataclass(frozen=True, slots=True)
@@ -498,8 +554,16 @@ class Case:
         return max(len(self.images.after) if self.images else 0, 1) + further
 
     def loads_in(self, state: int) -> tuple[CaseLoad, ...]:
-        """The known loads that act in the later state with a number, from 1."""
-        return tuple(load for load in self.loads if load.state in (None, state))
+        """The known loads of the reference state, 0, or what changes from them to the later state with a number."""
+        borne = tuple(load for load in self.loads if load.state == 0)
+        if state == 0:
+            return borne
+        return tuple(load for load in self.loads if load.state in (None, state)) + tuple(load.taken for load in borne)
+
+    @property
+    def strained_reference(self) -> bool:
+        """Whether the reference state bears loads that the law cannot simply take off: its rest state is found."""
+        return self.mechanics.material_law.finite and bool(self.loads_in(0))
 
     @property
     def align(self) -> str:

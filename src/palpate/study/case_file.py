@@ -59,7 +59,8 @@ def _read_text(path: Path) -> str:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ConfigurationError(
-            f"{path} is not UTF-8 text (byte {error.start}): give a case.toml saved as UTF-8"
+            f"{path} is not UTF-8 text (byte {error.start}), so it is no case.toml; from images alone an estimate needs"
+            " two or more, the one before and those after"
         ) from error
 
 

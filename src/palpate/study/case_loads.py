@@ -17,7 +17,9 @@ __all__ = ["case_loads", "loads_on"]
 
 
 def case_loads(case: Case, space: LagrangeSpace, state: int, *, share: float = 1.0) -> tuple[Load, ...]:
-    """The loads of `case` in the later state with a number, from 1, on `space`, or a `share` of them.
+    """What `case` adds in the later state with a number, from 1, to the loads of the reference, or a `share` of it.
+
+    Those of the reference itself for the number 0.
 
     Raises `ConfigurationError` for a surface that the mesh has not, or whose motion is prescribed.
     """
@@ -31,6 +33,7 @@ def loads_on(
 ) -> tuple[Load, ...]:
     """The same of `loads` alone; densities (n_tissues,) kg/m^3, one each of the mesh's tissues."""
     prescribed = [t.name for t in space.mesh.tissues if t.role in (Role.DRIVER, Role.RIGID)]
+    sliding = [t.name for t in space.mesh.tissues if t.role is Role.SLIDING]
     found: list[Load] = []
     for load in loads:
         if load.acceleration_m_s2 is not None:
@@ -40,7 +43,12 @@ def loads_on(
         if surface in prescribed:
             raise ConfigurationError(
                 f"[[loads]]: the motion of '{surface}' is prescribed, so a {load.kind} on it does nothing; give it the"
-                " role void if the load is to move it"
+                " role void (a surface of a mesh: the boundary free) if the load is to move it"
+            )
+        if surface in sliding and load.pressure_kpa is not None:
+            raise ConfigurationError(
+                f"[[loads]]: '{surface}' is sliding and does not move along its normal, so a pressure on it does"
+                " nothing; give it the boundary free if the pressure is to move it"
             )
         triangles = boundary_named(space.mesh, surface)
         if load.traction_kpa is not None:

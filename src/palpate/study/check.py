@@ -181,16 +181,21 @@ class _Problems:
         return tuple(sorted([*self.found, *warned], key=lambda problem: (-problem.exit_code, rank(problem.code))))
 
 
-def check_case(path: Path, overrides: Sequence[str], *, progress: Progress) -> CheckReport:
-    """All problems of the case file at `path` (with overrides as in `read_case`), its organs and its expected cost.
+def check_case(source: Path | Case, overrides: Sequence[str], *, progress: Progress) -> CheckReport:
+    """All problems of a case, or of a case file (with overrides as in `read_case`), its organs and its expected cost.
 
     The images are aligned, and meshed if nothing was refused before, as an estimate would. Nothing is solved. Raises
     nothing for a bad case: that is a problem, too.
     """
     problems = _Problems()
-    case = problems.attempt(lambda: read_case(path, overrides))
-    if case is None:
-        return CheckReport(path.stem, problems.all())
+    if isinstance(source, Case):
+        return _checked(source, problems, progress)
+    case = problems.attempt(lambda: read_case(source, overrides))
+    return CheckReport(source.stem, problems.all()) if case is None else _checked(case, problems, progress)
+
+
+def _checked(case: Case, problems: _Problems, progress: Progress) -> CheckReport:
+    """The report of a case, with the problems that were found before it."""
     problems.attempt(lambda: refuse_what_cannot_be_estimated(case))
     problems.attempt(lambda: require_samples(case))
     problems.warn(unit_warnings(case))
@@ -238,7 +243,7 @@ def _lay(pair: ImagedStates) -> list[tuple[str, Registration]]:
 def _cost(problems: _Problems, pairs: Sequence[ImagedStates], case: Case, progress: Progress) -> ExpectedCost:
     """What an estimate would cost on its very meshes; on meshes of a guessed size where something is refused."""
     first = pairs[0]
-    cost = expected_cost(case, first.before, first.after, n_pairs=len(pairs))
+    cost = expected_cost(case, first.before, first.after, n_pairs=len(pairs), mesh=first.mesh)
     if first.mesh is None:
         edge = edge_length_of(case, first.before, first.after).mm
         problems.attempt(lambda: refuse_edge(edge, case_domain(first.before, case)))

@@ -16,7 +16,7 @@ from palpate.images.tissue import Role
 from palpate.images.tissue_distance import REACH_MM, window_around
 from palpate.mechanics.solvers.registry import expected_of_size
 from palpate.memory import available_memory, total_memory
-from palpate.mesh import Box, SizeField
+from palpate.mesh import Box, SizeField, TetMesh
 from palpate.parallel import processors
 from palpate.progress import STAGES, Stage
 from palpate.study.case import Case
@@ -46,6 +46,7 @@ UNKNOWNS_A_TET = {"P1": 0.62, "P2": 4.4}
 FIXED_S: Mapping[Stage, float] = {"reading": 3.2, "linear law": 3.0, "intervals": 3.4, "report": 4.2}
 SECONDS_AN_UNKNOWN = 2.2e-4  # beside the solver, with 90 modes a driver, for each later image
 FINITE_STRAIN_S = 2.0e-4  # the same of equilibria and their derivatives at finite strain
+FROM_REST = 2  # further passes, each with a linear one, where the state without loads is found with the moduli
 SECONDS_A_DRAW = 7.5e-3  # of the posterior, in four chains, with 90 modes, for each later image
 SECONDS_A_CUT = 2.0e-4  # of meshing, for each tetrahedron and each tissue that is cut out
 PARALLEL_SHARE = 0.3  # of the time, that more processors shorten
@@ -74,13 +75,16 @@ class ExpectedCost:
     stages: Mapping[Stage, float] = field(default_factory=dict)
 
 
-def expected_cost(case: Case, before: Segmentation, after: tuple[Segmentation, ...], *, n_pairs: int) -> ExpectedCost:
+def expected_cost(
+    case: Case, before: Segmentation, after: tuple[Segmentation, ...], *, n_pairs: int, mesh: TetMesh | None = None
+) -> ExpectedCost:
     """The cost of estimating a case on this machine, from its first pair of images; further pairs cost the same each.
 
-    Nothing is meshed: tetrahedra from the sum of 1 / h^3 over the meshed volume, h the mesher's own edge length there.
+    Nothing is meshed: tetrahedra from the sum of 1 / h^3 over the meshed volume, h the mesher's own edge length there,
+    or those of the case's own `mesh`.
     """
-    size = expected_size(case, expected_tets(case, before, after))
-    return cost_of_meshes(case, before, [size] * n_pairs, n_after=len(after))
+    size = expected_size(case, expected_tets(case, before, after) if mesh is None else len(mesh.tets))
+    return cost_of_meshes(case, before, [size] * n_pairs, n_after=len(after) or case.n_states)
 
 
 def expected_size(case: Case, tets: int) -> tuple[int, int]:
@@ -108,9 +112,11 @@ def cost_of_meshes(
     for tets, unknowns in meshes:
         _, solving = expected_of_size(unknowns, case.driver.modes + SERIES, solver=solver)
         work = unknowns * modes * max(n_after, 1)
-        took["meshing"] += SECONDS_A_CUT * tets * (len(before.tissues) - 1) * shorter
+        took["meshing"] += (case.body is None) * SECONDS_A_CUT * tets * (len(before.tissues) - 1) * shorter
         took["linear law"] += SECONDS_AN_UNKNOWN * work * shorter + solving.seconds
         took["finite strain"] += finite * FINITE_STRAIN_S * work * shorter
+        if case.strained_reference:
+            took["finite strain"] += FROM_REST * (SECONDS_AN_UNKNOWN + FINITE_STRAIN_S) * work * shorter
         took["intervals"] += SECONDS_A_DRAW * case.estimate.samples * modes * max(n_after, 1)
         gigabytes += GB_AN_UNKNOWN * work + solving.bytes / 1e9
     return ExpectedCost(

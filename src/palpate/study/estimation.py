@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from palpate.errors import EstimationError
 from palpate.findings import Finding
 from palpate.inversion import (
+    KNOWN_MODULUS,
     Bounds,
     Inversion,
     InversionSettings,
@@ -427,28 +428,47 @@ def _estimates(
         return tuple(none)
     found, unit = [], scale if mapping.absolute else 1.0
     given = np.diag(covariance.total if covariance.given_model is None else covariance.given_model)
+    shift = mapping.reference_shift(inversion.minimum.unknowns)
     for i, (nothing, of) in enumerate(zip(none, known, strict=False)):
-        ratio, (low, high) = float(np.exp(inversion.minimum.unknowns[i])), of.interval
+        theta, (low, high) = float(inversion.minimum.unknowns[i]), of.interval
+        value, shares = float(np.exp(theta)), covariance.shares(i)
+        of_scale = float(np.sqrt(1.0 - shares.get(KNOWN_MODULUS, 0.0)))  # a ratio does not hang on the scale
+        by_ratio = _about(float(np.exp(theta - shift)), of.interval, value, of_scale)
         word, why = verdict(of.interval, at_bound=of.at_bound, absolute=mapping.absolute)
+        if word != "identified" and of_scale < 1.0:
+            word, why = _of_range(word, why, verdict(by_ratio, at_bound=of.at_bound, absolute=True))
         points = zip(unit * np.exp(of.own.profile.theta), of.own.profile.root, strict=True)
-        inside = log_interval(ratio, float(np.sqrt(given[i])), lower=low or 0.0, upper=high or np.inf)
+        inside = log_interval(value, float(np.sqrt(given[i])), lower=low or 0.0, upper=high or np.inf)
         within = (inside[0] or low, inside[1] or high)
         found.append(
             replace(
                 nothing,
                 interval_kind=of.own.kind,
                 interval95_given_model=_stated(within, word, unit),
-                variance_shares=covariance.shares(i),
-                profile=tuple((float(value), float(root)) for value, root in points),
-                value=ratio * scale if mapping.absolute else None,
+                variance_shares=shares,
+                profile=tuple((float(at), float(root)) for at, root in points),
+                value=value * scale if mapping.absolute else None,
                 interval95=_stated(of.interval, word, scale) if mapping.absolute else None,
-                ratio=None if mapping.by_load else ratio,
-                ratio_interval95=None if mapping.by_load else _stated(of.interval, word),
+                ratio=None if mapping.by_load else float(np.exp(theta - shift)),
+                ratio_interval95=None if mapping.by_load else _stated(by_ratio, word),
                 verdict=word,
                 why=why,
             )
         )
     return tuple(found)
+
+
+def _about(centre: float, interval: Interval, value: float, power: float) -> Interval:
+    """An interval of a value, moved to another centre and its half-widths in ln times a power."""
+    low, high = (None if end is None else float(centre * (end / value) ** power) for end in interval)
+    return low, high
+
+
+def _of_range(word: str, why: str, of_ratio: tuple[str, str]) -> tuple[str, str]:
+    """The verdict on a modulus whose scale is known within a range alone: the ratio may say more."""
+    if of_ratio[0] == NOT_IDENTIFIED or of_ratio[0] == word:
+        return word, why
+    return "ratio only", f"of the ratio {of_ratio[1]}; the range of the known modulus leaves more of it open in kPa"
 
 
 def _stated(interval: Interval, word: str, unit: float = 1.0) -> Interval | None:

@@ -70,14 +70,15 @@ def _value(hint: Any, bounds: Rule) -> dict[str, Any]:
     if isinstance(hint, types.UnionType):  # X | None: None is the key left out
         if bounds.convert:
             return LABEL
-        stated = _value(next(arm for arm in typing.get_args(hint) if arm is not types.NoneType), bounds)
+        arms = [_value(arm, bounds) for arm in typing.get_args(hint) if arm is not types.NoneType]
+        stated = arms[0] if len(arms) == 1 else {"oneOf": arms}
         return {"oneOf": [{"const": bounds.chosen}, stated]} if bounds.chosen else stated
     if typing.get_origin(hint) is tuple:
         return _list(typing.get_args(hint), bounds)
     if dataclasses.is_dataclass(hint):
         return _table(hint)
     if isinstance(hint, type) and issubclass(hint, StrEnum):
-        return {"enum": [str(member) for member in hint]}
+        return {"enum": list(bounds.choices) or [str(member) for member in hint]}
     value: dict[str, Any] = {"type": PLAIN[hint]}
     if bounds.choices:
         value = {"enum": list(bounds.choices)}

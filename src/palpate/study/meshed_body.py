@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError
-from palpate.images.alignment import RigidMotion
+from palpate.images.alignment import Motion
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
+from palpate.mechanics.loads import boundary_named
 from palpate.mesh.mesh_file import PLANES, WHOLE, MeshFile, body_mesh, plane_faces, read_mesh_file
 from palpate.mesh.space import lagrange_space
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.mesh.tetrahedralise import boundary_of
 from palpate.mesh.voxelise import voxelise
+from palpate.observation.measured_motion import measured_motion
+from palpate.observation.measured_points import MeasuredPoints
 from palpate.progress import Progress
 from palpate.study.body import ImagedStates
 from palpate.study.case import Case, CaseSurface, MeshBody
 from palpate.study.schema import nearest
 
-__all__ = ["mesh_states"]
+__all__ = ["mesh_states", "with_prescribed"]
 
 OUTSIDE = "outside"
-ROLES = {"moving": Role.DRIVER, "fixed": Role.RIGID, "free": Role.VOID}
 VOXELS_AN_EDGE, MOST_VOXELS, BORDER = 2.5, 4e6, 3  # of the label image that shows the mesh
 
 
@@ -38,8 +43,32 @@ def mesh_states(body: MeshBody, case: Case, *, progress: Progress) -> ImagedStat
     grid = _grid(mesh)
     index = voxelise(lagrange_space(mesh, "P1"), np.zeros_like(mesh.nodes), grid, crossing=True)
     before = Segmentation(index, grid, mesh.tissues)
-    bones = tuple(dict[int, RigidMotion]() for _ in range(case.n_states))
+    bones = tuple(dict[int, Motion]() for _ in range(case.n_states))
     return ImagedStates(before, (), bones, (), inputs={"mesh": file.digest}, mesh=mesh)
+
+
+def with_prescribed(states: ImagedStates, case: Case) -> ImagedStates:
+    """The states of a mesh with the motions that measured points prescribe to its surfaces.
+
+    Raises `ConfigurationError` for a state without measured points, `InputDataError` where they lie elsewhere.
+    """
+    surfaces = [surface.name for surface in case.surfaces if surface.boundary == "prescribed"]
+    if states.mesh is None or not surfaces:
+        return states
+    mesh, found = states.mesh, list[Mapping[int, Motion]]()
+    names = [tissue.name for tissue in mesh.tissues]
+    for state in range(1, states.n_later + 1):
+        points = [of for of in states.data if isinstance(of, MeasuredPoints) and of.file.state == state]
+        if not points:
+            raise ConfigurationError(
+                f"the motion of '{surfaces[0]}' is prescribed, and no [[data]] of state {state} says where points went:"
+                ' give landmarks or a displacement field, or the surface another boundary ("moving", "fixed")'
+            )
+        motion = measured_motion(points, kernel_mm=case.driver.kernel_mm, amplitude_mm=case.driver.prior_mm)
+        for name in surfaces:
+            motion.require(mesh.nodes[np.unique(boundary_named(mesh, name))], name)
+        found.append({names.index(name): motion for name in surfaces})
+    return replace(states, bones=tuple(found))
 
 
 def _mesh(file: MeshFile, case: Case) -> TetMesh:
@@ -64,7 +93,7 @@ def _mesh(file: MeshFile, case: Case) -> TetMesh:
         )
     faces = boundary_of(file.tets)
     surfaces = {surface.name: _faces(file, faces, surface) for surface in case.surfaces}
-    tissues += [Tissue(surface.name, ROLES[surface.boundary]) for surface in case.surfaces]
+    tissues += [surface.behind for surface in case.surfaces]
     tissues.append(Tissue(OUTSIDE, Role.VOID))
     return body_mesh(file, tissues, region, surfaces, len(tissues) - 1)
 

@@ -28,6 +28,7 @@ __all__ = ["CaseImages", "NewCase", "new_case", "write_new_case"]
 
 LARGEST_CASE = 1_000_000  # bytes
 WIDE_MM = 250.0  # of an image: more than the body of many, so that it must show what lies around, too
+GUESSED_WITHIN = 2.0  # times and by what a known modulus is guessed: measured ones of one tissue differ so
 ROLES = (
     "  estimate: its stiffness is wanted; its surface is looked at in all images",
     "  known:    its youngs_modulus_kpa is given; the first one sets the scale of all results",
@@ -229,8 +230,10 @@ def _tissue(tissue: GuessedTissue, before: LabelImage) -> str:
         if value is None:
             lines.append(_comment("youngs_modulus_kpa = ?  QUESTION: no published value is known; give it in kPa"))
         else:
+            low, high = value / GUESSED_WITHIN, value * GUESSED_WITHIN
             lines.append(
-                f"youngs_modulus_kpa = {value:g}  # every estimate in kPa scales with the first known tissue's"
+                f"youngs_modulus_kpa = [{low:g}, {high:g}]  # {value:g} is a guess, this the range that 95 % lie in:"
+                " it is in every interval in kPa, and in no ratio; give a number if it was measured"
             )
     return "\n".join(lines)
 

@@ -175,7 +175,7 @@ def unit_warnings(case: Case) -> tuple[Finding, ...]:
     tissue.
     """
     hints = []
-    for name, value in [(t.name, t.youngs_modulus_kpa) for t in case.tissues if t.role is not Role.RIGID]:
+    for name, value in [(t.name, t.modulus_kpa) for t in case.tissues if t.role is not Role.RIGID]:
         entries = published_for(name)
         low, high = min((e.low for e in entries), default=0.0), max((e.high for e in entries), default=0.0)
         low, high = (low / GIVEN_MARGIN, high * GIVEN_MARGIN) if entries else SOFT_TISSUE_KPA

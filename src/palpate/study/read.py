@@ -24,7 +24,7 @@ from palpate.phantoms.spheres import SpheresOptions, spheres, spheres_anatomy
 from palpate.progress import Progress, silent
 from palpate.study.body import ImagedStates, aligned
 from palpate.study.case import Case, CaseTissue
-from palpate.study.meshed_body import mesh_states
+from palpate.study.meshed_body import mesh_states, with_prescribed
 from palpate.study.provenance import file_digest
 from palpate.study.refusals import refuse_large
 from palpate.study.schema import nearest, shown
@@ -42,7 +42,8 @@ def read_states(case: Case, *, progress: Progress = silent) -> ImagedStates:
         after = (segment(scene.after, scene.tissues),)
         return aligned(segment(scene.before, scene.tissues), after, method=case.align, loaded=bool(case.loads))
     if case.body is not None:
-        return _with_measured(mesh_states(case.body, case, progress=progress), case, first=0, progress=progress)
+        states = mesh_states(case.body, case, progress=progress)
+        return with_prescribed(_with_measured(states, case, first=0, progress=progress), case)
     if case.images is None:
         raise ConfigurationError(f"case '{case.id}' has neither [images] nor [phantom]")
     return _read_pair(case, case.images.before, case.images.after, key="", first=0, progress=progress)
@@ -111,7 +112,7 @@ def phantom_scene(case: Case) -> Scene:
         options,
         law=case.phantom.law or case.mechanics.law,
         law_parameters=case.mechanics.law_parameters,
-        moduli_kpa={t.name: t.youngs_modulus_kpa for t in meshed if t.youngs_modulus_kpa is not None},
+        moduli_kpa={t.name: t.modulus_kpa for t in meshed if t.modulus_kpa is not None},
         poisson_ratio={t.name: t.poisson_ratio for t in meshed if t.poisson_ratio is not None},
     )
     if isinstance(options, PelvisOptions):

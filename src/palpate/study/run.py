@@ -11,7 +11,7 @@ import numpy as np
 from palpate.errors import ConfigurationError, EstimationError
 from palpate.findings import Finding, of_pair
 from palpate.images.tissue import Role
-from palpate.inversion import Bounds, Inversion, InversionSettings, ParameterMap, eta_of_ratio, invert
+from palpate.inversion import Bounds, Inversion, InversionSettings, ParameterMap, eta_of_ratio
 from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.laws.registry import law_named
 from palpate.parallel import blas_on_one_thread
@@ -20,6 +20,7 @@ from palpate.study.body import Body, ImagedStates, joint_problem, make_body
 from palpate.study.case import LAW_NAMES, SOUGHT_RATIOS, Case, Mechanics
 from palpate.study.cost import ExpectedCost, cost_of_meshes, expected_cost
 from palpate.study.estimation import Estimation, Observed, conclude
+from palpate.study.inverted import inverted
 from palpate.study.plausibility import estimate_warnings, unit_warnings
 from palpate.study.poisson_ratios import with_found_ratios
 from palpate.study.provenance import input_digests, software_versions
@@ -70,7 +71,7 @@ def estimate(
     reading = during("reading", progress)
     states, further = read_states(case, progress=reading), read_pairs(case, progress=reading)
     if progress is not silent or condition is not unconditional:
-        cost = expected_cost(case, states.before, states.after, n_pairs=1 + len(further))
+        cost = expected_cost(case, states.before, states.after, n_pairs=1 + len(further), mesh=states.mesh)
         condition(cost)
         progress(_forecast(cost))
     if case.phantom:
@@ -108,7 +109,7 @@ def estimate_states(
     problem = joint_problem(bodies, case, progress=during("linear law", progress))
     clock.append(time.perf_counter())
     settings = inversion_settings(case, problem.parameters)
-    inversion = invert(problem, settings, progress=during("linear law", progress))
+    inversion = inverted(bodies, problem, case, settings, progress=progress)
     images = tuple(image.index if image else None for pair in bodies for image in pair.states.later)
     observed = Observed(fitted_states(inversion, *bodies), images)
     stating = during("intervals", progress)
@@ -163,16 +164,18 @@ def _what_would_change(
 ) -> tuple[Variation, ...]:
     """What the estimate of a case rests on; nothing where not even the estimate itself can be followed.
 
-    Laws at finite strain differ from each other by less than from the linear one, which is held against one of them.
+    Laws at finite strain differ from each other by less than from the linear one, which is held against one of them. No
+    step leads to another law where that would also find another reference state.
     """
     mechanics, later = case.mechanics, [image for body in bodies for image in body.states.after]
     names = LAW_NAMES if mechanics.material_law.finite else (Mechanics().law,)
+    others = [law_named(name) for name in names if name != mechanics.law and not case.strained_reference]
     try:
         return what_would_change(
             inversion,
             settings,
             bodies[0].layered.mesh.tissues,
-            [law_named(name) for name in names if name != mechanics.law],
+            others,
             dilatation=choose_element(mechanics.element).dilatation,
             voxel_mm=voxel_mm(later),
         )

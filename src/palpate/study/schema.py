@@ -113,6 +113,8 @@ def read_table(kind: type[T], table: Mapping[str, object], *, where: str, folder
             values[key] = None
             continue
         _check_range(bounds, value, place)
+        if isinstance(value, str):  # before an enumeration names all of its words
+            _check_choice(bounds, value, place)
         converted = bounds.convert(value) if bounds.convert else _convert(hints[key], value, place)
         _check_value(bounds, converted, place)
         values[key] = converted
@@ -165,18 +167,23 @@ def _check_range(bounds: Rule, value: object, place: _Place) -> None:
 
 def _check_value(bounds: Rule, value: object, place: _Place) -> None:
     for item in value if isinstance(value, tuple) else (value,):
-        if bounds.choices and item not in bounds.choices:
-            raise ConfigurationError(f"{place} is {shown(item)}: {nearest(str(item), bounds.choices)}")
+        _check_choice(bounds, item, place)
     if bounds.test is not None and value is not None and not bounds.test(value):
         raise ConfigurationError(f"{place} is {shown(value)}, but it must be {bounds.wanted}")
+
+
+def _check_choice(bounds: Rule, value: object, place: _Place) -> None:
+    if bounds.choices and value not in bounds.choices:
+        raise ConfigurationError(f"{place} is {shown(value)}: {nearest(str(value), bounds.choices)}")
 
 
 def _convert(hint: Any, value: object, place: _Place) -> object:
     """`value` as the type `hint`, which is one of those that the schema uses."""
     origin = typing.get_origin(hint)
-    if origin is types.UnionType:  # X | None
-        inner = next(arm for arm in typing.get_args(hint) if arm is not types.NoneType)
-        return _convert(inner, value, place)
+    if origin is types.UnionType:  # X | None, or a number or several: X | tuple[X, X] | None
+        arms = [arm for arm in typing.get_args(hint) if arm is not types.NoneType]
+        listed = [arm for arm in arms if typing.get_origin(arm) is tuple]
+        return _convert(listed[0] if listed and isinstance(value, list) else arms[0], value, place)
     if origin is tuple:
         return _convert_tuple(typing.get_args(hint), value, place)
     if dataclasses.is_dataclass(hint):

@@ -27,7 +27,7 @@ from palpate.errors import (
     ResourceError,
 )
 from palpate.images.tissue import Role
-from palpate.inversion import Inversion, InversionSettings, StopRule, invert
+from palpate.inversion import Inversion, InversionSettings, StopRule
 from palpate.mechanics.dilatation import choose_element
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Progress, silent
@@ -36,6 +36,7 @@ from palpate.study.case import LAW_NAMES, Case
 from palpate.study.case_text import case_tables
 from palpate.study.edge_length import edge_length_of
 from palpate.study.estimation import Observed, conclude
+from palpate.study.inverted import inverted
 from palpate.study.outputs import OutputFolder, read_json, write_json
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.read import read_pairs, read_states
@@ -199,8 +200,8 @@ def _inverted(
     if start is not None:
         inside = np.clip(start, settings.bounds.lower, settings.bounds.upper)
         settings = replace(settings, starts=(inside,))
-        return invert(problem, settings, progress=progress, rule=VARIED), settings
-    return invert(problem, settings, progress=progress), settings
+        return inverted(bodies, problem, case, settings, progress=progress, rule=VARIED), settings
+    return inverted(bodies, problem, case, settings, progress=progress), settings
 
 
 def _estimated(case: Case, bodies: Bodies, sobol: int, progress: Progress) -> dict[str, Any]:

@@ -17,13 +17,15 @@ from palpate.inversion import fit_driver
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.equilibrium import equilibrium
+from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.loads import Load
+from palpate.mechanics.rest_state import unloaded_displacement
 from palpate.mesh.dihedral import tet_dihedrals
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.phantoms.wall_filling import wall_filling
-from palpate.study.body import Body, inverse_problem, make_body
+from palpate.study.body import Body, inverse_problem, make_body, strained_body
 from palpate.study.case import Case, Mechanics
 from palpate.study.case_loads import case_loads
 from palpate.study.provenance import input_digests, software_versions
@@ -78,11 +80,13 @@ def filled(
     outer: str,
     mechanics: Mechanics,
     loads: tuple[Load, ...] = (),
+    borne: tuple[Load, ...] = (),
 ) -> NDArray[np.float64]:
     """Displacement (n_points, 3) mm of a body whose drivers fill by `filling_mm`, whose bones are held.
 
-    segmentation: the labels that the drivers' walls come from; outer: see `outer_constraint`; loads: those that act,
-    too. The tissues of the space's mesh state their moduli. Raises `NotConverged` as `equilibrium` does.
+    segmentation: the labels that the drivers' walls come from; outer: see `outer_constraint`; loads: what is added to
+    those that the body bears as it is segmented, `borne`. The tissues of the space's mesh state their
+    moduli. Raises `NotConverged` as `equilibrium` does.
     """
     tissues = space.mesh.tissues
     _refuse_unknown(tissues)
@@ -99,13 +103,13 @@ def filled(
     constraint = outer_constraint(
         space, outer=outer, modes=no_modes, offset=offset.ravel(), prescribed=motion.prescribed
     )
+    law, dilatation = mechanics.material_law, choose_element(mechanics.element).dilatation
+    strained = None
+    if borne and law.finite:
+        model = finite_strain_model(space, constraint, law, dilatation=dilatation)
+        strained = unloaded_displacement(model, _moduli(tissues), np.zeros(0), borne)
     found = equilibrium(
-        space,
-        constraint,
-        _moduli(tissues),
-        law=mechanics.material_law,
-        dilatation=choose_element(mechanics.element).dilatation,
-        loads=loads,
+        space, constraint, _moduli(tissues), law=law, dilatation=dilatation, loads=loads, strained=strained
     )
     return found.displacement
 
@@ -115,7 +119,13 @@ def _steps(body: Body, case: Case, steps: int, progress: Progress) -> tuple[NDAr
     shares = [step / steps for step in range(1, steps + 1)]
     if case.motion is None and body.states.after:
         problem = inverse_problem(body, case, progress=progress)
-        return fit_driver(problem, _moduli(problem.states[0].model.space.mesh.tissues), shares=shares)[-1]
+        moduli = _moduli(problem.states[0].model.space.mesh.tissues)
+        model = problem.states[0].finite_strain
+        if model is not None and case.strained_reference:
+            given = np.zeros(model.material.n_modes)
+            strained = unloaded_displacement(model, moduli, given, case_loads(case, body.space, 0))
+            problem = inverse_problem(strained_body(body, strained, case), case, progress=progress)
+        return fit_driver(problem, moduli, shares=shares)[-1]
     if not case.mechanics.material_law.finite:
         whole = _moved(body, case, 1.0)
         return tuple(whole * share for share in shares)
@@ -131,6 +141,7 @@ def _moved(body: Body, case: Case, share: float) -> NDArray[np.float64]:
         outer=case.domain.outer_boundary,
         mechanics=case.mechanics,
         loads=case_loads(case, body.space, 1, share=share),
+        borne=case_loads(case, body.space, 0),
     )
 
 

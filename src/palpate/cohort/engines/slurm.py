@@ -154,7 +154,7 @@ def _memory_gb(task: Task) -> float:
     try:
         case = case_of(task.row, task.overrides)
         states = read_states(case)
-        cost = expected_cost(case, states.before, states.after, n_pairs=1 + len(case.pairs))
+        cost = expected_cost(case, states.before, states.after, n_pairs=1 + len(case.pairs), mesh=states.mesh)
     except PalpateError:
         return LEAST_MEMORY_GB
     return task.limits.memory_for(cost.memory_gb)
