@@ -34,7 +34,7 @@ law = "linear"
 element = "P1"
 
 [mesh]
-edge_length_mm = 8.0
+edge_length_mm = 6.0
 
 [driver]
 modes = 6

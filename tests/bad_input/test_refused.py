@@ -94,7 +94,7 @@ REFUSED = {
     "21 a speck": (lambda f: both(f, speck), 4, "has only 27 voxels"),
     "21 a sheet": (lambda f: both(f, sheet), 4, "nowhere two voxels thick"),
     "25 elements too coarse": (
-        lambda f: changed(f, "edge_length_mm = 8.0", "edge_length_mm = 38.0"),
+        lambda f: changed(f, "edge_length_mm = 6.0", "edge_length_mm = 38.0"),
         4,
         "edge_length_mm",
     ),

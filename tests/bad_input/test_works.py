@@ -163,7 +163,7 @@ def test_memory_that_runs_out_ends_with_6(folder, palpate):
 def test_an_interrupt_ends_with_130_and_leaves_earlier_files_whole(number, folder, palpate):
     (folder / "out").mkdir()
     (folder / "out" / "result.json").write_text("earlier")
-    changed(folder, "edge_length_mm = 8.0", "edge_length_mm = 2.0")  # long enough to be interrupted
+    changed(folder, "edge_length_mm = 6.0", "edge_length_mm = 2.0")  # long enough to be interrupted
     done = palpate("estimate", "case.toml", "--output", "out", "--quiet", cwd=folder, interrupt=[number, 1.5])
     assert "interrupted" in sentence(done, 130)
     assert sorted(path.name for path in (folder / "out").iterdir()) == ["log.txt", "result.json"]
