@@ -37,7 +37,7 @@ style: install
 lint: style
 	$(BIN)/mypy
 
-# A file's tests stay in one process, which makes what they share once; slow files begin (tests/conftest.py). Each process
+# A file's tests stay in one process, which makes what they share once; those of tests/slow.txt begin. Each process
 # keeps the memory that it freed: Mmg takes a third of a gigabyte for every mesh, which the system would clear each time.
 PYTEST = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MALLOC_MMAP_THRESHOLD_=4294967296 MALLOC_TRIM_THRESHOLD_=4294967296 \
   $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder

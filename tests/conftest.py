@@ -179,31 +179,12 @@ TESTS = Path(__file__).parent
 
 # Files, and folders of them, with the longest tests, or a process for every one. `make quick` leaves them out; every
 # layer has others. They come first, the longest before all, so that no processor waits for another at the end.
-SLOW = """
-test_demo.py bad_input study/test_default_law.py test_main_job.py study/test_pairs.py test_examples.py
-report/test_browser.py outputs experiments study/test_case_data.py test_identifiers.py
-study/test_null_pair.py cohort steps
-export/test_folder.py export/test_formats.py images/readers/test_dicom.py images/readers/test_fuzz.py
-images/readers/test_isolation.py images/readers/test_nifti.py images/readers/test_orientations.py
-images/test_alignment.py images/test_surface_alignment.py inversion/test_blocks.py
-inversion/test_driver.py inversion/test_estimate.py inversion/test_expansion.py
-inversion/test_outer_loop.py inversion/test_poisson.py inversion/test_reweighting.py
-mechanics/test_material.py mesh/test_anatomy.py observation/test_field_of_view.py
-observation/test_noise_model.py phantoms/test_boundary_motion.py phantoms/test_boundary_noise.py
-phantoms/test_pelvis.py phantoms/test_redrawn.py phantoms/test_spheres.py report/test_backgrounds.py
-report/test_case_report.py report/test_measured.py study/test_case_loads.py study/test_estimation.py
-study/test_frame_findings.py study/test_fuzz_cases.py study/test_loaded_reference.py
-study/test_meshed_body.py study/test_meshing.py study/test_mismatch_benchmark.py study/test_new_case.py
-study/test_poisson_ratios.py study/test_sensitivity.py study/test_together.py test_cli.py test_memory.py
-test_progress.py test_tutorial.py test_wheel.py uncertainty/test_cramer_rao.py
-uncertainty/test_image_pairs.py uncertainty/test_profile.py uncertainty/test_sampling.py
-uncertainty/test_sensitivity.py verification/test_eshelby.py verification/test_manufactured.py
-""".split()
+SLOW = (TESTS / "slow.txt").read_text(encoding="utf-8").split()
 
 
 def pytest_collection_modifyitems(items):
     """Mark the slow tests, and put them in their order."""
-    place = {TESTS / name: number for number, name in enumerate(SLOW)}
+    place = {(TESTS / name).resolve(strict=True): number for number, name in enumerate(SLOW)}
 
     def order(item) -> int:
         return min((place[path] for path in (item.path, *item.path.parents) if path in place), default=len(SLOW))
