@@ -55,6 +55,7 @@ BEAM_MM, BEAM_Z = 30.0, (-21.0, 79.0)
 BEAM_AXIS = (62.0, 33.0)  # of the clamp's markers, mm
 GRAVITY = 9.81e-3  # N a gram
 WEIGHTS_G = {"load52": 52.0, "load101": 101.0}
+BEAM_KG_M3 = 1080.0  # Dragon Skin
 FACE_SD_MM = 0.05  # of a face's points, which follow three markers as a rigid body
 
 # Beads: the box of gel that is meshed, and its inner part (um, which stand for mm).
@@ -214,7 +215,7 @@ def _tpu_prediction(block: Block, options: Options, step: int, fit: dict[str, An
 
 
 def beam(options: Options) -> dict[str, Any]:
-    """The beam's modulus from each weight, the clamp's motion unknown and held."""
+    """The beam's modulus from each weight: the clamp's motion unknown and held; without its own weight at rest."""
     data, folder = options.data, options.folder
     markers = _markers(data / "static_markers_mm.csv")
     low = np.array([BEAM_AXIS[0] - 0.5 * BEAM_MM, BEAM_AXIS[1] - 0.5 * BEAM_MM, BEAM_Z[0]])
@@ -222,7 +223,7 @@ def beam(options: Options) -> dict[str, Any]:
     nodes, tets = _box(low, size, (6, 6, 20))
     meshio.write(folder / "beam.vtu", meshio.Mesh(nodes, [("tetra", tets)]))
     found: dict[str, Any] = {"authors_kpa": 264.0}
-    for boundary in ("moving", "fixed"):
+    for boundary, hangs in (("moving", True), ("fixed", True), ("moving", False)):
         for load, grams in WEIGHTS_G.items():
             ends = [(3, BEAM_Z[0]), (0, BEAM_Z[1])] if boundary == "moving" else [(0, BEAM_Z[1])]
             places, motions = [], []
@@ -234,17 +235,23 @@ def beam(options: Options) -> dict[str, Any]:
                 motions.append(points @ rotation.T + shift - points)
             _pairs(folder / "faces.csv", np.concatenate(places), np.concatenate(motions))
             traction = -1e3 * grams * GRAVITY / BEAM_MM**2
+            weight = "".join(
+                f'[[loads]]\nkind = "gravity"\nstate = {state}\nacceleration_m_s2 = [{-1e3 * GRAVITY}, 0.0, 0.0]\n'
+                for state in (0, 1)
+            )
             (folder / "case.toml").write_text(
                 f'[body]\nmesh = "beam.vtu"\n[[surfaces]]\nname = "clamp"\nwhere = "z_min"\nboundary = "{boundary}"\n'
                 '[[surfaces]]\nname = "tip"\nwhere = "z_max"\nboundary = "free"\n[tissues.beam]\nlabel = 1\n'
-                'role = "estimate"\npoisson_ratio = 0.49\n[discrepancy]\nheterogeneity_sd = 0.0\npoisson_sd = 0.0\n'
+                f'role = "estimate"\npoisson_ratio = 0.49\ndensity_kg_m3 = {BEAM_KG_M3}\n'
+                "[discrepancy]\nheterogeneity_sd = 0.0\npoisson_sd = 0.0\n"
                 "[estimate]\nstarts_kpa = [100.0, 400.0]\nbounds_kpa = [10.0, 10000.0]\n"
-                f'[[loads]]\nkind = "traction"\nsurface = "tip"\ntraction_kpa = [{traction}, 0.0, 0.0]\n'
+                f'[[loads]]\nkind = "traction"\nsurface = "tip"\nstate = 1\ntraction_kpa = [{traction}, 0.0, 0.0]\n'
+                f"{weight if hangs else ''}"
                 f'[[data]]\nkind = "landmarks"\nfile = "faces.csv"\nsd_mm = {FACE_SD_MM}\n'
             )
             result = estimate(read_case(folder / "case.toml")).estimation
             (item,) = result.estimates
-            found[f"{load}, clamp {boundary}"] = {
+            found[f"{load}, clamp {boundary}{'' if hangs else ', weightless'}"] = {
                 "youngs_modulus_kpa": item.value and round(item.value, 1),
                 "interval95": [end and round(end, 1) for end in item.interval95 or (None, None)],
                 "verdict": item.verdict,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from importlib.resources import as_file, files
 
@@ -152,6 +153,10 @@ def test_a_change_of_volume_is_told_by_its_size(radius: float, code: str | None)
     findings = check_pair(BEFORE, body(shift={3: (0.0, 1.0, 0.0)}, radii={1: radius}))
     assert codes(findings) == ([code] if code else [])
     assert all("prostate" in finding.message and "driver" in finding.message for finding in findings)
+    for finding in findings:
+        drawn = re.search(r"otherwise, ([0-9.]+) mm .* further (in|out)", finding.message)
+        assert float(drawn[1]) == pytest.approx(abs(radius - 8.0), abs=0.05)
+        assert (drawn[2] == "out") == (radius > 8.0)
 
 
 def test_a_driver_may_fill() -> None:

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import sparse
 
 from palpate.errors import ConfigurationError, SolverError
 from palpate.mechanics.boundary import outer_constraint
@@ -91,15 +90,6 @@ def test_selected_outputs_are_the_rows_of_all(small, rng):
     whole, part = small.solve(moduli, q), small.at(dofs).solve(moduli, q)
     assert np.allclose(part.values, whole.values[dofs], atol=1e-13)
     assert np.allclose(part.tangent(), whole.tangent()[dofs], atol=1e-13)
-
-
-def test_outputs_through_an_operator_are_its_product(small, rng):
-    operator = sparse.csr_matrix(rng.standard_normal((4, len(small.output_basis))))
-    moduli, q = np.array([1.0, 6.0]), np.array([1.0, 2.0])
-    whole, part = small.solve(moduli, q), small.through(operator).solve(moduli, q)
-    assert np.allclose(part.values, operator @ whole.values)
-    with pytest.raises(ConfigurationError, match="4 outputs"):
-        _ = part.displacement
 
 
 def test_repeated_and_empty_snapshots_add_no_basis_vector(rng):

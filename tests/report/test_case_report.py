@@ -23,6 +23,7 @@ from palpate.report.pairs import drawn_images
 from palpate.report.rows import number
 from palpate.study.case import Mechanics
 from palpate.study.together import ImagePairs, ModulusRegion, PairAlone
+from palpate.study.variations import Variation
 
 EVIL = '</script><img src=x onerror=alert(1)>$\\frac{"&'
 
@@ -394,7 +395,7 @@ def test_the_methods_can_be_copied_with_their_bibtex(page):
 
 def test_the_profile_and_the_causes_of_the_variance_are_shown_where_they_are_known(case_result, tmp_path):
     first, second = case_result.estimation.estimates
-    shares = {"noise": 0.6, "driver": 0.1, "grid": 0.2, "mesh": 0.1}
+    shares = {"noise": 0.5, "driver": 0.1, "grid": 0.2, "mesh": 0.1, "instrument": 0.05, "known modulus": 0.05}
     seen = dataclasses.replace(first, variance_shares=shares, profile=((40.0, -2.5), (58.9, 0.0), (75.0, 1.96)))
     estimation = dataclasses.replace(case_result.estimation, estimates=(seen, second))
     page = write_case_report(dataclasses.replace(case_result, estimation=estimation), tmp_path).read_text()
@@ -403,6 +404,23 @@ def test_the_profile_and_the_causes_of_the_variance_are_shown_where_they_are_kno
     assert page.count("its variance:") == 1
     assert "the drivers&#39; motion 10 %" in page
     assert "the mesh 10 %" in page
+    assert "the range of the known modulus 5 %" in page
+    assert "could not be drawn" not in page[: page.index("<script")]
+
+
+def test_what_would_change_the_answer_is_drawn_and_a_ratio_leads_where_the_scale_is_a_range(case_result, tmp_path):
+    first, second = case_result.estimation.estimates
+    ranged = dataclasses.replace(first, verdict="ratio only", ratio=5.89, ratio_interval95=(4.9, 7.1))
+    changes = (
+        Variation("known_modulus", "surroundings", "x 1.2", "exact", {"prostate": 0.182, "bladder": 0.182}),
+        Variation("law", "", "linear", "linearised", None, reason="the estimate did not converge"),
+    )
+    estimation = dataclasses.replace(case_result.estimation, estimates=(ranged, second), variations=changes)
+    page = write_case_report(dataclasses.replace(case_result, estimation=estimation), tmp_path).read_text()
+    assert "Tornado of prostate: modulus of surroundings: x 1.2: +20 %" in page
+    assert page.count("What would change this answer") == 1
+    leads, follows = page.index("5.89 <small>"), page.index("58.9 kPa (47.1 to 73.6) if surroundings has 10.0 kPa")
+    assert leads < follows
     assert "could not be drawn" not in page[: page.index("<script")]
 
 

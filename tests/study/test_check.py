@@ -9,11 +9,14 @@ import sys
 import pytest
 
 from palpate.cli import main
+from palpate.errors import ResourceError
 from palpate.mechanics.solvers import registry
 from palpate.study import check, cost
 from palpate.study.case import Estimate
+from palpate.study.case_file import read_case
 from palpate.study.check import check_case
 from palpate.study.cost import expected_cost, expected_tets
+from palpate.study.run import estimate
 
 
 def silent(_: str) -> None:
@@ -91,6 +94,15 @@ def test_what_else_runs_does_not_change_what_is_expected(case_result, monkeypatc
         monkeypatch.setattr(module, "available_memory", lambda: 1e3)
     assert expected_cost(case, before, after, n_pairs=1) == plain
     assert [problem.code for problem in check.memory_problems(plain)] == ["memory-now"]
+
+
+def test_an_estimate_is_refused_for_the_memory_that_a_check_refuses_it_for(tmp_path):
+    (tmp_path / "case.toml").write_text('[phantom]\nkind = "spheres"\nseed = 1\n[mesh]\nedge_length_mm = 0.1\n')
+    found = check_case(tmp_path / "case.toml", (), progress=silent)
+    (refused,) = (problem for problem in found.problems if problem.code == "memory")
+    with pytest.raises(ResourceError, match="memory would be needed") as told:
+        estimate(read_case(tmp_path / "case.toml"))
+    assert str(told.value) == refused.message
 
 
 @pytest.mark.parametrize(("share", "code"), [(100.0, None), (1.0, 0), (0.1, 6)])

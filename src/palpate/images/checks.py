@@ -295,10 +295,13 @@ def _volume_change(before: Segmentation, after: Segmentation, i: int, name: str)
     change = after.volume(i) / before.volume(i) - 1.0
     if tissue.role is not Role.ESTIMATE or abs(change) <= VOLUME_CHANGE:
         return []
+    radii = [(0.75 * image.volume(i) / np.pi) ** (1.0 / 3.0) for image in (before, after)]  # of balls as large
+    drawn, voxel = abs(radii[1] - radii[0]), float(after.grid.voxel_volume ** (1.0 / 3.0))
     text = (
         f"the volume of '{tissue.name}' changes by {change:+.1%} from 'before' ({before.volume(i) / 1000.0:.4g} mL) to"
-        f" '{name}' ({after.volume(i) / 1000.0:.4g} mL); a filling between the scans is no deformation that a modulus"
-        " explains: give a hollow organ the role driver"
+        f" '{name}' ({after.volume(i) / 1000.0:.4g} mL): either it is drawn otherwise, {drawn:.2g} mm"
+        f" ({drawn / voxel:.2g} voxels) further {'out' if change > 0.0 else 'in'} all round would do, or it filled or"
+        " emptied, which no modulus explains; compare the outlines, and give a hollow organ that fills the role driver"
     )
     place = f"to '{name}' ({change:+.1%})"
     cut = [_touching(image.mask(i)) for image in (before, after)]

@@ -330,10 +330,6 @@ class FiniteStrainEquilibrium:
         result[first : first + self.model.constraint.n_modes] += self.model.constraint.modes.T @ gradient
         return result
 
-    def poisson_adjoint(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Products (n_regions,) of the columns du / d nu_r with g (n_dof,), by one adjoint solve; `NotConverged`."""
-        return np.asarray(-self._poisson_forces().T @ self._dual(self._stiffness(), gradient))
-
     def _stiffness(self) -> Stiffness:
         if not self.converged:
             raise NotConverged(f"a state out of equilibrium has no derivatives: {self.reason}")

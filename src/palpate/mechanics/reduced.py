@@ -81,16 +81,6 @@ class ReducedModel:
             output_material=self.output_material[dofs],
         )
 
-    def through(self, operator: sparse.csr_matrix[np.float64]) -> ReducedModel:
-        """The same model with the outputs H u for an operator H (n, n_outputs), such as a surface interpolation."""
-        return replace(
-            self,
-            output_basis=np.asarray(operator @ self.output_basis),
-            output_modes=np.asarray(operator @ self.output_modes),
-            output_offset=np.asarray(operator @ self.output_offset),
-            output_material=np.asarray(operator @ self.output_material),
-        )
-
     def system(self, moduli: NDArray[np.float64]) -> ReducedSystem:
         """The factorised reduced system at moduli (n_regions,) kPa; raises `SolverError`."""
         checked = checked_moduli(moduli, self.names)

@@ -153,7 +153,7 @@ def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tu
             truth=number(truth),
             error=f"{100.0 * (value / truth - 1.0):+.1f} %" if shown and value and truth else NONE,
             bar=_bar(value, interval, truth=truth, scale=scale) if scale and value and interval else None,
-            shares=_shares({CAUSES[cause]: share for cause, share in shares.items()}) if shown else (),
+            shares=_shares({CAUSES.get(cause, cause): share for cause, share in shares.items()}) if shown else (),
             sources=_shares({BELIEVED if kind == "prior" else kind: share for kind, share in told}) if shown else (),
         )
         rows.append(row)

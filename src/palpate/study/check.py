@@ -26,6 +26,7 @@ from palpate.study.case import Case
 from palpate.study.case_file import read_case
 from palpate.study.contacts import every_finding
 from palpate.study.cost import (
+    LESS_MEMORY,
     MEMORY_FACTOR,
     ExpectedCost,
     cost_of_meshes,
@@ -354,12 +355,13 @@ def _without(image: Segmentation, absent: dict[str, list[str]]) -> Segmentation:
 def memory_problems(cost: ExpectedCost) -> list[Problem]:
     """A problem when this machine's memory may not do, refused where it will not; else when too little is free now."""
     has, free = machine_memory_gb(), free_memory_gb()
-    advice = 'make mesh.edge_length_mm larger, or domain.extent = "margin" with a smaller margin_mm'
     lack = lack_of_memory(cost)
     if lack:
-        return [Problem("memory", f"{lack}; {advice}", ResourceError.exit_code)]
+        return [Problem("memory", f"{lack}; {LESS_MEMORY}", ResourceError.exit_code)]
     if has is not None and cost.memory_gb > has / MEMORY_FACTOR:
-        text = f"about {cost.memory_gb:.1f} GB of memory will be needed and this machine has {has:.1f} GB; {advice}"
+        text = (
+            f"about {cost.memory_gb:.1f} GB of memory will be needed and this machine has {has:.1f} GB; {LESS_MEMORY}"
+        )
         return [Problem("memory", text)]
     if free is not None and cost.memory_gb > free / MEMORY_FACTOR:
         text = (

@@ -24,6 +24,7 @@ from palpate.study.domain import case_domain
 from palpate.study.edge_length import EdgeLength, edge_length_of
 
 __all__ = [
+    "LESS_MEMORY",
     "MEMORY_FACTOR",
     "ExpectedCost",
     "cost_of_meshes",
@@ -54,6 +55,7 @@ FIXED_GB = 0.48
 GB_AN_UNKNOWN = 1.07e-5  # beside the factor, with 90 modes
 BYTES_A_VOXEL = 6.0  # of each image: the tissue of each voxel, and masks
 BYTES_A_DISTANCE = 81.0  # while the distance map of a tissue is made, for each voxel around it
+LESS_MEMORY = 'make mesh.edge_length_mm larger, or domain.extent = "margin" with a smaller margin_mm'
 USUAL_MODES = 90
 OVERHEAD_MODES = 10  # what an unknown costs without any mode, in modes
 SERIES = 30  # right-hand sides beside the modes
@@ -177,7 +179,10 @@ def free_memory_gb() -> float | None:
 
 
 def lack_of_memory(cost: ExpectedCost) -> str:
-    """What a run lacks that this machine cannot hold even if the prediction is `MEMORY_FACTOR` too high; else empty."""
+    """What a run lacks that this machine cannot hold even if the prediction is `MEMORY_FACTOR` too high; else empty.
+
+    What to do is `LESS_MEMORY`.
+    """
     has = machine_memory_gb()
     if has is None or cost.memory_gb <= MEMORY_FACTOR * has:
         return ""

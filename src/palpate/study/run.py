@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from palpate.errors import ConfigurationError, EstimationError
+from palpate.errors import ConfigurationError, EstimationError, ResourceError
 from palpate.findings import Finding, of_pair
 from palpate.images.tissue import Role
 from palpate.inversion import Bounds, Inversion, InversionSettings, ParameterMap, eta_of_ratio
@@ -18,7 +18,7 @@ from palpate.parallel import blas_on_one_thread
 from palpate.progress import Forecast, Progress, about, during, silent
 from palpate.study.body import Body, ImagedStates, joint_problem, make_body
 from palpate.study.case import LAW_NAMES, SOUGHT_RATIOS, Case, Mechanics
-from palpate.study.cost import ExpectedCost, cost_of_meshes, expected_cost
+from palpate.study.cost import LESS_MEMORY, ExpectedCost, cost_of_meshes, expected_cost, lack_of_memory
 from palpate.study.estimation import Estimation, Observed, conclude
 from palpate.study.inverted import inverted
 from palpate.study.plausibility import estimate_warnings, unit_warnings
@@ -61,8 +61,8 @@ def estimate(
 
     `truth`: true moduli (kPa) by tissue, to stand beside the estimates of a simulation; a phantom brings its own;
     `condition`: is asked with what is expected to be taken, once the images are read, and may raise.
-    Raises `PalpateError`s of reading, meshing and solving; an iteration that did not converge is no error but a
-    result whose status says so, with no values.
+    Raises `ResourceError` where this machine has not the memory, `PalpateError`s of reading, meshing and solving; an
+    iteration that did not converge is no error but a result whose status says so, with no values.
     """
     began = time.perf_counter()
     refuse_what_cannot_be_estimated(case)
@@ -70,10 +70,11 @@ def estimate(
     during("reading", progress)("reading and aligning the images")
     reading = during("reading", progress)
     states, further = read_states(case, progress=reading), read_pairs(case, progress=reading)
-    if progress is not silent or condition is not unconditional:
-        cost = expected_cost(case, states.before, states.after, n_pairs=1 + len(further), mesh=states.mesh)
-        condition(cost)
-        progress(_forecast(cost))
+    cost = expected_cost(case, states.before, states.after, n_pairs=1 + len(further), mesh=states.mesh)
+    if lack := lack_of_memory(cost):
+        raise ResourceError(f"{lack}; {LESS_MEMORY}")
+    condition(cost)
+    progress(_forecast(cost))
     if case.phantom:
         stated = [(t.name, t.youngs_modulus_kpa) for t in states.before.tissues if t.role is Role.ESTIMATE]
         truth = {name: value for name, value in stated if value is not None}
