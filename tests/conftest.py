@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
+import os
 import signal
 import sys
 from itertools import permutations
@@ -14,6 +15,7 @@ import pytest
 
 from palpate.findings import Finding
 from palpate.images.label_image import LabelImage, VoxelGrid
+from palpate.images.readers import read
 from palpate.images.segmentation import segment
 from palpate.images.tissue import Role
 from palpate.mesh.space import lagrange_space
@@ -36,6 +38,10 @@ CELLS = 10
 # children: the tests of interrupts begin as from a terminal, however they were started.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+if "PYTEST_XDIST_WORKER" in os.environ:  # `make test` lets its own processes keep freed memory, not those they start
+    for variable in ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_"):
+        os.environ.pop(variable, None)
 
 
 def tissue_at(points: np.ndarray) -> np.ndarray:
@@ -171,10 +177,31 @@ def sampled_result(case_result) -> CaseResult:
 
 TESTS = Path(__file__).parent
 
+# Files, and folders of them, with the longest tests, or a process for every one. `make quick` leaves them out; every
+# layer has others. They come first, the longest before all, so that no processor waits for another at the end.
+SLOW = (TESTS / "slow.txt").read_text(encoding="utf-8").split()
+
 
 def pytest_collection_modifyitems(items):
-    """The demo first, which takes a minute: one processor would wait for it at the end."""
-    items.sort(key=lambda item: item.path.name != "test_demo.py")
+    """Mark the slow tests, and put them in their order."""
+    place = {(TESTS / name).resolve(strict=True): number for number, name in enumerate(SLOW)}
+
+    def order(item) -> int:
+        return min((place[path] for path in (item.path, *item.path.parents) if path in place), default=len(SLOW))
+
+    items.sort(key=order)
+    for item in items:
+        if order(item) < len(SLOW):
+            item.add_marker("slow")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def images_read_here(request):
+    """Images are read in this process, not in one of their own, where reading is not what is tested."""
+    with pytest.MonkeyPatch.context() as patch:
+        if request.path.relative_to(TESTS).parts[0] in ("steps", "study"):
+            patch.setattr(read, "read_stored", lambda path, _kind, form, _limits, grid: form.stored(path, grid))
+        yield
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -17,7 +17,7 @@ import SimpleITK
 from dicom_files import ct_slices, save_contours, save_segmentation, save_series, traced
 from palpate.cli import main
 from palpate.images.label_image import LabelImage
-from scenes import balls
+from scenes import coarse_balls
 
 PLANTED = "Meyer^Erika"
 DATE = "19520229"
@@ -59,7 +59,7 @@ NAMES = {1: ("core of it", "#804020"), 2: ("shell", "#20c040"), 3: ("frame", "#4
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("identifiers")
-    scene = balls()
+    scene = coarse_balls()
     write_segmentation(folder / "before.seg.nrrd", scene.before)
     write_nifti(folder / "after.nii.gz", scene.after)
     grey = SimpleITK.GetImageFromArray(scene.before.labels.T.astype(np.int16))
@@ -129,9 +129,9 @@ def planted_in(path: Path) -> bool:
 @pytest.fixture(scope="module")
 def dicom_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("dicom")
-    scene = balls()
+    scene = coarse_balls()
     before, after = (image.labels.transpose(2, 1, 0) for image in (scene.before, scene.after))
-    slices = ct_slices(before.shape, (1.5, 1.5, 1.5), (0.0, 0.0, 0.0))
+    slices = ct_slices(before.shape, (2.5, 2.5, 2.5), (0.0, 0.0, 0.0))
     save_series(folder / "ct", slices)
     save_segmentation(folder / "before.dcm", slices, "BINARY", NAMES, {k: before == k for k in NAMES})
     save_contours(folder / "after.dcm", slices, NAMES, {k: traced(after == k, 0.5) for k in NAMES})

@@ -49,10 +49,10 @@ youngs_modulus_kpa = 10.0
 law = "linear"  # as the truth
 
 [mesh]
-edge_length_mm = 8.0
+edge_length_mm = 10.0
 
 [driver]
-modes = 30
+modes = 20
 
 [estimate]
 start_ratios = [1.0, 4.0]

@@ -11,7 +11,7 @@ SHELL_MM, CORE_MM = 20.0, 10.0
 
 @pytest.fixture(scope="module")
 def scene():
-    return spheres(SpheresOptions(seed=2, kind="pushed", push_mm=0.0, truth_edge_mm=4.0))
+    return spheres(SpheresOptions(seed=2, kind="pushed", push_mm=0.0, truth_edge_mm=5.0))
 
 
 def radius(scene, image, name, beyond_mm=0.0):

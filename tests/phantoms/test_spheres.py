@@ -12,7 +12,7 @@ from palpate.phantoms.spheres import SPHERES_KINDS, SpheresOptions, spheres
 
 @functools.cache
 def scene(kind, noise=None):
-    return spheres(SpheresOptions(seed=4, kind=kind, truth_edge_mm=6.0, spacing_mm=(1.5, 1.5, 1.5), noise=noise))
+    return spheres(SpheresOptions(seed=4, kind=kind, truth_edge_mm=8.0, spacing_mm=(2.0, 2.0, 2.0), noise=noise))
 
 
 @pytest.mark.parametrize("kind", SPHERES_KINDS)
@@ -58,15 +58,15 @@ def test_noise_moves_both_images_apart_and_leaves_the_truth_alone():
 
 
 def test_same_seed_gives_the_same_scene_and_another_seed_another():
-    again = spheres(SpheresOptions(seed=4, kind="pushed", truth_edge_mm=6.0, spacing_mm=(1.5, 1.5, 1.5)))
-    other = spheres(SpheresOptions(seed=5, kind="pushed", truth_edge_mm=6.0, spacing_mm=(1.5, 1.5, 1.5)))
+    again = spheres(SpheresOptions(seed=4, kind="pushed", truth_edge_mm=8.0, spacing_mm=(2.0, 2.0, 2.0)))
+    other = spheres(SpheresOptions(seed=5, kind="pushed", truth_edge_mm=8.0, spacing_mm=(2.0, 2.0, 2.0)))
     assert np.array_equal(again.after.labels, scene("pushed").after.labels)
     assert not np.array_equal(other.after.labels, again.after.labels)
 
 
 def test_too_large_a_push_and_unknown_names_are_refused():
     with pytest.raises(GeometryError, match="folds over"):
-        spheres(SpheresOptions(seed=1, kind="pushed", push_mm=25.0, truth_edge_mm=6.0))
+        spheres(SpheresOptions(seed=1, kind="pushed", push_mm=25.0, truth_edge_mm=8.0))
     with pytest.raises(ConfigurationError, match="kind is 'cubes'"):
         spheres(SpheresOptions(seed=1, kind="cubes"))
     with pytest.raises(ConfigurationError, match=r"names \['liver'\]"):

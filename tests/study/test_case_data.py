@@ -50,6 +50,7 @@ filling_mm = 4.0
 
 [mechanics]
 law = "linear"
+element = "P1"
 
 [domain]
 outer_boundary = "fixed"

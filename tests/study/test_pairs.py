@@ -10,10 +10,9 @@ import pytest
 from palpate.cli import main
 from palpate.errors import ConfigurationError
 from palpate.images.readers import write_label_image
-from palpate.phantoms.spheres import SpheresOptions, spheres
 from palpate.study.case_file import read_case
 from palpate.study.read import read_pairs
-from scenes import balls
+from scenes import coarse_balls
 
 CASE = """
 [images]
@@ -55,8 +54,8 @@ def inputs(tmp_path_factory) -> Path:
     """Two pairs of images of balls with the same moduli, squeezed in different ways, on different grids."""
     folder = tmp_path_factory.mktemp("pairs")
     (folder / "other").mkdir()
-    others = spheres(SpheresOptions(seed=3, spacing_mm=(1.4,) * 3, truth_edge_mm=6.0))
-    for seed, place, scene in ((2, folder, balls()), (3, folder / "other", others)):
+    for seed, place, voxel_mm in ((2, folder, 1.5), (3, folder / "other", 1.4)):
+        scene = coarse_balls(seed, voxel_mm)
         write_label_image(place / f"before_{seed}.nii.gz", scene.before)
         write_label_image(place / "after.nii.gz", scene.after)
     (folder / "case.toml").write_text(CASE + PAIR)

@@ -17,7 +17,6 @@ from palpate.export.fitted_model import fitted_model
 from palpate.images.readers import write_label_image
 from palpate.inversion import eta_of_ratio, parameter_map, ratio_of_eta, unit_blocks
 from palpate.mechanics.linear_model import linear_model
-from palpate.phantoms.spheres import SpheresOptions, spheres
 from palpate.report.case_report import write_case_report, write_failure_report
 from palpate.study.case import Estimate, Mechanics
 from palpate.study.case_file import read_case
@@ -26,6 +25,7 @@ from palpate.study.poisson_ratios import PoissonRatioEstimate, ratio_verdict, wi
 from palpate.study.result import failure_document
 from palpate.study.sensitivity import sensitivity
 from palpate.uncertainty import Covariance
+from scenes import coarse_balls
 
 CASE = """
 [images]
@@ -78,8 +78,7 @@ def seeking(case):
 @pytest.fixture(scope="module")
 def outputs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("ratios")
-    scene = spheres(SpheresOptions(seed=2, spacing_mm=(2.5,) * 3, truth_edge_mm=8.0))
-    for name, image in (("before", scene.before), ("after", scene.after)):
+    for name, image in (("before", coarse_balls().before), ("after", coarse_balls().after)):
         write_label_image(folder / f"{name}.nii.gz", image)
     (folder / "case.toml").write_text(CASE)
     assert main(["estimate", str(folder / "case.toml"), "--output", str(folder / "out"), "--quiet"]) == 0

@@ -48,7 +48,7 @@ element = "P1"
 edge_length_mm = 7.0
 
 [driver]
-modes = 12
+modes = 8
 
 [domain]
 outer_boundary = "fixed"
