@@ -165,18 +165,18 @@ def _what_would_change(
 ) -> tuple[Variation, ...]:
     """What the estimate of a case rests on; nothing where not even the estimate itself can be followed.
 
-    Laws at finite strain differ from each other by less than from the linear one, which is held against one of them. No
-    step leads to another law where that would also find another reference state.
+    A law at finite strain is held against the others of its kind, the linear one against the default: from a finite
+    strain no step leads to the linear law, nor to any where it would also find another reference state.
     """
     mechanics, later = case.mechanics, [image for body in bodies for image in body.states.after]
-    names = LAW_NAMES if mechanics.material_law.finite else (Mechanics().law,)
-    others = [law_named(name) for name in names if name != mechanics.law and not case.strained_reference]
+    finite = [name for name in LAW_NAMES if law_named(name).finite and name != mechanics.law]
+    others = [law_named(name) for name in (finite if mechanics.material_law.finite else (Mechanics().law,))]
     try:
         return what_would_change(
             inversion,
             settings,
             bodies[0].layered.mesh.tissues,
-            others,
+            [] if case.strained_reference else others,
             dilatation=choose_element(mechanics.element).dilatation,
             voxel_mm=voxel_mm(later),
         )
