@@ -10,6 +10,7 @@ import pytest
 
 from palpate.cli import main
 from palpate.errors import ResourceError
+from palpate.images.readers import write_label_image
 from palpate.mechanics.solvers import registry
 from palpate.study import check, cost
 from palpate.study.case import Estimate
@@ -17,6 +18,7 @@ from palpate.study.case_file import read_case
 from palpate.study.check import check_case
 from palpate.study.cost import expected_cost, expected_tets
 from palpate.study.run import estimate
+from scenes import coarse_balls
 
 
 def silent(_: str) -> None:
@@ -97,7 +99,13 @@ def test_what_else_runs_does_not_change_what_is_expected(case_result, monkeypatc
 
 
 def test_an_estimate_is_refused_for_the_memory_that_a_check_refuses_it_for(tmp_path):
-    (tmp_path / "case.toml").write_text('[phantom]\nkind = "spheres"\nseed = 1\n[mesh]\nedge_length_mm = 0.1\n')
+    for name, image in (("before", coarse_balls().before), ("after", coarse_balls().after)):
+        write_label_image(tmp_path / f"{name}.nii.gz", image)
+    (tmp_path / "case.toml").write_text(
+        '[images]\nbefore = "before.nii.gz"\nafter = ["after.nii.gz"]\n[mesh]\nedge_length_mm = 0.1\n'
+        '[tissues]\ncore = { label = 1, role = "estimate" }\nframe = { label = 3, role = "driver" }\n'
+        'rest = { label = "remaining", role = "known", youngs_modulus_kpa = 10.0 }\n'
+    )
     found = check_case(tmp_path / "case.toml", (), progress=silent)
     (refused,) = (problem for problem in found.problems if problem.code == "memory")
     with pytest.raises(ResourceError, match="memory would be needed") as told:
