@@ -49,8 +49,7 @@ from palpate.study import (
     inversion_settings,
     make_body,
 )
-from palpate.uncertainty import covariance_of, frozen_posterior, gain
-from palpate.uncertainty.covariance import noise_covariance
+from palpate.uncertainty import covariance_of, frozen_posterior, gain, noise_covariance
 
 Array = NDArray[np.float64]
 Result = dict[str, Any]  # a line of JSON

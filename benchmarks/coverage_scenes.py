@@ -27,13 +27,16 @@ from palpate.mesh import (
     tetrahedralise,
     vertex_normals,
 )
-from palpate.observation import NoiseModel, observed_surface
-from palpate.observation.contract import DataFile
-from palpate.observation.displacement_field import DisplacementField
-from palpate.observation.landmarks import Landmarks
-from palpate.observation.measured_points import PointTable
-from palpate.observation.point_displacement import PointDisplacement
-from palpate.observation.whitening import correlation
+from palpate.observation import (
+    DataFile,
+    DisplacementField,
+    Landmarks,
+    NoiseModel,
+    PointDisplacement,
+    PointTable,
+    correlation,
+    observed_surface,
+)
 from palpate.phantoms import (
     BoundaryMotion,
     Ellipsoid,

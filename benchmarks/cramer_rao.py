@@ -11,8 +11,7 @@ from scipy import sparse
 from scipy.spatial.distance import cdist
 
 from palpate.inversion import Evaluation, Linearisation
-from palpate.observation import NoiseModel, Observation, SurfaceDistance, SurfaceTarget
-from palpate.observation.point_displacement import PointDisplacement
+from palpate.observation import NoiseModel, Observation, PointDisplacement, SurfaceDistance, SurfaceTarget
 
 __all__ = ["cramer_rao", "efficient_gain", "fisher_information", "model_to_image", "target_of"]
 

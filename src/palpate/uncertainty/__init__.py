@@ -12,6 +12,7 @@ from palpate.uncertainty.covariance import (
     grid_position_shifts,
     imaging_errors,
     mesh_covariance,
+    noise_covariance,
     sandwich_covariance,
 )
 from palpate.uncertainty.diagnostics import ChainDiagnostics, chain_diagnostics, require_arviz
@@ -81,6 +82,7 @@ __all__ = [
     "mesh_covariance",
     "modulus_errors",
     "modulus_interval",
+    "noise_covariance",
     "pair_estimates",
     "poisson_errors",
     "posterior_chains",
