@@ -48,6 +48,8 @@ law = "linear"
 element = "P1"
 [noise]
 surface_sd_mm = 0.5
+[discrepancy]
+layer_sd = 0.0
 [driver]
 modes = 8
 [estimate]

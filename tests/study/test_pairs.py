@@ -40,7 +40,7 @@ youngs_modulus_kpa = 10.0
 """
 COARSE = [
     *("mechanics.law=linear", "mechanics.element=P1", "mesh.edge_length_mm=8", "driver.modes=12"),
-    *("estimate.start_ratios=[3.0]", "estimate.samples=100"),
+    *("estimate.start_ratios=[3.0]", "estimate.samples=100", "discrepancy.layer_sd=0"),
 ]
 PAIR = """
 [[pairs]]

@@ -61,6 +61,9 @@ edge_length_mm = 12.0
 [driver]
 modes = 8
 
+[discrepancy]
+layer_sd = 0.0
+
 [estimate]
 parameters = ["youngs_modulus", "poisson_ratio"]
 start_ratios = [3.0]
