@@ -138,7 +138,7 @@ def tornado_svg(document: Mapping[str, Any], tissue: str, *, name: str) -> str:
         axes.set_xlim(-reach, reach)
         axes.xaxis.set_major_locator(FixedLocator([math.log(m) for m in marks]))
         axes.xaxis.set_minor_locator(NullLocator())
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{math.exp(x):.2g}"))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{math.exp(x):.3g}"))
         axes.set_xlabel("modulus, times the estimate")
         axes.grid(visible=True, axis="x")
 
