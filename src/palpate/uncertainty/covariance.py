@@ -47,7 +47,7 @@ GridErrors = Sequence[Sequence[NDArray[np.float64]]]
 """Errors (n,) mm of the residuals of each observation, of each draw of a grid."""
 
 GRID_DRAWS = 8
-ROUNDING = 1e-9  # of a variance
+ROUNDING = 1e-6  # of a variance: what blocks that are held have left of it
 MARGIN_MM, MARGIN_VOXELS = 12.0, 8.0  # around the residuals' places, further than a distance map there is smoothed
 
 
