@@ -97,3 +97,9 @@ def test_the_readme_answers_a_newcomer_in_the_order_of_the_questions():
     headings = re.findall(r"^## (.+)$", (ROOT / "README.md").read_text(), flags=re.MULTILINE)
     wanted = ["What qualifies", "Install", "Two commands", "Result", "Limits", "Accuracy and speed"]
     assert [heading for heading in headings if heading in wanted] == wanted
+
+
+def test_every_file_that_newcomers_are_told_to_copy_is_there():
+    told = re.findall(r"\b[Cc]opy\s+`([^`]+\.py)`", (ROOT / "CONTRIBUTING.md").read_text())
+    assert len(told) > 3
+    assert [path for path in told if not (ROOT / "src" / "palpate" / path).is_file()] == []
