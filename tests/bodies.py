@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import permutations
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -46,3 +48,15 @@ def body(
 
 def inside(points: NDArray[np.float64], centre: tuple[float, ...], axes: tuple[float, ...]) -> NDArray[np.bool_]:
     return np.asarray((((points - centre) / axes) ** 2).sum(axis=1) < 1.0)
+
+
+def box_cells(counts: tuple[int, int, int], size: tuple[float, ...]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Nodes (n, 3) mm and tetrahedra (m, 4) of a box, six to a cell, some with their corners in another order."""
+    ends = np.array(counts) + 1
+    index = np.stack(np.meshgrid(*map(np.arange, ends), indexing="ij"), axis=-1).reshape(-1, 3)
+    corner = index[(index < ends - 1).all(axis=1)]
+    tets = []
+    for order in permutations(range(3)):
+        steps = np.cumsum(np.concatenate([np.zeros((1, 3), int), np.eye(3, dtype=int)[list(order)]]), axis=0)
+        tets.append(np.stack([np.ravel_multi_index((corner + step).T, ends) for step in steps], axis=1))
+    return index / (ends - 1) * size, np.concatenate(tets)

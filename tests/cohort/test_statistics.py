@@ -223,6 +223,34 @@ def test_what_a_result_says_of_a_row_is_read_from_its_file(tmp_path):
     assert found.images == {"before.voxels": "2"}
 
 
+def test_a_scan_whose_known_modulus_is_a_range_enters_with_its_ratio(tmp_path):
+    """The range is one guess for all scans: what it adds to each interval is no scatter between them."""
+    item = {
+        "parameter": "youngs_modulus",
+        "tissue": "prostate",
+        "unit": "kPa",
+        "value": 40.0,
+        "interval95": [15.0, 105.0],
+        "ratio": 10.0,
+        "ratio_interval95": [8.0, 12.5],
+        "verdict": "identified",
+        "profile": [[20.0, -1.96], [40.0, 0.0], [80.0, 1.96]],
+    }
+    shares = {"noise": 0.2, "known modulus": 0.8}
+    open_ends = {"verdict": "not identified", "interval95": None, "ratio_interval95": None}
+    of = {"given": {}, "ranged": {"variance_shares": shares}, "open": open_ends | {"variance_shares": shares}}
+    for row, more in of.items():
+        place = tmp_path / "cases" / row
+        place.mkdir(parents=True)
+        write_json(place / "result.json", {"estimates": [item | more], "warnings": [], "inputs": {}})
+        write_mark(place, Outcome(row, "done", "0" * 64))
+    rows = tuple(Row(row, row, stage=1) for row in of)
+    given, ranged, left_open = (r.moduli[0] for r in records_of(Plan(rows, ("0" * 64,) * 3), tmp_path))
+    assert (given.unit, given.value, given.low95, given.high95) == ("kPa", 40.0, 15.0, 105.0)
+    assert (ranged.unit, ranged.value, ranged.low95, ranged.high95) == ("ratio", 10.0, 8.0, 12.5)
+    assert (left_open.low95, left_open.high95) == pytest.approx((5.0, 20.0), rel=1e-4)
+
+
 def test_the_papers_mean_leaves_out_what_box_plots_draw_as_outliers():
     assert inside_fences(np.array([1.0, 1.1, 0.9, 1.05, 5.0])).tolist() == [True, True, True, True, False]
 

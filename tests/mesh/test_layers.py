@@ -52,7 +52,26 @@ def test_without_layers_a_space_is_itself(space):
 def test_a_layer_is_as_thick_as_its_elements(space):
     """Elements that touch a ball in a lattice of unit cubes: about the cube that a face belongs to, or two."""
     layers = layers_round_organs(space.mesh)
-    assert 0.8 < layer_thickness_mm(layered_space(space, layers).mesh, layers, 0) < 2.5
-    wide = replace(space, mesh=replace(space.mesh, nodes=3.0 * space.mesh.nodes))
-    thick = layer_thickness_mm(layered_space(wide, layers).mesh, layers, 0)
-    assert thick == pytest.approx(3.0 * layer_thickness_mm(layered_space(space, layers).mesh, layers, 0))
+    thickness = layer_thickness_mm(space.mesh, layers, 0)
+    assert 0.8 < thickness < 2.5
+    wide = replace(space.mesh, nodes=3.0 * space.mesh.nodes)
+    assert layer_thickness_mm(wide, layers, 0) == pytest.approx(3.0 * thickness)
+
+
+def test_an_organ_whose_layer_another_has_taken_is_still_so_far_from_the_next(space):
+    """Of two halves of one ball the second keeps what touches it alone; its layer is as thick as that of the first."""
+    mesh = space.mesh
+    halves = np.where((mesh.region == 0) & (mesh.nodes[mesh.tets].mean(axis=1)[:, 0] > 0.0), 3, mesh.region)
+    two = replace(mesh, region=halves, tissues=(*mesh.tissues, replace(ORGAN, name="other half")))
+    layers = layers_round_organs(two)
+    assert layers == (Layer(0, 1), Layer(3, 1))
+    first, second = (layer_thickness_mm(two, layers, organ) for organ in (0, 3))
+    assert second == pytest.approx(first, rel=0.5)
+
+
+def test_organs_that_meet_a_tissue_in_a_point_have_no_layer_there():
+    """Two tetrahedra that share a corner."""
+    nodes = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]], dtype=float)
+    tets = np.array([[0, 1, 2, 3], [0, 5, 4, 6]])
+    none = np.zeros((0, 3), dtype=np.int64)
+    assert layers_round_organs(TetMesh(nodes, tets, np.array([0, 1]), none, none[:, 0], (ORGAN, FAT))) == ()

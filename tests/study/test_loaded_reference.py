@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import palpate
+from bodies import box_cells
 from palpate.errors import ConfigurationError, NotConverged
 from palpate.images.tissue import Role, Tissue
 from palpate.mechanics.boundary import outer_constraint
@@ -62,14 +63,7 @@ def weighs(state, m_s2):
 
 def beam():
     """A straight beam of P1 tetrahedra, clamped where x is 0."""
-    counts = np.array([13, 4, 4])
-    index = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, 3)
-    corner = index[(index < counts - 1).all(axis=1)]
-    tets = []
-    for order in ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)):
-        steps = np.cumsum(np.concatenate([np.zeros((1, 3), int), np.eye(3, dtype=int)[list(order)]]), axis=0)
-        tets.append(np.stack([np.ravel_multi_index((corner + step).T, counts) for step in steps], axis=1))
-    nodes, tets = index / (counts - 1) * SIZE, np.concatenate(tets)
+    nodes, tets = box_cells((12, 3, 3), SIZE)
     volumes = np.linalg.det(nodes[tets[:, 1:]] - nodes[tets[:, :1]])
     tets = np.where(volumes[:, None] < 0.0, tets[:, [0, 2, 1, 3]], tets)
     boundary = boundary_of(tets)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import palpate
+from bodies import box_cells
 from palpate.cli import main
 from palpate.errors import ConfigurationError, GeometryError, InputDataError
 from palpate.export.fitted_model import fitted_model
@@ -73,15 +74,8 @@ sd_n = {0.01 * FORCE_N}
 
 
 def cells():
-    """A box of 4 x 4 x 6 cells of six tetrahedra each, some of them with their corners in another order."""
-    counts = np.array([5, 5, 7])
-    index = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, 3)
-    corner = index[(index < counts - 1).all(axis=1)]
-    tets = []
-    for order in ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)):
-        steps = np.cumsum(np.concatenate([np.zeros((1, 3), int), np.eye(3, dtype=int)[list(order)]]), axis=0)
-        tets.append(np.stack([np.ravel_multi_index((corner + step).T, counts) for step in steps], axis=1))
-    return index / (counts - 1) * SIZE, np.concatenate(tets)
+    """The bar's nodes and tetrahedra."""
+    return box_cells((4, 4, 6), SIZE)
 
 
 @pytest.fixture(scope="module")

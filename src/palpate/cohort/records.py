@@ -12,6 +12,7 @@ from typing import Any
 from palpate.cohort.mark import document_of
 from palpate.cohort.plan import CASES, Plan
 from palpate.cohort.task import Outcome, Row
+from palpate.inversion import KNOWN_MODULUS
 from palpate.parallel import mapped
 from palpate.uncertainty import NORMAL_95
 
@@ -96,15 +97,17 @@ def _record(plan: Plan, folder: Path, marks: Sequence[Outcome | None], number: i
 
 
 def _modulus(item: Mapping[str, Any]) -> Modulus:
-    """That of an entry of `estimates`.
+    """That of an entry of `estimates`: the ratio where its scale is a range, which all scans would err by together.
 
     Where no interval is stated, its ends are those of the profile likelihood, as far as that reaches them.
     """
-    unit = item.get("unit") or ("ratio" if item["value"] is None else "kPa")
-    in_kpa = unit == "kPa"
-    ends = item["interval95"] if in_kpa else item["ratio_interval95"]
-    low, high = ends or _ends_of_profile(item.get("profile") or ())
-    return Modulus(item["tissue"], unit, item["value"] if in_kpa else item["ratio"], low, high, item["verdict"])
+    stated = item.get("unit") or ("ratio" if item["value"] is None else "kPa")
+    ranged = KNOWN_MODULUS in (item.get("variance_shares") or {})
+    unit = "ratio" if ranged else stated
+    value, ends = (item["ratio"], item["ratio_interval95"]) if unit == "ratio" else (item["value"], item["interval95"])
+    reference = item["value"] / item["ratio"] if ranged and item["value"] and item["ratio"] else 1.0
+    low, high = ends or _ends_of_profile([(at / reference, root) for at, root in item.get("profile") or ()])
+    return Modulus(item["tissue"], unit, value, low, high, item["verdict"])
 
 
 def _ends_of_profile(profile: Sequence[Sequence[float]]) -> tuple[End, End]:

@@ -30,10 +30,9 @@ def unloaded_displacement(
     """Displacement w (n_points, 3) mm from the body free of stress, at x - w, to where it was seen under loads.
 
     At moduli (n_regions,) kPa and coefficients (n_material,) of the material, beginning where the model was strained
-    before; what the model prescribes stays where it
-    is, what slides does so. With u(X) the displacement of X under the loads: w <- u(x - w), which is
-    X <- X - (X + u(X) - x) (Sellier, Mechanics Research Communications 38 (2011), 46-48). Forces are those on the body
-    as it was seen. Raises `NotConverged` where this leads nowhere.
+    before; what the model prescribes stays where it is, what slides does so. With u(X) the displacement of X under the
+    loads: w <- u(x - w), which is X <- X - (X + u(X) - x) (Sellier, Mechanics Research Communications 38 (2011),
+    46-48). Forces are those on the body as it was seen. Raises `NotConverged` where this leads nowhere.
     """
     free = model.constraint.free
     still = Constraint(free, np.zeros((free.shape[0], 0)), np.zeros(free.shape[0]))

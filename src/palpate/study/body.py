@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -278,7 +279,12 @@ def make_body(states: ImagedStates, case: Case, *, progress: Progress) -> Body:
 
 def strained_body(body: Body, strained: NDArray[np.float64], case: Case) -> Body:
     """The body whose reference state lies `strained` (n_points, 3) mm from where it is free of stress."""
-    found = replace(body, strained=strained)
+    return _remade(body, case, strained=strained)
+
+
+def _remade(body: Body, case: Case, **changes: Any) -> Body:
+    """The body with these changes, on which what was measured is asked anew."""
+    found = replace(body, **changes)
     return replace(found, measured=_measured(found, case)[0])
 
 
@@ -312,14 +318,14 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
 
     All bodies have the same tissues in the same order. Raises as `inverse_problem` does.
     """
+    shared = tuple(layer for layer in bodies[0].layers if all(layer in body.layers for body in bodies))
+    bodies = [body if body.layers == shared else _remade(body, case, layers=shared) for body in bodies]
     progress("distances to the surfaces of all images")
     noise = stated_noise(case)
     imaged = [(r, o) for r, body in enumerate(bodies) for o in _seen(body, noise)]
     measured = [of for body in bodies for of in body.measured]
     seen = [(r, (*o, *(term for s, term in measured if s == n))) for n, (r, o) in enumerate(imaged, start=1)]
     progress("assembling one stiffness matrix a tissue")
-    shared = tuple(layer for layer in bodies[0].layers if all(layer in body.layers for body in bodies))
-    bodies = [replace(body, layers=shared) for body in bodies]
     numbers = np.cumsum([0, *(body.states.n_later for body in bodies)]).tolist()
     pairs = [pair for body, first in zip(bodies, numbers, strict=False) for pair in _models(body, case, first)]
     models = tuple(model for model, _ in pairs)
@@ -340,7 +346,7 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
         (
             *_blocks(case, pairs, seen),
             *known_modulus_blocks(models[0].space.mesh.tissues, models[0].regions, tuple(range(len(models)))),
-            *_layer_blocks(case, shared, models),
+            *_layer_blocks(case, bodies[0], models),
         ),
         loaded=case.known_force,
         open_poisson=_open_poisson(case, bodies[0].space.mesh),
@@ -384,17 +390,17 @@ def _blocks(
     return tuple(blocks) or unit_blocks(*(0 for _ in pairs))
 
 
-def _layer_blocks(case: Case, layers: Sequence[Layer], models: Sequence[LinearModel]) -> tuple[Block, ...]:
-    """One unknown an organ, of all layers round it."""
-    mesh, regions = models[0].space.mesh, models[0].regions
-    numbered = list(enumerate(layers, start=len(mesh.tissues) - len(layers)))
+def _layer_blocks(case: Case, body: Body, models: Sequence[LinearModel]) -> tuple[Block, ...]:
+    """One unknown an organ, of all layers round it, as thick as they are in a body."""
+    mesh, regions = body.space.mesh, models[0].regions
+    numbered = list(enumerate(body.layers, start=len(mesh.tissues)))
     of = [
         (
             mesh.tissues[organ].name,
             tuple(regions.index(number) for number, layer in numbered if layer.organ == organ),
-            layer_thickness_mm(mesh, layers, organ),
+            layer_thickness_mm(mesh, body.layers, organ),
         )
-        for organ in dict.fromkeys(layer.organ for layer in layers)
+        for organ in dict.fromkeys(layer.organ for layer in body.layers)
     ]
     believed = {"sd": case.discrepancy.layer_sd, "thickness_mm": case.discrepancy.layer_mm}
     return layer_blocks(of, tuple(range(len(models))), **believed)

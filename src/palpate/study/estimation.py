@@ -36,6 +36,7 @@ from palpate.study.together import ImagePairs, ModulusRegion, combinations_of, i
 from palpate.study.variations import Variation
 from palpate.uncertainty import (
     GRID_DRAWS,
+    NORMAL_95,
     Combination,
     Covariance,
     FittedState,
@@ -442,10 +443,10 @@ def estimates_of(
     for i, (nothing, of) in enumerate(zip(none, known, strict=False)):
         theta, (low, high) = float(inversion.minimum.unknowns[i]), of.interval
         value, shares = float(np.exp(theta)), covariance.shares(i)
-        of_scale = float(np.sqrt(1.0 - shares.get(KNOWN_MODULUS, 0.0)))  # a ratio does not hang on the scale
-        by_ratio = _about(float(np.exp(theta - shift)), of.interval, value, of_scale)
+        of_scale = float(np.sqrt(shares.get(KNOWN_MODULUS, 0.0) * covariance.total[i, i]))
+        by_ratio = _without(of_scale, of.interval, value, centre=float(np.exp(theta - shift)))
         word, why = verdict(of.interval, at_bound=of.at_bound, absolute=mapping.absolute)
-        if word != "identified" and of_scale < 1.0:
+        if word != "identified" and of_scale > 0.0:
             word, why = _of_range(word, why, verdict(by_ratio, at_bound=of.at_bound, absolute=True))
         points = zip(unit * np.exp(of.own.profile.theta), of.own.profile.root, strict=True)
         inside = log_interval(value, float(np.sqrt(given[i])), lower=low or 0.0, upper=high or np.inf)
@@ -468,10 +469,17 @@ def estimates_of(
     return tuple(found)
 
 
-def _about(centre: float, interval: Interval, value: float, power: float) -> Interval:
-    """An interval of a value, moved to another centre and its half-widths in ln times a power."""
-    low, high = (None if end is None else float(centre * (end / value) ** power) for end in interval)
-    return low, high
+def _without(sd: float, interval: Interval, value: float, *, centre: float) -> Interval:
+    """An interval of a value about another centre, its half-widths in ln less those of an independent cause of it.
+
+    sd: that of the cause, in ln; h -> sqrt(h^2 - (1.96 sd)^2).
+    """
+    halves = [None if end is None else abs(np.log(end / value)) for end in interval]
+    low, high = (None if h is None else float(np.sqrt(max(h**2 - (NORMAL_95 * sd) ** 2, 0.0))) for h in halves)
+    return (
+        None if low is None else float(centre * np.exp(-low)),
+        None if high is None else float(centre * np.exp(high)),
+    )
 
 
 def _of_range(word: str, why: str, of_ratio: tuple[str, str]) -> tuple[str, str]:
