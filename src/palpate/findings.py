@@ -58,6 +58,7 @@ Misleading = Literal[
 ]
 Widening = Literal[
     "ratio-only",
+    "map-of-prior",
     "hardly-observed",
     "motion-below-noise",
     "correlated",

@@ -21,7 +21,7 @@ Progress = Callable[[str], None]
 DOCUMENT, PAGE, DATA = "result.json", "report.html", "report-data.npz"
 ASIDE = tuple(f"{name}.earlier" for name in (PAGE, DATA))
 LABELS = ("labels.csv", "labels.nii.gz")
-NUMBERS = ("mesh.vtu", "model.npz", "posterior.nc", "stiffness.nii.gz")
+NUMBERS = ("mesh.vtu", "model.npz", "posterior.nc", "stiffness.nii.gz", "stiffness_sd.nii.gz")
 TARGETS = (DOCUMENT, PAGE, DATA, *ASIDE, *NUMBERS, *LABELS, "case.toml")
 
 

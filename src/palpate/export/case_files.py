@@ -13,7 +13,7 @@ from palpate.export.fitted_model import fitted_model
 from palpate.export.label_table import write_label_table
 from palpate.export.model_file import MODEL, write_model
 from palpate.export.netcdf import write_posterior
-from palpate.export.rasterise import region_image
+from palpate.export.rasterise import tetrahedron_image
 from palpate.export.vtk_xml import write_pvd, write_vtp, write_vtu
 from palpate.images.label_image import LabelImage
 from palpate.images.readers import write_label_image, write_scalar_image
@@ -35,19 +35,22 @@ MOST_BYTES = 60  # of a tissue's name in a file's: file systems count bytes, not
 def write_estimate_files(result: CaseResult, folder: Path) -> tuple[Path, ...]:
     """Write mesh.vtu (displacement of the last image), stiffness.nii.gz (`result.unit`), labels.nii.gz and labels.csv.
 
-    Each further pair has its own mesh_2.vtu, mesh_3.vtu ...; a converged result leaves model.npz for `palpate export`,
+    stiffness_sd.nii.gz, the standard deviation of ln E, where the modulus of a tissue is a field. Each further pair has its own mesh_2.vtu, mesh_3.vtu ...; a converged result leaves model.npz for `palpate export`,
     and posterior.nc where it has samples. Returns the paths written; raises `ResourceError` when the disk refuses.
     """
     make_folder(folder)
     paths = [folder / "mesh.vtu", folder / "stiffness.nii.gz"]
-    _write_fitted(paths[0], result, result.space, result.displacements)
-    stiffness = np.append(result.stiffness, np.nan)  # region -1 takes the last entry, NaN
-    region = region_image(result.space.mesh, result.before.grid)
-    write_scalar_image(paths[1], stiffness[region], result.before.grid)
+    _write_fitted(paths[0], result, 0, result.space, result.displacements)
+    grid, images = result.before.grid, result.stiffness_map()
+    if result.estimation.maps:
+        paths.append(folder / "stiffness_sd.nii.gz")
+    element = tetrahedron_image(result.space.mesh, grid)
+    for path, values in zip(paths[1:], images, strict=False):
+        write_scalar_image(path, np.append(values, np.nan)[element], grid)  # -1, outside the mesh, takes the last entry
     paths += _write_labels(result.before, folder)
     for number, pair in enumerate(result.further, start=2):
         paths.append(folder / f"mesh_{number}.vtu")
-        _write_fitted(paths[-1], result, pair.space, pair.displacements)
+        _write_fitted(paths[-1], result, number - 1, pair.space, pair.displacements)
     if result.estimation.status == "converged":
         model = fitted_model(result, seal=seal_of(result.to_dict()))
         paths.append(folder / MODEL)
@@ -59,14 +62,16 @@ def write_estimate_files(result: CaseResult, folder: Path) -> tuple[Path, ...]:
 
 
 def _write_fitted(
-    path: Path, result: CaseResult, space: LagrangeSpace, displacements: tuple[NDArray[np.float64], ...]
+    path: Path, result: CaseResult, pair: int, space: LagrangeSpace, displacements: tuple[NDArray[np.float64], ...]
 ) -> None:
-    """A mesh with the moduli of the result and the last of its displacements."""
-    mesh = space.mesh
-    kilopascals = result.stiffness if result.unit == "kPa" else np.full(len(mesh.tissues), np.nan)
-    extra = {} if result.unit == "kPa" else {"youngs_modulus_ratio": result.stiffness[mesh.region]}
+    """The mesh of a pair with the moduli of the result and the last of its displacements."""
+    stiffness, sd = result.stiffness_map(pair)
+    extra = {} if result.unit == "kPa" else {"youngs_modulus_ratio": stiffness}
+    if result.estimation.maps:
+        extra["ln_modulus_sd"] = sd
     last = displacements[-1] if displacements else np.zeros_like(space.points)
-    cells = _cell_data(mesh, kilopascals) | extra
+    kilopascals = stiffness if result.unit == "kPa" else np.full_like(stiffness, np.nan)
+    cells = _cell_data(space.mesh, kilopascals) | extra
     _write_moved(path, space, last, cells)
 
 
@@ -85,7 +90,7 @@ def write_mesh_files(result: MeshResult, folder: Path) -> tuple[Path, ...]:
     given = np.array([tissue.youngs_modulus_kpa or np.nan for tissue in mesh.tissues])
     path = folder / "mesh.vtu"
     still = np.zeros_like(space.points)
-    write_vtu(path, space, point_data={"displacement_mm": still}, cell_data=_cell_data(mesh, given))
+    write_vtu(path, space, point_data={"displacement_mm": still}, cell_data=_cell_data(mesh, given[mesh.region]))
     labels = _write_labels(result.before, folder)
     return (path, *labels, *_write_surfaces(space, still, folder / "surfaces", ending="before"))
 
@@ -98,7 +103,7 @@ def write_simulation_files(result: Simulation, folder: Path) -> tuple[Path, ...]
     write_label_image(images[1], result.after)
     space, last = result.space, result.displacements[-1]
     moduli = np.array([result.moduli_kpa.get(tissue.name, np.nan) for tissue in space.mesh.tissues])
-    cells = _cell_data(space.mesh, moduli)
+    cells = _cell_data(space.mesh, moduli[space.mesh.region])
     _write_moved(folder / "mesh.vtu", space, last, cells)
     table = write_label_table(folder / "labels.csv", space.mesh.tissues)
     surfaces, still = folder / "surfaces", np.zeros_like(last)
@@ -149,6 +154,6 @@ def _cell_data(mesh: TetMesh, moduli: NDArray[np.float64]) -> dict[str, NDArray[
     poisson = np.array([tissue.poisson_ratio for tissue in mesh.tissues])
     return {
         "label": first_labels(mesh.tissues)[mesh.region],
-        "youngs_modulus_kpa": moduli[mesh.region],
+        "youngs_modulus_kpa": moduli,
         "poisson_ratio": poisson[mesh.region],
     }

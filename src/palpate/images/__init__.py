@@ -11,9 +11,10 @@ if TYPE_CHECKING:
     from palpate.images.label_table import read_label_table
     from palpate.images.readers import read_intensities, read_label_image, write_label_image
     from palpate.images.segmentation import Segmentation, segment
-    from palpate.images.tissue import Role, Tissue
+    from palpate.images.tissue import FieldPrior, Role, Tissue
 
 __all__ = [
+    "FieldPrior",
     "LabelImage",
     "Role",
     "Segmentation",
@@ -29,6 +30,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "FieldPrior": "palpate.images.tissue",
     "LabelImage": "palpate.images.label_image",
     "Role": "palpate.images.tissue",
     "Segmentation": "palpate.images.segmentation",

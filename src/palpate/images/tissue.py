@@ -7,7 +7,7 @@ from enum import StrEnum
 
 from palpate.errors import ConfigurationError
 
-__all__ = ["Role", "Tissue"]
+__all__ = ["FieldPrior", "Role", "Tissue"]
 
 
 class Role(StrEnum):
@@ -22,12 +22,24 @@ class Role(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class FieldPrior:
+    """What is believed of ln E inside a tissue whose modulus is a field.
+
+    sd: standard deviation, dimensionless; length_mm: of its Gaussian kernel exp(-d^2 / (2 length_mm^2)), mm.
+    """
+
+    sd: float
+    length_mm: float
+
+
+@dataclass(frozen=True, slots=True)
 class Tissue:
     """One tissue: `labels` of the image, `role`, Poisson's ratio (dimensionless) and Young's modulus (kPa).
 
     `labels` empty means "remaining": every voxel that no other tissue names.
     `youngs_modulus_kpa` is required for `known`, the truth of a simulation for `estimate`, else None.
     `modulus_sd`: standard deviation of what is believed of ln E of a `known` tissue, dimensionless; 0: it is certain.
+    `field`: what is believed of ln E inside the tissue, where it is to be mapped.
     Where the image or its table has them, `colour`: #rrggbb, and `called`: the names of the labels there.
     """
 
@@ -39,6 +51,7 @@ class Tissue:
     colour: str | None = None
     called: tuple[str, ...] = ()
     modulus_sd: float = 0.0
+    field: FieldPrior | None = None
 
     def __post_init__(self) -> None:
         if not -1.0 < self.poisson_ratio < 0.5:

@@ -2,6 +2,7 @@
 
 from palpate.inversion.approximation import Approximation, ExactApproximation, Place, exact_approximation
 from palpate.inversion.blocks import (
+    FIELD,
     KNOWN_MODULUS,
     Acts,
     Block,
@@ -41,6 +42,7 @@ from palpate.inversion.reduced_basis import ReducedBasis, reduced_basis
 from palpate.inversion.reweighting import reweighted, with_first_noise
 
 __all__ = [
+    "FIELD",
     "KNOWN_MODULUS",
     "Acts",
     "Approximation",

@@ -23,6 +23,7 @@ from palpate.observation.prescribed_motion import PrescribedMotion
 from palpate.observation.wall_modes import Wall
 
 __all__ = [
+    "FIELD",
     "KNOWN_MODULUS",
     "Acts",
     "Block",
@@ -42,6 +43,7 @@ STILL, MOVES = 0.02, (1.0, 2.0)  # amplitudes of a frame that stands still, time
 STILL_RIGID, MOVED_RIGID = 0.005, 0.2
 DRAWN_ALIKE, SELDOM = 0.1, 0.01  # an offset of a surface that is drawn alike, over that of others; how often not
 KNOWN_MODULUS = "known modulus"
+FIELD, FIELD_AMPLITUDES = "field", (1.0, 1.0)  # of a tissue that is mapped, times the standard deviation stated
 CONSIDERED = 1e8  # times its precision: an unknown that is considered does not move
 HOMOGENEOUS_SHARE, PATCHY = 1.0 / 3.0, 0.3  # sd of ln E in a tissue that is nearly homogeneous, over that stated; odds
 
@@ -194,24 +196,31 @@ def material_blocks(
     """How ln E varies in each tissue, and by how much Poisson's ratios are not those given.
 
     A tissue is nearly homogeneous, by a third of what is stated, or patchy by all of it, of which the evidence chooses;
-    surfaces hardly tell the two apart, so that the former stays until the latter is clearly more likely.
+    surfaces hardly tell the two apart, so that the former stays until the latter is clearly more likely. The field of a
+    tissue that is mapped has the amplitude that the images' evidence gives it.
     """
     levels = [(share * heterogeneity_sd) ** 2 for share in (HOMOGENEOUS_SHARE, 1.0)]
-    blocks = [
-        Block(
-            tissues[tissue].name,
-            "heterogeneity",
-            Acts.MATERIAL,
-            states,
-            np.eye(n) / levels[0],
-            tuple((level * np.eye(n),) for level in levels),
-            amplitudes=(1.0, 1.0),
-            odds=(0.0, float(np.log(PATCHY))),
-            last=True,
-        )
-        for tissue, n in modes.sizes
-        if n
-    ]
+    blocks = []
+    for tissue, n in modes.sizes:
+        name, mapped = tissues[tissue].name, tissues[tissue].field
+        if n and mapped:
+            covariance = mapped.sd**2 * np.eye(n)
+            own = (name, FIELD, Acts.MATERIAL, states, np.linalg.inv(covariance), ((covariance,),))
+            blocks.append(Block(*own, amplitudes=FIELD_AMPLITUDES))
+        elif n:
+            blocks.append(
+                Block(
+                    name,
+                    "heterogeneity",
+                    Acts.MATERIAL,
+                    states,
+                    np.eye(n) / levels[0],
+                    tuple((level * np.eye(n),) for level in levels),
+                    amplitudes=(1.0, 1.0),
+                    odds=(0.0, float(np.log(PATCHY))),
+                    last=True,
+                )
+            )
     if modes.poisson:
         precision = np.eye(len(modes.poisson)) / poisson_sd**2
         blocks.append(Block("all tissues", "poisson", Acts.MATERIAL, states, precision))

@@ -15,7 +15,8 @@ from palpate.mesh.tet_mesh import TetMesh
 
 __all__ = ["HOMOGENEOUS", "MaterialModes", "material_forces", "material_modes"]
 
-SHARE, MOST = 0.95, 120  # of the variance of a tissue's ln E that its modes hold; their largest number
+SHARE = 0.95  # of the variance of a tissue's ln E that its modes hold
+MOST, MOST_OF_MAP = 120, 400  # modes of a tissue, and of one that is mapped
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,14 +62,17 @@ def material_modes(
 ) -> MaterialModes:
     """Modes of ln E in each of the meshed `tissues` (numbers), and one of the Poisson's ratio of each of `poisson`.
 
-    Fields are Karhunen-Loeve modes of a Gaussian kernel of length_mm and standard deviation 1, less their mean by
-    volume: the modulus of a tissue is the geometric mean over it.
+    Fields are Karhunen-Loeve modes of a Gaussian kernel of length_mm, or of the tissue's own length where its modulus
+    is a field, and standard deviation 1, less their mean by volume: the modulus of a tissue is the geometric mean over
+    it.
     """
     centres, found, sizes = mesh.nodes[mesh.tets].mean(axis=1), [], []
     for tissue in tissues:
         own = np.flatnonzero(mesh.region == tissue)
         volumes = mesh.volumes[own]
-        local = karhunen_loeve(centres[own], volumes, kernel_mm=length_mm, share=SHARE, most=MOST)
+        prior = mesh.tissues[tissue].field
+        length, most = (length_mm, MOST) if prior is None else (prior.length_mm, MOST_OF_MAP)
+        local = karhunen_loeve(centres[own], volumes, kernel_mm=length, share=SHARE, most=most)
         local = local - (volumes @ local) / volumes.sum()
         rows, columns = np.repeat(own, local.shape[1]), np.tile(np.arange(local.shape[1]), len(own))
         found.append(sparse.csr_matrix((local.ravel(), (rows, columns)), shape=(len(mesh.tets), local.shape[1])))

@@ -476,7 +476,7 @@ def _material(mesh: TetMesh, layers: Sequence[Layer], case: Case) -> MaterialMod
     parts = [(i, *(n for n, tissue in of_layers if tissue == i)) for i in free]
     return material_modes(
         mesh,
-        meshed if case.discrepancy.heterogeneity_sd else (),
+        [i for i in meshed if case.discrepancy.heterogeneity_sd or mesh.tissues[i].field],
         length_mm=case.discrepancy.heterogeneity_length_mm,
         poisson=parts if case.discrepancy.poisson_sd else (),
     )

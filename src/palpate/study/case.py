@@ -9,7 +9,7 @@ from pathlib import Path
 
 from palpate.errors import ConfigurationError
 from palpate.images.named_labels import MAX_LABEL, MAX_NAME, computed_by_spreadsheets
-from palpate.images.tissue import Role, Tissue
+from palpate.images.tissue import FieldPrior, Role, Tissue
 from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.laws.registry import LAWS, law_from, law_parameters
 from palpate.mechanics.solvers.registry import SOLVERS
@@ -199,7 +199,8 @@ class CaseTissue:
 
     `poisson_ratio` None: 0.45, or what a phantom draws; `poisson_ratio_sd`: standard deviation of what is believed of
     it where it is sought, None: 0.03. `youngs_modulus_kpa`: a number, or the 95 % range of what is believed of a
-    `known` one.
+    `known` one. `modulus` "field": it varies in the tissue and is mapped; `field_sd`: prior standard deviation of ln E
+    inside, `field_length_mm`: of its Gaussian kernel.
     """
 
     name: str
@@ -218,6 +219,9 @@ class CaseTissue:
     )
     density_kg_m3: float = field(default=1000.0, metadata=rule(between=(0.1, 3e4)))
     poisson_ratio_sd: float | None = field(default=None, metadata=rule(between=RATIO_SDS))
+    modulus: str = field(default="one", metadata=rule(choices=("one", "field")))
+    field_sd: float = field(default=0.7, metadata=rule(between=(0.01, 3.0)))
+    field_length_mm: float = field(default=8.0, metadata=rule(between=(1.0, 1e3)))
 
     def __post_init__(self) -> None:
         refuse_name(self.name, "the name of a tissue")
@@ -239,12 +243,18 @@ class CaseTissue:
                     f"tissue '{self.name}': youngs_modulus_kpa is {shown(self.youngs_modulus_kpa)}; a range begins with"
                     " its smaller end"
                 )
+        if self.modulus == "field" and self.role is not Role.ESTIMATE:
+            raise ConfigurationError(
+                f"tissue '{self.name}': modulus is \"field\", but its role is '{self.role}'; only a tissue whose"
+                " modulus is estimated can be mapped: give it the role `estimate`, or leave `modulus` out"
+            )
         self.with_labels(())  # a tissue's constants are checked by the tissue itself
 
     def with_labels(self, labels: tuple[int, ...]) -> Tissue:
         """The tissue with its labels; raises `ConfigurationError` when its constants are impossible."""
         ratio = POISSON_RATIO if self.poisson_ratio is None else self.poisson_ratio
-        return Tissue(self.name, self.role, labels, ratio, self.modulus_kpa, modulus_sd=self.modulus_sd)
+        mapped = FieldPrior(self.field_sd, self.field_length_mm) if self.modulus == "field" else None
+        return Tissue(self.name, self.role, labels, ratio, self.modulus_kpa, modulus_sd=self.modulus_sd, field=mapped)
 
     @property
     def modulus_kpa(self) -> float | None:

@@ -28,6 +28,7 @@ RESULT_FILES = (
     "model.npz",
     "posterior.nc",
     "stiffness.nii.gz",
+    "stiffness_sd.nii.gz",
 )
 UNSEALED = ("files", "warnings")  # which are added when the files take their places
 FURTHER_MESH = re.compile(r"mesh_\d+\.vtu")

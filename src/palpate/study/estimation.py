@@ -29,7 +29,13 @@ from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit, Imaged, OfInstrument, OfPoints, PointMotions
 from palpate.progress import Progress, silent
 from palpate.study.discrepancy import FoundDiscrepancy, discrepancy_findings, discrepancy_of
-from palpate.study.estimate_findings import data_findings, fold_findings, inversion_findings, pair_findings
+from palpate.study.estimate_findings import (
+    data_findings,
+    fold_findings,
+    inversion_findings,
+    map_findings,
+    pair_findings,
+)
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio, ratio_verdict
 from palpate.study.samples import CHAINS, ModulusSamples, draw_moduli, sample_findings
 from palpate.study.together import ImagePairs, ModulusRegion, combinations_of, image_pairs_of, regions_of
@@ -43,6 +49,7 @@ from palpate.uncertainty import (
     Information,
     Interval,
     ModulusInterval,
+    StiffnessMap,
     covariance_of,
     frozen_posterior,
     grid_errors,
@@ -50,6 +57,7 @@ from palpate.uncertainty import (
     information_shares,
     log_interval,
     modulus_interval,
+    stiffness_maps,
 )
 
 __all__ = [
@@ -177,7 +185,8 @@ class Estimation:
     what was believed before; discrepancy: what the images say of frame, drawing and material; combinations: what is
     known where single moduli are not; regions: joint ones of two moduli; forces, points: measured and fitted;
     image_pairs: what each of several later images says alone; samples: of the moduli's posterior,
-    where the case asks for them and the estimate converged; variations: what would change the answer.
+    where the case asks for them and the estimate converged; variations: what would change the answer; maps: of tissues
+    whose modulus is a field.
     """
 
     status: str
@@ -202,6 +211,7 @@ class Estimation:
     forces: tuple[ForceFit, ...] = ()
     points: tuple[PointFit, ...] = ()
     variations: tuple[Variation, ...] = ()
+    maps: tuple[StiffnessMap, ...] = ()
 
     @property
     def correlation(self) -> NDArray[np.float64]:
@@ -254,6 +264,7 @@ def conclude(
         stated = [e.interval95 if objective.parameters.absolute else e.ratio_interval95 for e in estimates]
         drawn = draw_moduli(inversion, covariance.total, stated, bounds=settings.bounds, draws=samples, rng=rng)
     found_discrepancy = discrepancy_of(inversion, observed.states) if minimum.converged else FoundDiscrepancy()
+    maps = stiffness_maps(inversion, np.diag(covariance.total)) if minimum.converged else ()
     findings = (
         *inversion_findings(inversion, covariance.total),
         *remark,
@@ -262,6 +273,7 @@ def conclude(
         *data_findings(inversion),
         *sample_findings(drawn),
         *discrepancy_findings(found_discrepancy),
+        *map_findings(maps),
     )
     return Estimation(
         status="converged" if minimum.converged else "not converged",
@@ -285,6 +297,7 @@ def conclude(
         regions=regions,
         image_pairs=pairs,
         samples=drawn,
+        maps=maps,
     )
 
 

@@ -23,6 +23,7 @@ from palpate.study.case_text import case_tables
 from palpate.study.discrepancy import FoundDiscrepancy
 from palpate.study.estimation import Estimation, ModulusEstimate, TissueFit, no_estimate
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio
+from palpate.uncertainty import StiffnessMap
 
 __all__ = [
     "SCHEMA",
@@ -144,6 +145,24 @@ class CaseResult:
         meshed = [v if t.meshed else None for t, v in zip(self.tissues, values, strict=True)]
         return np.array([math.nan if value is None else value for value in meshed])
 
+    def stiffness_map(self, pair: int = 0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Young's modulus in `unit`, and standard deviation of ln E, of each tetrahedron (n_tets,) of a pair's mesh.
+
+        Those of its tissue where that is not mapped, whose standard deviation is NaN.
+        """
+        bodies = [
+            (self.space, self.displacements),
+            *((further.space, further.displacements) for further in self.further),
+        ]
+        mesh = bodies[pair][0].mesh
+        first = sum(len(motions) for _, motions in bodies[:pair])
+        stiffness, sd = self.stiffness[mesh.region], np.full(len(mesh.region), np.nan)
+        for of in self.estimation.maps:
+            if first <= of.state < first + len(bodies[pair][1]):
+                stiffness[of.elements] *= np.exp(of.log_ratio)
+                sd[of.elements] = of.sd
+        return stiffness, sd
+
     def to_dict(self) -> dict[str, Any]:
         """The document `result.json`, schema palpate.result/1, ready for strict JSON."""
         estimation, names = self.estimation, image_names(self.case)
@@ -160,6 +179,7 @@ class CaseResult:
             "information": known and _plain(known),
             "information_shares": {tissue: dict(of) for tissue, of in estimation.information_shares.items()},
             "variations": [_plain(variation) for variation in estimation.variations],
+            "maps": [_map(of, names) for of in estimation.maps],
             "combinations": [_plain(pair) for pair in estimation.combinations],
             "regions": [_plain(region) for region in estimation.regions],
             "image_pairs": pairs and _plain(pairs) | {"alone": alone},
@@ -352,6 +372,18 @@ def _ratio(item: PoissonRatioEstimate, status: str) -> dict[str, Any]:
     if status != "converged":
         document |= dict.fromkeys(("value", "interval95")) | {"verdict": NOT_IDENTIFIED}
     return document
+
+
+def _map(of: StiffnessMap, names: Sequence[str]) -> dict[str, Any]:
+    """What a map comes to; its numbers stand in mesh.vtu and in the images of stiffness."""
+    region = of.region and {key: value for key, value in _plain(of.region).items() if key != "elements"}
+    return {
+        "tissue": of.tissue,
+        "after": names[of.state],
+        "prior_sd": of.prior_sd,
+        "resolved": of.resolved,
+        "region": region,
+    }
 
 
 def _discrepancy(found: FoundDiscrepancy, names: Sequence[str]) -> dict[str, Any]:

@@ -37,6 +37,7 @@ from palpate.uncertainty.sensitivity import (
     surface_errors,
 )
 from palpate.uncertainty.sobol import SobolIndices, require_salib, sobol_indices
+from palpate.uncertainty.stiffness_map import DifferentRegion, StiffnessMap, stiffness_maps
 
 __all__ = [
     "GRID_DRAWS",
@@ -45,6 +46,7 @@ __all__ = [
     "ChainDiagnostics",
     "Combination",
     "Covariance",
+    "DifferentRegion",
     "Equilibria",
     "Errors",
     "FastPath",
@@ -61,6 +63,7 @@ __all__ = [
     "Profile",
     "Shift",
     "SobolIndices",
+    "StiffnessMap",
     "agreement",
     "chain_diagnostics",
     "covariance_of",
@@ -92,5 +95,6 @@ __all__ = [
     "sample_posterior",
     "sandwich_covariance",
     "sobol_indices",
+    "stiffness_maps",
     "surface_errors",
 ]

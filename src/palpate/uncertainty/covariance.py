@@ -29,6 +29,7 @@ __all__ = [
     "Covariance",
     "FittedState",
     "GridErrors",
+    "covariance_among",
     "covariance_of",
     "error_noise",
     "gain",
@@ -66,7 +67,11 @@ def gain(evaluation: Evaluation, n_parameters: int) -> tuple[NDArray[np.float64]
 
     G = H^-1 J^T W: a change e of the data moves the estimate by -G e; H is the Gauss-Newton matrix with the prior.
     """
-    rows = evaluation.covariance_columns(n_parameters).T
+    return _gain(evaluation, evaluation.covariance_columns(n_parameters).T)
+
+
+def _gain(evaluation: Evaluation, rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """The same of combinations of the unknowns, with their rows (k, n_unknowns) of H^-1."""
     return tuple(s.jacobian.times(rows[:, s.columns].T).T * (s.precision * s.weights) for s in evaluation.lines)
 
 
@@ -114,11 +119,12 @@ def covariance_of(
 
     def parts(of: Evaluation) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Covariances by noise, prior and grid of one set of unknowns."""
-        noise, prior = _sandwich(objective, of, noise_of)
+        noise, prior = _sandwich(objective, of, of.covariance_columns(objective.n_parameters).T, noise_of)
         return noise, prior, grid_covariance(evaluation, scatter(shifts_by(of, errors, objective.n_parameters)), noise)
 
     noise, prior, grid = parts(evaluation)
-    further = [_considered(objective, evaluation), undecided_covariance(objective, evaluation, unknowns)]
+    rows = evaluation.covariance_columns(objective.n_parameters).T
+    further = [_considered(objective, evaluation, rows), undecided_covariance(objective, evaluation, unknowns)]
     prior = prior + sum((part for of in further for part in of.values()), np.zeros_like(prior))
     left = noise + prior + grid if given is evaluation else sum(parts(given), np.zeros_like(noise))
     return Covariance(noise, prior, grid, mesh, _causes(objective, evaluation, further), left + mesh)
@@ -143,16 +149,18 @@ def _causes(
     return found
 
 
-def _considered(objective: Objective, evaluation: Evaluation) -> dict[str, NDArray[np.float64]]:
-    """By cause, S P_b^-1 S^T (n_parameters, n_parameters) of blocks that are considered, not estimated.
+def _considered(
+    objective: Objective, evaluation: Evaluation, rows: NDArray[np.float64]
+) -> dict[str, NDArray[np.float64]]:
+    """By cause, S P_b^-1 S^T (k, k) of blocks that are considered, not estimated.
 
-    S = -H^-1 J^T W J_b: how the estimate answers to them.
+    S = -H^-1 J^T W J_b: how the unknowns with these rows (k, n_unknowns) of H^-1 answer to them.
     """
-    inverse, found = evaluation.covariance_columns(objective.n_parameters), dict[str, NDArray[np.float64]]()
+    found = dict[str, NDArray[np.float64]]()
     for i, block in enumerate(objective.parameters.blocks):
         if block.considered:
             own = objective.parameters.columns(i)
-            answer = inverse.T @ (evaluation.matrix - evaluation.prior)[:, own]
+            answer = rows @ (evaluation.matrix - evaluation.prior)[:, own]
             part = answer @ np.linalg.inv(block.precision) @ answer.T
             found[block.cause] = found.get(block.cause, np.zeros_like(part)) + part
     return found
@@ -208,18 +216,27 @@ def sandwich_covariance(objective: Objective, evaluation: Evaluation) -> NDArray
     have it, at the material place, by the mean of their noise models. Later states that move alike do not average
     it away, opposite ones do.
     """
-    noise, prior = _sandwich(objective, evaluation, error_noise(evaluation))
+    rows = evaluation.covariance_columns(objective.n_parameters).T
+    noise, prior = _sandwich(objective, evaluation, rows, error_noise(evaluation))
     return noise + prior
 
 
+def covariance_among(objective: Objective, evaluation: Evaluation, numbers: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Covariance (k, k) of the unknowns with these `numbers` (k,): the sandwich, and what is considered."""
+    rows = evaluation.covariance_columns(len(evaluation.matrix))[numbers]
+    noise, prior = _sandwich(objective, evaluation, rows, error_noise(evaluation))
+    return sum(_considered(objective, evaluation, rows).values(), noise + prior)
+
+
 def _sandwich(
-    objective: Objective, evaluation: Evaluation, noise_of: Mapping[tuple[int, str], NoiseModel]
+    objective: Objective,
+    evaluation: Evaluation,
+    rows: NDArray[np.float64],
+    noise_of: Mapping[tuple[int, str], NoiseModel],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Its two parts, (n_parameters, n_parameters) each: by the residuals, and by the prior."""
-    n = objective.n_parameters
-    inverse = evaluation.covariance_columns(n)
-    data = noise_covariance(objective, list(zip(evaluation.lines, gain(evaluation, n), strict=True)), noise_of)
-    return data, np.asarray(inverse.T @ evaluation.prior @ inverse)
+    """Its two parts, (k, k) each, of unknowns with their rows (k, n_unknowns) of H^-1: by residuals, by the prior."""
+    data = noise_covariance(objective, list(zip(evaluation.lines, _gain(evaluation, rows), strict=True)), noise_of)
+    return data, np.asarray(rows @ evaluation.prior @ rows.T)
 
 
 def noise_covariance(

@@ -1,0 +1,179 @@
+"""Maps of stiffness: the posterior of ln E in tissues whose modulus is a field, and whether a part of one differs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+from scipy.stats import norm
+
+from palpate.inversion import FIELD, Acts, Block, Inversion
+from palpate.mechanics.material import SHARE, material_modes
+from palpate.mesh.tet_mesh import FACES, TetMesh
+from palpate.uncertainty.covariance import covariance_among
+from palpate.uncertainty.intervals import NORMAL_95, Interval
+
+__all__ = ["DifferentRegion", "StiffnessMap", "stiffness_maps"]
+
+CONTRAST = 1.5  # from which a part of a tissue is another stiffness, and not its own scatter
+CERTAIN, LIKELY = 0.95, 0.5  # posterior probability of that: somewhere in a region that is reported, all over it
+MM3_PER_ML = 1000.0
+
+
+@dataclass(frozen=True, slots=True)
+class DifferentRegion:
+    """The largest connected part of a tissue that is likely stiffer, or softer, than the tissue by `CONTRAST`.
+
+    elements (n,): its tetrahedra; volume_ml; centre_mm (3,), RAS; contrast: geometric mean of E in it over that in the
+    rest of the tissue, with its 95 % interval; probability: the largest posterior probability, of an element in it.
+    """
+
+    elements: NDArray[np.int64]
+    volume_ml: float
+    centre_mm: NDArray[np.float64]
+    contrast: float
+    interval95: Interval
+    probability: float
+
+
+@dataclass(frozen=True, slots=True)
+class StiffnessMap:
+    """Posterior of ln E in the tetrahedra of one tissue of a reference state.
+
+    tissue: its name; state: number of a later state of that reference; elements (n,): numbers of its tetrahedra in the
+    mesh; log_ratio (n,): posterior mean of ln E over that of the tissue's geometric mean; sd (n,): posterior standard
+    deviation of ln E; resolution (n,): share of the prior's variance that the data removed, 0 to 1; prior_sd: of ln E,
+    learned; resolved: mean of the resolution over the tissue's volume; region: where it differs, if anywhere.
+    """
+
+    tissue: str
+    state: int
+    elements: NDArray[np.int64]
+    log_ratio: NDArray[np.float64]
+    sd: NDArray[np.float64]
+    resolution: NDArray[np.float64]
+    prior_sd: float
+    resolved: float
+    region: DifferentRegion | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Field:
+    """Posterior of a field at its elements: mean (n,), and its covariance F C F^T + R R^T - F P^-1 F^T + r.
+
+    seen (n, k): F, the modes that the data tell, with coefficients of covariance C (k, k), P^-1 (k, k) before them;
+    every (n, m): R, all modes of the prior times its standard deviation; left: r, the variance that none of them holds.
+    """
+
+    mean: NDArray[np.float64]
+    seen: NDArray[np.float64]
+    posterior: NDArray[np.float64]
+    prior: NDArray[np.float64]
+    every: NDArray[np.float64]
+    left: float
+
+    @property
+    def prior_variance(self) -> NDArray[np.float64]:
+        """(n,) before the data."""
+        return np.asarray((self.every**2).sum(axis=1) + self.left)
+
+    @property
+    def variance(self) -> NDArray[np.float64]:
+        """(n,) after them."""
+        change = np.einsum("ek,kl,el->e", self.seen, self.posterior - self.prior, self.seen)
+        return np.maximum(self.prior_variance + change, 0.0)
+
+    def variance_of(self, weights: NDArray[np.float64]) -> float:
+        """Of the sum of the field times weights (n,)."""
+        seen, every = weights @ self.seen, weights @ self.every
+        return float(max(every @ every + seen @ (self.posterior - self.prior) @ seen, 0.0))
+
+
+def stiffness_maps(inversion: Inversion, variances: NDArray[np.float64]) -> tuple[StiffnessMap, ...]:
+    """The map of every tissue whose modulus is a field, at a converged estimate.
+
+    variances (n_parameters,): of the log-moduli, with all their causes. The covariance of a field's coefficients is the
+    sandwich with what is considered, that of what the images do not see the prior's (Spantini et al. 2015, SIAM J. Sci.
+    Comput. 37, A2451, Theorem 2.3).
+    """
+    blocks = inversion.objective.parameters.blocks
+    return tuple(_map(inversion, i, block, variances) for i, block in enumerate(blocks) if block.cause == FIELD)
+
+
+def _map(inversion: Inversion, number: int, block: Block, variances: NDArray[np.float64]) -> StiffnessMap:
+    objective, minimum = inversion.objective, inversion.minimum
+    parameters, state = objective.parameters, block.states[0]
+    model = objective.states[state].model
+    mesh, own = model.space.mesh, parameters.columns(number)
+    tissue = next(i for i, t in enumerate(mesh.tissues) if t.name == block.of and t.field)
+    elements = np.flatnonzero(mesh.region == tissue)
+    first = int(np.searchsorted(parameters.acting(Acts.MATERIAL, state), own[0]))
+    seen = model.material.fields[elements][:, first : first + block.size].toarray()
+    theta, n = parameters.tissues.index(block.of), parameters.n_parameters
+    covariance = covariance_among(objective, minimum.evaluation, np.array([theta, *own]))
+    learned = np.linalg.inv(parameters.nuisance_precision[np.ix_(own - n, own - n)])
+    stated = mesh.tissues[tissue].field
+    assert stated is not None
+    amplitude = float(np.sqrt(np.trace(learned) / np.trace(np.linalg.inv(block.precision))))
+    sd = amplitude * stated.sd
+    every = sd * material_modes(mesh, (tissue,), length_mm=stated.length_mm).fields[elements].toarray()
+    mean = seen @ minimum.unknowns[own]
+    field = _Field(mean, seen, covariance[1:, 1:], learned, every, (1.0 - SHARE) * sd**2)
+    whole = field.variance + variances[theta] + 2.0 * seen @ covariance[1:, 0]
+    resolution = np.clip(1.0 - field.variance / field.prior_variance, 0.0, 1.0)
+    return StiffnessMap(
+        block.of,
+        state,
+        elements,
+        mean,
+        np.sqrt(np.maximum(whole, 0.0)),
+        resolution,
+        sd,
+        float(np.average(resolution, weights=mesh.volumes[elements])),
+        _region(mesh, elements, field),
+    )
+
+
+def _region(mesh: TetMesh, elements: NDArray[np.int64], field: _Field) -> DifferentRegion | None:
+    """The largest connected part that is likely another stiffness, and certainly so somewhere; None: there is none."""
+    sd, found = np.sqrt(np.maximum(field.variance, 1e-300)), list[DifferentRegion]()
+    for sign in (1.0, -1.0):
+        probability = norm.cdf((sign * field.mean - np.log(CONTRAST)) / sd)
+        likely = np.flatnonzero(probability > LIKELY)
+        _, part = connected_components(_neighbours(mesh.tets[elements[likely]]))
+        for label in np.unique(part[probability[likely] > CERTAIN]):
+            found.append(_different(mesh, elements, field, likely[part == label], probability))
+    return max(found, key=lambda region: region.volume_ml, default=None)
+
+
+def _different(
+    mesh: TetMesh,
+    elements: NDArray[np.int64],
+    field: _Field,
+    inside: NDArray[np.int64],
+    probability: NDArray[np.float64],
+) -> DifferentRegion:
+    volumes, is_in = mesh.volumes[elements], np.isin(np.arange(len(elements)), inside)
+    weights = np.where(is_in, volumes / volumes[is_in].sum(), -volumes / max(volumes[~is_in].sum(), 1e-300))
+    contrast, half = float(weights @ field.mean), NORMAL_95 * float(np.sqrt(field.variance_of(weights)))
+    centres = mesh.nodes[mesh.tets[elements[inside]]].mean(axis=1)
+    return DifferentRegion(
+        elements[inside],
+        float(volumes[inside].sum()) / MM3_PER_ML,
+        np.average(centres, axis=0, weights=volumes[inside]),
+        float(np.exp(contrast)),
+        (float(np.exp(contrast - half)), float(np.exp(contrast + half))),
+        float(probability[inside].max()),
+    )
+
+
+def _neighbours(tets: NDArray[np.int64]) -> sparse.csr_matrix[np.float64]:
+    """Which of the tetrahedra (n, 4) share a face, (n, n)."""
+    faces = np.sort(tets[:, FACES].reshape(-1, 3), axis=1)
+    _, face = np.unique(faces, axis=0, return_inverse=True)
+    owner = np.repeat(np.arange(len(tets)), len(FACES))
+    of_face = sparse.csr_matrix((np.ones(len(owner)), (owner, face.ravel())), shape=(len(tets), len(faces)))
+    return sparse.csr_matrix(of_face @ of_face.T)
