@@ -48,5 +48,6 @@ def test_every_file_of_the_package_is_in_the_wheel(unpacked):
         return {path.relative_to(package) for path in found}
 
     assert files(unpacked / "palpate") == files(ROOT / "src" / "palpate")
+    assert files(unpacked / "multifrontal") == files(ROOT / "packages" / "multifrontal" / "src" / "multifrontal")
     licences = {path.name for path in next(unpacked.glob("*.dist-info/licenses")).rglob("*") if path.is_file()}
     assert {"LICENSE", "NOTICE", "three.LICENSE.txt"} <= licences
