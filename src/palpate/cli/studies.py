@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from palpate.cli.outcome import Outcome, columns, listed, warning_lines
-from palpate.parallel import processors
 
 if TYPE_CHECKING:
     from palpate.study.case import Case
@@ -25,6 +24,7 @@ def reproduce(
 ) -> Outcome:
     """One of the paper's experiments, our numbers beside its own."""
     from palpate.experiments.reproduce.run import reproduce as run
+    from palpate.parallel import processors
 
     workers = min(processors(), PROCESSES)
     result = run(arguments.experiment, outputs.path, progress=progress, workers=workers)

@@ -20,8 +20,7 @@ from palpate.cohort.tables import CSV, PARQUET
 from palpate.cohort.task import Limits, Outcome, Row
 from palpate.errors import ConfigurationError, FolderInUse, PalpateError
 from palpate.progress import Progress
-from palpate.study.journal import STAGING
-from palpate.study.outputs import make_folder
+from palpate.study.outputs import STAGING, make_folder
 
 __all__ = ["Options", "run_cohort"]
 
