@@ -325,7 +325,8 @@ class FiniteStrainEquilibrium:
     def adjoint(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
         """T^T g (n_regions + n_modes,) for g (n_dof,), by one adjoint solve; raises `NotConverged`."""
         stiffness = self._stiffness()
-        dual = self._dual(stiffness, gradient)
+        load = np.asarray(self.balance.free.T @ gradient)
+        dual = self._system(stiffness, 1).transposed().solve(load[:, None])[:, 0]
         result, first = np.asarray(self._parameter_loads(stiffness).T @ dual), self.model.n_regions
         result[first : first + self.model.constraint.n_modes] += self.model.constraint.modes.T @ gradient
         return result
@@ -348,11 +349,6 @@ class FiniteStrainEquilibrium:
         if isinstance(ready, LinearisedSystem):
             ready = ready.nearby
         return LinearisedSystem(self.balance.restricted(stiffness), ready, symmetric=self.balance.symmetric)
-
-    def _dual(self, stiffness: Stiffness, gradient: NDArray[np.float64]) -> Array:
-        """K_ff^-T F^T g (n_free,)."""
-        load = np.asarray(self.balance.free.T @ gradient)
-        return self._system(stiffness, 1).transposed().solve(load[:, None])[:, 0]
 
     def _parameter_loads(self, stiffness: Stiffness) -> Array:
         """-F^T [dR / d ln E_r, K M, dR / dc_k] (n_free, n_regions + n_modes), mN."""
