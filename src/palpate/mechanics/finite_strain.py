@@ -319,7 +319,8 @@ class FiniteStrainEquilibrium:
     def poisson_tangents(self) -> NDArray[np.float64]:
         """Columns du / d nu_r (n_dof, n_regions) mm; raises `NotConverged`."""
         stiffness = self._stiffness()
-        loads = -self._poisson_forces()
+        slopes = self.model.moduli_by_poisson(self.moduli, self.coefficients[self.model.constraint.n_modes :])
+        loads = -np.asarray(self.balance.free.T @ self.balance.region_forces(self.values, slopes))
         return np.asarray(self.balance.free @ self._system(stiffness, loads.shape[1]).solve(loads))
 
     def adjoint(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -361,11 +362,6 @@ class FiniteStrainEquilibrium:
         """Derivatives of R (n_dof, k), mN, along directions (n_material, k) of the material modes, or by each alone."""
         material = self.coefficients[self.model.constraint.n_modes :]
         return self.model.material_forces(self.values, self.moduli, material, directions)
-
-    def _poisson_forces(self) -> Array:
-        """F^T dR / d nu_r (n_free, n_regions), mN."""
-        slopes = self.model.moduli_by_poisson(self.moduli, self.coefficients[self.model.constraint.n_modes :])
-        return np.asarray(self.balance.free.T @ self.balance.region_forces(self.values, slopes))
 
 
 def finite_strain_model(

@@ -43,15 +43,13 @@ class LocalEngine:
         if not hasattr(os, "fork"):
             raise ResourceError("cohorts need a system that forks processes: Linux or macOS, or a Dask worker on one")
         workers = max(min(self.workers or processors(), len(tasks)), 1)
-        pool = _Processes(Supervisor(self.work), Place(self._memory_gb(), workers))
+        free = available_memory()
+        memory_gb = self.memory_gb or (UNKNOWN_GB if free is None else SHARE * free / 1e9)
+        pool = _Processes(Supervisor(self.work), Place(memory_gb, workers))
         try:
             yield from packed(pool, tasks)
         finally:
             pool.close()
-
-    def _memory_gb(self) -> float:
-        free = available_memory()
-        return self.memory_gb or (UNKNOWN_GB if free is None else SHARE * free / 1e9)
 
 
 class _Processes:

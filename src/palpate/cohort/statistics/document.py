@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -67,15 +67,7 @@ def _organ(usable: Usable, records: Sequence[Record]) -> dict[str, Any]:
     remarks = [f"{len(several)} patients have rows of several stages: nothing by stage uses them"] if several else []
     without = len(usable.patients) - len(staged) - len(several)
     remarks += [f"{without} patients have no stage"] if without else []
-    found: dict[str, dict[str, float]] = {}
-    for record in records:
-        for name, text in record.row.covariates.items():
-            try:
-                number = float(text)
-            except ValueError:
-                number = math.nan
-            found.setdefault(name, {})[record.row.id] = number
-    covariates = {name: numbers for name, numbers in found.items() if any(map(math.isfinite, numbers.values()))}
+    covariates = _numeric_covariates(records)
     clean = [scan for scan in usable.scans if not set(scan.warnings) & set(MISLEADING)]
     warned = len(clean) < len(usable.scans)
     censored = sum(scan.value is None for scan in usable.scans)
@@ -181,3 +173,16 @@ def _quantiles(scans: Sequence[Scan]) -> list[float | None]:
     with np.errstate(invalid="ignore"):
         ends = [np.percentile([getattr(scan, end) for scan in scans], [25.0, 50.0, 75.0]) for end in ("low", "high")]
     return [float(low) if low == high else None for low, high in zip(*ends, strict=True)]
+
+
+def _numeric_covariates(records: Sequence[Record]) -> Mapping[str, Mapping[str, float]]:
+    """Name -> id of a row -> number, of the table's further columns that are numbers."""
+    found: dict[str, dict[str, float]] = {}
+    for record in records:
+        for name, text in record.row.covariates.items():
+            try:
+                number = float(text)
+            except ValueError:
+                number = math.nan
+            found.setdefault(name, {})[record.row.id] = number
+    return {name: numbers for name, numbers in found.items() if any(map(math.isfinite, numbers.values()))}
