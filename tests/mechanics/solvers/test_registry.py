@@ -12,9 +12,8 @@ from scipy.sparse.linalg import splu
 from multifrontal import nested_dissection, twin_rows
 from palpate.errors import ConfigurationError, SolverError
 from palpate.mechanics.boundary import outer_constraint
-from palpate.mechanics.coarser import linear_displacements
 from palpate.mechanics.linear_model import linear_model, weighted_sum
-from palpate.mechanics.rigid import rigid_modes
+from palpate.mechanics.rigid import linear_displacements, rigid_modes
 from palpate.mechanics.solvers import registry
 from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
 from palpate.mechanics.solvers.contract import Expectation, Hints, Solver
