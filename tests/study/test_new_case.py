@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from palpate.cli import main
+from palpate.demo import DATA
 from palpate.errors import ConfigurationError, InputDataError
-from palpate.experiments.simulated_pelvis import DATA
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_label_image, write_label_image

@@ -1,10 +1,14 @@
-"""The kinds of measurements that a case may name beside its images; a new one is a file and a line here."""
+"""The kinds of measurements that a case may name beside its images; a new one is a file and a line here.
+
+Other packages bring theirs as entry points `palpate.data`, each a `SourceKind`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from palpate.entry_points import brought
 from palpate.observation.contract import DataFile, DataSource
 from palpate.observation.displacement_field import read_displacement_field
 from palpate.observation.force import read_force
@@ -33,6 +37,7 @@ SOURCES = {
     "displacement-field": SourceKind(read_displacement_field),
     "force": SourceKind(read_force, ("surface", "force_n", "direction", "sd_n"), ("offset_sd_n",), tells_scale=True),
 }
+SOURCES |= brought("palpate.data", SourceKind, taken=SOURCES)
 
 
 def read_source(file: DataFile) -> DataSource:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from palpate.study.estimation import Observed, conclude, estimates_of, intervals_of, verdict
     from palpate.study.journal import recover
     from palpate.study.lock import held_folder, own_file
-    from palpate.study.outputs import make_folder, read_json, staged, write_json, write_text
+    from palpate.study.outputs import OutputFolder, make_folder, read_json, staged, write_json, write_text
     from palpate.study.provenance import software_versions
     from palpate.study.read import read_states
     from palpate.study.result import CaseResult, failure_document
@@ -35,6 +35,7 @@ __all__ = [
     "Mechanics",
     "MeshSettings",
     "Observed",
+    "OutputFolder",
     "Phantom",
     "aligned",
     "conclude",
@@ -79,6 +80,7 @@ _HOMES = {
     "Mechanics": "palpate.study.case",
     "MeshSettings": "palpate.study.case",
     "Observed": "palpate.study.estimation",
+    "OutputFolder": "palpate.study.outputs",
     "Phantom": "palpate.study.case",
     "aligned": "palpate.study.body",
     "conclude": "palpate.study.estimation",
