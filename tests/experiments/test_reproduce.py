@@ -9,7 +9,6 @@ import sys
 
 import numpy as np
 import pytest
-from palpate_validation.paper.figures import draw_figure4, draw_staging, draw_table
 from scipy import stats
 
 from palpate.cli import main
@@ -17,10 +16,19 @@ from palpate.cohort.statistics.association import pearson_p, points_behind
 from palpate.errors import ConfigurationError, GeometryError, ResourceError
 from palpate.mesh.anatomy import Box
 from palpate_validation.paper.cohort import ORGANS, PatientResult
-from palpate_validation.paper.figure4 import LAW, Figure4, Point
+from palpate_validation.paper.figure4 import LAW, Figure4, Point, draw_figure4
 from palpate_validation.paper.real_pelvis import grid_within
-from palpate_validation.paper.staging import Staging, paper_remark, with_stage
-from palpate_validation.paper.table import COLUMNS, PAPER_STAGING, PAPER_TABLE1, PAPER_TABLE2, Entry, Table, TableRow
+from palpate_validation.paper.staging import Staging, draw_staging, paper_remark, with_stage
+from palpate_validation.paper.table import (
+    COLUMNS,
+    PAPER_STAGING,
+    PAPER_TABLE1,
+    PAPER_TABLE2,
+    Entry,
+    Table,
+    TableRow,
+    draw_table,
+)
 from palpate_validation.reproduce import reproduce
 from palpate_validation.scenes import Job, Ledger, compute
 
