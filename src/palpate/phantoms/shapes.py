@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial import KDTree
 
-__all__ = ["Complement", "Ellipsoid", "Grown", "Shape", "Tube", "Union", "ball", "rotation_about"]
+__all__ = ["Complement", "Ellipsoid", "Shape", "Tube", "Union", "ball", "rotation_about"]
 
 NEWTON_STEPS = 40  # for the closest point of an ellipsoid; the iteration is monotone and rarely needs ten
 PLACES = 401  # along a tube, of which one is near every point's closest
@@ -167,19 +167,3 @@ class Complement:
     def gradient_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Gradient (n, 3), mm per mm."""
         return -self.part.gradient_at(points)
-
-
-@dataclass(frozen=True, slots=True)
-class Grown:
-    """What lies within `by_mm` of `part`."""
-
-    part: Shape
-    by_mm: float
-
-    def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Signed distance (n,) mm."""
-        return self.part.at(points) - self.by_mm
-
-    def gradient_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Gradient (n, 3), mm per mm."""
-        return self.part.gradient_at(points)

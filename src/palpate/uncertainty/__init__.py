@@ -23,7 +23,7 @@ from palpate.uncertainty.intervals import NORMAL_95, Interval, ModulusInterval, 
 from palpate.uncertainty.joint_region import JointRegion, joint_region
 from palpate.uncertainty.profile import FixedCorrespondence, Profile, fixed_correspondence
 from palpate.uncertainty.refit import refitted
-from palpate.uncertainty.sampling import PosteriorChains, posterior_chains, sample_posterior
+from palpate.uncertainty.sampling import PosteriorChains, posterior_chains
 from palpate.uncertainty.sensitivity import (
     Equilibria,
     Errors,
@@ -92,7 +92,6 @@ __all__ = [
     "refitted",
     "require_arviz",
     "require_salib",
-    "sample_posterior",
     "sandwich_covariance",
     "sobol_indices",
     "stiffness_maps",
