@@ -13,7 +13,7 @@ import numpy as np
 
 from palpate.cli.outcome import Outcome
 from palpate.images.readers import ImageFormat, StoredImage
-from palpate.observation.sources import SourceKind
+from palpate.observation.registry import SourceKind
 
 
 def read(path):

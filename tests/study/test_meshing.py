@@ -12,7 +12,7 @@ from palpate.images.readers import write_label_image
 from palpate.progress import silent
 from palpate.study import cost, meshing
 from palpate.study.body import ImagedStates, make_body
-from palpate.study.case_text import case_text
+from palpate.study.case_file import case_text
 from palpate.study.check import check_case
 from palpate.study.edge_length import EdgeLength
 from palpate.study.meshing import mesh_reference

@@ -19,9 +19,8 @@ from palpate.images.tissue import Role
 from palpate.images.totalsegmentator import CLASSES
 from palpate.study import check, cost, proposed_mesh
 from palpate.study.case_file import read_case
-from palpate.study.class_names import class_names
 from palpate.study.cost import expected_cost
-from palpate.study.guess import guess_tissues
+from palpate.study.guess import class_names, guess_tissues
 from palpate.study.new_case import CaseImages, new_case
 from palpate.study.read import read_segmentation, read_states
 

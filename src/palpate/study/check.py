@@ -35,8 +35,7 @@ from palpate.study.cost import (
     lack_of_memory,
     machine_memory_gb,
 )
-from palpate.study.domain import case_domain
-from palpate.study.edge_length import edge_length_of
+from palpate.study.edge_length import case_domain, edge_length_of
 from palpate.study.meshing import refuse_edge
 from palpate.study.plausibility import unit_warnings
 from palpate.study.read import measured, read_segmentation, read_states

@@ -1,10 +1,10 @@
-"""Who is who: the roles of an image's labels, guessed from their names, else from their places."""
+"""Who is who: labels without names named, and the roles of labels guessed from names, else from places."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import ndimage
@@ -13,16 +13,19 @@ from palpate.errors import InputDataError
 from palpate.images.label_image import LabelImage
 from palpate.images.named_labels import MAX_NAME
 from palpate.images.tissue import Role
+from palpate.images.totalsegmentator import CLASSES
 from palpate.study.case import is_tissue_name
-from palpate.study.plausibility import usual_modulus
+from palpate.study.plausibility import TABLE, usual_modulus
 
-__all__ = ["GuessedTissue", "guess_tissues"]
+__all__ = ["ClassNames", "GuessedTissue", "class_names", "guess_tissues"]
 
 SURROUNDINGS = "surroundings"
 BORDER_SHARE = 0.1  # of the image's border that the body, or the air around it, covers
 STILL_SHARE = 0.005  # of a label's voxels
 NEAR_MM = 15.0  # between the colon and an organ that it may move
 HOLLOW_CHANGE = 0.10  # of a volume: no solid organ changes so much between two scans
+BONE = "is bone"
+ENOUGH = 2  # pairs of left and right; one may lie right by chance
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,58 +57,9 @@ def _words(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
 
-BONE = "is bone"
-RULES = (
-    _Rule(_words("background air outside exterior external void"), Role.VOID, "is no part of the body"),
-    _Rule(
-        _words("tumour tumor tumours tumors lesion lesions cancer carcinoma gtv nodule metastasis"),
-        Role.ESTIMATE,
-        "is a tumour",
-    ),
-    _Rule(_words("renal kidney kidneys"), Role.ESTIMATE, "is a solid organ"),  # before the bony pelvis
-    _Rule(
-        _words(
-            "bone bones femur femurs femoral sacrum coccyx pelvis pelvic vertebra vertebrae spine hip hips ilium"
-            " ischium pubis rib ribs skull cranium tibia fibula humerus scapula clavicula clavicle sternum patella"
-            " mandible"
-        ),
-        Role.RIGID,
-        BONE,
-    ),
-    _Rule(
-        _words("rectum anorectum rectal lumen balloon probe transducer"),
-        Role.DRIVER,
-        "is hollow, and its wall moves the others",
-    ),
-    _Rule(
-        _words("muscle muscles gluteus gluteal iliopsoas psoas autochthon obturator levator fat adipose"),
-        Role.KNOWN,
-        "has a published stiffness",
-    ),
-    _Rule(
-        _words("surroundings surrounding body rest remaining remainder other others soft tissue tissues"),
-        Role.KNOWN,
-        "is what surrounds the organs",
-        rest=True,
-    ),
-    _Rule(
-        _words(
-            "artery arteries vein veins vessel vessels aorta vena cava nerve cord canal bowel colon intestine duodenum"
-            " stomach oesophagus esophagus trachea trunk disc discs skin cartilage cartilages costal lymph node ureter"
-            " urethra atrial appendage"
-        ),
-        None,
-        "is neither observed nor held",
-        rest=True,
-    ),
-    _Rule(
-        _words(
-            "prostate prostatic bladder liver spleen pancreas uterus cervix ovary breast brain heart lung lungs lobe"
-            " thyroid gland vesicle vesicles zone organ testis penis gallbladder adrenal"
-        ),
-        Role.ESTIMATE,
-        "is an organ",
-    ),
+RULES = tuple(
+    _Rule(_words(entry["words"]), Role(entry["role"]) if "role" in entry else None, entry["meaning"], "rest" in entry)
+    for entry in TABLE["role"]
 )
 
 UNLABELLED = _words("background clear label unlabelled unlabeled none")
@@ -281,3 +235,33 @@ def _renamed(guesses: Sequence[GuessedTissue]) -> list[GuessedTissue]:
         taken.add(name)
         found.append(replace(guess, name=name))
     return found
+
+
+@dataclass(frozen=True, slots=True)
+class ClassNames:
+    """The task whose numbers the labels are, their names, and how many pairs of left and right say so."""
+
+    task: str = ""
+    names: Mapping[int, str] = field(default_factory=dict)
+    pairs: int = 0
+
+
+def class_names(image: LabelImage) -> ClassNames:
+    """What the labels of an image without names are called, empty where that cannot be told.
+
+    Every label must be a class of the task, and each left one lie to the left of its right one. With fewer than two
+    such pairs nothing is assumed.
+    """
+    present = [int(label) for label in np.unique(image.labels) if label]
+    if image.names or not present:
+        return ClassNames()
+    centres = np.array(ndimage.center_of_mass(image.labels > 0, image.labels, present))
+    x = dict(zip(present, image.grid.world(centres)[:, 0], strict=True))
+    found = [ClassNames()]
+    for task, classes in CLASSES.items():
+        names = {number: name for name, number in classes.items() if number in x}
+        sides = [(n, classes[name.replace("left", "right")]) for n, name in names.items() if "left" in name]
+        pairs = [(left, right) for left, right in sides if right in x]
+        if len(names) == len(present) and len(pairs) >= ENOUGH and all(x[left] < x[right] for left, right in pairs):
+            found.append(ClassNames(task, names, len(pairs)))
+    return max(found, key=lambda known: known.pairs)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any
 
 from palpate.findings import Finding
 from palpate.images.tissue import Role
@@ -12,6 +15,7 @@ from palpate.study.estimation import Estimation
 
 __all__ = [
     "PUBLISHED",
+    "TABLE",
     "PublishedStiffness",
     "UsualModulus",
     "estimate_warnings",
@@ -50,88 +54,10 @@ class UsualModulus:
     source: str
 
 
-PUBLISHED = (
-    PublishedStiffness(
-        "prostate",
-        ("prostate", "prostatic", "central_gland", "peripheral_zone", "transition_zone"),
-        8.0,
-        26.0,
-        "indentation ex vivo, 552 sites of 46 glands, without cancer: 17.0 +- 9.0 kPa",
-        "Ahn et al., Urology 76 (2010) 1007",
-    ),
-    PublishedStiffness(
-        "prostate",
-        ("prostate", "prostatic", "central_gland", "peripheral_zone", "transition_zone"),
-        12.9,
-        36.7,
-        "static palpation in vivo, 12 patients, without cancer: 24.8 (interquartile range 11.9) kPa",
-        "doi 10.1177/09544119231154305",
-    ),
-    PublishedStiffness(
-        "prostate",
-        ("prostate", "prostatic"),
-        660.0,
-        660.0,
-        "tensile test, cadaver, transverse",
-        "Berardo et al.",
-    ),
-    PublishedStiffness(
-        "prostate cancer",
-        ("tumour", "tumor", "lesion", "cancer", "carcinoma"),
-        9.6,
-        38.6,
-        "indentation ex vivo, 552 sites of 46 glands: 24.1 +- 14.5 kPa",
-        "Ahn et al., Urology 76 (2010) 1007",
-    ),
-    PublishedStiffness(
-        "bladder wall",
-        ("bladder",),
-        214.0,
-        470.0,
-        "tensile test of the wall, linear range",
-        "Muslov et al. (2025)",
-        unless=("gall",),
-    ),
-    PublishedStiffness(
-        "colon and rectum wall",
-        ("colon", "rectum", "colorectal", "bowel"),
-        1830.0,
-        5180.0,
-        "tensile test of the wall: pig 1.83 MPa, human 5.18 MPa",
-        "doi 10.1186/s40064-015-0922-x",
-    ),
-    PublishedStiffness(
-        "liver",
-        ("liver", "hepatic"),
-        4.2,
-        6.6,
-        "shear modulus 1.8 +- 0.4 kPa, E = 3 G",
-        "PMC6925591, table 1",
-    ),
-    PublishedStiffness(
-        "fat",
-        ("fat", "adipose"),
-        2.25,
-        2.25,
-        "magnetic resonance elastography at 50 Hz: shear modulus 0.75 kPa, E = 3 G",
-        "Hatt et al. (2023), doi 10.1016/j.jmbbm.2023.105924",
-    ),
-    PublishedStiffness(
-        "muscle",
-        ("muscle", "gluteal", "gluteus", "iliopsoas"),
-        3.0,
-        3.0,
-        "magnetic resonance elastography at 50 Hz: shear modulus 1.0 kPa, E = 3 G",
-        "Hatt et al. (2023), doi 10.1016/j.jmbbm.2023.105924",
-    ),
-    PublishedStiffness(
-        "muscle",
-        ("muscle", "gluteal", "gluteus", "iliopsoas"),
-        1.5,
-        282.0,
-        "shear wave speed in vivo 0.7 to 9.7 m/s, E = 3 rho c^2 with rho = 1000 kg/m^3",
-        "PMC9631468, table 3",
-    ),
+TABLE: dict[str, list[dict[str, Any]]] = tomllib.loads((files("palpate.study") / "tissues.toml").read_text("utf-8"))
+PUBLISHED = tuple(
+    PublishedStiffness(**{key: tuple(value) if isinstance(value, list) else value for key, value in entry.items()})
+    for entry in TABLE["published"]
 )
 
 

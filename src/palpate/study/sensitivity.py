@@ -33,7 +33,7 @@ from palpate.parallel import blas_on_one_thread
 from palpate.progress import Progress, silent
 from palpate.study.body import Body, ImagedStates, joint_problem, make_body
 from palpate.study.case import LAW_NAMES, Case
-from palpate.study.case_text import case_tables
+from palpate.study.case_file import case_tables
 from palpate.study.edge_length import edge_length_of
 from palpate.study.estimation import Observed, conclude
 from palpate.study.inverted import inverted

@@ -31,9 +31,8 @@ from palpate.study.case_loads import case_loads
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.read import phantom_scene, read_states
 from palpate.study.result import MeshSummary, Provenance, Simulation
-from palpate.study.summary import mesh_summary
 
-__all__ = ["filled", "simulate"]
+__all__ = ["filled", "mesh_summary", "simulate"]
 
 Progress = Callable[[str], None]
 
@@ -170,6 +169,21 @@ def _labels(segmentation: Segmentation, space: LagrangeSpace, displacement: NDAr
     hollow = np.array([not tissue.meshed for tissue in tissues])
     index = np.where(hollow[index] & hollow[segmentation.index], segmentation.index, index)
     return LabelImage(table[index], segmentation.grid, names)
+
+
+def mesh_summary(body: Body) -> MeshSummary:
+    """Figures of the mesh of `body`."""
+    quality = body.quality
+    return MeshSummary(
+        quality.nodes,
+        quality.tets,
+        3 * len(body.space.points),
+        quality.min_dihedral_deg,
+        quality.p5_dihedral_deg,
+        quality.volume_error,
+        body.edge_length.mm if body.edge_length else None,
+        body.edge_length.in_words if body.edge_length else "",
+    )
 
 
 def _plain_summary(space: LagrangeSpace) -> MeshSummary:

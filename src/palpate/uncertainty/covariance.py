@@ -22,7 +22,7 @@ from palpate.observation.contract import Imaged
 from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import FitResponse, NoiseModel, mean_noise
 from palpate.parallel import mapped
-from palpate.uncertainty.discretisation import discretisation_sd
+from palpate.uncertainty.intervals import discretisation_sd
 
 __all__ = [
     "GRID_DRAWS",

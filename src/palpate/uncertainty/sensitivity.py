@@ -23,8 +23,7 @@ from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.linear_model import LinearEquilibrium, poisson_tangents
 from palpate.mechanics.newton import NewtonSettings
 from palpate.observation.contract import Imaged
-from palpate.uncertainty.profile import FixedCorrespondence, fixed_correspondence
-from palpate.uncertainty.refit import refitted
+from palpate.uncertainty.profile import FixedCorrespondence, fixed_correspondence, refitted
 
 __all__ = [
     "Equilibria",
