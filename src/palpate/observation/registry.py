@@ -47,9 +47,10 @@ def read_source(file: DataFile) -> DataSource:
     return SOURCES[file.kind].read(file)
 
 
-KINDS: tuple[Callable[[ImagedBody], tuple[tuple[Observation, ...], ...]], ...] = (surface_distances,)
+Kind = Callable[[ImagedBody], tuple[tuple[Observation, ...], ...]]
+KINDS: tuple[Kind, ...] = (surface_distances,)
 
 
-def observations(imaged: ImagedBody) -> tuple[tuple[Observation, ...], ...]:
+def observations(imaged: ImagedBody, kinds: tuple[Kind, ...] = KINDS) -> tuple[tuple[Observation, ...], ...]:
     """What each later image shows, kind after kind."""
-    return tuple(tuple(chain(*of_image)) for of_image in zip(*(made(imaged) for made in KINDS), strict=True))
+    return tuple(tuple(chain(*of_image)) for of_image in zip(*(made(imaged) for made in kinds), strict=True))

@@ -29,7 +29,7 @@ from palpate.mechanics.curved import CurvedModel
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import ForwardModel
 
-__all__ = ["FixedCorrespondence", "Profile", "Ray", "fixed_correspondence", "profile", "refitted"]
+__all__ = ["PASSES", "FixedCorrespondence", "Profile", "Ray", "fixed_correspondence", "profile", "refitted"]
 
 TRIALS = 12  # points on a ray from the estimate
 TRIES = 3  # at a point, of as many steps as a minimum has
@@ -217,17 +217,17 @@ class Ray:
 
 
 def refitted(
-    objective: Objective, minimum: Minimum, bounds: Bounds, *, max_steps: int = 40
+    objective: Objective, minimum: Minimum, bounds: Bounds, *, max_steps: int = 40, passes: int = PASSES
 ) -> tuple[Minimum, FixedCorrespondence]:
     """The estimate that the residuals in a `minimum`'s evaluation lead to, and what it is the minimum of.
 
     Reweighted (noise, robust losses, drivers' prior) and minimised in turn, until no log-modulus moves by 0.02 of its
-    standard deviation, ten times at the most: where it still does, the minimum has the outcome `STEPS`. No model is
-    solved. Raises `EstimationError` where the residuals leave an unknown open, `SolverError` where the approximation
+    standard deviation, `passes` times at the most: where it still does, the minimum has the outcome `STEPS`. No model
+    is solved. Raises `EstimationError` where the residuals leave an unknown open, `SolverError` where the approximation
     has no answer.
     """
     n, now = objective.n_parameters, minimum
-    for _ in range(PASSES):
+    for _ in range(passes):
         objective = reweighted(objective, now)
         weighed = LinearisedObjective(objective, now.unknowns, now.evaluation)(now.unknowns)
         fixed = fixed_correspondence(objective, now.unknowns, weighed)
