@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.observation.whitening import NEIGHBOURS, correlation, whitener
+from palpate.observation.noise_model import NEIGHBOURS, correlation, whitener
 
 
 def covariance_of(groups, length):

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from palpate.phantoms.boundary_noise import smooth_field
+from palpate.phantoms.motion import smooth_field
 from palpate.phantoms.scene import imaged
 from palpate.phantoms.spheres import SpheresOptions, spheres
 from palpate_validation.mismatch import redrawn

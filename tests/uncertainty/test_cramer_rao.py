@@ -20,7 +20,7 @@ from palpate.observation.noise_model import NoiseModel
 from palpate.observation.point_displacement import point_displacement
 from palpate.observation.robust_loss import Tukey
 from palpate.observation.surface_distance import SurfaceDistance
-from palpate.phantoms.boundary_noise import smooth_field
+from palpate.phantoms.motion import smooth_field
 from palpate.uncertainty import sandwich_covariance
 from palpate_validation.structured_meshes import box_mesh
 

@@ -1,8 +1,15 @@
 """Scenes with a known truth: concentric spheres, pelves, and the noise of their images."""
 
-from palpate.phantoms.boundary_noise import SmoothField, smooth_field
 from palpate.phantoms.exact_targets import TriangulatedDistance, exact_target, target_of_truth
-from palpate.phantoms.motion import AffineMotion, ScaledMotion, WallMotion, filling_of
+from palpate.phantoms.motion import (
+    AffineMotion,
+    ScaledMotion,
+    SmoothField,
+    WallMotion,
+    filling_of,
+    smooth_field,
+    wall_filling,
+)
 from palpate.phantoms.pelvis import PelvisOptions, pelvis, pelvis_anatomy, pelvis_grid, pelvis_motions
 from palpate.phantoms.pelvis_shapes import PelvisShapes, draw_pelvis
 from palpate.phantoms.scene import (
@@ -19,7 +26,6 @@ from palpate.phantoms.scene import (
 )
 from palpate.phantoms.shapes import Complement, Ellipsoid, Tube, ball, rotation_about
 from palpate.phantoms.spheres import SpheresOptions, spheres
-from palpate.phantoms.wall_filling import wall_filling
 
 __all__ = [
     "AffineMotion",

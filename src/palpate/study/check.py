@@ -18,8 +18,7 @@ from palpate.images.readers import read_intensities
 from palpate.images.registration import Registration
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
-from palpate.observation.field_of_view import field_of_view
-from palpate.observation.observed_surface import observed_surfaces, seen_in
+from palpate.observation.observed_surface import field_of_view, observed_surfaces, seen_in
 from palpate.progress import Progress
 from palpate.study.body import Body, ImagedStates, brought, make_body
 from palpate.study.case import Case

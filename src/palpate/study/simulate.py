@@ -24,7 +24,7 @@ from palpate.mesh.dihedral import tet_dihedrals
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.prescribed_motion import prescribed_motion
-from palpate.phantoms.wall_filling import wall_filling
+from palpate.phantoms.motion import wall_filling
 from palpate.study.body import Body, inverse_problem, make_body, strained_body
 from palpate.study.case import Case, Mechanics
 from palpate.study.case_loads import case_loads
