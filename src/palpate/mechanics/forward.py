@@ -66,11 +66,6 @@ class Equilibrium(Protocol):
         """What one call of `tangent` costs."""
         ...
 
-    @property
-    def adjoint_counts(self) -> SolveCounts:
-        """What one call of `adjoint` costs."""
-        ...
-
     def tangent(self) -> NDArray[np.float64]:
         """T (n_outputs, n_regions + n_modes), mm: columns du / d ln E_r, then du / dq_k."""
         ...
@@ -146,10 +141,5 @@ class DenseEquilibrium:
 
     @property
     def tangent_counts(self) -> SolveCounts:
-        """Nothing of the size of the mesh is solved."""
-        return SolveCounts()
-
-    @property
-    def adjoint_counts(self) -> SolveCounts:
         """Nothing of the size of the mesh is solved."""
         return SolveCounts()

@@ -201,16 +201,15 @@ class SmoothField:
 
     def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Field (n, 3) mm at points (n, 3) mm."""
-        blocks = range(0, len(points), BLOCK)
-        return np.concatenate([np.zeros((0, 3)), *(self._block(points[k : k + BLOCK]) for k in blocks)])
+        found = [np.zeros((0, 3))]
+        for first in range(0, len(points), BLOCK):
+            phase = points[first : first + BLOCK] @ self.frequencies.T
+            found.append(np.cos(phase) @ self.cosines + np.sin(phase) @ self.sines)
+        return np.concatenate(found)
 
     def warp(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points (n, 3) mm moved by the field."""
         return points + self.at(points)
-
-    def _block(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        phase = points @ self.frequencies.T
-        return np.asarray(np.cos(phase) @ self.cosines + np.sin(phase) @ self.sines)
 
 
 def smooth_field(rng: np.random.Generator, *, sd_mm: float, correlation_mm: float, features: int = 2000) -> SmoothField:

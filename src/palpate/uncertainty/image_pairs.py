@@ -108,6 +108,7 @@ def _joint_covariance(
     considered = np.zeros((mapping.n_unknowns, size))  # J_b^T W J H_s^-1 e_i
     shifts, mesh = list[NDArray[np.float64]](), np.zeros((n_pairs, n, n_pairs, n))
     references = [state.reference for state in objective.states]
+    of_observation = [s for s, state in enumerate(objective.states) for _ in state.observations]
     for s, (evaluation, own) in enumerate(zip(alone, owns, strict=True)):
         inverse, columns = evaluation.covariance_columns(n), slice(s * n, (s + 1) * n)
         answers[own, columns] = inverse
@@ -117,7 +118,7 @@ def _joint_covariance(
             placed = np.zeros((size, rows.shape[1]))
             placed[columns] = rows
             pairs.append((replace(line, state=s), placed))
-        seen = [i for i, line in enumerate(_lines(objective)) if line == s]
+        seen = [i for i, state in enumerate(of_observation) if state == s]
         shifts.append(shifts_by(evaluation, [[draw[i] for i in seen] for draw in errors], n))
         of_mesh = mesh_covariance(replace(objective, states=(objective.states[s],)))
         for t in range(n_pairs):
@@ -131,11 +132,6 @@ def _joint_covariance(
     itself = np.kron(np.eye(n_pairs), np.ones((n, n)))
     grid = scatter(np.concatenate(shifts, axis=1)) * (BETWEEN_GRIDS + (1.0 - BETWEEN_GRIDS) * itself)
     return np.asarray((total + grid_covariance(alone[0], grid, by_noise)).reshape(mesh.shape) + mesh)
-
-
-def _lines(objective: Objective) -> list[int]:
-    """The number of each observation's state, in their order."""
-    return [s for s, state in enumerate(objective.states) for _ in state.observations]
 
 
 def agreement(pairs: PairEstimates) -> Agreement:
