@@ -8,15 +8,26 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.images import VoxelGrid, segment
+from palpate.images import Role, VoxelGrid, segment
 from palpate.inversion import Bounds, Inversion, InversionSettings, ParameterMap
+from palpate.mechanics import LinearModel
 from palpate.mesh import LagrangeSpace
-from palpate.phantoms import imaged
+from palpate.observation import Observation, observed_surface, surface_distance
+from palpate.phantoms import imaged, target_of_truth
 from palpate.study import Body, ImagedStates, Observed, aligned, conclude, fitted_states, verdict
 from palpate.uncertainty import log_interval, sandwich_covariance
+from palpate_validation.paper.paper_method import paper_estimate, paper_target
 from palpate_validation.paper.table import Entry
 
-__all__ = ["entries_from_surfaces", "entries_from_voxels", "from_half", "imaged_states", "with_motions"]
+__all__ = [
+    "entries_by_the_paper",
+    "entries_from_surfaces",
+    "entries_from_voxels",
+    "exact_surfaces",
+    "from_half",
+    "imaged_states",
+    "with_motions",
+]
 
 SEARCHED = 100.0  # the moduli are sought within this factor of the start
 
@@ -48,6 +59,37 @@ def with_motions(states: ImagedStates, space: LagrangeSpace, motions: Motions) -
     """The same rest state with the later states of other u (n_points, 3) mm."""
     before = states.before
     return replace(states, after=tuple(segment(imaged(space, u, before.grid), before.tissues) for u in motions))
+
+
+def exact_surfaces(
+    space: LagrangeSpace, truth: LagrangeSpace, displacement: NDArray[np.float64]
+) -> tuple[Observation, ...]:
+    """The `estimate` surfaces of a model's `space` held against those of a truth under u (n_points, 3) mm."""
+    organs = [i for i, tissue in enumerate(truth.mesh.tissues) if tissue.role is Role.ESTIMATE]
+    surfaces = (observed_surface(space, organ) for organ in organs)
+    return tuple(surface_distance(target_of_truth(truth, displacement, surface)) for surface in surfaces)
+
+
+def entries_by_the_paper(
+    model: LinearModel,
+    space: LagrangeSpace,
+    displacement: NDArray[np.float64],
+    truth: Mapping[str, float],
+    *,
+    moduli: NDArray[np.float64],
+) -> dict[str, Entry]:
+    """What the paper's method says of each body on surfaces of a truth's `space` under u (n_points, 3) mm.
+
+    moduli (n_regions,) kPa: its start, and what it holds of the others.
+    """
+    surfaces = (observed_surface(model.space, model.space.mesh.tissue_index(name)) for name in truth)
+    targets = [paper_target(space, displacement, surface) for surface in surfaces]
+    fit = paper_estimate(model, targets, moduli=moduli, columns=np.array([model.names.index(name) for name in truth]))
+    values = fit.moduli.tolist() if fit.converged else [None] * len(truth)
+    return {
+        name: Entry.of(value, kpa, iterations=fit.iterations)
+        for value, (name, kpa) in zip(values, truth.items(), strict=True)
+    }
 
 
 def entries_from_surfaces(

@@ -29,8 +29,6 @@ from palpate.mechanics import (
     linear_model,
 )
 from palpate.mesh import Constraint, LagrangeSpace
-from palpate.observation import observed_surface, surface_distance
-from palpate.phantoms import target_of_truth
 from palpate_validation.paper.balls import (
     BODIES,
     POISSON_RATIO,
@@ -41,7 +39,7 @@ from palpate_validation.paper.balls import (
     mean_deformations,
     pulled,
 )
-from palpate_validation.paper.columns import from_half
+from palpate_validation.paper.columns import exact_surfaces, from_half
 from palpate_validation.paper.table import COLOURS, save_figure
 from palpate_validation.scenes import Job, Part, Progress, Scenes
 
@@ -209,8 +207,7 @@ class _Bench:
         truth = equilibrium(
             self.space, self.constraint, np.array(moduli), law=law, dilatation=Dilatation.BLENDED, loads=(load,)
         ).displacement
-        surfaces = [observed_surface(self.space, body) for body in range(len(BODIES))]
-        observations = tuple(surface_distance(target_of_truth(self.space, truth, surface)) for surface in surfaces)
+        observations = exact_surfaces(self.space, self.space, truth)
         blocks = unit_blocks(self.linear.n_modes)
         mapping = parameter_map(balls_tissues(moduli), self.linear.regions, blocks, loaded=True)
         settings = from_half(mapping, dict(zip(BODIES, moduli, strict=True)))

@@ -21,8 +21,7 @@ from palpate.inversion import (
 )
 from palpate.mechanics import Conditions, LinearModel, linear_model
 from palpate.mesh import LagrangeSpace
-from palpate.observation import Observation, observed_surface, surface_distance, surface_distances
-from palpate.phantoms import target_of_truth
+from palpate.observation import Observation, observed_surface, surface_distances
 from palpate.study import Case, Mechanics, MeshSettings, Phantom, make_body
 from palpate_validation.paper.balls import (
     BODIES,
@@ -34,8 +33,14 @@ from palpate_validation.paper.balls import (
     pulled,
     random_grid,
 )
-from palpate_validation.paper.columns import entries_from_surfaces, entries_from_voxels, from_half, imaged_states
-from palpate_validation.paper.paper_method import paper_estimate, paper_target
+from palpate_validation.paper.columns import (
+    entries_by_the_paper,
+    entries_from_surfaces,
+    entries_from_voxels,
+    exact_surfaces,
+    from_half,
+    imaged_states,
+)
 from palpate_validation.paper.table import (
     COLUMNS,
     PAPER_TABLE1,
@@ -189,10 +194,8 @@ class _Case:
     def from_surfaces(self, truth: LinearModel, progress: Progress) -> dict[str, Entry]:
         """What exact surfaces of `truth` say of every sphere."""
         model = _pulled_by(self.bench.coarse, self.stress_kpa)
-        u = self.displacement(truth)
-        surfaces = [observed_surface(model.space, body) for body in range(len(BODIES))]
-        observations = tuple(surface_distance(target_of_truth(truth.space, u, surface)) for surface in surfaces)
-        inversion, settings = self.inverted(model, observations, progress)
+        seen = exact_surfaces(model.space, truth.space, self.displacement(truth))
+        inversion, settings = self.inverted(model, seen, progress)
         return entries_from_surfaces(inversion, settings, self.truth)
 
     def from_voxels(self, progress: Progress) -> dict[str, Entry]:
@@ -229,13 +232,7 @@ class _Case:
             offset[dof] = np.linalg.lstsq(terms, u[near, dof % 3], rcond=None)[0][0]
         held = replace(own.constraint, modes=np.zeros((len(offset), 0)), offset=offset)
         model = own.under(Conditions(held, (pulled(own.space, self.stress_kpa),)))
-        targets = [paper_target(truth.space, u, observed_surface(own.space, body)) for body in range(len(BODIES))]
-        fit = paper_estimate(model, targets, moduli=0.5 * np.array(self.moduli), columns=np.arange(len(BODIES)))
-        values = fit.moduli.tolist() if fit.converged else [None] * len(BODIES)
-        return {
-            body: Entry.of(value, self.truth[body], iterations=fit.iterations)
-            for body, value in zip(BODIES, values, strict=True)
-        }
+        return entries_by_the_paper(model, truth.space, u, self.truth, moduli=0.5 * np.array(self.moduli))
 
 
 def _model(space: LagrangeSpace) -> LinearModel:

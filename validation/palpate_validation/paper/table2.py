@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.images import Role, VoxelGrid, observation_width, smoothing_width
+from palpate.images import VoxelGrid, observation_width, smoothing_width
 from palpate.inversion import (
     InverseProblem,
     LaterState,
@@ -29,8 +29,7 @@ from palpate.mechanics import (
     weighted_sum,
 )
 from palpate.mesh import LagrangeSpace, anatomy_of, check_mesh, lagrange_space, tetrahedralise
-from palpate.observation import observations, observed_surface, prescribed_motion, surface_distance
-from palpate.phantoms import target_of_truth
+from palpate.observation import observations, prescribed_motion
 from palpate.study import (
     Body,
     Case,
@@ -42,13 +41,14 @@ from palpate.study import (
     inverse_problem,
 )
 from palpate_validation.paper.columns import (
+    entries_by_the_paper,
     entries_from_surfaces,
     entries_from_voxels,
+    exact_surfaces,
     from_half,
     imaged_states,
     with_motions,
 )
-from palpate_validation.paper.paper_method import paper_estimate, paper_target
 from palpate_validation.paper.real_pelvis import ORGANS, SMOOTHING_MM, RealPelvis, grid_within, real_pelvis
 from palpate_validation.paper.table import (
     COLUMNS,
@@ -237,8 +237,8 @@ class _Surfaces:
         makers: dict[str, Callable[[], dict[str, Entry]]] = {
             "same_mesh": lambda: self.from_surfaces(kpa, self.coarse, self.coarse_truth(kpa), progress),
             "other_mesh": lambda: self.from_surfaces(kpa, self.bench.fine, self.bench.truth(kpa), progress),
-            "paper_method": lambda: self.by_the_paper(kpa),
-            "paper_method_other_mesh": lambda: self.by_the_paper_on_other_mesh(kpa),
+            "paper_method": lambda: self.by_the_paper(kpa, other_mesh=False),
+            "paper_method_other_mesh": lambda: self.by_the_paper(kpa, other_mesh=True),
         }
         return makers[name]()
 
@@ -252,35 +252,20 @@ class _Surfaces:
 
     def from_surfaces(self, kpa: float, truth: LinearModel, u: Array, progress: Progress) -> dict[str, Entry]:
         """What the exact surfaces of `truth` under u (n_points, 3) mm say of both organs."""
-        tissues = truth.space.mesh.tissues
-        surfaces = [observed_surface(self.coarse.space, i) for i, t in enumerate(tissues) if t.role is Role.ESTIMATE]
-        observations = tuple(surface_distance(target_of_truth(truth.space, u, surface)) for surface in surfaces)
-        mapping = parameter_map(tissues, self.coarse.regions, unit_blocks(self.coarse.n_modes))
-        state = LaterState(self.coarse, observations).with_approximation(self.basis)
+        seen = exact_surfaces(self.coarse.space, truth.space, u)
+        mapping = parameter_map(truth.space.mesh.tissues, self.coarse.regions, unit_blocks(self.coarse.n_modes))
+        state = LaterState(self.coarse, seen).with_approximation(self.basis)
         settings = from_half(mapping, dict.fromkeys(ORGANS, kpa))
         inversion = invert(InverseProblem((state,), mapping), settings, progress=progress)
         return entries_from_surfaces(inversion, settings, dict.fromkeys(ORGANS, kpa))
 
-    def by_the_paper(self, kpa: float) -> dict[str, Entry]:
-        """The paper's method on data of its own mesh."""
+    def by_the_paper(self, kpa: float, *, other_mesh: bool) -> dict[str, Entry]:
+        """The paper's method on data of its own mesh, or on those of `other_mesh`."""
         own = self.linear_tetrahedra
-        u = own.solve(moduli_of(own, kpa), np.zeros(0)).displacement
-        return self._by_the_paper(kpa, own.space, u)
-
-    def by_the_paper_on_other_mesh(self, kpa: float) -> dict[str, Entry]:
-        """The paper's method on the data of `other_mesh`."""
-        return self._by_the_paper(kpa, self.bench.fine.space, self.bench.truth(kpa))
-
-    def _by_the_paper(self, kpa: float, truth: LagrangeSpace, u: Array) -> dict[str, Entry]:
-        own = self.linear_tetrahedra
-        organs = [own.space.mesh.tissue_index(organ) for organ in ORGANS]
-        targets = [paper_target(truth, u, observed_surface(own.space, organ)) for organ in organs]
-        columns = np.array([own.names.index(organ) for organ in ORGANS])
-        fit = paper_estimate(own, targets, moduli=moduli_of(own, 0.5 * kpa), columns=columns)
-        values = fit.moduli.tolist() if fit.converged else [None] * len(ORGANS)
-        return {
-            organ: Entry.of(value, kpa, iterations=fit.iterations) for organ, value in zip(ORGANS, values, strict=True)
-        }
+        space = self.bench.fine.space if other_mesh else own.space
+        u = self.bench.truth(kpa) if other_mesh else own.solve(moduli_of(own, kpa), np.zeros(0)).displacement
+        start = moduli_of(own, 0.5 * kpa)
+        return entries_by_the_paper(own, space, u, dict.fromkeys(ORGANS, kpa), moduli=start)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from palpate.mechanics import LinearModel, linear_model, outer_constraint
 from palpate.mesh import lagrange_space
 from palpate_validation.conditions import mean_radial, prescribe
-from palpate_validation.problems.contract import Check, Problem
+from palpate_validation.problems.contract import Check, Problem, checked
 from palpate_validation.structured_meshes import known, octant_mesh
 
 __all__ = ["CONCENTRIC_PROBLEMS", "SENSITIVITIES", "hollow_spheres", "radial", "solid_spheres"]
@@ -60,13 +60,10 @@ def radial(model: LinearModel) -> Array:
 
 def _radial_checks(model: LinearModel, cases: Motions) -> tuple[Check, ...]:
     """cases: moduli (kPa) and the motions (mm) at 10 and 20 mm that they give, a unit of every mode."""
-    observe, checks = radial(model), []
+    observe, checks = radial(model), list[Check]()
     for moduli, expected in cases.items():
-        found = observe @ model.solve(np.array(moduli), np.ones(model.n_modes)).values
-        checks += [
-            Check(f"u({radius} mm), E = {list(moduli)} kPa (mm)", reference, float(value), 0.5)
-            for radius, reference, value in zip((10, 20), expected, found, strict=True)
-        ]
+        references = {f"u({r} mm), E = {list(moduli)} kPa (mm)": u for r, u in zip((10, 20), expected, strict=True)}
+        checks += checked(references, observe @ model.solve(np.array(moduli), np.ones(model.n_modes)).values, 0.5)
     return tuple(checks)
 
 

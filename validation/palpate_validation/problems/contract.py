@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from palpate.errors import PalpateError
 
-__all__ = ["Check", "Problem", "rows_of"]
+__all__ = ["Check", "Problem", "checked", "rows_of"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +49,12 @@ class Problem:
     source: str
     measure: Callable[[], tuple[Check, ...]]
     quick: bool = True
+
+
+def checked(references: Mapping[str, float], values: Iterable[float], tolerance_percent: float) -> tuple[Check, ...]:
+    """A check of each of some quantities, references by their names, with our values in the same order."""
+    pairs = zip(references.items(), map(float, values), strict=True)
+    return tuple(Check(name, reference, value, tolerance_percent) for (name, reference), value in pairs)
 
 
 def rows_of(problem: Problem) -> list[dict[str, Any]]:

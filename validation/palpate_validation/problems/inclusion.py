@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from palpate.mechanics import LinearModel, lame_parameters, linear_model, outer_constraint
 from palpate.mesh import lagrange_space, triangle_normals
 from palpate_validation.conditions import loaded, nodal_gradients, prescribe, sliding_sides, sphere_faces
-from palpate_validation.problems.contract import Check, Problem
+from palpate_validation.problems.contract import Check, Problem, checked
 from palpate_validation.structured_meshes import VOID, known, octant_mesh
 
 __all__ = ["INCLUSION_PROBLEMS", "ball_in_matrix", "cavity_stress", "strain_factors"]
@@ -80,14 +80,11 @@ def cavity_stress(nu: float) -> float:
 
 
 def _eshelby_checks(nu: float) -> tuple[Check, ...]:
-    model, checks = ball_in_matrix(nu), []
-    for (ratio, contrast), expected in ESHELBY.items():
-        if ratio == nu:
-            found = strain_factors(model, contrast)
-            checks += [
-                Check(f"{kind} factor, nu = {nu:g}, contrast {contrast:g}", reference, float(value), TOLERANCE)
-                for kind, reference, value in zip(("volumetric", "deviatoric"), expected, found, strict=True)
-            ]
+    model, checks = ball_in_matrix(nu), list[Check]()
+    for contrast, expected in ((contrast, of) for (ratio, contrast), of in ESHELBY.items() if ratio == nu):
+        kinds = zip(("volumetric", "deviatoric"), expected, strict=True)
+        references = {f"{kind} factor, nu = {nu:g}, contrast {contrast:g}": factor for kind, factor in kinds}
+        checks += checked(references, strain_factors(model, contrast), TOLERANCE)
     return tuple(checks)
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from palpate.mechanics import FiniteStrainModel, Law, finite_strain_model, law_named, pressure
 from palpate.mesh import LagrangeSpace, TetMesh, lagrange_space
 from palpate_validation.conditions import held_components
-from palpate_validation.problems.contract import Check, Problem
+from palpate_validation.problems.contract import Check, Problem, checked
 from palpate_validation.structured_meshes import known, octant_mesh, quarter_ring_mesh
 
 __all__ = ["BALLOON", "INFLATION_PROBLEMS", "NU", "bore_of", "inflated_model", "wall_pressures", "youngs"]
@@ -86,10 +86,7 @@ def _pressure_checks(
     table: dict[float, float], mesh: TetMesh, moduli: Sequence[float], law: Law = NEO, *, axes: int = 3
 ) -> tuple[Check, ...]:
     found = wall_pressures(mesh, law, moduli=moduli, stretches=list(table), axes=axes)
-    return tuple(
-        Check(f"pressure at the stretch {stretch:g} (kPa)", reference, float(value), TOLERANCE)
-        for (stretch, reference), value in zip(table.items(), found, strict=True)
-    )
+    return checked({f"pressure at the stretch {s:g} (kPa)": p for s, p in table.items()}, found, TOLERANCE)
 
 
 def _balloon_checks(law: Law) -> tuple[Check, ...]:

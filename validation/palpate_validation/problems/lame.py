@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from palpate.mechanics import Dilatation
 from palpate.mesh import lagrange_space
 from palpate_validation.conditions import loaded, mean_radial, pressure_load, sliding_sides, sphere_faces
-from palpate_validation.problems.contract import Check, Problem
+from palpate_validation.problems.contract import Check, Problem, checked
 from palpate_validation.structured_meshes import known, octant_mesh, quarter_ring_mesh
 
 __all__ = ["LAME_PROBLEMS", "glued_spheres", "thick_cylinder", "thick_sphere"]
@@ -57,19 +57,16 @@ def thick_cylinder(nu: float, modulus: float, pressure: float, dilatation: Dilat
 
 
 def _sphere_checks(nu: float, inner: float, outer: float, dilatation: Dilatation) -> tuple[Check, ...]:
-    found = thick_sphere(nu, dilatation)
-    names = (f"u(10 mm), nu = {nu:g} (mm)", f"u(20 mm), nu = {nu:g} (mm)")
-    return tuple(Check(n, r, float(v), TOLERANCE) for n, r, v in zip(names, (inner, outer), found, strict=True))
+    references = {f"u({r} mm), nu = {nu:g} (mm)": u for r, u in ((10, inner), (20, outer))}
+    return checked(references, thick_sphere(nu, dilatation), TOLERANCE)
 
 
 def _cylinder_checks(
     nu: float, modulus: float, pressure: float, dilatation: Dilatation, ends: dict[float, float]
 ) -> tuple[Check, ...]:
     radius, found = thick_cylinder(nu, modulus, pressure, dilatation)
-    return tuple(
-        Check(f"u({end:g} mm), nu = {nu:g} (mm)", value, float(found[np.abs(radius - end) < 1e-9].mean()), TOLERANCE)
-        for end, value in ends.items()
-    )
+    references = {f"u({end:g} mm), nu = {nu:g} (mm)": value for end, value in ends.items()}
+    return checked(references, (found[np.abs(radius - end) < 1e-9].mean() for end in ends), TOLERANCE)
 
 
 LAME_PROBLEMS = (
@@ -95,10 +92,7 @@ LAME_PROBLEMS = (
         "B2",
         "Two glued spheres are one",
         "Code_Aster V6.03.173; closed form",
-        lambda: tuple(
-            Check(f"u({radius} mm) (mm)", reference, float(value), TOLERANCE)
-            for (radius, reference), value in zip(GLUED.items(), glued_spheres(), strict=True)
-        ),
+        lambda: checked({f"u({radius} mm) (mm)": u for radius, u in GLUED.items()}, glued_spheres(), TOLERANCE),
     ),
     Problem(
         "B3a",
