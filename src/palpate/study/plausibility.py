@@ -56,7 +56,15 @@ class UsualModulus:
 
 TABLE: dict[str, list[dict[str, Any]]] = tomllib.loads((files("palpate.study") / "tissues.toml").read_text("utf-8"))
 PUBLISHED = tuple(
-    PublishedStiffness(**{key: tuple(value) if isinstance(value, list) else value for key, value in entry.items()})
+    PublishedStiffness(
+        entry["tissue"],
+        tuple(entry["words"]),
+        entry["low"],
+        entry["high"],
+        entry["method"],
+        entry["source"],
+        tuple(entry.get("unless", ())),
+    )
     for entry in TABLE["published"]
 )
 
