@@ -15,7 +15,7 @@ from palpate.images.named_labels import MAX_NAME
 from palpate.images.tissue import Role
 from palpate.images.totalsegmentator import CLASSES
 from palpate.study.case import is_tissue_name
-from palpate.study.plausibility import TABLE, usual_modulus
+from palpate.study.plausibility import TABLE, usual_stiffness
 
 __all__ = ["ClassNames", "GuessedTissue", "class_names", "guess_tissues"]
 
@@ -97,7 +97,9 @@ def guess_tissues(before: LabelImage, after: Sequence[LabelImage] = ()) -> tuple
     roles = (Role.ESTIMATE, Role.DRIVER, Role.RIGID, None, Role.KNOWN)
     tumours = [g for g in organs if g.role is Role.ESTIMATE and "tumour" in g.reason]
     organs.sort(key=lambda g: (g not in tumours, roles.index(g.role), sum(sizes[label] for label in g.labels)))
-    return tuple(_renamed([*organs, *_surroundings(rest, before), *outside]))
+    known = [g for g in organs if g.role is Role.KNOWN]
+    others = [g for g in organs if g.role is not Role.KNOWN]
+    return tuple(_renamed([*others, *_surroundings(rest, before), *known, *outside]))
 
 
 def _guess(label: int, before: LabelImage, after: Sequence[LabelImage], border: dict[int, float]) -> GuessedTissue:
@@ -113,13 +115,13 @@ def _guess(label: int, before: LabelImage, after: Sequence[LabelImage], border: 
             reason = f"'{found[0]}' {rule.meaning}"
             if rule.rest:
                 return GuessedTissue(SURROUNDINGS, (label,), Role.KNOWN, f"'{name}' {rule.meaning}")
-            usual = usual_modulus(name) if rule.role is Role.KNOWN else None
+            usual = usual_stiffness(name) if rule.role is Role.KNOWN else None
             return GuessedTissue(
                 name,
                 (label,),
                 rule.role,
-                reason if usual is None else f"{reason}: {usual.source}",
-                None if usual is None else usual.kpa,
+                reason if usual is None else f"{reason}: {usual.reference}",
+                None if usual is None else usual.usual_kpa,
             )
     return GuessedTissue(name, (label,), None, f"no rule knows the name '{name}'")
 
@@ -208,27 +210,23 @@ def _surroundings(rest: list[GuessedTissue], before: LabelImage) -> list[Guessed
     """One tissue for all that is left, with a modulus between those of fat and muscle."""
     if not rest:
         return []
-    fat, muscle = usual_modulus("fat"), usual_modulus("muscle")
+    fat, muscle = usual_stiffness("fat"), usual_stiffness("muscle")
     if fat is None or muscle is None:  # both stand in the table
         return []
-    value = round(float(np.sqrt(fat.kpa * muscle.kpa)), 2)
+    value = round(float(np.sqrt(fat.usual_kpa * muscle.usual_kpa)), 2)
     named = [before.names.get(g.labels[0], f"label {g.labels[0]}") for g in rest]
     reason = (
         f"all that no other tissue names ({', '.join(named)}); {value:g} kPa lies between fat and muscle"
-        f" ({muscle.source})"
+        f" ({muscle.reference})"
     )
     return [GuessedTissue(SURROUNDINGS, (), Role.KNOWN, reason, value)]
 
 
 def _renamed(guesses: Sequence[GuessedTissue]) -> list[GuessedTissue]:
-    """Known tissues after the surroundings; every name once, and none that a case file does not take for a tissue."""
-    known = [g for g in guesses if g.role is Role.KNOWN and g.name != SURROUNDINGS]
-    rest = [g for g in guesses if g.name == SURROUNDINGS]
-    others = [g for g in guesses if g.role not in (Role.KNOWN, Role.VOID)]
-    outside = [g for g in guesses if g.role is Role.VOID]
+    """Every name once, and none that a case file does not take for a tissue."""
     found: list[GuessedTissue] = []
     taken: set[str] = set()
-    for guess in [*others, *rest, *known, *outside]:
+    for guess in guesses:
         number = guess.labels[0] if guess.labels else "rest"
         name = guess.name if is_tissue_name(guess.name) else f"label {number}"
         name = name if name not in taken else f"{name[: MAX_NAME - 10]} {number}"

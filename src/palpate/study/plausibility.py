@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
@@ -17,12 +18,11 @@ __all__ = [
     "PUBLISHED",
     "TABLE",
     "PublishedStiffness",
-    "UsualModulus",
     "estimate_warnings",
     "plausibility_warnings",
     "published_for",
     "unit_warnings",
-    "usual_modulus",
+    "usual_stiffness",
 ]
 
 MARGIN = 3.0  # methods differ by ten to a hundred times: an estimate is doubtful only well outside what was published
@@ -45,13 +45,15 @@ class PublishedStiffness:
     source: str
     unless: tuple[str, ...] = ()
 
+    @property
+    def usual_kpa(self) -> float:
+        """A Young's modulus (kPa) that the tissue may be given before anything better is known: the geometric mean."""
+        return round(math.sqrt(self.low * self.high), 3)
 
-@dataclass(frozen=True, slots=True)
-class UsualModulus:
-    """A Young's modulus (kPa) that a tissue may be given before anything better is known, and where it comes from."""
-
-    kpa: float
-    source: str
+    @property
+    def reference(self) -> str:
+        """How it was measured and where it was published."""
+        return f"{self.method}; {self.source}"
 
 
 TABLE: dict[str, list[dict[str, Any]]] = tomllib.loads((files("palpate.study") / "tissues.toml").read_text("utf-8"))
@@ -78,13 +80,9 @@ def published_for(name: str) -> tuple[PublishedStiffness, ...]:
     return tuple(tumours or found)
 
 
-def usual_modulus(name: str) -> UsualModulus | None:
-    """The geometric mean of the narrowest published range for a tissue's name; None when nothing was published."""
-    entries = published_for(name)
-    if not entries:
-        return None
-    entry = min(entries, key=lambda item: item.high / item.low)
-    return UsualModulus(round((entry.low * entry.high) ** 0.5, 3), f"{entry.method}; {entry.source}")
+def usual_stiffness(name: str) -> PublishedStiffness | None:
+    """What was published for a tissue's name in the narrowest range; None when nothing was."""
+    return min(published_for(name), key=lambda entry: entry.high / entry.low, default=None)
 
 
 def plausibility_warnings(moduli_kpa: Mapping[str, float]) -> tuple[Finding, ...]:
@@ -92,7 +90,21 @@ def plausibility_warnings(moduli_kpa: Mapping[str, float]) -> tuple[Finding, ...
 
     A bladder is not compared with its wall: meshed as one solid it has an effective modulus, which none published.
     """
-    return tuple(warning for name, value in moduli_kpa.items() for warning in _out_of_range(name, value))
+    found = []
+    for name, value in moduli_kpa.items():
+        walls = "wall" in name.lower()
+        entries = [entry for entry in published_for(name) if walls or not entry.tissue.endswith("wall")]
+        low, high = min((e.low for e in entries), default=0.0), max((e.high for e in entries), default=math.inf)
+        if low / MARGIN <= value <= high * MARGIN:
+            continue
+        closest = min(entries, key=lambda entry: min(abs(value - entry.low), abs(value - entry.high)))
+        text = (
+            f"{name}: {value:.3g} kPa lies more than {MARGIN:g} times outside the published range for {closest.tissue}"
+            f" ({low:g} to {high:g} kPa; nearest: {closest.reference}). Check the `known` tissue's"
+            " modulus, the labels and the boundary before you believe it"
+        )
+        found.append(Finding("implausible-stiffness", text))
+    return tuple(found)
 
 
 def estimate_warnings(estimation: Estimation) -> tuple[Finding, ...]:
@@ -124,20 +136,3 @@ def unit_warnings(case: Case) -> tuple[Finding, ...]:
                 )
             )
     return tuple(hints)
-
-
-def _out_of_range(name: str, value: float) -> Iterable[Finding]:
-    walls = "wall" in name.lower()
-    entries = [entry for entry in published_for(name) if walls or not entry.tissue.endswith("wall")]
-    if not entries:
-        return
-    low, high = min(entry.low for entry in entries), max(entry.high for entry in entries)
-    if low / MARGIN <= value <= high * MARGIN:
-        return
-    closest = min(entries, key=lambda entry: min(abs(value - entry.low), abs(value - entry.high)))
-    yield Finding(
-        "implausible-stiffness",
-        f"{name}: {value:.3g} kPa lies more than {MARGIN:g} times outside the published range for {closest.tissue}"
-        f" ({low:g} to {high:g} kPa; nearest: {closest.method}; {closest.source}). Check the `known` tissue's modulus,"
-        " the labels and the boundary before you believe it",
-    )
