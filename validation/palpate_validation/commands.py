@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from palpate.cli.outcome import Outcome, columns
 from palpate.errors import EstimationError
-from palpate.parallel import processors
 
 if TYPE_CHECKING:
     from palpate.study import OutputFolder
@@ -46,6 +45,7 @@ def add_verify(command: Callable[..., argparse.ArgumentParser]) -> None:
 
 def reproduce(arguments: argparse.Namespace, _: Any, outputs: OutputFolder, progress: Progress) -> Outcome:
     """One of the paper's experiments, our numbers beside its own."""
+    from palpate.parallel import processors
     from palpate_validation.reproduce import reproduce as run
 
     name = arguments.experiment
