@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from palpate.errors import SolverError
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.equilibrium import equilibrium
 from palpate.mechanics.laws.registry import LAWS
@@ -110,3 +111,16 @@ def test_its_derivatives_leave_remainders_of_second_order(space, law):
         there = reaction.at(u + h * du, moduli * np.exp(h * dm), material + h * dc)[0]
         remainders.append(abs(there - value - h * (by_u @ du + direct @ np.concatenate([dm, dc]))))
     assert np.all(np.diff(np.log(remainders)) / np.diff(np.log(STEPS)) > 1.9)
+
+
+@pytest.mark.parametrize("law", ["neo-hookean", "mooney-rivlin"])
+@pytest.mark.parametrize("dilatation", list(Dilatation))
+def test_no_force_is_told_of_elements_that_are_turned_inside_out(space, law, dilatation):
+    reaction = surface_reaction(space, face(space, top=True), np.eye(3)[2], LAWS[law], dilatation=dilatation)
+    mirrored = np.zeros_like(space.points)
+    mirrored[:, 2] = -2.0 * space.points[:, 2]
+    motion, moduli = mirrored.ravel()[reaction.dofs], np.array([10.0, 40.0])
+    with pytest.raises(SolverError, match=r"the force on the surface around .* inside out \(volume ratio -1\)"):
+        reaction.at(motion, moduli, np.zeros(0))
+    linear = surface_reaction(space, face(space, top=True), np.eye(3)[2], LAWS["linear"], dilatation=dilatation)
+    assert np.isfinite(linear.at(motion, moduli, np.zeros(0))[0])
