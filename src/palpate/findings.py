@@ -37,6 +37,7 @@ Misleading = Literal[
     "implausible-stiffness",
     "units",
     "linear-strains",
+    "weightless-reference",
     "volume-change",
     "void-moves",
     "drawn-otherwise",
