@@ -46,9 +46,7 @@ class SurfaceReaction:
         At displacements (n,) mm of `dofs`, moduli (n_regions,) kPa and coefficients (n_material,) of the material.
         Raises `SolverError` where these turn elements inside out under a law of finite strain, which has no force then.
         """
-        whole = np.zeros(3 * len(self.model.space.points))
-        whole[self.dofs] = displacement
-        balance = self.model.balance(moduli, coefficients)
+        whole, balance = self._whole(displacement), self.model.balance(moduli, coefficients)
         smallest = balance.smallest_volume(whole)
         if smallest <= 0.0:
             raise SolverError(
@@ -64,6 +62,23 @@ class SurfaceReaction:
             NEWTON * by_displacement,
             NEWTON * np.concatenate([by_region, by_material]),
         )
+
+    def by_poisson(
+        self, displacement: NDArray[np.float64], moduli: NDArray[np.float64], coefficients: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Derivatives (n_regions,) N of F by the regions' Poisson's ratios, at what `at` takes.
+
+        The forces are linear in Lame's constants, whose derivatives take their place.
+        """
+        changes = self.model.moduli_by_poisson(moduli, coefficients)
+        forces = self.model.balance(moduli, coefficients).region_forces(self._whole(displacement), changes)
+        return np.asarray(NEWTON * (self.virtual @ forces))
+
+    def _whole(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Displacements (n_dof,) mm of all points, of which those of `dofs` (n,) matter."""
+        whole = np.zeros(3 * len(self.model.space.points))
+        whole[self.dofs] = displacement
+        return whole
 
 
 def surface_reaction(
