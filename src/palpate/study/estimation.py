@@ -256,7 +256,7 @@ def conclude(
     pairs = image_pairs_of(inversion, settings.bounds, errors, released)
     fixed = frozen_posterior(objective, minimum.unknowns, minimum.evaluation)
     known = intervals_of(inversion, settings, fixed, covariance)
-    estimates = estimates_of(inversion, known, covariance, truth=truth)
+    estimates = estimates_of(inversion, known, covariance, truth=truth, layers_told=not remark)
     of_moduli = covariance.total[: len(estimates), : len(estimates)]
     stating = {e.tissue for e in estimates if e.verdict != NOT_IDENTIFIED}
     pairs = pairs and pairs.with_intervals_of(stating)
@@ -421,9 +421,18 @@ def released_of(
 
 
 def estimates_of(
-    inversion: Inversion, known: Sequence[Known], covariance: Covariance, *, truth: Mapping[str, float]
+    inversion: Inversion,
+    known: Sequence[Known],
+    covariance: Covariance,
+    *,
+    truth: Mapping[str, float],
+    layers_told: bool = True,
 ) -> tuple[ModulusEstimate, ...]:
-    """What is stated of the moduli whose intervals are `known`; `truth`: true moduli (kPa) by tissue, where known."""
+    """What is stated of the moduli whose intervals are `known`; `truth`: true moduli (kPa) by tissue, where known.
+
+    layers_told: whether the covariance holds what layers round organs would do; where it does not, nothing is
+    `identified`.
+    """
     mapping, scale = inversion.objective.parameters, inversion.objective.parameters.scale_kpa
     none = [
         no_estimate(
@@ -448,6 +457,9 @@ def estimates_of(
         word, why = verdict(of.interval, at_bound=of.at_bound, absolute=mapping.absolute)
         if word != "identified" and of_scale > 0.0:
             word, why = _of_range(word, why, verdict(by_ratio, at_bound=of.at_bound, absolute=True))
+        if not layers_told and word != NOT_IDENTIFIED:
+            word = "weak" if word == "identified" else word
+            why = f"{why}, but does not hold what layers round the organs would do (warning `unsettled`)"
         points = zip(unit * np.exp(of.own.profile.theta), of.own.profile.root, strict=True)
         inside = log_interval(value, float(np.sqrt(given[i])), lower=low or 0.0, upper=high or np.inf)
         within = (inside[0] or low, inside[1] or high)
