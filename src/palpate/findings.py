@@ -55,6 +55,7 @@ Misleading = Literal[
     "rigid-unseen",
     "points-outside",
     "data-misfit",
+    "force-reversed",
     "no-equilibrium",
 ]
 Widening = Literal[

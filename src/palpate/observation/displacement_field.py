@@ -23,6 +23,7 @@ from palpate.observation.point_displacement import PointDisplacement, point_disp
 
 __all__ = ["DisplacementField", "read_displacement_field"]
 
+FEWEST = 4  # points that tell a motion which is not the same everywhere
 MOST_VECTORS = 2**26  # 1.6 GB as they are read
 ROUNDING = 1e-6  # of a voxel
 OF_LENGTH, OF_EDGE = 0.5, 0.6  # edge of a cell, over the correlation length and over an edge of the mesh
@@ -72,7 +73,13 @@ def read_displacement_field(file: DataFile) -> DisplacementField:
     if len(file.paths) != 1:
         raise InputDataError(f"a displacement field is one file; {len(file.paths)} are named; leave out file_after")
     if path.suffix.lower() == ".csv":
-        return DisplacementField(file, read_point_table(path))
+        table = read_point_table(path)
+        if len(table.before) < FEWEST:
+            raise InputDataError(
+                f"'{path}' holds {len(table.before)} of the {FEWEST} points or more that a displacement field has; give"
+                ' all of them, or state single ones as kind = "landmarks"'
+            )
+        return DisplacementField(file, table)
     reader = next((read for endings, read in READERS.items() if path.name.lower().endswith(endings)), None)
     if reader is None:
         known = ", ".join(ending for endings in READERS for ending in endings)
