@@ -188,7 +188,7 @@ def _on(sitk: Any, transform: Any, grid: Any) -> Any:
 
 def _within(image: Any, moved: NDArray[np.float64], affine: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which points (nx, ny, nz) of a grid with a RAS `affine`, displaced by (nx, ny, nz, 3) LPS mm, an image holds."""
-    index = np.stack(np.indices(moved.shape[:3]), axis=-1)
+    index = np.moveaxis(np.indices(moved.shape[:3]), 0, -1)
     points = (index @ affine[:3, :3].T + affine[:3, 3]) * LPS_TO_RAS + moved
     axes = np.array(image.GetDirection()).reshape(3, 3) * np.array(image.GetSpacing())
     place = (points - np.array(image.GetOrigin())) @ np.linalg.inv(axes).T
