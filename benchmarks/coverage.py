@@ -221,13 +221,13 @@ def _moduli(inversion: Inversion, body: Body, row: Row) -> list[Result]:
     objective, minimum = inversion.objective, inversion.minimum
     errors = [[np.zeros(len(line.weights)) for line in minimum.evaluation.lines]] * NO_GRID
     bonded = covariance = covariance_of(objective, minimum.evaluation, errors, unknowns=minimum.unknowns)
-    released, _ = released_of(inversion, body.settings)
+    released, remark = released_of(inversion, body.settings)
     if released is not None:
         covariance = bonded.with_released(objective, minimum, released)
     fixed = frozen_posterior(objective, minimum.unknowns, minimum.evaluation)
     known = intervals_of(inversion, body.settings, fixed, covariance)
     without = intervals_of(inversion, body.settings, fixed, bonded)
-    estimates = estimates_of(inversion, known, covariance, truth={})
+    estimates = estimates_of(inversion, known, covariance, truth={}, layers_told=not remark)
     limits = _limits(inversion, row)
     of_noise = None if row.limit is None else _by_true_noise(inversion, row.limit)
     scale, found = objective.parameters.scale_kpa, []

@@ -114,10 +114,11 @@ class Covariance:
         released: where the estimate ends with these blocks free.
         """
         n, free = objective.n_parameters, released.minimum
+        rows = minimum.evaluation.covariance_columns(n).T
         part = added_by(
             sandwich_covariance(released.objective, free.evaluation),
             free.unknowns[:n] - minimum.unknowns[:n],
-            held=sandwich_covariance(objective, minimum.evaluation),
+            held=self.noise + rows @ minimum.evaluation.prior @ rows.T,
         )
         cause = " and ".join(dict.fromkeys(block.cause for block in objective.parameters.blocks if block.released))
         return replace(self, prior=self.prior + part, causes={**self.causes, cause: part})
