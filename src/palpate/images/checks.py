@@ -17,11 +17,19 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.images.wall_motion import STILL_VOXELS, wall_motion
 
-__all__ = ["check_headers", "check_images", "check_pair", "check_segmentation", "later_names"]
+__all__ = [
+    "SMALL_VOXELS",
+    "VOLUME_IMPLAUSIBLE",
+    "check_headers",
+    "check_images",
+    "check_pair",
+    "check_segmentation",
+    "later_names",
+]
 
 OBSERVED = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
 VOLUME_CHANGE = 0.05  # no modulus explains a filling between the scans
-VOLUME_IMPLAUSIBLE = 0.30
+VOLUME_IMPLAUSIBLE = 0.30  # of an organ: no deformation, and hardly a filling, changes so much
 SMALL_VOXELS = 50
 THIN_VOXELS = 4
 THIN_SHARE = 0.2

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from palpate.errors import PalpateError
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
-from palpate.images.tissue import Role, Tissue
-from palpate.images.tissue_colours import tissue_colours
+from palpate.images.tissue import Role, Tissue, tissue_colours
 from palpate.mechanics.deformation import largest_strains
-from palpate.mesh.dihedral import tet_dihedrals
+from palpate.mesh.tet_mesh import tet_dihedrals
 from palpate.parallel import mapped
 from palpate.report.backgrounds import Grey, background, earlier_grey, later_grey, whole_box, whole_images
 from palpate.report.inputs import bone_distances, input_images

@@ -1,9 +1,11 @@
 """Which unknowns are eliminated together, in which order, and where that fills the factor.
 
-The elimination tree, column counts and supernodes are found on the graph of the nodes (groups of unknowns with equal
-columns), in time nearly linear in its edges: Liu, SIAM Review 34 (1992) 82-109; Gilbert, Ng & Peyton, SIAM J. Matrix
-Anal. Appl. 15 (1994) 1075-1091; supernodes with few explicit zeros are merged as by Ashcraft & Grimes, ACM TOMS 15
-(1989) 291-309.
+The order is METIS' nested dissection. Elimination tree, column counts and supernodes are found on the graph of the
+nodes (groups of unknowns with equal columns), in time nearly linear in its edges: Liu, SIAM Review 34 (1992) 82-109;
+Gilbert, Ng & Peyton, SIAM J. Matrix Anal. Appl. 15 (1994) 1075-1091; supernodes with few explicit zeros are merged as
+by Ashcraft & Grimes, ACM TOMS 15 (1989) 291-309. Inside a supernode nodes are ordered by partition refinement:
+Jacquelin, Ng & Peyton, SIAM Workshop on Combinatorial Scientific Computing (2018) 1-10. Without it METIS' order leaves
+seventy times as many pieces to add, the Morton order of the nodes' places four times as many.
 """
 
 from __future__ import annotations
@@ -11,18 +13,63 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import pymetis
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import minimum_spanning_tree
 
-from palpate.mechanics.solvers.multifrontal.refinement import refined_order
-
-__all__ = ["Supernodes", "children_of", "supernodes"]
+__all__ = ["Supernodes", "children_of", "dissection", "nested_dissection", "node_graph", "supernodes", "twin_rows"]
 
 Integers = NDArray[np.int64]
 
 SMALL = 48  # unknowns, up to which supernodes are merged whatever zeros that makes
 ZEROS = ((96, 0.5), (256, 0.2), (1 << 40, 0.05))  # share of explicit zeros allowed up to so many unknowns
+
+
+def twin_rows(matrix: sparse.csr_matrix[np.float64]) -> NDArray[np.int64]:
+    """Group number (n,), from 0 upwards, of each row; neighbouring rows with the same columns are in one group.
+
+    The three unknowns of a node are such twins, and so are the two of a node that slides on a plane. Two patterns are
+    compared by the sum of random 64-bit numbers of their columns: a chance of 2^-64 a row to be wrong, which would
+    cost speed, not correctness.
+    """
+    tickets = np.random.default_rng(0).integers(-(2**62), 2**62, size=matrix.shape[1])
+    entries = np.append(tickets[matrix.indices], 0)
+    sums = np.add.reduceat(entries, matrix.indptr[:-1])
+    lengths = np.diff(matrix.indptr)
+    different = (np.diff(sums) != 0) | (np.diff(lengths) != 0) | (lengths[1:] == 0)
+    return np.concatenate([[0], np.cumsum(different)])
+
+
+def node_graph(matrix: sparse.csr_matrix[np.float64], group: NDArray[np.int64]) -> sparse.csr_matrix[np.float64]:
+    """Which of the nodes (n, n), groups (n_rows,) of twin rows, share an entry; symmetric, without loops, sorted."""
+    first = np.flatnonzero(np.diff(group, prepend=-1))
+    n = len(first)
+    seen = matrix[first]
+    half = sparse.csr_matrix((np.ones(seen.nnz), group[seen.indices], seen.indptr), shape=(n, n))
+    half.setdiag(0.0)
+    graph = sparse.csr_matrix(half + half.T)  # an entry that rounding cancelled on one side only is there on both
+    graph.eliminate_zeros()
+    graph.sort_indices()
+    return graph
+
+
+def dissection(graph: sparse.csr_matrix[np.float64]) -> NDArray[np.int64]:
+    """Fill-reducing order (n,) of the nodes of a symmetric graph (n, n) without loops.
+
+    METIS: Karypis & Kumar, SIAM J. Sci. Comput. 20 (1998) 359-392.
+    """
+    if graph.nnz == 0:  # METIS wants an edge
+        return np.arange(graph.shape[0])
+    starts, adjacent = graph.indptr.astype(np.int32), graph.indices.astype(np.int32)
+    order, _ = pymetis.nested_dissection(pymetis.CSRAdjacency(adj_starts=starts, adjacent=adjacent))
+    return np.asarray(order, dtype=np.int64)
+
+
+def nested_dissection(matrix: sparse.csr_matrix[np.float64]) -> NDArray[np.int64]:
+    """Fill-reducing order (n,) of the unknowns of a symmetric pattern; those of one node, its twins, stay together."""
+    group = twin_rows(matrix)
+    return np.asarray(np.argsort(np.argsort(dissection(node_graph(matrix, group)))[group], kind="stable"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,3 +278,50 @@ def _structures(lower: sparse.csc_matrix[np.float64], member: Integers, parent: 
         if parent[s] >= 0:
             inherited[parent[s]].append(below)
     return found
+
+
+def refined_order(start: Integers, children: list[list[int]], below: list[Integers]) -> Integers:
+    """Order (n_nodes,) inside supernodes such that what descendants fill there lies in few runs.
+
+    start (n + 1,): first node of each supernode; children: supernodes; below: the nodes that each fills outside itself,
+    sorted. The nodes of a supernode are divided by whether its first child fills them, each part by its next one, and
+    so on down the tree; neighbouring parts meet with the sides that are filled.
+    """
+    part = np.zeros(int(start[-1]), dtype=np.int64)
+    for s in range(len(children)):
+        low, high, queue, n_parts = int(start[s]), int(start[s + 1]), children[s], 1
+        while queue and n_parts < high - low:
+            following: list[int] = []
+            for child in sorted(queue, key=lambda c: -len(below[c])):
+                rows = below[child]
+                hit = rows[np.searchsorted(rows, low) : np.searchsorted(rows, high)] - low
+                if len(hit) > 0:
+                    following += children[child]
+                    if len(hit) < high - low:
+                        part[low:high], n_parts = _divided(part[low:high], n_parts, hit)
+            queue = following
+    return np.lexsort((part, np.repeat(np.arange(len(children)), np.diff(start))))
+
+
+def _divided(part: Integers, n_parts: int, hit: Integers) -> tuple[Integers, int]:
+    """Each part (n,) divided by whether its nodes are among `hit` (m,), and how many parts there are then."""
+    inside = np.zeros(len(part), dtype=np.int64)
+    inside[hit] = 1
+    hits = np.bincount(part[hit], minlength=n_parts)
+    mixed = (hits > 0) & (hits < np.bincount(part, minlength=n_parts))
+    if not mixed.any():
+        return part, n_parts
+    # From left to right: whether the part's end towards the next one is filled; a divided one turns it round.
+    filled_first = np.zeros(n_parts, dtype=np.int64)
+    filled = False
+    for number in np.flatnonzero(hits).tolist():
+        if number and not hits[number - 1]:
+            filled = False
+        if mixed[number]:
+            filled_first[number] = filled
+            filled = not filled
+        else:
+            filled = True
+    ahead: Integers = np.cumsum(mixed) - mixed
+    second = mixed[part] & (inside != filled_first[part])
+    return part + ahead[part] + second, n_parts + int(mixed.sum())

@@ -9,17 +9,11 @@ import numpy as np
 import pytest
 import threadpoolctl
 from scipy import sparse
+from scipy.sparse.linalg import LinearOperator, cg
 
-from palpate.errors import ResourceError, SolverError
-from palpate.mechanics.solvers.contract import Hints
-from palpate.mechanics.solvers.multifrontal import elimination, plan, solver
-from palpate.mechanics.solvers.multifrontal.numeric import factorised
-from palpate.mechanics.solvers.multifrontal.plan import make_plan
-from palpate.mechanics.solvers.multifrontal.refinement import refined_order
-from palpate.mechanics.solvers.multifrontal.substitution import substituted
-from palpate.parallel import blas_on_one_thread
-
-NOTHING = Hints()
+import multifrontal
+from multifrontal import NotPositiveDefinite, dense, plan, symbolic
+from multifrontal.plan import make_plan
 
 
 def stiffness(pairs, sizes, seed, *, shift=0.1):
@@ -84,83 +78,68 @@ def relative_residual(matrix, found, rhs):
     return np.max(np.linalg.norm(matrix @ found - rhs, axis=0) / np.linalg.norm(rhs, axis=0))
 
 
-def with_threads(monkeypatch, threads):
-    monkeypatch.setattr(solver, "processors", lambda: threads)
+def factor_of(matrix, threads, dtype=np.float64):
+    return multifrontal.factorise(matrix, dtype=dtype, plan=make_plan(matrix, threads))
 
 
 @pytest.mark.parametrize(("threads", "columns"), [(1, 1), (2, 1), (2, 7), (5, 91)])
-def test_every_pattern_is_solved_to_rounding(matrix, threads, columns, monkeypatch):
-    with_threads(monkeypatch, threads)
+def test_every_pattern_is_solved_to_rounding(matrix, threads, columns):
     rhs = np.random.default_rng(1).standard_normal((matrix.shape[0], columns))
     before = rhs.copy()
-    found = solver.SOLVER.factorise(matrix, NOTHING).solve(rhs)
+    plan_of_it = multifrontal.analyse(matrix, threads=threads)
+    found = multifrontal.factorise(matrix, plan=plan_of_it).solve(rhs)
     assert relative_residual(matrix, found, rhs) < 1e-12
     assert np.array_equal(rhs, before)
 
 
-def test_single_precision_is_refined_to_its_tolerance(matrix):
-    rhs = np.random.default_rng(2).standard_normal((matrix.shape[0], 3)) * [1.0, 1e-60, 1e60]
-    ready = solver.MIXED.factorise(matrix, NOTHING)
-    assert relative_residual(matrix, ready.solve(rhs), rhs) < 1e-9
+def test_single_precision_is_near_and_refined_by_conjugate_gradients(body):
+    factor, rhs = multifrontal.factorise(body, dtype=np.float32), np.ones(body.shape[0])
+    near = factor.solve(rhs)
+    assert near.dtype == np.float64
+    assert 1e-9 < relative_residual(body, near[:, None], rhs[:, None]) < 1e-2
+    found, steps = cg(body, rhs, rtol=1e-12, M=LinearOperator(body.shape, factor.solve), maxiter=8)
+    assert steps == 0
+    assert relative_residual(body, found[:, None], rhs[:, None]) < 1e-11
 
 
-def test_single_precision_alone_is_near(body):
-    ready = solver.MIXED.factorise(1e30 * body, NOTHING)
-    assert isinstance(ready, solver.MixedFactorisation)
-    rhs = np.ones((body.shape[0], 2))
-    assert 1e-9 < relative_residual(1e30 * body, ready.nearly(rhs), rhs) < 1e-2
+def test_one_right_hand_side_may_be_a_vector(body):
+    factor, rhs = multifrontal.factorise(body), np.random.default_rng(2).standard_normal((body.shape[0], 3))
+    assert np.allclose(factor.solve(rhs[:, 1]), factor.solve(rhs)[:, 1], rtol=1e-12, atol=0)
 
 
-def test_what_single_precision_cannot_factorise_is_factorised_in_double():
-    pairs = [(i, i + 1) for i in range(2000)]
-    chain = stiffness(pairs, np.ones(2001, int), 9)
-    ends = sparse.diags_array(np.where(np.arange(2001) % 2, 1e5, 1e-1))
-    uneven = sparse.csr_matrix(ends @ chain @ ends)
-    ladder = sparse.diags_array([-np.ones(1999), np.full(2000, 2.0), -np.ones(1999)], offsets=[-1, 0, 1]).tocsr()
-    for hard in (sparse.csr_matrix(ladder @ ladder), uneven):
-        rhs = hard @ np.ones((hard.shape[0], 1))
-        assert relative_residual(hard, solver.MIXED.factorise(hard, NOTHING).solve(rhs), rhs) < 1e-9
-    ready = solver.MIXED.factorise(sparse.csr_matrix(ladder @ ladder), NOTHING)
-    assert isinstance(ready, solver.MultifrontalFactorisation)
+def test_columns_instead_of_rows_are_taken_too(body):
+    rhs = np.ones((body.shape[0], 1))
+    assert relative_residual(body, multifrontal.factorise(sparse.csc_array(body)).solve(rhs), rhs) < 1e-12
 
 
 def test_threads_change_nothing_but_rounding(body):
     rhs = np.random.default_rng(3).standard_normal((body.shape[0], 20))
-    found = []
-    for threads in (1, 2, 3, 8):
-        steps = make_plan(body, threads)
-        found.append(substituted(steps, factorised(steps, body.data, np.float64, threads), rhs, threads))
+    found = [factor_of(body, threads).solve(rhs) for threads in (1, 2, 3, 8)]
     for other in found[1:]:
         assert np.allclose(other, found[0], rtol=1e-11, atol=1e-13 * np.abs(found[0]).max())
 
 
 def test_the_same_threads_give_the_same_bits(body):
-    steps = make_plan(body, 3)
-    first, second = (factorised(steps, body.data, np.float64, 3) for _ in range(2))
+    first, second = (factor_of(body, 3).numbers for _ in range(2))
     assert np.array_equal(first, second)
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @pytest.mark.parametrize("threads", [1, 4])
 def test_an_indefinite_matrix_is_refused_with_its_pivot(body, dtype, threads):
-    steps = make_plan(body, threads)
     shifted = body.copy()
     shifted.setdiag(body.diagonal() - 20.0)
-    with pytest.raises(SolverError, match=r"pivot \d+ of elimination is not positive; hold the body"):
-        factorised(steps, shifted.data, dtype, threads)
+    with pytest.raises(NotPositiveDefinite, match="pivot") as refused:
+        factor_of(shifted, threads, dtype)
+    assert refused.value.n == body.shape[0]
+    assert 0 < refused.value.pivot <= body.shape[0]
 
 
-def test_one_pattern_is_analysed_once(body, monkeypatch):
-    made = []
-    monkeypatch.setattr(solver, "_plans", solver._Plans())
-    monkeypatch.setattr(solver, "make_plan", lambda *given: made.append(1) or make_plan(*given))
-    rhs = np.ones((body.shape[0], 1))
-    for factor in (1.0, 2.0):
-        found = solver.SOLVER.factorise(factor * body, NOTHING).solve(rhs)
-        assert relative_residual(factor * body, found, rhs) < 1e-12
-    assert len(made) == 1
-    solver.SOLVER.factorise(PATTERNS["random"](), NOTHING)
-    assert len(made) == 2
+def test_one_pattern_is_analysed_once(body):
+    first = multifrontal.analyse(body)
+    assert multifrontal.analyse(2.0 * body) is first
+    assert multifrontal.factorise(3.0 * body).plan is first
+    assert multifrontal.analyse(PATTERNS["random"]()) is not first
 
 
 def test_an_entry_that_is_missing_on_one_side_is_taken_from_neither_or_both(body):
@@ -169,7 +148,7 @@ def test_an_entry_that_is_missing_on_one_side_is_taken_from_neither_or_both(body
     lost.data[far[::2]] = 0.0
     lost.eliminate_zeros()
     rhs = np.ones((body.shape[0], 1))
-    found = solver.SOLVER.factorise(lost, NOTHING).solve(rhs)
+    found = multifrontal.factorise(lost).solve(rhs)
     assert relative_residual(body, found, rhs) < 0.1
 
 
@@ -182,36 +161,23 @@ def test_entries_in_any_order_and_in_parts_are_summed():
     by_row = np.argsort(rows, kind="stable")
     parts = (np.tile(0.5 * entries.data, 2)[order][by_row], columns[by_row], bounds)
     rhs = np.ones((matrix.shape[0], 1))
-    found = solver.SOLVER.factorise(sparse.csr_matrix(parts, shape=matrix.shape), NOTHING).solve(rhs)
+    found = multifrontal.factorise(sparse.csr_matrix(parts, shape=matrix.shape)).solve(rhs)
     assert relative_residual(matrix, found, rhs) < 1e-12
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_the_memory_announced_is_the_memory_taken(threads, monkeypatch):
+def test_the_memory_announced_is_the_memory_taken(threads):
     matrix = stiffness(cube(12), np.full(1728, 3), 10)
-    with_threads(monkeypatch, threads)
-    needed = solver.SOLVER.expect(matrix, NOTHING).bytes  # analyses the pattern
+    ready = multifrontal.analyse(matrix, threads=threads)
+    needed = ready.bytes(np.float64)
     tracemalloc.start()
     try:
-        ready = solver.SOLVER.factorise(matrix, NOTHING)
+        factor = multifrontal.factorise(matrix, plan=ready)
         taken = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
     assert needed < taken < 1.15 * needed
-    assert ready.factor.nbytes < needed
-
-
-def test_memory_that_is_not_there_is_refused_before_it_is_taken(monkeypatch):
-    matrix = stiffness(cube(9), np.full(729, 3), 11)
-    needed = solver.SOLVER.expect(matrix, NOTHING).bytes
-    monkeypatch.setattr(solver, "available_memory", lambda: 0.9 * needed)
-    tracemalloc.start()
-    try:
-        with pytest.raises(ResourceError, match=r"2187 unknowns needs [\d.]+ GB and [\d.]+ GB are free"):
-            solver.SOLVER.factorise(matrix, NOTHING)
-        assert tracemalloc.get_traced_memory()[1] < 0.2 * needed
-    finally:
-        tracemalloc.stop()
+    assert factor.numbers.nbytes < needed
 
 
 def blas_threads():
@@ -222,10 +188,9 @@ def test_no_changed_number_of_blas_threads_is_left_behind(body):
     with threadpoolctl.threadpool_limits(2, user_api="blas"):  # this thread's, so the limits below are nested
         before = blas_threads()
         assert set(before) == {2}
-        factorisation = solver.SOLVER.factorise(body, NOTHING)
-        factorisation.solve(np.ones((body.shape[0], 4)))
-        with pytest.raises(SolverError):
-            solver.SOLVER.factorise(-body, NOTHING)
+        multifrontal.factorise(body).solve(np.ones((body.shape[0], 4)))
+        with pytest.raises(NotPositiveDefinite):
+            multifrontal.factorise(-body)
         assert blas_threads() == before
 
 
@@ -233,9 +198,9 @@ def test_calls_side_by_side_and_nested_share_the_limit_and_restore_the_number_of
     before, together, seen = blas_threads(), threading.Barrier(4), list[int]()
 
     def work():
-        with blas_on_one_thread():
+        with dense.blas_on_one_thread():
             together.wait(timeout=60.0)  # all of them inside at once
-            with blas_on_one_thread():
+            with dense.blas_on_one_thread():
                 seen.extend(blas_threads())
             together.wait(timeout=60.0)
 
@@ -265,15 +230,15 @@ def test_tree_and_counts_are_those_of_elimination():
     filled = eliminated(matrix)
     n = matrix.shape[0]
     below = [np.flatnonzero(filled[j + 1 :, j]) + j + 1 for j in range(n)]
-    parent = elimination.elimination_tree(lower)
+    parent = symbolic.elimination_tree(lower)
     assert parent.tolist() == [int(rows[0]) if len(rows) else -1 for rows in below]
-    order = elimination.postorder(parent)
+    order = symbolic.postorder(parent)
     again = sparse.csr_matrix(sparse.tril(matrix[order][:, order], -1))
     again.sort_indices()
-    tree = elimination.elimination_tree(again)
+    tree = symbolic.elimination_tree(again)
     weight = np.random.default_rng(5).integers(1, 4, n)
     expected = (eliminated(matrix[order][:, order]) * weight[:, None]).sum(axis=0)
-    assert np.array_equal(elimination.column_counts(again, tree, weight), expected)
+    assert np.array_equal(symbolic.column_counts(again, tree, weight), expected)
 
 
 def test_fronts_hold_all_that_elimination_fills_and_little_more():
@@ -292,7 +257,7 @@ def test_supernodes_come_after_their_children_with_each_node_once():
     graph = sparse.csr_matrix(stiffness(cube(6), np.ones(216, int), 12))
     graph.setdiag(0.0)
     graph.eliminate_zeros()
-    found = elimination.supernodes(graph, np.random.default_rng(6).permutation(216), np.full(216, 3))
+    found = symbolic.supernodes(graph, np.random.default_rng(6).permutation(216), np.full(216, 3))
     assert np.array_equal(np.sort(found.order), np.arange(216))
     parents = found.parent
     assert all(above == -1 or above > s for s, above in enumerate(parents))
@@ -313,7 +278,7 @@ def test_refinement_lays_what_descendants_fill_side_by_side():
     below = [quarter, halves[0], halves[1], np.zeros(0, int)]
     below[0] = np.sort(np.concatenate([[1], quarter]))
     start = np.array([0, 1, 2, 4, 44])
-    order = refined_order(start, [[], [0], [], [1, 2]], below)
+    order = symbolic.refined_order(start, [[], [0], [], [1, 2]], below)
     assert np.array_equal(np.sort(order[4:]), np.arange(4, 44))
     for rows in (halves[0], halves[1], quarter):
         found = np.sort(np.argsort(order)[rows])
@@ -351,3 +316,65 @@ def test_contributions_never_share_memory_while_they_live():
                 overwritten = set(owner[low : low + size].tolist()) - {-1}
                 assert not overwritten & set(front.children)
                 owner[low : low + size] = number
+
+
+class Libraries:
+    """One number of threads for the whole process, as a BLAS has it."""
+
+    threads = 2
+
+    def limit(self, *, limits, user_api):
+        assert user_api == "blas"
+        before, self.threads = self.threads, limits
+        return Limit(self, before)
+
+
+class Limit:
+    """What sets back the number of threads that it found."""
+
+    def __init__(self, libraries, before):
+        self.libraries, self.before = libraries, before
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.libraries.threads = self.before
+
+
+@pytest.fixture
+def libraries(monkeypatch):
+    found = Libraries()
+    monkeypatch.setattr(dense, "_libraries", lambda: found)
+    return found
+
+
+def test_blas_computes_on_one_thread_until_the_last_of_several_callers_has_ended(libraries):
+    """The first one sets the limit, and ends before the second."""
+    inside, over = threading.Event(), threading.Event()
+
+    def first():
+        with dense.blas_on_one_thread():
+            inside.set()
+            over.wait(10.0)
+
+    other = threading.Thread(target=first)
+    other.start()
+    assert inside.wait(10.0)
+    with dense.blas_on_one_thread():
+        over.set()
+        other.join(10.0)
+        assert libraries.threads == 1
+    assert libraries.threads == 2
+
+
+def test_an_error_inside_lifts_the_limit(libraries):
+    @dense.blas_on_one_thread()
+    def failing():
+        with dense.blas_on_one_thread():
+            assert libraries.threads == 1
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        failing()
+    assert libraries.threads == 2

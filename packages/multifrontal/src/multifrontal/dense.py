@@ -1,23 +1,36 @@
-"""Dense kernels on fronts: BLAS and LAPACK through the function pointers that SciPy offers to Cython.
+"""Dense kernels on fronts, BLAS and LAPACK through the pointers that SciPy offers to Cython, and their threads.
 
 Called so, they leave Python's lock while they compute; SciPy's own wrappers do not. All matrices are in Fortran's order
 (columns contiguous, or parts of such), of one type, single or double; a symmetric one has its lower triangle only.
+
+The threads are ours. BLAS's own would share each small product among themselves, which takes longer than to compute it,
+and ten times as long on a machine that does other work too: they wait for each other in a busy loop.
 """
 
 from __future__ import annotations
 
 import ctypes
 import functools
-from collections.abc import Callable
+import os
+import re
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import threadpoolctl
 from numpy.typing import NDArray
 from scipy.linalg import cython_blas, cython_lapack
 
 __all__ = [
     "Matrix",
+    "blas_on_one_thread",
     "factor",
+    "pool_of",
+    "processors",
     "solve_right",
     "solve_transposed",
     "solve_vector",
@@ -127,3 +140,53 @@ def subtract_from_vector(y: Matrix, a: Matrix, x: Matrix, *, transposed: bool) -
         b"T" if transposed else b"N", _dimension(a.shape[0]), _dimension(a.shape[1]), _scalar(x.dtype, -1.0),
         _at(a), _leading(a), _at(x), _dimension(1), _scalar(x.dtype, 1.0), _at(y), _dimension(1),
     )  # fmt: skip
+
+
+def processors() -> int:
+    """Processors that this process may use, and that the linear algebra's own limit leaves."""
+    seen = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    limits = [os.environ.get(name, "") for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")]
+    return min([seen, *(int(limit) for limit in limits if re.fullmatch("[1-9][0-9]{0,5}", limit))])
+
+
+@dataclass
+class _Callers:
+    """How many want BLAS on one thread now, and what lifts the limit."""
+
+    number: int = 0
+    limit: AbstractContextManager[object] | None = None
+
+
+_callers, _turn = _Callers(), threading.Lock()
+
+
+@functools.cache
+def _libraries() -> threadpoolctl.ThreadpoolController:
+    return threadpoolctl.ThreadpoolController()
+
+
+@contextmanager
+def blas_on_one_thread() -> Iterator[None]:
+    """While this lasts BLAS computes each call on one thread; afterwards as before.
+
+    The limit is one for the whole process: the first of several callers side by side sets it, the last one lifts it,
+    and none waits for another, as it may be what that one waits for.
+    """
+    with _turn:
+        if _callers.number == 0:
+            _callers.limit = _libraries().limit(limits=1, user_api="blas")
+        _callers.number += 1
+    try:
+        yield
+    finally:
+        with _turn:
+            _callers.number -= 1
+            if _callers.number == 0 and _callers.limit is not None:
+                _callers.limit.__exit__(None, None, None)
+                _callers.limit = None
+
+
+def pool_of(threads: int) -> ThreadPoolExecutor:
+    """Threads of ours, for calls inside `blas_on_one_thread`."""
+    # A BLAS on OpenMP has limits of each thread's own; the thread ends before anybody else computes on it.
+    return ThreadPoolExecutor(threads, initializer=lambda: _libraries().limit(limits=1, user_api="blas"))
