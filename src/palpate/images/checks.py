@@ -17,7 +17,14 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.images.wall_motion import STILL_VOXELS, wall_motion
 
-__all__ = ["check_headers", "check_images", "check_pair", "check_segmentation", "later_names"]
+__all__ = [
+    "check_headers",
+    "check_images",
+    "check_pair",
+    "check_segmentation",
+    "later_names",
+    "share_inside",
+]
 
 OBSERVED = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
 VOLUME_CHANGE = 0.05  # no modulus explains a filling between the scans
@@ -194,7 +201,7 @@ def _too_thin(mask: NDArray[np.bool_], box: tuple[slice, ...], tissue: Tissue, n
 
 
 def _common_part(before: Segmentation, after: Segmentation, name: str) -> list[Finding]:
-    share = max(_share_inside(before.grid, after.grid), _share_inside(after.grid, before.grid))
+    share = max(share_inside(before.grid, after.grid), share_inside(after.grid, before.grid))
     if share == 0.0:
         centres = [grid.world((np.array([grid.shape]) - 1.0) / 2.0)[0] for grid in (before.grid, after.grid)]
         raise InputDataError(
@@ -208,7 +215,7 @@ def _common_part(before: Segmentation, after: Segmentation, name: str) -> list[F
     return [Finding("little-in-common", text, place=f"'{name}' ({share:.0%})")]
 
 
-def _share_inside(grid: VoxelGrid, other: VoxelGrid) -> float:
+def share_inside(grid: VoxelGrid, other: VoxelGrid) -> float:
     """Share of the grid's volume that lies inside the other one, by a lattice of 33^3 points out to the outer faces."""
     ticks = [np.linspace(-0.5, n - 0.5, 33) for n in grid.shape]
     lattice = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)

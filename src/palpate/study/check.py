@@ -44,7 +44,7 @@ from palpate.study.refusals import refuse_lost, refuse_unmeshable
 from palpate.study.run import refuse_what_cannot_be_estimated
 from palpate.study.samples import require_samples
 
-__all__ = ["CheckReport", "Problem", "check_case", "memory_problems"]
+__all__ = ["CheckReport", "Checked", "OrganRow", "Problem", "check_case", "checked_case", "memory_problems"]
 
 T = TypeVar("T")
 OBSERVED = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
@@ -149,6 +149,19 @@ class CheckReport:
         return "\n".join(lines)
 
 
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """A case as far as it was found good: its report, and what was made on the way.
+
+    states: its pairs of images that can be read, aligned; bodies: their meshes, none where something was refused.
+    """
+
+    report: CheckReport
+    case: Case | None = None
+    states: tuple[ImagedStates, ...] = ()
+    bodies: tuple[Body, ...] = ()
+
+
 class _Problems:
     """Collects what goes wrong, and goes on."""
 
@@ -183,20 +196,29 @@ class _Problems:
 
 
 def check_case(source: Path | Case, overrides: Sequence[str], *, progress: Progress) -> CheckReport:
+    """The report of `checked_case`."""
+    return checked_case(source, overrides, progress=progress).report
+
+
+def checked_case(
+    source: Path | Case, overrides: Sequence[str] = (), *, progress: Progress, meshed: bool = True
+) -> Checked:
     """All problems of a case, or of a case file (with overrides as in `read_case`), its organs and its expected cost.
 
-    The images are aligned, and meshed if nothing was refused before, as an estimate would. Nothing is solved. Raises
-    nothing for a bad case: that is a problem, too.
+    The images are aligned, and meshed (if `meshed`, and nothing was refused before), as an estimate would. Nothing is
+    solved. Raises nothing for a bad case: that is a problem, too.
     """
     problems = _Problems()
     if isinstance(source, Case):
-        return _checked(source, problems, progress)
+        return _checked(source, problems, progress, meshed=meshed)
     case = problems.attempt(lambda: read_case(source, overrides))
-    return CheckReport(source.stem, problems.all()) if case is None else _checked(case, problems, progress)
+    if case is None:
+        return Checked(CheckReport(source.stem, problems.all()))
+    return _checked(case, problems, progress, meshed=meshed)
 
 
-def _checked(case: Case, problems: _Problems, progress: Progress) -> CheckReport:
-    """The report of a case, with the problems that were found before it."""
+def _checked(case: Case, problems: _Problems, progress: Progress, *, meshed: bool) -> Checked:
+    """The same of a case, with the problems that were found before it."""
     problems.attempt(lambda: refuse_what_cannot_be_estimated(case))
     problems.attempt(lambda: require_samples(case))
     problems.warn(unit_warnings(case))
@@ -209,8 +231,8 @@ def _checked(case: Case, problems: _Problems, progress: Progress) -> CheckReport
     firsts = np.cumsum([0, *(pair.n_later for pair in pairs)]).tolist()
     pairs = [_with_data(problems, pair, case, first) for pair, first in zip(pairs, firsts, strict=False)]
     if not pairs:
-        return CheckReport(case.id, problems.all())
-    cost = problems.attempt(lambda: _cost(problems, pairs, case, progress))
+        return Checked(CheckReport(case.id, problems.all()), case)
+    cost, bodies = problems.attempt(lambda: _cost(problems, pairs, case, progress, meshed=meshed)) or (None, ())
     before, after = pairs[0].before, pairs[0].after
     names = ("before", *(f"after[{i}]" for i in range(len(after))))
     organs = tuple(
@@ -225,7 +247,8 @@ def _checked(case: Case, problems: _Problems, progress: Progress) -> CheckReport
     ]
     files = [(source.file, source.in_words) for pair in pairs for source in pair.data]
     measured_words = {f.name + (f", state {f.state}" if f.state > 1 else ""): words for f, words in files}
-    return CheckReport(case.id, problems.all(), names, organs, cost, tuple(found), measured_words)
+    report = CheckReport(case.id, problems.all(), names, organs, cost, tuple(found), measured_words)
+    return Checked(report, case, tuple(pairs), bodies)
 
 
 def _with_data(problems: _Problems, pair: ImagedStates, case: Case, first: int) -> ImagedStates:
@@ -241,20 +264,22 @@ def _lay(pair: ImagedStates) -> list[tuple[str, Registration]]:
     return list(zip(later_names(len(pair.after)), pair.alignments, strict=False))
 
 
-def _cost(problems: _Problems, pairs: Sequence[ImagedStates], case: Case, progress: Progress) -> ExpectedCost:
-    """What an estimate would cost on its very meshes; on meshes of a guessed size where something is refused."""
+def _cost(
+    problems: _Problems, pairs: Sequence[ImagedStates], case: Case, progress: Progress, *, meshed: bool
+) -> tuple[ExpectedCost, tuple[Body, ...]]:
+    """What an estimate would cost on its very meshes, and these; on meshes of a guessed size where one is refused."""
     first = pairs[0]
     cost = expected_cost(case, first.before, first.after, n_pairs=len(pairs), mesh=first.mesh)
     if first.mesh is None:
         edge = edge_length_of(case, first.before, first.after).mm
         problems.attempt(lambda: refuse_edge(edge, case_domain(first.before, case)))
     if any(problem.exit_code for problem in problems.all()):
-        return cost
-    if lack_of_memory(cost):
+        return cost, ()
+    if not meshed or lack_of_memory(cost):
         problems.found += memory_problems(cost)
-        return cost
+        return cost, ()
     bodies = [problems.attempt(partial(make_body, pair, case, progress=progress)) for pair in pairs]
-    made = [body for body in bodies if body is not None]
+    made = tuple(body for body in bodies if body is not None)
     for number, body in enumerate(made, start=1):
         problems.warn(body.findings, number)
         if body.states.mesh is None:
@@ -263,7 +288,7 @@ def _cost(problems: _Problems, pairs: Sequence[ImagedStates], case: Case, progre
         sizes = [(body.quality.tets, 3 * len(body.space.points)) for body in made]
         cost = cost_of_meshes(case, first.before, sizes, n_after=first.n_later)
     problems.found += memory_problems(cost)
-    return cost
+    return cost, () if any(problem.exit_code for problem in problems.all()) else made
 
 
 def _observe(body: Body) -> None:
