@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 from palpate.cli.console import log_is_open
@@ -13,6 +15,10 @@ if TYPE_CHECKING:
     from palpate.study.outputs import OutputFolder
 
 __all__ = ["Outcome", "columns", "estimates_table", "listed", "printable_lines", "warning_lines"]
+
+
+GAP = "  "  # between columns
+MOST_LETTERS, LEAST_LETTERS = 100, 20  # of a line in a terminal; of a column that is broken
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,10 +69,18 @@ def listed(outputs: OutputFolder) -> str:
     return f"written to {outputs.path}: {', '.join([*names, *log])}"
 
 
-def columns(rows: Sequence[Sequence[str]]) -> str:
-    """Rows of cells as lines of aligned columns."""
+def columns(rows: Sequence[Sequence[str]], *, most: int = MOST_LETTERS) -> str:
+    """Rows of cells as lines of aligned columns; of a table over `most` letters wide the widest column is broken."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    beyond = sum(widths) + len(GAP) * (len(widths) - 1) - most
+    widest = widths.index(max(widths))
+    if beyond > 0:
+        widths[widest] = max(widths[widest] - beyond, LEAST_LETTERS)
+    lines = list[str]()
+    for row in rows:
+        broken = [textwrap.wrap(cell, width, break_on_hyphens=False) for cell, width in zip(row, widths, strict=True)]
+        cells = zip_longest(*(parts or [""] for parts in broken), fillvalue="")
+        lines += [GAP.join(map(str.ljust, parts, widths)).rstrip() for parts in cells]
     return "\n".join(lines)
 
 

@@ -28,6 +28,7 @@ TARGETS = (DOCUMENT, PAGE, DATA, *ASIDE, *NUMBERS, *LABELS, "case.toml")
 def estimate(arguments: argparse.Namespace, case: Case | None, outputs: OutputFolder, progress: Progress) -> Outcome:
     """Estimate a case, or images for which a case is written first."""
     from palpate.steps import commands
+    from palpate.steps.previewing import PREVIEW, write_page
     from palpate.steps.saving import save_failure
     from palpate.study.case_as_run import refuse_other_case
     from palpate.study.case_file import read_case
@@ -44,6 +45,9 @@ def estimate(arguments: argparse.Namespace, case: Case | None, outputs: OutputFo
         progress(f"the case is written to {new.path}")
         case = read_case(new.path, arguments.set)
     refuse_other_case(case, outputs)
+    if arguments.preview:
+        write_page(case, outputs, progress=progress)
+        progress(f"the preview is written to {outputs.path / PREVIEW}")
     outputs.require(f"mesh_{number}.vtu" for number in range(2, len(case.pairs) + 2))
     try:
         result = commands.estimate(case, progress=progress)

@@ -16,6 +16,7 @@ import numpy as np
 from markupsafe import Markup, escape
 
 from palpate.findings import HARMLESS, WIDENING
+from palpate.images.registration import length_text
 from palpate.parallel import mapped
 from palpate.report.charts import (
     START_COLOURS,
@@ -297,7 +298,7 @@ def template_of(name: str) -> jinja2.Template:
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("palpate.report"), autoescape=True, undefined=jinja2.StrictUndefined
     )
-    environment.filters["number"] = number
+    environment.filters |= {"number": number, "length_text": length_text}
     return environment.get_template(name)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from palpate.errors import InputDataError
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers import read_intensities
+from palpate.images.registration import length_text
 from palpate.images.tissue import Role
 from palpate.images.tissue_colours import tissue_colours
 from palpate.progress import about
@@ -91,14 +92,13 @@ class _Later:
     fields: str
 
 
-def preview_page(
-    checked: Checked, prediction: Prediction | None, *, created: str, version: str, no_prediction: str = ""
-) -> str:
+def preview_page(checked: Checked, *, created: str, version: str, no_prediction: str = "") -> str:
     """The preview of a case that was checked, one self-contained page with all names escaped.
 
-    prediction: None where there is none, for the reason `no_prediction`. Of several pairs of images the first is drawn.
+    no_prediction: why the report has no predicted intervals, where it has none. Of several pairs of images the first is
+    drawn.
     """
-    case, report = checked.case, checked.report
+    case, report, prediction = checked.case, checked.report, checked.report.predicted
     states = checked.states[0] if checked.states else None
     data, images, rows, frame, names = None, (), (), None, ("before",)
     if states is not None and states.mesh is None and case is not None:
@@ -334,7 +334,7 @@ def _later(data: ReportData, states: ImagedStates, frame: FrameLook, k: int, ima
         stands="the bones stand" if bones else "what does not touch the drivers stands",
         residuals=""
         if found is None
-        else ", ".join(f"{name} {number(mm, digits=2)} mm" for name, mm in found.residual_by_tissue_mm.items()),
+        else ", ".join(f"{name} {length_text(mm)} mm" for name, mm in found.residual_by_tissue_mm.items()),
         fields=f"{later.name} shows {100.0 * first:.0f} % of what {reference.name} shows; {reference.name} shows"
         f" {100.0 * second:.0f} % of what {later.name} shows.",
     )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.images.alignment import RigidMotion, moved
+from palpate.images.alignment import moved
 from palpate.images.distance import smoothing_width
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
@@ -104,8 +104,7 @@ def preview_image(
 ) -> PreviewImage:
     """What is drawn of later image number `after`; greys: of the first image and of this one, brought to it."""
     before, aligned = states.before, states.after[after]
-    found = states.alignments[after].motion if states.alignments else RigidMotion.identity()
-    lay = found if found.angle_deg > 0.0 or found.translation.any() else None
+    lay = None if not states.alignments or states.alignments[after].still else states.alignments[after].motion
     images = [before, aligned, *([] if lay is None else [moved(aligned, lay)])]
     whole = whole_box(before)
     arrows = [

@@ -12,11 +12,14 @@ from palpate.images.named_labels import printable
 from palpate.images.tissue import Role
 from palpate.study.case import POISSON_RATIO, RATIO_SD, Case, CaseTissue
 from palpate.study.schema import Rule
-from palpate.study.toml_text import relative_path, toml_key, toml_value
+from palpate.study.toml_text import lasting_path, toml_key, toml_value
 
 __all__ = ["case_tables", "case_text"]
 
-HEADING = "# The case of the result beside it, as it was run: every setting is written out; paths begin at this file."
+HEADING = (
+    "# The case of the result beside it, as it was run: every setting is written out. Files outside of this folder are"
+    "\n# named by their whole paths, so that the folder may be moved."
+)
 
 
 def case_tables(case: Case, place: Callable[[Path], str]) -> dict[str, Any]:
@@ -45,7 +48,7 @@ def case_text(case: Case, folder: Path) -> str:
     """
     lines = [HEADING]
     lines += [f"# --set {printable(override)}" for override in case.overrides]
-    lines += ["", *_lines(case_tables(case, lambda path: relative_path(path, folder)), ())]
+    lines += ["", *_lines(case_tables(case, lambda path: lasting_path(path, folder)), ())]
     return "\n".join(lines).rstrip() + "\n"
 
 

@@ -15,7 +15,7 @@ from palpate.findings import Finding, of_pair, one_a_cause, rank
 from palpate.images.checks import check_pair, check_segmentation, later_names
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_intensities
-from palpate.images.registration import Registration
+from palpate.images.registration import Registration, length_text
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.observation.field_of_view import field_of_view
@@ -39,6 +39,7 @@ from palpate.study.domain import case_domain
 from palpate.study.edge_length import edge_length_of
 from palpate.study.meshing import refuse_edge
 from palpate.study.plausibility import unit_warnings
+from palpate.study.prediction import Prediction
 from palpate.study.read import measured, read_segmentation, read_states
 from palpate.study.refusals import refuse_lost, refuse_unmeshable
 from palpate.study.run import refuse_what_cannot_be_estimated
@@ -74,7 +75,7 @@ class CheckReport:
     """All problems of a case, its organs and what its estimate would cost (None when that cannot be told).
 
     alignments: how each later image lay, by its name; none where nothing was aligned; measured: what was read of each
-    file of [[data]], by its name.
+    file of [[data]], by its name; predicted: the intervals that may be expected, where they were asked for.
     """
 
     id: str
@@ -84,6 +85,7 @@ class CheckReport:
     cost: ExpectedCost | None = None
     alignments: tuple[tuple[str, Registration], ...] = ()
     measured: Mapping[str, str] = field(default_factory=dict)
+    predicted: Prediction | None = None
 
     @property
     def exit_code(self) -> int:
@@ -125,6 +127,7 @@ class CheckReport:
                 "solver": cost.solver,
                 "processors": cost.processors,
             },
+            "predicted": self.predicted and self.predicted.to_dict(),
         }
 
     def text(self) -> str:
@@ -137,7 +140,7 @@ class CheckReport:
             volumes = ", ".join(f"{volume:.4g}" for volume in row.volumes_ml)
             lines.append(f"{row.tissue} ({row.role}): {volumes} mL")
         for name, found in self.alignments:
-            kept = ", ".join(f"{tissue} {mm:.2g}" for tissue, mm in found.residual_by_tissue_mm.items())
+            kept = ", ".join(f"{tissue} {length_text(mm)}" for tissue, mm in found.residual_by_tissue_mm.items())
             lines.append(f"alignment: '{name}' {found.in_words} (surfaces then lie apart by, in mm: {kept})")
         lines += [f"{name}: {words}" for name, words in self.measured.items()]
         if self.cost is not None:
@@ -146,6 +149,8 @@ class CheckReport:
                 f"expected: {cost.tets} tetrahedra, {cost.unknowns} unknowns, {cost.memory_gb:.1f} GB,"
                 f" {cost.seconds / 60.0:.1f} min with {cost.solver} on {cost.processors} processor(s)"
             )
+        if self.predicted is not None:
+            lines += self.predicted.lines()
         return "\n".join(lines)
 
 

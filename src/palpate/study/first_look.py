@@ -73,7 +73,12 @@ def tissue_looks(before: Segmentation, after: Sequence[Segmentation], box: Box) 
 def frame_look(case: Case, before: Segmentation, after: Sequence[Segmentation]) -> FrameLook:
     """The frame of a case and what its images share."""
     shared = tuple((share_inside(before.grid, i.grid), share_inside(i.grid, before.grid)) for i in after)
-    return FrameLook(case_domain(before, case), _held(case), shared)
+    box, domain = case_domain(before, case), case.domain
+    size = " × ".join(f"{length:.0f}" for length in box.lengths)
+    shown = {"margin": f"{domain.margin_mm:g} mm around organs and drivers"}
+    around = shown.get(domain.extent, "all that the first image shows")
+    meshed = f"The mesh fills a box of {size} mm, {around}. Its faces are the frame."
+    return FrameLook(box, (meshed, *_held(case)), shared)
 
 
 def grid_box(image: Segmentation) -> Box:

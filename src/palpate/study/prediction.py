@@ -40,6 +40,11 @@ class PredictedModulus:
     why: str
     shares: Mapping[str, float] = field(default_factory=dict)
 
+    @property
+    def unit_text(self) -> str:
+        """The unit behind a number."""
+        return "kPa" if self.unit == "kPa" else f"times {self.relative_to}"
+
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
@@ -53,6 +58,14 @@ class Prediction:
     noise_sd_mm: float
     correlation_mm: float
     stated: bool
+
+    def lines(self) -> list[str]:
+        """A line a modulus, for people."""
+        return [
+            f"predicted for {of.tissue}, if it has {of.guess:.3g} {of.unit_text}: 95 % interval"
+            f" {ends_text(of.interval95)} {of.unit_text} ({of.verdict})"
+            for of in self.moduli
+        ]
 
     def to_dict(self) -> dict[str, Any]:
         """For a JSON document."""
@@ -75,6 +88,12 @@ class Prediction:
                 for of in self.moduli
             ],
         }
+
+
+def ends_text(interval: Interval) -> str:
+    """As "2 to 5", an open end as a dash."""
+    low, high = ("–" if end is None else f"{end:.3g}" for end in interval)
+    return f"{low} to {high}"
 
 
 @blas_on_one_thread()

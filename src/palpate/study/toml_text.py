@@ -8,7 +8,7 @@ from pathlib import Path
 
 from palpate.errors import ConfigurationError
 
-__all__ = ["relative_path", "toml_key", "toml_text", "toml_value"]
+__all__ = ["lasting_path", "relative_path", "toml_key", "toml_text", "toml_value"]
 
 
 def toml_text(value: str) -> str:
@@ -41,6 +41,12 @@ def relative_path(path: Path, folder: Path) -> str:
     if relative.startswith("~"):  # a case's reader takes that for somebody's home
         relative = str(Path("..", real.name, relative))
     return Path(relative).as_posix()
+
+
+def lasting_path(path: Path, folder: Path) -> str:
+    """`path` as a case file in the folder names it that may be moved: whole, but for what lies in the folder itself."""
+    place = path.absolute().parent.resolve() / path.name
+    return relative_path(path, folder) if place.is_relative_to(folder.resolve()) else place.as_posix()
 
 
 def toml_value(value: str | bool | float | list[str] | list[float]) -> str:
