@@ -33,7 +33,7 @@ class Outcome:
 
 def estimates_table(document: Mapping[str, Any]) -> str:
     """The estimates of a result as aligned columns, with its note."""
-    from palpate.report.rows import interval_text, moduli_in, number, ratio_rows
+    from palpate.report.rows import NONE, expected_share, interval_text, main_numbers, moduli_in, number, ratio_rows
 
     rows = [["tissue", "Young's modulus", "95 % interval", "ratio", "verdict", "truth"]]
     for item in moduli_in(document):
@@ -58,6 +58,13 @@ def estimates_table(document: Mapping[str, Any]) -> str:
         rows = [row[:-1] for row in rows]
     ratios = [[row.tissue, row.value, row.interval, row.verdict] for row in ratio_rows(document)]
     more = [columns([["tissue", "Poisson's ratio", "95 % interval", "verdict"], *ratios])] if ratios else []
+    far = []
+    for item in moduli_in(document):
+        found, ends = main_numbers(item)
+        if found and item["truth"] and (share := expected_share(found, ends, item["truth"])) != NONE:
+            error = f"{100.0 * (found / item['truth'] - 1.0):+.0f} %"
+            far.append(f"{item['tissue']} {error} ({share} of such estimates are off as far or further)")
+    more += [f"error, and how often it is as large by the interval: {', '.join(far)}"] if far else []
     note = [document["note"]] if document.get("note") else []
     return "\n".join([columns(rows), *more, *note])
 

@@ -60,9 +60,8 @@ def _pages(records: Sequence[Record]) -> dict[str, tuple[str, str]]:
     found = dict[str, tuple[str, str]]()
     for record in records:
         if record.page:
-            found.setdefault(
-                record.row.patient, (record.page, f"report of {record.row.id}, patient {record.row.patient}")
-            )
+            says = f"report of {record.row.id}, patient {record.row.patient}"
+            found.setdefault(record.row.patient, (record.page, says))
     return found
 
 

@@ -33,6 +33,7 @@ SMALL_VOXELS = 50
 THIN_VOXELS = 4
 THIN_SHARE = 0.2
 COMMON_SHARE = 0.5
+ON_FACE = 1e-6  # voxels: rounding of a point on an image's outer face
 FAR_SHARE = {Role.ESTIMATE: 0.5}  # of its size, by which the middle of a solid organ hardly moves; of others all of it
 SPACING_MM = (0.02, 20.0)  # outside of this a voxel edge is more likely in metres or micrometres
 MIRROR_CERTAIN = 0.25  # gain in agreement, of 1, at which a mirrored image is refused
@@ -221,7 +222,8 @@ def share_inside(grid: VoxelGrid, other: VoxelGrid) -> float:
     ticks = [np.linspace(-0.5, n - 0.5, 33) for n in grid.shape]
     lattice = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
     index = other.index(grid.world(lattice))
-    return float(((index >= -0.5) & (index <= np.array(other.shape) - 0.5)).all(axis=1).mean())
+    low, high = -0.5 - ON_FACE, np.array(other.shape) - 0.5 + ON_FACE
+    return float(((index >= low) & (index <= high)).all(axis=1).mean())
 
 
 def _mirrored(before: Segmentation, after: Segmentation, observed: Sequence[int], name: str) -> list[Finding]:

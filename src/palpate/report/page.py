@@ -94,8 +94,11 @@ class _Measured:
     widths: str
 
 
-def render(data: ReportData) -> str:
-    """The whole page of a report; a figure that cannot be drawn leaves a sentence in its place."""
+def render(data: ReportData, *, study: bool = False) -> str:
+    """The whole page of a report; a figure that cannot be drawn leaves a sentence in its place.
+
+    study: whether its sensitivity.html lies beside it.
+    """
     live = _attempt("the moving figures", lambda: payload(data))
     scripts = _scripts(data) if live is not None and (data.later or data.measured or data.mesh) else ()
     colours = {tissue.name: tissue.colour for tissue in data.tissues}
@@ -103,6 +106,7 @@ def render(data: ReportData) -> str:
     fixed = {item["tissue"] for item in found if item["verdict"] != "not identified"}  # of others no range is drawn
     page = template_of("case.html").render(
         data=data,
+        study=study,
         document=data.document,
         headline=headline(data.document),
         inputs=tuple(

@@ -207,6 +207,7 @@ def _preview(image: PreviewImage, packer: _Packer) -> dict[str, Any]:
         "greys": [_volume(volume, packer) for volume in image.greys],
         "arrows": [{"tissue": a.tissue, "start": a.start.tolist(), "end": a.end.tolist()} for a in image.arrows],
         "factor": image.factor,
+        "view": _box(image.view),
         "frame": image.frame.ravel().tolist(),
         "field": image.field.ravel().tolist(),
         "motion": None if image.motion is None else image.motion.tolist(),

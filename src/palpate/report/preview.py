@@ -226,10 +226,10 @@ def _state(look: TissueLook, after: int) -> _State:
     shift = look.shifts_mm[after] if look.shifts_mm else None
     return _State(
         volume=number(later),
-        change="" if change is None else f"{100.0 * change:+.1f} %",
+        change="" if change is None else f"{round(100.0 * change, 1) + 0.0:+.1f} %",
         much=change is not None and abs(change) > MUCH,
         shift=NONE if shift is None else f"{np.linalg.norm(shift):.1f}",
-        parts="" if shift is None else "R {:+.1f}, A {:+.1f}, S {:+.1f}".format(*shift),
+        parts="" if shift is None else "R {:+.1f}, A {:+.1f}, S {:+.1f}".format(*(np.round(shift, 1) + 0.0)),
     )
 
 
@@ -325,7 +325,7 @@ def _later(data: ReportData, states: ImagedStates, frame: FrameLook, k: int, ima
             picture_of(p.view.name, partial(alignment_svg, data, p, both, name=f"a{k}{p.view.name}"))
             for p in first_planes(reference.whole)
         ),
-        whole_widths=widths_of(reference.whole),
+        whole_widths=widths_of(image.view),
         moved=image.motion is not None,
         greys=any(image.greys),
         grey_volumes=image.greys,

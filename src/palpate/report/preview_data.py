@@ -36,6 +36,7 @@ __all__ = ["ROLE_COLOURS", "Arrow", "PreviewImage", "preview_data", "preview_ima
 ROLE_COLOURS = {"estimate": "#e69f00", "driver": "#56b4e9", "known": "#2ba888", "rigid": "#cfc8b8", "void": "#6d7278"}
 SHOWN = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
 ALL_TRIANGLES = 240_000  # of all surfaces, so that the page stays small
+RIM = 0.04  # of the longest side of an image, around it
 LONGEST_ARROW_MM = 20.0  # as it is drawn
 
 
@@ -55,7 +56,8 @@ class PreviewImage:
     organs, whole: labels of the first image, of this one aligned, and of this one as it lies where that is another
     place, in the box around the organs and in that of the whole image; greys: of both states, None where a case gives
     none; motion (3, 4): of the aligned surfaces back to where they lie, RAS mm; factor: how many times longer than it
-    is an arrow is drawn; frame, field: corners (8, 3) RAS mm of the box that is meshed, and of this image's grid.
+    is an arrow is drawn; view: what slices of the whole show; frame, field: corners (8, 3) RAS mm of the box that is
+    meshed, and of this image's grid.
     """
 
     organs: tuple[Volume, ...]
@@ -65,6 +67,7 @@ class PreviewImage:
     factor: float
     frame: NDArray[np.float64]
     field: NDArray[np.float64]
+    view: SliceBox
     motion: NDArray[np.float64] | None = None
 
 
@@ -123,6 +126,7 @@ def preview_image(
         factor=_factor(longest),
         frame=_corners(frame.box),
         field=_corners(grid_box(aligned)),
+        view=_padded(whole),
         motion=None if lay is None else lay.matrix[:3],
     )
 
@@ -138,6 +142,12 @@ def _surfaces(image: Segmentation, most_triangles: int) -> tuple[TriangleSurface
 def _corners(box: Box) -> NDArray[np.float64]:
     """Corners (8, 3) RAS mm of a box, as their numbers count in binary along its axes."""
     return box.world(box.lengths * np.array(list(np.ndindex(2, 2, 2)), dtype=np.float64))
+
+
+def _padded(box: SliceBox) -> SliceBox:
+    """The box with a rim, in which the image's own faces are seen."""
+    rim = RIM * float((box.high - box.low).max())
+    return SliceBox(box.low - rim, box.high + rim, box.position)
 
 
 def _factor(longest_mm: float) -> float:

@@ -8,9 +8,19 @@ from dataclasses import dataclass
 from typing import Any
 
 from palpate.inversion import KNOWN_MODULUS
-from palpate.uncertainty import Interval
+from palpate.uncertainty import NORMAL_95, Interval
 
-__all__ = ["NONE", "Bar", "EstimateRow", "estimate_rows", "interval_text", "main_numbers", "number", "scale_marks"]
+__all__ = [
+    "NONE",
+    "Bar",
+    "EstimateRow",
+    "estimate_rows",
+    "expected_share",
+    "interval_text",
+    "main_numbers",
+    "number",
+    "scale_marks",
+]
 
 NONE = "–"
 BELIEVED = "what was believed before"
@@ -59,7 +69,7 @@ class EstimateRow:
     """One tissue of the result table, all texts; shares: of each cause in the variance of ln E.
 
     sources: of each kind of data in what is known of it, where a case has more than images. reference: the modulus of
-    `relative_to`, kPa.
+    `relative_to`, kPa; expected: how often an error as large as that from the truth comes about, by the interval.
     """
 
     tissue: str
@@ -75,6 +85,7 @@ class EstimateRow:
     why: str
     truth: str
     error: str
+    expected: str
     bar: Bar | None
     shares: tuple[Share, ...]
     sources: tuple[Share, ...]
@@ -152,12 +163,26 @@ def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tu
             why=item["why"],
             truth=number(truth),
             error=f"{100.0 * (value / truth - 1.0):+.1f} %" if shown and value and truth else NONE,
+            expected=expected_share(value, interval, truth) if shown and value and truth else NONE,
             bar=_bar(value, interval, truth=truth, scale=scale) if scale and value and interval else None,
             shares=_shares({CAUSES.get(cause, cause): share for cause, share in shares.items()}) if shown else (),
             sources=_shares({BELIEVED if kind == "prior" else kind: share for kind, share in told}) if shown else (),
         )
         rows.append(row)
     return tuple(rows)
+
+
+def expected_share(value: float, interval: Interval | None, truth: float) -> str:
+    """How often an estimate lies as far from the truth as this one, "40 %", by its 95 % interval; a dash without one.
+
+    2 (1 - Phi(|ln E / E_0| / s)), s the interval's half-width of ln E on the side of the truth, over 1.96.
+    """
+    end = None if interval is None else interval[0 if truth < value else 1]
+    if not end or end == value:
+        return NONE
+    return (
+        f"{100.0 * math.erfc(abs(NORMAL_95 * math.log(value / truth) / math.log(value / end)) / math.sqrt(2.0)):.0f} %"
+    )
 
 
 def scale_marks(document: Mapping[str, Any]) -> tuple[tuple[float, str], ...]:

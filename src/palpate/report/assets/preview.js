@@ -5,7 +5,7 @@ const FACES = [0, 1, 3, 0, 3, 2, 4, 6, 7, 4, 7, 5, 0, 4, 5, 0, 5, 1, 2, 3, 7, 2,
 Palpate.Preview = class extends Palpate.Planes {
   constructor(facts, number, section) {
     const later = facts.later[number], reference = facts.references[later.reference], whole = section.dataset.box === "whole";
-    super(facts, later, section, whole ? reference.whole : reference.box);
+    super(facts, later, section, whole ? facts.preview[number].view : reference.box);
     this.own = facts.preview[number];
     this.shown = whole ? this.own.whole : this.own.organs;
     this.held = [["frame", this.own.frame, "#ffffff", []], ["field", this.own.field, "#ff6f59", [7, 5]]]

@@ -1,0 +1,51 @@
+"""What stands on a terminal fits it: tables of a hundred letters, sentences broken between words."""
+
+from __future__ import annotations
+
+import io
+import os
+
+import pytest
+
+from palpate.cli.outcome import MOST_LETTERS, columns
+from palpate.cli.progress import fitted
+
+SETTINGS = ", ".join(f"{setting}: -{setting} %" for setting in range(30))
+
+
+class Terminal(io.StringIO):
+    """A stream that says it is a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+    def fileno(self) -> int:
+        return 7
+
+
+def test_a_wide_table_is_broken_in_its_widest_column_and_loses_nothing():
+    rows = [["tissue", "changed", "modulus", "method"], ["prostate", "surface of bladder", SETTINGS, "re-estimated"]]
+    lines = columns(rows).splitlines()
+    assert len(lines) > 3
+    assert max(map(len, lines)) <= MOST_LETTERS
+    assert " ".join(" ".join(line[30:-14].split()) for line in lines[1:]).count("%") == 30
+    assert [line.split()[-1] for line in lines[:2]] == ["method", "re-estimated"]
+
+
+def test_a_narrow_table_stands_as_it_is():
+    assert columns([["a", "b"], ["long", "c"]]) == "a     b\nlong  c"
+
+
+@pytest.mark.parametrize("width", [40, 80])
+def test_a_sentence_is_broken_between_words_and_set_in(monkeypatch, width):
+    monkeypatch.setattr(os, "get_terminal_size", lambda _: os.terminal_size((width, 24)))
+    sentence = "[   1.0 s] " + "finite strain: the equilibrium at the linear estimate " * 3
+    lines = fitted(sentence.strip(), Terminal()).split("\n")
+    assert max(map(len, lines)) < width
+    assert " ".join(line.strip() for line in lines).split() == sentence.split()
+    assert all(line.startswith(" " * 11) for line in lines[1:])
+
+
+def test_where_there_is_no_terminal_a_sentence_stays_one_line():
+    assert fitted("word " * 100, io.StringIO()) == "word " * 100
+    assert fitted("word " * 100, None) == "word " * 100
