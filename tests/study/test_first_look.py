@@ -14,7 +14,7 @@ from palpate.study.case import Case, CaseTissue, Domain, Images
 from palpate.study.first_look import frame_look, grid_box, tissue_looks
 
 IMAGES = Images(Path("before.nii.gz"), (Path("after.nii.gz"),))
-TISSUES_OF_CASE = (CaseTissue("gland", 1, Role.ESTIMATE),)
+TISSUES_OF_CASE = (CaseTissue("gland", (1,), Role.ESTIMATE),)
 TISSUES = (Tissue("gland", Role.ESTIMATE, (1,)), Tissue("rest", Role.KNOWN, (), youngs_modulus_kpa=1.0))
 
 
@@ -44,11 +44,11 @@ def test_an_organ_at_the_cut_lies_no_way_from_the_frame():
 
 @pytest.mark.parametrize(("boundary", "word"), [("fixed", "held still"), ("free", "is free"), ("moving", "may move")])
 def test_what_holds_the_frame_is_told(boundary, word):
-    tissues = (CaseTissue("gland", 1, Role.ESTIMATE), CaseTissue("wall", 2, Role.RIGID))
+    tissues = (CaseTissue("gland", (1,), Role.ESTIMATE), CaseTissue("wall", (2,), Role.RIGID))
     case = Case("a", images=IMAGES, tissues=tissues, domain=Domain("margin", 6.0, boundary))
     before = block((10, 5, 6), (6, 8, 4))
     found = frame_look(case, before, [])
-    assert found.box.lengths == pytest.approx([24.0, 26.0, 20.0])  # 6 mm on each side, 6 mm of it beyond the image
+    assert found.box.lengths == pytest.approx([22.0, 26.0, 18.0])  # 6 mm beyond the middles of the outermost voxels
     assert "6 mm around organs" in found.held[0]
     assert word in found.held[1]
     assert "Rigid: wall" in found.held[2]
