@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from palpate.report import charts
 from palpate.report.collect import collect
-from palpate.report.rows import expected_share
+from palpate.report.rows import expected_share, scale_marks
 from palpate.report.svg import draw_svg, link_url
 
 
@@ -66,6 +66,14 @@ def test_the_label_of_the_misfit_lies_within_its_picture(case_result, figure_of,
     label = figure.axes[0].yaxis.label.get_window_extent(figure.canvas.get_renderer())
     assert label.x0 >= 0.0
     assert label.y0 >= 0.0
+
+
+@pytest.mark.parametrize(("low", "high"), [(13.8, 36.6), (21.0, 24.0), (0.5, 900.0)])
+def test_the_scale_of_the_bars_has_three_to_six_marks(low, high):
+    item = {"parameter": "youngs_modulus", "value": low, "interval95": [low, high], "truth": None}
+    marks = scale_marks({"status": "converged", "estimates": [item]})
+    assert 3 <= len(marks) <= 6
+    assert all(low * 0.8 < float(label) < high * 1.25 for _, label in marks)
 
 
 def test_a_link_in_a_chart_has_its_address_and_its_words_escaped():

@@ -38,6 +38,8 @@ CAUSES = {
     "grid": "the voxels' place",
     "mesh": "the mesh",
 }
+STEPS = ((1.0, 2.0, 5.0), tuple(0.5 * n for n in range(2, 20)), tuple(0.1 * n for n in range(10, 100)))  # of a decade
+FEWEST_MARKS = 3  # on a scale that can be read
 FADING = 0.6  # of a cause's opacity, that of the next one on the bar
 
 
@@ -191,9 +193,13 @@ def scale_marks(document: Mapping[str, Any]) -> tuple[tuple[float, str], ...]:
     if scale is None:
         return ()
     decades = range(math.floor(scale[0] / math.log(10.0)), math.ceil(scale[1] / math.log(10.0)) + 1)
-    numbers = [step * 10.0**decade for decade in decades for step in (1.0, 2.0, 5.0)]
-    places = [(BAR * (math.log(n) - scale[0]) / (scale[1] - scale[0]), f"{n:g}") for n in numbers]
-    inside = [mark for mark in places if 0.04 * BAR <= mark[0] <= 0.96 * BAR]
+    inside = list[tuple[float, str]]()
+    for steps in STEPS:
+        numbers = [step * 10.0**decade for decade in decades for step in steps]
+        places = [(BAR * (math.log(n) - scale[0]) / (scale[1] - scale[0]), f"{n:.3g}") for n in numbers]
+        inside = [mark for mark in places if 0.04 * BAR <= mark[0] <= 0.96 * BAR]
+        if len(inside) >= FEWEST_MARKS:
+            break
     return tuple(inside[:: math.ceil(len(inside) / 6) or 1])
 
 

@@ -124,10 +124,10 @@ Palpate.Planes = class {
     if (Number(slider.value) === Number(end)) return;
     event.preventDefault();
     this.turned = (this.turned || 0) + event.deltaY * (event.deltaMode ? 40 : 1);
-    const steps = Math.trunc(this.turned / 40);
+    const steps = Math.trunc(this.turned / 40); // mm
     if (!steps) return;
     this.turned -= 40 * steps;
-    go(Number(slider.value) - Math.sign(steps) * Math.min(Math.abs(steps), 3));
+    go(Number(slider.value) - Math.max(-3, Math.min(steps, 3)));
   }
 
   // All planes through a place, mm.
