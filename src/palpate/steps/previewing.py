@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -16,12 +17,13 @@ from palpate.study.case import Case
 from palpate.study.check import Checked, CheckReport, Problem, checked_case
 from palpate.study.lock import held_folder
 from palpate.study.new_case import NewCase, write_new_case
-from palpate.study.outputs import OutputFolder, Staging, read_regular, write_text
+from palpate.study.outputs import OutputFolder, read_regular, write_text
 from palpate.study.prediction import predicted_intervals
 from palpate.study.toml_text import toml_key
 
 __all__ = ["PREVIEW", "checked_with_page", "new_case_with_page", "place_page", "refuse_other_page", "write_page"]
 
+LOGGER = logging.getLogger(__name__)
 PREVIEW = "preview.html"
 LARGEST_PAGE = 2**28  # bytes
 HEAD = 2000  # bytes, in which a page says whose it is
@@ -56,8 +58,8 @@ def write_page(case: Case, outputs: OutputFolder, *, progress: Progress = silent
         staging.commit()
 
 
-def _stage_new_case_page(new: NewCase, staging: Staging, *, progress: Progress = silent) -> bool:
-    """The same of a case that `init` has written, not meshed; gives whether a page could be made.
+def _new_case_page(new: NewCase, *, progress: Progress = silent) -> str:
+    """The preview of a case that `init` has written, not meshed.
 
     A tissue whose role must be asked for is shown as void, and its question among the problems.
     """
@@ -68,13 +70,10 @@ def _stage_new_case_page(new: NewCase, staging: Staging, *, progress: Progress =
         if t.role is Role.KNOWN and t.youngs_modulus_kpa is None
     ]
     checked = checked_case(new.path, overrides, progress=progress, meshed=False)
-    if not checked.states:
-        return False
     asked = tuple(Problem("question", question, ConfigurationError.exit_code) for question in new.questions)
     report = replace(checked.report, problems=(*asked, *checked.report.problems))
     progress("drawing the preview")
-    write_text(staging.area / PREVIEW, _page(replace(checked, report=report), NOT_YET))
-    return True
+    return _page(replace(checked, report=report), NOT_YET)
 
 
 def new_case_with_page(
@@ -85,12 +84,20 @@ def new_case_with_page(
     cts: Sequence[Path] = (),
     progress: Progress = silent,
 ) -> NewCase:
-    """Write case.toml for label images as `write_new_case` does, and beside it its preview where one can be made."""
+    """Write case.toml for label images as `write_new_case` does, and beside it its preview.
+
+    The case stands without one where none can be made.
+    """
     refuse_other_page(outputs.path / PREVIEW)
     new = write_new_case(images, table, outputs, cts=cts)
+    try:
+        page = _new_case_page(new, progress=progress)
+    except Exception:  # a drawing never costs the case
+        LOGGER.exception("the preview could not be drawn")
+        return new
     with outputs.staged() as staging:
-        if _stage_new_case_page(new, staging, progress=progress):
-            staging.commit()
+        write_text(staging.area / PREVIEW, page)
+        staging.commit()
     return new
 
 
