@@ -112,8 +112,9 @@ def fitted(line: str, stream: TextIO | None) -> str:
         return line
     if not width // 2 > INDENT or len(line) < width:
         return line
-    options = {"break_long_words": False, "break_on_hyphens": False}
-    return "\n".join(textwrap.wrap(line, width - 1, subsequent_indent=" " * INDENT, **options)) or line
+    wrapper = textwrap.TextWrapper(width - 1, subsequent_indent=" " * INDENT)
+    wrapper.break_long_words = wrapper.break_on_hyphens = False
+    return wrapper.fill(line)
 
 
 def _duplicate(stream: TextIO | None) -> TextIO | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -13,19 +13,20 @@ from palpate.errors import InputDataError
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers import read_intensities
 from palpate.images.registration import length_text
-from palpate.images.tissue import Role
+from palpate.images.tissue import Role, Tissue
 from palpate.images.tissue_colours import tissue_colours
 from palpate.progress import about
 from palpate.report.backgrounds import Grey
 from palpate.report.page import Picture, page_scripts, picture_of, policy_of, template_of, widths_of
 from palpate.report.payload import payload
 from palpate.report.preview_data import ROLE_COLOURS, PreviewImage, preview_data, preview_image
-from palpate.report.report_data import ReportData
+from palpate.report.report_data import ReportData, Volume
 from palpate.report.rows import NONE, EstimateRow, estimate_rows, interval_text, number, scale_marks
 from palpate.report.slices import alignment_svg, first_planes, slice_svg
 from palpate.study.body import ImagedStates
 from palpate.study.case import Case
 from palpate.study.check import Checked, Problem
+from palpate.study.cost import ExpectedCost
 from palpate.study.first_look import FrameLook, TissueLook, frame_look, tissue_looks
 from palpate.study.prediction import Prediction
 
@@ -34,6 +35,7 @@ __all__ = ["GENERATOR", "preview_page"]
 GENERATOR = '<meta name="generator" content="Palpate preview">'  # by which a page of ours is known
 SCRIPTS = ("report.js", "slices.js", "preview.js", "start.js")
 MOST_LATER = 4  # later images that are drawn
+LEAST_SHARE = 0.005  # of a variance, that is told
 MUCH = 0.05  # change of a volume that no stiffness explains
 MEANING = {
     Role.ESTIMATE: "its stiffness is sought",
@@ -84,7 +86,7 @@ class _Later:
     whole_widths: str
     moved: bool
     greys: bool
-    grey_volumes: tuple[Any, ...]
+    grey_volumes: tuple[Volume | None, ...]
     factor: float
     alignment: str
     stands: str
@@ -98,61 +100,78 @@ def preview_page(checked: Checked, *, created: str, version: str, no_prediction:
     no_prediction: why the report has no predicted intervals, where it has none. Of several pairs of images the first is
     drawn.
     """
-    case, report, prediction = checked.case, checked.report, checked.report.predicted
-    states = checked.states[0] if checked.states else None
-    data, images, rows, frame, names = None, (), (), None, ("before",)
-    if states is not None and states.mesh is None and case is not None:
-        names = _names(case, states)
-        looks_frame = frame_look(case, states.before, states.after)
-        looks = tissue_looks(states.before, states.after, looks_frame.box)
-        frame, rows = looks_frame, _rows(states, looks)
-        if states.after:
-            data = _shown(preview_data(states, names, {"id": report.id}, created=created))
-            images = _images(case, states, data, looks, frame)
+    shown = _shown_of(checked, created)
+    report, prediction = checked.report, checked.report.predicted
+    images = shown.images if shown else ()
     scripts = page_scripts(SCRIPTS) if images else ()
-    expected = _expected(prediction, states)
+    expected, marks = _expected(prediction, shown.states if shown else None)
     return str(
         template_of("preview.html").render(
             id=report.id,
-            patient=case.patient if case and case.patient else report.id,
+            patient=checked.case.patient if checked.case else report.id,
             version=version,
             created=created,
             policy=policy_of(scripts),
             scripts=scripts,
-            live=payload(data, images) if data is not None and images else None,
+            live=payload(shown.data, images) if shown and shown.data and images else None,
             banner=_banner(report.problems, prediction),
             problems=report.problems,
-            predicted=expected[0],
-            marks=expected[1],
-            noise=None
-            if prediction is None
-            else {
-                "sd": number(prediction.noise_sd_mm, digits=2),
-                "length": number(prediction.correlation_mm, digits=2),
-                "stated": prediction.stated,
-            },
+            predicted=expected,
+            marks=marks,
+            noise=_noise(prediction),
             no_prediction=no_prediction or "There is no prediction.",
-            cost=None
-            if report.cost is None
-            else {
-                "time": about(report.cost.seconds),
-                "memory": number(report.cost.memory_gb, digits=2),
-                "tets": report.cost.tets,
-                "unknowns": report.cost.unknowns,
-                "solver": report.cost.solver,
-                "processors": report.cost.processors,
-            },
+            cost=_cost(report.cost),
             meshed=bool(checked.bodies),
-            tissues=rows,
-            names=names,
-            roles=_roles(states) if states else (),
-            held=frame.held if frame else (),
-            later=()
-            if data is None or states is None or frame is None
-            else tuple(_later(data, states, frame, k, image) for k, image in enumerate(images)),
+            tissues=_rows(shown.states, shown.looks) if shown else (),
+            names=shown.names if shown else (),
+            roles=_roles(shown.states) if shown else (),
+            held=shown.frame.held if shown else (),
+            later=tuple(_later(shown, k, image) for k, image in enumerate(images)) if shown else (),
             left_out=_left_out(checked, len(images)),
         )
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Shown:
+    """The first pair of images of a case as a preview shows it; data, images: where it has later ones."""
+
+    states: ImagedStates
+    names: tuple[str, ...]
+    frame: FrameLook
+    looks: tuple[TissueLook, ...]
+    data: ReportData | None = None
+    images: tuple[PreviewImage, ...] = ()
+
+
+def _shown_of(checked: Checked, created: str) -> _Shown | None:
+    """None of a case whose images cannot be read, or that comes as a mesh."""
+    case, states = checked.case, next(iter(checked.states), None)
+    if case is None or states is None or states.mesh is not None:
+        return None
+    frame, names = frame_look(case, states.before, states.after), _names(case, states)
+    looks = tissue_looks(states.before, states.after, frame.box)
+    if not states.after:
+        return _Shown(states, names, frame, looks)
+    data = preview_data(states, names, {"id": checked.report.id}, created=created)
+    data = replace(data, later=data.later[:MOST_LATER])
+    return _Shown(states, names, frame, looks, data, _images(case, states, data, looks, frame))
+
+
+def _noise(prediction: Prediction | None) -> Mapping[str, Any] | None:
+    """What the prediction takes for the noise of surfaces, as texts."""
+    if prediction is None:
+        return None
+    numbers = {"sd": prediction.noise_sd_mm, "length": prediction.correlation_mm}
+    return {name: number(mm, digits=2) for name, mm in numbers.items()} | {"stated": prediction.stated}
+
+
+def _cost(cost: ExpectedCost | None) -> Mapping[str, Any] | None:
+    """What an estimate is expected to take, as texts and counts."""
+    if cost is None:
+        return None
+    told = {"time": about(cost.seconds), "memory": number(cost.memory_gb, digits=2), "solver": cost.solver}
+    return told | {"tets": cost.tets, "unknowns": cost.unknowns, "processors": cost.processors}
 
 
 def _banner(problems: Sequence[Problem], prediction: Prediction | None) -> dict[str, Any]:
@@ -210,7 +229,7 @@ def _rows(states: ImagedStates, looks: Sequence[TissueLook]) -> tuple[_Row, ...]
     )
 
 
-def _modulus(tissue: Any) -> str:
+def _modulus(tissue: Tissue) -> str:
     """What is known of the modulus of a tissue."""
     if tissue.role is Role.ESTIMATE:
         return "sought"
@@ -254,22 +273,18 @@ def _expected(
     for of in prediction.moduli:
         kpa = of.unit == "kPa"
         interval = list(of.interval95)
-        item = {"parameter": "youngs_modulus", "tissue": of.tissue, "unit": of.unit, "relative_to": of.relative_to}
+        item: dict[str, Any] = {"parameter": "youngs_modulus", "tissue": of.tissue, "unit": of.unit}
         item |= {"value": of.guess if kpa else None, "interval95": interval if kpa else None}
         item |= {"ratio": None if kpa else of.guess, "ratio_interval95": None if kpa else interval}
-        shares = {cause: share for cause, share in of.shares.items() if share >= 0.005}
-        items.append(item | {"verdict": of.verdict, "why": of.why, "truth": None, "variance_shares": shares})
+        shares = {cause: share for cause, share in of.shares.items() if share >= LEAST_SHARE}
+        item |= {"relative_to": of.relative_to, "verdict": of.verdict, "why": of.why}
+        items.append(item | {"truth": None, "variance_shares": shares})
     document = {"status": "converged", "estimates": items, "case": {}}
     found = []
     for row, of in zip(estimate_rows(document, colours), prediction.moduli, strict=True):
         unit = "kPa" if of.unit == "kPa" else f"× {of.relative_to}"
         found.append((row, interval_text(of.interval95), number(of.guess), unit))
     return tuple(found), scale_marks(document)
-
-
-def _shown(data: ReportData) -> ReportData:
-    """With the first later images alone."""
-    return replace(data, later=data.later[:MOST_LATER])
 
 
 def _images(
@@ -301,7 +316,9 @@ def _grey(case: Case, states: ImagedStates, after: int | None) -> Grey | None:
     return Grey(values, VoxelGrid(grid.shape, back @ grid.affine))
 
 
-def _later(data: ReportData, states: ImagedStates, frame: FrameLook, k: int, image: PreviewImage) -> _Later:
+def _later(shown: _Shown, k: int, image: PreviewImage) -> _Later:
+    data, states, frame = shown.data, shown.states, shown.frame
+    assert data is not None, "there are later images"
     reference, later = data.references[0], data.later[k]
     assert reference.slices is not None, "the images of a preview have boxes"
     assert reference.whole is not None, "the images of a preview have boxes"

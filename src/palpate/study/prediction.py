@@ -151,7 +151,7 @@ def predicted_intervals(bodies: Sequence[Body], case: Case, *, progress: Progres
 
 def _guessed(case: Case, objective: Objective, middle: NDArray[np.float64]) -> NDArray[np.float64]:
     """The parameters (n_parameters,) at the moduli that tissues state, at the middle start where they do not."""
-    stated = {tissue.name: tissue.youngs_modulus_kpa for tissue in case.tissues}
+    stated = {tissue.name: tissue.modulus_kpa for tissue in case.tissues}
     guess, scale = middle.copy(), objective.parameters.scale_kpa
     for i, name in enumerate(objective.parameters.tissues):
         if (kpa := stated.get(name)) is not None:
