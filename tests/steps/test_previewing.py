@@ -41,6 +41,19 @@ def test_a_new_case_has_its_preview_beside_it(folder):
     new_case(folder)  # whose preview is our own
 
 
+@pytest.mark.parametrize(
+    ("names", "expected"), [(("sub-01_full", "sub-01_empty"), "sub-01"), (("before", "after"), "anna")]
+)
+def test_a_new_case_is_called_by_its_images_or_their_folder(folder, names, expected):
+    place = folder / "anna"
+    place.mkdir()
+    images = [place / f"{name}.nii.gz" for name in names]
+    for name, image in zip(("before", "after"), images, strict=True):
+        (folder / f"{name}.nii.gz").rename(image)
+    case = palpate.init(*images, labels=folder / "names.json", output=folder / "case")
+    assert palpate.read_case(case.path).id == expected
+
+
 def test_what_init_must_ask_stands_in_the_preview(folder):
     (folder / "names.json").write_text(json.dumps({"1": "prostate", "2": "colon", "3": "body"}))
     case = new_case(folder)
