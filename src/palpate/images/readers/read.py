@@ -85,7 +85,8 @@ def _check_file(path: Path, kind: str) -> None:
         found = path.stat()
     except FileNotFoundError as error:
         raise InputDataError(
-            f"there is no file '{path}'; check the path, which is relative to the case file"
+            f"there is no file '{path}'; check the path, which in a case file or cohort table begins at that file, and"
+            " whether it was moved since"
         ) from error
     except (OSError, ValueError) as error:
         raise InputDataError(
