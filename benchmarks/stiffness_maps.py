@@ -5,7 +5,7 @@
 
 Simulated data. A random pelvis whose prostate holds a ball of 7 mm radius that is `--contrast` times as stiff, or none
 (1), is moved by its rectum on a finer mesh; both states are imaged on 1 mm voxels, and a displacement field is measured
-on a lattice of 4 mm in and round the prostate, with an error of `--field-sd-mm` a component that is alike over 5 mm. The
+on a lattice of 4 mm in and round the prostate, with an error of `--field-sd-mm` a component, alike over 5 mm. The
 prostate's modulus is estimated as a field by the program's defaults (linear law). A line of JSON a draw: whether a
 region was found, with which probability, how far its centre lies from the ball's, its contrast with its interval, how
 much of the prior's variance the data removed, and the share of elements whose ln E lies inside its 95 % interval.
@@ -141,7 +141,7 @@ def _estimated(
         "probability": region and round(region.probability, 4),
         "off_mm": region and round(float(np.linalg.norm(region.centre_mm - centre)), 2),
         "volume_ml": region and round(region.volume_ml, 2),
-        "region_contrast": region and [round(v, 2) for v in (region.contrast, *map(float, region.interval95))],
+        "region_contrast": region and [region.contrast, *region.interval95],
         "in_ball": [round(float(found.log_ratio[organ & near].mean()), 2), round(float(found.sd[near].mean()), 2)],
         "resolved": round(found.resolved, 3),
         "prior_sd": round(found.prior_sd, 3),

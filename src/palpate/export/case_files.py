@@ -35,8 +35,9 @@ MOST_BYTES = 60  # of a tissue's name in a file's: file systems count bytes, not
 def write_estimate_files(result: CaseResult, folder: Path) -> tuple[Path, ...]:
     """Write mesh.vtu (displacement of the last image), stiffness.nii.gz (`result.unit`), labels.nii.gz and labels.csv.
 
-    stiffness_sd.nii.gz, the standard deviation of ln E, where the modulus of a tissue is a field. Each further pair has its own mesh_2.vtu, mesh_3.vtu ...; a converged result leaves model.npz for `palpate export`,
-    and posterior.nc where it has samples. Returns the paths written; raises `ResourceError` when the disk refuses.
+    stiffness_sd.nii.gz, the standard deviation of ln E, where the modulus of a tissue is a field. Each further pair has
+    its own mesh_2.vtu, mesh_3.vtu ...; a converged result leaves model.npz for `palpate export`, and posterior.nc where
+    it has samples. Returns the paths written; raises `ResourceError` when the disk refuses.
     """
     make_folder(folder)
     paths = [folder / "mesh.vtu", folder / "stiffness.nii.gz"]

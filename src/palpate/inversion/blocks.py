@@ -204,9 +204,10 @@ def material_blocks(
     for tissue, n in modes.sizes:
         name, mapped = tissues[tissue].name, tissues[tissue].field
         if n and mapped:
-            covariance = mapped.sd**2 * np.eye(n)
-            own = (name, FIELD, Acts.MATERIAL, states, np.linalg.inv(covariance), ((covariance,),))
-            blocks.append(Block(*own, amplitudes=FIELD_AMPLITUDES))
+            level = mapped.sd**2
+            family = ((level * np.eye(n),),)
+            own = Block(name, FIELD, Acts.MATERIAL, states, np.eye(n) / level, family, amplitudes=FIELD_AMPLITUDES)
+            blocks.append(own)
         elif n:
             blocks.append(
                 Block(

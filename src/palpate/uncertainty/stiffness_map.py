@@ -84,12 +84,12 @@ class _Field:
     def variance(self) -> NDArray[np.float64]:
         """(n,) after them."""
         change = np.einsum("ek,kl,el->e", self.seen, self.posterior - self.prior, self.seen)
-        return np.maximum(self.prior_variance + change, 0.0)
+        return np.asarray(np.maximum(self.prior_variance + change, 0.0))
 
     def variance_of(self, weights: NDArray[np.float64]) -> float:
         """Of the sum of the field times weights (n,)."""
         seen, every = weights @ self.seen, weights @ self.every
-        return float(max(every @ every + seen @ (self.posterior - self.prior) @ seen, 0.0))
+        return max(float(every @ every + seen @ (self.posterior - self.prior) @ seen), 0.0)
 
 
 def stiffness_maps(inversion: Inversion, variances: NDArray[np.float64]) -> tuple[StiffnessMap, ...]:
@@ -114,7 +114,7 @@ def _map(inversion: Inversion, number: int, block: Block, variances: NDArray[np.
     seen = model.material.fields[elements][:, first : first + block.size].toarray()
     theta, n = parameters.tissues.index(block.of), parameters.n_parameters
     covariance = covariance_among(objective, minimum.evaluation, np.array([theta, *own]))
-    learned = np.linalg.inv(parameters.nuisance_precision[np.ix_(own - n, own - n)])
+    learned = np.asarray(np.linalg.inv(parameters.nuisance_precision[np.ix_(own - n, own - n)]), dtype=np.float64)
     stated = mesh.tissues[tissue].field
     assert stated is not None
     amplitude = float(np.sqrt(np.trace(learned) / np.trace(np.linalg.inv(block.precision))))
