@@ -13,9 +13,9 @@ from palpate.mechanics.hyperelastic import Elements, Moduli
 from palpate.mesh.gaussian_process import karhunen_loeve
 from palpate.mesh.tet_mesh import TetMesh
 
-__all__ = ["HOMOGENEOUS", "MaterialModes", "material_forces", "material_modes"]
+__all__ = ["HOMOGENEOUS", "SHARE_OF_MAP", "MaterialModes", "material_forces", "material_modes"]
 
-SHARE = 0.95  # of the variance of a tissue's ln E that its modes hold
+SHARE, SHARE_OF_MAP = 0.95, 0.9995  # of the variance of a tissue's ln E that its modes hold, and of one that is mapped
 MOST, MOST_OF_MAP = 120, 400  # modes of a tissue, and of one that is mapped
 
 
@@ -71,8 +71,10 @@ def material_modes(
         own = np.flatnonzero(mesh.region == tissue)
         volumes = mesh.volumes[own]
         prior = mesh.tissues[tissue].field
-        length, most = (length_mm, MOST) if prior is None else (prior.length_mm, MOST_OF_MAP)
-        local = karhunen_loeve(centres[own], volumes, kernel_mm=length, share=SHARE, most=most)
+        length, share, most = (
+            (length_mm, SHARE, MOST) if prior is None else (prior.length_mm, SHARE_OF_MAP, MOST_OF_MAP)
+        )
+        local = karhunen_loeve(centres[own], volumes, kernel_mm=length, share=share, most=most)
         local = local - (volumes @ local) / volumes.sum()
         rows, columns = np.repeat(own, local.shape[1]), np.tile(np.arange(local.shape[1]), len(own))
         found.append(sparse.csr_matrix((local.ravel(), (rows, columns)), shape=(len(mesh.tets), local.shape[1])))

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.stats import norm
 
 from palpate.inversion import FIELD, Acts, Block, Inversion
-from palpate.mechanics.material import SHARE, material_modes
+from palpate.mechanics.material import SHARE_OF_MAP, material_modes
 from palpate.mesh.tet_mesh import FACES, TetMesh
 from palpate.uncertainty.covariance import covariance_among
 from palpate.uncertainty.intervals import NORMAL_95, Interval
@@ -121,7 +121,7 @@ def _map(inversion: Inversion, number: int, block: Block, variances: NDArray[np.
     sd = amplitude * stated.sd
     every = sd * material_modes(mesh, (tissue,), length_mm=stated.length_mm).fields[elements].toarray()
     mean = seen @ minimum.unknowns[own]
-    field = _Field(mean, seen, covariance[1:, 1:], learned, every, (1.0 - SHARE) * sd**2)
+    field = _Field(mean, seen, covariance[1:, 1:], learned, every, (1.0 - SHARE_OF_MAP) * sd**2)
     whole = field.variance + variances[theta] + 2.0 * seen @ covariance[1:, 0]
     resolution = np.clip(1.0 - field.variance / field.prior_variance, 0.0, 1.0)
     return StiffnessMap(
