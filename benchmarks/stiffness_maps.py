@@ -56,7 +56,7 @@ from palpate.study import (
     inversion_settings,
     make_body,
 )
-from palpate.uncertainty import NORMAL_95, sandwich_covariance, stiffness_maps
+from palpate.uncertainty import NORMAL_95, Interval, sandwich_covariance, stiffness_maps
 
 Array = NDArray[np.float64]
 
@@ -165,7 +165,7 @@ def _estimated(truth: _Truth, sd_mm: float, edge_mm: float, draw: int) -> dict[s
         "probability": region and round(region.probability, 4),
         "off_mm": region and round(float(np.linalg.norm(region.centre_mm - centre)), 2),
         "volume_ml": region and round(region.volume_ml, 2),
-        "region_contrast": region and [region.contrast, *region.interval95],
+        "region_contrast": region and [round(v, 2) for v in (region.contrast, *_numbers(region.interval95))],
         "in_ball": [round(float(found.log_ratio[organ & near].mean()), 2), round(float(found.sd[near].mean()), 2)],
         "resolved": round(found.resolved, 3),
         "prior_sd": round(found.prior_sd, 3),
@@ -198,6 +198,10 @@ def _field(
     file = DataFile("field", "displacement-field", (Path("simulated.csv"),), 1, sd_mm, correlation_mm=ALIKE_MM)
     table = PointTable(places, places + moved, ("",) * len(places), ())
     return DisplacementField(file, table).on(space, _none)[0], len(places), limit
+
+
+def _numbers(interval: Interval) -> tuple[float, ...]:
+    return tuple(np.nan if end is None else end for end in interval)
 
 
 def _none(name: str, direction: Array) -> NoReturn:

@@ -26,7 +26,7 @@ class Outcome:
 
 
 def estimates_table(document: Mapping[str, Any]) -> str:
-    """The estimates of a result as aligned columns, with its note."""
+    """The estimates of a result as aligned columns, what its maps say, and its note."""
     from palpate.report.rows import interval_text, moduli_in, number, ratio_rows
 
     rows = [["tissue", "Young's modulus", "95 % interval", "ratio", "verdict", "truth"]]
@@ -52,8 +52,9 @@ def estimates_table(document: Mapping[str, Any]) -> str:
         rows = [row[:-1] for row in rows]
     ratios = [[row.tissue, row.value, row.interval, row.verdict] for row in ratio_rows(document)]
     more = [columns([["tissue", "Poisson's ratio", "95 % interval", "verdict"], *ratios])] if ratios else []
+    maps = [item["words"] for item in document.get("maps", ())]
     note = [document["note"]] if document.get("note") else []
-    return "\n".join([columns(rows), *more, *note])
+    return "\n".join([columns(rows), *more, *maps, *note])
 
 
 def listed(outputs: OutputFolder) -> str:

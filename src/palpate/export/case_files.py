@@ -66,10 +66,10 @@ def _write_fitted(
     path: Path, result: CaseResult, pair: int, space: LagrangeSpace, displacements: tuple[NDArray[np.float64], ...]
 ) -> None:
     """The mesh of a pair with the moduli of the result and the last of its displacements."""
-    stiffness, sd = result.stiffness_map(pair)
+    stiffness, sd, resolution = result.stiffness_map(pair)
     extra = {} if result.unit == "kPa" else {"youngs_modulus_ratio": stiffness}
     if result.estimation.maps:
-        extra["ln_modulus_sd"] = sd
+        extra |= {"ln_modulus_sd": sd, "resolution": resolution}
     last = displacements[-1] if displacements else np.zeros_like(space.points)
     kilopascals = stiffness if result.unit == "kPa" else np.full_like(stiffness, np.nan)
     cells = _cell_data(space.mesh, kilopascals) | extra

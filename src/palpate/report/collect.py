@@ -33,8 +33,10 @@ from palpate.report.report_data import (
     ReportData,
     ReportTissue,
     SliceBox,
+    TissueMap,
     TriangleSurface,
 )
+from palpate.report.stiffness_maps import tissue_maps
 from palpate.report.surfaces import MOST_TRIANGLES, carried_outline, contour_width, image_surface, model_surface
 from palpate.study.case import Case, CaseLoad
 from palpate.study.case_data import CaseData
@@ -53,6 +55,7 @@ SHOWN = (*MOVING, Role.RIGID)
 RIGID_TRIANGLES = 12_000
 ALL_TRIANGLES = 300_000  # of all surfaces of the images, so that the page stays small
 NONE: tuple[TriangleSurface, ...] = ()
+NO_MAPS: tuple[TissueMap, ...] = ()
 NOT_MEASURED: tuple[MeasuredState, ...] = ()
 
 
@@ -122,6 +125,7 @@ def collect(result: CaseResult) -> ReportData:
         later=later,
         measured=measured,
         mesh=mesh,
+        maps=attempt.part("maps", lambda: tissue_maps(result), NO_MAPS),
         missing=attempt.missing,
     )
 

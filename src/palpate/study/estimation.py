@@ -39,9 +39,9 @@ from palpate.study.estimate_findings import (
     data_findings,
     fold_findings,
     inversion_findings,
-    map_findings,
     pair_findings,
 )
+from palpate.study.map_words import map_findings
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio, ratio_verdict
 from palpate.study.samples import CHAINS, ModulusSamples, draw_moduli, sample_findings
 from palpate.study.together import ImagePairs, ModulusRegion, combinations_of, image_pairs_of, regions_of
