@@ -191,7 +191,7 @@ def _field(
     places = np.stack(lattice, axis=-1).reshape(-1, 3)
     places = places[located(space.mesh, places).inside & located(scene.mesh, places).inside]
     at = point_interpolation(scene.space, located(scene.mesh, places))
-    moved, by_ball = at @ scene.displacement, at @ (scene.displacement - truth.without)
+    moved, by_ball = (np.asarray(at @ of) for of in (scene.displacement, scene.displacement - truth.without))
     root = np.linalg.cholesky(correlation(cdist(places, places), ALIKE_MM) + 1e-9 * np.eye(len(places)))
     limit = float(np.linalg.norm(linalg.solve_triangular(root, by_ball, lower=True))) / sd_mm
     moved = moved + sd_mm * root @ rng.normal(size=(len(places), 3))

@@ -190,5 +190,5 @@ def _body(
         pair.before.index,
         pair.before.grid,
         loads or ((),),
-        material and material.log_ratio,
+        None if material is None else material.log_ratio,
     )

@@ -103,9 +103,9 @@ def map_svg(data: ReportData, of: TissueMap, *, name: str) -> str:
 def _slice(axes: Axes, plane: Plane, cut: MapSlice, values: NDArray[np.float32], scale: Scale) -> None:
     across, up = plane.axes
     shades = np.ma.masked_invalid(values.astype(np.float64))
-    limits = {"norm": LogNorm(scale.low, scale.high), "cmap": scale.name}
     extent = (float(across[0]), float(across[-1]), float(up[0]), float(up[-1]))
-    axes.imshow(shades, extent=extent, origin="lower", interpolation="none", **limits)
+    limits = LogNorm(scale.low, scale.high)
+    axes.imshow(shades, extent=extent, origin="lower", interpolation="none", norm=limits, cmap=scale.name)
     blind = np.where(np.isfinite(cut.resolution), cut.resolution < RESOLVED, False).astype(np.float64)
     if blind.any():
         drawn = axes.contourf(across, up, blind, levels=[0.5, 1.5], colors="none", hatches=["////"])
