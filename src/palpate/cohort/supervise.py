@@ -153,7 +153,7 @@ class _Watch:
             if pid:
                 self.ended = self.process.returncode = os.waitstatus_to_exitcode(status)
                 most = round(usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9, 3)
-                if most > self.before_gb:
+                if self.working and most > self.before_gb:
                     self.peak_gb = max(self.peak_gb, most)
 
     def verdict(self) -> Outcome:
