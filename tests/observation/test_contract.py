@@ -119,6 +119,9 @@ class Spring:
         slope = moduli.sum() * np.eye(len(displacement))[2] - moduli.sum() * np.eye(len(displacement))[5]
         return moduli.sum() * stretch, slope, np.concatenate([moduli * stretch, 0.0 * coefficients])
 
+    def by_poisson(self, displacement, moduli, _coefficients):
+        return 2.0 * moduli * (displacement[2] - displacement[5])
+
 
 def of_force(_sphere, _point_motion):
     noise = NoiseModel(np.array([0.04]), np.array([1e-3]))

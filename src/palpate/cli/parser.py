@@ -33,6 +33,10 @@ EXAMPLES = {
         "palpate noise a.nii.gz b.nii.gz",
         "palpate noise a.nii.gz b.nii.gz --labels names.json --json",
     ),
+    "voxelise": (
+        "palpate voxelise before/prostate.stl before/bladder.stl --spacing 1 --output before",
+        "palpate voxelise after/prostate.stl after/bladder.stl --like before/surfaces.nii.gz --output after",
+    ),
     "mesh": ("palpate mesh case/case.toml --output mesh", "palpate mesh case/case.toml --set mesh.edge_length_mm=6"),
     "simulate": (
         "palpate simulate case/case.toml --output later",
@@ -127,7 +131,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def _add_preparations(subparsers: Any) -> None:
-    """What makes, checks and tries a case: init, check, noise, mesh, simulate."""
+    """What makes, checks and tries a case: init, check, noise, voxelise, mesh, simulate."""
     what = "write a case.toml for images, roles guessed from names"
     init = _command(subparsers, "init", commands.init, what=what)
     init.add_argument("images", type=Path, nargs="+", metavar="IMAGE", help="label images: before, then after ...")
@@ -145,6 +149,17 @@ def _add_preparations(subparsers: Any) -> None:
     noise.add_argument("--labels", type=Path, metavar="TABLE", help="label table: which number is which organ")
     what = "bring B to A first; default: on all surfaces where their grids differ"
     noise.add_argument("--align", choices=("auto", "surfaces", "none"), default="auto", help=what)
+    what = "make a label image of closed surfaces (STL), one an organ, called as its file is"
+    voxelise = _command(subparsers, "voxelise", commands.voxelise, what=what)
+    voxelise.add_argument("surfaces", type=Path, nargs="+", metavar="SURFACE.STL", help="closed surfaces of one state")
+    what = "edge of the voxels, mm; default: %(default)s"
+    voxelise.add_argument("--spacing", type=_positive, default=1.0, metavar="MM", help=what)
+    what = "how far the image reaches beyond the surfaces, mm; default: %(default)s"
+    voxelise.add_argument("--margin", type=_positive, default=30.0, metavar="MM", help=what)
+    what = "of files that do not say; default: %(default)s"
+    voxelise.add_argument("--axes", choices=("RAS", "LPS"), default="RAS", help=what)
+    voxelise.add_argument("--like", type=Path, metavar="IMAGE", help="take this image's grid: the first state's")
+    voxelise.set_defaults(targets=commands.SURFACE_TARGETS)
     mesh = _command(subparsers, "mesh", commands.mesh, what="make the tetrahedra of a case and write them")
     _add_case(mesh)
     mesh.set_defaults(targets=commands.MESH_TARGETS)

@@ -39,6 +39,7 @@ SMOOTH = 4.0  # mm: errors that are correlated over less are hardly taken for mo
 WITHIN = 0.75  # correlation lengths: errors so near are summed before a fit answers to them
 RESPONSE_CELLS = 800  # of a surface, on which what a fit leaves is seen
 NEIGHBOURS = 12
+AT_ONCE = 256  # means whose neighbours' distances are taken at once: some 40 MB
 GROWTH = 1.15  # of the number of points from block to block
 LEAST = 1e-3  # variance of what the neighbours leave open, over its own
 
@@ -332,9 +333,7 @@ def whitener(groups: NDArray[np.float64], length: float) -> sparse.csr_matrix[np
             tree = cKDTree(centres[order[:start]])
             near = order[:start][tree.query(centres[block], k=k)[1].reshape(len(block), k)]
         together = np.concatenate([near, block[:, None]], axis=1)
-        points = groups[together]
-        apart = np.linalg.norm(points[:, :, None, :, None] - points[:, None, :, None, :], axis=-1)
-        covariance = correlation(apart, length).mean(axis=(3, 4))
+        covariance = np.concatenate([_covariance(groups[part], length) for part in _parts(together)])
         across, own = covariance[:, :k, k:], covariance[:, k, k]
         weights = np.linalg.solve(covariance[:, :k, :k] + 1e-10 * np.eye(k), across)[:, :, 0]
         left = np.maximum(own - np.einsum("nk,nk->n", weights, across[:, :, 0]), LEAST * own)
@@ -345,3 +344,24 @@ def whitener(groups: NDArray[np.float64], length: float) -> sparse.csr_matrix[np
         start = end
     entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
     return sparse.csr_matrix(entries, shape=(n, n))
+
+
+def _parts(together: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Rows (n, k) of numbers in parts of at most `AT_ONCE` rows: the distances of all at once would take gigabytes."""
+    return [together[start : start + AT_ONCE] for start in range(0, len(together), AT_ONCE)]
+
+
+def _covariance(points: NDArray[np.float64], length: float) -> NDArray[np.float64]:
+    """Covariance (n, k, k) of the means of groups of points (n, k, m, 3) mm whose errors have the variance 1.
+
+    Squared distances are |x|^2 + |y|^2 - 2 x.y about the middle of the points.
+    """
+    n, k, m, _ = points.shape
+    flat = points.reshape(n, k * m, 3)
+    flat = flat - flat.mean(axis=1, keepdims=True)
+    squares = np.einsum("npi,npi->np", flat, flat)
+    apart = squares[:, :, None] + squares[:, None, :] - 2.0 * flat @ np.swapaxes(flat, 1, 2)
+    same = np.arange(k * m)
+    apart[:, same, same] = 0.0
+    distance = np.sqrt(np.maximum(apart, 0.0))
+    return np.asarray(correlation(distance, length).reshape(n, k, m, k, m).mean(axis=(2, 4)))

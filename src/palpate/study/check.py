@@ -23,6 +23,7 @@ from palpate.progress import Progress
 from palpate.study.body import Body, ImagedStates, brought, make_body
 from palpate.study.case import Case
 from palpate.study.case_file import read_case
+from palpate.study.case_loads import load_warnings
 from palpate.study.contacts import every_finding
 from palpate.study.cost import (
     LESS_MEMORY,
@@ -197,7 +198,7 @@ def _checked(case: Case, problems: _Problems, progress: Progress) -> CheckReport
     """The report of a case, with the problems that were found before it."""
     problems.attempt(lambda: refuse_what_cannot_be_estimated(case))
     problems.attempt(lambda: require_samples(case))
-    problems.warn(unit_warnings(case))
+    problems.warn((*unit_warnings(case), *load_warnings(case)))
     progress("reading the images")
     whole = case.phantom is not None or case.body is not None  # nothing to read one by one
     states = problems.attempt(lambda: read_states(case, progress=progress)) if whole else None
