@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import palpate.observation
-from palpate.experiments.verification.structured_meshes import box_mesh
 from palpate.images.distance import distance_map
 from palpate.images.label_image import VoxelGrid
 from palpate.mesh.locate import located
@@ -25,6 +24,7 @@ from palpate.observation.robust_loss import Tukey
 from palpate.observation.surface_distance import SurfaceDistance, surface_distance
 from palpate.observation.target import surface_target, target_from
 from palpate.phantoms.shapes import Ellipsoid, rotation_about
+from palpate_validation.structured_meshes import box_mesh
 
 MEMBERS = [name for name in vars(Observation) if not name.startswith("_")]
 STEPS = np.array([1e-2, 1e-3, 1e-4])

@@ -10,7 +10,6 @@ import pytest
 import SimpleITK
 
 from palpate.errors import InputDataError
-from palpate.experiments.verification.structured_meshes import box_mesh
 from palpate.images.alignment import RigidMotion
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers.nifti import write_displacement_field
@@ -20,6 +19,7 @@ from palpate.mesh.space import lagrange_space
 from palpate.observation.contract import DataFile
 from palpate.observation.displacement_field import read_displacement_field
 from palpate.observation.landmarks import read_landmarks
+from palpate_validation.structured_meshes import box_mesh
 
 LPS = np.array([-1.0, -1.0, 1.0])
 MOTION = np.array([[0.0, 0.1, 0.0], [-0.1, 0.0, 0.02], [0.0, -0.02, 0.0]])

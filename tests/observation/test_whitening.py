@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.observation.whitening import NEIGHBOURS, correlation, whitener
+from palpate.observation.noise_model import NEIGHBOURS, correlation, whitener
 
 
 def covariance_of(groups, length):
@@ -52,7 +52,7 @@ def test_its_size_grows_with_the_number_of_points():
 
 def test_it_is_the_same_however_many_means_are_looked_at_at_once(groups, monkeypatch):
     at_once = whitener(groups, 5.0)
-    monkeypatch.setattr("palpate.observation.whitening.AT_ONCE", 7)
+    monkeypatch.setattr("palpate.observation.noise_model.AT_ONCE", 7)
     assert abs(whitener(groups, 5.0) - at_once).max() < 1e-12
 
 

@@ -15,7 +15,7 @@ from palpate.observation.contract import Residuals, Weighting
 from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.robust_loss import Tukey
-from palpate.phantoms.boundary_noise import smooth_field
+from palpate.phantoms.motion import smooth_field
 from palpate.uncertainty import NORMAL_95, FittedState, gain, sandwich_covariance
 from palpate.uncertainty.covariance import (
     added_by,

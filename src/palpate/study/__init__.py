@@ -21,9 +21,8 @@ if TYPE_CHECKING:
         stated_posteriors,
         verdict,
     )
-    from palpate.study.journal import recover
     from palpate.study.lock import held_folder, own_file
-    from palpate.study.outputs import make_folder, read_json, staged, write_json, write_text
+    from palpate.study.outputs import make_folder, read_json, recover, staged, write_json, write_text
     from palpate.study.provenance import software_versions
     from palpate.study.read import read_states
     from palpate.study.result import CaseResult, failure_document
@@ -43,6 +42,7 @@ __all__ = [
     "Mechanics",
     "MeshSettings",
     "Observed",
+    "OutputFolder",
     "Phantom",
     "aligned",
     "conclude",
@@ -89,6 +89,7 @@ _HOMES = {
     "Mechanics": "palpate.study.case",
     "MeshSettings": "palpate.study.case",
     "Observed": "palpate.study.estimation",
+    "OutputFolder": "palpate.study.outputs",
     "Phantom": "palpate.study.case",
     "aligned": "palpate.study.body",
     "conclude": "palpate.study.estimation",
@@ -111,7 +112,7 @@ _HOMES = {
     "read_case": "palpate.study.case_file",
     "read_json": "palpate.study.outputs",
     "read_states": "palpate.study.read",
-    "recover": "palpate.study.journal",
+    "recover": "palpate.study.outputs",
     "released_of": "palpate.study.estimation",
     "software_versions": "palpate.study.provenance",
     "staged": "palpate.study.outputs",

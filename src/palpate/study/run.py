@@ -26,11 +26,10 @@ from palpate.study.plausibility import estimate_warnings, unit_warnings
 from palpate.study.poisson_ratios import with_found_ratios
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.read import read_pairs, read_states
+from palpate.study.refusals import linear_strain_warnings
 from palpate.study.result import CaseResult, MeshResult, PairResult, Provenance, image_names
 from palpate.study.samples import require_samples
-from palpate.study.simulate import simulate
-from palpate.study.strain_range import linear_strain_warnings
-from palpate.study.summary import mesh_summary
+from palpate.study.simulate import mesh_summary, simulate
 from palpate.study.variations import Variation, voxel_mm, what_would_change
 from palpate.uncertainty import FittedState
 

@@ -8,7 +8,6 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-
 from scipy.spatial import ConvexHull
 
 from palpate.inversion import Bounds, Inversion, LeastSquares, Minimum, OuterIterate

@@ -23,8 +23,7 @@ from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.linear_model import LinearEquilibrium, poisson_tangents
 from palpate.mechanics.newton import NewtonSettings
 from palpate.observation.contract import Imaged, OfMaterial
-from palpate.uncertainty.profile import FixedCorrespondence, fixed_correspondence
-from palpate.uncertainty.refit import refitted
+from palpate.uncertainty.profile import PASSES, FixedCorrespondence, fixed_correspondence, refitted
 
 __all__ = [
     "Equilibria",
@@ -68,13 +67,13 @@ class FastPath:
     least: Minimum
     bounds: Bounds
 
-    def under(self, errors: Errors) -> Shift:
+    def under(self, errors: Errors, *, passes: int = PASSES) -> Shift:
         """Where the estimate goes when the residuals of each observation change by e (n,) mm, weights and all.
 
-        Raises `EstimationError`, `SolverError` as `refitted`.
+        passes: see `refitted`, which also tells what is raised.
         """
         moved = replace(self.least, evaluation=replace(self.least.evaluation, lines=self._moved(errors)))
-        return self._shift(refitted(self.fixed.objective, moved, self.bounds, max_steps=STEPS)[0])
+        return self._shift(refitted(self.fixed.objective, moved, self.bounds, max_steps=STEPS, passes=passes)[0])
 
     def shift(self, errors: Errors = (), *, width: float = 1.0, dropped: NDArray[np.bool_] | None = None) -> Shift:
         """Where it goes under its own weights: with other residuals, another prior of the drivers, fewer modes.
