@@ -34,7 +34,7 @@ class Role(StrEnum):
 class FieldPrior:
     """What is believed of ln E inside a tissue whose modulus is a field.
 
-    sd: standard deviation, dimensionless; length_mm: of its Gaussian kernel exp(-d^2 / (2 length_mm^2)), mm.
+    sd: standard deviation, dimensionless; length_mm: of its kernel, Matern's with one derivative, mm.
     """
 
     sd: float

@@ -30,9 +30,11 @@ from palpate.report.report_data import (
     Reference,
     ReportData,
     ReportTissue,
+    TissueMap,
     TriangleSurface,
 )
 from palpate.report.slice_box import MOVING, slice_box
+from palpate.report.stiffness_maps import tissue_maps
 from palpate.report.surfaces import MOST_TRIANGLES, carried_outline, contour_width, image_surface, model_surface
 from palpate.study.case import Case, CaseLoad
 from palpate.study.case_data import CaseData
@@ -48,6 +50,7 @@ SHOWN = (*MOVING, Role.RIGID)
 RIGID_TRIANGLES = 12_000
 ALL_TRIANGLES = 300_000  # of all surfaces of the images, so that the page stays small
 NONE: tuple[TriangleSurface, ...] = ()
+NO_MAPS: tuple[TissueMap, ...] = ()
 NOT_MEASURED: tuple[MeasuredState, ...] = ()
 
 
@@ -117,6 +120,7 @@ def collect(result: CaseResult) -> ReportData:
         later=later,
         measured=measured,
         mesh=mesh,
+        maps=attempt.part("maps", lambda: tissue_maps(result), NO_MAPS),
         missing=attempt.missing,
     )
 

@@ -43,9 +43,10 @@ from palpate.uncertainty.sensitivity import (
     surface_errors,
 )
 from palpate.uncertainty.sobol import SobolIndices, require_salib, sobol_indices
-from palpate.uncertainty.stiffness_map import DifferentRegion, StiffnessMap, stiffness_maps
+from palpate.uncertainty.stiffness_map import CONTRAST, DifferentRegion, StiffnessMap, stiffness_maps
 
 __all__ = [
+    "CONTRAST",
     "GRID_DRAWS",
     "NORMAL_95",
     "Agreement",
