@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from palpate.inversion import KNOWN_MODULUS
+from palpate.inversion import FIELD, KNOWN_MODULUS
 from palpate.uncertainty import Interval
 
 __all__ = ["NONE", "Bar", "EstimateRow", "estimate_rows", "interval_text", "main_numbers", "number", "scale_marks"]
@@ -21,6 +21,7 @@ CAUSES = {
     "frame": "the frame's motion",
     "offset": "how surfaces are drawn",
     "heterogeneity": "tissues that are not homogeneous",
+    FIELD: "what is mapped",
     "poisson": "Poisson's ratios",
     "instrument": "the instruments' offsets",
     KNOWN_MODULUS: "the range of the known modulus",
