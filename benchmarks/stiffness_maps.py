@@ -41,7 +41,6 @@ from palpate.phantoms import (
     Scene,
     displacements,
     imaged,
-    patched,
     pelvis_anatomy,
     pelvis_grid,
     pelvis_motions,
@@ -57,6 +56,7 @@ from palpate.study import (
     make_body,
 )
 from palpate.uncertainty import NORMAL_95, Interval, sandwich_covariance, stiffness_maps
+from palpate_validation.mismatch import patched
 
 Array = NDArray[np.float64]
 
