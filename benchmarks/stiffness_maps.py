@@ -36,7 +36,6 @@ from palpate.phantoms import (
     Scene,
     displacements,
     imaged,
-    patched,
     pelvis_anatomy,
     pelvis_grid,
     pelvis_motions,
@@ -52,6 +51,7 @@ from palpate.study import (
     make_body,
 )
 from palpate.uncertainty import NORMAL_95, sandwich_covariance, stiffness_maps
+from palpate_validation.mismatch import patched
 
 Array = NDArray[np.float64]
 

@@ -252,11 +252,6 @@ class FiniteStrainEquilibrium:
         return SolveCounts(tangent=n, factorisations=int(self._many(n)))
 
     @property
-    def adjoint_counts(self) -> SolveCounts:
-        """One right-hand side."""
-        return SolveCounts(adjoint=1, factorisations=int(self._many(1)))
-
-    @property
     def factorisation(self) -> Factorisation | None:
         """The last factorisation, of a tangent stiffness near this state's: for `nearby` of another solve."""
         return self.path.factorisation

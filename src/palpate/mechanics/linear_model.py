@@ -330,11 +330,6 @@ class LinearEquilibrium:
         """One right-hand side a modulus and a mode."""
         return SolveCounts(tangent=self.system.model.n_regions + self.system.model.n_modes)
 
-    @property
-    def adjoint_counts(self) -> SolveCounts:
-        """One right-hand side."""
-        return SolveCounts(adjoint=1)
-
     def tangent(self) -> NDArray[np.float64]:
         """T (n_dof, n_regions + n_modes), mm: columns du / d ln E_r = -F K_ff^-1 F^T E_r K_r u, then du / dq_k."""
         constraint = self.system.model.constraint

@@ -19,7 +19,7 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.case import Case, CaseTissue
-from palpate.study.case_text import case_tables
+from palpate.study.case_file import case_tables
 from palpate.study.discrepancy import FoundDiscrepancy
 from palpate.study.estimation import Estimation, ModulusEstimate, TissueFit, no_estimate
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio

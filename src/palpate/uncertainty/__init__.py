@@ -16,14 +16,19 @@ from palpate.uncertainty.covariance import (
     sandwich_covariance,
 )
 from palpate.uncertainty.diagnostics import ChainDiagnostics, chain_diagnostics, require_arviz
-from palpate.uncertainty.discretisation import discretisation_sd
 from palpate.uncertainty.frozen_posterior import FrozenPosterior, frozen_posterior
 from palpate.uncertainty.image_pairs import Agreement, PairEstimates, agreement, pair_estimates
-from palpate.uncertainty.intervals import NORMAL_95, Interval, ModulusInterval, log_interval, modulus_interval
+from palpate.uncertainty.intervals import (
+    NORMAL_95,
+    Interval,
+    ModulusInterval,
+    discretisation_sd,
+    log_interval,
+    modulus_interval,
+)
 from palpate.uncertainty.joint_region import JointRegion, joint_region
-from palpate.uncertainty.profile import FixedCorrespondence, Profile, fixed_correspondence
-from palpate.uncertainty.refit import refitted
-from palpate.uncertainty.sampling import PosteriorChains, posterior_chains, sample_posterior
+from palpate.uncertainty.profile import FixedCorrespondence, Profile, fixed_correspondence, refitted
+from palpate.uncertainty.sampling import PosteriorChains, posterior_chains
 from palpate.uncertainty.sensitivity import (
     Equilibria,
     Errors,
@@ -92,7 +97,6 @@ __all__ = [
     "refitted",
     "require_arviz",
     "require_salib",
-    "sample_posterior",
     "sandwich_covariance",
     "sobol_indices",
     "stiffness_maps",

@@ -1,5 +1,9 @@
-"""Readers of image files and label tables, one file a format; importing this package registers them all."""
+"""Readers of image files and label tables, one file a format; importing this package registers them all.
 
+Other packages bring theirs as entry points `palpate.readers`, each an `ImageFormat`.
+"""
+
+from palpate.entry_points import brought
 from palpate.images.readers import (
     dicom,
     mask_folder,
@@ -14,9 +18,12 @@ from palpate.images.readers import (
 from palpate.images.readers.isolation import ReadLimits
 from palpate.images.readers.nifti import write_displacement_field, write_label_image, write_scalar_image
 from palpate.images.readers.read import read_intensities, read_label_image
+from palpate.images.readers.registry import ImageFormat, StoredImage, register
 
 __all__ = [
+    "ImageFormat",
     "ReadLimits",
+    "StoredImage",
     "dicom",
     "mask_folder",
     "metaimage",
@@ -32,3 +39,6 @@ __all__ = [
     "write_label_image",
     "write_scalar_image",
 ]
+
+for image_format in brought("palpate.readers", ImageFormat).values():
+    register(image_format)
