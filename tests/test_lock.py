@@ -27,7 +27,8 @@ def test_every_dependency_is_pinned_and_so_is_what_builds_the_wheel():
 
 
 def test_the_dockerfile_copies_what_the_build_reads():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    document = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    project, packages = document["project"], document["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]
     kept = set(re.findall(r"^!(\S+)$", (ROOT / ".dockerignore").read_text(encoding="utf-8"), flags=re.MULTILINE))
-    read = {project["readme"], *(name.partition("/")[0] for name in project["license-files"]), "requirements.lock"}
-    assert {"pyproject.toml", "src", *read} <= kept
+    read = {name.partition("/")[0] for name in (*project["license-files"], *packages)}
+    assert {"pyproject.toml", "requirements.lock", project["readme"], *read} <= kept
