@@ -107,7 +107,8 @@ minimum: install
 	$(BIN)/uv venv --clear --quiet --python $(PYTHON) build/minimum
 	$(BIN)/uv pip install --quiet --python build/minimum --resolution lowest-direct --editable ".[dev]"
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 build/minimum/bin/python -m pytest -n 2 \
-	  -W default::DeprecationWarning -W default::PendingDeprecationWarning $(addprefix tests/,$(MINIMUM))
+	  -W default::DeprecationWarning -W default::PendingDeprecationWarning $(addprefix tests/,$(MINIMUM)) \
+	  packages/multifrontal/tests
 
 # Every command that README and docs name, in its small form: some fifteen minutes; ends with the first that fails.
 commands: install

@@ -56,5 +56,6 @@ def test_every_file_of_the_package_is_in_the_wheel(unpacked):
 
     assert files(unpacked / "palpate") == files(ROOT / "src" / "palpate")
     assert files(unpacked / "palpate_validation") == files(ROOT / "validation" / "palpate_validation")
+    assert files(unpacked / "multifrontal") == files(ROOT / "packages" / "multifrontal" / "src" / "multifrontal")
     licences = {path.name for path in next(unpacked.glob("*.dist-info/licenses")).rglob("*") if path.is_file()}
     assert {"LICENSE", "NOTICE", "gel_beads.LICENSE.txt", "three.LICENSE.txt"} <= licences

@@ -33,14 +33,15 @@ SIMULATION_TARGETS = ("simulation.json", "mesh.vtu", "labels.csv", "mesh.pvd", "
 
 def init(arguments: argparse.Namespace, _: None, outputs: OutputFolder, progress: Progress) -> Outcome:
     """Write a case for images; an earlier case.toml is never replaced."""
-    from palpate.study.new_case import write_new_case
+    from palpate.steps.previewing import PREVIEW, new_case_with_page
 
     progress("reading the images")
-    case = write_new_case(arguments.images, arguments.labels, outputs, cts=arguments.ct)
+    case = new_case_with_page(arguments.images, arguments.labels, outputs, cts=arguments.ct, progress=progress)
     rows = [["tissue", "role", "why"]]
     rows += [[tissue.name, str(tissue.role or "?"), tissue.reason] for tissue in case.tissues]
     questions = "".join(f"question: {question}\n" for question in case.questions)
-    text = f"{columns(rows)}\n{questions}written to {case.path}; read it, correct it, then: palpate check {case.path}"
+    page = f"look at {outputs.path / PREVIEW}, " if PREVIEW in outputs.written else ""
+    text = f"{columns(rows)}\n{questions}written to {case.path}; {page}correct it, then: palpate check {case.path}"
     return Outcome(case.to_dict() | {"case": str(case.path)}, text)
 
 
@@ -48,11 +49,12 @@ def check(arguments: argparse.Namespace, _: None, outputs: None, progress: Progr
     """List every problem of a case."""
     from palpate.steps import commands
 
-    del outputs  # it writes nothing
-    found = commands.check(arguments.case_file, arguments.set, progress=progress)
+    del outputs  # it has no folder
+    found = commands.check(arguments.case_file, arguments.set, html=arguments.html, progress=progress)
     refused = "\n".join(problem.message for problem in found.problems if problem.exit_code)
     complaint = refused if arguments.quiet else ""  # what is refused is said even then, as by any other command
-    return Outcome(found.to_dict(), found.text(), found.exit_code, complaint)
+    shown = f"\nwritten to {arguments.html}" if arguments.html else ""
+    return Outcome(found.to_dict(), f"{found.text()}{shown}", found.exit_code, complaint)
 
 
 def noise(arguments: argparse.Namespace, _: None, outputs: None, progress: Progress) -> Outcome:

@@ -28,7 +28,10 @@ EXAMPLES = {
         "palpate init before.nii.gz after.nii.gz --labels names.json --output case",
         "palpate init masks_before/ masks_after/ --output case",
     ),
-    "check": ("palpate check case/case.toml", "palpate check case/case.toml --set mesh.edge_length_mm=6 --json"),
+    "check": (
+        "palpate check case/case.toml --html preview.html",
+        "palpate check case/case.toml --set mesh.edge_length_mm=6 --json",
+    ),
     "noise": (
         "palpate noise a.nii.gz b.nii.gz",
         "palpate noise a.nii.gz b.nii.gz --labels names.json --json",
@@ -137,10 +140,12 @@ def _add_preparations(subparsers: Any) -> None:
     init.add_argument("images", type=Path, nargs="+", metavar="IMAGE", help="label images: before, then after ...")
     init.add_argument("--labels", type=Path, metavar="TABLE", help="label table: which number is which organ")
     _add_ct(init)
-    init.set_defaults(logs=False, targets=("case.toml",))
+    init.set_defaults(logs=False, targets=("case.toml", "preview.html"))
     what = "list every problem of a case without computing"
     check = _command(subparsers, "check", commands.check, what=what, folder=None)
     check.add_argument("case_file", type=Path, metavar="CASE.TOML", help=CASE_HELP)
+    what = "write a page that shows who is who, how the images lie, what is held, and the intervals to expect"
+    check.add_argument("--html", type=Path, metavar="FILE", help=what)
     _add_set(check)
     what = "tell how well surfaces are drawn, from two segmentations of one state: [noise] and [discrepancy] of a case"
     noise = _command(subparsers, "noise", commands.noise, what=what, folder=None)
@@ -183,6 +188,8 @@ def _add_estimates(subparsers: Any) -> None:
     )
     estimate.add_argument("--labels", type=Path, metavar="TABLE", help="label table, with images")
     _add_ct(estimate)
+    what = "first write preview.html, which shows what will be estimated; costs another mesh"
+    estimate.add_argument("--preview", action="store_true", help=what)
     estimate.set_defaults(targets=written.TARGETS)
     _add_set(estimate)
     what = "keep N draws of the moduli's posterior in each of 4 chains, as posterior.nc (extra `samples`)"

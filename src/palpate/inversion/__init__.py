@@ -21,9 +21,11 @@ from palpate.inversion.estimate import (
     StartRun,
     as_good,
     continue_at_finite_strain,
+    first_noise_of,
     invert,
     with_released,
 )
+from palpate.inversion.evidence import with_learned_prior
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import Evaluation, Linearisation, LinearisedObjective, Objective
 from palpate.inversion.optimise import (
@@ -71,6 +73,7 @@ __all__ = [
     "continue_at_finite_strain",
     "eta_of_ratio",
     "exact_approximation",
+    "first_noise_of",
     "fit_coefficients",
     "fit_driver",
     "frame_blocks",
@@ -90,5 +93,6 @@ __all__ = [
     "unit_blocks",
     "wall_blocks",
     "with_first_noise",
+    "with_learned_prior",
     "with_released",
 ]

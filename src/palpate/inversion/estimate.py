@@ -39,7 +39,16 @@ from palpate.mechanics.forward import SolveCounts
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Progress, during
 
-__all__ = ["Candidate", "Inversion", "StartRun", "as_good", "continue_at_finite_strain", "invert", "with_released"]
+__all__ = [
+    "Candidate",
+    "Inversion",
+    "StartRun",
+    "as_good",
+    "continue_at_finite_strain",
+    "first_noise_of",
+    "invert",
+    "with_released",
+]
 
 OTHER = 1e-2  # decrement of minima that are compared: a two-hundredth of what tells them apart
 AS_GOOD = 1.92  # of minus the log-posterior: half the 95 % quantile of chi-squared with one degree of freedom
@@ -144,6 +153,22 @@ def invert(
     return continue_at_finite_strain(linear.pop(), settings, progress=there, rule=rule)  # which lets go of its bases
 
 
+@blas_on_one_thread()
+def first_noise_of(
+    problem: InverseProblem, settings: InversionSettings, *, progress: Progress
+) -> tuple[Objective, Minimum]:
+    """What an estimate begins with under the linear law: the objective under the noise that the images show, and where.
+
+    Its minimum is near the middle start, and no estimate: no start, robust weight or exact derivative was tried. Raises
+    as `invert` does.
+    """
+    middle = np.asarray(np.median(np.stack(settings.starts), axis=0))
+    begin = np.concatenate([middle, np.zeros(problem.parameters.n_coefficients)])
+    objective, unknowns, _ = _with_reduced_bases(problem.linear(), settings, begin, progress)
+    objective, _, _, nearby = _nearby(objective, unknowns, settings, progress)
+    return objective, nearby
+
+
 def continue_at_finite_strain(
     linear: Inversion, settings: InversionSettings, *, progress: Progress, rule: StopRule = REPORTED
 ) -> Inversion:
@@ -225,16 +250,8 @@ def _linear(
     begin (n_unknowns,): the middle start, with drivers' coefficients near the best ones there, and what it cost to find
     them in evaluations.
     """
-    still = np.zeros(objective.parameters.n_unknowns)
-    objective = with_first_noise(objective).rematched(still)
-    rest = objective(still)
-    fitted = fit_coefficients(objective, begin, bounds=settings.bounds, tolerance=TO_THE_NOISE)
-    objective = with_learned_prior(objective, fitted.evaluation, fitted.unknowns)
-    progress("the noise of the images, near the middle start")
-    nearby = gauss_newton(
-        objective.rematched(fitted.unknowns), fitted.unknowns, bounds=settings.bounds, tolerance=TO_THE_NOISE
-    )
-    objective, n = with_found_noise(objective, nearby), objective.n_parameters
+    objective, rest, fitted, nearby = _nearby(objective, begin, settings, progress)
+    n = objective.n_parameters
     minima = _from_starts(objective, settings, nearby.unknowns[n:], progress)
     first = _best(minima)
     start = [updated(objective, replace(minima[first], evaluations=0), rule)]
@@ -254,6 +271,25 @@ def _linear(
     of_first = followed[0].counts  # the others' approximations are this one's, extended
     spent = sum((other.counts - of_first for other in followed[1:]), of_first)
     return replace(concluded, evaluations=concluded.evaluations + evaluations, counts=spent)
+
+
+def _nearby(
+    objective: Objective, begin: NDArray[np.float64], settings: InversionSettings, progress: Progress
+) -> tuple[Objective, Evaluation, Minimum, Minimum]:
+    """The objective under the noise that images show near unknowns (n_unknowns,), and what it was found by.
+
+    That at no motion, the drivers' motion fitted at `begin`, and the minimum under the first noise.
+    """
+    still = np.zeros(objective.parameters.n_unknowns)
+    objective = with_first_noise(objective).rematched(still)
+    rest = objective(still)
+    fitted = fit_coefficients(objective, begin, bounds=settings.bounds, tolerance=TO_THE_NOISE)
+    objective = with_learned_prior(objective, fitted.evaluation, fitted.unknowns)
+    progress("the noise of the images, near the middle start")
+    nearby = gauss_newton(
+        objective.rematched(fitted.unknowns), fitted.unknowns, bounds=settings.bounds, tolerance=TO_THE_NOISE
+    )
+    return with_found_noise(objective, nearby), rest, fitted, nearby
 
 
 def _from_starts(

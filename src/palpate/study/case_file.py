@@ -18,11 +18,23 @@ from palpate.images.tissue import Role
 from palpate.study.case import POISSON_RATIO, RATIO_SD, Case, CaseTissue
 from palpate.study.schema import Rule, read_table, shortened
 
-__all__ = ["case_tables", "case_text", "read_case", "relative_path", "toml_key", "toml_text", "toml_value"]
+__all__ = [
+    "case_tables",
+    "case_text",
+    "lasting_path",
+    "read_case",
+    "relative_path",
+    "toml_key",
+    "toml_text",
+    "toml_value",
+]
 
 LARGEST_FILE = 100_000  # bytes; a case is a page of text, and one of a hundred tissues has 40 000
 MOST_DOTS = 100  # in a line: keys of thousands of parts would take the parser minutes
-HEADING = "# The case of the result beside it, as it was run: every setting is written out; paths begin at this file."
+HEADING = (
+    "# The case of the result beside it, as it was run: every setting is written out. Files outside of this folder are"
+    "\n# named by their whole paths, so that the folder may be moved."
+)
 
 
 def read_case(
@@ -133,7 +145,7 @@ def case_text(case: Case, folder: Path) -> str:
     """
     lines = [HEADING]
     lines += [f"# --set {printable(override)}" for override in case.overrides]
-    lines += ["", *_lines(case_tables(case, lambda path: relative_path(path, folder)), ())]
+    lines += ["", *_lines(case_tables(case, lambda path: lasting_path(path, folder)), ())]
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -215,6 +227,12 @@ def relative_path(path: Path, folder: Path) -> str:
     if relative.startswith("~"):  # a case's reader takes that for somebody's home
         relative = str(Path("..", real.name, relative))
     return Path(relative).as_posix()
+
+
+def lasting_path(path: Path, folder: Path) -> str:
+    """`path` as a case file in the folder names it that may be moved: whole, but for what lies in the folder itself."""
+    place = path.absolute().parent.resolve() / path.name
+    return relative_path(path, folder) if place.is_relative_to(folder.resolve()) else place.as_posix()
 
 
 def toml_value(value: str | bool | float | list[str] | list[float]) -> str:

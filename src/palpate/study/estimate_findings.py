@@ -13,14 +13,13 @@ from palpate.inversion import Inversion, Outcome
 from palpate.mechanics.deformation import deformation_determinants
 from palpate.observation.contract import Imaged, OfInstrument
 from palpate.study.together import ImagePairs
-from palpate.uncertainty import FittedState, StiffnessMap
+from palpate.uncertainty import FittedState
 
-__all__ = ["data_findings", "fold_findings", "inversion_findings", "map_findings", "pair_findings"]
+__all__ = ["data_findings", "fold_findings", "inversion_findings", "pair_findings"]
 
 STRONG_CORRELATION = 0.99
 HETEROGENEOUS = 0.01  # probability of such differences between image pairs that have the same moduli
 MISFIT = 1.5  # times the stated standard deviation: measurements that are not what they are said to be
-RESOLVED = 0.5  # share of the prior's variance that data must remove for a map to be theirs
 NOISIER, LEAST_IMAGES = 1.6, 3  # times the usual noise of so many later images: one is drawn badly
 
 
@@ -154,16 +153,3 @@ def fold_findings(states: Sequence[FittedState]) -> tuple[Finding, ...]:
                 )
             )
     return tuple(findings)
-
-
-def map_findings(maps: Sequence[StiffnessMap]) -> tuple[Finding, ...]:
-    """Of every map that shows what was believed rather than what was seen."""
-    return tuple(
-        Finding(
-            "map-of-prior",
-            f"the map of '{of.tissue}' is mostly what was believed of it: the data removed {of.resolved:.0%} of the"
-            " variance of ln E inside it; use the tissue's mean, or give a displacement field ([[data]])",
-        )
-        for of in maps
-        if of.resolved < RESOLVED
-    )

@@ -27,14 +27,20 @@ from palpate.inversion import (
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit, Imaged, OfInstrument, OfPoints, PointMotions
 from palpate.progress import Progress, silent
-from palpate.study.discrepancy import FoundDiscrepancy, discrepancy_findings, discrepancy_of
+from palpate.study.discrepancy import (
+    FittedMaterial,
+    FoundDiscrepancy,
+    discrepancy_findings,
+    discrepancy_of,
+    fitted_materials,
+)
 from palpate.study.estimate_findings import (
     data_findings,
     fold_findings,
     inversion_findings,
-    map_findings,
     pair_findings,
 )
+from palpate.study.map_words import map_findings
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio, ratio_verdict
 from palpate.study.samples import CHAINS, ModulusSamples, draw_moduli, sample_findings
 from palpate.study.together import ImagePairs, ModulusRegion, combinations_of, image_pairs_of, regions_of
@@ -186,7 +192,7 @@ class Estimation:
     known where single moduli are not; regions: joint ones of two moduli; forces, points: measured and fitted;
     image_pairs: what each of several later images says alone; samples: of the moduli's posterior,
     where the case asks for them and the estimate converged; variations: what would change the answer; maps: of tissues
-    whose modulus is a field.
+    whose modulus is a field; materials: of the elements, one a later state.
     """
 
     status: str
@@ -212,6 +218,7 @@ class Estimation:
     points: tuple[PointFit, ...] = ()
     variations: tuple[Variation, ...] = ()
     maps: tuple[StiffnessMap, ...] = ()
+    materials: tuple[FittedMaterial, ...] = ()
 
     @property
     def correlation(self) -> NDArray[np.float64]:
@@ -301,6 +308,7 @@ def conclude(
         image_pairs=pairs,
         samples=drawn,
         maps=maps,
+        materials=fitted_materials(inversion),
     )
 
 

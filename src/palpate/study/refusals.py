@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from palpate.errors import GeometryError, InputDataError, ResourceError
 from palpate.findings import Finding
+from palpate.images.checks import SMALL_VOXELS, VOLUME_IMPLAUSIBLE
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.mechanics.deformation import largest_strains
@@ -20,8 +21,6 @@ from palpate.study.cost import image_memory_gb, machine_memory_gb
 
 __all__ = ["LINEAR_RANGE", "linear_strain_warnings", "refuse_large", "refuse_lost", "refuse_unmeshable"]
 
-SMALLEST_VOXELS = 50
-VOLUME_IMPLAUSIBLE = 0.30  # of an organ: no deformation, and hardly a filling, changes so much
 ORGANS = (Role.ESTIMATE, Role.DRIVER)
 LINEAR_RANGE = 0.10  # principal strain: beyond it the squares that the linear law leaves out are tenths of it
 MOST_BEYOND = 0.01  # share of the meshed volume
@@ -37,9 +36,9 @@ def refuse_unmeshable(segmentation: Segmentation, name: str) -> None:
         if tissue.role not in ORGANS or not mask.any():
             continue
         count = int(np.count_nonzero(mask))
-        if count < SMALLEST_VOXELS:
+        if count < SMALL_VOXELS:
             raise GeometryError(
-                f"'{tissue.name}' has only {count} voxels in '{name}', and {SMALLEST_VOXELS} are the least that a"
+                f"'{tissue.name}' has only {count} voxels in '{name}', and {SMALL_VOXELS} are the least that a"
                 " surface can be made of: use finer images, or join it to its neighbour"
             )
         box = ndimage.find_objects(mask.astype(np.int8))[0]

@@ -20,8 +20,8 @@ from palpate.mechanics.equilibrium import equilibrium
 from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.loads import Load
 from palpate.mechanics.rest_state import unloaded_displacement
-from palpate.mesh.dihedral import tet_dihedrals
 from palpate.mesh.space import LagrangeSpace
+from palpate.mesh.tet_mesh import tet_dihedrals
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.phantoms.motion import wall_filling

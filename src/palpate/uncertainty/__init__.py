@@ -7,6 +7,7 @@ from palpate.uncertainty.covariance import (
     FittedState,
     GridErrors,
     covariance_of,
+    error_noise,
     gain,
     grid_errors,
     grid_position_shifts,
@@ -42,9 +43,10 @@ from palpate.uncertainty.sensitivity import (
     surface_errors,
 )
 from palpate.uncertainty.sobol import SobolIndices, require_salib, sobol_indices
-from palpate.uncertainty.stiffness_map import DifferentRegion, StiffnessMap, stiffness_maps
+from palpate.uncertainty.stiffness_map import CONTRAST, DifferentRegion, StiffnessMap, stiffness_maps
 
 __all__ = [
+    "CONTRAST",
     "GRID_DRAWS",
     "NORMAL_95",
     "Agreement",
@@ -73,6 +75,7 @@ __all__ = [
     "chain_diagnostics",
     "covariance_of",
     "discretisation_sd",
+    "error_noise",
     "exact_equilibria",
     "fast_path",
     "fixed_correspondence",

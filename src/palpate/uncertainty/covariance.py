@@ -137,19 +137,28 @@ def added_by(
 
 
 def covariance_of(
-    objective: Objective, evaluation: Evaluation, errors: GridErrors, *, unknowns: NDArray[np.float64]
+    objective: Objective,
+    evaluation: Evaluation,
+    errors: GridErrors,
+    *,
+    unknowns: NDArray[np.float64],
+    noise_of: Mapping[tuple[int, str], NoiseModel] | None = None,
 ) -> Covariance:
     """All that is known of the log-moduli's errors at unknowns (n_unknowns,).
 
     The sandwich, what is considered or undecided, the mesh, and what the scatter over grid positions, by the `errors`
-    there, adds (see `grid_covariance`).
+    there, adds (see `grid_covariance`); nothing of no errors. noise_of: the residuals' noise where it is not that of
+    the evaluation (see `error_noise`), whose residuals hold what wrong moduli leave.
     """
-    noise_of, mesh = error_noise(evaluation), mesh_covariance(objective)
+    noise_of = error_noise(evaluation) if noise_of is None else noise_of
+    mesh = mesh_covariance(objective)
     given = _given_model(objective, evaluation)
 
     def parts(of: Evaluation) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Covariances by noise, prior and grid of one set of unknowns."""
         noise, prior = _sandwich(objective, of, of.covariance_columns(objective.n_parameters).T, noise_of)
+        if not errors:
+            return noise, prior, np.zeros_like(noise)
         return noise, prior, grid_covariance(evaluation, scatter(shifts_by(of, errors, objective.n_parameters)), noise)
 
     noise, prior, grid = parts(evaluation)
