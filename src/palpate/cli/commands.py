@@ -1,4 +1,4 @@
-"""The sub-commands around an estimate: init, check, noise, mesh, simulate."""
+"""The sub-commands around an estimate: init, check, noise, voxelise, mesh, simulate."""
 
 from __future__ import annotations
 
@@ -12,11 +12,22 @@ if TYPE_CHECKING:
     from palpate.study.case import Case
     from palpate.study.outputs import OutputFolder
 
-__all__ = ["MESH_TARGETS", "SIMULATION_TARGETS", "check", "init", "mesh", "noise", "simulate"]
+__all__ = [
+    "MESH_TARGETS",
+    "SIMULATION_TARGETS",
+    "SURFACE_TARGETS",
+    "check",
+    "init",
+    "mesh",
+    "noise",
+    "simulate",
+    "voxelise",
+]
 
 Progress = Callable[[str], None]
 
 MESH_TARGETS = ("mesh.json", "mesh.vtu", "labels.csv", "labels.nii.gz")
+SURFACE_TARGETS = ("surfaces.nii.gz", "labels.json")
 SIMULATION_TARGETS = ("simulation.json", "mesh.vtu", "labels.csv", "mesh.pvd", "before.nii.gz", "after.nii.gz")
 
 
@@ -62,6 +73,31 @@ def noise(arguments: argparse.Namespace, _: None, outputs: None, progress: Progr
     document = found.to_dict()
     left = f"left out: {', '.join(found.left_out)}\n" if found.left_out else ""
     return Outcome(document, f"{columns(rows)}\n{left}{warning_lines(document)}\n{found.toml}")
+
+
+def voxelise(arguments: argparse.Namespace, _: None, outputs: OutputFolder, progress: Progress) -> Outcome:
+    """Make a label image of closed surfaces."""
+    from palpate.images.readers import write_label_image
+    from palpate.steps import commands
+    from palpate.study.outputs import write_json
+
+    found = commands.voxelise(
+        *arguments.surfaces,
+        spacing_mm=arguments.spacing,
+        margin_mm=arguments.margin,
+        axes=arguments.axes,
+        like=arguments.like,
+        progress=progress,
+    )
+    document = found.to_dict()
+    with outputs.staged() as staging:
+        write_label_image(staging.area / "surfaces.nii.gz", found.image)
+        write_json(staging.area / "labels.json", {"labels": document["labels"]})
+        staging.commit()
+    rows = [["label", "organ", "volume of the surface, ml", "of its voxels, ml"]]
+    for label, name in found.image.names.items():
+        rows.append([str(label), name, *(f"{volume / 1000.0:.4g}" for volume in found.volumes_mm3[name])])
+    return Outcome(document, f"{columns(rows)}\n{warning_lines(document)}{listed(outputs)}")
 
 
 def mesh(_: argparse.Namespace, case: Case, outputs: OutputFolder, progress: Progress) -> Outcome:

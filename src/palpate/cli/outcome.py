@@ -32,7 +32,7 @@ class Outcome:
 
 
 def estimates_table(document: Mapping[str, Any]) -> str:
-    """The estimates of a result as aligned columns, with its note."""
+    """The estimates of a result as aligned columns, what its maps say, and its note."""
     from palpate.report.rows import NONE, expected_share, interval_text, main_numbers, moduli_in, number, ratio_rows
 
     rows = [["tissue", "Young's modulus", "95 % interval", "ratio", "verdict", "truth"]]
@@ -65,8 +65,9 @@ def estimates_table(document: Mapping[str, Any]) -> str:
             error = f"{100.0 * (found / item['truth'] - 1.0):+.0f} %"
             far.append(f"{item['tissue']} {error} ({share} of such estimates are off as far or further)")
     more += [f"error, and how often it is as large by the interval: {', '.join(far)}"] if far else []
+    maps = [item["words"] for item in document.get("maps", ())]
     note = [document["note"]] if document.get("note") else []
-    return "\n".join([columns(rows), *more, *note])
+    return "\n".join([columns(rows), *more, *maps, *note])
 
 
 def listed(outputs: OutputFolder) -> str:

@@ -1,4 +1,4 @@
-"""The sub-commands whose outcome is a result with its report: estimate, demo, report."""
+"""The sub-commands whose outcome is a result with its report: estimate, demo, sensitivity, report."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from palpate.cli.outcome import Outcome, estimates_table, listed, warning_lines
+from palpate.cli.outcome import Outcome, columns, estimates_table, listed, warning_lines
 from palpate.errors import ConfigurationError, EstimationError
 
 if TYPE_CHECKING:
@@ -14,12 +14,13 @@ if TYPE_CHECKING:
     from palpate.study.outputs import OutputFolder
     from palpate.study.result import CaseResult
 
-__all__ = ["DOCUMENT", "PAGE", "TARGETS", "demo", "estimate", "report"]
+__all__ = ["DOCUMENT", "PAGE", "SENSITIVITY_TARGETS", "TARGETS", "demo", "estimate", "report", "sensitivity"]
 
 Progress = Callable[[str], None]
 
 DOCUMENT, PAGE, DATA = "result.json", "report.html", "report-data.npz"
 ASIDE = tuple(f"{name}.earlier" for name in (PAGE, DATA))
+SENSITIVITY_TARGETS = ("sensitivity.json", "sensitivity.html")
 LABELS = ("labels.csv", "labels.nii.gz")
 NUMBERS = ("mesh.vtu", "model.npz", "posterior.nc", "stiffness.nii.gz", "stiffness_sd.nii.gz")
 TARGETS = (DOCUMENT, PAGE, DATA, *ASIDE, *NUMBERS, *LABELS, "case.toml")
@@ -58,10 +59,25 @@ def estimate(arguments: argparse.Namespace, case: Case | None, outputs: OutputFo
 
 def demo(_: argparse.Namespace, case: None, outputs: OutputFolder, progress: Progress) -> Outcome:
     """The whole way on the pelvis that Palpate brings along."""
-    from palpate.experiments.demo import run_demo
+    from palpate.demo import run_demo
 
     del case  # it has its own
     return _write_estimate(run_demo(outputs.path, progress), outputs, progress)
+
+
+def sensitivity(
+    arguments: argparse.Namespace, case: Case, outputs: OutputFolder, progress: Callable[[str], None]
+) -> Outcome:
+    """How each modulus depends on what it rests on, the largest effect first."""
+    from palpate.report.tornado import sensitivity_table
+    from palpate.steps.saving import save_sensitivity
+    from palpate.study.sensitivity import Kept
+    from palpate.study.sensitivity import sensitivity as vary
+
+    found = vary(case, kept=Kept(outputs), sobol=arguments.sobol, progress=progress)
+    document = save_sensitivity(found, outputs)
+    text = f"{columns(sensitivity_table(document))}\n{warning_lines(document)}{listed(outputs)}"
+    return Outcome(document, text)
 
 
 def report(_: argparse.Namespace, case: None, outputs: OutputFolder, progress: Progress) -> Outcome:

@@ -18,6 +18,8 @@ from palpate.images.tissue import Role, Tissue
 from palpate.images.wall_motion import STILL_VOXELS, wall_motion
 
 __all__ = [
+    "SMALL_VOXELS",
+    "VOLUME_IMPLAUSIBLE",
     "check_headers",
     "check_images",
     "check_pair",
@@ -28,7 +30,7 @@ __all__ = [
 
 OBSERVED = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
 VOLUME_CHANGE = 0.05  # no modulus explains a filling between the scans
-VOLUME_IMPLAUSIBLE = 0.30
+VOLUME_IMPLAUSIBLE = 0.30  # of an organ: no deformation, and hardly a filling, changes so much
 SMALL_VOXELS = 50
 THIN_VOXELS = 4
 THIN_SHARE = 0.2

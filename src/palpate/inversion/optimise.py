@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
+from palpate.errors import SolverError
 from palpate.inversion.objective import Evaluation, Objective, determined
 
 __all__ = [
@@ -64,6 +65,7 @@ class Outcome(StrEnum):
     STALLED = "no smaller value was found within a quarter of the posterior's width"
     STEPS = "the iteration reached its largest number of steps; raise it, or start nearer"
     STUCK = "no step reduced the objective; look at the fit of the driver's surface and at the images"
+    UNSOLVABLE = "every shorter step led where the model cannot be solved, as where it turns elements inside out"
     NOT_FINITE = "the objective is not a finite number; check the images and the moduli's bounds"
     NO_EQUILIBRIUM = "the body has no equilibrium there under the material law"
     NOT_FOLLOWED = "it could not be followed under the material law; log.txt says why"
@@ -227,11 +229,11 @@ def gauss_newton(
         if since >= CIRCLING and _within_noise(now, free, whole, decrement):
             (unknowns, now), outcome = nearest, Outcome.STALLED
             break
-        found, trials = _search(objective, unknowns, now, free=free, bounds=bounds, region=region)
+        found, trials, solved = _search(objective, unknowns, now, free=free, bounds=bounds, region=region)
         evaluations += trials
         if found is None:
             near = decrement < STALLED or _within_noise(now, free, whole, decrement)
-            outcome = Outcome.STALLED if near else Outcome.STUCK
+            outcome = Outcome.STALLED if near else Outcome.STUCK if solved else Outcome.UNSOLVABLE
             break
         unknowns, now, region = found
     return Minimum(unknowns, now, outcome, tuple(history), evaluations)
@@ -245,28 +247,33 @@ def _search(
     free: NDArray[np.bool_],
     bounds: Bounds,
     region: _Region,
-) -> tuple[tuple[NDArray[np.float64], Evaluation, _Region] | None, int]:
-    """First step that makes progress, with the region for the next; None when there is none; and the trials.
+) -> tuple[tuple[NDArray[np.float64], Evaluation, _Region] | None, int, bool]:
+    """First step that makes progress, with the region for the next, or None; the trials; whether any was solved.
 
     After a refusal only steps are tried that promise a reduction of more than `WORTH`: less is the noise of re-chosen
     closest points.
     """
     n = objective.n_parameters
-    before = newton_decrement(now, free)
+    before, solved = newton_decrement(now, free), False
     for trials in range(SEARCHES):
         trial = unknowns + _step(now, free, n, region)
         trial[:n] = np.clip(trial[:n], bounds.lower, bounds.upper)
         step = trial - unknowns
         promised = -now.score @ step - 0.5 * step @ now.matrix @ step
         if trials and promised < WORTH:
-            return None, trials
-        there = objective(trial)
+            return None, trials, solved
+        try:
+            there = objective(trial)
+        except SolverError:  # no law answers where elements are turned inside out
+            region = region.smaller()
+            continue
+        solved = True
         gain = now.value - there.value
         progress = gain > 1e-4 * promised or newton_decrement(there, free) < 0.9 * before
         if promised > 0.0 and progress:  # what a bound leaves of a step may lead uphill
-            return (trial, there, region.larger() if gain > 0.25 * promised else region), trials + 1
+            return (trial, there, region.larger() if gain > 0.25 * promised else region), trials + 1, True
         region = region.smaller()
-    return None, SEARCHES
+    return None, SEARCHES, solved
 
 
 def _at_rest(coefficients: NDArray[np.float64]) -> bool:

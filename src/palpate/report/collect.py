@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from palpate.errors import PalpateError
 from palpate.images.segmentation import Segmentation
-from palpate.images.tissue import Role, Tissue
-from palpate.images.tissue_colours import tissue_colours
+from palpate.images.tissue import Role, Tissue, tissue_colours
 from palpate.mechanics.deformation import largest_strains
-from palpate.mesh.dihedral import tet_dihedrals
+from palpate.mesh.tet_mesh import tet_dihedrals
 from palpate.parallel import mapped
 from palpate.report.backgrounds import Grey, background, earlier_grey, later_grey, whole_box, whole_images
 from palpate.report.inputs import bone_distances, input_images
@@ -31,9 +30,11 @@ from palpate.report.report_data import (
     Reference,
     ReportData,
     ReportTissue,
+    TissueMap,
     TriangleSurface,
 )
 from palpate.report.slice_box import MOVING, slice_box
+from palpate.report.stiffness_maps import tissue_maps
 from palpate.report.surfaces import MOST_TRIANGLES, carried_outline, contour_width, image_surface, model_surface
 from palpate.study.case import Case, CaseLoad
 from palpate.study.case_data import CaseData
@@ -49,6 +50,7 @@ SHOWN = (*MOVING, Role.RIGID)
 RIGID_TRIANGLES = 12_000
 ALL_TRIANGLES = 300_000  # of all surfaces of the images, so that the page stays small
 NONE: tuple[TriangleSurface, ...] = ()
+NO_MAPS: tuple[TissueMap, ...] = ()
 NOT_MEASURED: tuple[MeasuredState, ...] = ()
 
 
@@ -118,6 +120,7 @@ def collect(result: CaseResult) -> ReportData:
         later=later,
         measured=measured,
         mesh=mesh,
+        maps=attempt.part("maps", lambda: tissue_maps(result), NO_MAPS),
         missing=attempt.missing,
     )
 

@@ -32,11 +32,12 @@ from palpate.report.interval_charts import profile_svg, region_svg, repeats_svg
 from palpate.report.methods import methods_text
 from palpate.report.payload import payload
 from palpate.report.pictures import mesh_png, organs_png, points_png
-from palpate.report.report_data import LaterImage, MeasuredState, Reference, ReportData, SliceBox
+from palpate.report.report_data import LaterImage, MeasuredState, Reference, ReportData, SliceBox, TissueMap
 from palpate.report.rows import estimate_rows, moduli_in, number, ratio_rows, scale_marks
 from palpate.report.scales import Scale, angle_scale, distance_scale, modulus_scale, strain_scale
 from palpate.report.section import VIEWS
 from palpate.report.slices import alignment_svg, contour_names, first_planes, points_svg, slice_svg
+from palpate.report.stiffness_maps import map_png, map_svg
 from palpate.report.tornado import tornado_svg
 
 __all__ = ["Picture", "page_scripts", "picture_of", "policy_of", "render", "template_of", "widths_of"]
@@ -81,6 +82,16 @@ class _Later:
     scale: Scale
     reference: Reference
     widths: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Map:
+    """The figures of one map of stiffness."""
+
+    tissue: str
+    words: str
+    slices: Picture
+    space: tuple[Picture, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +144,7 @@ def render(data: ReportData, *, study: bool = False) -> str:
             if data.document.get("forces")
             else None
         ),
+        maps=tuple(_map(data, k, of) for k, of in enumerate(data.maps)),
         mesh_pictures=_mesh_pictures(data),
         moduli=_attempt("the scale of the moduli", lambda: modulus_scale(data)) if data.mesh else None,
         curves=_curves(data),
@@ -245,6 +257,16 @@ def _measured(data: ReportData, k: int, state: MeasuredState) -> _Measured:
         ),
         space=_photographs({f"motion to {state.name}": partial(points_png, data, state)}),
         widths=widths_of(state.box),
+    )
+
+
+def _map(data: ReportData, k: int, of: TissueMap) -> _Map:
+    name = data.tissues[of.tissue].name
+    return _Map(
+        name,
+        of.words,
+        picture_of(f"{name}: modulus and its standard deviation", partial(map_svg, data, of, name=f"map{k}")),
+        _photographs({f"{name}, cut open": partial(map_png, data, of)}),
     )
 
 

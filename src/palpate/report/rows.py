@@ -31,6 +31,7 @@ CAUSES = {
     "frame": "the frame's motion",
     "offset": "how surfaces are drawn",
     "heterogeneity": "tissues that are not homogeneous",
+    "layer": "layers round the organs",
     "poisson": "Poisson's ratios",
     "instrument": "the instruments' offsets",
     KNOWN_MODULUS: "the range of the known modulus",

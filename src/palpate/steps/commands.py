@@ -8,6 +8,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 from palpate.errors import ConfigurationError, InputDataError
+from palpate.images.readers import read_label_image
 from palpate.progress import Progress, silent
 from palpate.steps.previewing import checked_with_page, new_case_with_page, place_page, refuse_other_page
 from palpate.steps.results import CaseResult, SavedResult
@@ -23,8 +24,9 @@ from palpate.study.outputs import OutputFolder, read_json
 from palpate.study.result import SCHEMA, MeshResult, Simulation
 from palpate.study.sensitivity import Kept, Sensitivity
 from palpate.study.sensitivity import sensitivity as vary
+from palpate.study.surface_labels import SurfaceLabels, surface_labels
 
-__all__ = ["check", "estimate", "init", "make_mesh", "noise", "read_result", "sensitivity", "simulate"]
+__all__ = ["check", "estimate", "init", "make_mesh", "noise", "read_result", "sensitivity", "simulate", "voxelise"]
 
 PathLike = str | os.PathLike[str]
 
@@ -100,6 +102,24 @@ def noise(
     """
     table = None if labels is None else Path(labels)
     return drawing_noise(Path(first), Path(second), labels=table, align=align, progress=progress)
+
+
+def voxelise(
+    *surfaces: PathLike,
+    spacing_mm: float = 1.0,
+    margin_mm: float = 30.0,
+    axes: str = "RAS",
+    like: PathLike | None = None,
+    progress: Progress = silent,
+) -> SurfaceLabels:
+    """The label image of closed surfaces (STL), one an organ, as `palpate voxelise` writes it.
+
+    spacing_mm, margin_mm: of the grid that is made; like: an image whose grid is taken; axes: "RAS" or "LPS", of files
+    that do not say. Raises `InputDataError` for surfaces that cannot be read or are not closed.
+    """
+    grid = None if like is None else read_label_image(Path(like)).grid
+    paths = [Path(path) for path in surfaces]
+    return surface_labels(paths, spacing_mm=spacing_mm, margin_mm=margin_mm, axes=axes, like=grid, progress=progress)
 
 
 def make_mesh(case: Case, *, progress: Progress = silent) -> MeshResult:

@@ -14,12 +14,12 @@ from palpate.images.tissue import Role
 from palpate.progress import Progress, silent
 from palpate.report.preview import GENERATOR, preview_page
 from palpate.study.case import Case
+from palpate.study.case_file import toml_key
 from palpate.study.check import Checked, CheckReport, Problem, checked_case
 from palpate.study.lock import held_folder
 from palpate.study.new_case import NewCase, write_new_case
 from palpate.study.outputs import OutputFolder, read_regular, write_text
 from palpate.study.prediction import predicted_intervals
-from palpate.study.toml_text import toml_key
 
 __all__ = ["PREVIEW", "checked_with_page", "new_case_with_page", "place_page", "refuse_other_page", "write_page"]
 

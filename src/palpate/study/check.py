@@ -18,12 +18,12 @@ from palpate.images.readers import read_intensities
 from palpate.images.registration import Registration, length_text
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
-from palpate.observation.field_of_view import field_of_view
-from palpate.observation.observed_surface import observed_surfaces, seen_in
+from palpate.observation.observed_surface import field_of_view, observed_surfaces, seen_in
 from palpate.progress import Progress
 from palpate.study.body import Body, ImagedStates, brought, make_body
 from palpate.study.case import Case
 from palpate.study.case_file import read_case
+from palpate.study.case_loads import load_warnings
 from palpate.study.contacts import every_finding
 from palpate.study.cost import (
     LESS_MEMORY,
@@ -35,8 +35,7 @@ from palpate.study.cost import (
     lack_of_memory,
     machine_memory_gb,
 )
-from palpate.study.domain import case_domain
-from palpate.study.edge_length import edge_length_of
+from palpate.study.edge_length import case_domain, edge_length_of
 from palpate.study.meshing import refuse_edge
 from palpate.study.plausibility import unit_warnings
 from palpate.study.prediction import Prediction
@@ -226,7 +225,7 @@ def _checked(case: Case, problems: _Problems, progress: Progress, *, meshed: boo
     """The same of a case, with the problems that were found before it."""
     problems.attempt(lambda: refuse_what_cannot_be_estimated(case))
     problems.attempt(lambda: require_samples(case))
-    problems.warn(unit_warnings(case))
+    problems.warn((*unit_warnings(case), *load_warnings(case)))
     progress("reading the images")
     whole = case.phantom is not None or case.body is not None  # nothing to read one by one
     states = problems.attempt(lambda: read_states(case, progress=progress)) if whole else None

@@ -16,14 +16,12 @@ from palpate.images.label_table import read_label_table
 from palpate.images.named_labels import MAX_NAME, printable
 from palpate.images.readers import read_intensities, read_label_image
 from palpate.images.tissue import Role
-from palpate.study.background import Background, background_of
 from palpate.study.case import REMAINING
 from palpate.study.case_as_run import CASE_NAME
-from palpate.study.class_names import class_names
-from palpate.study.guess import GuessedTissue, guess_tissues
+from palpate.study.case_file import relative_path, toml_key, toml_text
+from palpate.study.guess import GuessedTissue, class_names, guess_tissues
 from palpate.study.outputs import OutputFolder, read_regular, write_text
-from palpate.study.proposed_mesh import MARGIN_MM, proposed_edge, proposed_window
-from palpate.study.toml_text import relative_path, toml_key, toml_text
+from palpate.study.proposed_mesh import MARGIN_MM, Background, background_of, proposed_edge, proposed_window
 
 __all__ = ["CaseImages", "NewCase", "new_case", "write_new_case"]
 

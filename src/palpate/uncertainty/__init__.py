@@ -17,14 +17,19 @@ from palpate.uncertainty.covariance import (
     sandwich_covariance,
 )
 from palpate.uncertainty.diagnostics import ChainDiagnostics, chain_diagnostics, require_arviz
-from palpate.uncertainty.discretisation import discretisation_sd
 from palpate.uncertainty.frozen_posterior import FrozenPosterior, frozen_posterior
 from palpate.uncertainty.image_pairs import Agreement, PairEstimates, agreement, pair_estimates
-from palpate.uncertainty.intervals import NORMAL_95, Interval, ModulusInterval, log_interval, modulus_interval
+from palpate.uncertainty.intervals import (
+    NORMAL_95,
+    Interval,
+    ModulusInterval,
+    discretisation_sd,
+    log_interval,
+    modulus_interval,
+)
 from palpate.uncertainty.joint_region import JointRegion, joint_region
-from palpate.uncertainty.profile import FixedCorrespondence, Profile, fixed_correspondence
-from palpate.uncertainty.refit import refitted
-from palpate.uncertainty.sampling import PosteriorChains, posterior_chains, sample_posterior
+from palpate.uncertainty.profile import FixedCorrespondence, Profile, fixed_correspondence, refitted
+from palpate.uncertainty.sampling import PosteriorChains, posterior_chains
 from palpate.uncertainty.sensitivity import (
     Equilibria,
     Errors,
@@ -38,9 +43,10 @@ from palpate.uncertainty.sensitivity import (
     surface_errors,
 )
 from palpate.uncertainty.sobol import SobolIndices, require_salib, sobol_indices
-from palpate.uncertainty.stiffness_map import DifferentRegion, StiffnessMap, stiffness_maps
+from palpate.uncertainty.stiffness_map import CONTRAST, DifferentRegion, StiffnessMap, stiffness_maps
 
 __all__ = [
+    "CONTRAST",
     "GRID_DRAWS",
     "NORMAL_95",
     "Agreement",
@@ -94,7 +100,6 @@ __all__ = [
     "refitted",
     "require_arviz",
     "require_salib",
-    "sample_posterior",
     "sandwich_covariance",
     "sobol_indices",
     "stiffness_maps",

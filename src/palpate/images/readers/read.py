@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from palpate.errors import InputDataError, ResourceError
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.named_labels import LabelTable, checked_table
-from palpate.images.readers.canonical import to_canonical
 from palpate.images.readers.isolation import ReadLimits, read_stored
 from palpate.images.readers.registry import StoredImage, format_of
-from palpate.images.readers.values import REDUCED
+from palpate.images.readers.values import REDUCED, to_canonical
 
 __all__ = ["read_intensities", "read_label_image"]
 
