@@ -13,8 +13,7 @@ from palpate.errors import InputDataError
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers import read_intensities
 from palpate.images.registration import length_text
-from palpate.images.tissue import Role, Tissue
-from palpate.images.tissue_colours import tissue_colours
+from palpate.images.tissue import Role, Tissue, tissue_colours
 from palpate.progress import about
 from palpate.report.backgrounds import Grey
 from palpate.report.page import Picture, page_scripts, picture_of, policy_of, template_of, widths_of

@@ -26,9 +26,8 @@ from palpate.uncertainty.covariance import (
     scatter,
     shifts_by,
 )
-from palpate.uncertainty.intervals import NORMAL_95
+from palpate.uncertainty.intervals import NORMAL_95, within_subject_cv
 from palpate.uncertainty.profile import fixed_correspondence
-from palpate.uncertainty.repeatability import within_subject_cv
 
 __all__ = ["Agreement", "PairEstimates", "agreement", "pair_estimates"]
 
