@@ -33,7 +33,7 @@ from scipy import stats
 
 from palpate.errors import EstimationError, PalpateError
 from palpate.images import segment
-from palpate.inversion import InverseProblem, Inversion, InversionSettings, StopRule, invert
+from palpate.inversion import InverseProblem, Inversion, InversionSettings, StopRule, frozen_posterior, invert
 from palpate.mesh import LagrangeSpace
 from palpate.observation import NoiseModel, Observation, ObservedSurface, SurfaceDistance, surface_distance
 from palpate.phantoms import Scene, target_of_truth
@@ -49,14 +49,14 @@ from palpate.study import (
     inversion_settings,
     make_body,
 )
-from palpate.uncertainty import covariance_of, frozen_posterior, gain, noise_covariance
+from palpate.uncertainty import covariance_of, gain, noise_covariance
 
 Array = NDArray[np.float64]
 Result = dict[str, Any]  # a line of JSON
 BodyKey = tuple[str, bool, str, str]  # truth, whether points are measured, the estimate's law and the truth's
 
 OUT = 2.0  # half-widths
-NEARLY = StopRule(step_sd=0.2, passes=3)  # what an estimate may still move is little beside what noise does
+NEARLY = StopRule(step_sd=0.2)  # what an estimate may still move is little beside what noise does
 CLEAN = NoiseModel(np.array([2.0 * 0.05**2]), np.array([3.0]))  # of the clean estimate: smaller than any row's
 MOST_TELLING = "field-0.2"  # by whose clean estimate all points are followed: it sees what the others see
 NO_GRID = 3  # draws of a voxel grid, in which nothing is off

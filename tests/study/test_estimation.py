@@ -11,7 +11,7 @@ from palpate.errors import NotConverged
 from palpate.images.tissue import Role
 from palpate.inversion import Inversion, Outcome, OuterIterate, gauss_newton, invert, known_modulus_blocks
 from palpate.inversion.estimate import Candidate
-from palpate.inversion.outer_loop import Convergence
+from palpate.inversion.trust_region import Convergence
 from palpate.mechanics.forward import SolveCounts
 from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimation import Observed, conclude, hull, verdict
@@ -233,10 +233,13 @@ def test_a_minimum_without_equilibrium_is_remarked_and_no_minimum_to_compare_wit
 
 def test_an_estimate_whose_outer_loop_ran_out_says_what_is_open(estimation, inversion, settings, observed):
     assert "unsettled" not in codes(estimation)
-    result = stated(with_candidate(inversion, convergence=Convergence(2.0, 0.5, 0.1)), settings, observed)
+    out_of_steps = replace(inversion.minimum, outcome=Outcome.STEPS)
+    ended = with_candidate(inversion, minimum=out_of_steps, convergence=Convergence(2.0, 0.5, 0.1))
+    result = stated(spoilt(ended, Outcome.STEPS), settings, observed)
     (remark,) = (remark for remark in result.remarks if remark.code == "unsettled")
-    assert "still change each other" in remark.message
+    assert "still moves" in remark.message
     assert "linearised anew" not in remark.message
+    assert result.status == "not converged"
 
 
 def with_range(twins, twin, settings, *, sd):

@@ -18,12 +18,20 @@ from palpate.inversion.blocks import (
 from palpate.inversion.driver_fit import fit_driver
 from palpate.inversion.estimate import (
     Inversion,
+    InversionSettings,
     StartRun,
     as_good,
     continue_at_finite_strain,
     invert,
     with_released,
 )
+from palpate.inversion.frozen_posterior import (
+    FixedCorrespondence,
+    FrozenPosterior,
+    fixed_correspondence,
+    frozen_posterior,
+)
+from palpate.inversion.hyper_parameters import with_correlations, with_first_noise, with_hyper_parameters
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import Evaluation, Linearisation, LinearisedObjective, Objective
 from palpate.inversion.optimise import (
@@ -32,14 +40,12 @@ from palpate.inversion.optimise import (
     LeastSquares,
     Minimum,
     Outcome,
-    fit_coefficients,
     gauss_newton,
     posterior_sd,
 )
-from palpate.inversion.outer_loop import InversionSettings, OuterIterate, StopRule, run_outer_loop
 from palpate.inversion.parameters import ParameterMap, eta_of_ratio, parameter_map, ratio_of_eta
 from palpate.inversion.reduced_basis import ReducedBasis, reduced_basis
-from palpate.inversion.reweighting import reweighted, with_first_noise
+from palpate.inversion.trust_region import OuterIterate, StopRule, begun, fit_coefficients, minimised
 
 __all__ = [
     "FIELD",
@@ -50,6 +56,8 @@ __all__ = [
     "Bounds",
     "Evaluation",
     "ExactApproximation",
+    "FixedCorrespondence",
+    "FrozenPosterior",
     "InverseProblem",
     "Inversion",
     "InversionSettings",
@@ -68,27 +76,31 @@ __all__ = [
     "StartRun",
     "StopRule",
     "as_good",
+    "begun",
     "continue_at_finite_strain",
     "eta_of_ratio",
     "exact_approximation",
     "fit_coefficients",
     "fit_driver",
+    "fixed_correspondence",
     "frame_blocks",
+    "frozen_posterior",
     "gauss_newton",
     "instrument_block",
     "invert",
     "known_modulus_blocks",
     "layer_blocks",
     "material_blocks",
+    "minimised",
     "offset_block",
     "parameter_map",
     "posterior_sd",
     "ratio_of_eta",
     "reduced_basis",
-    "reweighted",
-    "run_outer_loop",
     "unit_blocks",
     "wall_blocks",
+    "with_correlations",
     "with_first_noise",
+    "with_hyper_parameters",
     "with_released",
 ]

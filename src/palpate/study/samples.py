@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from palpate.errors import ResourceError
 from palpate.findings import Finding
-from palpate.inversion import Bounds, Inversion
+from palpate.inversion import Bounds, Inversion, frozen_posterior
 from palpate.study.case import SAMPLES, Case
 from palpate.uncertainty import (
     ChainDiagnostics,
     Interval,
     chain_diagnostics,
-    frozen_posterior,
     posterior_chains,
     require_arviz,
 )

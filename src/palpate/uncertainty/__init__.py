@@ -17,11 +17,10 @@ from palpate.uncertainty.covariance import (
 )
 from palpate.uncertainty.diagnostics import ChainDiagnostics, chain_diagnostics, require_arviz
 from palpate.uncertainty.discretisation import discretisation_sd
-from palpate.uncertainty.frozen_posterior import FrozenPosterior, frozen_posterior
 from palpate.uncertainty.image_pairs import Agreement, PairEstimates, agreement, pair_estimates
 from palpate.uncertainty.intervals import NORMAL_95, Interval, ModulusInterval, log_interval, modulus_interval
 from palpate.uncertainty.joint_region import JointRegion, joint_region
-from palpate.uncertainty.profile import FixedCorrespondence, Profile, fixed_correspondence
+from palpate.uncertainty.profile import Profile
 from palpate.uncertainty.refit import refitted
 from palpate.uncertainty.sampling import PosteriorChains, posterior_chains, sample_posterior
 from palpate.uncertainty.sensitivity import (
@@ -51,8 +50,6 @@ __all__ = [
     "Errors",
     "FastPath",
     "FittedState",
-    "FixedCorrespondence",
-    "FrozenPosterior",
     "GridErrors",
     "Information",
     "Interval",
@@ -70,8 +67,6 @@ __all__ = [
     "discretisation_sd",
     "exact_equilibria",
     "fast_path",
-    "fixed_correspondence",
-    "frozen_posterior",
     "gain",
     "grid_errors",
     "grid_position_shifts",

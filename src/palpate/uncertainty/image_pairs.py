@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from palpate.inversion import Bounds, Evaluation, Minimum, Objective, gauss_newton
+from palpate.inversion import Bounds, Evaluation, Minimum, Objective, fixed_correspondence, gauss_newton
 from palpate.observation.noise_model import NoiseModel
 from palpate.uncertainty.covariance import (
     GridErrors,
@@ -26,7 +26,6 @@ from palpate.uncertainty.covariance import (
     shifts_by,
 )
 from palpate.uncertainty.intervals import NORMAL_95
-from palpate.uncertainty.profile import fixed_correspondence
 from palpate.uncertainty.repeatability import within_subject_cv
 
 __all__ = ["Agreement", "PairEstimates", "agreement", "pair_estimates"]

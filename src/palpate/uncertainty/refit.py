@@ -1,7 +1,7 @@
-"""Weights and an estimate that agree with given residuals, with the closest points and the approximation held.
+"""Hyper-parameters and an estimate that agree with given residuals, with closest points and the approximation held.
 
 A change of the residuals also changes what they say of their noise, of outliers and of the drivers' motion. That moves
-an estimate to first order, too: with the weights held it would be foretold too small.
+an estimate to first order, too: with the hyper-parameters held it would be foretold too small.
 """
 
 from __future__ import annotations
@@ -12,15 +12,17 @@ import numpy as np
 
 from palpate.inversion import (
     Bounds,
+    FixedCorrespondence,
     LinearisedObjective,
     Minimum,
     Objective,
     Outcome,
+    fixed_correspondence,
     gauss_newton,
     posterior_sd,
-    reweighted,
+    with_correlations,
+    with_hyper_parameters,
 )
-from palpate.uncertainty.profile import FixedCorrespondence, fixed_correspondence
 
 __all__ = ["refitted"]
 
@@ -34,14 +36,15 @@ def refitted(
 ) -> tuple[Minimum, FixedCorrespondence]:
     """The estimate that the residuals in a `minimum`'s evaluation lead to, and what it is the minimum of.
 
-    Reweighted (noise, robust losses, drivers' prior) and minimised in turn, until no log-modulus moves by 0.02 of its
-    standard deviation, ten times at the most: where it still does, the minimum has the outcome `STEPS`. No model is
-    solved. Raises `EstimationError` where the residuals leave an unknown open, `SolverError` where the approximation
-    has no answer.
+    Hyper-parameters and unknowns in turn, until no log-modulus moves by 0.02 of its standard deviation, ten times at
+    the most: where it still does, the minimum has the outcome `STEPS`. No model is solved. Raises `EstimationError`
+    where the residuals leave an unknown open, `SolverError` where the approximation has no answer.
     """
     n, now = objective.n_parameters, minimum
+    objective = with_correlations(objective, now.evaluation)
     for _ in range(PASSES):
-        objective = reweighted(objective, now)
+        here = LinearisedObjective(objective, now.unknowns, now.evaluation)(now.unknowns)
+        objective = with_hyper_parameters(objective, here, now.unknowns)
         weighed = LinearisedObjective(objective, now.unknowns, now.evaluation)(now.unknowns)
         fixed = fixed_correspondence(objective, now.unknowns, weighed)
         before, now = now, gauss_newton(fixed, now.unknowns, bounds=bounds, tolerance=TOLERANCE, max_steps=max_steps)

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from palpate.errors import EstimationError
+from palpate.inversion import FrozenPosterior, frozen_posterior
 from palpate.inversion.objective import Evaluation, Objective, determined
 from palpate.inversion.optimise import Bounds
 from palpate.parallel import blas_on_one_thread
-from palpate.uncertainty.frozen_posterior import FrozenPosterior, frozen_posterior
 
 __all__ = [
     "PosteriorChains",

@@ -10,11 +10,21 @@ from palpate.experiments.verification.inflation import NEO, NU, bore_of, inflate
 from palpate.experiments.verification.problem import Check, Problem
 from palpate.experiments.verification.structured_meshes import known, octant_mesh
 from palpate.experiments.verification.twin import TRUTH, noise_of, settings_from, twin_model, twin_problem
-from palpate.inversion import Inversion, InversionSettings, Objective, gauss_newton, invert, with_first_noise
+from palpate.inversion import (
+    Inversion,
+    InversionSettings,
+    Objective,
+    StopRule,
+    begun,
+    invert,
+    minimised,
+    with_first_noise,
+)
 from palpate.mechanics import ForwardModel, LinearModel
 from palpate.mesh import lagrange_space
 from palpate.observation import NoiseModel
 from palpate.phantoms import smooth_field
+from palpate.progress import silent
 from palpate.study import verdict
 from palpate.uncertainty import NORMAL_95, log_interval, sandwich_covariance
 
@@ -53,7 +63,8 @@ def coverage(repeats: int, seed: int) -> Array:
         noise = smooth_field(rng, sd_mm=NOISE_SD, correlation_mm=NOISE_LENGTH, features=200)
         problem = twin_problem(model, noise, stated_noise=stated)
         objective = with_first_noise(Objective(problem.states, problem.parameters).under([approximation]))
-        found = gauss_newton(objective.rematched(start), start, bounds=settings.bounds)
+        rule = StopRule(model_error=np.inf, derivatives=False, learn=False)
+        found = minimised(begun(objective, start), settings.bounds, rule, progress=silent, title="repeat").minimum
         sd = np.sqrt(np.diag(sandwich_covariance(objective, found.evaluation)))
         inside += np.abs(found.unknowns - truth) < NORMAL_95 * sd
     return np.asarray(inside / repeats)
