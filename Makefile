@@ -82,13 +82,15 @@ dist: install
 	rm -rf dist
 	$(BIN)/python -m build --outdir dist .
 
-# The wheel alone in an empty environment, and the demo in an empty folder away from the repository.
+# The wheel alone in an empty environment: the demo and the problems with known answers in an empty folder away from the
+# repository.
 dist-test: dist
 	rm -rf build/empty build/away
 	$(PYTHON) -m venv build/empty
 	build/empty/bin/python -m pip install --quiet --disable-pip-version-check dist/*.whl
 	mkdir -p build/away
-	wheel=$$PWD/build/empty/bin/palpate; cd build/away && $$wheel demo --output out && $$wheel check out/case.toml
+	wheel=$$PWD/build/empty/bin/palpate; cd build/away && $$wheel demo --output out && $$wheel check out/case.toml && \
+	  $$wheel verify --quick --output verification
 
 # The quick tests with the oldest versions of all libraries that pyproject.toml allows; old libraries may use what newer
 # ones of others have deprecated.
@@ -98,7 +100,8 @@ minimum: install
 	$(BIN)/uv venv --clear --quiet --python $(PYTHON) build/minimum
 	$(BIN)/uv pip install --quiet --python build/minimum --resolution lowest-direct --editable ".[dev]"
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 build/minimum/bin/python -m pytest -n 2 \
-	  -W default::DeprecationWarning -W default::PendingDeprecationWarning $(addprefix tests/,$(MINIMUM))
+	  -W default::DeprecationWarning -W default::PendingDeprecationWarning $(addprefix tests/,$(MINIMUM)) \
+	  packages/multifrontal/tests
 
 # Every command that README and docs name, in its small form: some fifteen minutes; ends with the first that fails.
 commands: install

@@ -4,8 +4,8 @@
     python benchmarks/cohort_kills.py --engine dask --runs 100
     python benchmarks/cohort_kills.py --engine local --runs 100 --stub    # minutes: rows that only write files
 
-Each run is killed once at a random moment of its time: the whole run, a warm worker, the child that computes, or (dask)
-the scheduler or a Dask worker; then resumed until it ends by itself. Its results must be those of the undisturbed run
+Each run is killed once at a random moment of its time: the whole run, the child that computes, or (dask) the scheduler
+or a Dask worker; then resumed until it ends by itself. Its results must be those of the undisturbed run
 to the last digit, each row with one mark, nothing hidden left. Prints JSON; exit code 1 where a run differs.
 """
 
@@ -31,17 +31,17 @@ from typing import Any
 from cohort_case import make_stub_table, make_table, numbers_of
 
 from cohort_stub import WORK, run
-from palpate.cohort.engines.contract import Engine
 from palpate.cohort.engines.dask import DaskEngine
 from palpate.cohort.engines.local import LocalEngine
+from palpate.cohort.engines.packing import Engine
 from palpate.errors import PalpateError
 
 PALPATE = [sys.executable, "-m", "palpate"]
 MOST_RESUMES = 6
-TARGETS = {"local": ("run", "worker", "child"), "dask": ("run", "scheduler", "dask worker", "worker", "child")}
+TARGETS = {"local": ("run", "child"), "dask": ("run", "scheduler", "dask worker", "child")}
 QUIET = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
 NOTHING = "nothing"
-WARM = "palpate.cohort.warm"
+CHILD = "palpate.cohort.child"
 
 
 class Cluster:
@@ -104,22 +104,20 @@ def command_of(pid: int) -> str:
     return ""
 
 
-def warm_processes(roots: list[int]) -> list[int]:
-    """The warm processes that these have started."""
+def computing(roots: list[int]) -> list[int]:
+    """The processes of these that work on a row."""
     found = [child for root in roots for child in children(root)]
-    return [pid for pid in found if WARM in command_of(pid)]
+    return [pid for pid in found if CHILD in command_of(pid)]
 
 
 def victim(target: str, run: int, cluster: Cluster | None) -> int | None:
     """A process to be killed; None where there is none of that kind at the moment."""
     roots = [run] if cluster is None else cluster.pids("worker")
-    warm = warm_processes(roots)
     choices = {
         "run": [run],
         "scheduler": [] if cluster is None else cluster.pids("scheduler"),
         "dask worker": roots,
-        "worker": warm,
-        "child": [child for pid in warm for child in children(pid)],
+        "child": computing(roots),
     }[target]
     return random.choice(choices) if choices else None
 

@@ -26,7 +26,7 @@ from memory import peak_mb
 from random_pelves import random_pelvis, write_images
 
 from palpate import check, init, make_mesh
-from palpate.experiments.simulated_pelvis import DATA
+from palpate.demo import DATA
 from palpate.images import Role, write_label_image
 from palpate.phantoms import PelvisOptions, Scene, SpheresOptions, pelvis, spheres
 from palpate.study import Case, ExpectedCost, estimate, expected_cost, read_case, read_states

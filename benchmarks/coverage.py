@@ -48,6 +48,7 @@ from palpate.study import (
     inverse_problem,
     inversion_settings,
     make_body,
+    released_of,
 )
 from palpate.uncertainty import covariance_of, gain, noise_covariance
 
@@ -219,27 +220,31 @@ def _moduli(inversion: Inversion, body: Body, row: Row) -> list[Result]:
     """By tissue: the error of ln E, its standard deviation, the ends of its intervals less the truth, the verdict."""
     objective, minimum = inversion.objective, inversion.minimum
     errors = [[np.zeros(len(line.weights)) for line in minimum.evaluation.lines]] * NO_GRID
-    covariance = covariance_of(objective, minimum.evaluation, errors, unknowns=minimum.unknowns)
+    bonded = covariance = covariance_of(objective, minimum.evaluation, errors, unknowns=minimum.unknowns)
+    released, remark = released_of(inversion, body.settings)
+    if released is not None:
+        covariance = bonded.with_released(objective, minimum, released)
     fixed = frozen_posterior(objective, minimum.unknowns, minimum.evaluation)
-    known, _ = intervals_of(inversion, body.settings, fixed, covariance)
-    estimates = estimates_of(inversion, known, covariance, truth={})
+    known = intervals_of(inversion, body.settings, fixed, covariance)
+    without = intervals_of(inversion, body.settings, fixed, bonded)
+    estimates = estimates_of(inversion, known, covariance, truth={}, layers_told=not remark)
     limits = _limits(inversion, row)
     of_noise = None if row.limit is None else _by_true_noise(inversion, row.limit)
     scale, found = objective.parameters.scale_kpa, []
-    for i, (estimate, of) in enumerate(zip(estimates, known, strict=True)):
+    for i, (estimate, of, of_bonded) in enumerate(zip(estimates, known, without, strict=True)):
         given = estimate.interval95_given_model
         found.append(
             {
                 "tissue": estimate.tissue,
                 "error": float(minimum.unknowns[i] - body.truth[i]),
-                "sd": float(np.sqrt(covariance.total[i, i])),
+                "sd": float(np.sqrt(bonded.total[i, i])),
                 "sd_true_noise": None
                 if of_noise is None
-                else float(np.sqrt(covariance.total[i, i] - covariance.noise[i, i] + of_noise[i, i])),
+                else float(np.sqrt(bonded.total[i, i] - bonded.noise[i, i] + of_noise[i, i])),
                 "shares": {name: round(share, 4) for name, share in covariance.shares(i).items()},
                 "verdict": estimate.verdict,
                 "interval": _ends(of.interval, body.truth[i]),
-                "own": _ends(of.own.ends, body.truth[i]),
+                "own": _ends(of_bonded.own.ends, body.truth[i]),
                 "given_model": _ends(given, body.truth[i] + np.log(scale)) if given else None,
                 **{name: limit[i] for name, limit in limits.items()},
             }

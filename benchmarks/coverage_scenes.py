@@ -51,7 +51,6 @@ from palpate.phantoms import (
     displacements,
     grid_box,
     imaged,
-    patched,
     pelvis_anatomy,
     pelvis_grid,
     pelvis_motions,
@@ -60,6 +59,7 @@ from palpate.phantoms import (
     smooth_field,
     spheres,
 )
+from palpate_validation.mismatch import patched
 
 __all__ = ["NOISES", "POINTS", "ROWS", "TRUTHS", "Points", "Row", "Skin", "measured_points", "skins_of"]
 

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 import palpate
-from palpate.experiments.simulated_pelvis import DATA
+from palpate.demo import DATA
 from palpate.mechanics import Dilatation, equilibrium
 from palpate.mesh import Constraint, TetMesh, tissue_surface
 

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.experiments.simulated_pelvis import DATA
+from palpate.demo import DATA
 from palpate.images import LabelImage, read_label_image, write_label_image
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))

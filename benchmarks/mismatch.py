@@ -47,7 +47,7 @@ def main() -> int:
     """Estimate the scenes that were asked for and print their summaries."""
     arguments = _arguments()
     keys, overrides = _keys(arguments), tuple(arguments.set)
-    done = _read(arguments.output)
+    done = read_lines(arguments.output)
     made = nullcontext(arguments.scenes_cache) if arguments.scenes_cache else tempfile.TemporaryDirectory()
     with made as cache:
         for key in () if arguments.summary else keys:
@@ -57,7 +57,7 @@ def main() -> int:
                 continue
             if place not in done:
                 done[place] = _case(key, Path(cache), overrides, arguments.keep)
-                _append(arguments.output, done[place])
+                append_line(arguments.output, done[place])
             _say(_line(done[place]))
     if arguments.make_only:
         return 0
@@ -65,8 +65,8 @@ def main() -> int:
     for kind, law, noise in dict.fromkeys((key.kind, key.law, key.noise_mm) for key in keys):
         cases = [r for k, r in sorted(done.items()) if (k[0], *k[2:]) == (kind, law, noise, overrides)]
         if cases:
-            rows[f"{kind}, {law}, {_noise_name(noise)}"] = _summary(cases)
-    print(json.dumps({"simulated": True, "rows": rows}, indent=1) if arguments.json else _table(rows))
+            rows[f"{kind}, {law}, {_noise_name(noise)}"] = summary_of(cases)
+    print(json.dumps({"simulated": True, "rows": rows}, indent=1) if arguments.json else table_of(rows))
     return 0
 
 
@@ -144,7 +144,7 @@ def _case(key: SceneKey, cache: Path, overrides: tuple[str, ...], keep: Path | N
     return line | {
         "status": document["status"],
         "reason": document["reason"],
-        "estimates": [_held_beside(item, truth) for item in document["estimates"] if item["tissue"] in truth],
+        "estimates": [held_beside(item, truth) for item in document["estimates"] if item["tissue"] in truth],
         "warnings": [warning["code"] for warning in document["warnings"]],
         "dofs": document["mesh"]["dofs"],
         "seconds": time.perf_counter() - began,
@@ -153,7 +153,7 @@ def _case(key: SceneKey, cache: Path, overrides: tuple[str, ...], keep: Path | N
     }
 
 
-def _held_beside(item: Result, truth: dict[str, float]) -> Result:
+def held_beside(item: Result, truth: dict[str, float]) -> Result:
     """One of the "estimates" of result.json with its ln-error, and whether its intervals hold the truth (None: none).
 
     half_widths: the distance of the truth from the estimate in half-widths of its interval, in ln E; None without one.
@@ -173,7 +173,7 @@ def _held_beside(item: Result, truth: dict[str, float]) -> Result:
     return found | {"half_widths": abs(error) / half if error is not None and half else None}
 
 
-def _summary(cases: Sequence[Result]) -> Result:
+def summary_of(cases: Sequence[Result]) -> Result:
     """Of the cases of one kind, law and noise."""
     usable = [r for r in cases if "error" not in r]
     of = [item for r in usable for item in r["estimates"]]
@@ -211,7 +211,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
     return float(np.mean(found)) if found else None
 
 
-def _table(rows: dict[str, Result]) -> str:
+def table_of(rows: dict[str, Result]) -> str:
     """The rows as they stand in the docs; half-widths are those of ln E."""
     head = "simulated scene | cases (errors) | RMS ln-error | of identified, weak | worst | 95 % hold | given the model"
     head += " | out (identified) | verdicts | half-width (given the model) | seconds"
@@ -261,7 +261,7 @@ def _commit() -> str:
     return found.stdout.strip()
 
 
-def _read(path: Path) -> dict[Key, Result]:
+def read_lines(path: Path) -> dict[Key, Result]:
     """The cases that are there; a line that a killed run left unfinished is computed anew."""
     found: dict[Key, Result] = {}
     for line in path.read_text().splitlines() if path.exists() else []:
@@ -274,7 +274,7 @@ def _read(path: Path) -> dict[Key, Result]:
     return found
 
 
-def _append(path: Path, result: Result) -> None:
+def append_line(path: Path, result: Result) -> None:
     """One line more, on a line of its own whatever a killed run left."""
     unfinished = path.exists() and path.read_bytes()[-1:] not in (b"", b"\n")
     with path.open("a") as file:

@@ -27,22 +27,20 @@ from palpate.observation import observed_surface
 from palpate.phantoms import (
     AffineMotion,
     BoundaryMotion,
-    Grown,
     PelvisOptions,
     ScaledMotion,
     WallMotion,
     displacements,
     grid_box,
     imaged,
-    patched,
     pelvis_anatomy,
     pelvis_grid,
     pelvis_motions,
-    redrawn,
     refuse_folded,
     rotation_about,
     smooth_field,
 )
+from palpate_validation.mismatch import Grown, patched, redrawn
 
 __all__ = ["KINDS", "SceneKey", "scene_folder"]
 

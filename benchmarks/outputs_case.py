@@ -149,9 +149,10 @@ def state(
 
 def recovered(folder: Path) -> bool:
     """Do what the next run in the folder does first; whether there was something to do."""
-    journal = (folder / ".writing-outputs" / "journal.json").exists()
+    hidden = folder / ".writing-outputs"
+    cut = (hidden / "ready").exists() or any(path.is_file() for path in (hidden / "old").rglob("*"))
     recover(folder)
-    return journal
+    return cut
 
 
 def leftovers(folder: Path) -> list[str]:

@@ -52,7 +52,7 @@ def main() -> None:
 
 
 def write_together(folder: Path, content: dict[str, bytes]) -> None:
-    """As a command does: digested, brought to the disk, renamed under a journal."""
+    """As a command does: digested, brought to the disk, renamed together."""
     with staged(folder) as staging:
         for name, data in content.items():
             (staging.area / name).write_bytes(data)

@@ -72,7 +72,7 @@ def attempt(bench: Bench, trial: Trial, seconds: dict[str, float]) -> dict[str, 
         process.send(trial.signal)
     code, out, err = process.end()
     seen = {"signal": trial.signal.name, "command": trial.command, "moment": trial.moment}
-    seen["journal"] = str(recovered(folder)) if trial.signal is signal.SIGKILL else "False"
+    seen["cut"] = str(recovered(folder)) if trial.signal is signal.SIGKILL else "False"
     seen["state"] = state(bench, trial.command, folder)
     seen["end"] = end_of(trial, code, err, running=running)
     flaw = flaw_of(trial, seen, out, err, code)
@@ -142,7 +142,7 @@ def wait_for(trial: Trial, process: Run, folder: Path, seconds: float) -> None:
         time.sleep(trial.share * seconds)
         return
     seconds = WRITING
-    watched = hidden if trial.moment == "staging" else hidden / "journal.json"
+    watched = hidden if trial.moment == "staging" else hidden / "ready"
     while process.code is None and not watched.exists():
         time.sleep(0.0002)
     longest = {"estimate": 0.4 * seconds, "mesh": 0.05, "report": 0.02, "init": 0.005}[trial.command]
@@ -217,7 +217,7 @@ def summary(seen: list[dict[str, str]]) -> dict[str, object]:
         for one in seen:
             group = groups.setdefault(one[key], Counter())
             group.update(["runs", one["end"], f"folder {one['state']}"])
-            group.update(["journal found"] if one["journal"] == "True" else [])
+            group.update(["cut among the renames"] if one["cut"] == "True" else [])
         return {name: dict(sorted(group.items())) for name, group in sorted(groups.items())}
 
     failures = [one["failure"] for one in seen if "failure" in one]

@@ -23,8 +23,9 @@ from memory import peak_mb
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from multifrontal import nested_dissection
 from palpate.mechanics import SOLVERS as OURS
-from palpate.mechanics import Hints, linear_model, nested_dissection, outer_constraint, weighted_sum
+from palpate.mechanics import Hints, linear_model, outer_constraint, weighted_sum
 from palpate.mesh import lagrange_space, tetrahedralise
 from palpate.observation import prescribed_motion
 from palpate.phantoms import PelvisOptions, pelvis_anatomy

@@ -29,6 +29,10 @@ def work(task: Task, tell) -> Outcome:
         held = bytearray(int(float(number) * 1e9))
         held[::4096] = b"x" * len(held[::4096])
         time.sleep(1000.0)
+    if what == "swell":
+        held = bytearray(int(float(number) * 1e9))
+        held[::4096] = b"x" * len(held[::4096])
+        os.kill(os.getpid(), signal.SIGKILL)
     if what == "allocate" and task.coarser == 1.0:
         return Outcome.failed(task, "resources", "memory was short", cause="memory")
     if what == "die" and task.attempt <= int(number):

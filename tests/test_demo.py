@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from palpate.experiments.demo import run_demo
+from palpate.demo import run_demo
 from palpate.progress import STAGES, Forecast, Told
 
 ROOT = Path(__file__).parents[1]

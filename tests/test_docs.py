@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 import tomllib
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -99,7 +100,37 @@ def test_the_readme_answers_a_newcomer_in_the_order_of_the_questions():
     assert [heading for heading in headings if heading in wanted] == wanted
 
 
-def test_every_file_that_newcomers_are_told_to_copy_is_there():
-    told = re.findall(r"\b[Cc]opy\s+`([^`]+\.py)`", (ROOT / "CONTRIBUTING.md").read_text())
-    assert len(told) > 3
-    assert [path for path in told if not (ROOT / "src" / "palpate" / path).is_file()] == []
+def test_every_path_that_newcomers_are_told_is_there():
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    copied = re.findall(r"\b[Cc]opy\s+`([^`]+\.py)`", text)
+    named = {*copied, *re.findall(r"`([\w./-]+/|[\w./-]*\w\.(?:py|md|toml|txt))`", text)}
+    assert len(copied) > 3
+    assert len(named) > 40
+    places = (ROOT, ROOT / "src" / "palpate")
+    assert [name for name in sorted(named) if not any((place / name).exists() for place in places)] == []
+
+
+TOOLS = {"import-linter": "lint-imports", "mkdocs-material": "material", "pytest-xdist": "-n 2", "scipy-stubs": "mypy"}
+MODULES = {"h5py": "h5netcdf", "libigl": "igl", "pynrrd": "nrrd", "scikit-fem": "skfem", "torch-fem": "torchfem"}
+
+
+def requirements() -> list[str]:
+    """The name of every library that the package, its extras and its development ask for."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    every = chain(project["dependencies"], *project["optional-dependencies"].values())
+    return sorted({re.match(r"[\w-]+", requirement).group() for requirement in every})
+
+
+def test_every_dependency_is_used():
+    folders = ("src", "validation", "tests", "benchmarks", "docs", "examples")
+    code = "\n".join(path.read_text() for folder in folders for path in (ROOT / folder).rglob("*.py"))
+    orders = (ROOT / "Makefile").read_text() + (ROOT / "mkdocs.yml").read_text()
+    imported = {name.lower() for name in re.findall(r"(?:import |from |import_module\(\"|installed\(\")(\w+)", code)}
+    modules = {name: MODULES.get(name, name.replace("-", "_")).lower() for name in requirements()}
+    others = [name for name, module in modules.items() if module not in imported]
+    assert [name for name in others if TOOLS.get(name, name.split("-")[0]) not in orders] == []
+
+
+def test_every_dependency_has_its_line():
+    told = (ROOT / "docs" / "libraries.md").read_text().lower()
+    assert [name for name in requirements() if not re.search(rf"\b{name.lower()}\b", told)] == []

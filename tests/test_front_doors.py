@@ -1,4 +1,4 @@
-"""Experiments, benchmarks and examples use what the layers offer in their `__init__`, and nothing deeper."""
+"""Validation, benchmarks and examples use what the layers offer in their `__init__`, and nothing deeper."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LAYERS = (
 )
 SCRIPTS = sorted(
     path.relative_to(ROOT)
-    for folder in ("benchmarks", "examples", "src/palpate/experiments")
+    for folder in ("benchmarks", "examples", "validation")
     for path in (ROOT / folder).rglob("*.py")
 )
 

@@ -19,30 +19,38 @@ from palpate.study import refusals
 
 
 @pytest.fixture
-def group(tmp_path, monkeypatch):
+def group(tmp_path):
     """A control group of 1 GB, 0.7 GB of it used, of which 0.2 GB are caches that it would give back."""
     (tmp_path / "memory.max").write_text("1000000000\n")
     (tmp_path / "memory.current").write_text("700000000\n")
     (tmp_path / "memory.stat").write_text("anon 5\ninactive_file 200000000\n")
+    (tmp_path / "meminfo").write_text("MemTotal: 4000000 kB\nMemFree: 1 kB\nMemAvailable: 2000000 kB\n")
     paths = str(tmp_path / "memory.max"), str(tmp_path / "memory.current"), "inactive_file"
-    monkeypatch.setattr(memory, "CGROUPS", (paths,))
-    return tmp_path
+    return {"groups": (paths,), "machine": tmp_path / "meminfo"}
 
 
-@pytest.mark.usefixtures("group")
-def test_a_control_group_leaves_no_more_than_its_limit():
-    assert memory.available_memory() == 5e8
+def test_a_control_group_leaves_no_more_than_its_limit(group):
+    assert memory.available_memory(**group) == 5e8
+    assert memory.total_memory(**group) == 1e9
 
 
-def test_a_control_group_without_a_limit_leaves_what_the_machine_has(group):
-    (group / "memory.max").write_text("max\n")
-    assert memory.available_memory() == memory._of_machine() or memory.available_memory() > 5e8
+def test_a_control_group_without_a_limit_leaves_what_the_machine_has(group, tmp_path):
+    (tmp_path / "memory.max").write_text("max\n")
+    assert memory.available_memory(**group) == 2e6 * 1024.0
+    assert memory.total_memory(**group) == 4e6 * 1024.0
 
 
-def test_nothing_is_said_where_the_system_does_not_tell(monkeypatch):
-    monkeypatch.setattr(memory, "CGROUPS", (("/nowhere/limit", "/nowhere/use", "inactive_file"),))
-    monkeypatch.setattr(memory, "_of_machine", lambda: None)
-    assert memory.available_memory() is None
+def test_nothing_is_said_where_the_system_does_not_tell(tmp_path):
+    nowhere = {"groups": (("/nowhere/limit", "/nowhere/use", "inactive_file"),), "machine": tmp_path / "none"}
+    assert memory.available_memory(**nowhere) is None
+    assert memory.total_memory(**nowhere) is None
+
+
+@pytest.mark.parametrize(("stated", "left"), [("0.25", 2.5e8), ("3", 5e8), ("-1", 5e8), ("much", 5e8), ("", 5e8)])
+def test_what_the_environment_states_is_a_limit_if_it_is_a_plain_number(group, monkeypatch, stated, left):
+    monkeypatch.setenv("PALPATE_MEMORY_GB", stated)
+    assert memory.available_memory(**group) == left
+    assert memory.total_memory(**group) == (left if stated == "0.25" else 1e9)
 
 
 CASE = """
@@ -86,6 +94,6 @@ def test_images_that_this_machine_cannot_hold_are_refused_with_the_numbers(monke
     tissues = (Tissue("rest", Role.VOID), Tissue("organ", Role.ESTIMATE, (1,)))
     image = Segmentation(index, VoxelGrid((40, 40, 40), np.eye(4)), tissues)
     refusals.refuse_large(image, "before.nii.gz")
-    monkeypatch.setattr(refusals, "machine_memory_gb", lambda: 0.005)
+    monkeypatch.setenv("PALPATE_MEMORY_GB", "0.005")
     with pytest.raises(ResourceError, match=r"40 x 40 x 40 voxels.*0\.0 GB of memory.*crop the images"):
         refusals.refuse_large(image, "before.nii.gz")

@@ -11,8 +11,10 @@ from types import ModuleType
 import pytest
 
 import palpate
+import palpate_validation
 
-MODULES = sorted(m.name for m in pkgutil.walk_packages(palpate.__path__, "palpate.") if not m.name.startswith("_"))
+PACKAGES = {"palpate.": palpate.__path__, "palpate_validation.": palpate_validation.__path__}
+MODULES = sorted(m.name for name, path in PACKAGES.items() for m in pkgutil.walk_packages(path, name))
 COUNT = r"(?:\d+ )?(?:\d+|n\w*|[km]|draws)(?: [+/] (?:\d+|n_\w+))?(?: corners| axes)?"
 SHAPE = re.compile(rf"\({COUNT}(?:,|(?:, {COUNT})+)\)")  # (n, 3), (n_nodes,), (3 n_points, n_modes + 1)
 

@@ -34,11 +34,18 @@ def run(unpacked: Path, folder: Path, *arguments: str) -> subprocess.CompletedPr
 def test_a_case_is_made_of_the_demos_images_from_the_wheel(unpacked, tmp_path):
     done = run(unpacked, tmp_path, "-c", "import palpate; print(palpate.__file__)")
     assert Path(done.stdout.strip()) == unpacked / "palpate" / "__init__.py"
-    data = unpacked / "palpate" / "experiments" / "data"
+    data = unpacked / "palpate" / "demo" / "data"
     images = [str(data / f"simulated_{state}.nii.gz") for state in ("before", "after")]
     done = run(unpacked, tmp_path, "-m", "palpate", "init", *images, "--labels", str(data / "labels.json"), "--quiet")
     assert (done.returncode, done.stderr) == (0, "")
     assert "[tissues.prostate]" in (tmp_path / "palpate-output" / "case.toml").read_text()
+
+
+def test_the_commands_beside_the_package_come_with_the_wheel(unpacked, tmp_path):
+    done = run(unpacked, tmp_path, "-m", "palpate", "verify", "--help")
+    assert "--quick" in done.stdout
+    done = run(unpacked, tmp_path, "-c", "import palpate_validation.verify as v; print(v.__file__)")
+    assert Path(done.stdout.strip()) == unpacked / "palpate_validation" / "verify.py"
 
 
 def test_every_file_of_the_package_is_in_the_wheel(unpacked):
@@ -48,5 +55,7 @@ def test_every_file_of_the_package_is_in_the_wheel(unpacked):
         return {path.relative_to(package) for path in found}
 
     assert files(unpacked / "palpate") == files(ROOT / "src" / "palpate")
+    assert files(unpacked / "palpate_validation") == files(ROOT / "validation" / "palpate_validation")
+    assert files(unpacked / "multifrontal") == files(ROOT / "packages" / "multifrontal" / "src" / "multifrontal")
     licences = {path.name for path in next(unpacked.glob("*.dist-info/licenses")).rglob("*") if path.is_file()}
-    assert {"LICENSE", "NOTICE", "three.LICENSE.txt"} <= licences
+    assert {"LICENSE", "NOTICE", "gel_beads.LICENSE.txt", "three.LICENSE.txt"} <= licences

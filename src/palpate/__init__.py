@@ -9,7 +9,17 @@ if TYPE_CHECKING:
     from typing import Any
 
     from palpate.export.folder import export
-    from palpate.steps.commands import check, estimate, init, make_mesh, noise, read_result, sensitivity, simulate
+    from palpate.steps.commands import (
+        check,
+        estimate,
+        init,
+        make_mesh,
+        noise,
+        read_result,
+        sensitivity,
+        simulate,
+        voxelise,
+    )
     from palpate.steps.results import CaseResult, SavedResult
     from palpate.study.case import Case
     from palpate.study.case_file import read_case
@@ -28,6 +38,7 @@ __all__ = [
     "read_result",
     "sensitivity",
     "simulate",
+    "voxelise",
 ]
 
 _HOMES = {
@@ -44,6 +55,7 @@ _HOMES = {
     "read_result": "palpate.steps.commands",
     "sensitivity": "palpate.steps.commands",
     "simulate": "palpate.steps.commands",
+    "voxelise": "palpate.steps.commands",
 }
 
 

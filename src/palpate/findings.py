@@ -37,6 +37,7 @@ Misleading = Literal[
     "implausible-stiffness",
     "units",
     "linear-strains",
+    "weightless-reference",
     "volume-change",
     "void-moves",
     "drawn-otherwise",
@@ -54,6 +55,7 @@ Misleading = Literal[
     "rigid-unseen",
     "points-outside",
     "data-misfit",
+    "force-reversed",
     "no-equilibrium",
 ]
 Widening = Literal[

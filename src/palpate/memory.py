@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -15,8 +17,11 @@ else:
 
 __all__ = ["available_memory", "peak_memory_gb", "total_memory"]
 
+STATED = "PALPATE_MEMORY_GB"  # in the environment: what others leave of a machine that is shared without control groups
+MACHINE = Path("/proc/meminfo")
+Groups = tuple[tuple[str, str, str], ...]
 # Control groups, version 2 and 1, as a container sees its own: limit, use, and the line of its caches in memory.stat.
-CGROUPS = (
+CGROUPS: Groups = (
     ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current", "inactive_file"),
     (
         "/sys/fs/cgroup/memory/memory.limit_in_bytes",
@@ -26,10 +31,10 @@ CGROUPS = (
 )
 
 
-def available_memory() -> float | None:
-    """Bytes that are free on this machine and under its control group's limit; None where the system does not tell."""
-    found = [_of_machine()]
-    for limit, use, caches in CGROUPS:
+def available_memory(groups: Groups = CGROUPS, machine: Path = MACHINE) -> float | None:
+    """Bytes that are free on this machine and under its control groups' limit; None where the system does not tell."""
+    found = [_of_machine("MemAvailable:", machine), _stated()]
+    for limit, use, caches in groups:
         with suppress(OSError, ValueError, IndexError):  # "max": no limit
             lines = Path(limit).with_name("memory.stat").read_text(encoding="ascii").splitlines()
             given_back = next((float(line.split()[1]) for line in lines if line.split()[0] == caches), 0.0)
@@ -46,21 +51,27 @@ def peak_memory_gb() -> float | None:
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9, 3)
 
 
-def total_memory() -> float | None:
-    """Bytes that this machine has, or its control group may have, whatever runs; None where the system does not tell.
+def total_memory(groups: Groups = CGROUPS, machine: Path = MACHINE) -> float | None:
+    """Bytes that this machine has, or its control groups may have, whatever runs; None where the system does not tell.
 
     What is decided by it is the same from run to run.
     """
-    found = [_of_machine("MemTotal:")]
-    for limit, _, _ in CGROUPS:
+    found = [_of_machine("MemTotal:", machine), _stated()]
+    for limit, _, _ in groups:
         with suppress(OSError, ValueError):  # "max": no limit
             found.append(float(Path(limit).read_text(encoding="ascii")))
     return min((amount for amount in found if amount is not None), default=None)
 
 
-def _of_machine(line: str = "MemAvailable:") -> float | None:
+def _stated() -> float | None:
+    """What the environment leaves to this program; no limit where that is no plain number."""
+    stated = os.environ.get(STATED, "")
+    return 1e9 * float(stated) if re.fullmatch(r"[0-9]{1,6}(\.[0-9]{1,6})?", stated) else None
+
+
+def _of_machine(line: str, machine: Path) -> float | None:
     try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        lines = machine.read_text(encoding="ascii").splitlines()
         return next(float(found.split()[1]) for found in lines if found.startswith(line)) * 1024.0
     except (OSError, StopIteration, ValueError):
         return None

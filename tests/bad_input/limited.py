@@ -21,7 +21,7 @@ import time
 import nibabel  # noqa: F401
 
 import palpate.cli
-import palpate.experiments.demo
+import palpate.demo
 import palpate.export.case_files
 import palpate.report.case_report
 import palpate.study.check

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from palpate.cohort.statistics.association import association
-from palpate.cohort.statistics.permutation import permutation_test
+from palpate.cohort.statistics.association import association, permutation_test
 from palpate.cohort.statistics.regression import stage_regression
 from palpate.cohort.statistics.scans import Scan
 

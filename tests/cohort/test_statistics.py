@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 
 import numpy as np
 import pytest
@@ -298,3 +299,11 @@ def test_the_page_loads_nothing_and_escapes_every_name(records, document):
     assert "<script" not in page
     assert page.count("<svg") == 3
     assert "http" not in page.replace("http://www.w3.org/", "").replace("http-equiv", "")
+
+
+def test_a_patients_point_leads_to_a_report_where_there_is_one(records, document):
+    shown = [dataclasses.replace(one, page=f"cases/{one.row.id}/report.html") for one in records[:4]] + records[4:]
+    page = cohort_page(shown, document, created="now", version="0")
+    links = re.findall(r'<a href="(cases/[^"]+)" aria-label="([^"]+)">', page)
+    assert links == [("cases/r0/report.html", "report of r0, patient P0")] * 3  # one in each chart
+    assert "palpate-link" not in page

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from palpate.experiments.simulated_pelvis import DATA, LAW
+from palpate.demo import DATA, LAW
 from palpate.images.tissue import Role
 from palpate.study.case_file import read_case
 

@@ -14,17 +14,23 @@ from scipy import stats
 from palpate.cli import main
 from palpate.cohort.statistics.association import pearson_p, points_behind
 from palpate.errors import ConfigurationError, GeometryError, ResourceError
-from palpate.experiments.reproduce.cohort import ORGANS, PatientResult
-from palpate.experiments.reproduce.figure4 import LAW, Figure4, Point
-from palpate.experiments.reproduce.figures import draw_figure4, draw_staging, draw_table
-from palpate.experiments.reproduce.jobs import Job, compute
-from palpate.experiments.reproduce.ledger import Ledger
-from palpate.experiments.reproduce.paper import PAPER_STAGING, PAPER_TABLE1, PAPER_TABLE2
-from palpate.experiments.reproduce.real_pelvis import grid_within
-from palpate.experiments.reproduce.run import reproduce
-from palpate.experiments.reproduce.staging import Staging, paper_remark, with_stage
-from palpate.experiments.reproduce.table import COLUMNS, Entry, Table, TableRow
 from palpate.mesh.anatomy import Box
+from palpate_validation.paper.cohort import ORGANS, PatientResult
+from palpate_validation.paper.figure4 import LAW, Figure4, Point, draw_figure4
+from palpate_validation.paper.real_pelvis import grid_within
+from palpate_validation.paper.staging import Staging, draw_staging, paper_remark, with_stage
+from palpate_validation.paper.table import (
+    COLUMNS,
+    PAPER_STAGING,
+    PAPER_TABLE1,
+    PAPER_TABLE2,
+    Entry,
+    Table,
+    TableRow,
+    draw_table,
+)
+from palpate_validation.reproduce import reproduce
+from palpate_validation.scenes import Job, Ledger, compute
 
 STAGES = np.array([1.0, 1.0, 2.0, 2.0, 3.0, 3.0, 3.0, 4.0])
 

@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.experiments.reproduce import cohort
-from palpate.experiments.reproduce.balls import (
+from palpate.inversion import parameter_map, unit_blocks
+from palpate.mechanics.linear_model import linear_model
+from palpate.observation.observed_surface import observed_surface
+from palpate_validation.paper.balls import (
     BODIES,
     Balls,
     balls_space,
@@ -18,17 +20,11 @@ from palpate.experiments.reproduce.balls import (
     pulled,
     random_grid,
 )
-from palpate.experiments.reproduce.cohort import ORGANS, CohortSettings, estimate_patient, true_moduli
-from palpate.experiments.reproduce.figure4 import LAW, Figure4Settings, figure4, nominal_stress
-from palpate.experiments.reproduce.ledger import Ledger
-from palpate.experiments.reproduce.paper_method import paper_estimate, paper_target
-from palpate.experiments.reproduce.table1 import Table1Settings, table1
-from palpate.inversion import parameter_map, unit_blocks
-from palpate.mechanics.linear_model import linear_model
-from palpate.mesh.space import lagrange_space
-from palpate.mesh.tetrahedralise import tetrahedralise
-from palpate.observation.observed_surface import observed_surface
-from palpate.phantoms.pelvis_shapes import draw_pelvis
+from palpate_validation.paper.cohort import ORGANS, CohortSettings, estimate_patient, patient_space, true_moduli
+from palpate_validation.paper.figure4 import LAW, Figure4Settings, figure4, nominal_stress
+from palpate_validation.paper.paper_method import paper_estimate, paper_target
+from palpate_validation.paper.table1 import Table1Settings, table1
+from palpate_validation.scenes import Ledger
 
 TINY = Balls(radii_mm=(8.0, 14.0, 20.0), edge_mm=8.0, truth_edge_mm=6.0)
 MODULI = np.array([50.0, 100.0, 150.0])
@@ -95,7 +91,7 @@ def test_same_mesh_gives_the_moduli_back_and_finished_columns_are_kept(tmp_path)
     stand_in = {"kpa": 50.0, "error_percent": 0.0, "interval95": None, "verdict": None, "iterations": 1}
     for column in others:
         kept.keep(f"50/100/150 {column}", dict.fromkeys(BODIES, stand_in))
-    document = table1(settings, kept, progress=lambda _: None).to_dict()
+    document = table1(settings).found(kept, progress=lambda _: None).to_dict()
     assert [row["body"] for row in document["rows"]] == list(BODIES)
     assert document["worst_error_percent"]["same_mesh"] < 0.01
     assert {row["columns"]["same_mesh"]["verdict"] for row in document["rows"]} == {"identified"}
@@ -110,7 +106,7 @@ def test_small_stretches_obey_hooke_and_large_ones_do_not():
 def test_the_law_of_the_truth_is_right_where_the_linear_one_is_not():
     """At 30 % of deformation, too, where a round on first-order models leaves more than the square of its step."""
     settings = Figure4Settings(balls=replace(TINY, edge_mm=11.0), moduli_kpa=(tuple(MODULI),), deformations=(0.2, 0.3))
-    found = figure4(settings, Ledger(None, ""), progress=lambda _: None)
+    found = figure4(settings).found(Ledger(None, ""), progress=lambda _: None)
     errors = {law: [abs(p.error_percent) for p in found.points if p.law == law] for law in ("linear", LAW)}
     assert max(errors["linear"]) > 5.0
     assert max(errors[LAW]) < 0.01
@@ -132,7 +128,5 @@ def test_the_default_cohort_keeps_to_its_limit_of_unknowns():
     settings = CohortSettings()
     assert len(settings.stages) == len(settings.pairs) == 8
     assert sum(settings.pairs) == 180
-    box = cohort.grid_box(cohort.centred_grid(cohort.FIELD_MM, (1.0, 1.0, 1.0)))
-    shapes = draw_pelvis(np.random.default_rng(settings.seed + 2), box, bones=False)  # the largest of the eight
-    mesh = tetrahedralise(cohort._anatomy(shapes), edge_length_mm=settings.edge_mm)
-    assert 3 * len(lagrange_space(mesh, "P2").points) <= 30_000
+    space = patient_space(settings, 2)[1]  # the largest of the eight
+    assert 3 * len(space.points) <= 30_000

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.experiments.reproduce.real_pelvis import ORGANS, RealPelvis, real_pelvis
-from palpate.experiments.reproduce.table import COLUMNS
-from palpate.experiments.reproduce.table2 import Table2Settings, _Bench, _jobs, _Surfaces
 from palpate.mesh.space import LagrangeSpace
+from palpate_validation.paper.real_pelvis import ORGANS, RealPelvis, real_pelvis
+from palpate_validation.paper.table import COLUMNS, entries_of
+from palpate_validation.paper.table2 import Table2Settings, table2
 
 
 @pytest.fixture(scope="module")
@@ -37,13 +37,13 @@ def test_the_filling_is_proportional_to_its_size(pelvis, space):
 
 def test_every_part_of_the_table_is_made_once():
     settings = Table2Settings(moduli_kpa=(50.0, 100.0, 150.0), positions=2)
-    keys = [key for job in _jobs(settings) for key in job.keys]
+    keys = [key for job in table2(settings).jobs for key in job.keys]
     assert sorted(keys) == sorted(f"{kpa:g} {column}" for kpa in settings.moduli_kpa for column in COLUMNS)
-    assert ("50 voxels", "150 voxels") in [job.keys for job in _jobs(settings)]  # of one grid, and so of one mesh
+    assert ("50 voxels", "150 voxels") in [job.keys for job in table2(settings).jobs]  # of one grid, and so of one mesh
 
 
 def test_same_mesh_gives_the_moduli_back_where_the_driver_is_given():
-    surfaces = _Surfaces(_Bench(Table2Settings(edge_mm=14.0, moduli_kpa=(50.0, 150.0))))
-    found = surfaces.column("same_mesh", 150.0, lambda _: None)
+    surfaces, *_ = table2(Table2Settings(edge_mm=14.0, moduli_kpa=(50.0, 150.0))).jobs
+    found = entries_of(surfaces.make("150 same_mesh", lambda _: None))
     assert max(abs(found[organ].error_percent) for organ in ORGANS) < 0.01
     assert {found[organ].verdict for organ in ORGANS} == {"identified"}

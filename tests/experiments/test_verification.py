@@ -12,12 +12,9 @@ import pytest
 
 from palpate.cli import main
 from palpate.errors import NotConverged
-from palpate.experiments.verification import registry
-from palpate.experiments.verification.beads import prediction_errors, read_beads
-from palpate.experiments.verification.page import page
-from palpate.experiments.verification.problem import Check, Problem, as_row
-from palpate.experiments.verification.registry import PROBLEMS
-from palpate.experiments.verification.run import UNFINISHED, document_of, rows_of, verify
+from palpate_validation.problems.beads import prediction_errors, read_beads
+from palpate_validation.problems.contract import Check, Problem, rows_of
+from palpate_validation.verify import PROBLEMS, Verification, page, verification
 
 PAGE = (Path(__file__).parents[2] / "docs" / "verification.md").read_text()
 KEYS = {
@@ -61,7 +58,7 @@ def test_the_error_is_that_of_the_scale():
 
 
 def test_a_row_is_json_even_without_a_value():
-    row = as_row(made("B1"), Check("x", 1.0, float("nan"), 1.0))
+    (row,) = rows_of(made("B1", float("nan")))
     assert set(row) == KEYS
     assert json.loads(json.dumps(row, allow_nan=False))["value"] is None
     assert row["pass"] is False
@@ -74,7 +71,7 @@ def test_a_problem_that_cannot_be_computed_has_failed():
     (row,) = rows_of(replace(made("B1"), measure=fail))
     assert "no equilibrium" in row["quantity"]
     assert (row["pass"], row["value"]) == (False, None)
-    assert "failed: B1" in page([row])
+    assert "failed: B1" in page(Verification((row,)))
 
 
 def test_an_interrupted_run_goes_on_where_it_was(tmp_path):
@@ -91,18 +88,20 @@ def test_an_interrupted_run_goes_on_where_it_was(tmp_path):
 
     problems = [counted("B1"), counted("B2")]
     with pytest.raises(KeyboardInterrupt):
-        verify(problems, tmp_path, progress=lambda _: None)
-    document = verify(problems, tmp_path, progress=lambda _: None)
+        verification(problems).written(tmp_path, progress=lambda _: None)
+    document = verification(problems).written(tmp_path, progress=lambda _: None).to_dict()
     assert computed == ["B1", "B2", "B2"]
     assert (document["passed"], document["failed"]) == (2, 0)
-    assert not (tmp_path / UNFINISHED).exists()
-    verify(problems, tmp_path, progress=lambda _: None)
+    assert {path.name for path in tmp_path.iterdir() if path.suffix} == {"verification.json", "verification.md"}
+    verification(problems).written(tmp_path, progress=lambda _: None)
     assert computed[3:] == ["B1", "B2"]
 
 
 @pytest.mark.parametrize(("value", "code"), [(1.005, 0), (1.02, 5)])
 def test_the_command_says_by_its_exit_code_whether_all_is_well(tmp_path, monkeypatch, capfd, value, code):
-    monkeypatch.setattr(registry, "PROBLEMS", (made("B1", value), replace(made("B2", 1.0), quick=False)))
+    monkeypatch.setattr(
+        "palpate_validation.verify.PROBLEMS", (made("B1", value), replace(made("B2", 1.0), quick=False))
+    )
     assert main(["verify", "--json", "--quick", "--output", str(tmp_path)]) == code
     document = json.loads(capfd.readouterr().out)
     assert [row["id"] for row in document["problems"]] == ["B1"]
@@ -117,7 +116,7 @@ def test_the_command_says_by_its_exit_code_whether_all_is_well(tmp_path, monkeyp
 
 def test_the_document_counts_its_checks():
     rows = rows_of(made("B1", 1.0, 1.005, 2.0))
-    document = document_of(rows)
+    document = Verification(tuple(rows)).to_dict()
     assert (document["passed"], document["failed"]) == (2, 1)
 
 

@@ -25,7 +25,8 @@ from dicom_files import PLANTED, TILTED, ct_slices, save_series
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.export import abaqus, febio
 from palpate.export.fitted_model import fitted_model
-from palpate.export.groups import element_faces, face_groups, plain_names
+from palpate.export.formats import Options, format_named
+from palpate.export.groups import OFF, element_faces, face_groups, plain_names
 from palpate.images.alignment import RigidMotion
 from palpate.images.label_image import VoxelGrid
 from palpate.images.registration import Registration
@@ -532,3 +533,72 @@ def test_known_loads_keep_their_sum(case_result, tmp_path, model):
     assert [load.get("type") for load in root.find("Loads")] == ["nodal_force", "pressure"]
     with pytest.raises(ConfigurationError, match="neither known loads"):
         palpate.export(result, tmp_path / "sofa", format="sofa")
+
+
+def parts_of(path):
+    """Cells (numbers from 0) and constant of every section of an Abaqus file."""
+    sets, sections, moduli, kind, now = {}, [], {}, "", ""
+    for line in path.read_text().splitlines():
+        if line.startswith("*"):
+            kind, options = line.split(",")[0], dict(o.strip().split("=") for o in line.split(",")[1:] if "=" in o)
+            now = options.get("ELSET") or options.get("NAME", now)
+            if kind == "*SOLID SECTION":
+                sections.append((options["ELSET"], options["MATERIAL"]))
+        elif kind == "*ELEMENT":
+            sets.setdefault(now, []).append(int(line.split(",")[0]) - 1)
+        elif kind == "*ELSET":
+            sets.setdefault(now, []).extend(int(n) - 1 for n in line.split(",") if n.strip())
+        elif kind == "*HYPERELASTIC":
+            moduli[now] = float(line.split(",")[0])
+    return [(np.array(sets[cells]), moduli[material]) for cells, material in sections]
+
+
+def test_elements_of_a_tissue_that_is_not_homogeneous_have_their_own_moduli_in_every_simulator(model, tmp_path):
+    mesh = model.bodies[0].mesh
+    own = np.flatnonzero(mesh.region == mesh.tissue_index("prostate"))
+    logs = np.zeros(len(mesh.region))
+    logs[own] = 0.4 * np.sin(mesh.nodes[mesh.tets[own]].mean(axis=1)[:, 0] / 5.0)
+    body = dataclasses.replace(model.bodies[0], log_ratio=logs)
+    wanted = 58.9 * np.exp(logs[own])
+    np.testing.assert_allclose(body.element_moduli(model.moduli)[own], wanted)
+    for name in ("abaqus", "febio", "gmsh", "sofa"):
+        format_named(name).write(model, body, tmp_path, Options(linear=False))
+
+    parts = parts_of(tmp_path / "palpate.inp")
+    assert sorted(np.concatenate([cells for cells, _ in parts]).tolist()) == list(range(len(mesh.region)))
+    found = np.zeros(len(mesh.region))
+    for cells, constant in parts:
+        found[cells] = 4.0 * constant * (1.0 + 0.45)  # E of C10 = mu / 2
+    off = found[own] / wanted - 1.0
+    assert np.abs(off).max() <= OFF + 1e-9
+    assert np.abs(off).max() > 0.2 * OFF
+
+    root = ET.parse(tmp_path / "palpate.feb").getroot()
+    (values,) = root.iter("ElementData")
+    (cells,) = (s for s in root.iter("ElementSet") if s.get("name") == values.get("elem_set"))
+    assert cells.text.split(",") == [str(cell + 1) for cell in own]
+    np.testing.assert_allclose([float(value.text) for value in values], wanted, rtol=1e-9)
+    prostate = next(m for m in root.iter("material") if m.get("name") == "prostate")
+    assert (prostate.find("E").get("type"), prostate.find("E").text) == ("map", values.get("name"))
+    bladder = next(m for m in root.iter("material") if m.get("name") == "bladder")
+    assert float(bladder.find("E").text) == 31.2
+
+    gmsh = meshio.read(tmp_path / "palpate.msh")
+    ordered = np.sort(gmsh.cells_dict["tetra10"][:, :4], axis=1)
+    places = {tuple(corners): number for number, corners in enumerate(ordered.tolist())}
+    rows = [places[tuple(sorted(corners))] for corners in mesh.tets[own].tolist()]
+    read = np.concatenate(
+        [
+            data
+            for block, data in zip(gmsh.cells, gmsh.cell_data["youngs_modulus_kpa"], strict=True)
+            if block.type == "tetra10"
+        ]
+    )
+    np.testing.assert_allclose(np.asarray(read).ravel()[rows], wanted, rtol=1e-6)
+
+    document = json.loads((tmp_path / "model.json").read_text())
+    with np.load(tmp_path / "model.npz") as arrays:
+        part = arrays["part"]
+    shear = {of["part"]: float(str(of["parameters"]["ParameterSet"]).split()[0]) for of in document["tissues"]}
+    theirs = np.array([2.0 * (1.0 + 0.45) * shear[number] for number in part[own].tolist()])
+    np.testing.assert_allclose(theirs, found[own], rtol=1e-9)

@@ -7,8 +7,7 @@ from pathlib import Path
 from palpate.export.label_table import write_label_table
 from palpate.images.label_table import read_label_table
 from palpate.images.segmentation import first_labels
-from palpate.images.tissue import Role, Tissue
-from palpate.images.tissue_colours import tissue_colours
+from palpate.images.tissue import Role, Tissue, tissue_colours
 
 TISSUES = (
     Tissue("prostate", Role.ESTIMATE, (4, 2), colour="#ff8000"),

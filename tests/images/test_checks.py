@@ -128,7 +128,7 @@ def test_a_shifted_image_is_not_called_mirrored() -> None:
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_flip_of_a_real_nearly_symmetric_pelvis_is_noticed(axis: int) -> None:
-    with as_file(files("palpate.experiments") / "data" / "labels.nii.gz") as path:
+    with as_file(files("palpate.demo") / "data" / "labels.nii.gz") as path:
         image = read_label_image(path)
     organs = (
         Tissue("prostate", Role.ESTIMATE, (1,)),

@@ -10,7 +10,7 @@ import pytest
 from palpate.errors import InputDataError
 from palpate.images.label_table import read_label_table
 from palpate.images.named_labels import NamedLabel
-from palpate.images.readers.table_slicer import slicer_table
+from palpate.images.readers.column_tables import slicer_table
 
 
 @pytest.mark.parametrize(

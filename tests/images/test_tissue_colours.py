@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from palpate.images.tissue import Role, Tissue
-from palpate.images.tissue_colours import tissue_colours
+from palpate.images.tissue import Role, Tissue, tissue_colours
 
 
 def tissue(colour):

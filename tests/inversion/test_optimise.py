@@ -93,6 +93,24 @@ def test_minima_within_a_posterior_width_are_one(toys):
     assert not same_minimum(found.unknowns + np.array([0.6, 0.0]), found, 2)
 
 
+def test_a_step_to_where_nothing_can_be_solved_is_refused_and_a_shorter_one_taken(toys):
+    """The first one overshoots the minimum at 1, as far as 1.15."""
+    truth, start = np.ones(2), np.array([1.0, 0.5])
+    folds = toys.Folding(toys.Saturating(truth), most=1.05)
+    assert gauss_newton(folds.of, start, bounds=WIDE, max_steps=2).history[1].theta[1] > folds.most
+    found = gauss_newton(folds, start, bounds=WIDE, tolerance=1e-9)
+    assert found.converged
+    assert found.unknowns == pytest.approx(truth, abs=1e-4)
+
+
+def test_where_every_step_leads_to_what_cannot_be_solved_the_outcome_says_so(toys):
+    nowhere = toys.Folding(toys.Quadratic(np.eye(3), np.array([0.0, 0.0, 2.0])), most=0.25)
+    ended = gauss_newton(nowhere, np.array([0.0, 0.0, 0.25]), bounds=WIDE)
+    assert ended.outcome is Outcome.UNSOLVABLE
+    assert not ended.converged
+    assert "inside out" in ended.outcome.value
+
+
 def test_an_objective_that_is_no_number_says_so(toys):
     broken = toys.Quadratic(np.full((3, 3), np.nan), np.zeros(3))
     assert gauss_newton(broken, np.ones(3), bounds=WIDE).outcome is Outcome.NOT_FINITE

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from palpate.errors import SolverError
 from palpate.inversion.objective import Evaluation
 
 
@@ -32,6 +33,23 @@ class Quadratic:
         return Evaluation(
             value, value, slope, self.pull * slope, self.curvature.copy(), (), 0.0 * self.curvature, 0.0 * slope
         )
+
+
+@dataclass(frozen=True)
+class Folding:
+    """Another objective, where the last unknown is no larger than `most`: beyond nothing can be solved."""
+
+    of: Quadratic | Saturating
+    most: float
+
+    @property
+    def n_parameters(self):
+        return self.of.n_parameters
+
+    def __call__(self, unknowns):
+        if unknowns[-1] > self.most:
+            raise SolverError("the motion turns elements inside out")
+        return self.of(unknowns)
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,8 @@ from palpate.observation.observed_surface import observed_surface
 from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.observation.surface_distance import surface_distance
 from palpate.observation.target import surface_target
-from palpate.phantoms.boundary_noise import smooth_field
 from palpate.phantoms.exact_targets import exact_target, target_of_truth
+from palpate.phantoms.motion import smooth_field
 from palpate.phantoms.scene import Scene, centred_grid, imaged
 from palpate.phantoms.shapes import ball
 

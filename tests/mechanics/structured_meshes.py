@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from palpate.experiments.verification.conditions import (
+from palpate_validation.conditions import (
     all_prescribed,
     held_components,
     mean_radial,
@@ -10,7 +10,7 @@ from palpate.experiments.verification.conditions import (
     pressure_load,
     sphere_faces,
 )
-from palpate.experiments.verification.structured_meshes import (
+from palpate_validation.structured_meshes import (
     VOID,
     box_mesh,
     known,

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from palpate.errors import SolverError
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.equilibrium import equilibrium
 from palpate.mechanics.laws.registry import LAWS
@@ -110,3 +113,36 @@ def test_its_derivatives_leave_remainders_of_second_order(space, law):
         there = reaction.at(u + h * du, moduli * np.exp(h * dm), material + h * dc)[0]
         remainders.append(abs(there - value - h * (by_u @ du + direct @ np.concatenate([dm, dc]))))
     assert np.all(np.diff(np.log(remainders)) / np.diff(np.log(STEPS)) > 1.9)
+
+
+@pytest.mark.parametrize("law", ["neo-hookean", "mooney-rivlin"])
+@pytest.mark.parametrize("dilatation", list(Dilatation))
+def test_no_force_is_told_of_elements_that_are_turned_inside_out(space, law, dilatation):
+    reaction = surface_reaction(space, face(space, top=True), np.eye(3)[2], LAWS[law], dilatation=dilatation)
+    mirrored = np.zeros_like(space.points)
+    mirrored[:, 2] = -2.0 * space.points[:, 2]
+    motion, moduli = mirrored.ravel()[reaction.dofs], np.array([10.0, 40.0])
+    with pytest.raises(SolverError, match=r"the force on the surface around .* inside out \(volume ratio -1\)"):
+        reaction.at(motion, moduli, np.zeros(0))
+    linear = surface_reaction(space, face(space, top=True), np.eye(3)[2], LAWS["linear"], dilatation=dilatation)
+    assert np.isfinite(linear.at(motion, moduli, np.zeros(0))[0])
+
+
+@pytest.mark.parametrize("dilatation", list(Dilatation))
+@pytest.mark.parametrize("law", ["linear", "neo-hookean", "mooney-rivlin"])
+def test_its_derivatives_by_poissons_ratios_are_those_that_differences_say(space, law, dilatation):
+    """At a held displacement, each region's alone."""
+    rng, moduli = np.random.default_rng(3), np.array([10.0, 40.0])
+
+    def reaction(soft, hard):
+        """Of tissues with these Poisson's ratios, on a face that both of them have."""
+        tissues = tuple(replace(t, poisson_ratio=r) for t, r in zip(space.mesh.tissues, (soft, hard), strict=True))
+        with_them = replace(space, mesh=replace(space.mesh, tissues=tissues))
+        return surface_reaction(with_them, face(space, top=True), np.eye(3)[2], LAWS[law], dilatation=dilatation)
+
+    u, h = 0.02 * rng.standard_normal(len(reaction(0.3, 0.3).dofs)), 1e-4
+    found = reaction(0.3, 0.45).by_poisson(u, moduli, np.zeros(0))
+    for i, step in enumerate(np.eye(2) * h):
+        high, low = (reaction(0.3 + s[0], 0.45 + s[1]).at(u, moduli, np.zeros(0))[0] for s in (step, -step))
+        assert found[i] == pytest.approx((high - low) / (2.0 * h), rel=1e-4)
+    assert np.abs(found).min() > 0.0

@@ -4,8 +4,7 @@ from scipy.spatial.transform import Rotation
 
 from palpate.mesh.anatomy import Box
 from palpate.mesh.cutting import cut, edge_lengths, graded_grid, signed_volumes
-from palpate.mesh.dihedral import tet_dihedrals
-from palpate.mesh.tet_mesh import FACES
+from palpate.mesh.tet_mesh import FACES, tet_dihedrals
 
 BOX = Box(np.array([-20.0, -20.0, -20.0]), Rotation.from_euler("xyz", [0.1, 0.2, 0.3]).as_matrix(), np.full(3, 40.0))
 

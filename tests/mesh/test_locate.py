@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.experiments.verification.structured_meshes import box_mesh
 from palpate.mesh.locate import located, point_interpolation
 from palpate.mesh.space import lagrange_space
+from palpate_validation.structured_meshes import box_mesh
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import palpate.observation
-from palpate.experiments.verification.structured_meshes import box_mesh
 from palpate.images.distance import distance_map
 from palpate.images.label_image import VoxelGrid
 from palpate.mesh.locate import located
@@ -25,6 +24,7 @@ from palpate.observation.robust_loss import PowerLaw
 from palpate.observation.surface_distance import SurfaceDistance, surface_distance
 from palpate.observation.target import surface_target, target_from
 from palpate.phantoms.shapes import Ellipsoid, rotation_about
+from palpate_validation.structured_meshes import box_mesh
 
 MEMBERS = [name for name in vars(Observation) if not name.startswith("_")]
 STEPS = np.array([1e-2, 1e-3, 1e-4])
@@ -118,6 +118,9 @@ class Spring:
         stretch = displacement[2] - displacement[5]
         slope = moduli.sum() * np.eye(len(displacement))[2] - moduli.sum() * np.eye(len(displacement))[5]
         return moduli.sum() * stretch, slope, np.concatenate([moduli * stretch, 0.0 * coefficients])
+
+    def by_poisson(self, displacement, moduli, _coefficients):
+        return 2.0 * moduli * (displacement[2] - displacement[5])
 
 
 def of_force(_sphere, _point_motion):

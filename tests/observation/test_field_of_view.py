@@ -15,8 +15,7 @@ from palpate.mesh.anatomy import anatomy_of, domain_box
 from palpate.mesh.space import lagrange_space
 from palpate.mesh.tetrahedralise import tetrahedralise
 from palpate.observation.contract import ImagedBody
-from palpate.observation.field_of_view import field_of_view
-from palpate.observation.observed_surface import observed_surfaces
+from palpate.observation.observed_surface import field_of_view, observed_surfaces
 from palpate.observation.surface_distance import surface_distances
 
 SHAPE = (44, 40, 40)

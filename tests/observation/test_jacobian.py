@@ -44,3 +44,15 @@ def test_other_derivatives_of_the_displacement_leave_those_by_offsets(whole, rng
 def test_one_that_is_formed_is_itself(rng):
     dense = rng.standard_normal((6, 3))
     assert Jacobian.of(dense).dense == pytest.approx(dense)
+
+
+def test_it_is_the_same_product_however_many_residuals_are_formed_at_once(rng, monkeypatch):
+    """As a field of measured points has it: about as many residuals as displacements."""
+    rows, dofs, columns = 103, 90, 7
+    seen = sparse.random_array((rows, dofs), density=0.1, rng=rng, format="csr")
+    jacobian = Jacobian(sparse.csr_matrix(seen), rng.standard_normal((dofs, columns)))
+    weights = rng.uniform(0.0, 2.0, rows)
+    at_once = jacobian.gram(weights)
+    monkeypatch.setattr("palpate.observation.jacobian.ROWS", 10)
+    assert jacobian.gram(weights) == pytest.approx(at_once, rel=1e-12)
+    assert at_once == pytest.approx(jacobian.dense.T @ (weights[:, None] * jacobian.dense))

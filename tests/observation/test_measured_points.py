@@ -10,7 +10,6 @@ import pytest
 import SimpleITK
 
 from palpate.errors import InputDataError
-from palpate.experiments.verification.structured_meshes import box_mesh
 from palpate.images.alignment import RigidMotion
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers.nifti import write_displacement_field
@@ -20,6 +19,7 @@ from palpate.mesh.space import lagrange_space
 from palpate.observation.contract import DataFile
 from palpate.observation.displacement_field import read_displacement_field
 from palpate.observation.landmarks import read_landmarks
+from palpate_validation.structured_meshes import box_mesh
 
 LPS = np.array([-1.0, -1.0, 1.0])
 MOTION = np.array([[0.0, 0.1, 0.0], [-0.1, 0.0, 0.02], [0.0, -0.02, 0.0]])
@@ -147,6 +147,14 @@ def test_a_table_that_is_none_is_refused(tmp_path, text, words):
         read(tmp_path / "m.csv")
 
 
+@pytest.mark.parametrize("n", [1, 3])
+def test_a_field_of_a_row_or_two_is_no_field_but_a_marker_is_one(tmp_path, points, n):
+    path = csv_of(tmp_path / "m.csv", points[:n], moved(points[:n]))
+    with pytest.raises(InputDataError, match=f"holds {n} of the 4 points or more"):
+        read(path, kind="displacement-field")
+    assert f"{n} pair{'s' * (n > 1)} of points" in read(path).in_words
+
+
 @pytest.mark.parametrize(
     "content", ["{}", "[", '{"markups": 3}', '{"markups": [{"controlPoints": [{"position": [1]}]}]}']
 )
@@ -186,6 +194,41 @@ def test_a_field_is_read_from_what_itk_writes(tmp_path, space, ending):
     term, _ = source.on(space, no_force)
     motion = (moved(space.points) - space.points).ravel()[term.dofs]
     assert np.abs(term.residuals(motion).values).max() < 1e-3
+
+
+def itk_field(low, high, spacing, slope, shift):
+    """The field x -> slope x + shift, LPS mm, on a grid from low to high, as a transform; a slope per axis."""
+    sizes = [int(n) for n in np.rint((np.array(high) - low) / spacing) + 1]
+    index = np.stack(np.indices(sizes), axis=-1)
+    values = (np.array(low) + spacing * index) * slope + shift
+    image = SimpleITK.GetImageFromArray(np.swapaxes(values, 0, 2), isVector=True)
+    image.SetOrigin([float(x) for x in low])
+    image.SetSpacing([float(spacing)] * 3)
+    return SimpleITK.DisplacementFieldTransform(image)
+
+
+def test_a_composite_of_fields_on_several_grids_is_what_one_after_the_other_does(tmp_path):
+    """Only where a point's way keeps to all grids: beyond one ITK takes its displacement for none."""
+    first = itk_field([-20.0, -20.0, -20.0], [20.0, 20.0, 20.0], 2.0, 0.05, 1.0)  # the last is applied first
+    second = itk_field([-10.0, -30.0, -30.0], [30.0, 30.0, 30.0], 5.0, -0.1, 2.0)
+    turn = SimpleITK.AffineTransform(3)
+    turn.SetTranslation([3.0, 0.0, 0.0])
+    SimpleITK.WriteTransform(SimpleITK.CompositeTransform([second, turn, first]), str(tmp_path / "all.h5"))
+    source = read(tmp_path / "all.h5", kind="displacement-field")
+    lps = source.table.before * LPS
+    way = lps * 1.05 + 1.0 + np.array([3.0, 0.0, 0.0])
+    assert source.table.after * LPS == pytest.approx(way * 0.9 + 2.0, abs=1e-9)
+    grid = np.stack(np.meshgrid(*[np.arange(-20.0, 21.0, 2.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    kept = grid[:, 0] * 1.05 + 4.0 >= -10.0
+    assert 0 < np.count_nonzero(kept) < len(grid)
+    assert {tuple(x) for x in lps.round(6)} == {tuple(x) for x in grid[kept].round(6)}
+
+
+def test_fields_whose_grids_lie_apart_are_refused(tmp_path):
+    apart = [itk_field([x, 0.0, 0.0], [x + 10.0, 10.0, 10.0], 2.0, 0.0, 1.0) for x in (0.0, 50.0)]
+    SimpleITK.WriteTransform(SimpleITK.CompositeTransform(apart), str(tmp_path / "apart.h5"))
+    with pytest.raises(InputDataError, match=r"the 2 fields of .* write the transform as one field"):
+        read(tmp_path / "apart.h5", kind="displacement-field")
 
 
 def images(shift):

@@ -9,7 +9,7 @@ import pytest
 
 from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import FitResponse, NoiseModel, fit_noise_model, mean_noise
-from palpate.phantoms.boundary_noise import smooth_field
+from palpate.phantoms.motion import smooth_field
 
 RADIUS = 20.0
 

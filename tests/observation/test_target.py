@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.images.distance import distance_map
+from palpate.images.distance import distance_map, terrace_noise
 from palpate.images.label_image import VoxelGrid
-from palpate.images.voxel_noise import terrace_noise
 from palpate.observation.observed_surface import ObservedSurface
 from palpate.observation.surface_residuals import correspondence
 from palpate.observation.target import surface_target, target_from

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.observation.whitening import NEIGHBOURS, correlation, whitener
+from palpate.observation.noise_model import NEIGHBOURS, correlation, whitener
 
 
 def covariance_of(groups, length):
@@ -48,3 +48,15 @@ def test_independent_errors_are_scaled_by_how_many_are_averaged(groups):
 def test_its_size_grows_with_the_number_of_points():
     groups = np.random.default_rng(4).uniform(0.0, 60.0, (4000, 1, 3))
     assert whitener(groups, 5.0).nnz <= len(groups) * (NEIGHBOURS + 1)
+
+
+def test_it_is_the_same_however_many_means_are_looked_at_at_once(groups, monkeypatch):
+    at_once = whitener(groups, 5.0)
+    monkeypatch.setattr("palpate.observation.noise_model.AT_ONCE", 7)
+    assert abs(whitener(groups, 5.0) - at_once).max() < 1e-12
+
+
+def test_points_that_stand_twice_in_a_mean_count_as_one(groups):
+    """Of a cell with few points some stand twice, whose distance is none."""
+    twice = np.repeat(groups, 2, axis=1)
+    assert abs(whitener(twice, 5.0) - whitener(groups, 5.0)).max() < 1e-6

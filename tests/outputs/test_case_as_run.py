@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import shutil
 import tomllib
 
 from palpate.cli import main
+from palpate.study.case_file import read_case
 
 
 def document(out):
@@ -16,7 +18,7 @@ def test_the_case_as_it_was_run_stands_beside_its_result(estimate, out):
     assert estimate("anna", "--quiet", "--set", "mesh.edge_length_mm=3") == 0
     tables = tomllib.loads((out / "case.toml").read_text())
     assert (tables["id"], tables["mesh"]["edge_length_mm"]) == ("anna", 3)
-    assert tables["images"]["before"] == "../before.nii.gz"
+    assert tables["images"]["before"] == (out.parent / "before.nii.gz").resolve().as_posix()
     assert "case.toml" in document(out)["files"]
     assert document(out)["overrides"] == ["mesh.edge_length_mm=3"]
     assert document(out)["case"]["mesh"] == {"edge_length_mm": 3.0}
@@ -44,6 +46,16 @@ def test_it_can_be_run_again_in_its_own_folder(estimate, out):
     for _ in range(2):
         assert main(["estimate", str(out / "case.toml"), "--output", str(out), "--quiet"]) == 0
         assert (out / "case.toml").read_bytes() == first
+
+
+def test_it_can_be_run_again_where_its_folder_was_moved_to(estimate, out, tmp_path_factory):
+    assert estimate("anna", "--quiet") == 0
+    images = read_case(out / "case.toml").images
+    moved = tmp_path_factory.mktemp("elsewhere") / "deep" / "er"
+    moved.parent.mkdir()
+    shutil.move(out, moved)
+    assert main(["estimate", str(moved / "case.toml"), "--output", str(moved), "--quiet"]) == 0
+    assert read_case(moved / "case.toml").images == images
 
 
 def test_an_input_is_not_replaced_by_the_case_with_its_overrides(estimate, out, capsys):

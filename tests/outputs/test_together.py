@@ -16,7 +16,7 @@ from palpate.cli import main
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers import write_label_image
 from palpate.report import case_report
-from palpate.study import journal
+from palpate.study import outputs
 
 FILES = {
     "result.json",
@@ -42,7 +42,8 @@ def result(folder: Path) -> dict:
 
 
 def among_the_renames(folder: Path) -> bool:
-    return (folder / journal.STAGING / journal.JOURNAL).exists()
+    """Whether it is decided that the new files take their places, and not all of them have."""
+    return (folder / outputs.STAGING / outputs.READY).exists()
 
 
 def refuse(error):
@@ -74,15 +75,15 @@ def test_without_its_page_a_result_keeps_its_numbers_and_has_nobody_elses(estima
 
 
 def test_a_disk_that_is_full_after_the_page_costs_the_page_only(estimate, out, monkeypatch):
-    first, calls = journal.carry_out, []
+    first, calls = outputs._exchange, []
 
-    def full(folder, renames):
-        calls.append(len(renames))
+    def full(folder, leaving):
+        calls.append(len(outputs.Staging(folder).names()))
         if len(calls) == 1:
             raise NO_SPACE
-        return first(folder, renames)
+        return first(folder, leaving)
 
-    monkeypatch.setattr("palpate.study.outputs.carry_out", full)
+    monkeypatch.setattr(outputs, "_exchange", full)
     assert estimate("bert", "--quiet") == 0
     assert calls == [9, 7]
     assert not (out / "report.html").exists()
@@ -184,7 +185,7 @@ def test_a_signal_before_the_renames_finds_none_done_and_says_so(estimate, out, 
     assert contents(out) == before
 
 
-@pytest.mark.parametrize("turn", [0, 1, 5, 6, 9, 11])
+@pytest.mark.parametrize("turn", [0, 1, 4, 7, 8])
 def test_the_report_completes_what_a_kill_has_cut(estimate, out, monkeypatch, turn):
     class Killed(BaseException):
         """The end of the process."""
@@ -201,7 +202,7 @@ def test_the_report_completes_what_a_kill_has_cut(estimate, out, monkeypatch, tu
     assert estimate("anna", "--quiet") == 0
     with monkeypatch.context() as patch:
         patch.setattr(Path, "replace", cut)
-        patch.setattr("palpate.study.outputs.clear", lambda _: None)  # nobody clears up after a kill
+        patch.setattr(outputs, "_clear", lambda _: None)  # nobody clears up after a kill
         with pytest.raises(Killed):
             estimate("bert", "--quiet")
     assert main(["report", str(out), "--quiet"]) == 0
@@ -213,7 +214,6 @@ def test_the_report_completes_what_a_kill_has_cut(estimate, out, monkeypatch, tu
 def test_what_a_killed_run_left_is_removed(estimate, out):
     (out / ".writing-outputs" / "new").mkdir(parents=True)
     (out / ".writing-outputs" / "new" / "mesh.vtu").write_text("half")
-    (out / ".writing-abc123-mesh.vtu").write_text("half")
     assert estimate("anna", "--quiet") == 0
     assert {path.name for path in out.iterdir()} == FILES
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from palpate.phantoms.boundary_noise import smooth_field
+from palpate.phantoms.motion import smooth_field
 
 
 def pairs(distance, n=4000):

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from palpate.phantoms.boundary_noise import smooth_field
-from palpate.phantoms.motion import AffineMotion, filling_of
+from palpate.phantoms.motion import AffineMotion, filling_of, smooth_field
 from palpate.phantoms.shapes import Tube, rotation_about
 
 TUBE = Tube(np.linspace([0.0, 0.0, -20.0], [0.0, 4.0, 20.0], 5), np.full(5, 11.0))

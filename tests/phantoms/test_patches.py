@@ -3,8 +3,8 @@ import pytest
 
 from palpate.errors import GeometryError
 from palpate.mesh.tetrahedralise import tetrahedralise
-from palpate.phantoms.patches import patched
 from palpate.phantoms.spheres import SpheresOptions, spheres_anatomy
+from palpate_validation.mismatch import patched
 
 
 @pytest.fixture(scope="module")

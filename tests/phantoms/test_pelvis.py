@@ -5,7 +5,7 @@ import pytest
 
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role
-from palpate.phantoms.boundary_noise import smooth_field
+from palpate.phantoms.motion import smooth_field
 from palpate.phantoms.pelvis import PelvisOptions, pelvis
 from palpate.phantoms.pelvis_shapes import draw_pelvis
 from palpate.phantoms.scene import centred_grid, grid_box

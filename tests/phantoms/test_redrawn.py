@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from palpate.phantoms.boundary_noise import smooth_field
-from palpate.phantoms.redrawn import redrawn
+from palpate.phantoms.motion import smooth_field
 from palpate.phantoms.scene import imaged
 from palpate.phantoms.spheres import SpheresOptions, spheres
+from palpate_validation.mismatch import redrawn
 
 SHELL_MM, CORE_MM = 20.0, 10.0
 

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from palpate.phantoms.shapes import Complement, Ellipsoid, Grown, Tube, Union, ball, rotation_about
+from palpate.phantoms.shapes import Complement, Ellipsoid, Tube, Union, ball, rotation_about
+from palpate_validation.mismatch import Grown
 
 TURN = rotation_about(np.array([1.0, 2.0, -0.5]), 25.0)
 ELLIPSOID = Ellipsoid(np.array([1.0, -2.0, 3.0]), np.array([17.0, 22.0, 28.0]), TURN)

@@ -12,14 +12,20 @@ import matplotlib.image as mpimg
 import numpy as np
 import pytest
 
+from bodies import ELSEWHERE, STILL, body
 from palpate.images.readers import write_scalar_image
 from palpate.observation.contract import PointMotions
 from palpate.report.case_report import write_case_report
+from palpate.report.preview import preview_page
+from palpate.study.body import brought
+from palpate.study.case import Case, CaseTissue, Images
+from palpate.study.check import Checked, CheckReport
 from palpate.study.estimation import PointFit
 
 playwright = pytest.importorskip("playwright.sync_api", reason="no playwright; pip install palpate[browser]")
 
 SOFTWARE_GL = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+IMAGES = Images(Path("before.nii.gz"), (Path("after.nii.gz"),))
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 
 
@@ -161,6 +167,36 @@ def test_the_slider_moves_the_slice_and_a_click_the_others(opened):
     assert changed(first, pixels(axial)) > 0.02
     axial.click(position={"x": 20, "y": 20})
     assert changed(other, pixels(coronal)) > 0.02
+
+
+def test_the_wheel_goes_through_the_slices_and_at_their_end_scrolls_the_page(opened):
+    page = opened()
+    figure = alive(page, "slices")
+    axial, slider = figure.locator("canvas").nth(0), figure.locator("input[type=range]").nth(0)
+    axial.scroll_into_view_if_needed()
+    page.wait_for_timeout(400)
+    axial.hover()
+    first, before, top = drawn(axial), float(slider.input_value()), page.evaluate("scrollY")
+    page.mouse.wheel(0, 120)
+    page.wait_for_timeout(300)
+    assert float(slider.input_value()) == before - 3.0  # a millimetre for every 40 pixels
+    assert page.evaluate("scrollY") == top
+    assert changed(first, drawn(axial)) > 0.01
+    assert slider.get_attribute("aria-valuetext") == f"z = {before - 3.0:.1f} mm"
+    slider.fill(slider.get_attribute("min"))
+    page.mouse.wheel(0, 120)
+    page.wait_for_timeout(300)
+    assert page.evaluate("scrollY") > top
+
+
+def test_every_slider_says_what_it_stands_at(opened):
+    page = opened()
+    for section in ("alignment", "slices", "organs", "mesh"):
+        alive(page, section)
+    sliders = page.locator(".live input[type=range]:visible")
+    words = [sliders.nth(i).get_attribute("aria-valuetext") for i in range(sliders.count())]
+    assert len(words) >= 8
+    assert all(words)
 
 
 def test_layers_and_states_can_be_told_apart(opened):
@@ -377,3 +413,71 @@ def test_without_webgl_the_bodies_stand_as_pictures(engine, address):
     assert page.locator("section.organs canvas:visible").count() == 0
     browser.close()
     assert not complaints
+
+
+@pytest.fixture(scope="module")
+def preview(tmp_path_factory):
+    """The preview of a body that lay elsewhere in its later image."""
+    states = brought(body(STILL), (body(ELSEWHERE, filling=4.0, seed=1),), method="surfaces")
+    tissues = tuple(
+        CaseTissue(t.name, t.labels or "remaining", t.role, youngs_modulus_kpa=t.youngs_modulus_kpa)
+        for t in states.before.tissues
+    )
+    checked = Checked(CheckReport("preview", ()), Case("preview", images=IMAGES, tissues=tissues), (states,))
+    path = tmp_path_factory.mktemp("preview") / "preview.html"
+    path.write_text(preview_page(checked, created="now", version="0"), encoding="utf-8")
+    return path.as_uri()
+
+
+@pytest.fixture
+def previewed(browser, preview):
+    """Its page, on a telephone or not, in silence."""
+    pages, complaints = [], []
+
+    def open_page(**settings):
+        page = browser.new_page(**({"viewport": {"width": 1100, "height": 900}} | settings))
+        pages.append(page)
+        page.on("console", lambda message: complaints.append(message.text))
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("request", lambda request: None if request.url == preview else complaints.append(request.url))
+        page.goto(preview)
+        return page
+
+    yield open_page
+    for page in pages:
+        page.close()
+    assert not complaints
+
+
+@pytest.mark.parametrize(
+    ("section", "change"),
+    [
+        ("organs", lambda of: of.locator(".fade").fill("100")),
+        ("organs", lambda of: of.locator("[data-show=names]").uncheck()),
+        ("organs", lambda of: of.locator("[data-show=arrows]").uncheck()),
+        ("organs", lambda of: of.locator("[data-show=before]").uncheck()),
+        ("organs", lambda of: of.locator("[data-show=aligned]").uncheck()),
+        ("organs", lambda of: of.locator("label", has_text="tissue").last.click()),
+        ("whole", lambda of: of.locator(".fade").fill("100")),
+        ("whole", lambda of: of.locator("[data-show=field]").uncheck()),
+    ],
+)
+def test_every_control_of_a_preview_changes_the_picture(previewed, section, change):
+    page = previewed()
+    figure = page.locator(f"section.preview[data-box={section}]")
+    figure.scroll_into_view_if_needed()
+    page.wait_for_selector(f"section.preview[data-box={section}][data-state=live]")
+    page.wait_for_timeout(300)
+    canvas = figure.locator("canvas").nth(0)
+    first = drawn(canvas)
+    change(figure)
+    page.wait_for_timeout(200)
+    assert changed(first, drawn(canvas)) > 0.0005
+
+
+def test_a_preview_fits_a_telephone(previewed):
+    page = previewed(viewport={"width": 390, "height": 900})
+    for section in ("organs", "whole"):
+        page.locator(f"section.preview[data-box={section}]").scroll_into_view_if_needed()
+        page.wait_for_selector(f"section.preview[data-box={section}][data-state=live]")
+    assert page.evaluate("document.documentElement.scrollWidth") == 390

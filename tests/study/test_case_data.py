@@ -17,7 +17,7 @@ from palpate.images.readers import write_label_image
 from palpate.images.readers.nifti import write_displacement_field
 from palpate.mesh.locate import located, point_interpolation
 from palpate.observation.contract import DataFile
-from palpate.observation.sources import SOURCES, SourceKind
+from palpate.observation.registry import SOURCES, SourceKind
 from palpate.report.collect import collect
 from palpate.report.methods import methods_text
 from palpate.study.case_data import CaseData

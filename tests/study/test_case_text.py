@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from palpate.errors import ConfigurationError
-from palpate.study.case_file import read_case
-from palpate.study.case_text import case_tables, case_text
+from palpate.study.case_file import case_tables, case_text, read_case
 
 TISSUES = """
 [tissues."left hip"]

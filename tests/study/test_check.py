@@ -85,7 +85,7 @@ def test_cost_is_that_of_the_solver_that_will_run(case_result, monkeypatch):
     assert plain.solver.startswith("multifrontal")
     assert iterated.solver == "multigrid"
     assert iterated.seconds > plain.seconds
-    monkeypatch.setattr(registry, "total_memory", lambda: 1.0)
+    monkeypatch.setenv("PALPATE_MEMORY_GB", "0.001")
     assert expected_cost(case, before, after, n_pairs=1).solver != "multifrontal"
 
 
@@ -116,7 +116,6 @@ def test_an_estimate_is_refused_for_the_memory_that_a_check_refuses_it_for(tmp_p
 @pytest.mark.parametrize(("share", "code"), [(100.0, None), (1.0, 0), (0.1, 6)])
 def test_memory_that_will_not_do_is_told_before(case_result, monkeypatch, share, code):
     needed = expected_cost(case_result.case, case_result.before, case_result.after, n_pairs=1)
-    for module in (cost, check):
-        monkeypatch.setattr(module, "machine_memory_gb", lambda: share * needed.memory_gb)
+    monkeypatch.setenv("PALPATE_MEMORY_GB", f"{share * needed.memory_gb:.6f}")
     found = [problem.exit_code for problem in check.memory_problems(needed)]
     assert found == ([] if code is None else [code])

@@ -285,8 +285,13 @@ def test_an_interval_that_holds_no_layer_says_so(inversion, settings, observed, 
     for ending in (lost, lambda *_arguments, **_options: open_):
         monkeypatch.setattr("palpate.study.estimation.with_released", ending)
         result = stated(inversion, settings, observed)
+        assert result.status == "converged"
         (remark,) = (remark for remark in result.remarks if remark.code == "unsettled")
         assert "layers round organs" in remark.message
+        for estimate in result.estimates:
+            assert estimate.verdict == "weak"
+            assert np.divide(*estimate.interval95[::-1]) < 4.0
+            assert "does not hold what layers" in estimate.why
 
 
 def test_the_same_seed_gives_the_same_statement(inversion, settings, observed, estimation):

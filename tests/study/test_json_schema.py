@@ -10,8 +10,8 @@ import jsonschema
 import pytest
 import referencing
 
+from palpate.demo import DATA
 from palpate.errors import NotConverged
-from palpate.experiments.simulated_pelvis import DATA
 from palpate.study.json_schema import SCHEMAS, case_schema
 from palpate.study.result import failure_document
 

@@ -131,3 +131,20 @@ def test_loads_that_no_state_without_stress_can_bear_end_in_a_sentence(tmp_path)
     write(tmp_path, "neo-hookean")
     with pytest.raises(NotConverged, match="without the loads"):
         found(tmp_path, "neo-hookean", weighs(0, -100.0), weighs(1, -98.0))
+
+
+@pytest.mark.parametrize(
+    ("law", "loads", "warned"),
+    [
+        ("neo-hookean", ((1, 9.81),), True),
+        ("mooney-rivlin", ((1, 9.81),), True),
+        ("neo-hookean", ((0, -9.81), (1, 9.81)), False),
+        ("linear", ((1, 9.81),), False),
+        ("neo-hookean", (), False),
+    ],
+)
+def test_weight_in_a_later_state_alone_is_asked_about_at_finite_strain(tmp_path, law, loads, warned):
+    write(tmp_path, "linear")
+    (tmp_path / "case.toml").write_text(CASE.replace("LAW", law) + "".join(weighs(*load) for load in loads))
+    codes = [problem.code for problem in palpate.check(tmp_path / "case.toml").problems]
+    assert ("weightless-reference" in codes) is warned

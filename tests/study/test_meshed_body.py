@@ -112,6 +112,17 @@ def test_a_force_and_a_field_tell_kilopascals(folder):
     assert {surface.tissue for surface in drawn.outlines} == {0}  # the bar, not what its surfaces are called
 
 
+def test_a_force_of_the_wrong_sign_is_named(folder):
+    """The bar is stretched: what pulls it has the direction that its face moves to."""
+    (folder / "reversed.toml").write_text(CASE.replace("[0.0, 0.0, 1.0]", "[0.0, 0.0, -1.0]"))
+    right, wrong = (estimate(read_case(folder / name)) for name in ("case.toml", "reversed.toml"))
+    assert "force-reversed" not in [remark.code for remark in right.all_remarks]
+    (remark,) = (remark for remark in wrong.all_remarks if remark.code == "force-reversed")
+    assert f"measured as {FORCE_N:.3g} N" in remark.message
+    assert "turn its direction round" in remark.message
+    assert wrong.estimation.estimates[0].verdict == "not identified"
+
+
 def test_twice_the_force_is_twice_the_modulus(folder):
     one = estimate(read_case(folder / "case.toml"))
     text = CASE.replace(f"force_n = {FORCE_N}", f"force_n = {2.0 * FORCE_N}")

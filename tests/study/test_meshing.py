@@ -10,9 +10,9 @@ from palpate.errors import GeometryError, MeshQualityError
 from palpate.images.label_image import LabelImage
 from palpate.images.readers import write_label_image
 from palpate.progress import silent
-from palpate.study import cost, meshing
+from palpate.study import meshing
 from palpate.study.body import ImagedStates, make_body
-from palpate.study.case_text import case_text
+from palpate.study.case_file import case_text
 from palpate.study.check import check_case
 from palpate.study.edge_length import EdgeLength
 from palpate.study.meshing import mesh_reference
@@ -31,7 +31,6 @@ def tried(case_result, monkeypatch):
         return case_result.space.mesh, Quality()
 
     monkeypatch.setattr(meshing, "_fit_mesh", fit)
-    monkeypatch.setattr(cost, "machine_memory_gb", lambda: 1e3)
     return edges
 
 
@@ -73,7 +72,7 @@ def test_after_two_finer_meshes_the_last_refusal_stands_with_all_that_was_tried(
 
 
 def test_no_finer_mesh_is_tried_that_the_machine_has_no_memory_for(case_result, tried, monkeypatch):
-    monkeypatch.setattr(cost, "machine_memory_gb", lambda: 0.01)
+    monkeypatch.setenv("PALPATE_MEMORY_GB", "0.01")
     with pytest.raises(GeometryError, match=r"at 4 mm; a mesh of 3 mm was not tried: about .* GB of memory would be"):
         mesh_of(case_result, 4.0)
     assert tried == [4.0]

@@ -40,7 +40,7 @@ def item(value, interval, verdict="identified"):
 
 
 def test_an_interval_is_measured_in_half_widths_of_ln_e(mismatch):
-    found = mismatch._held_beside(item(10.0, [5.0, 20.0]), {"prostate": 40.0})
+    found = mismatch.held_beside(item(10.0, [5.0, 20.0]), {"prostate": 40.0})
     assert found["ln_error"] == pytest.approx(np.log(0.25))
     assert found["half_widths"] == pytest.approx(2.0)
     assert not found["interval95_holds"]
@@ -49,7 +49,7 @@ def test_an_interval_is_measured_in_half_widths_of_ln_e(mismatch):
 def test_an_open_end_holds_and_no_interval_is_not_counted(mismatch):
     truth = {"prostate": 40.0}
     held, none, nothing = (
-        mismatch._held_beside(each, truth) for each in (item(10.0, [5.0, None]), item(10.0, None), item(None, None))
+        mismatch.held_beside(each, truth) for each in (item(10.0, [5.0, None]), item(10.0, None), item(None, None))
     )
     assert held["interval95_holds"] is True
     assert held["half_widths"] is None
@@ -59,25 +59,25 @@ def test_an_open_end_holds_and_no_interval_is_not_counted(mismatch):
         {"seed": n, "status": "converged", "seconds": 1.0, "estimates": [e]}
         for n, e in enumerate((held, none, nothing))
     ]
-    row = mismatch._summary([*cases, {"seed": 9, "error": "GeometryError: why"}])
+    row = mismatch.summary_of([*cases, {"seed": 9, "error": "GeometryError: why"}])
     assert row["interval95_holds"] == {"share": 1.0, "intervals": 1}
     assert row["errors"] == ["9: GeometryError: why"]
-    assert "4 (1)" in mismatch._table({"still": row})
+    assert "4 (1)" in mismatch.table_of({"still": row})
 
 
 def test_truths_that_lie_outside_by_two_half_widths_are_counted_by_verdict(mismatch):
     ends, truth = [9.0, 100.0 / 9.0], {"prostate": 20.0}
-    estimates = [mismatch._held_beside(item(10.0, ends, verdict), truth) for verdict in ("identified", "weak")]
-    row = mismatch._summary([{"seed": 1, "status": "converged", "seconds": 1.0, "estimates": estimates}])
+    estimates = [mismatch.held_beside(item(10.0, ends, verdict), truth) for verdict in ("identified", "weak")]
+    row = mismatch.summary_of([{"seed": 1, "status": "converged", "seconds": 1.0, "estimates": estimates}])
     assert (row["out"], row["out_identified"]) == (2, 1)
 
 
 def test_a_line_that_was_cut_off_is_computed_anew(mismatch, tmp_path):
     file, line = tmp_path / "lines.jsonl", {"scene": "still", "seed": 1, "law": "linear", "noise_mm": 0.0, "set": []}
-    mismatch._append(file, line)
+    mismatch.append_line(file, line)
     file.write_text(file.read_text() + '{"scene": "cro')
-    mismatch._append(file, line | {"seed": 2})
-    assert sorted(key[1] for key in mismatch._read(file)) == [1, 2]
+    mismatch.append_line(file, line | {"seed": 2})
+    assert sorted(key[1] for key in mismatch.read_lines(file)) == [1, 2]
 
 
 @pytest.mark.parametrize("kind", ["crop", "all", "fov"])

@@ -10,18 +10,17 @@ import numpy as np
 import pytest
 
 from palpate.cli import main
+from palpate.demo import DATA
 from palpate.errors import ConfigurationError, InputDataError
-from palpate.experiments.simulated_pelvis import DATA
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_label_image, write_label_image
 from palpate.images.tissue import Role
 from palpate.images.totalsegmentator import CLASSES
-from palpate.study import check, cost, proposed_mesh
+from palpate.study import check, cost
 from palpate.study.case_file import read_case
-from palpate.study.class_names import class_names
 from palpate.study.cost import expected_cost
-from palpate.study.guess import guess_tissues
+from palpate.study.guess import class_names, guess_tissues
 from palpate.study.new_case import CaseImages, new_case
 from palpate.study.read import read_segmentation, read_states
 
@@ -103,7 +102,6 @@ def test_an_image_of_one_label_is_refused():
 
 
 def test_the_case_is_read_by_its_reader_with_paths_that_lead_to_the_images(folder, capsys, monkeypatch):
-    monkeypatch.setattr(check, "machine_memory_gb", lambda: 64.0)
     monkeypatch.setattr(check, "make_body", lambda *_, **__: None)  # meshes are made by other tests
     command = ["init", str(folder / "b.nii.gz"), str(folder / "a.nii.gz"), "--labels", str(folder / "names.json")]
     assert main([*command, "--output", str(folder / "new" / "case 1"), "--json", "--quiet"]) == 0
@@ -248,9 +246,7 @@ def test_the_proposed_mesh_fits_the_memory_of_the_machine(folder, monkeypatch):
         return check.memory_problems(expected_cost(case, states.before, states.after, n_pairs=1))
 
     roomy, _ = edge_and_memory(new_case(images, folder).text)
-    for module in (cost, check, proposed_mesh):
-        monkeypatch.setattr(module, "machine_memory_gb", lambda: has_gb)
-        monkeypatch.setattr(module, "free_memory_gb", lambda: 64.0, raising=False)
+    monkeypatch.setenv("PALPATE_MEMORY_GB", f"{has_gb:g}")
     text = new_case(images, folder).text
     edge, problems = edge_and_memory(text)
     assert edge > roomy

@@ -14,7 +14,7 @@ from palpate.cli import main
 from palpate.errors import InputDataError
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers import write_label_image
-from palpate.phantoms.boundary_noise import smooth_field
+from palpate.phantoms.motion import smooth_field
 from palpate.study.null_pair import noise_of_drawings
 
 GRID = VoxelGrid((64, 64, 64), np.eye(4))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import itertools
-import json
 import os
 import signal
 from contextlib import suppress
@@ -12,9 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from palpate.errors import InputDataError, ResourceError
-from palpate.study import journal
-from palpate.study.outputs import make_folder, staged, write_json, write_text
+from palpate.errors import ResourceError
+from palpate.study.outputs import STAGING, make_folder, recover, staged, write_json, write_text
 
 OLD = {"result.json": "old", "mesh.vtu": "old", "sub/a": "old", "page": "old", "page.earlier": "older", "mine": "mine"}
 NEW = {"result.json": "new", "mesh.vtu": "new", "sub/b": "new", "page.earlier": "old", "mine": "mine"}
@@ -73,14 +71,14 @@ def test_a_kill_at_any_operation_leaves_what_the_next_run_makes_whole(tmp_path, 
         folder = tmp_path / str(turn)
         put(folder, OLD)
         with monkeypatch.context() as patch:
-            patch.setattr("palpate.study.outputs.clear", lambda _: None)  # nobody clears up after a kill
+            patch.setattr("palpate.study.outputs._clear", lambda _: None)  # nobody clears up after a kill
             calls = fails(patch, turn, Killed(), only=False)
             with suppress(Killed):
                 replace(folder)
-        visible = {name: text for name, text in content(folder).items() if not name.startswith(journal.STAGING)}
+        visible = {name: text for name, text in content(folder).items() if not name.startswith(STAGING)}
         assert visible.get("result.json") is None or visible in (OLD, NEW)  # where the document is, its files are
         assert not {"old", "new"} <= {visible.get(name) for name in ("mesh.vtu", "sub/a", "sub/b")}
-        journal.recover(folder)
+        recover(folder)
         assert content(folder) in (OLD, NEW), turn
         seen.append(content(folder) == NEW)
         if len(calls) <= turn:
@@ -103,9 +101,9 @@ def test_a_refused_operation_leaves_the_old_files_or_the_new_ones(tmp_path, monk
                 done = True
             except ResourceError:
                 done = False
-        if not (folder / journal.STAGING).exists():
+        if not (folder / STAGING).exists():
             assert content(folder) == (NEW if done else OLD), turn
-        journal.recover(folder)
+        recover(folder)
         assert content(folder) in (OLD, NEW), turn
         assert not done or content(folder) == NEW
         if len(calls) <= turn:
@@ -132,19 +130,27 @@ def test_what_is_not_committed_is_gone(tmp_path):
     with staged(tmp_path) as staging:
         write_text(staging.area / "result.json", "half")
     assert content(tmp_path) == OLD
-    assert not (tmp_path / journal.STAGING).exists()
+    assert not (tmp_path / STAGING).exists()
 
 
-def test_a_journal_made_by_others_moves_nothing_out_of_the_folder(tmp_path):
-    area = tmp_path / "out" / journal.STAGING
-    area.mkdir(parents=True)
-    (tmp_path / "mine").write_text("mine")
-    moves = ["../mine", "taken"], ["/etc/hostname", "taken"], ["a"], [1, 2], ["a", ""], ["a", "./b"], ["a\0", "b"]
-    for pairs in ("x", {"a": "b"}, *([move] for move in moves)):
-        (area / journal.JOURNAL).write_text(json.dumps(pairs))
-        with pytest.raises(InputDataError, match="is not what Palpate writes"):
-            journal.recover(tmp_path / "out")
-    assert (tmp_path / "mine").read_text() == "mine"
+@pytest.mark.parametrize("part", ["ready", "old"])
+def test_a_hidden_folder_made_by_others_moves_nothing_into_or_out_of_the_folder(tmp_path, part):
+    out, other = tmp_path / "out", tmp_path / "other"
+    put(other, {"mine": "mine"})
+    (out / STAGING).mkdir(parents=True)
+    (out / STAGING / part).symlink_to(other)
+    with pytest.raises(ResourceError, match="no folder of Palpate's"):
+        recover(out)
+    (out / STAGING / part).unlink()
+    put(out / STAGING / part, {"sub/taken": "planted"})
+    (out / "sub").symlink_to(other)
+    with pytest.raises(ResourceError, match="leads out of the folder through a link"):
+        recover(out)
+    (out / "sub").unlink()
+    (out / STAGING / part / "link").symlink_to(other / "mine")
+    recover(out)
+    assert content(out) == {"sub/taken": "planted"}
+    assert content(other) == {"mine": "mine"}
 
 
 def test_a_full_disk_is_a_resource_error(tmp_path):

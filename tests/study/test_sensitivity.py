@@ -94,13 +94,13 @@ def interrupted(case_file, tmp_path_factory):
             raise EstimationError("no equilibrium")
         return until(problem, settings, progress=progress, **rule)
 
-    every = list(study._variants(case, case.mesh.edge_length_mm))
+    every = list(study.variants_of(case, case.mesh.edge_length_mm))
     few = [
         next(v for v in every if v.name == name)
         for name in ("edge-length", "outer-boundary-sliding", "law-neo-hookean")
     ]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(study, "_variants", lambda *_: iter(few))
+        patch.setattr(study, "variants_of", lambda *_: iter(few))
         patch.setattr(inverted, "invert", again)
         with pytest.raises(KeyboardInterrupt):
             palpate.sensitivity(case, sobol=8, output=folder)
@@ -151,9 +151,9 @@ def test_a_study_goes_on_where_it_was_interrupted(interrupted):
 def test_another_case_takes_nothing_from_it(case_file):
     case = read_case(case_file)
     keys = {
-        study._key(case, {}),
-        study._key(case, {"before": "ab"}),
-        study._key(replace(case, driver=replace(case.driver, modes=15)), {}),
+        study.kept_under(case, {}),
+        study.kept_under(case, {"before": "ab"}),
+        study.kept_under(replace(case, driver=replace(case.driver, modes=15)), {}),
     }
     assert len(keys) == 3
 
@@ -207,7 +207,7 @@ def test_sobol_indices_say_what_the_ranges_say(document):
 
 def test_variants_begin_with_the_cheap_ones_and_leave_out_what_the_case_says(case_file):
     case = read_case(case_file)
-    assert [v.name for v in study._variants(case, 7.0)] == [
+    assert [v.name for v in study.variants_of(case, 7.0)] == [
         "edge-length",
         "outer-boundary-sliding",
         "outer-boundary-free",
@@ -215,8 +215,8 @@ def test_variants_begin_with_the_cheap_ones_and_leave_out_what_the_case_says(cas
         "law-mooney-rivlin",
     ]
     curved = replace(case, mechanics=replace(case.mechanics, law="neo-hookean"))
-    assert next(study._variants(curved, 7.0)).case.mechanics.law == "linear"
-    assert next(study._variants(case, 7.0)).case.mesh.edge_length_mm == pytest.approx(8.75)
+    assert next(study.variants_of(curved, 7.0)).case.mechanics.law == "linear"
+    assert next(study.variants_of(case, 7.0)).case.mesh.edge_length_mm == pytest.approx(8.75)
 
 
 def test_the_largest_effect_comes_first_and_failures_last(document):

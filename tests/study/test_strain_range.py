@@ -10,8 +10,8 @@ import pytest
 from palpate.mechanics.laws.registry import LAWS
 from palpate.study.body import Body, ImagedStates
 from palpate.study.case import Mechanics
+from palpate.study.refusals import linear_strain_warnings
 from palpate.study.run import strain_warnings
-from palpate.study.strain_range import linear_strain_warnings
 
 
 @pytest.fixture

@@ -15,9 +15,16 @@ from palpate.observation.contract import Residuals, Weighting
 from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.robust_loss import PowerLaw
-from palpate.phantoms.boundary_noise import smooth_field
+from palpate.phantoms.motion import smooth_field
 from palpate.uncertainty import NORMAL_95, FittedState, gain, sandwich_covariance
-from palpate.uncertainty.covariance import error_noise, grid_covariance, grid_position_shifts, imaging_errors, scatter
+from palpate.uncertainty.covariance import (
+    added_by,
+    error_noise,
+    grid_covariance,
+    grid_position_shifts,
+    imaging_errors,
+    scatter,
+)
 from palpate.uncertainty.intervals import log_interval
 
 SD = 0.3
@@ -301,3 +308,19 @@ def test_the_grid_adds_to_stated_noise_and_to_what_residuals_tell_what_that_lack
         for line in told.lines
     ]
     assert np.array_equal(grid_covariance(replace(told, lines=tuple(lines)), grid, noise), grid)
+
+
+def test_an_estimate_that_moves_when_what_is_held_is_free_errs_by_as_much():
+    held, free = np.diag([0.01, 0.04]), np.diag([0.02, 0.04])
+    part = added_by(free, np.array([0.3, 0.0]), held=held)
+    assert part == pytest.approx(np.diag([0.01 + 0.09, 0.0]))
+
+
+def test_nothing_is_added_where_it_is_known_better_with_more_unknowns(rng):
+    """What a second fit finds narrower, as one of other residuals may, takes nothing from the first one."""
+    held = np.diag([0.04, 0.04])
+    assert added_by(0.5 * held, np.zeros(2), held=held) == pytest.approx(np.zeros((2, 2)))
+    wide = rng.standard_normal((2, 2))
+    total = held + added_by(wide @ wide.T, np.zeros(2), held=held)
+    for less in (held, wide @ wide.T):
+        assert np.linalg.eigvalsh(total - less).min() > -1e-12

@@ -11,7 +11,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from palpate.experiments.verification.structured_meshes import box_mesh
 from palpate.inversion import Evaluation, LaterState, Objective, ParameterMap, unit_blocks
 from palpate.inversion.objective import Linearisation
 from palpate.mesh import lagrange_space, located, point_interpolation
@@ -21,8 +20,9 @@ from palpate.observation.noise_model import NoiseModel
 from palpate.observation.point_displacement import point_displacement
 from palpate.observation.robust_loss import PowerLaw
 from palpate.observation.surface_distance import SurfaceDistance
-from palpate.phantoms.boundary_noise import smooth_field
+from palpate.phantoms.motion import smooth_field
 from palpate.uncertainty import sandwich_covariance
+from palpate_validation.structured_meshes import box_mesh
 
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "cramer_rao.py"
 NOISE = NoiseModel(np.array([0.3**2]), np.array([5.0]))

@@ -8,11 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from palpate.experiments.verification.structured_meshes import box_mesh, known, unknown
 from palpate.inversion import LaterState, Objective, parameter_map, unit_blocks
 from palpate.mesh import lagrange_space
 from palpate.uncertainty import discretisation_sd
 from palpate.uncertainty.covariance import mesh_covariance
+from palpate_validation.structured_meshes import box_mesh, known, unknown
 
 TISSUES = (unknown("gland"), unknown("sac"), known("fat"))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.uncertainty.repeatability import within_subject_cv
+from palpate.uncertainty.intervals import within_subject_cv
 
 
 @pytest.mark.parametrize("sd", [0.05, 0.3, 0.8])

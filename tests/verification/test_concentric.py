@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate.experiments.verification.concentric import hollow_spheres
 from palpate.mechanics.reduced import projection
+from palpate_validation.problems.concentric import hollow_spheres
 
 
 def test_the_reduced_model_has_the_same_sensitivities():

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from palpate.experiments.verification.cook import INCOMPRESSIBLE, deflection
 from palpate.mechanics.dilatation import choose_element
+from palpate_validation.problems.cook import INCOMPRESSIBLE, deflection
 
 
 @pytest.mark.parametrize("element", ["P2", "auto"])

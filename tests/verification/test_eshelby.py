@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate.experiments.verification.inclusion import ball_in_matrix, strain_factors
+from palpate_validation.problems.inclusion import ball_in_matrix, strain_factors
 
 
 def test_a_stiff_inclusion_hides_its_modulus():

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.experiments.verification.conditions import sliding_sides
-from palpate.experiments.verification.inflation import BALLOON, NEO, NU, bore_of, youngs
-from palpate.experiments.verification.structured_meshes import known, octant_mesh
 from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.loads import pressure
 from palpate.mesh.space import lagrange_space
+from palpate_validation.conditions import sliding_sides
+from palpate_validation.problems.inflation import BALLOON, NEO, NU, bore_of, youngs
+from palpate_validation.structured_meshes import known, octant_mesh
 
 
 def test_a_following_pressure_inflates_the_balloon_by_the_same_law():

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.experiments.verification.lame import thick_cylinder
 from palpate.mechanics.dilatation import Dilatation
+from palpate_validation.problems.lame import thick_cylinder
 
 
 @pytest.mark.parametrize(

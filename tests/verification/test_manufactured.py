@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.experiments.verification.manufactured import neo_hookean_errors, observed_orders
 from palpate.mechanics.dilatation import Dilatation
+from palpate_validation.problems.manufactured import neo_hookean_errors, observed_orders
 
 
 @pytest.mark.parametrize(("element", "sizes", "orders"), [("P1", (6, 12), (2, 1)), ("P2", (4, 8), (3, 2))])

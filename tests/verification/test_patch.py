@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.experiments.verification.conditions import prescribe
-from palpate.experiments.verification.patch import finite_affine_error
-from palpate.experiments.verification.structured_meshes import VOID, box_mesh, known
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.laws.registry import LAWS
 from palpate.mechanics.linear_model import linear_model
 from palpate.mesh.space import lagrange_space
+from palpate_validation.conditions import prescribe
+from palpate_validation.problems.patch import finite_affine_error
+from palpate_validation.structured_meshes import VOID, box_mesh, known
 
 
 @pytest.mark.parametrize("element", ["P1", "P2"])

@@ -12,7 +12,7 @@ from palpate.errors import ConfigurationError, ResourceError
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from palpate.cohort.engines.contract import Engine
+    from palpate.cohort.engines.packing import Engine
     from palpate.cohort.records import Record
     from palpate.cohort.task import Row
     from palpate.study.outputs import OutputFolder
@@ -71,8 +71,8 @@ def statistics(_: argparse.Namespace, case: None, outputs: OutputFolder, progres
     from palpate.cohort.tables import require_tables
 
     require_tables()
-    from palpate.cohort.closing import close_cohort
     from palpate.cohort.plan import read_plan
+    from palpate.cohort.run import close_cohort
     from palpate.study.outputs import read_json
 
     del case

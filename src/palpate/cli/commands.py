@@ -1,4 +1,4 @@
-"""The sub-commands around an estimate: init, check, noise, mesh, simulate."""
+"""The sub-commands around an estimate: init, check, noise, voxelise, mesh, simulate."""
 
 from __future__ import annotations
 
@@ -12,24 +12,36 @@ if TYPE_CHECKING:
     from palpate.study.case import Case
     from palpate.study.outputs import OutputFolder
 
-__all__ = ["MESH_TARGETS", "SIMULATION_TARGETS", "check", "init", "mesh", "noise", "simulate"]
+__all__ = [
+    "MESH_TARGETS",
+    "SIMULATION_TARGETS",
+    "SURFACE_TARGETS",
+    "check",
+    "init",
+    "mesh",
+    "noise",
+    "simulate",
+    "voxelise",
+]
 
 Progress = Callable[[str], None]
 
 MESH_TARGETS = ("mesh.json", "mesh.vtu", "labels.csv", "labels.nii.gz")
+SURFACE_TARGETS = ("surfaces.nii.gz", "labels.json")
 SIMULATION_TARGETS = ("simulation.json", "mesh.vtu", "labels.csv", "mesh.pvd", "before.nii.gz", "after.nii.gz")
 
 
 def init(arguments: argparse.Namespace, _: None, outputs: OutputFolder, progress: Progress) -> Outcome:
     """Write a case for images; an earlier case.toml is never replaced."""
-    from palpate.study.new_case import write_new_case
+    from palpate.steps.previewing import PREVIEW, new_case_with_page
 
     progress("reading the images")
-    case = write_new_case(arguments.images, arguments.labels, outputs, cts=arguments.ct)
+    case = new_case_with_page(arguments.images, arguments.labels, outputs, cts=arguments.ct, progress=progress)
     rows = [["tissue", "role", "why"]]
     rows += [[tissue.name, str(tissue.role or "?"), tissue.reason] for tissue in case.tissues]
     questions = "".join(f"question: {question}\n" for question in case.questions)
-    text = f"{columns(rows)}\n{questions}written to {case.path}; read it, correct it, then: palpate check {case.path}"
+    page = f"look at {outputs.path / PREVIEW}, " if PREVIEW in outputs.written else ""
+    text = f"{columns(rows)}\n{questions}written to {case.path}; {page}correct it, then: palpate check {case.path}"
     return Outcome(case.to_dict() | {"case": str(case.path)}, text)
 
 
@@ -37,11 +49,12 @@ def check(arguments: argparse.Namespace, _: None, outputs: None, progress: Progr
     """List every problem of a case."""
     from palpate.steps import commands
 
-    del outputs  # it writes nothing
-    found = commands.check(arguments.case_file, arguments.set, progress=progress)
+    del outputs  # it has no folder
+    found = commands.check(arguments.case_file, arguments.set, html=arguments.html, progress=progress)
     refused = "\n".join(problem.message for problem in found.problems if problem.exit_code)
     complaint = refused if arguments.quiet else ""  # what is refused is said even then, as by any other command
-    return Outcome(found.to_dict(), found.text(), found.exit_code, complaint)
+    shown = f"\nwritten to {arguments.html}" if arguments.html else ""
+    return Outcome(found.to_dict(), f"{found.text()}{shown}", found.exit_code, complaint)
 
 
 def noise(arguments: argparse.Namespace, _: None, outputs: None, progress: Progress) -> Outcome:
@@ -60,6 +73,31 @@ def noise(arguments: argparse.Namespace, _: None, outputs: None, progress: Progr
     document = found.to_dict()
     left = f"left out: {', '.join(found.left_out)}\n" if found.left_out else ""
     return Outcome(document, f"{columns(rows)}\n{left}{warning_lines(document)}\n{found.toml}")
+
+
+def voxelise(arguments: argparse.Namespace, _: None, outputs: OutputFolder, progress: Progress) -> Outcome:
+    """Make a label image of closed surfaces."""
+    from palpate.images.readers import write_label_image
+    from palpate.steps import commands
+    from palpate.study.outputs import write_json
+
+    found = commands.voxelise(
+        *arguments.surfaces,
+        spacing_mm=arguments.spacing,
+        margin_mm=arguments.margin,
+        axes=arguments.axes,
+        like=arguments.like,
+        progress=progress,
+    )
+    document = found.to_dict()
+    with outputs.staged() as staging:
+        write_label_image(staging.area / "surfaces.nii.gz", found.image)
+        write_json(staging.area / "labels.json", {"labels": document["labels"]})
+        staging.commit()
+    rows = [["label", "organ", "volume of the surface, ml", "of its voxels, ml"]]
+    for label, name in found.image.names.items():
+        rows.append([str(label), name, *(f"{volume / 1000.0:.4g}" for volume in found.volumes_mm3[name])])
+    return Outcome(document, f"{columns(rows)}\n{warning_lines(document)}{listed(outputs)}")
 
 
 def mesh(_: argparse.Namespace, case: Case, outputs: OutputFolder, progress: Progress) -> Outcome:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 from palpate.cli.console import log_is_open
@@ -13,6 +15,10 @@ if TYPE_CHECKING:
     from palpate.study.outputs import OutputFolder
 
 __all__ = ["Outcome", "columns", "estimates_table", "listed", "printable_lines", "warning_lines"]
+
+
+GAP = "  "  # between columns
+MOST_LETTERS, LEAST_LETTERS = 100, 20  # of a line in a terminal; of a column that is broken
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,8 +32,8 @@ class Outcome:
 
 
 def estimates_table(document: Mapping[str, Any]) -> str:
-    """The estimates of a result as aligned columns, with its note."""
-    from palpate.report.rows import interval_text, moduli_in, number, ratio_rows
+    """The estimates of a result as aligned columns, what its maps say, and its note."""
+    from palpate.report.rows import NONE, expected_share, interval_text, main_numbers, moduli_in, number, ratio_rows
 
     rows = [["tissue", "Young's modulus", "95 % interval", "ratio", "verdict", "truth"]]
     for item in moduli_in(document):
@@ -52,8 +58,16 @@ def estimates_table(document: Mapping[str, Any]) -> str:
         rows = [row[:-1] for row in rows]
     ratios = [[row.tissue, row.value, row.interval, row.verdict] for row in ratio_rows(document)]
     more = [columns([["tissue", "Poisson's ratio", "95 % interval", "verdict"], *ratios])] if ratios else []
+    far = []
+    for item in moduli_in(document):
+        found, ends = main_numbers(item)
+        if found and item["truth"] and (share := expected_share(found, ends, item["truth"])) != NONE:
+            error = f"{100.0 * (found / item['truth'] - 1.0):+.0f} %"
+            far.append(f"{item['tissue']} {error} ({share} of such estimates are off as far or further)")
+    more += [f"error, and how often it is as large by the interval: {', '.join(far)}"] if far else []
+    maps = [item["words"] for item in document.get("maps", ())]
     note = [document["note"]] if document.get("note") else []
-    return "\n".join([columns(rows), *more, *note])
+    return "\n".join([columns(rows), *more, *maps, *note])
 
 
 def listed(outputs: OutputFolder) -> str:
@@ -63,10 +77,18 @@ def listed(outputs: OutputFolder) -> str:
     return f"written to {outputs.path}: {', '.join([*names, *log])}"
 
 
-def columns(rows: Sequence[Sequence[str]]) -> str:
-    """Rows of cells as lines of aligned columns."""
+def columns(rows: Sequence[Sequence[str]], *, most: int = MOST_LETTERS) -> str:
+    """Rows of cells as lines of aligned columns; of a table over `most` letters wide the widest column is broken."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    beyond = sum(widths) + len(GAP) * (len(widths) - 1) - most
+    widest = widths.index(max(widths))
+    if beyond > 0:
+        widths[widest] = max(widths[widest] - beyond, LEAST_LETTERS)
+    lines = list[str]()
+    for row in rows:
+        broken = [textwrap.wrap(cell, width, break_on_hyphens=False) for cell, width in zip(row, widths, strict=True)]
+        cells = zip_longest(*(parts or [""] for parts in broken), fillvalue="")
+        lines += [GAP.join(map(str.ljust, parts, widths)).rstrip() for parts in cells]
     return "\n".join(lines)
 
 

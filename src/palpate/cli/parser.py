@@ -5,13 +5,17 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from importlib import metadata
 from pathlib import Path
+from types import FunctionType
 from typing import Any, NoReturn
 
-from palpate.cli import cohorts, commands, exports, studies, verification, written
+from palpate.cli import cohorts, commands, exports, written
 from palpate.cli.outcome import Outcome
+from palpate.entry_points import brought
+from palpate.errors import ConfigurationError
 from palpate.export.formats import FORMATS
 from palpate.study.schema import nearest, shown
 
@@ -24,10 +28,17 @@ EXAMPLES = {
         "palpate init before.nii.gz after.nii.gz --labels names.json --output case",
         "palpate init masks_before/ masks_after/ --output case",
     ),
-    "check": ("palpate check case/case.toml", "palpate check case/case.toml --set mesh.edge_length_mm=6 --json"),
+    "check": (
+        "palpate check case/case.toml --html preview.html",
+        "palpate check case/case.toml --set mesh.edge_length_mm=6 --json",
+    ),
     "noise": (
         "palpate noise a.nii.gz b.nii.gz",
         "palpate noise a.nii.gz b.nii.gz --labels names.json --json",
+    ),
+    "voxelise": (
+        "palpate voxelise before/prostate.stl before/bladder.stl --spacing 1 --output before",
+        "palpate voxelise after/prostate.stl after/bladder.stl --like before/surfaces.nii.gz --output after",
     ),
     "mesh": ("palpate mesh case/case.toml --output mesh", "palpate mesh case/case.toml --set mesh.edge_length_mm=6"),
     "simulate": (
@@ -53,9 +64,7 @@ EXAMPLES = {
     ),
     "status": ("palpate status study", "palpate status study --json"),
     "statistics": ("palpate statistics study", "palpate statistics study --json"),
-    "reproduce": ("palpate reproduce table1", "palpate reproduce figure4 --output figure4"),
     "view": ("palpate view out", "palpate view out --no-browser"),
-    "verify": ("palpate verify --quick", "palpate verify --output verification"),
 }
 
 
@@ -87,9 +96,10 @@ class _Parser(argparse.ArgumentParser):
         if message.endswith("required: COMMAND"):
             self.print_help(sys.stderr)
             self.exit(2, "\npalpate: give a command, `palpate demo` first of all\n")
-        mistyped = re.search(r"COMMAND: invalid choice: '(.*)' \(choose", message, re.DOTALL)
+        mistyped = re.search(r"COMMAND: invalid choice: '(.*)' \(choose from (.*)\)", message, re.DOTALL)
         if mistyped:
-            message = f"there is no command {shown(mistyped[1])}: {nearest(mistyped[1], EXAMPLES)}"
+            names = re.findall(r"[\w-]+", mistyped[2])
+            message = f"there is no command {shown(mistyped[1])}: {nearest(mistyped[1], names)}"
         super().error(message)
 
 
@@ -116,21 +126,26 @@ def make_parser() -> argparse.ArgumentParser:
     _add_estimates(subparsers)
     _add_results(subparsers)
     _add_cohort(subparsers)
-    _add_proofs(subparsers)
+    try:
+        _add_brought(subparsers)
+    except ConfigurationError as error:
+        parser.error(str(error))
     return parser
 
 
 def _add_preparations(subparsers: Any) -> None:
-    """What makes, checks and tries a case: init, check, noise, mesh, simulate."""
+    """What makes, checks and tries a case: init, check, noise, voxelise, mesh, simulate."""
     what = "write a case.toml for images, roles guessed from names"
     init = _command(subparsers, "init", commands.init, what=what)
     init.add_argument("images", type=Path, nargs="+", metavar="IMAGE", help="label images: before, then after ...")
     init.add_argument("--labels", type=Path, metavar="TABLE", help="label table: which number is which organ")
     _add_ct(init)
-    init.set_defaults(logs=False, targets=("case.toml",))
+    init.set_defaults(logs=False, targets=("case.toml", "preview.html"))
     what = "list every problem of a case without computing"
     check = _command(subparsers, "check", commands.check, what=what, folder=None)
     check.add_argument("case_file", type=Path, metavar="CASE.TOML", help=CASE_HELP)
+    what = "write a page that shows who is who, how the images lie, what is held, and the intervals to expect"
+    check.add_argument("--html", type=Path, metavar="FILE", help=what)
     _add_set(check)
     what = "tell how well surfaces are drawn, from two segmentations of one state: [noise] and [discrepancy] of a case"
     noise = _command(subparsers, "noise", commands.noise, what=what, folder=None)
@@ -139,6 +154,17 @@ def _add_preparations(subparsers: Any) -> None:
     noise.add_argument("--labels", type=Path, metavar="TABLE", help="label table: which number is which organ")
     what = "bring B to A first; default: on all surfaces where their grids differ"
     noise.add_argument("--align", choices=("auto", "surfaces", "none"), default="auto", help=what)
+    what = "make a label image of closed surfaces (STL), one an organ, called as its file is"
+    voxelise = _command(subparsers, "voxelise", commands.voxelise, what=what)
+    voxelise.add_argument("surfaces", type=Path, nargs="+", metavar="SURFACE.STL", help="closed surfaces of one state")
+    what = "edge of the voxels, mm; default: %(default)s"
+    voxelise.add_argument("--spacing", type=_positive, default=1.0, metavar="MM", help=what)
+    what = "how far the image reaches beyond the surfaces, mm; default: %(default)s"
+    voxelise.add_argument("--margin", type=_positive, default=30.0, metavar="MM", help=what)
+    what = "of files that do not say; default: %(default)s"
+    voxelise.add_argument("--axes", choices=("RAS", "LPS"), default="RAS", help=what)
+    voxelise.add_argument("--like", type=Path, metavar="IMAGE", help="take this image's grid: the first state's")
+    voxelise.set_defaults(targets=commands.SURFACE_TARGETS)
     mesh = _command(subparsers, "mesh", commands.mesh, what="make the tetrahedra of a case and write them")
     _add_case(mesh)
     mesh.set_defaults(targets=commands.MESH_TARGETS)
@@ -162,16 +188,18 @@ def _add_estimates(subparsers: Any) -> None:
     )
     estimate.add_argument("--labels", type=Path, metavar="TABLE", help="label table, with images")
     _add_ct(estimate)
+    what = "first write preview.html, which shows what will be estimated; costs another mesh"
+    estimate.add_argument("--preview", action="store_true", help=what)
     estimate.set_defaults(targets=written.TARGETS)
     _add_set(estimate)
     what = "keep N draws of the moduli's posterior in each of 4 chains, as posterior.nc (extra `samples`)"
     estimate.add_argument("--samples", type=_samples, action="append", dest="set", default=[], metavar="N", help=what)
     what = "estimate a case, and each modulus again under changed assumptions; goes on where it was interrupted"
-    sensitivity = _command(subparsers, "sensitivity", studies.sensitivity, what=what)
+    sensitivity = _command(subparsers, "sensitivity", written.sensitivity, what=what)
     _add_case(sensitivity)
     what = "also Sobol indices of N samples an input, a power of 2 (extra `sensitivity`)"
     sensitivity.add_argument("--sobol", type=_power_of_two, default=0, metavar="N", help=what)
-    sensitivity.set_defaults(targets=studies.SENSITIVITY_TARGETS)
+    sensitivity.set_defaults(targets=written.SENSITIVITY_TARGETS)
 
 
 def _add_ct(command: argparse.ArgumentParser) -> None:
@@ -232,14 +260,10 @@ def _add_cohort(subparsers: Any) -> None:
     statistics.set_defaults(makes_folder=False, targets=cohorts.TARGETS)
 
 
-def _add_proofs(subparsers: Any) -> None:
-    """What holds our numbers beside known ones: reproduce, verify."""
-    what = "compute one of the paper's experiments, its numbers beside ours; goes on where it was interrupted"
-    reproduce = _command(subparsers, "reproduce", studies.reproduce, what=what, folder="palpate-reproduce")
-    reproduce.add_argument("experiment", choices=("table1", "table2", "figure4", "staging"))
-    what = "compute the problems with known answers and hold our numbers beside them"
-    verify = _command(subparsers, "verify", verification.verify, what=what, folder="palpate-verification")
-    verify.add_argument("--quick", action="store_true", help="leave out the slow problems")
+def _add_brought(subparsers: Any) -> None:
+    """What other packages bring: each entry point of `palpate.commands` adds one by what it is given, `_command`."""
+    for add in brought("palpate.commands", FunctionType, taken=EXAMPLES).values():
+        add(partial(_command, subparsers))
 
 
 def _add_case(command: argparse.ArgumentParser) -> None:
@@ -254,14 +278,23 @@ def _add_set(command: argparse.ArgumentParser) -> None:
 
 
 def _command(
-    subparsers: Any, name: str, function: Callable[..., Outcome], *, what: str, folder: str | None = "palpate-output"
+    subparsers: Any,
+    name: str,
+    function: Callable[..., Outcome],
+    *,
+    what: str,
+    folder: str | None = "palpate-output",
+    examples: Sequence[str] = (),
 ) -> argparse.ArgumentParser:
-    """A sub-command with the common flags; `folder`: where it writes by default, with a log; None: nowhere."""
+    """A sub-command with the common flags; `folder`: where it writes by default, with a log; None: nowhere.
+
+    examples: of `EXAMPLES` where none are given.
+    """
     command: argparse.ArgumentParser = subparsers.add_parser(
         name,
         help=what,
         description=what[0].upper() + what[1:] + ".",
-        epilog="\n  ".join(("examples:", *EXAMPLES[name])),
+        epilog="\n  ".join(("examples:", *(examples or EXAMPLES[name]))),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     command.set_defaults(command=function, logs=folder is not None, output=None, makes_folder=True, targets=())

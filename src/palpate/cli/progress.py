@@ -10,6 +10,7 @@ import math
 import os
 import signal
 import sys
+import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -32,6 +33,7 @@ STEADY = 0.75  # of a stage: beyond, its share creeps, as nobody knows how much 
 MOST = 0.99
 PATIENCE_S = 8.0
 WIDTH = 32
+INDENT = 11  # of what follows the time
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +79,7 @@ def progress_on_stderr(*, quiet: bool, patience_s: float = PATIENCE_S) -> Iterat
         LOGGER.info(sentence)
         said.append((sentence, time.monotonic()))
         if not quiet:
-            bar.tell(sentence, f"[{time.monotonic() - began:6.1f} s] {printable(sentence)}")
+            bar.tell(sentence, fitted(f"[{time.monotonic() - began:6.1f} s] {printable(sentence)}", sys.stderr))
 
     def remind(over: threading.Event) -> None:
         """Say that the last thing still goes on."""
@@ -87,7 +89,8 @@ def progress_on_stderr(*, quiet: bool, patience_s: float = PATIENCE_S) -> Iterat
             now = time.monotonic()
             if now - max(since, reminded) > patience_s and not bar.moves:
                 reminded = now
-                tell(f"[{now - began:6.1f} s] still, after {now - since:.0f} s: {printable(sentence)}", stream)
+                words = f"[{now - began:6.1f} s] still, after {now - since:.0f} s: {printable(sentence)}"
+                tell(fitted(words, stream), stream)
 
     stream = None if quiet else _duplicate(sys.stderr)  # before any library takes the place of standard error
     try:
@@ -97,6 +100,21 @@ def progress_on_stderr(*, quiet: bool, patience_s: float = PATIENCE_S) -> Iterat
         bar.close()
         if stream is not sys.stderr and stream is not None:
             stream.close()
+
+
+def fitted(line: str, stream: TextIO | None) -> str:
+    """A line broken between words, where `stream` is a terminal that is narrower; what follows is set in."""
+    try:
+        if stream is None or not stream.isatty():
+            return line
+        width = os.get_terminal_size(stream.fileno()).columns
+    except (OSError, ValueError):  # closed, or no terminal after all
+        return line
+    if not width // 2 > INDENT or len(line) < width:
+        return line
+    wrapper = textwrap.TextWrapper(width - 1, subsequent_indent=" " * INDENT)
+    wrapper.break_long_words = wrapper.break_on_hyphens = False
+    return wrapper.fill(line)
 
 
 def _duplicate(stream: TextIO | None) -> TextIO | None:

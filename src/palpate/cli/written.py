@@ -1,4 +1,4 @@
-"""The sub-commands whose outcome is a result with its report: estimate, demo, report."""
+"""The sub-commands whose outcome is a result with its report: estimate, demo, sensitivity, report."""
 
 from __future__ import annotations
 
@@ -6,20 +6,21 @@ import argparse
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from palpate.cli.outcome import Outcome, estimates_table, listed, warning_lines
-from palpate.errors import ConfigurationError, EstimationError, InputDataError
+from palpate.cli.outcome import Outcome, columns, estimates_table, listed, warning_lines
+from palpate.errors import ConfigurationError, EstimationError
 
 if TYPE_CHECKING:
     from palpate.study.case import Case
     from palpate.study.outputs import OutputFolder
     from palpate.study.result import CaseResult
 
-__all__ = ["DOCUMENT", "PAGE", "TARGETS", "demo", "estimate", "report"]
+__all__ = ["DOCUMENT", "PAGE", "SENSITIVITY_TARGETS", "TARGETS", "demo", "estimate", "report", "sensitivity"]
 
 Progress = Callable[[str], None]
 
 DOCUMENT, PAGE, DATA = "result.json", "report.html", "report-data.npz"
 ASIDE = tuple(f"{name}.earlier" for name in (PAGE, DATA))
+SENSITIVITY_TARGETS = ("sensitivity.json", "sensitivity.html")
 LABELS = ("labels.csv", "labels.nii.gz")
 NUMBERS = ("mesh.vtu", "model.npz", "posterior.nc", "stiffness.nii.gz", "stiffness_sd.nii.gz")
 TARGETS = (DOCUMENT, PAGE, DATA, *ASIDE, *NUMBERS, *LABELS, "case.toml")
@@ -28,6 +29,7 @@ TARGETS = (DOCUMENT, PAGE, DATA, *ASIDE, *NUMBERS, *LABELS, "case.toml")
 def estimate(arguments: argparse.Namespace, case: Case | None, outputs: OutputFolder, progress: Progress) -> Outcome:
     """Estimate a case, or images for which a case is written first."""
     from palpate.steps import commands
+    from palpate.steps.previewing import PREVIEW, write_page
     from palpate.steps.saving import save_failure
     from palpate.study.case_as_run import refuse_other_case
     from palpate.study.case_file import read_case
@@ -44,6 +46,9 @@ def estimate(arguments: argparse.Namespace, case: Case | None, outputs: OutputFo
         progress(f"the case is written to {new.path}")
         case = read_case(new.path, arguments.set)
     refuse_other_case(case, outputs)
+    if arguments.preview:
+        write_page(case, outputs, progress=progress)
+        progress(f"the preview is written to {outputs.path / PREVIEW}")
     outputs.require(f"mesh_{number}.vtu" for number in range(2, len(case.pairs) + 2))
     try:
         result = commands.estimate(case, progress=progress)
@@ -54,30 +59,36 @@ def estimate(arguments: argparse.Namespace, case: Case | None, outputs: OutputFo
 
 def demo(_: argparse.Namespace, case: None, outputs: OutputFolder, progress: Progress) -> Outcome:
     """The whole way on the pelvis that Palpate brings along."""
-    from palpate.experiments.demo import run_demo
+    from palpate.demo import run_demo
 
     del case  # it has its own
     return _write_estimate(run_demo(outputs.path, progress), outputs, progress)
 
 
+def sensitivity(
+    arguments: argparse.Namespace, case: Case, outputs: OutputFolder, progress: Callable[[str], None]
+) -> Outcome:
+    """How each modulus depends on what it rests on, the largest effect first."""
+    from palpate.report.tornado import sensitivity_table
+    from palpate.steps.saving import save_sensitivity
+    from palpate.study.sensitivity import Kept
+    from palpate.study.sensitivity import sensitivity as vary
+
+    found = vary(case, kept=Kept(outputs), sobol=arguments.sobol, progress=progress)
+    document = save_sensitivity(found, outputs)
+    text = f"{columns(sensitivity_table(document))}\n{warning_lines(document)}{listed(outputs)}"
+    return Outcome(document, text)
+
+
 def report(_: argparse.Namespace, case: None, outputs: OutputFolder, progress: Progress) -> Outcome:
     """Draw the page of an estimate again from the data that it left in its output folder."""
-    from palpate.report.case_report import redrawn_page
+    from palpate.steps.saving import redraw_page
     from palpate.study.earlier import strange_files
-    from palpate.study.outputs import read_json, write_json, write_text
 
     del case
-    result = read_json(outputs.path / DOCUMENT)
-    files = result.setdefault("files", {})
-    if DATA not in files:
-        raise InputDataError(f"{outputs.path / DOCUMENT} tells of a run without {DATA}; run the estimate again")
     progress("drawing the report")
-    page = redrawn_page(outputs.path, document=result, sha256=files[DATA]["sha256"])
-    with outputs.staged() as staging:
-        write_text(staging.area / PAGE, page)
-        files |= staging.digests()
-        write_json(staging.area / DOCUMENT, result)
-        staging.commit()
+    result = redraw_page(outputs)
+    files = result["files"]
     path = outputs.path / PAGE
     strange = strange_files(outputs.path, files)
     text = "".join(f"warning: {outputs.path / name} is not of the run that result.json tells of\n" for name in strange)

@@ -6,11 +6,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from palpate.report.svg import INK, draw_svg
+from palpate.report.svg import INK, draw_svg, link_url
 
 __all__ = ["MOST_IN_FOREST", "boxes_svg", "forest_svg", "scatter_svg"]
 
@@ -21,18 +22,21 @@ MOST_IN_FOREST = 150
 COLOUR = "#0072b2"
 LINE = "#d55e00"
 OPEN = "#777777"  # what is known of a scan without a value
+NONE: Mapping[str, tuple[str, str]] = {}
 SPREAD = 0.18  # of points beside each other at a stage
 
 Patients = Sequence[Mapping[str, Any]]
+Pages = Mapping[str, tuple[str, str]]
+"""Address of a report of each patient, and what a link to it says."""
 
 
-def boxes_svg(patients: Patients, tissue: str, unit: str, *, name: str) -> str:
+def boxes_svg(patients: Patients, tissue: str, unit: str, *, name: str, pages: Pages = NONE) -> str:
     """Quartiles of all scans of each stage, and the medians of its patients as points, with both numbers, as SVG.
 
     Where scans of a stage have no value there is no box, which would leave them out: their ends stand among the others'
     values, as arrows to where they may lie. Raises `ValueError` when nobody has a stage.
     """
-    stages = _stages(patients, tissue)
+    stages, links = _stages(patients, tissue), _numbered(patients, pages)
 
     def draw(figure: Figure) -> None:
         """A box and points a stage."""
@@ -60,35 +64,40 @@ def boxes_svg(patients: Patients, tissue: str, unit: str, *, name: str) -> str:
                     whiskerprops={"color": INK},
                     capprops={"color": INK},
                 )
-            medians = [found for patient in own if (found := patient["summary"][tissue]["median"]) is not None]
-            axes.plot(stage + _beside(len(medians)), medians, "o", color=COLOUR, markersize=4.5, alpha=0.85)
+            medians = [(p, found) for p in own if (found := p["summary"][tissue]["median"]) is not None]
+            for place, (patient, median) in zip(stage + _beside(len(medians)), medians, strict=True):
+                points = axes.plot(place, median, "o", color=COLOUR, markersize=4.5, alpha=0.85)
+                _link(points[0], patient, links)
             labels.append(f"{stage}\n{len(own)} patients\n{len(scans) + len(censored)} scans")
         axes.set_xticks(stages, labels)
         axes.set_xlim(min(stages) - 0.6, max(stages) + 0.6)
         _label(axes, unit)
 
     says = f"{tissue}: quartiles of the scans' {_axis(unit)} at each stage, medians of patients as points"
-    return draw_svg(draw, size=SIZE, name=name, says=says)
+    return draw_svg(draw, size=SIZE, name=name, says=says, links=[pages[patient] for patient in links])
 
 
-def scatter_svg(patients: Patients, tissue: str, unit: str, line: Mapping[str, Any], *, name: str) -> str:
+def scatter_svg(
+    patients: Patients, tissue: str, unit: str, line: Mapping[str, Any], *, name: str, pages: Pages = NONE
+) -> str:
     """Each patient's combined modulus with its 95 % interval against the stage, and the regression's line, as SVG.
 
     Arrows are ends of scans without a value. line: `regression` of statistics.json. Raises `ValueError` when nobody has
     a stage.
     """
-    stages = _stages(patients, tissue)
+    stages, links = _stages(patients, tissue), _numbered(patients, pages)
 
     def draw(figure: Figure) -> None:
         """Points with bars, the line through their weighted middle."""
         axes = figure.add_axes(PLACE)
         axes.set_yscale("log")
         for stage in stages:
-            own = [p["summary"][tissue] for p in patients if p["stage"] == stage and tissue in p["summary"]]
-            for place, summary in zip(stage + _beside(len(own)), own, strict=True):
+            own = [p for p in patients if p["stage"] == stage and tissue in p["summary"]]
+            for place, patient in zip(stage + _beside(len(own)), own, strict=True):
+                summary = patient["summary"][tissue]
                 if (found := summary["combined"]) is not None:
                     axes.plot([place, place], [found["low95"], found["high95"]], color=COLOUR, linewidth=1.4, alpha=0.6)
-                    axes.plot(place, found["value"], "o", color=COLOUR, markersize=4.5)
+                    _link(axes.plot(place, found["value"], "o", color=COLOUR, markersize=4.5)[0], patient, links)
                 for ends in summary["censored"]:
                     _draw_ends(axes, place, ends)
         factor = line.get("factor_per_stage")
@@ -100,10 +109,10 @@ def scatter_svg(patients: Patients, tissue: str, unit: str, line: Mapping[str, A
         _label(axes, unit)
 
     says = f"{tissue}: each patient's {_axis(unit)} with its 95 % interval against the stage, and a line through them"
-    return draw_svg(draw, size=SIZE, name=name, says=says)
+    return draw_svg(draw, size=SIZE, name=name, says=says, links=[pages[patient] for patient in links])
 
 
-def forest_svg(patients: Patients, tissue: str, unit: str, *, name: str) -> str:
+def forest_svg(patients: Patients, tissue: str, unit: str, *, name: str, pages: Pages = NONE) -> str:
     """Each patient's combined modulus with its 95 % interval, a line each, by stage, as SVG.
 
     Arrows are ends of scans without a value. Raises `ValueError` when there are none, or too many to be drawn.
@@ -112,7 +121,7 @@ def forest_svg(patients: Patients, tissue: str, unit: str, *, name: str) -> str:
     if not 0 < len(own) <= MOST_IN_FOREST:
         raise ValueError(f"{len(own)} patients have a modulus; 1 to {MOST_IN_FOREST} are drawn")
     own.sort(key=lambda patient: (patient["stage"] is None, patient["stage"] or 0))
-    height = 0.7 + ROW * len(own)
+    height, links = 0.7 + ROW * len(own), _numbered(own, pages)
 
     def draw(figure: Figure) -> None:
         """Bars from top to bottom."""
@@ -121,7 +130,7 @@ def forest_svg(patients: Patients, tissue: str, unit: str, *, name: str) -> str:
         for number, patient in enumerate(own):
             if (found := patient["summary"][tissue]["combined"]) is not None:
                 axes.plot([found["low95"], found["high95"]], [number, number], color=COLOUR, linewidth=2.5, alpha=0.6)
-                axes.plot(found["value"], number, "s", color=COLOUR, markersize=4.0)
+                _link(axes.plot(found["value"], number, "s", color=COLOUR, markersize=4.0)[0], patient, links)
             for ends in patient["summary"][tissue]["censored"]:
                 _draw_ends(axes, number, ends, along=True)
         stages = ["" if p["stage"] is None else f", stage {p['stage']}" for p in own]
@@ -135,7 +144,18 @@ def forest_svg(patients: Patients, tissue: str, unit: str, *, name: str) -> str:
         axes.set_xlabel(_axis(unit))
 
     says = f"{tissue}: each patient's {_axis(unit)} with its 95 % interval, by stage"
-    return draw_svg(draw, size=(SIZE[0], height), name=name, says=says)
+    return draw_svg(draw, size=(SIZE[0], height), name=name, says=says, links=[pages[patient] for patient in links])
+
+
+def _numbered(patients: Patients, pages: Pages) -> dict[str, int]:
+    """The patients who have a page, numbered."""
+    return {name: number for number, name in enumerate(p["patient"] for p in patients if p["patient"] in pages)}
+
+
+def _link(artist: Artist, patient: Mapping[str, Any], links: Mapping[str, int]) -> None:
+    """Make the point of a patient a link to the page, where there is one."""
+    if patient["patient"] in links:
+        artist.set_url(link_url(links[patient["patient"]]))
 
 
 def _draw_ends(axes: Axes, place: float, ends: Sequence[float | None], *, along: bool = False) -> None:

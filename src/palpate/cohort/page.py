@@ -40,7 +40,8 @@ def cohort_page(records: Sequence[Record], document: Mapping[str, Any], *, creat
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     environment.filters["number"] = number
     environment.filters["interval"] = lambda ends: interval_text(None if ends is None else tuple(ends))
-    charts = {tissue: _charts(document, tissue, place) for place, tissue in enumerate(document["organs"])}
+    pages = _pages(records)
+    charts = {tissue: _charts(document, tissue, place, pages) for place, tissue in enumerate(document["organs"])}
     shown = [record for record in records if record.state == "failed"] + [r for r in records if r.state != "failed"]
     page: str = environment.get_template("cohort.html").render(
         records=shown[:MOST_ROWS],
@@ -54,7 +55,19 @@ def cohort_page(records: Sequence[Record], document: Mapping[str, Any], *, creat
     return page
 
 
-def _charts(document: Mapping[str, Any], tissue: str, place: int) -> tuple[_Chart, ...]:
+def _pages(records: Sequence[Record]) -> dict[str, tuple[str, str]]:
+    """Address of the report of each patient's first row that has one, and what a link to it says."""
+    found = dict[str, tuple[str, str]]()
+    for record in records:
+        if record.page:
+            says = f"report of {record.row.id}, patient {record.row.patient}"
+            found.setdefault(record.row.patient, (record.page, says))
+    return found
+
+
+def _charts(
+    document: Mapping[str, Any], tissue: str, place: int, pages: Mapping[str, tuple[str, str]]
+) -> tuple[_Chart, ...]:
     organ, patients = document["organs"][tissue], document["patients"]
     drawings = {
         "Scans by stage, patients as points": partial(boxes_svg, patients, tissue, organ["unit"]),
@@ -64,7 +77,7 @@ def _charts(document: Mapping[str, Any], tissue: str, place: int) -> tuple[_Char
     charts = []
     for i, (title, draw) in enumerate(drawings.items()):
         try:
-            svg = draw(name=f"c{place}-{i}")
+            svg = draw(name=f"c{place}-{i}", pages=pages)
             charts.append(_Chart(title, Markup(svg)))  # noqa: S704 - drawn by us, names in it as paths
         except ValueError as error:
             charts.append(_Chart(title, None, str(error)))

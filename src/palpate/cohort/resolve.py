@@ -13,8 +13,7 @@ from typing import Any
 from palpate.cohort.task import Row
 from palpate.errors import ConfigurationError, InputDataError, PalpateError
 from palpate.study.case import Case
-from palpate.study.case_file import read_case
-from palpate.study.case_text import case_tables
+from palpate.study.case_file import case_tables, read_case
 from palpate.study.provenance import file_digest, software_versions
 
 __all__ = ["case_of", "row_key"]

@@ -10,22 +10,24 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
-from palpate.cohort.closing import close_cohort
-from palpate.cohort.engines.contract import Engine
+from palpate.cohort.engines.packing import Engine
 from palpate.cohort.mark import MARK, held_soon
-from palpate.cohort.plan import CASES, PLAN, make_plan, write_plan
+from palpate.cohort.page import cohort_page
+from palpate.cohort.plan import CASES, PLAN, Plan, make_plan, write_plan
 from palpate.cohort.progress import Tally
-from palpate.cohort.records import Record
-from palpate.cohort.tables import CSV, PARQUET
+from palpate.cohort.records import Record, records_of
+from palpate.cohort.statistics.document import statistics_document
+from palpate.cohort.tables import CSV, PARQUET, write_csv, write_parquet
 from palpate.cohort.task import Limits, Outcome, Row
 from palpate.errors import ConfigurationError, FolderInUse, PalpateError
 from palpate.progress import Progress
-from palpate.study.journal import STAGING
-from palpate.study.outputs import make_folder
+from palpate.study.outputs import STAGING, make_folder, staged, write_json, write_text
+from palpate.study.provenance import software_versions
 
-__all__ = ["Options", "run_cohort"]
+__all__ = ["STATISTICS", "Options", "close_cohort", "run_cohort"]
 
 LOGGER = logging.getLogger(__name__)
+STATISTICS, PAGE = "statistics.json", "cohort.html"
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,3 +95,22 @@ def _is_wanted(mark: Outcome | None, options: Options) -> bool:
     if mark is None:
         return not options.only_failed or options.resume
     return mark.state == "failed" and (options.only_failed or mark.failure_class == "lost")
+
+
+def close_cohort(plan: Plan, folder: Path, *, tables_only: bool = False) -> tuple[Record, ...]:
+    """Write cohort.csv, cohort.parquet, statistics.json and cohort.html, all or none, from the rows' files.
+
+    tables_only: the first two alone. Raises `ResourceError` when the disk refuses, or a library is missing.
+    """
+    records = records_of(plan, folder)
+    with staged(folder) as staging:
+        write_csv(records, staging.area / CSV)
+        write_parquet(records, staging.area / PARQUET)
+        if not tables_only:
+            document = statistics_document(records)
+            write_json(staging.area / STATISTICS, document)
+            version = software_versions().get("palpate", "")
+            page = cohort_page(records, document, created=plan.began, version=version)
+            write_text(staging.area / PAGE, page)
+        staging.commit()
+    return records

@@ -1,4 +1,4 @@
-"""One attempt of one task: in a child of a warm process, watched for memory, time and sudden ends."""
+"""One attempt of one task: in a process of its own, watched for memory, time and sudden ends."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -23,7 +24,7 @@ ESTIMATE = "palpate.cohort.work:estimate_row"
 # workers there were, and where.
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 LOOK_S = 0.1  # how often memory is looked at
-START_S = 600.0  # for the warm process to import what it needs
+START_S = 600.0  # for the process to import what it needs
 BEFORE_PREDICTION_S = 3600.0  # for the images, each of which has limits of its own
 MUCH = 0.5  # of the limit on memory: a child that the system kills beyond that was most likely too large
 READ_SIZE = 65536
@@ -31,86 +32,75 @@ READ_SIZE = 65536
 
 @dataclass(slots=True)
 class Supervisor:
-    """Runs tasks one after the other with the function `work` ("module:function"), on one thread each.
+    """Runs tasks with the function `work` ("module:function"), each in a new process and on one thread.
 
-    Holds a process that has imported the work and forks a child for each task; `close` ends both.
+    Several may run side by side, one a thread of the caller's; `close` ends them all.
     """
 
     work: str = ESTIMATE
-    _process: subprocess.Popen[bytes] | None = None
-    _rest: bytes = b""
+    _running: set[int] = field(default_factory=set)  # process groups
     _closed: bool = False
 
     def attempt(self, task: Task) -> Outcome:
-        """What one attempt of a task comes to; whatever happens to the child is an outcome, and the next one is new."""
-        watch = _Watch(task)
-        try:
-            process = self._started()
-            self._send(process, task)
-            while watch.ended is None:
-                for message in self._heard(process, LOOK_S):
-                    watch.hear(message)
-                watch.look()
-        except (OSError, EOFError, ValueError):  # gone, closed from another thread, or no line of ours
-            self._drop()
-        return watch.verdict()
+        """What one attempt of a task comes to; whatever happens to its process is an outcome.
 
-    def close(self) -> None:
-        """End the process, and with it the child; from any thread."""
-        self._closed = True
-        self._drop()
-
-    def _drop(self) -> None:
-        process, self._process, self._rest = self._process, None, b""
-        if process is not None:
-            process.kill()
-            process.wait()
-            for pipe in (process.stdin, process.stdout):
-                cast("BinaryIO", pipe).close()
-
-    def _started(self) -> subprocess.Popen[bytes]:
-        if self._closed:
-            raise EOFError
-        if self._process is not None and self._process.poll() is None:
-            return self._process
-        self._drop()
+        Raises `ResourceError` where no process can be started.
+        """
         places = os.pathsep.join(str(Path(place).resolve()) for place in sys.path if place)
         environment = {**os.environ, **dict.fromkeys(THREADS, "1"), "PYTHONPATH": places}
-        command = [sys.executable, "-P", "-W", "ignore", "-m", "palpate.cohort.warm", self.work]
+        command = [sys.executable, "-P", "-W", "ignore", "-m", "palpate.cohort.child", self.work]
         try:
-            self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module, no shell
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment
+            process = subprocess.Popen(  # noqa: S603 - our own interpreter and module, no shell
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, process_group=0
             )
         except OSError as error:
             raise ResourceError(
                 f"no process could be started ({error.strerror}): is memory left, and a process for this user?"
             ) from error
-        return self._process
+        watch = _Watch(task, process)
+        self._running.add(process.pid)
+        try:
+            if not self._closed:
+                tasks, answers, rest = cast("BinaryIO", process.stdin), cast("BinaryIO", process.stdout).fileno(), b""
+                with suppress(BrokenPipeError):  # it has ended already
+                    tasks.write(task.to_json().encode("ascii") + b"\n")
+                    tasks.flush()
+                while watch.ended is None:
+                    watch.look()
+                    patience = LOOK_S if watch.ended is None else 0.0
+                    while select.select([answers], [], [], patience)[0] and (part := os.read(answers, READ_SIZE)):
+                        *lines, rest = (rest + part).split(b"\n")
+                        for line in lines:
+                            watch.hear(json.loads(line))
+        finally:
+            _end_group(process.pid)  # and what it has started
+            watch.ended = process.wait()
+            self._running.discard(process.pid)
+            for pipe in (process.stdin, process.stdout):
+                with suppress(OSError):
+                    cast("BinaryIO", pipe).close()
+        return watch.verdict()
 
-    def _send(self, process: subprocess.Popen[bytes], task: Task) -> None:
-        pipe = cast("BinaryIO", process.stdin)
-        pipe.write(task.to_json().encode("ascii") + b"\n")
-        pipe.flush()
+    def close(self) -> None:
+        """End all processes; from any thread."""
+        self._closed = True
+        for group in tuple(self._running):
+            _end_group(group)
 
-    def _heard(self, process: subprocess.Popen[bytes], seconds: float) -> list[dict[str, Any]]:
-        """The messages that have come; waits so long for the first. Raises `EOFError` when the process is gone."""
-        pipe = cast("BinaryIO", process.stdout).fileno()
-        if not select.select([pipe], [], [], seconds)[0]:
-            return []
-        part = os.read(pipe, READ_SIZE)
-        if not part:
-            raise EOFError
-        *lines, self._rest = (self._rest + part).split(b"\n")
-        return [json.loads(line) for line in lines]
+
+def _end_group(group: int) -> None:
+    with suppress(OSError):  # it has ended
+        os.killpg(group, signal.SIGKILL)
 
 
 @dataclass(slots=True)
 class _Watch:
-    """What is known of a running child, and the verdict when it has ended."""
+    """What is known of the process that works on a task, and the verdict when it has ended."""
 
     task: Task
-    pid: int = 0
-    began: float = field(default_factory=time.monotonic)  # of the child, once there is one
+    process: subprocess.Popen[bytes]
+    began: float = field(default_factory=time.monotonic)  # the process, then its work
+    working: bool = False
     expected_gb: float | None = None
     memory_gb: float = float("inf")  # limits
     seconds: float = BEFORE_PREDICTION_S
@@ -128,48 +118,39 @@ class _Watch:
 
     def hear(self, message: dict[str, Any]) -> None:
         """Take one message."""
-        if "pid" in message:
-            self.pid, self.began = int(message["pid"]), time.monotonic()
+        if "begun" in message:
+            self.working, self.began = True, time.monotonic()
         elif "expected" in message:
             self.expected_gb, seconds = map(float, message["expected"])
             self.memory_gb = self.task.limits.memory_for(self.expected_gb)
             self.seconds = self.task.limits.seconds_for(seconds)
-        elif "outcome" in message:
-            self.outcome = Outcome(**message["outcome"])
         else:
-            self.ended, self.peak_gb = int(message["ended"]), max(float(message["peak_gb"]), self.peak_gb)
+            self.outcome = Outcome(**message["outcome"])
 
     def look(self) -> None:
-        """End the child when it runs over a limit; raises `EOFError` when none comes."""
-        seconds = time.monotonic() - self.began
-        if not self.pid and seconds > START_S:
-            raise EOFError
-        if self.ended is not None or self.outcome is not None or not self.pid or self.stopped:
+        """Whether the process has ended; it is ended when it runs over a limit."""
+        self.ended = self.process.poll()
+        if self.ended is not None or self.outcome is not None or self.stopped:
             return
+        seconds = time.monotonic() - self.began
         try:
-            pages = int(Path(f"/proc/{self.pid}/statm").read_text(encoding="ascii").split()[1])
+            pages = int(Path(f"/proc/{self.process.pid}/statm").read_text(encoding="ascii").split()[1])
         except (OSError, IndexError, ValueError):  # it has ended, or the system does not tell
             pages = 0
         self.peak_gb = max(self.peak_gb, pages * self.page / 1e9)
-        if pages * self.page / 1e9 > self.memory_gb:
-            self._stop("memory")
-        elif seconds > self.seconds:
-            self._stop("time")
-
-    def _stop(self, reason: str) -> None:
-        self.stopped = reason
-        for end in (os.killpg, os.kill):
-            try:
-                end(self.pid, signal.SIGKILL)
-            except OSError:  # it has just ended, or its group has
-                continue
+        if self.working and pages * self.page / 1e9 > self.memory_gb:
+            self.stopped = "memory"
+        elif seconds > (self.seconds if self.working else START_S):
+            self.stopped = "time" if self.working else "start"
+        if self.stopped:
+            _end_group(self.process.pid)
 
     def verdict(self) -> Outcome:
         """The outcome that the child told, or what its end means."""
         seconds = time.monotonic() - self.began
         told = self.outcome if self.outcome is not None and not self.stopped else self._sudden_end()
         expected = told.expected_gb if self.expected_gb is None else self.expected_gb
-        return told.took(seconds, expected_gb=expected, peak_gb=round(self.peak_gb, 3))
+        return told.took(seconds, expected_gb=expected, peak_gb=round(max(self.peak_gb, told.peak_gb or 0.0), 3))
 
     def _sudden_end(self) -> Outcome:
         task, limit = self.task, self.memory_gb
@@ -178,12 +159,11 @@ class _Watch:
         if self.stopped == "memory":
             text = f"it took more than the {limit:.1f} GB of memory that it was given"
             return Outcome.failed(task, "resources", text, cause="memory")
-        if self.ended is None:
-            return Outcome.failed(task, "lost", "the process that computed it is gone", cause="lost")
         if self.ended == -signal.SIGKILL and self.peak_gb > MUCH * limit:
             text = f"the system ended it at {self.peak_gb:.1f} GB of memory, most likely for want of more"
             return Outcome.failed(task, "resources", text, cause="memory")
-        name = {-int(number): number.name for number in signal.Signals}.get(self.ended, f"exit code {self.ended}")
-        if self.ended in (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGHUP, -signal.SIGINT):
+        code = self.ended or 0
+        name = {-int(number): number.name for number in signal.Signals}.get(code, f"exit code {code}")
+        if code in (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGHUP, -signal.SIGINT):
             return Outcome.failed(task, "lost", f"something ended the process that computed it ({name})", cause="lost")
         return Outcome.failed(task, "crash", f"the process that computed it crashed ({name}); its log.txt may tell why")

@@ -68,18 +68,14 @@ def _attempt(task: Task, tell: Tell) -> Outcome:
             return earlier  # somebody else was quicker
         refuse_other_case(case, outputs)
         if task.coarser > 1.0:  # which the result tells as an override
-            edge = round(_edge_length_mm(case) * task.coarser, 3)
+            edge = case.mesh.edge_length_mm
+            if edge is None:  # the images choose it
+                states = read_states(case)
+                edge = edge_length_of(case, states.before, states.after).mm
+            edge = round(edge * task.coarser, 3)
             overrides = (*case.overrides, f"mesh.edge_length_mm={edge}")
             case = replace(case, mesh=replace(case.mesh, edge_length_mm=edge), overrides=overrides)
         return _estimated(task, case, key, outputs, tell)
-
-
-def _edge_length_mm(case: Case) -> float:
-    """That of the case, or what its images choose, which are read for it."""
-    if case.mesh.edge_length_mm is not None:
-        return case.mesh.edge_length_mm
-    states = read_states(case)
-    return edge_length_of(case, states.before, states.after).mm
 
 
 def _estimated(task: Task, case: Case, key: str, outputs: OutputFolder, tell: Tell) -> Outcome:

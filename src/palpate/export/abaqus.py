@@ -15,7 +15,15 @@ import numpy as np
 from palpate.export.conditions import prescribed
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.formats import Options
-from palpate.export.groups import element_faces, face_groups, plain_names, tissue_groups
+from palpate.export.groups import (
+    OFF,
+    MaterialPart,
+    element_faces,
+    face_groups,
+    material_parts,
+    plain_names,
+    tissue_groups,
+)
 from palpate.export.text_lines import rows, wrapped
 from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
@@ -43,8 +51,10 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
 
 def _text(model: FittedModel, body: FittedBody, space: LagrangeSpace, element: str) -> str:
     mesh, tissues = body.mesh, tissue_groups(body.mesh)
-    groups = face_groups(mesh)
-    names = plain_names([*tissues, *(group.name for group in groups)])
+    groups, materials = face_groups(mesh), material_parts(mesh, body.log_ratio)
+    names = plain_names(
+        dict.fromkeys([*tissues, *(group.name for group in groups), *(part.name for part in materials)])
+    )
     parts = [
         "*HEADING\nFitted by Palpate. Units: mm, kPa, mN; RAS coordinates.\n",
         f"** {model.units}\n** law: {model.law}; Palpate's element: {model.element}\n",
@@ -60,16 +70,21 @@ def _text(model: FittedModel, body: FittedBody, space: LagrangeSpace, element: s
         cells, faces = element_faces(mesh, group.triangles)
         parts += [f"*NSET, NSET={names[group.name]}\n", wrapped(points + 1)]
         parts += [f"*SURFACE, NAME={names[group.name]}_F, TYPE=ELEMENT\n", rows("%d, S%d", cells + 1, FACE[faces])]
-    for number, tissue in enumerate(body.tissues):
-        if tissue.name in tissues:
-            parts += [f"*MATERIAL, NAME={names[tissue.name]}\n", _material(model, number)]
-            parts += [f"*SOLID SECTION, ELSET={names[tissue.name]}, MATERIAL={names[tissue.name]}\n"]
+    if any(part.name not in tissues for part in materials):
+        parts.append(f"** an element's modulus is within {OFF:.1%} of the fitted one\n")
+    for part in materials:
+        name = names[part.name]
+        if part.name not in tissues:
+            parts += [f"*ELSET, ELSET={name}\n", wrapped(part.cells + 1)]
+        parts += [f"*MATERIAL, NAME={name}\n", _material(model, body, part)]
+        parts += [f"*SOLID SECTION, ELSET={name}, MATERIAL={name}\n"]
     return "".join([*parts, *_steps(model, body, space)])
 
 
-def _material(model: FittedModel, number: int) -> str:
-    """The law of a tissue (index) with its constants in kPa, D1 in 1/kPa."""
-    modulus, ratio, law = float(model.moduli[number]), model.tissues[number].poisson_ratio, model.law_among(*LAWS)
+def _material(model: FittedModel, body: FittedBody, part: MaterialPart) -> str:
+    """The law of a part of a tissue with its constants in kPa, D1 in 1/kPa."""
+    modulus = float(model.moduli[part.tissue] * np.exp(part.log_ratio))
+    ratio, law = body.tissues[part.tissue].poisson_ratio, model.law_among(*LAWS)
     if isinstance(law, Linear):
         return f"*ELASTIC\n{modulus:.12g}, {ratio:.12g}\n"
     shear, compliance = modulus / (2.0 * (1.0 + ratio)), 6.0 * (1.0 - 2.0 * ratio) / modulus

@@ -35,8 +35,9 @@ MOST_BYTES = 60  # of a tissue's name in a file's: file systems count bytes, not
 def write_estimate_files(result: CaseResult, folder: Path) -> tuple[Path, ...]:
     """Write mesh.vtu (displacement of the last image), stiffness.nii.gz (`result.unit`), labels.nii.gz and labels.csv.
 
-    stiffness_sd.nii.gz, the standard deviation of ln E, where the modulus of a tissue is a field. Each further pair has its own mesh_2.vtu, mesh_3.vtu ...; a converged result leaves model.npz for `palpate export`,
-    and posterior.nc where it has samples. Returns the paths written; raises `ResourceError` when the disk refuses.
+    stiffness_sd.nii.gz, the standard deviation of ln E, where the modulus of a tissue is a field. Each further pair has
+    its own mesh_2.vtu, mesh_3.vtu ...; a converged result leaves model.npz for `palpate export`, and posterior.nc where
+    it has samples. Returns the paths written; raises `ResourceError` when the disk refuses.
     """
     make_folder(folder)
     paths = [folder / "mesh.vtu", folder / "stiffness.nii.gz"]
@@ -65,10 +66,10 @@ def _write_fitted(
     path: Path, result: CaseResult, pair: int, space: LagrangeSpace, displacements: tuple[NDArray[np.float64], ...]
 ) -> None:
     """The mesh of a pair with the moduli of the result and the last of its displacements."""
-    stiffness, sd = result.stiffness_map(pair)
+    stiffness, sd, resolution = result.stiffness_map(pair)
     extra = {} if result.unit == "kPa" else {"youngs_modulus_ratio": stiffness}
     if result.estimation.maps:
-        extra["ln_modulus_sd"] = sd
+        extra |= {"ln_modulus_sd": sd, "resolution": resolution}
     last = displacements[-1] if displacements else np.zeros_like(space.points)
     kilopascals = stiffness if result.unit == "kPa" else np.full_like(stiffness, np.nan)
     cells = _cell_data(space.mesh, kilopascals) | extra

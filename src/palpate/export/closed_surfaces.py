@@ -1,4 +1,7 @@
-"""The surface of each tissue before and after as closed triangles, normals outwards, for STL, OBJ and PLY."""
+"""The surface of each tissue before and after as closed triangles, normals outwards: OBJ, PLY and STL.
+
+A file a tissue and state. Their headings tell 3D Slicer that the coordinates are RAS.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.export.case_files import file_name
-from palpate.export.fitted_model import FittedBody
+from palpate.export.fitted_model import FittedBody, FittedModel
+from palpate.export.formats import Options
+from palpate.export.text_lines import rows
 from palpate.images.tissue import Role
-from palpate.mesh.surface import tissue_surface
+from palpate.mesh.surface import tissue_surface, triangle_normals
 from palpate.observation.observed_surface import SUBTRIANGLES
 from palpate.study.outputs import write_bytes
 
-__all__ = ["ClosedSurface", "closed_surfaces", "write_surfaces"]
+__all__ = ["ClosedSurface", "closed_surfaces", "write_obj", "write_ply", "write_stl"]
+
+HEADING = b"SPACE=RAS; lengths in mm"
+FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])  # of PLY
+FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])  # of STL
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +73,54 @@ def closed_surfaces(body: FittedBody) -> Iterator[ClosedSurface]:
             yield ClosedSurface(stem, tissue.name, state, own, closed)
 
 
-def write_surfaces(body: FittedBody, folder: Path, ending: str, content: Callable[[ClosedSurface], bytes]) -> None:
+def write_obj(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
+    """Write NN_tissue_before.obj and NN_tissue_after.obj, Wavefront's text; the tissue's name is its object's."""
+    del model, options
+
+    def content(surface: ClosedSurface) -> bytes:
+        """Points, then triangles that count them from 1."""
+        heading = f"# {HEADING.decode()}\no {surface.name}\n"
+        text = heading + rows("v %.9g %.9g %.9g", surface.points) + rows("f %d %d %d", surface.triangles + 1)
+        return text.encode()
+
+    _write_surfaces(body, folder, "obj", content)
+
+
+def write_ply(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
+    """Write NN_tissue_before.ply and NN_tissue_after.ply, binary little-endian, double precision."""
+    del model, options
+
+    def content(surface: ClosedSurface) -> bytes:
+        """A heading that describes the rows of numbers after it."""
+        heading = (
+            f"ply\nformat binary_little_endian 1.0\ncomment {HEADING.decode()}\n"
+            f"element vertex {len(surface.points)}\nproperty double x\nproperty double y\nproperty double z\n"
+            f"element face {len(surface.triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
+        )
+        faces = np.zeros(len(surface.triangles), dtype=FACE)
+        faces["count"], faces["corners"] = 3, surface.triangles
+        return heading.encode() + surface.points.astype("<f8").tobytes() + faces.tobytes()
+
+    _write_surfaces(body, folder, "ply", content)
+
+
+def write_stl(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
+    """Write NN_tissue_before.stl and NN_tissue_after.stl, binary."""
+    del model, options
+
+    def content(surface: ClosedSurface) -> bytes:
+        """80 bytes of heading, the number of facets, and each with its normal."""
+        facets = np.zeros(len(surface.triangles), dtype=FACET)
+        normals = triangle_normals(surface.points, surface.triangles)
+        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+        facets["normal"] = normals / np.maximum(lengths, np.finfo(float).tiny)
+        facets["corners"] = surface.points[surface.triangles]
+        return HEADING.ljust(80) + np.uint32(len(facets)).tobytes() + facets.tobytes()
+
+    _write_surfaces(body, folder, "stl", content)
+
+
+def _write_surfaces(body: FittedBody, folder: Path, ending: str, content: Callable[[ClosedSurface], bytes]) -> None:
     """Write each closed surface to a file of its own; raises `ResourceError` when the disk refuses."""
     for surface in closed_surfaces(body):
         write_bytes(folder / f"{surface.stem}.{ending}", content(surface))

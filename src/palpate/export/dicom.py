@@ -21,7 +21,7 @@ from palpate.export.formats import Options
 from palpate.export.rasterise import region_image
 from palpate.images.input_file import read_input
 from palpate.images.segmentation import first_labels
-from palpate.images.tissue_colours import tissue_colours
+from palpate.images.tissue import tissue_colours
 from palpate.study.outputs import write_bytes
 from palpate.study.provenance import software_versions
 

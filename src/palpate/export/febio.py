@@ -51,13 +51,15 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
     root.append(ET.Comment(f" fitted by Palpate; {model.units}; stresses in kPa, forces in mN "))
     _add(root, "Module", type="solid")
     material = _add(root, "Material")
-    for number, name in enumerate(tissue_groups(body.mesh), start=1):
-        _material(material, model, name, number)
-    _mesh(_add(root, "Mesh"), body, space, held, loads)
+    groups = enumerate(tissue_groups(body.mesh).items(), start=1)
+    maps = {name: (cells, _material(material, model, body, name, number)) for number, (name, cells) in groups}
+    mesh = _add(root, "Mesh")
+    _mesh(mesh, body, space, held, loads)
     domains = _add(root, "MeshDomains")
     for name in tissue_groups(body.mesh):
         _add(domains, "SolidDomain", name=name, mat=name)
     data = _add(root, "MeshData")
+    _element_data(mesh, data, maps)
     curves = _add(root, "LoadData")
     if loads:
         _loads(data, _add(root, "Loads"), loads, len(space.points), first_curve=len(body.displacements) + 1)
@@ -89,14 +91,19 @@ def _add(parent: Element, tag: str, text: object = None, **attributes: object) -
     return child
 
 
-def _material(parent: Element, model: FittedModel, name: str, number: int) -> None:
-    """A tissue's law with its constants in kPa."""
-    index = [tissue.name for tissue in model.tissues].index(name)
+def _material(
+    parent: Element, model: FittedModel, body: FittedBody, name: str, number: int
+) -> dict[str, NDArray[np.float64]]:
+    """A tissue's law with its constants in kPa; those that differ between its elements, (n,) each."""
+    cells = tissue_groups(body.mesh)[name]
+    index = int(body.mesh.region[cells[0]])
     modulus, ratio, law = (
         float(model.moduli[index]),
-        model.tissues[index].poisson_ratio,
+        body.tissues[index].poisson_ratio,
         model.law_among(Linear, NeoHookean, MooneyRivlin),
     )
+    log_ratio = np.zeros(1) if body.log_ratio is None else body.log_ratio[cells]
+    scale = np.exp(log_ratio) if np.ptp(log_ratio) > 0.0 else np.ones(1)
     constants = {"E": modulus, "v": ratio}
     kind = "neo-Hookean" if law.finite else "isotropic elastic"
     if isinstance(law, MooneyRivlin):
@@ -106,8 +113,26 @@ def _material(parent: Element, model: FittedModel, name: str, number: int) -> No
         constants, kind = {"c1": first, "c2": second, "k": lame - 4.0 * second}, "coupled Mooney-Rivlin"
     material = _add(parent, "material", id=number, name=name, type=kind)
     density = float(model.densities[index]) * 1e-9  # kg/mm^3, which goes with mm, kPa and mN
+    maps = {key: value * scale for key, value in constants.items() if key != "v" and len(scale) > 1}
     for key, value in {"density": density, **constants}.items():
-        _add(material, key, f"{value:.12g}")
+        if key in maps:
+            _add(material, key, f"{name} {key}", type="map")
+        else:
+            _add(material, key, f"{value:.12g}")
+    return maps
+
+
+def _element_data(
+    mesh: Element, data: Element, maps: dict[str, tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]]
+) -> None:
+    """The constants of each tissue's elements, by their number."""
+    for name, (cells, constants) in maps.items():
+        if constants:
+            _add(mesh, "ElementSet", ",".join(map(str, (cells + 1).tolist())), name=f"{name} elements")
+        for key, numbers in constants.items():
+            values = _add(data, "ElementData", name=f"{name} {key}", elem_set=f"{name} elements", data_type="scalar")
+            for place, value in enumerate(numbers.tolist(), start=1):
+                _add(values, "elem", f"{value:.12g}", lid=place)
 
 
 def _mesh(mesh: Element, body: FittedBody, space: LagrangeSpace, held: Prescribed, loads: tuple[Load, ...]) -> None:

@@ -17,11 +17,14 @@ from palpate.mechanics.laws.registry import law_from
 from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.study.case import CaseLoad
+from palpate.study.discrepancy import FittedMaterial
 from palpate.study.estimation import ModulusEstimate
 from palpate.study.result import CaseResult, PairResult
 from palpate.study.samples import ModulusSamples
 
 __all__ = ["FittedBody", "FittedModel", "fitted_model"]
+
+HIGHEST_RATIO = 0.4999  # Poisson's, that a case may have
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +34,7 @@ class FittedBody:
     order: 1 or 2, of the displacements (n_points, 3) mm on the points of `space`, one a later image; alignments: one
     (4, 4) a later image, which takes points from the world of the first image, RAS mm, to where the later one has them;
     index (n_x, n_y, n_z): the tissue of each voxel of the first image, on `grid`; loads: the known ones in each later
-    image.
+    image; log_ratio (n_tets,): ln E of each element over that of its tissue, None: tissues are homogeneous.
     """
 
     mesh: TetMesh
@@ -41,9 +44,12 @@ class FittedBody:
     index: NDArray[np.int16]
     grid: VoxelGrid
     loads: tuple[tuple[CaseLoad, ...], ...]
+    log_ratio: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         index, n = self.index, len(self.mesh.tissues)
+        if self.log_ratio is not None and self.log_ratio.shape != self.mesh.region.shape:
+            raise InputDataError("the elements of a fitted model do not all have a modulus")
         if index.shape != self.grid.shape or (index.size and not 0 <= int(index.min()) <= int(index.max()) < n):
             raise InputDataError(f"the voxels of a fitted model do not all belong to one of its {n} tissues")
 
@@ -56,6 +62,11 @@ class FittedBody:
     def space(self) -> LagrangeSpace:
         """The displacements' points on the mesh."""
         return lagrange_space(self.mesh, f"P{self.order}")
+
+    def element_moduli(self, of_tissues: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Young's modulus (n_tets,) of each element, in the unit of those of its tissues (n_tissues,)."""
+        factor = 1.0 if self.log_ratio is None else np.exp(self.log_ratio)
+        return np.asarray(of_tissues[self.mesh.region] * factor)
 
     def with_linear_tetrahedra(self) -> FittedBody:
         """The same with the displacements of the corners alone."""
@@ -137,7 +148,8 @@ def fitted_model(result: CaseResult, *, seal: str) -> FittedModel:
     pairs += [(pair, pair.displacements) for pair in result.further]
     numbers = np.cumsum([1, *(len(motions) for _, motions in pairs)]).tolist()
     loads = [tuple(case.loads_in(n) for n in range(*ends)) for ends in pairwise(numbers)]
-    bodies = [_body(*pair, acting) for pair, acting in zip(pairs, loads, strict=True)]
+    materials = [estimation.materials[n - 1] if estimation.materials else None for n in numbers[:-1]]
+    bodies = [_body(*pair, acting, of) for pair, acting, of in zip(pairs, loads, materials, strict=True)]
     density = {tissue.name: tissue.density_kg_m3 for tissue in case.tissues}
     law = case.mechanics.material_law
     return FittedModel(
@@ -162,9 +174,12 @@ def _body(
     pair: CaseResult | PairResult,
     displacements: tuple[NDArray[np.float64], ...],
     loads: tuple[tuple[CaseLoad, ...], ...],
+    material: FittedMaterial | None,
 ) -> FittedBody:
-    mesh = pair.space.mesh
-    nameless = tuple(replace(tissue, called=()) for tissue in mesh.tissues)  # the labels' own names are the image's
+    mesh, shifts = pair.space.mesh, material.poisson_shifts if material else {}
+    ratios = [min(tissue.poisson_ratio + shifts.get(tissue.name, 0.0), HIGHEST_RATIO) for tissue in mesh.tissues]
+    # the labels' own names are the image's
+    nameless = tuple(replace(t, called=(), poisson_ratio=ratio) for t, ratio in zip(mesh.tissues, ratios, strict=True))
     alignments = tuple(found.motion.matrix for found in pair.alignments) or tuple(np.eye(4) for _ in displacements)
     motions = displacements or (np.zeros_like(pair.space.points),)
     return FittedBody(
@@ -175,4 +190,5 @@ def _body(
         pair.before.index,
         pair.before.grid,
         loads or ((),),
+        None if material is None else material.log_ratio,
     )

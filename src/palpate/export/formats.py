@@ -1,4 +1,4 @@
-"""The formats of `palpate export`, a module each: another format is another file here, and a line in FORMATS."""
+"""The formats of `palpate export`: another format is another file here, and a line in FORMATS."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Options:
 
 
 class Write(Protocol):
-    """What a format's module offers as `write`: one body's files into a folder that is there."""
+    """The function that writes a format: one body's files into a folder that is there."""
 
     def __call__(self, model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
         """Write them; raises `ResourceError` when the disk refuses, or a library is missing."""
@@ -36,17 +36,18 @@ class Write(Protocol):
 class Format:
     """A format: the module of `palpate.export` that writes it, and what it is, in a few words.
 
-    every_pair: whether each pair of images has files of its own.
+    every_pair: whether each pair of images has files of its own; function: of the module.
     """
 
     module: str
     description: str
     every_pair: bool = True
+    function: str = "write"
 
     @property
     def write(self) -> Write:
         """The function that writes it."""
-        return cast("Write", import_module(f"palpate.export.{self.module}").write)
+        return cast("Write", getattr(import_module(f"palpate.export.{self.module}"), self.function))
 
 
 FORMATS = {
@@ -56,12 +57,12 @@ FORMATS = {
     "febio": Format("febio", "FEBio 4, .feb"),
     "gmsh": Format("gmsh", "gmsh 4.1 with physical groups, .msh"),
     "netcdf": Format("netcdf", "posterior samples for ArviZ and xarray, .nc", every_pair=False),
-    "obj": Format("obj", "Wavefront surfaces before and after, .obj"),
+    "obj": Format("closed_surfaces", "Wavefront surfaces before and after, .obj", function="write_obj"),
     "paraview": Format("paraview", "a ParaView script with its data, .py"),
-    "ply": Format("ply", "polygon surfaces before and after, .ply"),
+    "ply": Format("closed_surfaces", "polygon surfaces before and after, .ply", function="write_ply"),
     "slicer": Format("slicer", "a 3D Slicer script with its data, .py"),
     "sofa": Format("sofa", "a SOFA scene with its mesh, .py"),
-    "stl": Format("stl", "surfaces before and after, .stl"),
+    "stl": Format("closed_surfaces", "surfaces before and after, .stl", function="write_stl"),
     "vtu": Format("vtu", "VTK meshes with an animation, .vtu, .pvd, .vtm"),
     "warp": Format("warp", "the fitted motion as a displacement field for ITK, .nii.gz"),
 }

@@ -51,13 +51,14 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
         parts += [heading, rows("%d %.9g %.9g %.9g", np.arange(1, n + 1), displacement), "$EndNodeData\n"]
     # a triangle has the values of the tetrahedron behind it, for programs that ask a value of every element
     behind = [element_faces(body.mesh, triangles)[0] for _, triangles in surfaces]
-    region = body.mesh.region[np.concatenate([*behind, *volumes.values()])]
+    cells = np.concatenate([*behind, *volumes.values()])
+    poisson = np.array([tissue.poisson_ratio for tissue in body.tissues])
     for name, values in (
-        ("youngs_modulus_kpa" if model.unit == "kPa" else "youngs_modulus_ratio", model.moduli),
-        ("poisson_ratio", np.array([tissue.poisson_ratio for tissue in body.tissues])),
+        ("youngs_modulus_kpa" if model.unit == "kPa" else "youngs_modulus_ratio", body.element_moduli(model.moduli)),
+        ("poisson_ratio", poisson[body.mesh.region]),
     ):
-        heading = f'$ElementData\n1\n"{name}"\n1\n0\n3\n0\n1\n{len(region)}\n'
-        parts += [heading, rows("%d %.9g", np.arange(1, len(region) + 1), values[region]), "$EndElementData\n"]
+        heading = f'$ElementData\n1\n"{name}"\n1\n0\n3\n0\n1\n{len(cells)}\n'
+        parts += [heading, rows("%d %.9g", np.arange(1, len(cells) + 1), values[cells]), "$EndElementData\n"]
     write_text(folder / "palpate.msh", "".join(parts))
 
 

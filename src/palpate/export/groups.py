@@ -12,7 +12,19 @@ from palpate.images.tissue import Role
 from palpate.mesh.surface import tissue_surface
 from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh
 
-__all__ = ["FaceGroup", "element_faces", "face_groups", "plain_names", "tissue_groups"]
+__all__ = [
+    "OFF",
+    "FaceGroup",
+    "MaterialPart",
+    "element_faces",
+    "face_groups",
+    "material_parts",
+    "plain_names",
+    "tissue_groups",
+]
+
+STEP = 0.05  # of ln E, between the materials of a tissue that is not homogeneous
+OFF = float(np.expm1(0.5 * STEP))  # of a modulus, that an element has less or more than its material, at the most
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +42,33 @@ def tissue_groups(mesh: TetMesh) -> dict[str, NDArray[np.int64]]:
         for number, tissue in enumerate(mesh.tissues)
         if tissue.meshed
     }
+
+
+@dataclass(frozen=True, slots=True)
+class MaterialPart:
+    """Elements of a tissue with one modulus: its name, the tissue's number, cells (n,), ln E over the tissue's."""
+
+    name: str
+    tissue: int
+    cells: NDArray[np.int64]
+    log_ratio: float
+
+
+def material_parts(mesh: TetMesh, log_ratio: NDArray[np.float64] | None) -> tuple[MaterialPart, ...]:
+    """The meshed tissues, those whose elements have other moduli by log_ratio (n_tets,) in parts of nearly one.
+
+    The parts of a tissue are called as it is, with their number; a homogeneous tissue is one part of its own name.
+    """
+    found = list[MaterialPart]()
+    for name, cells in tissue_groups(mesh).items():
+        tissue = int(mesh.region[cells[0]])
+        logs = np.zeros(len(cells)) if log_ratio is None else log_ratio[cells]
+        step = np.rint(logs / STEP).astype(np.int64)
+        kinds = np.unique(step)
+        for number, kind in enumerate(kinds, start=1):
+            called = name if len(kinds) == 1 else f"{name} part {number} of {len(kinds)}"
+            found.append(MaterialPart(called, tissue, cells[step == kind], STEP * float(kind)))
+    return tuple(found)
 
 
 def face_groups(mesh: TetMesh) -> tuple[FaceGroup, ...]:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from palpate.images.named_labels import NamedLabel
-from palpate.images.readers.table_slicer import slicer_table
+from palpate.images.readers.column_tables import slicer_table
 from palpate.images.segmentation import first_labels
-from palpate.images.tissue import Tissue
-from palpate.images.tissue_colours import tissue_colours
+from palpate.images.tissue import Tissue, tissue_colours
 from palpate.study.outputs import write_text
 
 __all__ = ["write_label_table"]

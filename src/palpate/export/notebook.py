@@ -13,8 +13,7 @@ from palpate.errors import ResourceError
 from palpate.export.rasterise import region_image
 from palpate.images.label_image import LabelImage
 from palpate.images.readers import write_label_image, write_scalar_image
-from palpate.images.tissue import Role
-from palpate.images.tissue_colours import tissue_colours
+from palpate.images.tissue import Role, tissue_colours
 from palpate.study.result import CaseResult
 
 __all__ = ["notebook_viewer"]

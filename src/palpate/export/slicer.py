@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.export import ply, warp
-from palpate.export.closed_surfaces import closed_surfaces
+from palpate.export import warp
+from palpate.export.closed_surfaces import closed_surfaces, write_ply
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.formats import Options
 from palpate.export.label_table import write_label_table
@@ -15,7 +15,7 @@ from palpate.export.rasterise import region_image
 from palpate.images.label_image import LabelImage
 from palpate.images.readers import write_label_image, write_scalar_image
 from palpate.images.segmentation import first_labels
-from palpate.images.tissue_colours import tissue_colours
+from palpate.images.tissue import tissue_colours
 from palpate.study.outputs import write_json, write_text
 
 __all__ = ["write"]
@@ -78,7 +78,7 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
     write_label_table(folder / "labels.csv", body.tissues)
     moduli = np.nan_to_num(np.append(model.moduli, 0.0))  # 0 where nothing is meshed: Slicer shows NaN as anything
     write_scalar_image(folder / "stiffness.nii.gz", moduli[region_image(body.mesh, body.grid)], body.grid)
-    ply.write(model, body, folder, options)
+    write_ply(model, body, folder, options)
     warp.write(model, body, folder, options)
     shown = zip(body.tissues, tissue_colours(body.tissues), strict=True)
     colours = {tissue.name: [part / 255.0 for part in bytes.fromhex(colour[1:])] for tissue, colour in shown}

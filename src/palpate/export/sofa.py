@@ -15,7 +15,7 @@ from palpate.errors import ConfigurationError
 from palpate.export.conditions import prescribed
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.formats import Options
-from palpate.export.groups import face_groups, plain_names, tissue_groups
+from palpate.export.groups import MaterialPart, face_groups, material_parts, plain_names
 from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
 from palpate.mechanics.laws.neo_hookean import NeoHookean
@@ -70,7 +70,7 @@ def createScene(root):
     state = body.addObject("MechanicalObject", name="state", template="Vec3d", position=nodes)
     for tissue in MODEL["tissues"]:
         child = body.addChild(tissue["id"])
-        tets = ARRAYS["tets"][ARRAYS["region"] == tissue["region"]].tolist()
+        tets = ARRAYS["tets"][ARRAYS["part"] == tissue["part"]].tolist()
         child.addObject("TetrahedronSetTopologyContainer", name="topology", position=nodes, tetrahedra=tets)
         child.addObject("TetrahedronSetGeometryAlgorithms", template="Vec3d")
         child.addObject(tissue["force_field"], name="law", template="Vec3d", **tissue["parameters"])
@@ -123,11 +123,15 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
             "the SOFA scene has neither known loads nor faces that slide askew to the world's axes; export to abaqus or"
             " febio"
         )
-    mesh = body.mesh
+    mesh, parts = body.mesh, material_parts(body.mesh, body.log_ratio)
+    part = np.empty(len(mesh.tets), dtype=np.int64)
+    for number, of in enumerate(parts):
+        part[of.cells] = number
     arrays = {
         "nodes": mesh.nodes,
         "tets": mesh.tets,
         "region": mesh.region,
+        "part": part,
         "prescribed": held.whole,
         "motion": np.stack([motion[held.whole] for motion in linear.displacements]),
         "sliding": held.sliding,
@@ -136,12 +140,12 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
     groups = {f"group_{number}": np.unique(group.triangles) for number, group in enumerate(face_groups(mesh))}
     memory = io.BytesIO()
     np.savez_compressed(memory, allow_pickle=False, **arrays, **groups)
-    names = plain_names(tissue_groups(mesh))
+    names = plain_names(of.name for of in parts)
     document = {
         "schema": "palpate.sofa/1",
         "units": model.units,
         "plugins": list(PLUGINS),
-        "tissues": [_tissue(model, number, names[t.name]) for number, t in enumerate(mesh.tissues) if t.meshed],
+        "tissues": [_tissue(model, body, number, of, names[of.name]) for number, of in enumerate(parts)],
         "groups": {f"group_{number}": group.name for number, group in enumerate(face_groups(mesh))},
     }
     write_bytes(folder / "model.npz", memory.getvalue())
@@ -149,9 +153,9 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
     write_text(folder / "scene.py", SCENE)
 
 
-def _tissue(model: FittedModel, number: int, plain: str) -> dict[str, object]:
-    """A tissue's force field with its parameters, moduli in kPa."""
-    tissue, modulus = model.tissues[number], float(model.moduli[number])
+def _tissue(model: FittedModel, body: FittedBody, number: int, part: MaterialPart, plain: str) -> dict[str, object]:
+    """The force field of a part of a tissue with its parameters, moduli in kPa."""
+    tissue, modulus = body.tissues[part.tissue], float(model.moduli[part.tissue] * np.exp(part.log_ratio))
     ratio, law = tissue.poisson_ratio, model.law_among(Linear, NeoHookean, MooneyRivlin)
     shear = modulus / (2.0 * (1.0 + ratio))
     lame, bulk = 2.0 * shear * ratio / (1.0 - 2.0 * ratio), modulus / (3.0 * (1.0 - 2.0 * ratio))
@@ -163,4 +167,4 @@ def _tissue(model: FittedModel, number: int, plain: str) -> dict[str, object]:
     elif isinstance(law, MooneyRivlin):
         first, second = (shear * coefficient for coefficient in law.coefficients)
         parameters = {"materialName": "MooneyRivlin", "ParameterSet": f"{first:.12g} {second:.12g} {bulk:.12g}"}
-    return {"name": tissue.name, "id": plain, "region": number, "force_field": force_field, "parameters": parameters}
+    return {"name": part.name, "id": plain, "part": number, "force_field": force_field, "parameters": parameters}

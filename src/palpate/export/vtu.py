@@ -46,7 +46,7 @@ def write_states(model: FittedModel, body: FittedBody, folder: Path) -> list[str
     modulus = "youngs_modulus_kpa" if model.unit == "kPa" else "youngs_modulus_ratio"
     cells: dict[str, NDArray[Any]] = {
         "label": first_labels(body.tissues)[region],
-        modulus: model.moduli[region],
+        modulus: body.element_moduli(model.moduli),
         "poisson_ratio": poisson[region],
     }
     names = []

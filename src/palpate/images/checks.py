@@ -17,15 +17,26 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.images.wall_motion import STILL_VOXELS, wall_motion
 
-__all__ = ["check_headers", "check_images", "check_pair", "check_segmentation", "later_names"]
+__all__ = [
+    "SMALL_VOXELS",
+    "VOLUME_IMPLAUSIBLE",
+    "check_headers",
+    "check_images",
+    "check_pair",
+    "check_segmentation",
+    "later_names",
+    "share_inside",
+]
 
 OBSERVED = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
 VOLUME_CHANGE = 0.05  # no modulus explains a filling between the scans
-VOLUME_IMPLAUSIBLE = 0.30
+VOLUME_IMPLAUSIBLE = 0.30  # of an organ: no deformation, and hardly a filling, changes so much
 SMALL_VOXELS = 50
 THIN_VOXELS = 4
 THIN_SHARE = 0.2
 COMMON_SHARE = 0.5
+ON_FACE = 1e-6  # voxels: rounding of a point on an image's outer face
+FAR_SHARE = {Role.ESTIMATE: 0.5}  # of its size, by which the middle of a solid organ hardly moves; of others all of it
 SPACING_MM = (0.02, 20.0)  # outside of this a voxel edge is more likely in metres or micrometres
 MIRROR_CERTAIN = 0.25  # gain in agreement, of 1, at which a mirrored image is refused
 MIRROR_LIKELY = 0.10
@@ -194,7 +205,7 @@ def _too_thin(mask: NDArray[np.bool_], box: tuple[slice, ...], tissue: Tissue, n
 
 
 def _common_part(before: Segmentation, after: Segmentation, name: str) -> list[Finding]:
-    share = max(_share_inside(before.grid, after.grid), _share_inside(after.grid, before.grid))
+    share = max(share_inside(before.grid, after.grid), share_inside(after.grid, before.grid))
     if share == 0.0:
         centres = [grid.world((np.array([grid.shape]) - 1.0) / 2.0)[0] for grid in (before.grid, after.grid)]
         raise InputDataError(
@@ -208,12 +219,13 @@ def _common_part(before: Segmentation, after: Segmentation, name: str) -> list[F
     return [Finding("little-in-common", text, place=f"'{name}' ({share:.0%})")]
 
 
-def _share_inside(grid: VoxelGrid, other: VoxelGrid) -> float:
+def share_inside(grid: VoxelGrid, other: VoxelGrid) -> float:
     """Share of the grid's volume that lies inside the other one, by a lattice of 33^3 points out to the outer faces."""
     ticks = [np.linspace(-0.5, n - 0.5, 33) for n in grid.shape]
     lattice = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
     index = other.index(grid.world(lattice))
-    return float(((index >= -0.5) & (index <= np.array(other.shape) - 0.5)).all(axis=1).mean())
+    low, high = -0.5 - ON_FACE, np.array(other.shape) - 0.5 + ON_FACE
+    return float(((index >= low) & (index <= high)).all(axis=1).mean())
 
 
 def _mirrored(before: Segmentation, after: Segmentation, observed: Sequence[int], name: str) -> list[Finding]:
@@ -273,7 +285,10 @@ def _refuse_exchanged(found: NDArray[np.float64], organs: Sequence[str], name: s
 
 
 def _shifts(before: Segmentation, after: Segmentation, observed: Sequence[int], name: str) -> list[Finding]:
-    """Organs that move by more than their own size, measured against the rigid tissues where there are any."""
+    """Organs that move by more than half of their size, and drivers by all of it.
+
+    Measured against the rigid tissues where there are any; what an alignment has taken out is not in it.
+    """
     shift = {i: after.middle(i) - before.middle(i) for i in observed}
     rigid = [shift[i] for i in observed if before.tissues[i].role is Role.RIGID]
     common = np.mean(rigid, axis=0) if rigid else np.zeros(3)
@@ -281,10 +296,13 @@ def _shifts(before: Segmentation, after: Segmentation, observed: Sequence[int], 
     for i, vector in shift.items():
         size = (6.0 * before.volume(i) / np.pi) ** (1.0 / 3.0)
         length = float(np.linalg.norm(vector - common))
-        if length > size:
+        share = FAR_SHARE.get(before.tissues[i].role, 1.0)
+        if length > share * size:
+            against = "against the rigid tissues, " if rigid else ""
             text = (
-                f"'{before.tissues[i].name}' moves by {length:.1f} mm from 'before' to '{name}', more than its size of"
-                f" {size:.1f} mm; check that its label means the same organ, and that the images are aligned"
+                f"'{before.tissues[i].name}' moves by {length:.1f} mm from 'before' to '{name}', {against}more than"
+                f" {'half of ' if share < 1.0 else ''}its size of {size:.1f} mm; check that its label means the same"
+                " organ, and that the images lie on each other"
             )
             findings.append(Finding("large-shift", text, before.tissues[i].name, f"to '{name}' ({length:.1f} mm)"))
     return findings

@@ -14,9 +14,11 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.surface_alignment import residuals_by_tissue
 from palpate.images.tissue import Role, Tissue
 
-__all__ = ["ON", "Registration", "registration"]
+__all__ = ["ON", "Registration", "length_text", "registration"]
 
 
+LEAST_MM = 0.01  # no image shows less
+ROUNDING = 1e-3  # mm, degrees: of a motion that a solver finds where there is none
 ON = {"rigid-tissues": "the rigid tissues", "surfaces": "all surfaces that both images show"}
 
 
@@ -51,13 +53,18 @@ class Registration:
         return self.motion.angle_deg
 
     @property
+    def still(self) -> bool:
+        """Whether the whole does not move, but for what rounding makes of nothing."""
+        return self.distance_mm < ROUNDING and self.rotation_deg < ROUNDING
+
+    @property
     def in_words(self) -> str:
         """What goes on after the later image's name: where it lay, on what that was measured, what was done."""
-        if self.distance_mm == 0.0 and self.rotation_deg == 0.0:
+        if self.still:
             return f"is left where it lies: {ON[self.by]} show no clear motion of the whole"
         return (
             f"lay {self.distance_mm:.1f} mm and {self.rotation_deg:.1f} degrees elsewhere, measured on {ON[self.by]},"
-            f" and was brought back; these keep {self.residual_mm:.2g} mm"
+            f" and was brought back; these keep {length_text(self.residual_mm)} mm"
         )
 
     def own_motion_mm(self, tissues: Sequence[Tissue]) -> float:
@@ -76,6 +83,11 @@ class Registration:
             "residual_mm": round(self.residual_mm, 4),
             "residual_by_tissue_mm": {name: round(mm, 4) for name, mm in self.residual_by_tissue_mm.items()},
         }
+
+
+def length_text(mm: float) -> str:
+    """A length as a person wants it: two digits, and nothing below a hundredth of a millimetre."""
+    return f"{mm:.2g}" if mm >= LEAST_MM else f"less than {LEAST_MM:g}"
 
 
 def registration(before: Segmentation, after: Segmentation, fit: RigidFit, *, by: str) -> Registration:

@@ -22,6 +22,7 @@ from palpate.inversion.estimate import (
     StartRun,
     as_good,
     continue_at_finite_strain,
+    first_noise_of,
     invert,
     with_released,
 )
@@ -80,6 +81,7 @@ __all__ = [
     "continue_at_finite_strain",
     "eta_of_ratio",
     "exact_approximation",
+    "first_noise_of",
     "fit_coefficients",
     "fit_driver",
     "fixed_correspondence",

@@ -43,7 +43,8 @@ STILL, MOVES = 0.02, (1.0, 2.0)  # amplitudes of a frame that stands still, time
 STILL_RIGID, MOVED_RIGID = 0.005, 0.2
 DRAWN_ALIKE, SELDOM = 0.1, 0.01  # an offset of a surface that is drawn alike, over that of others; how often not
 KNOWN_MODULUS = "known modulus"
-FIELD, FIELD_AMPLITUDES = "field", (1.0, 1.0)  # of a tissue that is mapped, times the standard deviation stated
+FIELD = "field"
+FIELD_AMPLITUDES = (1.0, 2.0)  # of a tissue that is mapped, times the standard deviation stated
 CONSIDERED = 1e8  # times its precision: an unknown that is considered does not move
 HOMOGENEOUS_SHARE, PATCHY = 1.0 / 3.0, 0.3  # sd of ln E in a tissue that is nearly homogeneous, over that stated; odds
 
@@ -197,16 +198,27 @@ def material_blocks(
 
     A tissue is nearly homogeneous, by a third of what is stated, or patchy by all of it, of which the evidence chooses;
     surfaces hardly tell the two apart, so that the former stays until the latter is clearly more likely. The field of a
-    tissue that is mapped has the amplitude that the images' evidence gives it.
+    tissue that is mapped has the amplitude that is stated until twice of it is clearly more likely. It has no less: a
+    small part that differs in a tissue that is else homogeneous speaks for a small amplitude, which hides it.
     """
     levels = [(share * heterogeneity_sd) ** 2 for share in (HOMOGENEOUS_SHARE, 1.0)]
     blocks = []
     for tissue, n in modes.sizes:
         name, mapped = tissues[tissue].name, tissues[tissue].field
         if n and mapped:
-            covariance = mapped.sd**2 * np.eye(n)
-            own = (name, FIELD, Acts.MATERIAL, states, np.linalg.inv(covariance), ((covariance,),))
-            blocks.append(Block(*own, amplitudes=FIELD_AMPLITUDES))
+            amounts = [(share * mapped.sd) ** 2 for share in FIELD_AMPLITUDES]
+            blocks.append(
+                Block(
+                    name,
+                    FIELD,
+                    Acts.MATERIAL,
+                    states,
+                    np.eye(n) / mapped.sd**2,
+                    tuple((amount * np.eye(n),) for amount in amounts),
+                    amplitudes=(1.0, 1.0),
+                    odds=(0.0,) * len(amounts),
+                )
+            )
         elif n:
             blocks.append(
                 Block(

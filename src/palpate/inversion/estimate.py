@@ -38,6 +38,7 @@ __all__ = [
     "StartRun",
     "as_good",
     "continue_at_finite_strain",
+    "first_noise_of",
     "invert",
     "with_released",
 ]
@@ -157,6 +158,23 @@ def invert(
         return linear[0]
     there = during("finite strain", progress)
     return continue_at_finite_strain(linear.pop(), settings, progress=there, rule=rule)  # which lets go of its bases
+
+
+@blas_on_one_thread()
+def first_noise_of(
+    problem: InverseProblem, settings: InversionSettings, *, progress: Progress
+) -> tuple[Objective, Minimum]:
+    """What an estimate begins with under the linear law: the objective under the noise that the images show, and where.
+
+    Its minimum is near the middle start, and no estimate: no other start and no exact derivative was tried. Raises as
+    `invert` does.
+    """
+    middle = np.asarray(np.median(np.stack(settings.starts), axis=0))
+    begin = np.concatenate([middle, np.zeros(problem.parameters.n_coefficients)])
+    objective, unknowns, _ = _with_reduced_bases(problem.linear(), settings, begin, progress)
+    objective = with_first_noise(objective).rematched(np.zeros(objective.parameters.n_unknowns))
+    nearby = minimised(begun(objective, unknowns), settings.bounds, CHEAP, progress=progress, title="the middle start")
+    return nearby.objective, nearby.minimum
 
 
 def continue_at_finite_strain(

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.errors import SolverError
 from palpate.inversion.objective import Evaluation
 
 __all__ = [
@@ -50,6 +51,7 @@ class Outcome(StrEnum):
     CONVERGED = "the decrement fell under its tolerance"
     STEPS = "the iteration reached its largest number of steps; raise it, or start nearer"
     STUCK = "no step reduced the objective; look at the fit of the driver's surface and at the images"
+    UNSOLVABLE = "every shorter step led where the model cannot be solved, as where it turns elements inside out"
     NOT_FINITE = "the objective is not a finite number; check the images and the moduli's bounds"
     NO_EQUILIBRIUM = "the body has no equilibrium there under the material law"
     NOT_FOLLOWED = "it could not be followed under the material law; log.txt says why"
@@ -166,10 +168,11 @@ def gauss_newton(
         if decrement < tolerance and np.all(np.abs(_step(now, free, n, WHOLE)[:n]) < within):
             outcome = Outcome.CONVERGED
             break
-        found, trials = _search(objective, unknowns, now, free=free, bounds=bounds, region=region)
+        found, trials, solved = _search(objective, unknowns, now, free=free, bounds=bounds, region=region)
         evaluations += trials
         if found is None:
-            outcome = Outcome.CONVERGED if decrement < tolerance else Outcome.STUCK
+            near = decrement < tolerance
+            outcome = Outcome.CONVERGED if near else Outcome.STUCK if solved else Outcome.UNSOLVABLE
             break
         unknowns, now, region = found
     return Minimum(unknowns, now, outcome, tuple(history), evaluations)
@@ -183,20 +186,25 @@ def _search(
     free: NDArray[np.bool_],
     bounds: Bounds,
     region: _Region,
-) -> tuple[tuple[NDArray[np.float64], Evaluation, _Region] | None, int]:
-    """First step that reduces the objective, with the region for the next; None when there is none; and the trials."""
-    n = objective.n_parameters
+) -> tuple[tuple[NDArray[np.float64], Evaluation, _Region] | None, int, bool]:
+    """First step that reduces the objective, with the next region, or None; the trials; whether any was solved."""
+    n, solved = objective.n_parameters, False
     for trials in range(SEARCHES):
         trial = unknowns + _step(now, free, n, region)
         trial[:n] = np.clip(trial[:n], bounds.lower, bounds.upper)
         step = trial - unknowns
         promised = -now.score @ step - 0.5 * step @ now.matrix @ step
-        there = objective(trial)
+        try:
+            there = objective(trial)
+        except SolverError:  # no law answers where elements are turned inside out
+            region = region.smaller()
+            continue
+        solved = True
         gain = now.value - there.value
         if promised > 0.0 and gain > 1e-4 * promised:  # what a bound leaves of a step may lead uphill
-            return (trial, there, region.larger() if gain > 0.25 * promised else region), trials + 1
+            return (trial, there, region.larger() if gain > 0.25 * promised else region), trials + 1, True
         region = region.smaller()
-    return None, SEARCHES
+    return None, SEARCHES, solved
 
 
 def _free(

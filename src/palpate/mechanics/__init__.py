@@ -20,7 +20,6 @@ from palpate.mechanics.linearised import LinearisedSystem
 from palpate.mechanics.loads import DeadLoad, boundary_named, pressure, traction
 from palpate.mechanics.newton import NewtonSettings
 from palpate.mechanics.solvers.contract import Hints
-from palpate.mechanics.solvers.pattern import nested_dissection
 from palpate.mechanics.solvers.registry import SOLVERS, expected_of_size, factorise
 from palpate.mechanics.stiffness import lame_parameters
 
@@ -51,7 +50,6 @@ __all__ = [
     "lame_parameters",
     "law_named",
     "linear_model",
-    "nested_dissection",
     "outer_constraint",
     "pressure",
     "quadrature",

@@ -8,9 +8,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.mechanics.dense_equilibrium import DenseEquilibrium
 from palpate.mechanics.first_order import FirstOrderModel, expanded
-from palpate.mechanics.forward import Equilibrium, ForwardModel
+from palpate.mechanics.forward import DenseEquilibrium, Equilibrium, ForwardModel
 
 __all__ = ["CurvedModel"]
 

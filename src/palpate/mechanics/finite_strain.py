@@ -252,11 +252,6 @@ class FiniteStrainEquilibrium:
         return SolveCounts(tangent=n, factorisations=int(self._many(n)))
 
     @property
-    def adjoint_counts(self) -> SolveCounts:
-        """One right-hand side."""
-        return SolveCounts(adjoint=1, factorisations=int(self._many(1)))
-
-    @property
     def factorisation(self) -> Factorisation | None:
         """The last factorisation, of a tangent stiffness near this state's: for `nearby` of another solve."""
         return self.path.factorisation
@@ -319,13 +314,15 @@ class FiniteStrainEquilibrium:
     def poisson_tangents(self) -> NDArray[np.float64]:
         """Columns du / d nu_r (n_dof, n_regions) mm; raises `NotConverged`."""
         stiffness = self._stiffness()
-        loads = -self._poisson_forces()
+        slopes = self.model.moduli_by_poisson(self.moduli, self.coefficients[self.model.constraint.n_modes :])
+        loads = -np.asarray(self.balance.free.T @ self.balance.region_forces(self.values, slopes))
         return np.asarray(self.balance.free @ self._system(stiffness, loads.shape[1]).solve(loads))
 
     def adjoint(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
         """T^T g (n_regions + n_modes,) for g (n_dof,), by one adjoint solve; raises `NotConverged`."""
         stiffness = self._stiffness()
-        dual = self._dual(stiffness, gradient)
+        load = np.asarray(self.balance.free.T @ gradient)
+        dual = self._system(stiffness, 1).transposed().solve(load[:, None])[:, 0]
         result, first = np.asarray(self._parameter_loads(stiffness).T @ dual), self.model.n_regions
         result[first : first + self.model.constraint.n_modes] += self.model.constraint.modes.T @ gradient
         return result
@@ -349,11 +346,6 @@ class FiniteStrainEquilibrium:
             ready = ready.nearby
         return LinearisedSystem(self.balance.restricted(stiffness), ready, symmetric=self.balance.symmetric)
 
-    def _dual(self, stiffness: Stiffness, gradient: NDArray[np.float64]) -> Array:
-        """K_ff^-T F^T g (n_free,)."""
-        load = np.asarray(self.balance.free.T @ gradient)
-        return self._system(stiffness, 1).transposed().solve(load[:, None])[:, 0]
-
     def _parameter_loads(self, stiffness: Stiffness) -> Array:
         """-F^T [dR / d ln E_r, K M, dR / dc_k] (n_free, n_regions + n_modes), mN."""
         forces = self.balance.region_forces(self.values, self.balance.moduli)
@@ -365,11 +357,6 @@ class FiniteStrainEquilibrium:
         """Derivatives of R (n_dof, k), mN, along directions (n_material, k) of the material modes, or by each alone."""
         material = self.coefficients[self.model.constraint.n_modes :]
         return self.model.material_forces(self.values, self.moduli, material, directions)
-
-    def _poisson_forces(self) -> Array:
-        """F^T dR / d nu_r (n_free, n_regions), mN."""
-        slopes = self.model.moduli_by_poisson(self.moduli, self.coefficients[self.model.constraint.n_modes :])
-        return np.asarray(self.balance.free.T @ self.balance.region_forces(self.values, slopes))
 
 
 def finite_strain_model(

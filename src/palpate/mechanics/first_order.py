@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.mechanics.dense_equilibrium import DenseEquilibrium
-from palpate.mechanics.forward import Equilibrium, checked_coefficients, checked_moduli
+from palpate.mechanics.forward import DenseEquilibrium, Equilibrium, checked_coefficients, checked_moduli
 
 __all__ = ["FirstOrderEquilibrium", "FirstOrderModel", "expanded"]
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from palpate.errors import ConfigurationError
 
-__all__ = ["Equilibrium", "ForwardModel", "SolveCounts", "checked_coefficients", "checked_moduli"]
+__all__ = ["DenseEquilibrium", "Equilibrium", "ForwardModel", "SolveCounts", "checked_coefficients", "checked_moduli"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,11 +64,6 @@ class Equilibrium(Protocol):
     @property
     def tangent_counts(self) -> SolveCounts:
         """What one call of `tangent` costs."""
-        ...
-
-    @property
-    def adjoint_counts(self) -> SolveCounts:
-        """What one call of `adjoint` costs."""
         ...
 
     def tangent(self) -> NDArray[np.float64]:
@@ -124,3 +119,27 @@ def checked_coefficients(coefficients: ArrayLike, n_modes: int) -> NDArray[np.fl
         )
     values.setflags(write=False)
     return values
+
+
+class DenseEquilibrium:
+    """The part of `Equilibrium` that follows from the outputs `values` (n_outputs,) mm alone."""
+
+    __slots__ = ()
+    values: NDArray[np.float64]
+
+    @property
+    def displacement(self) -> NDArray[np.float64]:
+        """Displacement u (n_outputs / 3, 3) mm; raises `ConfigurationError` when the outputs are not whole points."""
+        if len(self.values) % 3:
+            raise ConfigurationError(f"the model has {len(self.values)} outputs, not three a point: use `values`")
+        return self.values.reshape(-1, 3)
+
+    @property
+    def counts(self) -> SolveCounts:
+        """Nothing of the size of the mesh was solved."""
+        return SolveCounts()
+
+    @property
+    def tangent_counts(self) -> SolveCounts:
+        """Nothing of the size of the mesh is solved."""
+        return SolveCounts()

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from palpate.mechanics.coarser import linear_displacements
 from palpate.mechanics.conditions import Conditions
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.forward import SolveCounts, checked_coefficients, checked_moduli
@@ -21,7 +20,7 @@ from palpate.mechanics.hyperelastic import Elements, Moduli, elements_of
 from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.loads import Load
 from palpate.mechanics.material import HOMOGENEOUS, MaterialModes, material_forces
-from palpate.mechanics.rigid import rigid_modes
+from palpate.mechanics.rigid import linear_displacements, rigid_modes
 from palpate.mechanics.solvers.contract import EXACT, Factorisation
 from palpate.mechanics.solvers.registry import factorise
 from palpate.mechanics.stiffness import (
@@ -329,11 +328,6 @@ class LinearEquilibrium:
     def tangent_counts(self) -> SolveCounts:
         """One right-hand side a modulus and a mode."""
         return SolveCounts(tangent=self.system.model.n_regions + self.system.model.n_modes)
-
-    @property
-    def adjoint_counts(self) -> SolveCounts:
-        """One right-hand side."""
-        return SolveCounts(adjoint=1)
 
     def tangent(self) -> NDArray[np.float64]:
         """T (n_dof, n_regions + n_modes), mm: columns du / d ln E_r = -F K_ff^-1 F^T E_r K_r u, then du / dq_k."""

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from palpate.mechanics.hyperelastic import Elements, Moduli
-from palpate.mesh.gaussian_process import karhunen_loeve
+from palpate.mesh.gaussian_process import karhunen_loeve, matern
 from palpate.mesh.tet_mesh import TetMesh
 
-__all__ = ["HOMOGENEOUS", "MaterialModes", "material_forces", "material_modes"]
+__all__ = ["HOMOGENEOUS", "MaterialModes", "field_modes", "material_forces", "material_modes"]
 
-SHARE = 0.95  # of the variance of a tissue's ln E that its modes hold
+SHARE, SHARE_OF_MAP = 0.95, 0.9995  # of the variance of a tissue's ln E that its modes hold, and of one that is mapped
 MOST, MOST_OF_MAP = 120, 400  # modes of a tissue, and of one that is mapped
 
 
@@ -62,23 +62,34 @@ def material_modes(
 ) -> MaterialModes:
     """Modes of ln E in each of the meshed `tissues` (numbers), and one of the Poisson's ratio of each of `poisson`.
 
-    Fields are Karhunen-Loeve modes of a Gaussian kernel of length_mm, or of the tissue's own length where its modulus
-    is a field, and standard deviation 1, less their mean by volume: the modulus of a tissue is the geometric mean over
-    it.
+    Fields are those of `field_modes`, less their mean by volume: the modulus of a tissue is the geometric mean over it.
     """
-    centres, found, sizes = mesh.nodes[mesh.tets].mean(axis=1), [], []
+    found, sizes = list[sparse.csr_matrix[np.float64]](), list[tuple[int, int]]()
     for tissue in tissues:
         own = np.flatnonzero(mesh.region == tissue)
         volumes = mesh.volumes[own]
-        prior = mesh.tissues[tissue].field
-        length, most = (length_mm, MOST) if prior is None else (prior.length_mm, MOST_OF_MAP)
-        local = karhunen_loeve(centres[own], volumes, kernel_mm=length, share=SHARE, most=most)
+        local = field_modes(mesh, tissue, length_mm=length_mm)
         local = local - (volumes @ local) / volumes.sum()
         rows, columns = np.repeat(own, local.shape[1]), np.tile(np.arange(local.shape[1]), len(own))
         found.append(sparse.csr_matrix((local.ravel(), (rows, columns)), shape=(len(mesh.tets), local.shape[1])))
         sizes.append((tissue, local.shape[1]))
     fields = sparse.csr_matrix(sparse.hstack(found)) if found else sparse.csr_matrix((len(mesh.tets), 0))
     return MaterialModes(fields, tuple(poisson), tuple(sizes))
+
+
+def field_modes(mesh: TetMesh, tissue: int, *, length_mm: float) -> NDArray[np.float64]:
+    """Karhunen-Loeve modes (n, k) of ln E, of standard deviation 1, in the n elements of a tissue (number).
+
+    Of a Gaussian kernel of length_mm; where the tissue's modulus is a field, of Matern's with its own length, which
+    allows of what has an edge.
+    """
+    own = np.flatnonzero(mesh.region == tissue)
+    centres, volumes, prior = mesh.nodes[mesh.tets[own]].mean(axis=1), mesh.volumes[own], mesh.tissues[tissue].field
+    if prior is None:
+        return karhunen_loeve(centres, volumes, kernel_mm=length_mm, share=SHARE, most=MOST)
+    return karhunen_loeve(
+        centres, volumes, kernel_mm=prior.length_mm, share=SHARE_OF_MAP, most=MOST_OF_MAP, kernel=matern
+    )
 
 
 def material_forces(

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from palpate.errors import SolverError
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_model
 from palpate.mechanics.laws.contract import Law
@@ -43,10 +44,16 @@ class SurfaceReaction:
         """F in N, its derivatives by u (n,), N/mm, and by ln E and the material (n_regions + n_material,), N.
 
         At displacements (n,) mm of `dofs`, moduli (n_regions,) kPa and coefficients (n_material,) of the material.
+        Raises `SolverError` where these turn elements inside out under a law of finite strain, which has no force then.
         """
-        whole = np.zeros(3 * len(self.model.space.points))
-        whole[self.dofs] = displacement
-        balance = self.model.balance(moduli, coefficients)
+        whole, balance = self._whole(displacement), self.model.balance(moduli, coefficients)
+        smallest = balance.smallest_volume(whole)
+        if smallest <= 0.0:
+            raise SolverError(
+                f"the force on the surface around {np.round(self.centre, 1).tolist()} mm (RAS) has no value: the motion"
+                f" turns elements there inside out (volume ratio {smallest:.3g}), for which the"
+                f" {self.model.elements.law.name} law has no stress; look at what was measured there, and its direction"
+            )
         by_region = self.virtual @ balance.region_forces(whole, balance.moduli)
         by_displacement = np.asarray(balance.stiffness(whole).T @ self.virtual)[self.dofs]
         by_material = self.virtual @ self.model.material_forces(whole, moduli, coefficients)
@@ -55,6 +62,23 @@ class SurfaceReaction:
             NEWTON * by_displacement,
             NEWTON * np.concatenate([by_region, by_material]),
         )
+
+    def by_poisson(
+        self, displacement: NDArray[np.float64], moduli: NDArray[np.float64], coefficients: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Derivatives (n_regions,) N of F by the regions' Poisson's ratios, at what `at` takes.
+
+        The forces are linear in Lame's constants, whose derivatives take their place.
+        """
+        changes = self.model.moduli_by_poisson(moduli, coefficients)
+        forces = self.model.balance(moduli, coefficients).region_forces(self._whole(displacement), changes)
+        return np.asarray(NEWTON * (self.virtual @ forces))
+
+    def _whole(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Displacements (n_dof,) mm of all points, of which those of `dofs` (n,) matter."""
+        whole = np.zeros(3 * len(self.model.space.points))
+        whole[self.dofs] = displacement
+        return whole
 
 
 def surface_reaction(

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from palpate.errors import ConfigurationError, SolverError
-from palpate.mechanics.dense_equilibrium import DenseEquilibrium
-from palpate.mechanics.forward import checked_coefficients, checked_moduli
+from palpate.mechanics.forward import DenseEquilibrium, checked_coefficients, checked_moduli
 from palpate.mechanics.linear_model import LinearModel
 from palpate.mechanics.solvers.products import times
 

@@ -13,9 +13,8 @@ from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.mesh.anatomy import Anatomy
 from palpate.mesh.cutting import face_pieces
-from palpate.mesh.dihedral import tet_dihedrals
 from palpate.mesh.places import in_words, largest_difference
-from palpate.mesh.tet_mesh import FACES, TetMesh
+from palpate.mesh.tet_mesh import FACES, TetMesh, tet_dihedrals
 from palpate.parallel import mapped
 
 __all__ = ["MeshQuality", "check_mesh", "dihedral_angles", "level_set_volumes", "mesh_figures", "mesh_quality"]

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from palpate.mesh.cutting import Grid, signed_volumes, within_faces
-from palpate.mesh.dihedral import tet_dihedrals
 from palpate.mesh.snapping import Contacts
+from palpate.mesh.tet_mesh import tet_dihedrals
 
 __all__ = ["smoothed"]
 

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from palpate.errors import GeometryError
 from palpate.images.tissue import Tissue
 
-__all__ = ["FACES", "OUTER", "TetMesh"]
+__all__ = ["FACES", "OUTER", "TetMesh", "tet_dihedrals"]
 
 OUTER = -1  # what lies beyond the domain's own border: the cut of the image
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])  # faces of a tetrahedron, seen from outside
+FACE_PAIRS = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,3 +72,15 @@ class TetMesh:
         if name not in names:
             raise GeometryError(f"the mesh has no tissue '{name}'; it has {names}")
         return names.index(name)
+
+
+def tet_dihedrals(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Angles (n, 6) in degrees between the faces of tetrahedra with `corners` (n, 4, 3) mm, at their six edges.
+
+    180 degrees less the angle between outward normals; the same for an inverted tetrahedron.
+    """
+    a, b, c = (corners[:, FACES[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-300)
+    cosine = np.einsum("npi,npi->np", normals[:, FACE_PAIRS[:, 0]], normals[:, FACE_PAIRS[:, 1]])
+    return np.asarray(180.0 - np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))

@@ -13,11 +13,10 @@ from palpate.images.tissue import Role, Tissue
 from palpate.mesh.anatomy import Anatomy
 from palpate.mesh.closing import closed
 from palpate.mesh.cutting import Grid, cut, face_pieces, graded_grid, signed_volumes
-from palpate.mesh.dihedral import tet_dihedrals
 from palpate.mesh.remeshing import compact, remeshed
 from palpate.mesh.smoothing import smoothed
 from palpate.mesh.snapping import contacts_of, debiased, snapped
-from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh
+from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh, tet_dihedrals
 from palpate.progress import Progress, silent
 
 __all__ = ["SizeField", "boundary_of", "tetrahedralise"]

@@ -234,6 +234,13 @@ class OfMaterial(Protocol):
         """The same where the unknowns are combinations (n_fields, k) of the material's fields."""
         ...
 
+    def by_poisson(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivatives (n, n_regions) of its residuals by the regions' Poisson's ratios at displacements (n_dofs,) mm.
+
+        At the moduli and coefficients that it is `under`.
+        """
+        ...
+
 
 @runtime_checkable
 class OfInstrument(Protocol):
@@ -296,6 +303,12 @@ class Reaction(Protocol):
 
         At displacements (n,) mm, moduli (n_regions,) kPa and coefficients (n_material,).
         """
+        ...
+
+    def by_poisson(
+        self, displacement: NDArray[np.float64], moduli: NDArray[np.float64], coefficients: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Its derivatives (n_regions,) by the regions' Poisson's ratios, at the same."""
         ...
 
 

@@ -23,7 +23,9 @@ from palpate.observation.point_displacement import PointDisplacement, point_disp
 
 __all__ = ["DisplacementField", "read_displacement_field"]
 
+FEWEST = 4  # points that tell a motion which is not the same everywhere
 MOST_VECTORS = 2**26  # 1.6 GB as they are read
+ROUNDING = 1e-6  # of a voxel
 OF_LENGTH, OF_EDGE = 0.5, 0.6  # edge of a cell, over the correlation length and over an edge of the mesh
 
 
@@ -64,14 +66,20 @@ def read_displacement_field(file: DataFile) -> DisplacementField:
     """Read a field that maps the first state to the later one, mm.
 
     .csv as landmarks have it; .nii, .nii.gz (intent 1006 or 1007); .nrrd, .mha, .mhd and transforms .h5, .tfm, .xfm,
-    .mat by SimpleITK, which the extra `itk` brings. Voxels without a finite vector, or whose vector is exactly 0, are
-    taken for empty. Raises `InputDataError`.
+    .mat, composites of several grids too, by SimpleITK, which the extra `itk` brings. Voxels without a finite vector,
+    or whose vector is exactly 0, are taken for empty. Raises `InputDataError`.
     """
     path = file.paths[0]
     if len(file.paths) != 1:
         raise InputDataError(f"a displacement field is one file; {len(file.paths)} are named; leave out file_after")
     if path.suffix.lower() == ".csv":
-        return DisplacementField(file, read_point_table(path))
+        table = read_point_table(path)
+        if len(table.before) < FEWEST:
+            raise InputDataError(
+                f"'{path}' holds {len(table.before)} of the {FEWEST} points or more that a displacement field has; give"
+                ' all of them, or state single ones as kind = "landmarks"'
+            )
+        return DisplacementField(file, table)
     reader = next((read for endings, read in READERS.items() if path.name.lower().endswith(endings)), None)
     if reader is None:
         known = ", ".join(ending for endings in READERS for ending in endings)
@@ -128,28 +136,63 @@ def _itk(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _transform(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The displacement field that a transform holds; others are maps without a grid, which a field must have."""
+    """The displacement of a transform on the finest grid of the fields that it holds.
+
+    Others are maps without a grid, which a field must have. No number stands where a point's way leaves the grid of a
+    field: beyond it ITK takes its displacement for none.
+    """
     sitk = _simpleitk(path)
     try:
         transform = sitk.ReadTransform(str(path))
-        parts = (
-            [transform.GetNthTransform(n) for n in range(transform.GetNumberOfTransforms())]
-            if hasattr(transform, "GetNumberOfTransforms")
-            else [transform]
-        )
-        fields = [part for part in parts if part.GetName() == "DisplacementFieldTransform"]
-        if not fields:
+        parts = _parts(sitk, transform)
+        images = {
+            n: sitk.DisplacementFieldTransform(part).GetDisplacementField()
+            for n, part in enumerate(parts)
+            if part.GetName() == "DisplacementFieldTransform"
+        }
+        if not images:
             raise InputDataError(
                 f"'{path}' holds no displacement field ({transform.GetName()}); write the transform as a field on the"
                 " first image's grid"
             )
-        grid = sitk.DisplacementFieldTransform(fields[-1]).GetDisplacementField()
-        whole = sitk.TransformToDisplacementField(
-            transform, sitk.sitkVectorFloat64, grid.GetSize(), grid.GetOrigin(), grid.GetSpacing(), grid.GetDirection()
-        )
-        return _of_itk(sitk, whole)
+        grid = min(reversed(images.values()), key=lambda image: float(np.prod(image.GetSpacing())))
+        _refuse_many(grid.GetSize(), path)
+        whole, affine = _of_itk(sitk, _on(sitk, transform, grid))
+        for n, image in images.items():
+            first = [sitk.Transform(3, sitk.sitkIdentity), *parts[n + 1 :]]  # the last one is applied first
+            moved, _ = _of_itk(sitk, _on(sitk, sitk.CompositeTransform(first), grid))
+            whole[~_within(image, moved, affine)] = np.nan
+        if np.isnan(whole).all():
+            raise InputDataError(
+                f"the {len(images)} fields of '{path}' have grids that no point's way keeps to; write the transform as"
+                " one field on the first image's grid"
+            )
+        return whole, affine
     except RuntimeError as error:
         raise InputDataError(f"'{path}' cannot be read by SimpleITK: {str(error).splitlines()[-1]}") from error
+
+
+def _parts(sitk: Any, transform: Any) -> list[Any]:
+    """The transforms of which one is made, in their order; a file holds none within another."""
+    if transform.GetName() != "CompositeTransform":
+        return [transform]
+    whole = sitk.CompositeTransform(transform)
+    return [whole.GetNthTransform(n) for n in range(whole.GetNumberOfTransforms())]
+
+
+def _on(sitk: Any, transform: Any, grid: Any) -> Any:
+    """The displacement of a transform as an image on the grid of another."""
+    size, origin, spacing, direction = grid.GetSize(), grid.GetOrigin(), grid.GetSpacing(), grid.GetDirection()
+    return sitk.TransformToDisplacementField(transform, sitk.sitkVectorFloat64, size, origin, spacing, direction)
+
+
+def _within(image: Any, moved: NDArray[np.float64], affine: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which points (nx, ny, nz) of a grid with a RAS `affine`, displaced by (nx, ny, nz, 3) LPS mm, an image holds."""
+    index = np.moveaxis(np.indices(moved.shape[:3]), 0, -1)
+    points = (index @ affine[:3, :3].T + affine[:3, 3]) * LPS_TO_RAS + moved
+    axes = np.array(image.GetDirection()).reshape(3, 3) * np.array(image.GetSpacing())
+    place = (points - np.array(image.GetOrigin())) @ np.linalg.inv(axes).T
+    return np.asarray(np.all((place > -ROUNDING) & (place < np.array(image.GetSize()) - 1.0 + ROUNDING), axis=-1))
 
 
 def _of_itk(sitk: Any, image: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -83,13 +83,24 @@ class Force:
 
         Raises `ConfigurationError` before moduli are known, see `under`.
         """
-        if self.at is None:
-            raise ConfigurationError(f"the {self.name} depends on the moduli: ask for its residuals `under` some")
-        value, by_displacement, direct = self.reaction.at(displacement, *self.at)
+        value, by_displacement, direct = self.reaction.at(displacement, *self._known)
         centre, row = self.reaction.centre[None], sparse.csr_matrix(by_displacement[None])
         values = np.array([value + offset - self.measured])
         along = self.direction[None]
         return Residuals(values, np.ones(1), centre, along, centre, row, row, direct=direct[None])
+
+    def by_poisson(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivatives (1, n_regions) N of the residual by the regions' Poisson's ratios at displacements (n_dofs,) mm.
+
+        Raises as `residuals`.
+        """
+        return self.reaction.by_poisson(displacement, *self._known)[None]
+
+    @property
+    def _known(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        if self.at is None:
+            raise ConfigurationError(f"the {self.name} depends on the moduli: ask for its residuals `under` some")
+        return self.at
 
     def with_noise(self, noise: NoiseModel) -> Force:
         """The same, counting by the variance of the noise."""

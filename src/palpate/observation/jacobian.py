@@ -14,6 +14,7 @@ from scipy import sparse
 
 __all__ = ["Jacobian", "jacobian_of"]
 
+ROWS = 8192  # residuals whose rows are formed at once: some 30 MB
 MANY = 4  # residuals a displacement, from which on the products of the sparse factor cost less than J itself
 
 
@@ -44,10 +45,14 @@ class Jacobian:
 
     def gram(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
         """J^T W J (n_columns, n_columns) for W = diag(weights (n,)), none negative."""
-        matrix = self.by_displacement
+        matrix, total = self.by_displacement, np.zeros(2 * (self.tangent.shape[1],))
         if matrix.shape[0] < MANY * matrix.shape[1]:
-            formed = np.sqrt(weights)[:, None] * np.asarray(matrix @ self.tangent)
-            return np.asarray(formed.T @ formed)
+            for start in range(0, matrix.shape[0], ROWS):
+                part = slice(start, start + ROWS)
+                formed = np.asarray(matrix[part] @ self.tangent)
+                formed *= np.sqrt(weights[part])[:, None]
+                total += formed.T @ formed
+            return total
         scaled = np.repeat(np.sqrt(weights), np.diff(matrix.indptr)) * matrix.data
         root = sparse.csr_matrix((scaled, matrix.indices, matrix.indptr), shape=matrix.shape)
         return np.asarray(self.tangent.T @ (sparse.csr_matrix(root.T @ root) @ self.tangent))

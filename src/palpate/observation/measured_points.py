@@ -67,7 +67,9 @@ class MeasuredPoints:
     def in_words(self) -> str:
         """Number of pairs, and how far they move."""
         rms = np.sqrt(np.mean(np.sum(self.table.moved**2, axis=1)))
-        return f"{len(self.table.before)} pairs of points, which move by {rms:.2g} mm (root mean square)"
+        n = len(self.table.before)
+        many = f"{n} pairs of points, which move by" if n > 1 else "1 pair of points, which moves by"
+        return f"{many} {rms:.2g} mm (root mean square)"
 
     def brought(self, motion: RigidMotion) -> Self:
         """The same with the later points moved back by the rigid motion of the later state."""

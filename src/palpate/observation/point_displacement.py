@@ -12,9 +12,8 @@ from scipy import sparse
 from palpate.mesh.locate import Places, point_interpolation
 from palpate.mesh.space import LagrangeSpace
 from palpate.observation.contract import DataFile, Fit, PointMotions, Residuals, Weighting
-from palpate.observation.noise_model import FitResponse, NoiseModel
+from palpate.observation.noise_model import FitResponse, NoiseModel, whitener
 from palpate.observation.robust_loss import PowerLaw
-from palpate.observation.whitening import whitener
 
 __all__ = ["PointDisplacement", "point_displacement"]
 

@@ -15,7 +15,6 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue_distance import tissue_distance_map
 from palpate.mesh.surface import vertex_normals
 from palpate.observation.contract import Fit, ImagedBody, Observation, Residuals, Weighting
-from palpate.observation.field_of_view import field_of_view
 from palpate.observation.noise_model import (
     EXACT_NOISE,
     SEGMENTATION_NOISE,
@@ -23,7 +22,7 @@ from palpate.observation.noise_model import (
     NoiseModel,
     fit_noise_model,
 )
-from palpate.observation.observed_surface import ObservedSurface, observed_surfaces, seen_in
+from palpate.observation.observed_surface import ObservedSurface, field_of_view, observed_surfaces, seen_in
 from palpate.observation.robust_loss import Huber, PowerLaw, RobustLoss
 from palpate.observation.surface_residuals import Correspondence, correspondence, surface_residuals
 from palpate.observation.target import SurfaceTarget, surface_target

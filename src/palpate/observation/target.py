@@ -8,13 +8,11 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.images.distance import DistanceMap
+from palpate.images.distance import DistanceMap, terrace_noise
 from palpate.images.isosurface import IsosurfacePoints, isosurface_points
-from palpate.images.voxel_noise import terrace_noise
 from palpate.mesh.anatomy import LevelSet
 from palpate.mesh.surface import triangle_normals
-from palpate.observation.field_of_view import FieldOfView
-from palpate.observation.observed_surface import ObservedSurface
+from palpate.observation.observed_surface import FieldOfView, ObservedSurface
 
 __all__ = ["OneLookUp", "SurfaceTarget", "places_within", "surface_target", "target_from", "values_and_gradients"]
 

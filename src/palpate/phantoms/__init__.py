@@ -1,12 +1,17 @@
 """Scenes with a known truth: concentric spheres, pelves, and the noise of their images."""
 
-from palpate.phantoms.boundary_noise import SmoothField, smooth_field
-from palpate.phantoms.exact_targets import exact_target, target_of_truth
-from palpate.phantoms.motion import AffineMotion, ScaledMotion, WallMotion, filling_of
-from palpate.phantoms.patches import patched
+from palpate.phantoms.exact_targets import TriangulatedDistance, exact_target, target_of_truth
+from palpate.phantoms.motion import (
+    AffineMotion,
+    ScaledMotion,
+    SmoothField,
+    WallMotion,
+    filling_of,
+    smooth_field,
+    wall_filling,
+)
 from palpate.phantoms.pelvis import PelvisOptions, pelvis, pelvis_anatomy, pelvis_grid, pelvis_motions
 from palpate.phantoms.pelvis_shapes import PelvisShapes, draw_pelvis
-from palpate.phantoms.redrawn import redrawn
 from palpate.phantoms.scene import (
     BoundaryMotion,
     Noise,
@@ -19,16 +24,14 @@ from palpate.phantoms.scene import (
     reimaged,
     rescaled,
 )
-from palpate.phantoms.shapes import Complement, Ellipsoid, Grown, Tube, ball, rotation_about
+from palpate.phantoms.shapes import Complement, Ellipsoid, Tube, ball, rotation_about
 from palpate.phantoms.spheres import SpheresOptions, spheres
-from palpate.phantoms.wall_filling import wall_filling
 
 __all__ = [
     "AffineMotion",
     "BoundaryMotion",
     "Complement",
     "Ellipsoid",
-    "Grown",
     "Noise",
     "PelvisOptions",
     "PelvisShapes",
@@ -36,6 +39,7 @@ __all__ = [
     "Scene",
     "SmoothField",
     "SpheresOptions",
+    "TriangulatedDistance",
     "Tube",
     "WallMotion",
     "ball",
@@ -46,12 +50,10 @@ __all__ = [
     "filling_of",
     "grid_box",
     "imaged",
-    "patched",
     "pelvis",
     "pelvis_anatomy",
     "pelvis_grid",
     "pelvis_motions",
-    "redrawn",
     "refuse_folded",
     "reimaged",
     "rescaled",

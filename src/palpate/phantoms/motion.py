@@ -1,4 +1,4 @@
-"""How the walls of hollow and rigid tissues move between the two images of a scene."""
+"""How walls move: fillings of hollow organs, smooth random motion as of another hand, affine motion."""
 
 from __future__ import annotations
 
@@ -8,10 +8,24 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.phantoms.boundary_noise import SmoothField
+from palpate.errors import GeometryError
+from palpate.images.segmentation import Segmentation
+from palpate.images.tissue import Role
 from palpate.phantoms.shapes import Tube
 
-__all__ = ["AffineMotion", "Filling", "ScaledMotion", "Swelling", "WallMotion", "filling_of"]
+__all__ = [
+    "AffineMotion",
+    "Filling",
+    "ScaledMotion",
+    "SmoothField",
+    "Swelling",
+    "WallMotion",
+    "filling_of",
+    "smooth_field",
+    "wall_filling",
+]
+ENDS = 2.2  # half the organ's length in lengths of the filling: 9 % of it is left at the ends
+BLOCK = 4096  # points at a time: the waves of a block fit into the cache
 
 
 class WallMotion(Protocol):
@@ -131,3 +145,81 @@ class AffineMotion:
 def _around(spokes: NDArray[np.float64], towards: NDArray[np.float64], lean: float) -> NDArray[np.float64]:
     """Share (n, 1), dimensionless, of the motion along spokes (n, 3): 1 `towards` (3,), less on the other side."""
     return np.asarray((1.0 + lean * spokes @ towards[:, None]) / (1.0 + lean))
+
+
+def wall_filling(segmentation: Segmentation, tissue: int, *, filling_mm: float) -> Filling:
+    """The filling of a tissue of the segmentation, by its index, by `filling_mm` where the organs are nearest.
+
+    It is fullest half way from its middle to the tenth of its voxels that are nearest to the first `estimate` tissue's
+    centre (in its middle when there is none).
+
+    Its middle line is the parabola through its voxels along their longest axis (least squares), its radius that of a
+    round tube with the same spread across, R^2 = 2 mean r^2. Raises `GeometryError` for a tissue of a few voxels.
+    """
+    voxels = segmentation.grid.world(np.argwhere(segmentation.mask(tissue)).astype(float))
+    if len(voxels) < 10:
+        raise GeometryError(
+            f"'{segmentation.tissues[tissue].name}' has {len(voxels)} voxels: too few to fill; check its label"
+        )
+    centre = voxels.mean(axis=0)
+    axis = np.linalg.eigh((voxels - centre).T @ (voxels - centre))[1][:, -1]
+    along = (voxels - centre) @ axis
+    length = float(np.abs(along).max()) / ENDS
+    aside = voxels - centre - np.outer(along, axis)
+    terms = np.stack([np.ones_like(along), along / length, (along / length) ** 2], axis=1)
+    shift, tilt, bend = np.linalg.lstsq(terms, aside, rcond=None)[0]
+    radius = float(np.sqrt(2.0 * np.mean(np.sum((aside - terms @ np.stack([shift, tilt, bend])) ** 2, axis=1))))
+    fullest, estimated = 0.0, [i for i, each in enumerate(segmentation.tissues) if each.role is Role.ESTIMATE]
+    if estimated:
+        organ = segmentation.grid.world(np.argwhere(segmentation.mask(estimated[0])).astype(float)).mean(axis=0)
+        distance = np.linalg.norm(voxels - organ, axis=1)
+        fullest = 0.5 * float(along[distance <= np.quantile(distance, 0.1)].mean())
+    return Filling(
+        origin=centre + shift,
+        axis=axis,
+        bend=bend,
+        radius_mm=radius,
+        filling_mm=filling_mm,
+        fullest_mm=fullest,
+        length_mm=length,
+        towards=axis,
+        lean=0.0,
+        stray=smooth_field(np.random.default_rng(0), sd_mm=0.0, correlation_mm=20.0, features=1),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class SmoothField:
+    """A vector field made of plane waves.
+
+    frequencies (n_waves, 3) rad/mm; cosines and sines (n_waves, 3) mm, the amplitude of each wave along each axis.
+    """
+
+    frequencies: NDArray[np.float64]
+    cosines: NDArray[np.float64]
+    sines: NDArray[np.float64]
+
+    def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Field (n, 3) mm at points (n, 3) mm."""
+        found = [np.zeros((0, 3))]
+        for first in range(0, len(points), BLOCK):
+            phase = points[first : first + BLOCK] @ self.frequencies.T
+            found.append(np.cos(phase) @ self.cosines + np.sin(phase) @ self.sines)
+        return np.concatenate(found)
+
+    def warp(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points (n, 3) mm moved by the field."""
+        return points + self.at(points)
+
+
+def smooth_field(rng: np.random.Generator, *, sd_mm: float, correlation_mm: float, features: int = 2000) -> SmoothField:
+    """A draw of a Gaussian random field with independent components.
+
+    Each component has the standard deviation `sd_mm` (mm) and the correlation exp(-r^2 / (2 l^2)) between places r
+    apart, l = `correlation_mm` (mm). Method: random Fourier features (Rahimi and Recht 2007), whose frequencies are
+    normal with the standard deviation 1 / l.
+    """
+    scale = sd_mm / np.sqrt(features)
+    frequencies = rng.normal(scale=1.0 / correlation_mm, size=(features, 3))
+    cosines, sines = scale * rng.normal(size=(2, features, 3))
+    return SmoothField(frequencies, cosines, sines)

@@ -22,8 +22,7 @@ from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.tet_mesh import OUTER, TetMesh
 from palpate.mesh.tetrahedralise import tetrahedralise
 from palpate.mesh.voxelise import Warp, voxelise
-from palpate.phantoms.boundary_noise import smooth_field
-from palpate.phantoms.motion import ScaledMotion, WallMotion
+from palpate.phantoms.motion import ScaledMotion, WallMotion, smooth_field
 
 __all__ = [
     "BoundaryMotion",

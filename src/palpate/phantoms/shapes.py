@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial import KDTree
 
-__all__ = ["Complement", "Ellipsoid", "Grown", "Shape", "Tube", "Union", "ball", "rotation_about"]
+__all__ = ["Complement", "Ellipsoid", "Shape", "Tube", "Union", "ball", "rotation_about"]
 
 NEWTON_STEPS = 40  # for the closest point of an ellipsoid; the iteration is monotone and rarely needs ten
 PLACES = 401  # along a tube, of which one is near every point's closest
@@ -50,7 +50,8 @@ class Ellipsoid:
         """Exact Euclidean signed distance (n,) mm."""
         local = (points - self.centre) @ self.rotation
         distance = np.linalg.norm(local - self._closest(local), axis=1)
-        return np.asarray(np.where(self._outside(local), distance, -distance))
+        outside = ((local / self.semi_axes) ** 2).sum(axis=1) > 1.0
+        return np.asarray(np.where(outside, distance, -distance))
 
     def gradient_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Outward normal (n, 3), dimensionless, at the closest point of the surface."""
@@ -60,9 +61,6 @@ class Ellipsoid:
     def surface(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points (n, 3) mm of the surface that belong to unit `directions` (n, 3)."""
         return np.asarray(self.centre + (directions * self.semi_axes) @ self.rotation.T)
-
-    def _outside(self, local: NDArray[np.float64]) -> NDArray[np.bool_]:
-        return np.asarray(((local / self.semi_axes) ** 2).sum(axis=1) > 1.0)
 
     def _closest(self, local: NDArray[np.float64]) -> NDArray[np.float64]:
         """Closest surface point: q = a^2 p / (t + a^2) with sum (a p / (t + a^2))^2 = 1 (Eberly 2013)."""
@@ -167,19 +165,3 @@ class Complement:
     def gradient_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Gradient (n, 3), mm per mm."""
         return -self.part.gradient_at(points)
-
-
-@dataclass(frozen=True, slots=True)
-class Grown:
-    """What lies within `by_mm` of `part`."""
-
-    part: Shape
-    by_mm: float
-
-    def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Signed distance (n,) mm."""
-        return self.part.at(points) - self.by_mm
-
-    def gradient_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Gradient (n, 3), mm per mm."""
-        return self.part.gradient_at(points)

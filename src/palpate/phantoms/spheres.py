@@ -12,8 +12,7 @@ from palpate.images.label_image import VoxelGrid
 from palpate.images.tissue import Role, Tissue
 from palpate.mechanics.laws.registry import law_from
 from palpate.mesh.anatomy import Anatomy, LevelSet
-from palpate.phantoms.boundary_noise import smooth_field
-from palpate.phantoms.motion import AffineMotion, Swelling, WallMotion
+from palpate.phantoms.motion import AffineMotion, Swelling, WallMotion, smooth_field
 from palpate.phantoms.scene import Noise, Scene, centred_grid, grid_box, make_scene
 from palpate.phantoms.shapes import Complement, ball
 

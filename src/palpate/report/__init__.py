@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from palpate.report.cards import moduli_figure, result_cards, result_lines
-    from palpate.report.case_report import write_case_report, write_failure_report
+    from palpate.report.case_report import redrawn_page, write_case_report, write_failure_report
     from palpate.report.rows import interval_text, number
     from palpate.report.sensitivity_report import sensitivity_page
 
@@ -15,6 +15,7 @@ __all__ = [
     "interval_text",
     "moduli_figure",
     "number",
+    "redrawn_page",
     "result_cards",
     "result_lines",
     "sensitivity_page",
@@ -29,6 +30,7 @@ _HOMES = {
     "result_cards": "palpate.report.cards",
     "result_lines": "palpate.report.cards",
     "sensitivity_page": "palpate.report.sensitivity_report",
+    "redrawn_page": "palpate.report.case_report",
     "write_case_report": "palpate.report.case_report",
     "write_failure_report": "palpate.report.case_report",
 }

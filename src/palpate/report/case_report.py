@@ -35,11 +35,12 @@ def write_failure_report(case: Case, error: PalpateError, folder: Path) -> Path:
     return _write(collect_failure(case, error), folder)
 
 
-def redrawn_page(folder: Path, *, document: Mapping[str, Any], sha256: str | None = None) -> str:
+def redrawn_page(folder: Path, *, document: Mapping[str, Any], sha256: str | None = None, study: bool = False) -> str:
     """The page made again from report-data.npz in `folder`, which must have the SHA-256 that is given.
 
-    document: the result.json beside it. Raises `InputDataError` when the data are missing, damaged, or of another run,
-    when they cannot be drawn, and when the document says other numbers than they do.
+    document: the result.json beside it; study: whether its sensitivity.html is, too. Raises `InputDataError` when the
+    data are missing, damaged, or of another run, when they cannot be drawn, and when the document says other numbers
+    than they do.
     """
     path = folder / DATA_NAME
     data = ReportData.load(path, sha256=sha256)
@@ -49,7 +50,7 @@ def redrawn_page(folder: Path, *, document: Mapping[str, Any], sha256: str | Non
             " run the estimate again"
         )
     try:
-        return render(data)
+        return render(data, study=study)
     except MemoryError:
         raise
     except Exception as error:  # the page was drawn from them once: they are not what was written then

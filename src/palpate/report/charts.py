@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 from numpy.typing import NDArray
 
 from palpate.report.report_data import ModelSurface, ReportData
@@ -29,6 +30,7 @@ DASHED = (0, (4, 3))
 BINS = 41
 BROAD: dict[str, Any] = {"color": "#c98b00", "linewidth": 7.0, "alpha": 0.6, "solid_capstyle": "butt"}
 FITTED = "#3d8be0"
+FEWEST_MARKS = 3  # of an axis that can be read
 ROW_INCHES, MOST_LETTERS = 0.3, 24
 START_COLOURS = ("#3b7dd8", "#d9822b", "#3a9d5d", "#b0559b", "#8a6d3b", "#4aa3a3", "#c0504d", "#7f7fd0")
 
@@ -116,6 +118,8 @@ def modulus_svg(data: ReportData, estimate: int, *, name: str) -> str:
             figure.axes[0].axhspan(interval[0], interval[1], color=INK, alpha=0.1, linewidth=0)
         if item["truth"] is not None:
             figure.axes[0].axhline(item["truth"], color=INK, linewidth=1.0, linestyle=DASHED)
+        if figure.axes[0].get_yscale() == "log":
+            _mark(figure.axes[0])
 
     return draw_svg(draw, size=SIZE, name=name, says=says)
 
@@ -129,7 +133,7 @@ def waterfall_svg(data: ReportData, *, name: str) -> str:
 
     def draw(figure: Figure) -> None:
         """The starts as dots on a line."""
-        axes = figure.add_axes((0.2, 0.2, 0.77, 0.74))
+        axes = figure.add_axes((0.23, 0.2, 0.74, 0.74))
         axes.plot(range(1, len(order) + 1), ends[order], color=INK, linewidth=0.8, alpha=0.5)
         for rank, start in enumerate(order, start=1):
             colour = START_COLOURS[start % len(START_COLOURS)]
@@ -187,7 +191,7 @@ def _finite(value: float | None) -> float:
 
 def _paths(figure: Figure, paths: list[list[float]], label: str) -> None:
     """One line a start on a logarithmic axis; the last path, the outer loop's, goes on where the starts end."""
-    axes = figure.add_axes((0.17, 0.2, 0.8, 0.74))
+    axes = figure.add_axes((0.23, 0.2, 0.74, 0.74))
     for start, path in enumerate(paths[:-1]):
         colour = START_COLOURS[start % len(START_COLOURS)]
         axes.plot(range(len(path)), path, color=colour, linewidth=1.6, marker="o", markersize=3.2)
@@ -202,7 +206,17 @@ def _paths(figure: Figure, paths: list[list[float]], label: str) -> None:
     values = np.array([value for path in paths for value in path])
     if len(values) and (values > 0).all():
         axes.set_yscale("log")
-        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
         axes.yaxis.set_minor_formatter(NullFormatter())
+        _mark(axes)
     axes.grid(visible=True, axis="y")
+
+
+def _mark(axes: Axes) -> None:
+    """Round numbers along a logarithmic axis: two or more of 1, 2, 5 in a decade, else those of a linear one."""
+    low, high = axes.get_ylim()
+    marks = [m for m in LogLocator(subs=(1.0, 2.0, 5.0)).tick_values(low, high) if low <= m <= high]
+    if len(marks) < FEWEST_MARKS:
+        marks = [m for m in MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high) if low <= m <= high]
+    axes.yaxis.set_major_locator(FixedLocator(marks))
+    axes.yaxis.set_minor_locator(NullLocator())

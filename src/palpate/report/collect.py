@@ -13,12 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import PalpateError
-from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
-from palpate.images.tissue import Role, Tissue
-from palpate.images.tissue_colours import tissue_colours
+from palpate.images.tissue import Role, Tissue, tissue_colours
 from palpate.mechanics.deformation import largest_strains
-from palpate.mesh.dihedral import tet_dihedrals
+from palpate.mesh.tet_mesh import tet_dihedrals
 from palpate.parallel import mapped
 from palpate.report.backgrounds import Grey, background, earlier_grey, later_grey, whole_box, whole_images
 from palpate.report.inputs import bone_distances, input_images
@@ -32,9 +30,11 @@ from palpate.report.report_data import (
     Reference,
     ReportData,
     ReportTissue,
-    SliceBox,
+    TissueMap,
     TriangleSurface,
 )
+from palpate.report.slice_box import MOVING, slice_box
+from palpate.report.stiffness_maps import tissue_maps
 from palpate.report.surfaces import MOST_TRIANGLES, carried_outline, contour_width, image_surface, model_surface
 from palpate.study.case import Case, CaseLoad
 from palpate.study.case_data import CaseData
@@ -46,13 +46,11 @@ LOGGER = logging.getLogger(__name__)
 T = TypeVar("T")
 
 MOST_LATER = 4  # later images whose slices and surfaces are drawn; a page of more is not read
-MARGIN_MM = 15.0
-ENOUGH_VOXELS = 4_000_000
-MOVING = (Role.ESTIMATE, Role.DRIVER)
 SHOWN = (*MOVING, Role.RIGID)
 RIGID_TRIANGLES = 12_000
 ALL_TRIANGLES = 300_000  # of all surfaces of the images, so that the page stays small
 NONE: tuple[TriangleSurface, ...] = ()
+NO_MAPS: tuple[TissueMap, ...] = ()
 NOT_MEASURED: tuple[MeasuredState, ...] = ()
 
 
@@ -122,6 +120,7 @@ def collect(result: CaseResult) -> ReportData:
         later=later,
         measured=measured,
         mesh=mesh,
+        maps=attempt.part("maps", lambda: tissue_maps(result), NO_MAPS),
         missing=attempt.missing,
     )
 
@@ -244,7 +243,7 @@ def _reference(drawing: _Drawing) -> Reference:
     pair, attempt = drawing.pair, drawing.attempt
     result, name = pair.result, pair.before
     image = result.before if result.after else _of_mesh(result.before)
-    box = attempt.part(f"slices of {name}", lambda: _slice_box(result), None)
+    box = attempt.part(f"slices of {name}", lambda: slice_box(result.before, result.after), None)
     shown = attempt.part(
         f"background of {name}",
         lambda: None if box is None else background(result, drawing.grey, image, box, labels=drawing.unread),
@@ -321,60 +320,7 @@ def _mesh(result: CaseResult) -> MeshPicture:
     )
 
 
-def _slice_box(result: CaseResult) -> SliceBox:
-    """A box around all estimated tissues and drivers, and the planes that show as much of them as possible."""
-    moving = _indices(result, MOVING)
-    boxes = [_extent(_thinned(image), moving) for image in (result.before, *result.after)]
-    border = np.array([_range(result.before.grid, axis) for axis in range(3)])
-    low = np.maximum(np.min([pair[0] for pair in boxes], axis=0) - MARGIN_MM, border[:, 0])
-    high = np.minimum(np.max([pair[1] for pair in boxes], axis=0) + MARGIN_MM, border[:, 1])
-    before = _thinned(result.before)
-    position = np.array([_richest(before, moving, axis) for axis in range(3)])
-    return SliceBox(low, high, position) if result.after else whole_box(result.before, position)
-
-
 def _of_mesh(image: Segmentation) -> Segmentation:
     """The voxels that show a mesh, without those of hollow tissues, which stand behind its surfaces only by name."""
     meshed = np.array([tissue.meshed for tissue in image.tissues])
     return Segmentation(np.where(meshed[image.index], image.index, -1).astype(np.int16), image.grid, image.tissues)
-
-
-def _extent(image: Segmentation, tissues: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Corners (3,) mm of the box around the tissues' voxels; the whole image when there are none."""
-    index = np.argwhere(np.isin(image.index, tissues)).astype(np.float64)
-    if not len(index):
-        index = np.array([[0.0, 0.0, 0.0], [*image.grid.shape]])
-    points = image.grid.world(index)
-    return points.min(axis=0), points.max(axis=0)
-
-
-def _thinned(image: Segmentation) -> Segmentation:
-    """Every n-th voxel along each axis of a large image: enough to see where the organs are."""
-    step = int(np.ceil((image.index.size / ENOUGH_VOXELS) ** (1.0 / 3.0)))
-    index = image.index[::step, ::step, ::step]
-    affine = image.grid.affine.copy()
-    affine[:3, :3] *= step
-    nx, ny, nz = index.shape
-    return Segmentation(index, VoxelGrid((nx, ny, nz), affine), image.tissues)
-
-
-def _richest(image: Segmentation, tissues: tuple[int, ...], axis: int) -> float:
-    """Position (mm) along a world axis that shows much of every tissue, each measured by its own largest section."""
-    grid = image.grid
-    low, high = _range(grid, axis)
-    bins = np.linspace(low, high, max(round((high - low) / float(grid.spacing.max())), 1) + 1)
-    score = np.zeros(len(bins) - 1)
-    for tissue in tissues:
-        places = grid.world(np.argwhere(image.index == tissue).astype(np.float64))[:, axis]
-        area = np.histogram(places, bins)[0]
-        weight = 3.0 if image.tissues[tissue].role is Role.ESTIMATE else 1.0
-        score += weight * np.log(0.03 + area / max(area.max(), 1))  # what is absent costs more than what is small
-    best = int(np.argmax(score))
-    return float(0.5 * (bins[best] + bins[best + 1]))
-
-
-def _range(grid: VoxelGrid, axis: int) -> tuple[float, float]:
-    """Outer faces of the grid along a world axis, mm."""
-    corners = np.array(np.meshgrid(*[[-0.5, n - 0.5] for n in grid.shape])).reshape(3, -1).T
-    places = grid.world(corners)[:, axis]
-    return float(places.min()), float(places.max())

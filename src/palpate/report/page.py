@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib import resources
@@ -16,6 +16,7 @@ import numpy as np
 from markupsafe import Markup, escape
 
 from palpate.findings import HARMLESS, WIDENING
+from palpate.images.registration import length_text
 from palpate.parallel import mapped
 from palpate.report.charts import (
     START_COLOURS,
@@ -31,14 +32,15 @@ from palpate.report.interval_charts import profile_svg, region_svg, repeats_svg
 from palpate.report.methods import methods_text
 from palpate.report.payload import payload
 from palpate.report.pictures import mesh_png, organs_png, points_png
-from palpate.report.report_data import LaterImage, MeasuredState, Reference, ReportData, SliceBox
+from palpate.report.report_data import LaterImage, MeasuredState, Reference, ReportData, SliceBox, TissueMap
 from palpate.report.rows import estimate_rows, moduli_in, number, ratio_rows, scale_marks
 from palpate.report.scales import Scale, angle_scale, distance_scale, modulus_scale, strain_scale
 from palpate.report.section import VIEWS
 from palpate.report.slices import alignment_svg, contour_names, first_planes, points_svg, slice_svg
+from palpate.report.stiffness_maps import map_png, map_svg
 from palpate.report.tornado import tornado_svg
 
-__all__ = ["Picture", "render"]
+__all__ = ["Picture", "page_scripts", "picture_of", "policy_of", "render", "template_of", "widths_of"]
 
 T = TypeVar("T")
 LOGGER = logging.getLogger(__name__)
@@ -83,6 +85,16 @@ class _Later:
 
 
 @dataclass(frozen=True, slots=True)
+class _Map:
+    """The figures of one map of stiffness."""
+
+    tissue: str
+    words: str
+    slices: Picture
+    space: tuple[Picture, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class _Measured:
     """The figures of the points that were measured in one later state."""
 
@@ -93,15 +105,19 @@ class _Measured:
     widths: str
 
 
-def render(data: ReportData) -> str:
-    """The whole page of a report; a figure that cannot be drawn leaves a sentence in its place."""
+def render(data: ReportData, *, study: bool = False) -> str:
+    """The whole page of a report; a figure that cannot be drawn leaves a sentence in its place.
+
+    study: whether its sensitivity.html lies beside it.
+    """
     live = _attempt("the moving figures", lambda: payload(data))
     scripts = _scripts(data) if live is not None and (data.later or data.measured or data.mesh) else ()
     colours = {tissue.name: tissue.colour for tissue in data.tissues}
     found = moduli_in(data.document) if data.document["status"] == "converged" else []
     fixed = {item["tissue"] for item in found if item["verdict"] != "not identified"}  # of others no range is drawn
-    page = _template().render(
+    page = template_of("case.html").render(
         data=data,
+        study=study,
         document=data.document,
         headline=headline(data.document),
         inputs=tuple(
@@ -109,7 +125,7 @@ def render(data: ReportData) -> str:
             for pair in sorted({image.pair for image in data.images})
         ),
         registrations={row["after"]: row for row in data.document.get("alignment", ())},
-        policy=_policy(scripts),
+        policy=policy_of(scripts),
         scripts=scripts,
         live=live if scripts else None,
         rows=estimate_rows(data.document, colours),
@@ -124,35 +140,36 @@ def render(data: ReportData) -> str:
         later=tuple(_later(data, k, later) for k, later in enumerate(data.later)),
         measured=tuple(_measured(data, k, state) for k, state in enumerate(data.measured)),
         forces=(
-            _picture("Measured and fitted forces", partial(forces_svg, data, name="forces"))
+            picture_of("Measured and fitted forces", partial(forces_svg, data, name="forces"))
             if data.document.get("forces")
             else None
         ),
+        maps=tuple(_map(data, k, of) for k, of in enumerate(data.maps)),
         mesh_pictures=_mesh_pictures(data),
         moduli=_attempt("the scale of the moduli", lambda: modulus_scale(data)) if data.mesh else None,
         curves=_curves(data),
         profiles=tuple(
-            _picture(f"Profile of {item['tissue']}", partial(profile_svg, data, i, name=f"profile{i}"))
+            picture_of(f"Profile of {item['tissue']}", partial(profile_svg, data, i, name=f"profile{i}"))
             for i, item in enumerate(moduli_in(data.document))
             if item["tissue"] in fixed and item.get("profile")
         ),
         regions=tuple(
-            _picture(" and ".join(region["tissues"]), partial(region_svg, data, i, name=f"region{i}"))
+            picture_of(" and ".join(region["tissues"]), partial(region_svg, data, i, name=f"region{i}"))
             for i, region in enumerate(data.document.get("regions", ()))
             if fixed.issuperset(region["tissues"])
         ),
         tornados=tuple(
-            _picture(item["tissue"], partial(tornado_svg, data.document, item["tissue"], name=f"change{i}"))
+            picture_of(item["tissue"], partial(tornado_svg, data.document, item["tissue"], name=f"change{i}"))
             for i, item in enumerate(moduli_in(data.document))
             if item["tissue"] in fixed and data.document.get("variations")
         ),
         repeats=tuple(
-            _picture(f"Repeats of {item['tissue']}", partial(repeats_svg, data, i, name=f"repeats{i}"))
+            picture_of(f"Repeats of {item['tissue']}", partial(repeats_svg, data, i, name=f"repeats{i}"))
             for i, item in enumerate(moduli_in(data.document))
             if item["tissue"] in fixed and data.document["image_pairs"]
         ),
         angles=(
-            _picture("Dihedral angles of the mesh", partial(angle_svg, data.mesh.angles, name="angles"))
+            picture_of("Dihedral angles of the mesh", partial(angle_svg, data.mesh.angles, name="angles"))
             if data.mesh
             else None
         ),
@@ -167,13 +184,17 @@ def render(data: ReportData) -> str:
 
 
 def _scripts(data: ReportData) -> tuple[Markup, ...]:
-    """The page's scripts, ours and three.js, as they stand in the package."""
+    """The page's scripts, ours and three.js."""
+    return page_scripts((*SCRIPTS[:-1], OF_POINTS, SCRIPTS[-1]) if data.measured else SCRIPTS)
+
+
+def page_scripts(names: Sequence[str]) -> tuple[Markup, ...]:
+    """Scripts by their names, as they stand in the package."""
     folder = resources.files("palpate.report") / "assets"
-    names = (*SCRIPTS[:-1], OF_POINTS, SCRIPTS[-1]) if data.measured else SCRIPTS
     return tuple(Markup((folder / name).read_text(encoding="utf-8")) for name in names)  # noqa: S704 - our own files
 
 
-def _policy(scripts: tuple[Markup, ...]) -> Markup:
+def policy_of(scripts: tuple[Markup, ...]) -> Markup:
     """The Content-Security-Policy that lets these scripts run and nothing else be loaded or run."""
     digests = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
     hashes = " ".join(f"'sha256-{digest}'" for digest in digests) or "'none'"
@@ -199,12 +220,12 @@ def _later(data: ReportData, k: int, later: LaterImage) -> _Later:
     return _Later(
         name=later.name,
         alignment=tuple(
-            _picture(plane.view.name, partial(alignment_svg, data, plane, later, name=f"a{k}{plane.view.name}"))
+            picture_of(plane.view.name, partial(alignment_svg, data, plane, later, name=f"a{k}{plane.view.name}"))
             for plane in (first_planes(whole) if whole else ())
         ),
-        whole_widths=_widths(whole),
+        whole_widths=widths_of(whole),
         slices=tuple(
-            _picture(plane.view.name, partial(slice_svg, data, plane, later, name=f"s{k}{plane.view.name}"))
+            picture_of(plane.view.name, partial(slice_svg, data, plane, later, name=f"s{k}{plane.view.name}"))
             for plane in planes
         ),
         organs=_photographs(
@@ -214,7 +235,7 @@ def _later(data: ReportData, k: int, later: LaterImage) -> _Later:
             }
         ),
         residuals=tuple(
-            _picture(
+            picture_of(
                 data.tissues[model.tissue].name,
                 partial(residual_svg, data, model, voxel_mm=reference.voxel_mm, name=f"r{k}t{model.tissue}"),
             )
@@ -222,7 +243,7 @@ def _later(data: ReportData, k: int, later: LaterImage) -> _Later:
         ),
         scale=distance_scale(reference.voxel_mm),
         reference=reference,
-        widths=_widths(reference.slices),
+        widths=widths_of(reference.slices),
     )
 
 
@@ -231,15 +252,25 @@ def _measured(data: ReportData, k: int, state: MeasuredState) -> _Measured:
         state=state,
         reference=data.references[state.reference],
         slices=tuple(
-            _picture(plane.view.name, partial(points_svg, data, plane, state, name=f"p{k}{plane.view.name}"))
+            picture_of(plane.view.name, partial(points_svg, data, plane, state, name=f"p{k}{plane.view.name}"))
             for plane in first_planes(state.box)
         ),
         space=_photographs({f"motion to {state.name}": partial(points_png, data, state)}),
-        widths=_widths(state.box),
+        widths=widths_of(state.box),
     )
 
 
-def _widths(box: SliceBox | None) -> str:
+def _map(data: ReportData, k: int, of: TissueMap) -> _Map:
+    name = data.tissues[of.tissue].name
+    return _Map(
+        name,
+        of.words,
+        picture_of(f"{name}: modulus and its standard deviation", partial(map_svg, data, of, name=f"map{k}")),
+        _photographs({f"{name}, cut open": partial(map_png, data, of)}),
+    )
+
+
+def widths_of(box: SliceBox | None) -> str:
     """Of the columns of three slices, as CSS, so that all show a millimetre in the same size."""
     return "" if box is None else " ".join(f"{box.high[v.across] - box.low[v.across]:.1f}fr" for v in VIEWS)
 
@@ -260,12 +291,12 @@ def _curves(data: ReportData) -> tuple[Picture, ...]:
     if not data.document["starts"]:
         return ()
     moduli = [
-        _picture(f"Stiffness of {item['tissue']}", partial(modulus_svg, data, i, name=f"modulus{i}"))
+        picture_of(f"Stiffness of {item['tissue']}", partial(modulus_svg, data, i, name=f"modulus{i}"))
         for i, item in enumerate(moduli_in(data.document))
     ]
     return (
-        _picture("Misfit", partial(objective_svg, data, name="misfit")),
-        _picture("Waterfall of the starts", partial(waterfall_svg, data, name="waterfall")),
+        picture_of("Misfit", partial(objective_svg, data, name="misfit")),
+        picture_of("Waterfall of the starts", partial(waterfall_svg, data, name="waterfall")),
         *moduli,
     )
 
@@ -284,20 +315,20 @@ def _photographs(drawings: Mapping[str, Callable[[], bytes]]) -> tuple[Picture, 
         source = base64.b64encode(drawings[title]()).decode()
         return f'<img alt="{escape(title)}" src="data:image/png;base64,{source}">'
 
-    return tuple(mapped(lambda title: _picture(title, partial(element, title)), drawings))
+    return tuple(mapped(lambda title: picture_of(title, partial(element, title)), drawings))
 
 
 @cache
-def _template() -> jinja2.Template:
-    """The page's template, which takes a quarter of a page's time to compile."""
+def template_of(name: str) -> jinja2.Template:
+    """A page's template, which takes a quarter of a page's time to compile."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("palpate.report"), autoescape=True, undefined=jinja2.StrictUndefined
     )
-    environment.filters["number"] = number
-    return environment.get_template("case.html")
+    environment.filters |= {"number": number, "length_text": length_text}
+    return environment.get_template(name)
 
 
-def _picture(title: str, draw: Callable[[], str]) -> Picture:
+def picture_of(title: str, draw: Callable[[], str]) -> Picture:
     """The figure that `draw` makes, which is our own SVG or image and therefore safe to embed."""
     try:
         return Picture(title, Markup(draw()))  # noqa: S704 - drawn by svg.py, where names become outlines

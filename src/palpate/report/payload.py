@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from palpate.report.preview_data import ROLE_COLOURS, PreviewImage
 from palpate.report.report_data import (
     GREY_STEPS,
     LaterImage,
@@ -67,11 +69,13 @@ class _Packer:
         return self.add(indices.astype(np.uint16 if small else np.uint32))
 
 
-def payload(data: ReportData) -> Payload:
-    """Pack what the page draws itself."""
+def payload(data: ReportData, preview: Sequence[PreviewImage] = ()) -> Payload:
+    """Pack what the page draws itself; preview: what it draws of each later image where nothing is fitted yet."""
     low, step = _quantum(data)
     packer = _Packer(low, step)
     facts = {
+        "preview": [_preview(image, packer) for image in preview],
+        "roles": dict(ROLE_COLOURS),
         "low": low.tolist(),
         "step": step,
         "unit": data.unit,
@@ -193,6 +197,20 @@ def _measured(state: MeasuredState, packer: _Packer) -> dict[str, Any]:
             }
             for of in state.points
         ],
+    }
+
+
+def _preview(image: PreviewImage, packer: _Packer) -> dict[str, Any]:
+    return {
+        "organs": [_volume(volume, packer) for volume in image.organs],
+        "whole": [_volume(volume, packer) for volume in image.whole],
+        "greys": [_volume(volume, packer) for volume in image.greys],
+        "arrows": [{"tissue": a.tissue, "start": a.start.tolist(), "end": a.end.tolist()} for a in image.arrows],
+        "factor": image.factor,
+        "view": _box(image.view),
+        "frame": image.frame.ravel().tolist(),
+        "field": image.field.ravel().tolist(),
+        "motion": None if image.motion is None else image.motion.tolist(),
     }
 
 

@@ -12,7 +12,18 @@ from palpate.report.render import Camera, Triangles, render_png
 from palpate.report.report_data import LaterImage, MeasuredState, MeshPicture, ReportData
 from palpate.report.scales import Scale, distance_scale, modulus_scale, strain_scale
 
-__all__ = ["arrow_triangles", "mesh_png", "organs_png", "points_png", "section_faces", "tissue_shades"]
+__all__ = [
+    "BESIDE_FRONT",
+    "HEIGHT",
+    "WIDTH",
+    "arrow_triangles",
+    "face_normals",
+    "mesh_png",
+    "organs_png",
+    "points_png",
+    "section_faces",
+    "tissue_shades",
+]
 
 WIDTH, HEIGHT = 620, 460
 BESIDE = Camera.looking((-1.0, 0.3, 0.15))  # the patient's left side, a little from the front
@@ -66,7 +77,7 @@ def points_png(data: ReportData, state: MeasuredState) -> bytes:
         colours.append(np.array(to_rgb(colour)))
     every = np.concatenate(corners)
     shades = np.concatenate([np.broadcast_to(c, of.shape) for c, of in zip(colours, corners, strict=True)])
-    triangles = Triangles(every, shades, np.repeat(_normals(every)[:, None], 3, axis=1))
+    triangles = Triangles(every, shades, np.repeat(face_normals(every)[:, None], 3, axis=1))
     return render_png(triangles, BESIDE_FRONT, width=WIDTH, height=HEIGHT)
 
 
@@ -111,11 +122,11 @@ def mesh_png(data: ReportData, *, by: Literal["tissue", "modulus", "strain"]) ->
         shades = tissue_shades(data, modulus_scale(data) if by == "modulus" else None)[mesh.region[tets]]
     corners = mesh.nodes.astype(np.float64)[faces]
     colours = np.repeat(shades[:, None], 3, axis=1)
-    triangles = Triangles(corners, colours, np.repeat(_normals(corners)[:, None], 3, axis=1), edges=True)
+    triangles = Triangles(corners, colours, np.repeat(face_normals(corners)[:, None], 3, axis=1), edges=True)
     return render_png(triangles, AT_THE_SIDE, width=WIDTH, height=HEIGHT)
 
 
-def _normals(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+def face_normals(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     """Unit normals (n, 3) of triangles (n, 3, 3)."""
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12))

@@ -20,6 +20,7 @@ __all__ = [
     "BoneDistance",
     "InputImage",
     "LaterImage",
+    "MapSlice",
     "MeasuredPoints",
     "MeasuredState",
     "MeshPicture",
@@ -28,6 +29,7 @@ __all__ = [
     "ReportData",
     "ReportTissue",
     "SliceBox",
+    "TissueMap",
     "TriangleSurface",
     "Volume",
 ]
@@ -247,14 +249,43 @@ class MeshPicture:
 
 
 @dataclass(frozen=True, slots=True)
+class MapSlice:
+    """A slice of a map: modulus in the result's unit, sd of ln E, resolution, (n_up, n_across) each; NaN outside."""
+
+    modulus: NDArray[np.float32] = field(metadata=MAY_BE_NAN)
+    sd: NDArray[np.float32] = field(metadata=MAY_BE_NAN)
+    resolution: NDArray[np.float32] = field(metadata=MAY_BE_NAN)
+
+
+@dataclass(frozen=True, slots=True)
+class TissueMap:
+    """The map of `tissue` (index), in words and slices; its mean modulus in the result's unit.
+
+    low, high, position (3,) mm: the slices' box, and where they lie, in the order of `VIEWS`; elements (n,): of the
+    mesh; moduli (n,): of them, in the result's unit, the mean where the data do not resolve them.
+    """
+
+    tissue: int
+    words: str
+    mean: float
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    position: NDArray[np.float64]
+    slices: tuple[MapSlice, ...]
+    elements: NDArray[np.int32]
+    moduli: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
 class ReportData:
     """One case's report before it is drawn.
 
     document: that of result.json; unit: of the moduli, "kPa" or "ratio"; images: every label image, pair after pair;
     moduli_paths: of each start, and last of the outer loop, tissue -> moduli by iteration; references: the reference
     states, that of the mesh first; later: their later images; measured: the later states in which points were measured;
-    missing: part of the page ("mesh", or "slices",
-    "surfaces", "background", "distances", "outlines", "alignment", "points" of an image) -> why it is not there.
+    maps: of tissues whose modulus is a field, in the first reference state;
+    missing: part of the page ("mesh", "maps", or "slices", "surfaces", "background", "distances", "outlines",
+    "alignment", "points" of an image) -> why it is not there.
     """
 
     document: Mapping[str, Any]
@@ -268,6 +299,7 @@ class ReportData:
     later: tuple[LaterImage, ...] = ()
     measured: tuple[MeasuredState, ...] = ()
     mesh: MeshPicture | None = None
+    maps: tuple[TissueMap, ...] = ()
     missing: Mapping[str, str] = field(default_factory=dict)
 
     def save(self, path: Path) -> None:

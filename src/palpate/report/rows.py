@@ -8,9 +8,19 @@ from dataclasses import dataclass
 from typing import Any
 
 from palpate.inversion import KNOWN_MODULUS
-from palpate.uncertainty import Interval
+from palpate.uncertainty import NORMAL_95, Interval
 
-__all__ = ["NONE", "Bar", "EstimateRow", "estimate_rows", "interval_text", "main_numbers", "number", "scale_marks"]
+__all__ = [
+    "NONE",
+    "Bar",
+    "EstimateRow",
+    "estimate_rows",
+    "expected_share",
+    "interval_text",
+    "main_numbers",
+    "number",
+    "scale_marks",
+]
 
 NONE = "–"
 BELIEVED = "what was believed before"
@@ -21,6 +31,7 @@ CAUSES = {
     "frame": "the frame's motion",
     "offset": "how surfaces are drawn",
     "heterogeneity": "tissues that are not homogeneous",
+    "layer": "layers round the organs",
     "poisson": "Poisson's ratios",
     "instrument": "the instruments' offsets",
     KNOWN_MODULUS: "the range of the known modulus",
@@ -28,6 +39,8 @@ CAUSES = {
     "grid": "the voxels' place",
     "mesh": "the mesh",
 }
+STEPS = ((1.0, 2.0, 5.0), tuple(0.5 * n for n in range(2, 20)), tuple(0.1 * n for n in range(10, 100)))  # of a decade
+FEWEST_MARKS = 3  # on a scale that can be read
 FADING = 0.6  # of a cause's opacity, that of the next one on the bar
 
 
@@ -59,7 +72,7 @@ class EstimateRow:
     """One tissue of the result table, all texts; shares: of each cause in the variance of ln E.
 
     sources: of each kind of data in what is known of it, where a case has more than images. reference: the modulus of
-    `relative_to`, kPa.
+    `relative_to`, kPa; expected: how often an error as large as that from the truth comes about, by the interval.
     """
 
     tissue: str
@@ -75,6 +88,7 @@ class EstimateRow:
     why: str
     truth: str
     error: str
+    expected: str
     bar: Bar | None
     shares: tuple[Share, ...]
     sources: tuple[Share, ...]
@@ -152,6 +166,7 @@ def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tu
             why=item["why"],
             truth=number(truth),
             error=f"{100.0 * (value / truth - 1.0):+.1f} %" if shown and value and truth else NONE,
+            expected=expected_share(value, interval, truth) if shown and value and truth else NONE,
             bar=_bar(value, interval, truth=truth, scale=scale) if scale and value and interval else None,
             shares=_shares({CAUSES.get(cause, cause): share for cause, share in shares.items()}) if shown else (),
             sources=_shares({BELIEVED if kind == "prior" else kind: share for kind, share in told}) if shown else (),
@@ -160,15 +175,32 @@ def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tu
     return tuple(rows)
 
 
+def expected_share(value: float, interval: Interval | None, truth: float) -> str:
+    """How often an estimate lies as far from the truth as this one, "40 %", by its 95 % interval; a dash without one.
+
+    2 (1 - Phi(|ln E / E_0| / s)), s the interval's half-width of ln E on the side of the truth, over 1.96.
+    """
+    end = None if interval is None else interval[0 if truth < value else 1]
+    if not end or end == value:
+        return NONE
+    return (
+        f"{100.0 * math.erfc(abs(NORMAL_95 * math.log(value / truth) / math.log(value / end)) / math.sqrt(2.0)):.0f} %"
+    )
+
+
 def scale_marks(document: Mapping[str, Any]) -> tuple[tuple[float, str], ...]:
     """Places (0 to BAR) and labels of round numbers on the common scale of the bars."""
     scale = _scale(moduli_in(document)) if document["status"] == "converged" else None
     if scale is None:
         return ()
     decades = range(math.floor(scale[0] / math.log(10.0)), math.ceil(scale[1] / math.log(10.0)) + 1)
-    numbers = [step * 10.0**decade for decade in decades for step in (1.0, 2.0, 5.0)]
-    places = [(BAR * (math.log(n) - scale[0]) / (scale[1] - scale[0]), f"{n:g}") for n in numbers]
-    inside = [mark for mark in places if 0.04 * BAR <= mark[0] <= 0.96 * BAR]
+    inside = list[tuple[float, str]]()
+    for steps in STEPS:
+        numbers = [step * 10.0**decade for decade in decades for step in steps]
+        places = [(BAR * (math.log(n) - scale[0]) / (scale[1] - scale[0]), f"{n:.3g}") for n in numbers]
+        inside = [mark for mark in places if 0.04 * BAR <= mark[0] <= 0.96 * BAR]
+        if len(inside) >= FEWEST_MARKS:
+            break
     return tuple(inside[:: math.ceil(len(inside) / 6) or 1])
 
 

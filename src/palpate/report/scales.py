@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.report.report_data import ReportData
-from palpate.study.strain_range import LINEAR_RANGE
+from palpate.study.refusals import LINEAR_RANGE
 
 __all__ = ["Scale", "angle_scale", "distance_scale", "modulus_scale", "strain_scale"]
 

@@ -12,7 +12,7 @@ from scipy import ndimage
 from palpate.images.label_image import VoxelGrid
 from palpate.images.tissue_distance import window_of
 
-__all__ = ["VIEWS", "Plane", "View", "cut_image", "joined"]
+__all__ = ["VIEWS", "Plane", "View", "cut_image", "cut_triangles", "joined"]
 
 PIXEL_MM = 0.8
 
@@ -88,7 +88,7 @@ def joined(points: NDArray[np.float64], triangles: NDArray[np.int64], plane: Pla
 
     Closed ones end where they begin.
     """
-    segments, keys = _cut(points, triangles, plane)
+    segments, keys = cut_triangles(points, triangles, plane)
     neighbours: dict[int, list[int]] = {}
     for number, ends in enumerate(keys.tolist()):
         for end in ends:
@@ -113,10 +113,13 @@ def joined(points: NDArray[np.float64], triangles: NDArray[np.int64], plane: Pla
     return lines
 
 
-def _cut(
+def cut_triangles(
     points: NDArray[np.float64], triangles: NDArray[np.int64], plane: Plane
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Segments (n, 2, 2) mm of a section, and the numbers (n, 2) of the triangles' edges that their ends lie on."""
+    """Segments (n, 2, 2) mm of a section, and the numbers (n, 2) of the edges that their ends lie on.
+
+    points (n_points, 3) mm, triangles (n_triangles, 3).
+    """
     height = points[:, plane.view.normal] - plane.position
     height = np.where(height == 0.0, 1e-9, height)  # a node in the plane counts as just above it
     corner = height[triangles]

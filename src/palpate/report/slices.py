@@ -43,8 +43,11 @@ def contour_names(data: ReportData) -> tuple[tuple[str, str], ...]:
     return tuple((data.tissues[i].name, data.tissues[i].colour) for i in drawn)
 
 
-def slice_svg(data: ReportData, plane: Plane, later: LaterImage, *, name: str) -> str:
-    """One slice as SVG: the earlier image under the contours of both images and of the model fitted to `later`."""
+def slice_svg(data: ReportData, plane: Plane, later: LaterImage, *, name: str, model: bool = True) -> str:
+    """One slice as SVG: the earlier image under the contours of both images and of the model fitted to `later`.
+
+    model: whether there is one.
+    """
     reference = data.references[later.reference]
 
     def draw(figure: Figure) -> None:
@@ -59,7 +62,8 @@ def slice_svg(data: ReportData, plane: Plane, later: LaterImage, *, name: str) -
         _furnish(axes, plane)
 
     where = f"{plane.view.name.capitalize()} slice at {'xyz'[plane.view.normal]} = {plane.position:.0f} mm"
-    says = f"{where}: {reference.name} under the outlines of {reference.name}, {later.name} and the fitted model."
+    outlines = f"{reference.name}, {later.name} and the fitted model" if model else f"{reference.name} and {later.name}"
+    says = f"{where}: {reference.name} under the outlines of {outlines}."
     return draw_svg(draw, size=_size(plane), name=name, says=says)
 
 

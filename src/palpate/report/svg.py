@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import matplotlib as mpl
 from markupsafe import escape
 from matplotlib.figure import Figure
 
-__all__ = ["INK", "draw_svg"]
+__all__ = ["INK", "draw_svg", "link_url"]
 
 INK = "#010203"  # stands for the page's text colour, which differs between light and dark pages
 STYLE = {
@@ -37,11 +37,24 @@ STYLE = {
 }
 
 
-def draw_svg(draw: Callable[[Figure], None], *, size: tuple[float, float], name: str, says: str) -> str:
+def link_url(number: int) -> str:
+    """What an artist's url is until a figure's link of that number takes its place."""
+    return f"palpate-link-{number}-"
+
+
+def draw_svg(
+    draw: Callable[[Figure], None],
+    *,
+    size: tuple[float, float],
+    name: str,
+    says: str,
+    links: Sequence[tuple[str, str]] = (),
+) -> str:
     """The SVG element that `draw` paints on an empty figure of `size` (inches), and that `says` this to who cannot see.
 
     `name`, unique in the page, keeps the figure's identifiers apart from those of others. Elements that `draw` gave
-    the gid "layer-X" get the class "layer-X". No state of matplotlib outlives the call.
+    the gid "layer-X" get the class "layer-X". links: address of each and what it says, where `draw` gave artists
+    the url `link_url` of its number. No state of matplotlib outlives the call.
     """
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=size)
@@ -58,5 +71,9 @@ def draw_svg(draw: Callable[[Figure], None], *, size: tuple[float, float], name:
     element = re.sub(r'\bid="', f'id="{name}-', element)
     element = re.sub(r"url\(#", f"url(#{name}-", element)
     element = re.sub(r'(xlink:)?href="#', f'href="#{name}-', element)
-    element = element.replace("<svg", f'<svg role="img" aria-label="{escape(says)}"', 1)
+    for number, (address, words) in enumerate(links):
+        link = f'<a href="{escape(address)}" aria-label="{escape(words)}">'
+        element = element.replace(f'<a xlink:href="{link_url(number)}" target="_blank">', link)
+    role = "group" if links else "img"  # an image hides what is in it from who cannot see
+    element = element.replace("<svg", f'<svg role="{role}" aria-label="{escape(says)}"', 1)
     return element.replace(INK, "currentColor")

@@ -79,13 +79,14 @@ def tornado_rows(document: Mapping[str, Any], tissue: str) -> tuple[TornadoRow, 
     return tuple(sorted(rows, key=lambda row: -row.size))
 
 
-def effect_text(row: TornadoRow) -> str:
-    """What each setting does, in per cent of the modulus: "0.43: -3 %, 0.47: +4 %"."""
+def effect_text(row: TornadoRow, *, reasons: bool = False) -> str:
+    """What each setting does, in per cent of the modulus: "0.43: -3 %, 0.47: +4 %"; with `reasons` why one does not."""
     words = []
     for setting, change in row.effects.items():
         end = " (at the search's bound)" if setting in row.at_bound else ""
         words.append(f"{setting}: {100.0 * math.expm1(change):+.3g} %{end}")
-    return ", ".join([*words, *(f"{setting}: no estimate" for setting in row.failed)])
+    words += [f"{setting}: no estimate" + (f" ({why})" if reasons else "") for setting, why in row.failed.items()]
+    return ", ".join(words)
 
 
 def sensitivity_table(document: Mapping[str, Any]) -> list[list[str]]:
@@ -95,7 +96,8 @@ def sensitivity_table(document: Mapping[str, Any]) -> list[list[str]]:
         value, interval = main_numbers(item)
         unit = "kPa" if item["unit"] == "kPa" else f"x {item['relative_to']}"
         rows.append([item["tissue"], "-", f"{number(value)} {unit} (95 %: {interval_text(interval)})", ""])
-        rows += [["", row.label, effect_text(row), row.method] for row in tornado_rows(document, item["tissue"])]
+        found = tornado_rows(document, item["tissue"])
+        rows += [["", row.label, effect_text(row, reasons=True), row.method] for row in found]
     return rows
 
 

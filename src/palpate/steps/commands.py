@@ -8,7 +8,9 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 from palpate.errors import ConfigurationError, InputDataError
+from palpate.images.readers import read_label_image
 from palpate.progress import Progress, silent
+from palpate.steps.previewing import checked_with_page, new_case_with_page, place_page, refuse_other_page
 from palpate.steps.results import CaseResult, SavedResult
 from palpate.steps.saving import save_sensitivity
 from palpate.study import run
@@ -16,14 +18,15 @@ from palpate.study.case import Case
 from palpate.study.check import CheckReport, check_case
 from palpate.study.earlier import RESULT
 from palpate.study.lock import held_folder
-from palpate.study.new_case import NewCase, write_new_case
+from palpate.study.new_case import NewCase
 from palpate.study.null_pair import NullPair, drawing_noise
 from palpate.study.outputs import OutputFolder, read_json
 from palpate.study.result import SCHEMA, MeshResult, Simulation
 from palpate.study.sensitivity import Kept, Sensitivity
 from palpate.study.sensitivity import sensitivity as vary
+from palpate.study.surface_labels import SurfaceLabels, surface_labels
 
-__all__ = ["check", "estimate", "init", "make_mesh", "noise", "read_result", "sensitivity", "simulate"]
+__all__ = ["check", "estimate", "init", "make_mesh", "noise", "read_result", "sensitivity", "simulate", "voxelise"]
 
 PathLike = str | os.PathLike[str]
 
@@ -39,28 +42,36 @@ def init(
 
     labels: a label table; ct: the CT of `before`, or of each state in turn, which also tells air from tissue in label
     0. The case that is given says where it lies (`path`), who is taken for what and why (`tissues`), and what nobody
-    can guess (`questions`). Raises `InputDataError` for images that cannot be used,
-    `ConfigurationError` where another case.toml is in the way, `ResourceError` where nothing can be written.
+    can guess (`questions`). Beside it preview.html shows how the images were read, where that can be shown. Raises
+    `InputDataError` for images that cannot be used, `ConfigurationError` where another case.toml is in the way,
+    `ResourceError` where nothing can be written.
     """
     outputs = OutputFolder(Path(output))
     with held_folder(outputs.path):
         table = None if labels is None else Path(labels)
-        return write_new_case(
-            [Path(path) for path in (before, *after)], table, outputs, cts=[Path(path) for path in ct]
-        )
+        images = [Path(path) for path in (before, *after)]
+        return new_case_with_page(images, table, outputs, cts=[Path(path) for path in ct])
 
 
-def check(case: Case | PathLike, overrides: Sequence[str] = (), *, progress: Progress = silent) -> CheckReport:
+def check(
+    case: Case | PathLike, overrides: Sequence[str] = (), *, html: PathLike | None = None, progress: Progress = silent
+) -> CheckReport:
     """Every problem of a case or its file at once, its organs and what an estimate costs, as `palpate check` tells.
 
-    overrides: of a file, as for `read_case`; progress: is called with a sentence at each stage. Raises nothing
-    for a bad case, which is a problem of the report; `ConfigurationError` for overrides of a case that is read.
+    overrides: of a file, as for `read_case`; html: where a page is to be written that shows the case, its images and
+    the intervals that may be expected (then they are in the report, too); progress: is called with a sentence at each
+    stage. Raises nothing for a bad case, which is a problem of the report; `ConfigurationError` for overrides of a case
+    that is read, and where `html` is a file that is no preview of ours, `ResourceError` where it cannot be written.
     """
-    if isinstance(case, Case):
-        if overrides:
-            raise ConfigurationError("overrides are for a case file: palpate.read_case(file, overrides) reads it so")
-        return check_case(case, (), progress=progress)
-    return check_case(Path(case), overrides, progress=progress)
+    if isinstance(case, Case) and overrides:
+        raise ConfigurationError("overrides are for a case file: palpate.read_case(file, overrides) reads it so")
+    source = case if isinstance(case, Case) else Path(case)
+    if html is None:
+        return check_case(source, overrides, progress=progress)
+    refuse_other_page(Path(html))
+    report, page = checked_with_page(source, overrides, progress=progress)
+    place_page(page, Path(html))
+    return report
 
 
 def read_result(folder: PathLike) -> SavedResult:
@@ -91,6 +102,24 @@ def noise(
     """
     table = None if labels is None else Path(labels)
     return drawing_noise(Path(first), Path(second), labels=table, align=align, progress=progress)
+
+
+def voxelise(
+    *surfaces: PathLike,
+    spacing_mm: float = 1.0,
+    margin_mm: float = 30.0,
+    axes: str = "RAS",
+    like: PathLike | None = None,
+    progress: Progress = silent,
+) -> SurfaceLabels:
+    """The label image of closed surfaces (STL), one an organ, as `palpate voxelise` writes it.
+
+    spacing_mm, margin_mm: of the grid that is made; like: an image whose grid is taken; axes: "RAS" or "LPS", of files
+    that do not say. Raises `InputDataError` for surfaces that cannot be read or are not closed.
+    """
+    grid = None if like is None else read_label_image(Path(like)).grid
+    paths = [Path(path) for path in surfaces]
+    return surface_labels(paths, spacing_mm=spacing_mm, margin_mm=margin_mm, axes=axes, like=grid, progress=progress)
 
 
 def make_mesh(case: Case, *, progress: Progress = silent) -> MeshResult:

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 from palpate import report
 from palpate.errors import ResourceError
 from palpate.export.notebook import notebook_viewer
-from palpate.images.tissue import Role, Tissue
-from palpate.images.tissue_colours import tissue_colours
+from palpate.images.tissue import Role, Tissue, tissue_colours
 from palpate.report.rows import moduli_in
 from palpate.steps.saving import save_estimate
 from palpate.study import result

@@ -8,21 +8,30 @@ from pathlib import Path
 from typing import Any
 
 from palpate import report
-from palpate.errors import EstimationError, ResourceError
+from palpate.errors import EstimationError, InputDataError, ResourceError
 from palpate.export.case_files import write_estimate_files
 from palpate.findings import Finding, warning_rows
 from palpate.progress import during, silent
 from palpate.study.case import Case
 from palpate.study.case_as_run import stage_case
-from palpate.study.earlier import RESULT, earlier_files
-from palpate.study.outputs import OutputFolder, Staging, write_json, write_text
+from palpate.study.earlier import RESULT, earlier_files, vouched
+from palpate.study.outputs import OutputFolder, Staging, read_json, write_json, write_text
 from palpate.study.result import CaseResult, failure_document
 from palpate.study.sensitivity import Sensitivity
 
-__all__ = ["DATA", "PAGE", "save_document", "save_estimate", "save_failure", "save_sensitivity"]
+__all__ = [
+    "DATA",
+    "PAGE",
+    "has_study",
+    "redraw_page",
+    "save_document",
+    "save_estimate",
+    "save_failure",
+    "save_sensitivity",
+]
 
 LOGGER = logging.getLogger(__name__)
-PAGE, DATA = "report.html", "report-data.npz"
+PAGE, DATA, STUDY = "report.html", "report-data.npz", "sensitivity.json"
 
 
 def save_estimate(
@@ -59,8 +68,43 @@ def save_sensitivity(found: Sensitivity, outputs: OutputFolder) -> dict[str, Any
     document = found.to_dict()
     with outputs.staged() as staging:
         write_text(staging.area / "sensitivity.html", report.sensitivity_page(document))
-        save_document(staging, "sensitivity.json", document)
+        save_document(staging, STUDY, document)
+    if has_study(outputs.path) and {PAGE, DATA} <= set(vouched(outputs.path, RESULT)):
+        try:
+            redraw_page(outputs)  # which links to the study from now on
+        except InputDataError as error:  # the study stands without it
+            LOGGER.warning("the report beside the study is left as it is: %s", error)
     return document
+
+
+def redraw_page(outputs: OutputFolder) -> dict[str, Any]:
+    """Draw report.html of an estimate again from the data in its folder; gives the document result.json.
+
+    Raises `InputDataError` as `redrawn_page` does, and where the run left no data.
+    """
+    result = read_json(outputs.path / RESULT)
+    files = result.setdefault("files", {})
+    if DATA not in files:
+        raise InputDataError(f"{outputs.path / RESULT} tells of a run without {DATA}; run the estimate again")
+    study = has_study(outputs.path)
+    page = report.redrawn_page(outputs.path, document=result, sha256=files[DATA]["sha256"], study=study)
+    with outputs.staged() as staging:
+        write_text(staging.area / PAGE, page)
+        files |= staging.digests()
+        write_json(staging.area / RESULT, result)
+        staging.commit()
+    return result
+
+
+def has_study(folder: Path) -> bool:
+    """Whether the sensitivity study in a folder is that of its estimate: both begin with the same moduli."""
+    try:
+        study, result = read_json(folder / STUDY), read_json(folder / RESULT)
+        named = [[(item["tissue"], item["value"], item["ratio"]) for item in of["estimates"]] for of in (study, result)]
+    except (InputDataError, KeyError, TypeError):
+        return False
+    same = all(one in named[1] for one in named[0])
+    return bool(named[0]) and same and "sensitivity.html" in vouched(folder, STUDY)
 
 
 def save_document(staging: Staging, name: str, document: dict[str, Any]) -> None:

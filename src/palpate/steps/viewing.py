@@ -14,8 +14,7 @@ from urllib.parse import quote, unquote
 
 from palpate.errors import InputDataError, ResourceError
 from palpate.study.earlier import RESULT
-from palpate.study.journal import is_inside
-from palpate.study.outputs import read_json, read_regular
+from palpate.study.outputs import is_inside, read_json, read_regular
 
 __all__ = ["Viewing", "viewing"]
 

@@ -12,10 +12,9 @@ if TYPE_CHECKING:
     from palpate.study.cost import ExpectedCost, expected_cost
     from palpate.study.earlier import strange_files
     from palpate.study.edge_length import EdgeLength, edge_length_of
-    from palpate.study.estimation import Observed, conclude, estimates_of, intervals_of, verdict
-    from palpate.study.journal import recover
+    from palpate.study.estimation import Observed, conclude, estimates_of, intervals_of, released_of, verdict
     from palpate.study.lock import held_folder, own_file
-    from palpate.study.outputs import make_folder, read_json, staged, write_json, write_text
+    from palpate.study.outputs import make_folder, read_json, recover, staged, write_json, write_text
     from palpate.study.provenance import software_versions
     from palpate.study.read import read_states
     from palpate.study.result import CaseResult, failure_document
@@ -35,6 +34,7 @@ __all__ = [
     "Mechanics",
     "MeshSettings",
     "Observed",
+    "OutputFolder",
     "Phantom",
     "aligned",
     "conclude",
@@ -58,6 +58,7 @@ __all__ = [
     "read_json",
     "read_states",
     "recover",
+    "released_of",
     "software_versions",
     "staged",
     "strange_files",
@@ -79,6 +80,7 @@ _HOMES = {
     "Mechanics": "palpate.study.case",
     "MeshSettings": "palpate.study.case",
     "Observed": "palpate.study.estimation",
+    "OutputFolder": "palpate.study.outputs",
     "Phantom": "palpate.study.case",
     "aligned": "palpate.study.body",
     "conclude": "palpate.study.estimation",
@@ -101,7 +103,8 @@ _HOMES = {
     "read_case": "palpate.study.case_file",
     "read_json": "palpate.study.outputs",
     "read_states": "palpate.study.read",
-    "recover": "palpate.study.journal",
+    "recover": "palpate.study.outputs",
+    "released_of": "palpate.study.estimation",
     "software_versions": "palpate.study.provenance",
     "staged": "palpate.study.outputs",
     "strange_files": "palpate.study.earlier",

@@ -67,6 +67,7 @@ __all__ = [
     "inverse_problem",
     "joint_problem",
     "make_body",
+    "on_linear_elements",
     "stated_noise",
     "strained_body",
 ]
@@ -280,6 +281,11 @@ def make_body(states: ImagedStates, case: Case, *, progress: Progress) -> Body:
 def strained_body(body: Body, strained: NDArray[np.float64], case: Case) -> Body:
     """The body whose reference state lies `strained` (n_points, 3) mm from where it is free of stress."""
     return _remade(body, case, strained=strained)
+
+
+def on_linear_elements(body: Body, case: Case) -> Body:
+    """The body on linear elements of its mesh, without layers or the strain of its reference: coarse, and quick."""
+    return _remade(body, case, space=lagrange_space(body.space.mesh, "P1"), layers=(), strained=None)
 
 
 def _remade(body: Body, case: Case, **changes: Any) -> Body:

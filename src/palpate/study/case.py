@@ -200,7 +200,7 @@ class CaseTissue:
     `poisson_ratio` None: 0.45, or what a phantom draws; `poisson_ratio_sd`: standard deviation of what is believed of
     it where it is sought, None: 0.03. `youngs_modulus_kpa`: a number, or the 95 % range of what is believed of a
     `known` one. `modulus` "field": it varies in the tissue and is mapped; `field_sd`: prior standard deviation of ln E
-    inside, `field_length_mm`: of its Gaussian kernel.
+    inside, `field_length_mm`: of its kernel.
     """
 
     name: str

@@ -7,11 +7,9 @@ from pathlib import Path
 from palpate.errors import ConfigurationError, PalpateError
 from palpate.findings import Finding
 from palpate.study.case import Case
-from palpate.study.case_file import read_case
-from palpate.study.case_text import case_tables, case_text
+from palpate.study.case_file import case_tables, case_text, read_case, relative_path
 from palpate.study.earlier import RESULT, vouched
 from palpate.study.outputs import OutputFolder, Staging, write_text
-from palpate.study.toml_text import relative_path
 
 __all__ = ["CASE_NAME", "refuse_other_case", "stage_case"]
 

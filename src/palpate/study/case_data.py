@@ -9,7 +9,7 @@ import numpy as np
 
 from palpate.errors import ConfigurationError
 from palpate.observation.contract import DataFile
-from palpate.observation.sources import SOURCES
+from palpate.observation.registry import SOURCES
 from palpate.study.schema import rule
 
 __all__ = ["CaseData"]

@@ -15,15 +15,15 @@ from palpate.findings import Finding, of_pair, one_a_cause, rank
 from palpate.images.checks import check_pair, check_segmentation, later_names
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_intensities
-from palpate.images.registration import Registration
+from palpate.images.registration import Registration, length_text
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
-from palpate.observation.field_of_view import field_of_view
-from palpate.observation.observed_surface import observed_surfaces, seen_in
+from palpate.observation.observed_surface import field_of_view, observed_surfaces, seen_in
 from palpate.progress import Progress
 from palpate.study.body import Body, ImagedStates, brought, make_body
 from palpate.study.case import Case
 from palpate.study.case_file import read_case
+from palpate.study.case_loads import load_warnings
 from palpate.study.contacts import every_finding
 from palpate.study.cost import (
     LESS_MEMORY,
@@ -35,16 +35,16 @@ from palpate.study.cost import (
     lack_of_memory,
     machine_memory_gb,
 )
-from palpate.study.domain import case_domain
-from palpate.study.edge_length import edge_length_of
+from palpate.study.edge_length import case_domain, edge_length_of
 from palpate.study.meshing import refuse_edge
 from palpate.study.plausibility import unit_warnings
+from palpate.study.prediction import Prediction
 from palpate.study.read import measured, read_segmentation, read_states
 from palpate.study.refusals import refuse_lost, refuse_unmeshable
 from palpate.study.run import refuse_what_cannot_be_estimated
 from palpate.study.samples import require_samples
 
-__all__ = ["CheckReport", "Problem", "check_case", "memory_problems"]
+__all__ = ["CheckReport", "Checked", "OrganRow", "Problem", "check_case", "checked_case", "memory_problems"]
 
 T = TypeVar("T")
 OBSERVED = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
@@ -74,7 +74,7 @@ class CheckReport:
     """All problems of a case, its organs and what its estimate would cost (None when that cannot be told).
 
     alignments: how each later image lay, by its name; none where nothing was aligned; measured: what was read of each
-    file of [[data]], by its name.
+    file of [[data]], by its name; predicted: the intervals that may be expected, where they were asked for.
     """
 
     id: str
@@ -84,6 +84,7 @@ class CheckReport:
     cost: ExpectedCost | None = None
     alignments: tuple[tuple[str, Registration], ...] = ()
     measured: Mapping[str, str] = field(default_factory=dict)
+    predicted: Prediction | None = None
 
     @property
     def exit_code(self) -> int:
@@ -125,6 +126,7 @@ class CheckReport:
                 "solver": cost.solver,
                 "processors": cost.processors,
             },
+            "predicted": self.predicted and self.predicted.to_dict(),
         }
 
     def text(self) -> str:
@@ -137,7 +139,7 @@ class CheckReport:
             volumes = ", ".join(f"{volume:.4g}" for volume in row.volumes_ml)
             lines.append(f"{row.tissue} ({row.role}): {volumes} mL")
         for name, found in self.alignments:
-            kept = ", ".join(f"{tissue} {mm:.2g}" for tissue, mm in found.residual_by_tissue_mm.items())
+            kept = ", ".join(f"{tissue} {length_text(mm)}" for tissue, mm in found.residual_by_tissue_mm.items())
             lines.append(f"alignment: '{name}' {found.in_words} (surfaces then lie apart by, in mm: {kept})")
         lines += [f"{name}: {words}" for name, words in self.measured.items()]
         if self.cost is not None:
@@ -146,7 +148,22 @@ class CheckReport:
                 f"expected: {cost.tets} tetrahedra, {cost.unknowns} unknowns, {cost.memory_gb:.1f} GB,"
                 f" {cost.seconds / 60.0:.1f} min with {cost.solver} on {cost.processors} processor(s)"
             )
+        if self.predicted is not None:
+            lines += self.predicted.lines()
         return "\n".join(lines)
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """A case as far as it was found good: its report, and what was made on the way.
+
+    states: its pairs of images that can be read, aligned; bodies: their meshes, none where something was refused.
+    """
+
+    report: CheckReport
+    case: Case | None = None
+    states: tuple[ImagedStates, ...] = ()
+    bodies: tuple[Body, ...] = ()
 
 
 class _Problems:
@@ -183,23 +200,32 @@ class _Problems:
 
 
 def check_case(source: Path | Case, overrides: Sequence[str], *, progress: Progress) -> CheckReport:
+    """The report of `checked_case`."""
+    return checked_case(source, overrides, progress=progress).report
+
+
+def checked_case(
+    source: Path | Case, overrides: Sequence[str] = (), *, progress: Progress, meshed: bool = True
+) -> Checked:
     """All problems of a case, or of a case file (with overrides as in `read_case`), its organs and its expected cost.
 
-    The images are aligned, and meshed if nothing was refused before, as an estimate would. Nothing is solved. Raises
-    nothing for a bad case: that is a problem, too.
+    The images are aligned, and meshed (if `meshed`, and nothing was refused before), as an estimate would. Nothing is
+    solved. Raises nothing for a bad case: that is a problem, too.
     """
     problems = _Problems()
     if isinstance(source, Case):
-        return _checked(source, problems, progress)
+        return _checked(source, problems, progress, meshed=meshed)
     case = problems.attempt(lambda: read_case(source, overrides))
-    return CheckReport(source.stem, problems.all()) if case is None else _checked(case, problems, progress)
+    if case is None:
+        return Checked(CheckReport(source.stem, problems.all()))
+    return _checked(case, problems, progress, meshed=meshed)
 
 
-def _checked(case: Case, problems: _Problems, progress: Progress) -> CheckReport:
-    """The report of a case, with the problems that were found before it."""
+def _checked(case: Case, problems: _Problems, progress: Progress, *, meshed: bool) -> Checked:
+    """The same of a case, with the problems that were found before it."""
     problems.attempt(lambda: refuse_what_cannot_be_estimated(case))
     problems.attempt(lambda: require_samples(case))
-    problems.warn(unit_warnings(case))
+    problems.warn((*unit_warnings(case), *load_warnings(case)))
     progress("reading the images")
     whole = case.phantom is not None or case.body is not None  # nothing to read one by one
     states = problems.attempt(lambda: read_states(case, progress=progress)) if whole else None
@@ -209,8 +235,8 @@ def _checked(case: Case, problems: _Problems, progress: Progress) -> CheckReport
     firsts = np.cumsum([0, *(pair.n_later for pair in pairs)]).tolist()
     pairs = [_with_data(problems, pair, case, first) for pair, first in zip(pairs, firsts, strict=False)]
     if not pairs:
-        return CheckReport(case.id, problems.all())
-    cost = problems.attempt(lambda: _cost(problems, pairs, case, progress))
+        return Checked(CheckReport(case.id, problems.all()), case)
+    cost, bodies = problems.attempt(lambda: _cost(problems, pairs, case, progress, meshed=meshed)) or (None, ())
     before, after = pairs[0].before, pairs[0].after
     names = ("before", *(f"after[{i}]" for i in range(len(after))))
     organs = tuple(
@@ -225,7 +251,8 @@ def _checked(case: Case, problems: _Problems, progress: Progress) -> CheckReport
     ]
     files = [(source.file, source.in_words) for pair in pairs for source in pair.data]
     measured_words = {f.name + (f", state {f.state}" if f.state > 1 else ""): words for f, words in files}
-    return CheckReport(case.id, problems.all(), names, organs, cost, tuple(found), measured_words)
+    report = CheckReport(case.id, problems.all(), names, organs, cost, tuple(found), measured_words)
+    return Checked(report, case, tuple(pairs), bodies)
 
 
 def _with_data(problems: _Problems, pair: ImagedStates, case: Case, first: int) -> ImagedStates:
@@ -241,20 +268,22 @@ def _lay(pair: ImagedStates) -> list[tuple[str, Registration]]:
     return list(zip(later_names(len(pair.after)), pair.alignments, strict=False))
 
 
-def _cost(problems: _Problems, pairs: Sequence[ImagedStates], case: Case, progress: Progress) -> ExpectedCost:
-    """What an estimate would cost on its very meshes; on meshes of a guessed size where something is refused."""
+def _cost(
+    problems: _Problems, pairs: Sequence[ImagedStates], case: Case, progress: Progress, *, meshed: bool
+) -> tuple[ExpectedCost, tuple[Body, ...]]:
+    """What an estimate would cost on its very meshes, and these; on meshes of a guessed size where one is refused."""
     first = pairs[0]
     cost = expected_cost(case, first.before, first.after, n_pairs=len(pairs), mesh=first.mesh)
     if first.mesh is None:
         edge = edge_length_of(case, first.before, first.after).mm
         problems.attempt(lambda: refuse_edge(edge, case_domain(first.before, case)))
     if any(problem.exit_code for problem in problems.all()):
-        return cost
-    if lack_of_memory(cost):
+        return cost, ()
+    if not meshed or lack_of_memory(cost):
         problems.found += memory_problems(cost)
-        return cost
+        return cost, ()
     bodies = [problems.attempt(partial(make_body, pair, case, progress=progress)) for pair in pairs]
-    made = [body for body in bodies if body is not None]
+    made = tuple(body for body in bodies if body is not None)
     for number, body in enumerate(made, start=1):
         problems.warn(body.findings, number)
         if body.states.mesh is None:
@@ -263,7 +292,7 @@ def _cost(problems: _Problems, pairs: Sequence[ImagedStates], case: Case, progre
         sizes = [(body.quality.tets, 3 * len(body.space.points)) for body in made]
         cost = cost_of_meshes(case, first.before, sizes, n_after=first.n_later)
     problems.found += memory_problems(cost)
-    return cost
+    return cost, () if any(problem.exit_code for problem in problems.all()) else made
 
 
 def _observe(body: Body) -> None:

@@ -20,8 +20,7 @@ from palpate.mesh import Box, SizeField, TetMesh
 from palpate.parallel import processors
 from palpate.progress import STAGES, Stage
 from palpate.study.case import Case
-from palpate.study.domain import case_domain
-from palpate.study.edge_length import EdgeLength, edge_length_of
+from palpate.study.edge_length import EdgeLength, case_domain, edge_length_of
 
 __all__ = [
     "LESS_MEMORY",

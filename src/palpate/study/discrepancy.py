@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,12 +15,14 @@ from palpate.mesh.surface import cut_faces
 from palpate.uncertainty import NORMAL_95, FittedState
 
 __all__ = [
+    "FittedMaterial",
     "FoundDiscrepancy",
     "FrameFound",
     "HeterogeneityFound",
     "OffsetFound",
     "discrepancy_findings",
     "discrepancy_of",
+    "fitted_materials",
 ]
 
 TOLD = 2.0  # standard deviations, from which an offset is said in words
@@ -71,6 +73,30 @@ class FoundDiscrepancy:
     frame: tuple[FrameFound | None, ...] = ()
     offsets: tuple[OffsetFound, ...] = ()
     heterogeneity: tuple[HeterogeneityFound, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class FittedMaterial:
+    """How the elements of a body differ from homogeneous tissues in an estimate.
+
+    log_ratio (n_tets,): ln E of each over that of its tissue; poisson_shifts: by tissue, of Poisson's ratio.
+    """
+
+    log_ratio: NDArray[np.float64]
+    poisson_shifts: Mapping[str, float]
+
+
+def fitted_materials(inversion: Inversion) -> tuple[FittedMaterial, ...]:
+    """The material of the best minimum, one a later state."""
+    parameters, found = inversion.objective.parameters, list[FittedMaterial]()
+    coefficients = parameters.coefficients(inversion.minimum.unknowns)
+    for state, of_state in zip(inversion.objective.states, coefficients, strict=True):
+        mesh, material = state.model.space.mesh, state.model.material
+        own = of_state[state.model.constraint.n_modes :]
+        logs = np.log(material.scale(own)) if material.fields.shape[1] else np.zeros(len(mesh.tets))
+        shifts = {mesh.tissues[number].name: shift for number, shift in material.poisson_shifts(own).items()}
+        found.append(FittedMaterial(logs, shifts))
+    return tuple(found)
 
 
 def discrepancy_of(inversion: Inversion, states: Sequence[FittedState]) -> FoundDiscrepancy:

@@ -12,8 +12,7 @@ from typing import Any
 
 from palpate.errors import InputDataError
 from palpate.findings import Finding
-from palpate.study.journal import is_inside
-from palpate.study.outputs import Digests, read_json, sha256_of
+from palpate.study.outputs import Digests, is_inside, read_json, sha256_of
 
 __all__ = ["RESULT", "Earlier", "earlier_files", "seal_of", "strange_files", "vouched"]
 

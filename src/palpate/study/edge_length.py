@@ -1,4 +1,4 @@
-"""The edge length of a case's tetrahedra: what it states, or one by the thickness of its organs and their surfaces."""
+"""What a case meshes: the box around its organs, and edges by their thickness where the case states none."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.images.tissue_distance import window_around
 from palpate.mechanics.dilatation import choose_element
+from palpate.mesh.anatomy import Box, domain_box, margin_box
 from palpate.study.case import Case
 
-__all__ = ["EdgeLength", "edge_length_of"]
+__all__ = ["EdgeLength", "case_domain", "edge_length_of"]
 
 ACROSS_BALL = {Role.ESTIMATE: 5.0, Role.DRIVER: 4.0}  # edges across a ball of the tissue's volume
 ACROSS_THIN = 2.5  # edges across its thickness
@@ -97,3 +98,17 @@ def _thickness(mask: NDArray[np.bool_], grid: VoxelGrid) -> float:
     steps = [-(-n // MOST_VOXELS) for n in part.shape]
     part = np.pad(part[:: steps[0], :: steps[1], :: steps[2]], 1)
     return 2.0 * float(ndimage.distance_transform_edt(part, sampling=steps * grid.spacing).max())
+
+
+def case_domain(before: Segmentation, case: Case) -> Box:
+    """The box that is meshed: all that the reference image shows, or with extent "margin" its part around the organs.
+
+    A later image with a smaller field of view shows less of it, and cuts nothing off of the body.
+    """
+    box = domain_box([before.grid])
+    if case.domain.extent == "image":
+        return box
+    shown = [i for i, tissue in enumerate(before.tissues) if tissue.role in (Role.ESTIMATE, Role.DRIVER)]
+    organs = np.isin(before.index, shown)
+    outer = np.argwhere(organs & ~ndimage.binary_erosion(organs)).astype(float)  # those inside would be many more
+    return margin_box(box, before.grid.world(outer), margin_mm=case.domain.margin_mm)

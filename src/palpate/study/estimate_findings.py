@@ -11,16 +11,15 @@ from palpate.findings import Finding
 from palpate.images.checks import later_names
 from palpate.inversion import Inversion, Outcome
 from palpate.mechanics.deformation import deformation_determinants
-from palpate.observation.contract import Imaged
+from palpate.observation.contract import Imaged, OfInstrument
 from palpate.study.together import ImagePairs
-from palpate.uncertainty import FittedState, StiffnessMap
+from palpate.uncertainty import FittedState
 
-__all__ = ["data_findings", "fold_findings", "inversion_findings", "map_findings", "pair_findings"]
+__all__ = ["data_findings", "fold_findings", "inversion_findings", "pair_findings"]
 
 STRONG_CORRELATION = 0.99
 HETEROGENEOUS = 0.01  # probability of such differences between image pairs that have the same moduli
 MISFIT = 1.5  # times the stated standard deviation: measurements that are not what they are said to be
-RESOLVED = 0.5  # share of the prior's variance that data must remove for a map to be theirs
 NOISIER, LEAST_IMAGES = 1.6, 3  # times the usual noise of so many later images: one is drawn badly
 
 
@@ -107,10 +106,24 @@ def _noisy_pairs(pairs: ImagePairs) -> Iterable[Finding]:
 
 
 def data_findings(inversion: Inversion) -> tuple[Finding, ...]:
-    """A finding for each kind of measurements beside the images that the model misses by more than is stated."""
-    findings = []
+    """A finding for each kind of measurements beside the images that the model misses by more than is stated.
+
+    And for each reading of an instrument whose sign no modulus gives.
+    """
+    findings, mapping, unknowns = [], inversion.objective.parameters, inversion.minimum.unknowns
     for line in inversion.minimum.evaluation.lines:
         seen = line.observation
+        if isinstance(seen, OfInstrument):
+            names, offsets = mapping.offset_names(line.state), mapping.offsets(unknowns, line.state)
+            offset = dict(zip(names, offsets.tolist(), strict=True)).get(seen.name, 0.0)
+            alone = seen.measured + float(line.residuals.values[0]) - offset
+            if alone * seen.measured < 0.0:
+                text = (
+                    f"the {seen.name} was measured as {seen.measured:.3g} {seen.unit}, and the motion needs one of the"
+                    f" other sign ({alone:.2g} {seen.unit} at these moduli), so that no modulus explains it: turn its"
+                    " direction round. It is positive where it pulls the surface along its direction"
+                )
+                findings.append(Finding("force-reversed", text, seen.name, place=f"in state {line.state + 1}"))
         stated, found = seen.first_noise((seen,)).sd, seen.noise_model.sd
         if not isinstance(seen, Imaged) and found > MISFIT * stated:
             text = (
@@ -140,16 +153,3 @@ def fold_findings(states: Sequence[FittedState]) -> tuple[Finding, ...]:
                 )
             )
     return tuple(findings)
-
-
-def map_findings(maps: Sequence[StiffnessMap]) -> tuple[Finding, ...]:
-    """Of every map that shows what was believed rather than what was seen."""
-    return tuple(
-        Finding(
-            "map-of-prior",
-            f"the map of '{of.tissue}' is mostly what was believed of it: the data removed {of.resolved:.0%} of the"
-            " variance of ln E inside it; use the tissue's mean, or give a displacement field ([[data]])",
-        )
-        for of in maps
-        if of.resolved < RESOLVED
-    )

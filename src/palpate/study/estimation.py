@@ -12,7 +12,6 @@ from palpate.errors import EstimationError
 from palpate.findings import Finding
 from palpate.inversion import (
     KNOWN_MODULUS,
-    Bounds,
     Inversion,
     InversionSettings,
     Iterate,
@@ -29,14 +28,20 @@ from palpate.inversion import (
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit, Imaged, OfInstrument, OfPoints, PointMotions
 from palpate.progress import Progress, silent
-from palpate.study.discrepancy import FoundDiscrepancy, discrepancy_findings, discrepancy_of
+from palpate.study.discrepancy import (
+    FittedMaterial,
+    FoundDiscrepancy,
+    discrepancy_findings,
+    discrepancy_of,
+    fitted_materials,
+)
 from palpate.study.estimate_findings import (
     data_findings,
     fold_findings,
     inversion_findings,
-    map_findings,
     pair_findings,
 )
+from palpate.study.map_words import map_findings
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio, ratio_verdict
 from palpate.study.samples import CHAINS, ModulusSamples, draw_moduli, sample_findings
 from palpate.study.together import ImagePairs, ModulusRegion, combinations_of, image_pairs_of, regions_of
@@ -75,6 +80,7 @@ __all__ = [
     "hull",
     "intervals_of",
     "no_estimate",
+    "released_of",
     "verdict",
 ]
 
@@ -116,7 +122,7 @@ class Start:
 class ModulusEstimate:
     """Young's modulus of one tissue, in `unit` (kPa, or a ratio to `relative_to`), with its 95 % interval.
 
-    interval95: what is believed with all of the model's discrepancies unknown, by which the verdict is told;
+    interval95: what is believed with all discrepancies of the model unknown, layers too, by which the verdict is told;
     interval95_given_model: what would be left if the model held. None: no interval is stated, as of every modulus that
     is not identified; `value` is None in ratio mode and when nothing converged. variance_shares: of each cause in the
     variance of ln E; profile: values (kPa, or ratios) with their signed root deviances.
@@ -187,7 +193,7 @@ class Estimation:
     known where single moduli are not; regions: joint ones of two moduli; forces, points: measured and fitted;
     image_pairs: what each of several later images says alone; samples: of the moduli's posterior,
     where the case asks for them and the estimate converged; variations: what would change the answer; maps: of tissues
-    whose modulus is a field.
+    whose modulus is a field; materials: of the elements, one a later state.
     """
 
     status: str
@@ -213,6 +219,7 @@ class Estimation:
     points: tuple[PointFit, ...] = ()
     variations: tuple[Variation, ...] = ()
     maps: tuple[StiffnessMap, ...] = ()
+    materials: tuple[FittedMaterial, ...] = ()
 
     @property
     def correlation(self) -> NDArray[np.float64]:
@@ -250,11 +257,14 @@ def conclude(
     progress(f"intervals: correlation of the residuals, and the model as {GRID_DRAWS} random voxel grids show it")
     errors = grid_errors(objective, minimum.evaluation, observed.states, rng=rng)
     covariance = covariance_of(objective, minimum.evaluation, errors, unknowns=minimum.unknowns)
+    released, remark = released_of(inversion, settings, progress=progress)
+    if released is not None:
+        covariance = covariance.with_released(objective, minimum, released)
     progress("intervals: profiles, and the fit of every surface before and after")
-    pairs = image_pairs_of(inversion, settings.bounds, errors)
+    pairs = image_pairs_of(inversion, settings.bounds, errors, released)
     fixed = frozen_posterior(objective, minimum.unknowns, minimum.evaluation)
-    known, remark = intervals_of(inversion, settings, fixed, covariance, progress=progress)
-    estimates = estimates_of(inversion, known, covariance, truth=truth)
+    known = intervals_of(inversion, settings, fixed, covariance)
+    estimates = estimates_of(inversion, known, covariance, truth=truth, layers_told=not remark)
     of_moduli = covariance.total[: len(estimates), : len(estimates)]
     stating = {e.tissue for e in estimates if e.verdict != NOT_IDENTIFIED}
     pairs = pairs and pairs.with_intervals_of(stating)
@@ -299,6 +309,7 @@ def conclude(
         image_pairs=pairs,
         samples=drawn,
         maps=maps,
+        materials=fitted_materials(inversion),
     )
 
 
@@ -374,40 +385,32 @@ class Known:
 
 
 def intervals_of(
-    inversion: Inversion,
-    settings: InversionSettings,
-    fixed: LeastSquares,
-    covariance: Covariance,
-    *,
-    progress: Progress = silent,
-) -> tuple[tuple[Known, ...], tuple[Finding, ...]]:
-    """Of each parameter its interval, none where nothing converged; it holds that with released blocks free as well.
+    inversion: Inversion, settings: InversionSettings, fixed: LeastSquares, covariance: Covariance
+) -> tuple[Known, ...]:
+    """Of each parameter its interval, none where nothing converged.
 
-    fixed: the posterior of which profiles are taken. With them a finding where the latter was not found.
+    fixed: the posterior of which profiles are taken; covariance: by all causes (see `Covariance.with_released`), as
+    which the profiles are scaled.
     """
     if not inversion.minimum.converged:
-        return (), ()
-    (released, remark), bounds = _released(inversion, settings, progress), settings.bounds
-    n = inversion.objective.n_parameters
+        return ()
+    n, bounds = inversion.objective.n_parameters, settings.bounds
     found, variances, at_bound = [], np.diag(covariance.total), bounds.reached(inversion.minimum.unknowns[:n])
     best = inversion.candidates[inversion.best]
     others = [c for c in inversion.candidates if c is not best and c.minimum.converged]
-    least = np.diag(inversion.minimum.evaluation.covariance_columns(n)[:n])
-    scales = least / variances  # of a profile's deviance
-    wider = [] if released is None else _released_intervals(released, variances - least, bounds)
+    scales = np.diag(inversion.minimum.evaluation.covariance_columns(n)[:n]) / variances  # of a profile's deviance
     for i in range(n):
         limits = {"lower": float(np.exp(bounds.lower[i])), "upper": float(np.exp(bounds.upper[i]))}
         own = modulus_interval(fixed, inversion.minimum, i, variance=float(variances[i]), bounds=bounds)
         sd = float(np.sqrt(variances[i]))
         good = [c.minimum.unknowns for c in others if as_good(c.value, best.value, scale=float(scales[i]))]
         ellipses = (log_interval(float(np.exp(x[i])), sd, **limits) for x in good)
-        interval = hull([own.ends, *ellipses, *wider[i : i + 1]])
-        found.append(Known(own, interval, bool(at_bound[i])))
-    return tuple(found), remark
+        found.append(Known(own, hull([own.ends, *ellipses]), bool(at_bound[i])))
+    return tuple(found)
 
 
-def _released(
-    inversion: Inversion, settings: InversionSettings, progress: Progress
+def released_of(
+    inversion: Inversion, settings: InversionSettings, *, progress: Progress = silent
 ) -> tuple[OuterIterate | None, tuple[Finding, ...]]:
     """The minimum with released blocks free, where there is one, and what is told where there should be."""
     try:
@@ -426,18 +429,19 @@ def _released(
     return found, (Finding("unsettled", text),)
 
 
-def _released_intervals(released: OuterIterate, beyond: NDArray[np.float64], bounds: Bounds) -> list[Interval]:
-    """Of each parameter where released blocks are free; beyond (n,): its variance by what is no least squares."""
-    minimum, n = released.minimum, len(beyond)
-    free = frozen_posterior(released.objective, minimum.unknowns, minimum.evaluation)
-    variances = np.diag(minimum.evaluation.covariance_columns(n)[:n]) + beyond
-    return [modulus_interval(free, minimum, i, variance=float(variances[i]), bounds=bounds).ends for i in range(n)]
-
-
 def estimates_of(
-    inversion: Inversion, known: Sequence[Known], covariance: Covariance, *, truth: Mapping[str, float]
+    inversion: Inversion,
+    known: Sequence[Known],
+    covariance: Covariance,
+    *,
+    truth: Mapping[str, float],
+    layers_told: bool = True,
 ) -> tuple[ModulusEstimate, ...]:
-    """What is stated of the moduli whose intervals are `known`; `truth`: true moduli (kPa) by tissue, where known."""
+    """What is stated of the moduli whose intervals are `known`; `truth`: true moduli (kPa) by tissue, where known.
+
+    layers_told: whether the covariance holds what layers round organs would do; where it does not, nothing is
+    `identified`.
+    """
     mapping, scale = inversion.objective.parameters, inversion.objective.parameters.scale_kpa
     none = [
         no_estimate(
@@ -462,6 +466,9 @@ def estimates_of(
         word, why = verdict(of.interval, at_bound=of.at_bound, absolute=mapping.absolute)
         if word != "identified" and of_scale > 0.0:
             word, why = _of_range(word, why, verdict(by_ratio, at_bound=of.at_bound, absolute=True))
+        if not layers_told and word != NOT_IDENTIFIED:
+            word = "weak" if word == "identified" else word
+            why = f"{why}, but does not hold what layers round the organs would do (warning `unsettled`)"
         points = zip(unit * np.exp(of.own.profile.theta), of.own.profile.root, strict=True)
         inside = log_interval(value, float(np.sqrt(given[i])), lower=low or 0.0, upper=high or np.inf)
         within = (inside[0] or low, inside[1] or high)

@@ -1,10 +1,10 @@
-"""Who is who: the roles of an image's labels, guessed from their names, else from their places."""
+"""Who is who: labels without names named, and the roles of labels guessed from names, else from places."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import ndimage
@@ -13,16 +13,19 @@ from palpate.errors import InputDataError
 from palpate.images.label_image import LabelImage
 from palpate.images.named_labels import MAX_NAME
 from palpate.images.tissue import Role
+from palpate.images.totalsegmentator import CLASSES
 from palpate.study.case import is_tissue_name
-from palpate.study.plausibility import usual_modulus
+from palpate.study.plausibility import TABLE, usual_stiffness
 
-__all__ = ["GuessedTissue", "guess_tissues"]
+__all__ = ["ClassNames", "GuessedTissue", "class_names", "guess_tissues"]
 
 SURROUNDINGS = "surroundings"
 BORDER_SHARE = 0.1  # of the image's border that the body, or the air around it, covers
 STILL_SHARE = 0.005  # of a label's voxels
 NEAR_MM = 15.0  # between the colon and an organ that it may move
 HOLLOW_CHANGE = 0.10  # of a volume: no solid organ changes so much between two scans
+BONE = "is bone"
+ENOUGH = 2  # pairs of left and right; one may lie right by chance
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,58 +57,9 @@ def _words(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
 
-BONE = "is bone"
-RULES = (
-    _Rule(_words("background air outside exterior external void"), Role.VOID, "is no part of the body"),
-    _Rule(
-        _words("tumour tumor tumours tumors lesion lesions cancer carcinoma gtv nodule metastasis"),
-        Role.ESTIMATE,
-        "is a tumour",
-    ),
-    _Rule(_words("renal kidney kidneys"), Role.ESTIMATE, "is a solid organ"),  # before the bony pelvis
-    _Rule(
-        _words(
-            "bone bones femur femurs femoral sacrum coccyx pelvis pelvic vertebra vertebrae spine hip hips ilium"
-            " ischium pubis rib ribs skull cranium tibia fibula humerus scapula clavicula clavicle sternum patella"
-            " mandible"
-        ),
-        Role.RIGID,
-        BONE,
-    ),
-    _Rule(
-        _words("rectum anorectum rectal lumen balloon probe transducer"),
-        Role.DRIVER,
-        "is hollow, and its wall moves the others",
-    ),
-    _Rule(
-        _words("muscle muscles gluteus gluteal iliopsoas psoas autochthon obturator levator fat adipose"),
-        Role.KNOWN,
-        "has a published stiffness",
-    ),
-    _Rule(
-        _words("surroundings surrounding body rest remaining remainder other others soft tissue tissues"),
-        Role.KNOWN,
-        "is what surrounds the organs",
-        rest=True,
-    ),
-    _Rule(
-        _words(
-            "artery arteries vein veins vessel vessels aorta vena cava nerve cord canal bowel colon intestine duodenum"
-            " stomach oesophagus esophagus trachea trunk disc discs skin cartilage cartilages costal lymph node ureter"
-            " urethra atrial appendage"
-        ),
-        None,
-        "is neither observed nor held",
-        rest=True,
-    ),
-    _Rule(
-        _words(
-            "prostate prostatic bladder liver spleen pancreas uterus cervix ovary breast brain heart lung lungs lobe"
-            " thyroid gland vesicle vesicles zone organ testis penis gallbladder adrenal"
-        ),
-        Role.ESTIMATE,
-        "is an organ",
-    ),
+RULES = tuple(
+    _Rule(_words(entry["words"]), Role(entry["role"]) if "role" in entry else None, entry["meaning"], "rest" in entry)
+    for entry in TABLE["role"]
 )
 
 UNLABELLED = _words("background clear label unlabelled unlabeled none")
@@ -143,7 +97,9 @@ def guess_tissues(before: LabelImage, after: Sequence[LabelImage] = ()) -> tuple
     roles = (Role.ESTIMATE, Role.DRIVER, Role.RIGID, None, Role.KNOWN)
     tumours = [g for g in organs if g.role is Role.ESTIMATE and "tumour" in g.reason]
     organs.sort(key=lambda g: (g not in tumours, roles.index(g.role), sum(sizes[label] for label in g.labels)))
-    return tuple(_renamed([*organs, *_surroundings(rest, before), *outside]))
+    known = [g for g in organs if g.role is Role.KNOWN]
+    others = [g for g in organs if g.role is not Role.KNOWN]
+    return tuple(_renamed([*others, *_surroundings(rest, before), *known, *outside]))
 
 
 def _guess(label: int, before: LabelImage, after: Sequence[LabelImage], border: dict[int, float]) -> GuessedTissue:
@@ -159,13 +115,13 @@ def _guess(label: int, before: LabelImage, after: Sequence[LabelImage], border: 
             reason = f"'{found[0]}' {rule.meaning}"
             if rule.rest:
                 return GuessedTissue(SURROUNDINGS, (label,), Role.KNOWN, f"'{name}' {rule.meaning}")
-            usual = usual_modulus(name) if rule.role is Role.KNOWN else None
+            usual = usual_stiffness(name) if rule.role is Role.KNOWN else None
             return GuessedTissue(
                 name,
                 (label,),
                 rule.role,
-                reason if usual is None else f"{reason}: {usual.source}",
-                None if usual is None else usual.kpa,
+                reason if usual is None else f"{reason}: {usual.reference}",
+                None if usual is None else usual.usual_kpa,
             )
     return GuessedTissue(name, (label,), None, f"no rule knows the name '{name}'")
 
@@ -254,30 +210,56 @@ def _surroundings(rest: list[GuessedTissue], before: LabelImage) -> list[Guessed
     """One tissue for all that is left, with a modulus between those of fat and muscle."""
     if not rest:
         return []
-    fat, muscle = usual_modulus("fat"), usual_modulus("muscle")
+    fat, muscle = usual_stiffness("fat"), usual_stiffness("muscle")
     if fat is None or muscle is None:  # both stand in the table
         return []
-    value = round(float(np.sqrt(fat.kpa * muscle.kpa)), 2)
+    value = round(float(np.sqrt(fat.usual_kpa * muscle.usual_kpa)), 2)
     named = [before.names.get(g.labels[0], f"label {g.labels[0]}") for g in rest]
     reason = (
         f"all that no other tissue names ({', '.join(named)}); {value:g} kPa lies between fat and muscle"
-        f" ({muscle.source})"
+        f" ({muscle.reference})"
     )
     return [GuessedTissue(SURROUNDINGS, (), Role.KNOWN, reason, value)]
 
 
 def _renamed(guesses: Sequence[GuessedTissue]) -> list[GuessedTissue]:
-    """Known tissues after the surroundings; every name once, and none that a case file does not take for a tissue."""
-    known = [g for g in guesses if g.role is Role.KNOWN and g.name != SURROUNDINGS]
-    rest = [g for g in guesses if g.name == SURROUNDINGS]
-    others = [g for g in guesses if g.role not in (Role.KNOWN, Role.VOID)]
-    outside = [g for g in guesses if g.role is Role.VOID]
+    """Every name once, and none that a case file does not take for a tissue."""
     found: list[GuessedTissue] = []
     taken: set[str] = set()
-    for guess in [*others, *rest, *known, *outside]:
+    for guess in guesses:
         number = guess.labels[0] if guess.labels else "rest"
         name = guess.name if is_tissue_name(guess.name) else f"label {number}"
         name = name if name not in taken else f"{name[: MAX_NAME - 10]} {number}"
         taken.add(name)
         found.append(replace(guess, name=name))
     return found
+
+
+@dataclass(frozen=True, slots=True)
+class ClassNames:
+    """The task whose numbers the labels are, their names, and how many pairs of left and right say so."""
+
+    task: str = ""
+    names: Mapping[int, str] = field(default_factory=dict)
+    pairs: int = 0
+
+
+def class_names(image: LabelImage) -> ClassNames:
+    """What the labels of an image without names are called, empty where that cannot be told.
+
+    Every label must be a class of the task, and each left one lie to the left of its right one. With fewer than two
+    such pairs nothing is assumed.
+    """
+    present = [int(label) for label in np.unique(image.labels) if label]
+    if image.names or not present:
+        return ClassNames()
+    centres = np.array(ndimage.center_of_mass(image.labels > 0, image.labels, present))
+    x = dict(zip(present, image.grid.world(centres)[:, 0], strict=True))
+    found = [ClassNames()]
+    for task, classes in CLASSES.items():
+        names = {number: name for name, number in classes.items() if number in x}
+        sides = [(n, classes[name.replace("left", "right")]) for n, name in names.items() if "left" in name]
+        pairs = [(left, right) for left, right in sides if right in x]
+        if len(names) == len(present) and len(pairs) >= ENOUGH and all(x[left] < x[right] for left, right in pairs):
+            found.append(ClassNames(task, names, len(pairs)))
+    return max(found, key=lambda known: known.pairs)

@@ -11,8 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from palpate.errors import FolderInUse, ResourceError
-from palpate.study.journal import recover
-from palpate.study.outputs import make_folder
+from palpate.study.outputs import make_folder, recover
 
 if sys.platform != "win32":
     import fcntl

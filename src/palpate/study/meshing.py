@@ -18,8 +18,7 @@ from palpate.mesh.tetrahedralise import tetrahedralise
 from palpate.progress import Progress
 from palpate.study.case import Case
 from palpate.study.cost import expected_cost, lack_of_memory
-from palpate.study.domain import case_domain
-from palpate.study.edge_length import EdgeLength, edge_length_of
+from palpate.study.edge_length import EdgeLength, case_domain, edge_length_of
 
 __all__ = ["ReferenceMesh", "mesh_reference", "refuse_edge"]
 

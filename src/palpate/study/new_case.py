@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -12,23 +13,22 @@ import numpy as np
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.label_image import LabelImage
 from palpate.images.label_table import read_label_table
-from palpate.images.named_labels import printable
+from palpate.images.named_labels import MAX_NAME, printable
 from palpate.images.readers import read_intensities, read_label_image
 from palpate.images.tissue import Role
-from palpate.study.background import Background, background_of
 from palpate.study.case import REMAINING
 from palpate.study.case_as_run import CASE_NAME
-from palpate.study.class_names import class_names
-from palpate.study.guess import GuessedTissue, guess_tissues
+from palpate.study.case_file import relative_path, toml_key, toml_text
+from palpate.study.guess import GuessedTissue, class_names, guess_tissues
 from palpate.study.outputs import OutputFolder, read_regular, write_text
-from palpate.study.proposed_mesh import MARGIN_MM, proposed_edge, proposed_window
-from palpate.study.toml_text import relative_path, toml_key, toml_text
+from palpate.study.proposed_mesh import MARGIN_MM, Background, background_of, proposed_edge, proposed_window
 
 __all__ = ["CaseImages", "NewCase", "new_case", "write_new_case"]
 
 LARGEST_CASE = 1_000_000  # bytes
 WIDE_MM = 250.0  # of an image: more than the body of many, so that it must show what lies around, too
 GUESSED_WITHIN = 2.0  # times and by what a known modulus is guessed: measured ones of one tissue differ so
+LEAST_NAME = 3  # letters that images' names share, to be a case's name
 ROLES = (
     "  estimate: its stiffness is wanted; its surface is looked at in all images",
     "  known:    its youngs_modulus_kpa is given; the first one sets the scale of all results",
@@ -144,7 +144,8 @@ def new_case(images: CaseImages, folder: Path) -> NewCase:
     elif background is not None:
         notes.append(background.in_words)
     from_ct = background is not None and background.has_air
-    blocks = [_heading(questions, notes), _images(images, folder, from_ct=from_ct)]
+    named_by = _identifier([images.before, *images.after])
+    blocks = [f"{_heading(questions, notes)}\nid = {toml_text(named_by)}", _images(images, folder, from_ct=from_ct)]
     share = float(np.prod([s.stop - s.start for s in window]) / before.labels.size)
     if share < 1.0:
         blocks.append(f'[domain]\nextent = "margin"  # {MARGIN_MM:g} mm around the organs: {share:.0%} of the image')
@@ -153,6 +154,15 @@ def new_case(images: CaseImages, folder: Path) -> NewCase:
         blocks.append(f"[mesh]\nedge_length_mm = {proposed[0]:g}  # {proposed[1]}")
     blocks += [_tissue(tissue, before) for tissue in tissues]
     return NewCase(folder / CASE_NAME, "\n\n".join(blocks) + "\n", tissues, questions)
+
+
+def _identifier(images: Sequence[Path]) -> str:
+    """What the images' names begin with alike; else the name of their folder."""
+    letters = zip(*(path.name.split(".")[0] for path in images), strict=False)
+    alike = "".join(same[0] for same in takewhile(lambda same: len(set(same)) == 1, letters)).strip("-_ ")
+    folder = images[0].absolute().parent.name
+    found = alike if len(alike) >= LEAST_NAME else folder or alike
+    return printable(found)[:MAX_NAME] or "case"
 
 
 def _background(

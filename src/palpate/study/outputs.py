@@ -1,4 +1,9 @@
-"""The files that a run writes: made out of sight in the output folder, put in place all together or not at all."""
+"""The files that a run writes: made out of sight in the output folder, put in place all together or not at all.
+
+New files are made in `.writing-outputs/new`. When all are on the disk, those that give way step aside into `old`; then
+`new` is renamed to `ready`, which decides: from here on the new files move to their places, before it the old ones
+would move back. Either is done by whoever finds such a folder, so a kill is completed or undone by the next command.
+"""
 
 from __future__ import annotations
 
@@ -6,32 +11,29 @@ import errno
 import hashlib
 import json
 import os
+import shutil
+import signal
 import stat
+import threading
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from types import FrameType
 from typing import Any
 
 from palpate.errors import InputDataError, ResourceError
-from palpate.study.journal import (
-    STAGING,
-    carry_out,
-    clear,
-    interrupts_deferred,
-    is_inside,
-    is_unfinished,
-    recover,
-    sync_folder,
-)
 
 __all__ = [
+    "STAGING",
     "Digests",
     "OutputFolder",
     "Staging",
+    "is_inside",
     "make_folder",
     "read_json",
     "read_regular",
+    "recover",
     "sha256_of",
     "staged",
     "write_bytes",
@@ -41,10 +43,11 @@ __all__ = [
 
 Digests = Mapping[str, Mapping[str, str]]  # name of a file in the folder -> {"sha256": hexadecimal}
 
-NEW = "new"  # in the hidden folder: what takes its place
-OLD = "old"  # what gave way
+STAGING = ".writing-outputs"  # the hidden folder in an output folder
+NEW, READY, OLD = "new", "ready", "old"  # in it: being made; about to take their places; what gives way
 ASIDE = ".earlier"  # behind the name of a file that is set aside
 LARGEST_DOCUMENT = 2**26  # bytes of a JSON document that is read
+SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,12 +68,11 @@ class Staging:
     @property
     def unfinished(self) -> bool:
         """Whether a `commit` that failed is left to the next run in the folder, for it could not be undone either."""
-        return is_unfinished(self.folder)
+        return _is_unfinished(self.folder)
 
     def names(self) -> tuple[str, ...]:
         """The staged files, relative to the folder, with slashes; sorted, documents that list others last."""
-        names = [path.relative_to(self.area).as_posix() for path in self.area.rglob("*") if path.is_file()]
-        return tuple(sorted(names, key=lambda name: (name.endswith(".json"), name)))
+        return _files(self.area)
 
     def digests(self) -> dict[str, dict[str, str]]:
         """SHA-256 of each staged file, which tells a run's own files from an earlier run's."""
@@ -87,27 +89,19 @@ class Staging:
         Killed in between, the next run in the folder completes it. Raises `ResourceError` when the disk refuses, with
         everything as it was, unless it is left `unfinished`: else it may be tried again.
         """
-        names = self.names()
-        _refuse_improper(self.folder, (*names, *(f"{name}{ASIDE}" for name in aside)))
-        leaving = [name for name in (*reversed(names), *retired) if (self.folder / name).exists()]
-        renames = [(name, f"{STAGING}/{OLD}/{name}") for name in leaving]
-        for name in aside:
-            if (self.folder / f"{name}{ASIDE}").exists():
-                renames.append((f"{name}{ASIDE}", f"{STAGING}/{OLD}/{name}{ASIDE}"))
-            renames.append((name, f"{name}{ASIDE}"))
-        renames += [(f"{STAGING}/{NEW}/{name}", name) for name in names]
+        names, renamed = self.names(), [f"{name}{ASIDE}" for name in aside]
+        _refuse_improper(self.folder, (*names, *renamed))
         try:
-            for name in names:  # to the disk
-                with (self.area / name).open("rb+") as file:
-                    os.fsync(file.fileno())
-            for _, target in renames:
-                (self.folder / target).parent.mkdir(parents=True, exist_ok=True)
-            for place in (self.area, *(path for path in self.area.rglob("*") if path.is_dir())):
-                sync_folder(place)
-            with interrupts_deferred():
-                carry_out(self.folder, renames)
+            for name in aside:
+                shutil.copy2(self.folder / name, self.area / f"{name}{ASIDE}")
+            # documents that list others leave first
+            leaving = [*reversed(names), *renamed, *retired, *(name for name in aside if name not in names)]
+            with _interrupts_deferred():
+                _exchange(self.folder, [name for name in leaving if (self.folder / name).exists()])
                 self.written.extend(names)
         except OSError as error:
+            with suppress(OSError):
+                self.discard(*renamed)
             raise _refused(self.folder, error) from error
 
 
@@ -124,8 +118,16 @@ class OutputFolder:
 
     def same_files(self, names: Iterable[str], files: Iterable[Path]) -> list[str]:
         """Those of `names` in the folder that are one of `files`, of which some may not exist."""
+
+        def same(path: Path, other: Path) -> bool:
+            """Whether both are one file."""
+            try:
+                return path.samefile(other)
+            except (OSError, ValueError):
+                return False
+
         others = list(files)
-        return [name for name in names if any(_is_same(self.path / name, file) for file in others)]
+        return [name for name in names if any(same(self.path / name, file) for file in others)]
 
     @contextmanager
     def staged(self) -> Iterator[Staging]:
@@ -139,7 +141,145 @@ class OutputFolder:
         except OSError as error:
             raise _refused(self.path, error) from error
         finally:
-            clear(self.path)
+            _clear(self.path)
+
+
+def recover(folder: Path) -> None:
+    """Complete or undo what a killed run left in `folder`, which this process holds, and remove its hidden files.
+
+    Raises `ResourceError` when the renames are refused again, or the hidden folder is not one of Palpate's.
+    """
+    area = folder / STAGING
+    if any(path.is_symlink() or (path.exists() and not path.is_dir()) for path in (area, area / READY, area / OLD)):
+        raise ResourceError(f"{area} is no folder of Palpate's: remove it, or choose another --output folder")
+    try:
+        with _interrupts_deferred():
+            _settle(folder)
+    except OSError as error:
+        raise ResourceError(
+            f"{area} holds what an interrupted run left, and it cannot be completed ({error.strerror or error}): give"
+            " the right to write there, or choose another --output folder"
+        ) from error
+    _clear(folder)
+
+
+def _exchange(folder: Path, leaving: Iterable[str]) -> None:
+    """Let the `leaving` files step aside and the staged ones take their places; raises `OSError` with all as it was."""
+    area = folder / STAGING
+    try:
+        for name in _files(area / NEW):
+            with (area / NEW / name).open("rb+") as file:
+                os.fsync(file.fileno())
+        _sync_folders(area / NEW)
+        for name in leaving:
+            _move(folder / name, area / OLD / name)
+        _sync_folders(area / OLD, *{(folder / name).parent for name in leaving})
+        (area / NEW).replace(area / READY)  # it is decided
+        _sync_folders(area)
+        _settle(folder)
+    except OSError as error:
+        try:
+            decided = _settle(folder)
+        except OSError as again:
+            whose = "new files" if (area / READY).exists() else "files that were there"
+            raise ResourceError(
+                f"cannot write in {folder} ({again.strerror or again}): the {whose} are whole in {area}, from which the"
+                " next command with this folder completes them"
+            ) from error
+        if not decided:
+            raise
+
+
+def _settle(folder: Path) -> bool:
+    """Move files that are ready to their places, or else back what has stepped aside; whether it were those ready."""
+    area = folder / STAGING
+    decided = (area / READY).is_dir()
+    source = area / (READY if decided else OLD)
+    for name in _files(source):
+        if not is_inside(folder, name):
+            raise ResourceError(f"{folder / name} leads out of the folder through a link: remove the link")
+        if decided or not os.path.lexists(folder / name):
+            _move(source / name, folder / name)
+            _sync_folders((folder / name).parent)
+    if decided:  # what stepped aside must not come back
+        for name in _files(area / OLD):
+            if (folder / name).parent != folder:
+                with suppress(OSError):  # not empty
+                    (folder / name).parent.rmdir()
+        shutil.rmtree(area / OLD, ignore_errors=True)
+        if not _files(area / OLD):
+            shutil.rmtree(area / READY)
+    return decided
+
+
+def _is_unfinished(folder: Path) -> bool:
+    return (folder / STAGING / READY).exists() or bool(_files(folder / STAGING / OLD))
+
+
+def _clear(folder: Path) -> None:
+    """Remove the hidden folder, unless there is something to complete or to undo."""
+    if not _is_unfinished(folder):
+        shutil.rmtree(folder / STAGING, ignore_errors=True)
+
+
+def _files(folder: Path) -> tuple[str, ...]:
+    """Regular files below `folder`, relative to it, with slashes; sorted, documents that list others last."""
+    paths = [path for path in folder.rglob("*") if path.is_file() and not path.is_symlink()]
+    names = [path.relative_to(folder).as_posix() for path in paths]
+    return tuple(sorted(names, key=lambda name: (name.endswith(".json"), name)))
+
+
+def _move(path: Path, place: Path) -> None:
+    place.parent.mkdir(parents=True, exist_ok=True)
+    path.replace(place)
+
+
+def _sync_folders(*folders: Path) -> None:
+    """Bring the names in folders, and in those below a hidden one, to the disk, where the system lets us."""
+    for folder in folders:
+        below = [path for path in folder.rglob("*") if path.is_dir()] if STAGING in folder.parts else []
+        for place in (folder, *below):
+            with suppress(OSError):
+                file = os.open(place, os.O_RDONLY)
+                try:
+                    os.fsync(file)
+                finally:
+                    os.close(file)
+
+
+@contextmanager
+def _interrupts_deferred() -> Iterator[None]:
+    """Keep signals that end a run until the block has ended; then they reach the handlers that were there before."""
+    if threading.current_thread() is not threading.main_thread():  # signals interrupt the main thread only
+        yield
+        return
+    came: list[int] = []
+
+    def keep(number: int, frame: FrameType | None) -> None:
+        """Remember the signal."""
+        del frame
+        came.append(number)
+
+    numbers = [getattr(signal, name) for name in SIGNALS if hasattr(signal, name)]
+    handlers = {number: signal.getsignal(number) for number in numbers}
+    ours = {number: handler for number, handler in handlers.items() if handler not in (signal.SIG_IGN, None)}
+    try:
+        for number in ours:
+            signal.signal(number, keep)
+        yield
+    finally:
+        for number, handler in ours.items():
+            signal.signal(number, handler)
+        for number in came:
+            signal.raise_signal(number)
+
+
+def is_inside(folder: Path, name: str) -> bool:
+    """Whether `name` is the relative path of something in `folder`, reached through no link and no `..`."""
+    path = PurePosixPath(name)
+    if not path.parts or path.is_absolute() or ".." in path.parts or "\0" in name or str(path) != name:
+        return False
+    return not any((folder / parent).is_symlink() for parent in path.parents if parent.parts)
 
 
 def staged(folder: Path) -> AbstractContextManager[Staging]:
@@ -222,13 +362,6 @@ def sha256_of(path: Path) -> str:
         raise _refused(path, error) from error
 
 
-def _is_same(path: Path, other: Path) -> bool:
-    try:
-        return path.samefile(other)
-    except (OSError, ValueError):
-        return False
-
-
 def _refuse_improper(folder: Path, names: Iterable[str]) -> None:
     """Raise `ResourceError` where something that no file can replace has a name that is to be written in `folder`.
 
@@ -240,27 +373,21 @@ def _refuse_improper(folder: Path, names: Iterable[str]) -> None:
         try:
             if not is_inside(folder, name):
                 raise ResourceError(f"{path} leads out of the folder through a link: remove the link")
-            if os.path.lexists(path):
-                _refuse_target(path)
+            if not os.path.lexists(path):
+                continue
+            if not stat.S_ISREG(path.lstat().st_mode):
+                raise ResourceError(
+                    f"{path} is no regular file (a folder, a link, a pipe ...), so the new {path.name} cannot take its"
+                    " place: remove it, or choose another --output folder"
+                )
+            os.close(os.open(path, os.O_WRONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)))
         except OSError as error:
-            raise _refused(path, error) from error
+            if error.errno != errno.EACCES:  # no hindrance to replacing; EPERM: protected by the file system
+                raise _refused(path, error) from error
 
 
 def _no_constant(name: str) -> float:
     raise ValueError(f"it holds {name}")
-
-
-def _refuse_target(path: Path) -> None:
-    if not stat.S_ISREG(path.lstat().st_mode):
-        raise ResourceError(
-            f"{path} is no regular file (a folder, a link, a pipe ...), so the new {path.name} cannot take its place:"
-            " remove it, or choose another --output folder"
-        )
-    try:
-        os.close(os.open(path, os.O_WRONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)))
-    except PermissionError as error:
-        if error.errno == errno.EPERM:  # protected by the file system; EACCES is no hindrance to replacing
-            raise
 
 
 def _refused(path: Path, error: OSError) -> ResourceError:

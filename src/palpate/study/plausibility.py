@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import math
+import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any
 
 from palpate.findings import Finding
 from palpate.images.tissue import Role
@@ -12,13 +16,13 @@ from palpate.study.estimation import Estimation
 
 __all__ = [
     "PUBLISHED",
+    "TABLE",
     "PublishedStiffness",
-    "UsualModulus",
     "estimate_warnings",
     "plausibility_warnings",
     "published_for",
     "unit_warnings",
-    "usual_modulus",
+    "usual_stiffness",
 ]
 
 MARGIN = 3.0  # methods differ by ten to a hundred times: an estimate is doubtful only well outside what was published
@@ -41,97 +45,29 @@ class PublishedStiffness:
     source: str
     unless: tuple[str, ...] = ()
 
+    @property
+    def usual_kpa(self) -> float:
+        """A Young's modulus (kPa) that the tissue may be given before anything better is known: the geometric mean."""
+        return round(math.sqrt(self.low * self.high), 3)
 
-@dataclass(frozen=True, slots=True)
-class UsualModulus:
-    """A Young's modulus (kPa) that a tissue may be given before anything better is known, and where it comes from."""
-
-    kpa: float
-    source: str
+    @property
+    def reference(self) -> str:
+        """How it was measured and where it was published."""
+        return f"{self.method}; {self.source}"
 
 
-PUBLISHED = (
+TABLE: dict[str, list[dict[str, Any]]] = tomllib.loads((files("palpate.study") / "tissues.toml").read_text("utf-8"))
+PUBLISHED = tuple(
     PublishedStiffness(
-        "prostate",
-        ("prostate", "prostatic", "central_gland", "peripheral_zone", "transition_zone"),
-        8.0,
-        26.0,
-        "indentation ex vivo, 552 sites of 46 glands, without cancer: 17.0 +- 9.0 kPa",
-        "Ahn et al., Urology 76 (2010) 1007",
-    ),
-    PublishedStiffness(
-        "prostate",
-        ("prostate", "prostatic", "central_gland", "peripheral_zone", "transition_zone"),
-        12.9,
-        36.7,
-        "static palpation in vivo, 12 patients, without cancer: 24.8 (interquartile range 11.9) kPa",
-        "doi 10.1177/09544119231154305",
-    ),
-    PublishedStiffness(
-        "prostate",
-        ("prostate", "prostatic"),
-        660.0,
-        660.0,
-        "tensile test, cadaver, transverse",
-        "Berardo et al.",
-    ),
-    PublishedStiffness(
-        "prostate cancer",
-        ("tumour", "tumor", "lesion", "cancer", "carcinoma"),
-        9.6,
-        38.6,
-        "indentation ex vivo, 552 sites of 46 glands: 24.1 +- 14.5 kPa",
-        "Ahn et al., Urology 76 (2010) 1007",
-    ),
-    PublishedStiffness(
-        "bladder wall",
-        ("bladder",),
-        214.0,
-        470.0,
-        "tensile test of the wall, linear range",
-        "Muslov et al. (2025)",
-        unless=("gall",),
-    ),
-    PublishedStiffness(
-        "colon and rectum wall",
-        ("colon", "rectum", "colorectal", "bowel"),
-        1830.0,
-        5180.0,
-        "tensile test of the wall: pig 1.83 MPa, human 5.18 MPa",
-        "doi 10.1186/s40064-015-0922-x",
-    ),
-    PublishedStiffness(
-        "liver",
-        ("liver", "hepatic"),
-        4.2,
-        6.6,
-        "shear modulus 1.8 +- 0.4 kPa, E = 3 G",
-        "PMC6925591, table 1",
-    ),
-    PublishedStiffness(
-        "fat",
-        ("fat", "adipose"),
-        2.25,
-        2.25,
-        "magnetic resonance elastography at 50 Hz: shear modulus 0.75 kPa, E = 3 G",
-        "Hatt et al. (2023), doi 10.1016/j.jmbbm.2023.105924",
-    ),
-    PublishedStiffness(
-        "muscle",
-        ("muscle", "gluteal", "gluteus", "iliopsoas"),
-        3.0,
-        3.0,
-        "magnetic resonance elastography at 50 Hz: shear modulus 1.0 kPa, E = 3 G",
-        "Hatt et al. (2023), doi 10.1016/j.jmbbm.2023.105924",
-    ),
-    PublishedStiffness(
-        "muscle",
-        ("muscle", "gluteal", "gluteus", "iliopsoas"),
-        1.5,
-        282.0,
-        "shear wave speed in vivo 0.7 to 9.7 m/s, E = 3 rho c^2 with rho = 1000 kg/m^3",
-        "PMC9631468, table 3",
-    ),
+        entry["tissue"],
+        tuple(entry["words"]),
+        entry["low"],
+        entry["high"],
+        entry["method"],
+        entry["source"],
+        tuple(entry.get("unless", ())),
+    )
+    for entry in TABLE["published"]
 )
 
 
@@ -144,13 +80,9 @@ def published_for(name: str) -> tuple[PublishedStiffness, ...]:
     return tuple(tumours or found)
 
 
-def usual_modulus(name: str) -> UsualModulus | None:
-    """The geometric mean of the narrowest published range for a tissue's name; None when nothing was published."""
-    entries = published_for(name)
-    if not entries:
-        return None
-    entry = min(entries, key=lambda item: item.high / item.low)
-    return UsualModulus(round((entry.low * entry.high) ** 0.5, 3), f"{entry.method}; {entry.source}")
+def usual_stiffness(name: str) -> PublishedStiffness | None:
+    """What was published for a tissue's name in the narrowest range; None when nothing was."""
+    return min(published_for(name), key=lambda entry: entry.high / entry.low, default=None)
 
 
 def plausibility_warnings(moduli_kpa: Mapping[str, float]) -> tuple[Finding, ...]:
@@ -158,7 +90,21 @@ def plausibility_warnings(moduli_kpa: Mapping[str, float]) -> tuple[Finding, ...
 
     A bladder is not compared with its wall: meshed as one solid it has an effective modulus, which none published.
     """
-    return tuple(warning for name, value in moduli_kpa.items() for warning in _out_of_range(name, value))
+    found = []
+    for name, value in moduli_kpa.items():
+        walls = "wall" in name.lower()
+        entries = [entry for entry in published_for(name) if walls or not entry.tissue.endswith("wall")]
+        low, high = min((e.low for e in entries), default=0.0), max((e.high for e in entries), default=math.inf)
+        if low / MARGIN <= value <= high * MARGIN:
+            continue
+        closest = min(entries, key=lambda entry: min(abs(value - entry.low), abs(value - entry.high)))
+        text = (
+            f"{name}: {value:.3g} kPa lies more than {MARGIN:g} times outside the published range for {closest.tissue}"
+            f" ({low:g} to {high:g} kPa; nearest: {closest.reference}). Check the `known` tissue's"
+            " modulus, the labels and the boundary before you believe it"
+        )
+        found.append(Finding("implausible-stiffness", text))
+    return tuple(found)
 
 
 def estimate_warnings(estimation: Estimation) -> tuple[Finding, ...]:
@@ -190,20 +136,3 @@ def unit_warnings(case: Case) -> tuple[Finding, ...]:
                 )
             )
     return tuple(hints)
-
-
-def _out_of_range(name: str, value: float) -> Iterable[Finding]:
-    walls = "wall" in name.lower()
-    entries = [entry for entry in published_for(name) if walls or not entry.tissue.endswith("wall")]
-    if not entries:
-        return
-    low, high = min(entry.low for entry in entries), max(entry.high for entry in entries)
-    if low / MARGIN <= value <= high * MARGIN:
-        return
-    closest = min(entries, key=lambda entry: min(abs(value - entry.low), abs(value - entry.high)))
-    yield Finding(
-        "implausible-stiffness",
-        f"{name}: {value:.3g} kPa lies more than {MARGIN:g} times outside the published range for {closest.tissue}"
-        f" ({low:g} to {high:g} kPa; nearest: {closest.method}; {closest.source}). Check the `known` tissue's modulus,"
-        " the labels and the boundary before you believe it",
-    )

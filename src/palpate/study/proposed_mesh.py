@@ -1,14 +1,17 @@
-"""What a case to be should mesh: a box around the organs, and an edge length for which there is the memory."""
+"""What a case to be should mesh: a box around the organs, edges for which there is the memory, and how much is air."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
 
-from palpate.images.label_image import LabelImage
+from palpate.images.body_in_ct import outside_body, shows_air
+from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.segmentation import segment
 from palpate.images.tissue import Role
 from palpate.study.case import REMAINING, Case, CaseTissue, Domain, Images, MeshSettings
@@ -16,12 +19,14 @@ from palpate.study.cost import MEMORY_FACTOR, cost_of_meshes, expected_size, mac
 from palpate.study.edge_length import edge_length_of
 from palpate.study.guess import GuessedTissue
 
-__all__ = ["MARGIN_MM", "proposed_edge", "proposed_window"]
+__all__ = ["MARGIN_MM", "Background", "background_of", "proposed_edge", "proposed_window"]
 
 MARGIN_MM = 40.0
 CROP_BELOW = 0.6  # a domain of the margin's box is proposed when it saves so much of the image
 STEP_MM, LONGEST_MM = 0.5, 12.0  # in which edges grow until the memory does, and where that ends
 SOME_KPA = 1.0  # a modulus, on which no size depends
+CORNERS, SAMPLES = 20_000, 50_000  # voxels that make the hull, and that are held against it, at the most
+LITTLE = 0.001  # of label 0: no air worth a tissue
 
 
 def proposed_window(before: LabelImage, tissues: Sequence[GuessedTissue]) -> tuple[slice, ...]:
@@ -73,3 +78,65 @@ def proposed_edge(
     if edge > suited.mm:
         why = f"{suited.mm:g} mm would suit the organs ({why}), but this machine has {has:.0f} GB of memory"
     return edge, why
+
+
+@dataclass(frozen=True, slots=True)
+class Background:
+    """Label 0 inside the domain: its share of that, and the share of it outside the body.
+
+    `seen`: the body was seen in a CT; else its outside is what lies beyond the convex hull of all labels, of which
+    some may still be body.
+    """
+
+    share: float
+    outside: float
+    seen: bool
+
+    @property
+    def has_air(self) -> bool:
+        """Whether a CT shows air in it that is worth a tissue."""
+        return self.seen and self.outside > LITTLE
+
+    @property
+    def in_words(self) -> str:
+        """What it is taken for, and how much of it may be wrong."""
+        of = f"label 0 ({self.share:.0%} of what is meshed)"
+        if self.seen:
+            return f"{of} is air around the body for {self.outside:.1%} of its volume, by the CT; the rest is tissue"
+        return (
+            f"{of} is taken for tissue of the body throughout, and {self.outside:.0%} of its volume lies beyond the"
+            " convex hull of all labels, where no label tells tissue from air. Air that is taken for tissue holds the"
+            " organs as tissue would: give the CT (palpate init ... --ct CT), or label the body (TotalSegmentator's"
+            " task body) in all images"
+        )
+
+
+def background_of(
+    image: LabelImage, window: tuple[slice, ...], ct: tuple[NDArray[np.float32], VoxelGrid] | None
+) -> Background | None:
+    """Label 0 of the part `window` of `image`; `ct`: HU (nx, ny, nz) and their grid. None where there is no label 0.
+
+    A grey image without air, as of an MR, tells nothing.
+    """
+    zero = image.labels[window] == 0
+    if not zero.any():
+        return None
+    share = float(zero.mean())
+    if ct is not None and shows_air(ct[0]):
+        outside = outside_body(*ct, image.grid)[window]
+        return Background(share, float(np.count_nonzero(outside & zero) / np.count_nonzero(zero)), seen=True)
+    places = np.argwhere(zero) + np.array([s.start for s in window], dtype=np.int64)
+    return Background(share, _beyond_hull(np.argwhere(image.labels != 0), places), seen=False)
+
+
+def _beyond_hull(labelled: NDArray[np.int64], places: NDArray[np.int64]) -> float:
+    """Share of the voxels `places` (n, 3) outside the convex hull of the voxels `labelled` (m, 3)."""
+    try:
+        hull = ConvexHull(labelled[:: -(-len(labelled) // CORNERS)])
+    except (QhullError, ValueError):  # all in one plane
+        return 1.0
+    chosen = places[:: -(-len(places) // SAMPLES)]
+    beyond = np.zeros(len(chosen), dtype=np.bool_)
+    for *normal, offset in hull.equations:
+        beyond |= chosen @ np.array(normal) + offset > 0.0
+    return float(beyond.mean())

@@ -17,7 +17,7 @@ from palpate.images.readers.registry import format_of
 from palpate.images.segmentation import Segmentation, segment
 from palpate.images.tissue import Tissue
 from palpate.observation.contract import DataSource
-from palpate.observation.sources import read_source
+from palpate.observation.registry import read_source
 from palpate.phantoms.pelvis import PelvisOptions, pelvis, pelvis_anatomy
 from palpate.phantoms.scene import Scene
 from palpate.phantoms.spheres import SpheresOptions, spheres, spheres_anatomy

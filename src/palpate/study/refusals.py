@@ -1,22 +1,29 @@
-"""What no estimate can begin with: organs too small or thin to be meshed, organs that are lost between the images."""
+"""What no estimate can begin with (organs too small, thin or lost), and where its linear law ends."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from palpate.errors import GeometryError, InputDataError, ResourceError
+from palpate.findings import Finding
+from palpate.images.checks import SMALL_VOXELS, VOLUME_IMPLAUSIBLE
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
+from palpate.mechanics.deformation import largest_strains
+from palpate.mechanics.laws.contract import Law
+from palpate.mesh.space import LagrangeSpace
 from palpate.study.cost import image_memory_gb, machine_memory_gb
 
-__all__ = ["refuse_large", "refuse_lost", "refuse_unmeshable"]
+__all__ = ["LINEAR_RANGE", "linear_strain_warnings", "refuse_large", "refuse_lost", "refuse_unmeshable"]
 
-SMALLEST_VOXELS = 50
-VOLUME_IMPLAUSIBLE = 0.30  # of an organ: no deformation, and hardly a filling, changes so much
 ORGANS = (Role.ESTIMATE, Role.DRIVER)
+LINEAR_RANGE = 0.10  # principal strain: beyond it the squares that the linear law leaves out are tenths of it
+MOST_BEYOND = 0.01  # share of the meshed volume
 
 
 def refuse_unmeshable(segmentation: Segmentation, name: str) -> None:
@@ -29,9 +36,9 @@ def refuse_unmeshable(segmentation: Segmentation, name: str) -> None:
         if tissue.role not in ORGANS or not mask.any():
             continue
         count = int(np.count_nonzero(mask))
-        if count < SMALLEST_VOXELS:
+        if count < SMALL_VOXELS:
             raise GeometryError(
-                f"'{tissue.name}' has only {count} voxels in '{name}', and {SMALLEST_VOXELS} are the least that a"
+                f"'{tissue.name}' has only {count} voxels in '{name}', and {SMALL_VOXELS} are the least that a"
                 " surface can be made of: use finer images, or join it to its neighbour"
             )
         box = ndimage.find_objects(mask.astype(np.int8))[0]
@@ -83,3 +90,36 @@ def _cut(segmentation: Segmentation, tissue: int) -> bool:
     """Whether the tissue reaches the border of its image."""
     mask = segmentation.mask(tissue)
     return any(bool(np.take(mask, end, axis).any()) for axis in range(3) for end in (0, -1))
+
+
+def linear_strain_warnings(
+    law: Law, *moved: tuple[LagrangeSpace, Sequence[NDArray[np.float64]]], images: Sequence[str]
+) -> tuple[Finding, ...]:
+    """A warning when the linear `law` was used where more than 1 % of the meshed volume strains by more than 10 %.
+
+    moved: each body's space with its displacements (n_points, 3) mm, one a later image; images: a name of each later
+    image, body after body. The strain is that of `largest_strains`. The image with the largest share is told of.
+    """
+    if law.finite:
+        return ()
+    strained = []
+    for space, displacement in ((space, motion) for space, motions in moved for motion in motions):
+        strains, volumes = largest_strains(space, displacement), space.mesh.volumes
+        order = np.argsort(strains)
+        reached = np.cumsum(volumes[order]) / volumes.sum()
+        # the 99th percentile by volume
+        tail = strains[order[min(int(np.searchsorted(reached, 0.99)), len(order) - 1)]]
+        strained.append((float(volumes[strains > LINEAR_RANGE].sum() / volumes.sum()), float(tail)))
+    names = [*images, *["a later image"] * len(strained)]  # states that come from no file may have none
+    share, tail, image = max(((*s, name) for s, name in zip(strained, names, strict=False)), default=(0.0, 0.0, ""))
+    if share <= MOST_BEYOND:
+        return ()
+    return (
+        Finding(
+            "linear-strains",
+            f"{image}: {100 * share:.1f} % of the meshed volume strains by more than {100 * LINEAR_RANGE:.0f} % (99th"
+            f" percentile {100 * tail:.0f} %), beyond the range of the linear law, whose moduli can then be wrong by"
+            " tens of per cent and others when the images are exchanged, whatever their intervals; set [mechanics] law"
+            ' = "neo-hookean", with the state that is free of stress (the emptier one) as images.before',
+        ),
+    )

@@ -19,9 +19,10 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.case import Case, CaseTissue
-from palpate.study.case_text import case_tables
+from palpate.study.case_file import case_tables
 from palpate.study.discrepancy import FoundDiscrepancy
 from palpate.study.estimation import Estimation, ModulusEstimate, TissueFit, no_estimate
+from palpate.study.map_words import map_words
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio
 from palpate.uncertainty import StiffnessMap
 
@@ -145,10 +146,10 @@ class CaseResult:
         meshed = [v if t.meshed else None for t, v in zip(self.tissues, values, strict=True)]
         return np.array([math.nan if value is None else value for value in meshed])
 
-    def stiffness_map(self, pair: int = 0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Young's modulus in `unit`, and standard deviation of ln E, of each tetrahedron (n_tets,) of a pair's mesh.
+    def stiffness_map(self, pair: int = 0) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Young's modulus in `unit`, standard deviation of ln E, and its resolution, (n_tets,) each, of a pair's mesh.
 
-        Those of its tissue where that is not mapped, whose standard deviation is NaN.
+        Of tissues that are not mapped those of the tissue, NaN and NaN.
         """
         bodies = [
             (self.space, self.displacements),
@@ -157,11 +158,12 @@ class CaseResult:
         mesh = bodies[pair][0].mesh
         first = sum(len(motions) for _, motions in bodies[:pair])
         stiffness, sd = self.stiffness[mesh.region], np.full(len(mesh.region), np.nan)
+        resolution = sd.copy()
         for of in self.estimation.maps:
             if first <= of.state < first + len(bodies[pair][1]):
                 stiffness[of.elements] *= np.exp(of.log_ratio)
-                sd[of.elements] = of.sd
-        return stiffness, sd
+                sd[of.elements], resolution[of.elements] = of.sd, of.resolution
+        return stiffness, sd, resolution
 
     def to_dict(self) -> dict[str, Any]:
         """The document `result.json`, schema palpate.result/1, ready for strict JSON."""
@@ -382,6 +384,7 @@ def _map(of: StiffnessMap, names: Sequence[str]) -> dict[str, Any]:
         "after": names[of.state],
         "prior_sd": of.prior_sd,
         "resolved": of.resolved,
+        "words": map_words(of),
         "region": region,
     }
 

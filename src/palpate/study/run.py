@@ -19,6 +19,7 @@ from palpate.parallel import blas_on_one_thread
 from palpate.progress import Forecast, Progress, about, during, silent
 from palpate.study.body import Body, ImagedStates, joint_problem, make_body
 from palpate.study.case import LAW_NAMES, SOUGHT_RATIOS, Case, Mechanics
+from palpate.study.case_loads import load_warnings
 from palpate.study.cost import LESS_MEMORY, ExpectedCost, cost_of_meshes, expected_cost, lack_of_memory
 from palpate.study.estimation import Estimation, Observed, conclude
 from palpate.study.inverted import inverted
@@ -26,11 +27,10 @@ from palpate.study.plausibility import estimate_warnings, unit_warnings
 from palpate.study.poisson_ratios import with_found_ratios
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.read import read_pairs, read_states
+from palpate.study.refusals import linear_strain_warnings
 from palpate.study.result import CaseResult, MeshResult, PairResult, Provenance, image_names
 from palpate.study.samples import require_samples
-from palpate.study.simulate import simulate
-from palpate.study.strain_range import linear_strain_warnings
-from palpate.study.summary import mesh_summary
+from palpate.study.simulate import mesh_summary, simulate
 from palpate.study.variations import Variation, voxel_mm, what_would_change
 from palpate.uncertainty import FittedState
 
@@ -273,4 +273,5 @@ def refuse_what_cannot_be_estimated(case: Case) -> None:
 
 def _remarks(case: Case, *bodies: Body) -> tuple[Finding, ...]:
     pairs = enumerate(((*body.states.findings, *body.findings) for body in bodies), start=1)
-    return (*unit_warnings(case), *(finding for n, findings in pairs for finding in of_pair(findings, n)))
+    of_images = (finding for n, findings in pairs for finding in of_pair(findings, n))
+    return (*unit_warnings(case), *load_warnings(case), *of_images)

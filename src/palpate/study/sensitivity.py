@@ -33,7 +33,7 @@ from palpate.parallel import blas_on_one_thread
 from palpate.progress import Progress, silent
 from palpate.study.body import Body, ImagedStates, joint_problem, make_body
 from palpate.study.case import LAW_NAMES, Case
-from palpate.study.case_text import case_tables
+from palpate.study.case_file import case_tables
 from palpate.study.edge_length import edge_length_of
 from palpate.study.estimation import Observed, conclude
 from palpate.study.inverted import inverted
@@ -45,7 +45,7 @@ from palpate.study.run import fitted_states, inversion_settings, refuse_what_can
 from palpate.study.variations import SobolResult, Variation, fast_variations, sobol_result, voxel_mm
 from palpate.uncertainty import require_salib
 
-__all__ = ["KEPT", "Kept", "Sensitivity", "sensitivity"]
+__all__ = ["KEPT", "Kept", "Sensitivity", "Variant", "kept_under", "sensitivity", "variants_of"]
 
 KEPT = "variants"  # folder of the finished parts
 COARSER = 1.25  # times the mesh's edge length
@@ -109,7 +109,7 @@ class Sensitivity:
 
 
 @dataclass(frozen=True, slots=True)
-class _Variant:
+class Variant:
     """A case that is estimated anew: `name` of its file; makes: what differs, "model", "mesh" or "images"."""
 
     name: str
@@ -152,7 +152,7 @@ def sensitivity(case: Case, *, kept: Kept | None = None, sobol: int = 0, progres
         require_salib()
     progress("reading the images")
     images = _read(case, progress)
-    key = _key(case, images.inputs)
+    key = kept_under(case, images.inputs)
     bodies = cache(lambda: images.bodies(case, progress))
     base = kept.get(f"estimate-sobol-{sobol}", key)
     if base is None:
@@ -160,7 +160,7 @@ def sensitivity(case: Case, *, kept: Kept | None = None, sobol: int = 0, progres
         kept.put(f"estimate-sobol-{sobol}", key, base)
     variations = [Variation(**each) for each in base["variations"]]
     edge_mm = edge_length_of(case, images.first.before, images.first.after).mm
-    variants = list(_variants(case, edge_mm))
+    variants = list(variants_of(case, edge_mm))
     for number, variant in enumerate(variants, start=1):
         part = kept.get(variant.name, key)
         if part is None:
@@ -185,7 +185,7 @@ def _read(case: Case, progress: Progress) -> _Images:
     return _Images(first, further, input_digests(case, first.inputs, *(pair.inputs for pair in further)))
 
 
-def _key(case: Case, inputs: Mapping[str, str]) -> str:
+def kept_under(case: Case, inputs: Mapping[str, str]) -> str:
     """What a finished part is of: the case without the places of its files, their contents, this version."""
     parts = [case_tables(case, lambda path: path.name), dict(inputs), software_versions().get("palpate")]
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
@@ -234,33 +234,33 @@ def _estimated(case: Case, bodies: Bodies, sobol: int, progress: Progress) -> di
     }
 
 
-def _variants(case: Case, edge_mm: float) -> Iterator[_Variant]:
+def variants_of(case: Case, edge_mm: float) -> Iterator[Variant]:
     """What is estimated anew, what costs least first; edge_mm: the edge length of the case as it is."""
     law, domain = case.mechanics, case.domain
     laws = sorted((name for name in LAW_NAMES if name != law.law), key=lambda name: name != "linear")
     boundaries = [name for name in ("sliding", "free", "fixed") if name != domain.outer_boundary]
     coarser_mm = COARSER * edge_mm
 
-    def of_law(name: str) -> _Variant:
+    def of_law(name: str) -> Variant:
         """Under another law."""
-        return _Variant(f"law-{name}", "law", name, replace(case, mechanics=replace(law, law=name)))
+        return Variant(f"law-{name}", "law", name, replace(case, mechanics=replace(law, law=name)))
 
     yield from (of_law(name) for name in laws if name == "linear")
     coarser = replace(case, mesh=replace(case.mesh, edge_length_mm=coarser_mm))
-    yield _Variant("edge-length", "edge_length", f"{coarser_mm:g} mm", coarser, "mesh")
+    yield Variant("edge-length", "edge_length", f"{coarser_mm:g} mm", coarser, "mesh")
     for name in boundaries:
         other = replace(case, domain=replace(domain, outer_boundary=name))
-        yield _Variant(f"outer-boundary-{name}", "outer_boundary", name, other)
+        yield Variant(f"outer-boundary-{name}", "outer_boundary", name, other)
     yield from (of_law(name) for name in laws if name != "linear")
     rigid = any(tissue.role is Role.RIGID for tissue in case.tissues)
     if case.images is not None and (rigid or case.align != "none"):
         method = "none" if case.align != "none" else "rigid-tissues"
         unaligned = replace(case, images=replace(case.images, align=method))
-        yield _Variant(f"alignment-{method}", "alignment", method, unaligned, "images")
+        yield Variant(f"alignment-{method}", "alignment", method, unaligned, "images")
 
 
 def _varied(
-    variant: _Variant, images: _Images, bodies: Callable[[], Bodies], base: Mapping[str, Any], progress: Progress
+    variant: Variant, images: _Images, bodies: Callable[[], Bodies], base: Mapping[str, Any], progress: Progress
 ) -> Variation:
     """One variant estimated anew; one that has no estimate says why."""
     began, case, changes, reason = time.perf_counter(), variant.case, None, ""

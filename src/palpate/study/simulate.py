@@ -20,20 +20,19 @@ from palpate.mechanics.equilibrium import equilibrium
 from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.loads import Load
 from palpate.mechanics.rest_state import unloaded_displacement
-from palpate.mesh.dihedral import tet_dihedrals
 from palpate.mesh.space import LagrangeSpace
+from palpate.mesh.tet_mesh import tet_dihedrals
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.prescribed_motion import prescribed_motion
-from palpate.phantoms.wall_filling import wall_filling
+from palpate.phantoms.motion import wall_filling
 from palpate.study.body import Body, inverse_problem, make_body, strained_body
 from palpate.study.case import Case, Mechanics
 from palpate.study.case_loads import case_loads
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.read import phantom_scene, read_states
 from palpate.study.result import MeshSummary, Provenance, Simulation
-from palpate.study.summary import mesh_summary
 
-__all__ = ["filled", "simulate"]
+__all__ = ["filled", "mesh_summary", "simulate"]
 
 Progress = Callable[[str], None]
 
@@ -170,6 +169,21 @@ def _labels(segmentation: Segmentation, space: LagrangeSpace, displacement: NDAr
     hollow = np.array([not tissue.meshed for tissue in tissues])
     index = np.where(hollow[index] & hollow[segmentation.index], segmentation.index, index)
     return LabelImage(table[index], segmentation.grid, names)
+
+
+def mesh_summary(body: Body) -> MeshSummary:
+    """Figures of the mesh of `body`."""
+    quality = body.quality
+    return MeshSummary(
+        quality.nodes,
+        quality.tets,
+        3 * len(body.space.points),
+        quality.min_dihedral_deg,
+        quality.p5_dihedral_deg,
+        quality.volume_error,
+        body.edge_length.mm if body.edge_length else None,
+        body.edge_length.in_words if body.edge_length else "",
+    )
 
 
 def _plain_summary(space: LagrangeSpace) -> MeshSummary:

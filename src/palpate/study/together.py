@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inversion import Bounds, Inversion, LeastSquares
+from palpate.inversion import Bounds, Inversion, LeastSquares, OuterIterate
 from palpate.uncertainty import (
     NORMAL_95,
     Agreement,
@@ -80,16 +80,18 @@ class ModulusRegion:
     open: bool
 
 
-def image_pairs_of(inversion: Inversion, bounds: Bounds, errors: GridErrors) -> ImagePairs | None:
+def image_pairs_of(
+    inversion: Inversion, bounds: Bounds, errors: GridErrors, released: OuterIterate | None = None
+) -> ImagePairs | None:
     """Of the later images of a converged estimate, where two or more have a minimum alone; else None.
 
-    errors: of the residuals on random grids, see `grid_errors`.
+    errors: of the residuals on random grids, see `grid_errors`; released: see `pair_estimates`.
     """
     mapping = inversion.objective.parameters
     if len(inversion.objective.states) < 2 or not inversion.minimum.converged:
         return None
     scale, names = mapping.scale_kpa, mapping.tissues
-    every = pair_estimates(inversion.objective, inversion.minimum, bounds, errors)
+    every = pair_estimates(inversion.objective, inversion.minimum, bounds, errors, released)
     if np.count_nonzero(every.converged) < 2:
         return None
     pairs = every.of(every.converged, len(names))

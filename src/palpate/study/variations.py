@@ -15,7 +15,7 @@ from palpate.images.tissue import Role, Tissue
 from palpate.inversion import Inversion, InversionSettings
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.laws.contract import Law
-from palpate.observation.contract import Imaged
+from palpate.observation.contract import Imaged, OfMaterial
 from palpate.parallel import mapped
 from palpate.uncertainty import (
     Equilibria,
@@ -149,8 +149,8 @@ def what_would_change(
     """What an estimate rests on, in few lines: known modulus, surfaces by half a voxel, Poisson's ratios, frame, law.
 
     A surface whose offset is an unknown of the estimate is none of them: no step from there says what another offset
-    would be found. laws: others than that of the estimate, which none has that seeks Poisson's ratios; otherwise as
-    `fast_variations`.
+    would be found. laws: others than that of the estimate, which none has that seeks Poisson's ratios or measures what
+    depends on the material directly, as a force does; otherwise as `fast_variations`.
     """
     path, minimum = fast_path(inversion.objective, inversion.minimum, settings.bounds), inversion.minimum
     names, equilibria = inversion.objective.parameters.tissues, _equilibria(inversion)
@@ -177,8 +177,10 @@ def what_would_change(
         """What a step to another law's equilibrium does."""
         return lambda: path.shift(law_errors(minimum.evaluation, equilibria, law, dilatation))
 
-    sought = inversion.objective.parameters.poisson
-    return (*found, *(_stated(names, ("law", "", law.name), under(law)) for law in laws if not sought))
+    bound = inversion.objective.parameters.poisson or any(
+        isinstance(o, OfMaterial) for o in inversion.objective.observations
+    )
+    return (*found, *(_stated(names, ("law", "", law.name), under(law)) for law in laws if not bound))
 
 
 def sobol_result(

@@ -7,6 +7,7 @@ from palpate.uncertainty.covariance import (
     FittedState,
     GridErrors,
     covariance_of,
+    error_noise,
     gain,
     grid_errors,
     grid_position_shifts,
@@ -16,13 +17,18 @@ from palpate.uncertainty.covariance import (
     sandwich_covariance,
 )
 from palpate.uncertainty.diagnostics import ChainDiagnostics, chain_diagnostics, require_arviz
-from palpate.uncertainty.discretisation import discretisation_sd
 from palpate.uncertainty.image_pairs import Agreement, PairEstimates, agreement, pair_estimates
-from palpate.uncertainty.intervals import NORMAL_95, Interval, ModulusInterval, log_interval, modulus_interval
+from palpate.uncertainty.intervals import (
+    NORMAL_95,
+    Interval,
+    ModulusInterval,
+    discretisation_sd,
+    log_interval,
+    modulus_interval,
+)
 from palpate.uncertainty.joint_region import JointRegion, joint_region
-from palpate.uncertainty.profile import Profile
-from palpate.uncertainty.refit import refitted
-from palpate.uncertainty.sampling import PosteriorChains, posterior_chains, sample_posterior
+from palpate.uncertainty.profile import Profile, refitted
+from palpate.uncertainty.sampling import PosteriorChains, posterior_chains
 from palpate.uncertainty.sensitivity import (
     Equilibria,
     Errors,
@@ -36,9 +42,10 @@ from palpate.uncertainty.sensitivity import (
     surface_errors,
 )
 from palpate.uncertainty.sobol import SobolIndices, require_salib, sobol_indices
-from palpate.uncertainty.stiffness_map import DifferentRegion, StiffnessMap, stiffness_maps
+from palpate.uncertainty.stiffness_map import CONTRAST, DifferentRegion, StiffnessMap, stiffness_maps
 
 __all__ = [
+    "CONTRAST",
     "GRID_DRAWS",
     "NORMAL_95",
     "Agreement",
@@ -65,6 +72,7 @@ __all__ = [
     "chain_diagnostics",
     "covariance_of",
     "discretisation_sd",
+    "error_noise",
     "exact_equilibria",
     "fast_path",
     "gain",
@@ -87,7 +95,6 @@ __all__ = [
     "refitted",
     "require_arviz",
     "require_salib",
-    "sample_posterior",
     "sandwich_covariance",
     "sobol_indices",
     "stiffness_maps",

@@ -15,19 +15,22 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue_distance import cropped, window_of
 from palpate.inversion.hyper_parameters import of_one_noise, undecided_covariance
 from palpate.inversion.objective import Evaluation, Linearisation, Objective
+from palpate.inversion.optimise import Minimum
+from palpate.inversion.trust_region import OuterIterate
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Imaged
 from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import FitResponse, NoiseModel, mean_noise
 from palpate.parallel import mapped
-from palpate.uncertainty.discretisation import discretisation_sd
+from palpate.uncertainty.intervals import discretisation_sd
 
 __all__ = [
     "GRID_DRAWS",
     "Covariance",
     "FittedState",
     "GridErrors",
+    "added_by",
     "covariance_among",
     "covariance_of",
     "error_noise",
@@ -104,21 +107,57 @@ class Covariance:
         shares = {name: float(part[number, number] / self.total[number, number]) for name, part in parts.items()}
         return {name: share for name, share in shares.items() if name != "prior" or share > ROUNDING}
 
+    def with_released(self, objective: Objective, minimum: Minimum, released: OuterIterate) -> Covariance:
+        """The same with what blocks add that were held while the `minimum` was sought (see `Block.released`).
+
+        released: where the estimate ends with these blocks free.
+        """
+        n, free = objective.n_parameters, released.minimum
+        rows = minimum.evaluation.covariance_columns(n).T
+        part = added_by(
+            sandwich_covariance(released.objective, free.evaluation),
+            free.unknowns[:n] - minimum.unknowns[:n],
+            held=self.noise + rows @ minimum.evaluation.prior @ rows.T,
+        )
+        cause = " and ".join(dict.fromkeys(block.cause for block in objective.parameters.blocks if block.released))
+        return replace(self, prior=self.prior + part, causes={**self.causes, cause: part})
+
+
+def added_by(
+    free: NDArray[np.float64], shift: NDArray[np.float64], *, held: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """What the covariance `held` (n, n) of estimates lacks that take some unknowns for known.
+
+    With these free the estimates are others, further by a `shift` d (n,), with the covariance `free`: the second moment
+    of what the first ones err by is free + d d^T. The positive part of what that is beyond `held`: with it the whole is
+    at least as large as each of the two in every direction.
+    """
+    return _positive_part(free + np.outer(shift, shift) - held)
+
 
 def covariance_of(
-    objective: Objective, evaluation: Evaluation, errors: GridErrors, *, unknowns: NDArray[np.float64]
+    objective: Objective,
+    evaluation: Evaluation,
+    errors: GridErrors,
+    *,
+    unknowns: NDArray[np.float64],
+    noise_of: Mapping[tuple[int, str], NoiseModel] | None = None,
 ) -> Covariance:
     """All that is known of the log-moduli's errors at unknowns (n_unknowns,).
 
     The sandwich, what is considered or undecided, the mesh, and what the scatter over grid positions, by the `errors`
-    there, adds (see `grid_covariance`).
+    there, adds (see `grid_covariance`); nothing of no errors. noise_of: the residuals' noise where it is not that of
+    the evaluation (see `error_noise`), whose residuals hold what wrong moduli leave.
     """
-    noise_of, mesh = error_noise(evaluation), mesh_covariance(objective)
+    noise_of = error_noise(evaluation) if noise_of is None else noise_of
+    mesh = mesh_covariance(objective)
     given = _given_model(objective, evaluation)
 
     def parts(of: Evaluation) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Covariances by noise, prior and grid of one set of unknowns."""
         noise, prior = _sandwich(objective, of, of.covariance_columns(objective.n_parameters).T, noise_of)
+        if not errors:
+            return noise, prior, np.zeros_like(noise)
         return noise, prior, grid_covariance(evaluation, scatter(shifts_by(of, errors, objective.n_parameters)), noise)
 
     noise, prior, grid = parts(evaluation)
@@ -140,7 +179,7 @@ def _causes(
     for cause, part in (item for of in further for item in of.items()):
         found[cause] = found.get(cause, np.zeros_like(part)) + part
     for i, block in enumerate(objective.parameters.blocks):
-        if block.released:  # its share is not in this covariance, but in the ends of the interval
+        if block.released:  # its share is that of `with_released`
             continue
         own = objective.parameters.columns(i)
         part = inverse[own].T @ evaluation.prior[np.ix_(own, own)] @ inverse[own]
@@ -355,7 +394,12 @@ def grid_covariance(
     seen = [line.observation for line in evaluation.lines]
     if any(isinstance(o, Imaged) and o.stated_noise is not None for o in seen):
         return grid
-    sizes, axes = np.linalg.eigh(grid - noise)
+    return _positive_part(grid - noise)
+
+
+def _positive_part(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The symmetric matrix (n, n) without its negative eigenvalues."""
+    sizes, axes = np.linalg.eigh(matrix)
     return np.asarray((axes * np.maximum(sizes, 0.0)) @ axes.T)
 
 

@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from palpate.inversion import Bounds, Evaluation, Minimum, Objective, fixed_correspondence, gauss_newton
+from palpate.inversion import Bounds, Minimum, Objective, OuterIterate, fixed_correspondence, gauss_newton
 from palpate.observation.noise_model import NoiseModel
 from palpate.uncertainty.covariance import (
     GridErrors,
+    added_by,
     error_noise,
     gain,
     grid_covariance,
@@ -71,13 +72,33 @@ class Agreement:
     covariance: NDArray[np.float64]
 
 
-def pair_estimates(objective: Objective, minimum: Minimum, bounds: Bounds, errors: GridErrors) -> PairEstimates:
+def pair_estimates(
+    objective: Objective, minimum: Minimum, bounds: Bounds, errors: GridErrors, released: OuterIterate | None = None
+) -> PairEstimates:
     """The estimate of each later state alone, near the joint `minimum`: with its closest points, weights and prior.
 
-    errors: of the residuals on random grids (see `grid_errors`). Nothing is solved; the approximations of the joint
-    estimate stand. Raises `EstimationError` where a state alone leaves a driver's motion open.
+    errors: of the residuals on random grids (see `grid_errors`); released: where the joint estimate ends with blocks
+    free that were held, which adds to each pair's covariance as to that of all (see `added_by`). Nothing is solved; the
+    approximations of the joint estimate stand. Raises `EstimationError` where a state alone leaves a driver's motion
+    open.
     """
-    n, found, owns = objective.n_parameters, list[Minimum](), list[NDArray[np.int64]]()
+    n, shape = objective.n_parameters, 2 * (len(objective.states), objective.n_parameters)
+    alone = _each_alone(objective, minimum, bounds)
+    theta, converged = np.stack([of.unknowns[:n] for of in alone]), np.array([of.converged for of in alone])
+    noise, prior = _noise_and_prior(objective, alone)
+    covariance = _joint_covariance(objective, alone, errors, noise=noise, prior=prior)
+    if released is not None:
+        free = _each_alone(released.objective, released.minimum, bounds)
+        shift = np.stack([of.unknowns[:n] for of in free]) - theta
+        both = sum(_noise_and_prior(released.objective, free), np.zeros_like(noise))
+        covariance += added_by(both, shift.ravel(), held=noise + prior).reshape(shape)
+        converged &= [of.converged for of in free]
+    return PairEstimates(theta, covariance, converged)
+
+
+def _each_alone(objective: Objective, minimum: Minimum, bounds: Bounds) -> list[Minimum]:
+    """The minimum of each later state alone, its unknowns those of `ParameterMap.alone`."""
+    found = list[Minimum]()
     for s, state in enumerate(objective.states):
         parameters, own = objective.parameters.alone(s)
         seen = [line for line in minimum.evaluation.lines if line.state == s]
@@ -86,51 +107,63 @@ def pair_estimates(objective: Objective, minimum: Minimum, bounds: Bounds, error
         evaluation = replace(minimum.evaluation, lines=lines)
         fixed = fixed_correspondence(Objective((state,), parameters), start, evaluation)
         found.append(gauss_newton(fixed, start, bounds=bounds, tolerance=1e-4))
-        owns.append(own)
-    covariance = _joint_covariance(objective, [of.evaluation for of in found], owns, errors)
-    theta = np.stack([of.unknowns[:n] for of in found])
-    return PairEstimates(theta, covariance, np.array([of.converged for of in found]))
+    return found
 
 
-def _joint_covariance(
-    objective: Objective, alone: Sequence[Evaluation], owns: Sequence[NDArray[np.int64]], errors: GridErrors
-) -> NDArray[np.float64]:
-    """Covariance (n_pairs, n, n_pairs, n) of the estimates of each state alone, by their evaluations.
+def _noise_and_prior(objective: Objective, alone: Sequence[Minimum]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Covariances (n_pairs n, n_pairs n) of the estimates of each state alone by noise, and by the prior.
 
-    owns: numbers (n_own,) of each one's unknowns among all. With the gains G_s of the residuals and H_s^-1 of each: by
-    the noise, of which half is the rest image's, which those of one reference share, G_s C_st G_t^T; by the prior,
-    H_s^-1 P_st H_t^-1, which counts once of what they have in common; by what is considered; by the place of the grid
-    (see `grid_covariance`); and by the mesh, which those of one reference share.
+    With the gains G_s of the residuals and H_s^-1 of each: by the noise, of which half is the rest image's, which those
+    of one reference share, G_s C_st G_t^T; by the prior, H_s^-1 P_st H_t^-1, which counts once of what they have in
+    common.
     """
-    n, n_pairs, mapping = objective.n_parameters, len(alone), objective.parameters
-    size, pairs, noise = n * n_pairs, [], dict[tuple[int, str], NoiseModel]()
+    n, mapping = objective.n_parameters, objective.parameters
+    size, pairs, noise = n * len(alone), [], dict[tuple[int, str], NoiseModel]()
     answers = np.zeros((mapping.n_unknowns, size))  # H_s^-1 e_i, side by side
-    considered = np.zeros((mapping.n_unknowns, size))  # J_b^T W J H_s^-1 e_i
-    shifts, mesh = list[NDArray[np.float64]](), np.zeros((n_pairs, n, n_pairs, n))
-    references = [state.reference for state in objective.states]
-    for s, (evaluation, own) in enumerate(zip(alone, owns, strict=True)):
-        inverse, columns = evaluation.covariance_columns(n), slice(s * n, (s + 1) * n)
-        answers[own, columns] = inverse
-        considered[own, columns] = (evaluation.matrix - evaluation.prior) @ inverse
+    for s, evaluation in enumerate(of.evaluation for of in alone):
+        columns = slice(s * n, (s + 1) * n)
+        answers[mapping.alone(s)[1], columns] = evaluation.covariance_columns(n)
         noise |= {(s, kind): model for (_, kind), model in error_noise(evaluation).items()}
         for line, rows in zip(evaluation.lines, gain(evaluation, n), strict=True):
             placed = np.zeros((size, rows.shape[1]))
             placed[columns] = rows
             pairs.append((replace(line, state=s), placed))
+    return noise_covariance(objective, pairs, noise), np.asarray(answers.T @ mapping.prior_matrix @ answers)
+
+
+def _joint_covariance(
+    objective: Objective,
+    alone: Sequence[Minimum],
+    errors: GridErrors,
+    *,
+    noise: NDArray[np.float64],
+    prior: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Covariance (n_pairs, n, n_pairs, n) of the estimates of each state alone.
+
+    To those by noise and prior, (n_pairs n, n_pairs n) each, comes what is considered; the place of the grid (see
+    `grid_covariance`); and the mesh, which those of one reference share.
+    """
+    n, n_pairs, mapping = objective.n_parameters, len(alone), objective.parameters
+    considered = np.zeros((mapping.n_unknowns, n * n_pairs))  # J_b^T W J H_s^-1 e_i
+    shifts, mesh = list[NDArray[np.float64]](), np.zeros((n_pairs, n, n_pairs, n))
+    references = [state.reference for state in objective.states]
+    for s, evaluation in enumerate(of.evaluation for of in alone):
+        of_data = evaluation.matrix - evaluation.prior
+        considered[mapping.alone(s)[1], s * n : (s + 1) * n] = of_data @ evaluation.covariance_columns(n)
         seen = [i for i, line in enumerate(_lines(objective)) if line == s]
         shifts.append(shifts_by(evaluation, [[draw[i] for i in seen] for draw in errors], n))
         of_mesh = mesh_covariance(replace(objective, states=(objective.states[s],)))
         for t in range(n_pairs):
             mesh[s, :, t] += of_mesh if references[s] == references[t] else 0.0
-    by_noise = noise_covariance(objective, pairs, noise)
-    total = by_noise + answers.T @ mapping.prior_matrix @ answers
+    total = noise + prior
     for i, block in enumerate(mapping.blocks):
         if block.considered:
             of_block = considered[mapping.columns(i)]
             total += of_block.T @ np.linalg.solve(block.precision, of_block)
     itself = np.kron(np.eye(n_pairs), np.ones((n, n)))
     grid = scatter(np.concatenate(shifts, axis=1)) * (BETWEEN_GRIDS + (1.0 - BETWEEN_GRIDS) * itself)
-    return np.asarray((total + grid_covariance(alone[0], grid, by_noise)).reshape(mesh.shape) + mesh)
+    return np.asarray((total + grid_covariance(alone[0].evaluation, grid, noise)).reshape(mesh.shape) + mesh)
 
 
 def _lines(objective: Objective) -> list[int]:

@@ -1,20 +1,34 @@
-"""The 95 % interval of a modulus: the ellipse where that is true, else where the profile likelihood ends."""
+"""Intervals of a modulus: by ellipse or profile, by the mesh beside it, and how it varies from scan to scan."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate.inversion import Bounds, LeastSquares, Minimum
+from palpate.mesh.space import LagrangeSpace
+from palpate.mesh.surface import tissue_surface, triangle_normals
 from palpate.uncertainty.profile import Profile, profile
 
-__all__ = ["NORMAL_95", "Interval", "ModulusInterval", "log_interval", "modulus_interval"]
+__all__ = [
+    "NORMAL_95",
+    "Interval",
+    "ModulusInterval",
+    "discretisation_sd",
+    "log_interval",
+    "modulus_interval",
+    "within_subject_cv",
+]
 
 Interval = tuple[float | None, float | None]
 
 NORMAL_95 = 1.959964
 AS_ELLIPSE = 0.1  # of the half-width: an end of the profile that is no further from the ellipse's says the same
+COEFFICIENT = 0.5
+LINEAR = 2.0  # edges of quadratic elements for one of linear ones: they have the same points
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,3 +60,32 @@ def log_interval(centre: float, sd: float, *, lower: float, upper: float) -> Int
     """95 % interval exp(ln centre +- 1.96 sd); an end beyond the bounds (lower, upper), in `centre`'s unit, is open."""
     low, high = centre * np.exp(-NORMAL_95 * sd), centre * np.exp(NORMAL_95 * sd)
     return (float(low) if low > lower else None, float(high) if high < upper else None)
+
+
+def discretisation_sd(space: LagrangeSpace, tissues: Sequence[int]) -> float:
+    """Standard deviation of ln E, dimensionless, that another mesh of the same edge length would make.
+
+    s = c (h / d)^2 with h = (6 sqrt(2) V / N)^(1/3), the edge of N regular tetrahedra that fill the volume V of the
+    `tissues` (by their index in the mesh; several that share a modulus together), twice that for linear elements, and
+    d = 6 V / A with the area A of their surfaces: the diameter of a ball, three times the thickness of a plate. The
+    order is that of quadratic elements' surfaces; c is measured (`benchmarks/edge_length.py`, docs/method.md).
+    """
+    mesh = space.mesh
+    inside = np.isin(mesh.region, tissues)
+    volume = float(mesh.volumes[inside].sum())
+    area = sum(
+        float(np.linalg.norm(triangle_normals(mesh.nodes, tissue_surface(mesh, t).triangles), axis=1).sum())
+        for t in tissues
+    )
+    edge = (1.0 if space.order > 1 else LINEAR) * (6.0 * np.sqrt(2.0) * volume / np.count_nonzero(inside)) ** (1 / 3)
+    return float(COEFFICIENT * (edge * area / (6.0 * volume)) ** 2)
+
+
+def within_subject_cv(variance: NDArray[np.float64] | float) -> NDArray[np.float64]:
+    """Within-subject coefficient of variation of E, of variances (n,) of ln E within subjects, or of one.
+
+    sqrt(exp(s^2) - 1): standard deviation over mean where ln E is normal within a subject (Quan & Shih, Biometrics 52
+    (1996) 1195-1203). exp(s) - 1 of Bland & Altman (BMJ 313 (1996) 106) is what one standard deviation adds to E: the
+    same for small s, a fifth more at s = 0.5.
+    """
+    return np.asarray(np.sqrt(np.expm1(variance)))

@@ -9,43 +9,17 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from palpate.errors import EstimationError
-from palpate.inversion import FrozenPosterior, frozen_posterior
-from palpate.inversion.objective import Evaluation, Objective, determined
+from palpate.inversion import FrozenPosterior
+from palpate.inversion.objective import Evaluation, determined
 from palpate.inversion.optimise import Bounds
-from palpate.parallel import blas_on_one_thread
 
-__all__ = [
-    "PosteriorChains",
-    "PosteriorSamples",
-    "posterior_chains",
-    "sample_posterior",
-]
+__all__ = ["PosteriorChains", "posterior_chains"]
 
 STEP = 0.35  # of a proposal, in standard deviations of the posterior
 THIN = 10  # steps of a draw that is kept
 SHRUNK = 1.0 - 1e-9  # of a start's distance: one at a bound lies inside whatever rounding does
 SPREAD = 1.5  # standard deviations, by which chains start apart
-BETWEEN_CHECKS = 4000  # evaluations
-GAP = 1.0  # of log-likelihood, that the frozen posterior may be off; re-chosen closest points alone make some tenths
-
-
-@dataclass(frozen=True, slots=True)
-class PosteriorSamples:
-    """A Markov chain: log-moduli theta (n_evaluations, n_parameters) and the share of its proposals that it accepted.
-
-    refreshed: how often closest points were chosen anew; gap: the largest error (log-likelihood) of the frozen
-    posterior that a check found.
-    """
-
-    theta: NDArray[np.float64]
-    accepted: float
-    refreshed: int
-    gap: float
-
-    def interval(self, share: float = 0.95) -> NDArray[np.float64]:
-        """Equal-tailed credible interval (n_parameters, 2) of the log-moduli that holds `share` of the samples."""
-        tail = 0.5 * (1.0 - share)
-        return np.asarray(np.quantile(self.theta, [tail, 1.0 - tail], axis=0).T)
+BLOCK = 4000  # proposals at once: those of all steps would take gigabytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,41 +33,6 @@ class PosteriorChains:
     theta: NDArray[np.float64]
     log_density: NDArray[np.float64]
     accepted: NDArray[np.float64]
-
-
-@blas_on_one_thread()
-def sample_posterior(
-    objective: Objective,
-    start: NDArray[np.float64],
-    *,
-    bounds: Bounds,
-    evaluations: int,
-    rng: np.random.Generator,
-) -> PosteriorSamples:
-    """Sample the posterior around a minimum `start` (n,) with so many evaluations.
-
-    Preconditioned Crank-Nicolson steps x' = c + sqrt(1 - b^2) (x - c) + b L xi with L L^T = H^-1, which a posterior
-    that is exactly normal always accepts (Cotter, Roberts, Stuart & White, Stat. Sci. 28 (2013) 424-446). Every 4000
-    evaluations the objective itself is asked; where the frozen one is off by more than 1, it is frozen anew. Raises
-    `EstimationError` where a modulus moves nothing, `ConfigurationError` for models that are not reduced ones.
-    """
-    evaluation = objective(start)
-    frozen = frozen_posterior(objective, start, evaluation)
-    laplace = _laplace(start, evaluation)
-    anchor = evaluation.value - frozen.value(start)
-    now, chain, counts, gap, refreshed = start, [], 0, 0.0, 0
-    for done in range(0, evaluations, BETWEEN_CHECKS):
-        steps = min(BETWEEN_CHECKS, evaluations - done)
-        stretch = _chain(frozen, laplace, now, bounds=bounds, steps=steps, rng=rng)
-        now = stretch.end
-        chain.append(stretch.theta)
-        counts += stretch.accepted
-        off = abs(objective.value(now) - frozen.value(now) - anchor)
-        gap = max(gap, off)
-        if off > GAP:
-            frozen = frozen_posterior(objective, now)
-            anchor, refreshed = objective.value(now) - frozen.value(now), refreshed + 1
-    return PosteriorSamples(np.concatenate(chain), counts / evaluations, refreshed, gap)
 
 
 def posterior_chains(
@@ -114,7 +53,9 @@ def posterior_chains(
     matrix, L L^T = `covariance` (n_parameters, n_parameters), that by correlated residuals, prior and grid (the
     open-faced sandwich: Shaby, J. Comput. Graph. Stat. 23 (2014) 853-876). evaluation: of the objective at the minimum
     `start` (n,). Every chain starts elsewhere, at 1.5 standard deviations, and leaves out a tenth of its draws; a draw
-    is the last of ten steps. Raises `EstimationError` where a modulus moves nothing.
+    is the last of ten steps: x' = c + sqrt(1 - b^2) (x - c) + b L xi with L L^T = H^-1, preconditioned Crank-Nicolson,
+    which a posterior that is exactly normal always accepts (Cotter, Roberts, Stuart & White, Stat. Sci. 28 (2013)
+    424-446). Raises `EstimationError` where a modulus moves nothing.
     """
     n = frozen.objective.n_parameters
     laplace = _laplace(start, evaluation)
@@ -128,8 +69,8 @@ def posterior_chains(
         inside = np.clip(start[:n] + stretch @ (now[:n] - start[:n]), bounds.lower, bounds.upper)
         now[:n] = start[:n] + SHRUNK * np.linalg.solve(stretch, inside - start[:n])
         parts = []
-        for done in range(0, warm + steps, BETWEEN_CHECKS):  # proposals of all steps at once would take gigabytes
-            several = min(BETWEEN_CHECKS, warm + steps - done)
+        for done in range(0, warm + steps, BLOCK):
+            several = min(BLOCK, warm + steps - done)
             parts.append(_chain(frozen, laplace, now, bounds=bounds, steps=several, rng=generator, stretch=stretch))
             now = parts[-1].end
         kept = slice(warm + THIN - 1, None, THIN)
@@ -190,12 +131,11 @@ def _chain(
     bounds: Bounds,
     steps: int,
     rng: np.random.Generator,
-    stretch: NDArray[np.float64] | None = None,
+    stretch: NDArray[np.float64],
 ) -> _Stretch:
-    """So many steps from unknowns (n,); `stretch` (n_parameters, n_parameters): A of `posterior_chains`, or none."""
+    """So many steps from unknowns (n,); `stretch` (n_parameters, n_parameters): A of `posterior_chains`."""
     n = frozen.objective.n_parameters
     centre = laplace.centre[:n]
-    stretch = np.eye(n) if stretch is None else stretch
     theta, energy, accepted = np.empty((steps, n)), np.empty(steps), 0
     now, value = start, frozen.value(start)
     level = value - laplace.energy(start)

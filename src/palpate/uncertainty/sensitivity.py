@@ -31,8 +31,8 @@ from palpate.mechanics.hyperelastic import elements_of
 from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.linear_model import LinearEquilibrium, poisson_tangents
 from palpate.mechanics.newton import NewtonSettings
-from palpate.observation.contract import Imaged
-from palpate.uncertainty.refit import refitted
+from palpate.observation.contract import Imaged, OfMaterial
+from palpate.uncertainty.profile import PASSES, refitted
 
 __all__ = [
     "Equilibria",
@@ -76,13 +76,13 @@ class FastPath:
     least: Minimum
     bounds: Bounds
 
-    def under(self, errors: Errors) -> Shift:
+    def under(self, errors: Errors, *, passes: int = PASSES) -> Shift:
         """Where the estimate goes when the residuals of each observation change by e (n,) mm, weights and all.
 
-        Raises `EstimationError`, `SolverError` as `refitted`.
+        passes: see `refitted`, which also tells what is raised.
         """
         moved = replace(self.least, evaluation=replace(self.least.evaluation, lines=self._moved(errors)))
-        return self._shift(refitted(self.fixed.objective, moved, self.bounds, max_steps=STEPS)[0])
+        return self._shift(refitted(self.fixed.objective, moved, self.bounds, max_steps=STEPS, passes=passes)[0])
 
     def shift(self, errors: Errors = (), *, width: float = 1.0, dropped: NDArray[np.bool_] | None = None) -> Shift:
         """Where it goes under its own weights: with other residuals, another prior of the drivers, fewer modes.
@@ -135,13 +135,24 @@ def poisson_errors(
 ) -> Errors:
     """Derivatives (n, n_regions) mm of each observation's residuals by the Poisson's ratios of the regions.
 
-    At the equilibria of the later states, held moduli and coefficients; dilatation: that of the element.
+    At the equilibria of the later states, held moduli and coefficients; dilatation: that of the element. In the
+    residuals' unit of what depends on the material directly, as a force does.
     """
     tangents = [
         there.poisson_tangents() if isinstance(there, FiniteStrainEquilibrium) else poisson_tangents(there, dilatation)
         for there in equilibria
     ]
-    return _of_displacements(evaluation, tangents)
+    moved = _of_displacements(evaluation, tangents)
+    return tuple(e + _by_poisson(line, equilibria[line.state]) for line, e in zip(evaluation.lines, moved, strict=True))
+
+
+def _by_poisson(line: Linearisation, there: LinearEquilibrium | FiniteStrainEquilibrium) -> NDArray[np.float64] | float:
+    """Derivatives (n, n_regions) of an observation's residuals by Poisson's ratios at a held displacement."""
+    seen, system = line.observation, there if isinstance(there, FiniteStrainEquilibrium) else there.system
+    if not isinstance(seen, OfMaterial):
+        return 0.0
+    material = there.coefficients[system.model.constraint.n_modes :]
+    return seen.under(system.moduli, material).by_poisson(there.values[seen.dofs])
 
 
 def law_errors(

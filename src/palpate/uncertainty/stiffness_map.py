@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,24 +11,27 @@ from scipy.sparse.csgraph import connected_components
 from scipy.stats import norm
 
 from palpate.inversion import FIELD, Acts, Block, Inversion
-from palpate.mechanics.material import SHARE, material_modes
+from palpate.mechanics.material import field_modes
 from palpate.mesh.tet_mesh import FACES, TetMesh
 from palpate.uncertainty.covariance import covariance_among
 from palpate.uncertainty.intervals import NORMAL_95, Interval
 
-__all__ = ["DifferentRegion", "StiffnessMap", "stiffness_maps"]
+__all__ = ["CONTRAST", "DifferentRegion", "StiffnessMap", "stiffness_maps"]
 
 CONTRAST = 1.5  # from which a part of a tissue is another stiffness, and not its own scatter
 CERTAIN, LIKELY = 0.95, 0.5  # posterior probability of that: somewhere in a region that is reported, all over it
 MM3_PER_ML = 1000.0
+SMOOTH = 1e-6  # of the prior's precision: modes that no element tells apart
 
 
 @dataclass(frozen=True, slots=True)
 class DifferentRegion:
     """The largest connected part of a tissue that is likely stiffer, or softer, than the tissue by `CONTRAST`.
 
-    elements (n,): its tetrahedra; volume_ml; centre_mm (3,), RAS; contrast: geometric mean of E in it over that in the
-    rest of the tissue, with its 95 % interval; probability: the largest posterior probability, of an element in it.
+    elements (n,): its tetrahedra; volume_ml; centre_mm (3,), RAS; contrast: geometric mean of E where that is certain,
+    in its core, over that outside of the whole region, with its 95 % interval, as if nothing had been believed of how
+    much it differs (what is believed draws the map to the tissue's mean); probability: the largest posterior
+    probability, of an element in it.
     """
 
     elements: NDArray[np.int64]
@@ -62,18 +65,24 @@ class StiffnessMap:
 
 @dataclass(frozen=True, slots=True)
 class _Field:
-    """Posterior of a field at its elements: mean (n,), and its covariance F C F^T + R R^T - F P^-1 F^T + r.
+    """Posterior of a field at its elements: F x, and its covariance F C F^T + R R^T - F P^-1 F^T + r.
 
-    seen (n, k): F, the modes that the data tell, with coefficients of covariance C (k, k), P^-1 (k, k) before them;
-    every (n, m): R, all modes of the prior times its standard deviation; left: r, the variance that none of them holds.
+    seen (n, k): F, the modes that the data tell, with coefficients x (k,) of covariance C (k, k), P^-1 (k, k) before
+    them; every (n, m): R, all modes of the prior times its standard deviation; left (n,): r, the variance that none of
+    them holds.
     """
 
-    mean: NDArray[np.float64]
+    coefficients: NDArray[np.float64]
     seen: NDArray[np.float64]
     posterior: NDArray[np.float64]
     prior: NDArray[np.float64]
     every: NDArray[np.float64]
-    left: float
+    left: NDArray[np.float64]
+
+    @property
+    def mean(self) -> NDArray[np.float64]:
+        """(n,) of ln E."""
+        return np.asarray(self.seen @ self.coefficients)
 
     @property
     def prior_variance(self) -> NDArray[np.float64]:
@@ -84,12 +93,28 @@ class _Field:
     def variance(self) -> NDArray[np.float64]:
         """(n,) after them."""
         change = np.einsum("ek,kl,el->e", self.seen, self.posterior - self.prior, self.seen)
-        return np.maximum(self.prior_variance + change, 0.0)
+        return np.asarray(np.maximum(self.prior_variance + change, 0.0))
+
+    def free_along(self, shape: NDArray[np.float64], volumes: NDArray[np.float64]) -> _Field:
+        """The posterior if nothing were believed beforehand of how much of a `shape` (n,) the field has.
+
+        With h the shape's coefficients, by volumes (n,), and P h = p: the prior's precision is P - p p^T / h^T p then,
+        so that x gains C p (p^T x) / d and C gains C p p^T C / d, d = p^T (h - C p) (Sherman and Morrison 1950).
+        """
+        weighted = volumes[:, None] * self.seen
+        precision = np.linalg.inv(self.prior)
+        gram = weighted.T @ self.seen
+        h = np.linalg.solve(gram + SMOOTH * np.trace(gram) / np.trace(precision) * precision, weighted.T @ shape)
+        p = precision @ h
+        back = self.posterior @ p
+        share = max(float(p @ (h - back)), np.finfo(float).tiny)
+        x = self.coefficients + back * float(p @ self.coefficients) / share
+        return replace(self, coefficients=x, posterior=self.posterior + np.outer(back, back) / share)
 
     def variance_of(self, weights: NDArray[np.float64]) -> float:
         """Of the sum of the field times weights (n,)."""
         seen, every = weights @ self.seen, weights @ self.every
-        return float(max(every @ every + seen @ (self.posterior - self.prior) @ seen, 0.0))
+        return max(float(every @ every + seen @ (self.posterior - self.prior) @ seen), 0.0)
 
 
 def stiffness_maps(inversion: Inversion, variances: NDArray[np.float64]) -> tuple[StiffnessMap, ...]:
@@ -114,25 +139,26 @@ def _map(inversion: Inversion, number: int, block: Block, variances: NDArray[np.
     seen = model.material.fields[elements][:, first : first + block.size].toarray()
     theta, n = parameters.tissues.index(block.of), parameters.n_parameters
     covariance = covariance_among(objective, minimum.evaluation, np.array([theta, *own]))
-    learned = np.linalg.inv(parameters.nuisance_precision[np.ix_(own - n, own - n)])
+    learned = np.asarray(np.linalg.inv(parameters.nuisance_precision[np.ix_(own - n, own - n)]), dtype=np.float64)
     stated = mesh.tissues[tissue].field
     assert stated is not None
     amplitude = float(np.sqrt(np.trace(learned) / np.trace(np.linalg.inv(block.precision))))
     sd = amplitude * stated.sd
-    every = sd * material_modes(mesh, (tissue,), length_mm=stated.length_mm).fields[elements].toarray()
-    mean = seen @ minimum.unknowns[own]
-    field = _Field(mean, seen, covariance[1:, 1:], learned, every, (1.0 - SHARE) * sd**2)
+    modes, volumes = field_modes(mesh, tissue, length_mm=stated.length_mm), mesh.volumes[elements]
+    left = sd**2 * np.maximum(1.0 - (modes**2).sum(axis=1), 0.0)
+    every = sd * (modes - (volumes @ modes) / volumes.sum())
+    field = _Field(minimum.unknowns[own], seen, covariance[1:, 1:], learned, every, left)
     whole = field.variance + variances[theta] + 2.0 * seen @ covariance[1:, 0]
     resolution = np.clip(1.0 - field.variance / field.prior_variance, 0.0, 1.0)
     return StiffnessMap(
         block.of,
         state,
         elements,
-        mean,
+        field.mean,
         np.sqrt(np.maximum(whole, 0.0)),
         resolution,
         sd,
-        float(np.average(resolution, weights=mesh.volumes[elements])),
+        float(np.average(resolution, weights=volumes)),
         _region(mesh, elements, field),
     )
 
@@ -156,9 +182,11 @@ def _different(
     inside: NDArray[np.int64],
     probability: NDArray[np.float64],
 ) -> DifferentRegion:
-    volumes, is_in = mesh.volumes[elements], np.isin(np.arange(len(elements)), inside)
-    weights = np.where(is_in, volumes / volumes[is_in].sum(), -volumes / max(volumes[~is_in].sum(), 1e-300))
-    contrast, half = float(weights @ field.mean), NORMAL_95 * float(np.sqrt(field.variance_of(weights)))
+    volumes, outside = mesh.volumes[elements], ~np.isin(np.arange(len(elements)), inside)
+    core = ~outside & (probability > CERTAIN)
+    weights = core * volumes / volumes[core].sum() - outside * volumes / max(float(volumes[outside].sum()), 1e-300)
+    free = field.free_along(core - np.average(core, weights=volumes), volumes)
+    contrast, half = float(weights @ free.mean), NORMAL_95 * float(np.sqrt(free.variance_of(weights)))
     centres = mesh.nodes[mesh.tets[elements[inside]]].mean(axis=1)
     return DifferentRegion(
         elements[inside],

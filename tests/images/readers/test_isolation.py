@@ -87,7 +87,8 @@ def test_a_reader_killed_by_the_system_is_short_of_memory(tmp_path: Path, monkey
 
 
 def test_a_reader_that_hangs_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stand_in(monkeypatch, f"sys.stdout.buffer.write({GREETING!r}); sys.stdout.flush(); time.sleep(60)")
+    limit = "from palpate.images.readers.child import _limit; _limit(2**34, 100, 0.5)"
+    stand_in(monkeypatch, f"sys.stdout.buffer.write({GREETING!r}); sys.stdout.flush()\n{limit}\ntime.sleep(60)")
     with pytest.raises(ResourceError, match=r"a\.nii' took more than"):
         read_label_image(saved(tmp_path / "a.nii"), limits=ReadLimits(wall_seconds=0.5))
 
@@ -140,7 +141,7 @@ def test_memory_beyond_the_limit_is_a_resource_error(tmp_path: Path) -> None:
 
 @needs_limits
 def test_processor_time_beyond_the_limit_is_a_resource_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    limit = "from palpate.images.readers.child import _limit; _limit(2**34, 1)"
+    limit = "from palpate.images.readers.child import _limit; _limit(2**34, 1, 900.0)"
     stand_in(monkeypatch, f"sys.stdout.buffer.write({GREETING!r}); sys.stdout.flush()\n{limit}\nwhile True: pass")
     with pytest.raises(ResourceError, match=r"a\.nii' took more than"):
         read_label_image(saved(tmp_path / "a.nii"))
@@ -149,7 +150,7 @@ def test_processor_time_beyond_the_limit_is_a_resource_error(tmp_path: Path, mon
 @needs_limits
 def test_the_process_can_write_no_file(tmp_path: Path) -> None:
     code = (
-        "from palpate.images.readers.child import _limit; _limit(2**34, 10)\n"
+        "from palpate.images.readers.child import _limit; _limit(2**34, 10, 900.0)\n"
         "import signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "open('written', 'wb', buffering=0).write(b'x')"
     )
@@ -174,7 +175,7 @@ def test_what_a_library_prints_does_not_reach_the_answer(tmp_path: Path, monkeyp
         "import palpate.images.readers.child as child, palpate.images.readers.registry as registry\n"
         "plain = child.format_of\n"
         f"child.format_of = lambda path: (os.write(1, b'noise'), print('noise', flush=True), plain(path))[-1]\n"
-        f"child.main([str(2**33), '20', 'labels', {str(path)!r}])"
+        f"child.main([str(2**33), '20', '900', 'labels', {str(path)!r}])"
     )
     stand_in(monkeypatch, code)
     assert read_label_image(path).labels.shape == (4, 5, 6)
@@ -186,7 +187,7 @@ def test_a_flaw_of_a_reader_is_a_sentence(tmp_path: Path, monkeypatch: pytest.Mo
         "import palpate.images.readers.child as child\n"
         "def broken(path): raise ZeroDivisionError('by zero')\n"
         "child.format_of = broken\n"
-        f"child.main([str(2**33), '20', 'labels', {str(path)!r}])"
+        f"child.main([str(2**33), '20', '900', 'labels', {str(path)!r}])"
     )
     stand_in(monkeypatch, code)
     with pytest.raises(InputDataError, match=r"reader of '.*a\.nii' failed \(ZeroDivisionError: by zero\)"):

@@ -9,15 +9,14 @@ import pytest
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from multifrontal import nested_dissection, twin_rows
 from palpate.errors import ConfigurationError, SolverError
 from palpate.mechanics.boundary import outer_constraint
-from palpate.mechanics.coarser import linear_displacements
 from palpate.mechanics.linear_model import linear_model, weighted_sum
-from palpate.mechanics.rigid import rigid_modes
+from palpate.mechanics.rigid import linear_displacements, rigid_modes
 from palpate.mechanics.solvers import registry
 from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
 from palpate.mechanics.solvers.contract import Expectation, Hints, Solver
-from palpate.mechanics.solvers.pattern import nested_dissection, twin_rows
 from palpate.mechanics.solvers.registry import SOLVERS, factorise
 from palpate.mechanics.stiffness import tissue_stiffness
 from palpate.mesh.space import lagrange_space

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import threading
 import time
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
@@ -82,13 +81,7 @@ class DaskEngine:
 
 def attempt_on_worker(task: str, work: str) -> dict[str, Any]:
     """One attempt of a task (JSON) in a child of the Dask worker that calls this; the outcome as JSON's own types."""
-    supervisor: Supervisor | None = getattr(_warm, "supervisor", None)
-    if supervisor is None or supervisor.work != work:
-        supervisor = _warm.supervisor = Supervisor(work)
-    return supervisor.attempt(Task.from_json(task)).to_dict()
-
-
-_warm = threading.local()  # a warm process for each thread of a worker
+    return Supervisor(work).attempt(Task.from_json(task)).to_dict()
 
 
 class _Cluster:

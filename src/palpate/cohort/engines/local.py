@@ -1,9 +1,8 @@
-"""The engine of this machine: some warm processes, each with a child at a time."""
+"""The engine of this machine: some threads, each of which watches a process at a time."""
 
 from __future__ import annotations
 
 import os
-import queue
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
@@ -44,36 +43,30 @@ class LocalEngine:
         if not hasattr(os, "fork"):
             raise ResourceError("cohorts need a system that forks processes: Linux or macOS, or a Dask worker on one")
         workers = max(min(self.workers or processors(), len(tasks)), 1)
-        pool = _Processes([Supervisor(self.work) for _ in range(workers)], self._memory_gb())
+        free = available_memory()
+        memory_gb = self.memory_gb or (UNKNOWN_GB if free is None else SHARE * free / 1e9)
+        pool = _Processes(Supervisor(self.work), Place(memory_gb, workers))
         try:
             yield from packed(pool, tasks)
         finally:
             pool.close()
 
-    def _memory_gb(self) -> float:
-        free = available_memory()
-        return self.memory_gb or (UNKNOWN_GB if free is None else SHARE * free / 1e9)
-
 
 class _Processes:
-    """Supervisors of this process, each in a thread of its own while it has a task."""
+    """Processes of this machine, each watched by a thread."""
 
-    def __init__(self, supervisors: list[Supervisor], memory_gb: float) -> None:
-        self._all = supervisors
-        self._idle: queue.SimpleQueue[Supervisor] = queue.SimpleQueue()
-        for supervisor in supervisors:
-            self._idle.put(supervisor)
-        self._place = Place(memory_gb, len(supervisors))
-        self._threads = ThreadPoolExecutor(len(supervisors), thread_name_prefix="case")
+    def __init__(self, supervisor: Supervisor, place: Place) -> None:
+        self._supervisor, self._place = supervisor, place
+        self._threads = ThreadPoolExecutor(place.slots, thread_name_prefix="case")
 
     def places(self) -> Mapping[str, Place]:
         """Where we are."""
         return {HERE: self._place}
 
     def start(self, task: Task, place: str) -> Hashable:
-        """Hand the task to an idle supervisor."""
+        """Begin an attempt in a process of its own."""
         del place
-        return self._threads.submit(self._attempt, task)
+        return self._threads.submit(self._supervisor.attempt, task)
 
     def ended(self, running: Mapping[Hashable, Task]) -> Sequence[tuple[Hashable, Outcome]]:
         """Those that have ended within a moment."""
@@ -81,15 +74,7 @@ class _Processes:
         done, _ = wait(futures, timeout=MOMENT_S, return_when=FIRST_COMPLETED)
         return [(future, future.result()) for future in done]
 
-    def _attempt(self, task: Task) -> Outcome:
-        supervisor = self._idle.get()
-        try:
-            return supervisor.attempt(task)
-        finally:
-            self._idle.put(supervisor)
-
     def close(self) -> None:
         """End all processes and threads."""
-        for supervisor in self._all:
-            supervisor.close()
+        self._supervisor.close()
         self._threads.shutdown(wait=True, cancel_futures=True)

@@ -16,7 +16,7 @@ from palpate.cohort.mark import held_soon, write_mark
 from palpate.cohort.task import Outcome, Task
 from palpate.errors import FolderInUse, ResourceError
 
-__all__ = ["Place", "Pool", "again", "marked", "packed"]
+__all__ = ["Engine", "Place", "Pool", "again", "marked", "packed"]
 
 LOST_ATTEMPTS = 3
 GRACE_S = 10.0
@@ -118,3 +118,20 @@ def marked(task: Task, outcome: Outcome) -> Outcome:
             return write_mark(folder, outcome)
     except FolderInUse:
         return outcome
+
+
+class Engine(Protocol):
+    """Who computes the rows of a cohort. Results and done marks are files in the rows' folders, never its own."""
+
+    @property
+    def name(self) -> str:
+        """What `--engine` calls it."""
+        ...
+
+    def outcomes(self, tasks: Sequence[Task]) -> Iterator[Outcome]:
+        """The outcome of each task, in the order in which they end; a failed one's mark is written by then.
+
+        Whoever stops asking ends what still runs. Raises `ResourceError` when the engine itself is gone: the rows
+        without an outcome are then waiting.
+        """
+        ...

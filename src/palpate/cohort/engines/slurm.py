@@ -60,7 +60,12 @@ class SlurmEngine:
         for program in ("sbatch", "squeue", "scancel"):
             if shutil.which(program) is None:
                 raise ResourceError(f"--engine slurm needs SLURM's {program}, which is not installed on this machine")
-        self._end_earlier()
+        with suppress(
+            InputDataError, ResourceError
+        ):  # an array of an earlier run is ended: its rows are in the new one
+            job = str(read_json(self.folder / FOLDER / JOB).get("job"))
+            if JOB_NUMBER.fullmatch(job):
+                _run("scancel", job)
         left = {task.row.id: task for task in tasks}
         while left:
             job = self._submit(list(left.values()))
@@ -120,13 +125,6 @@ class SlurmEngine:
             f'exec {command} --task "$SLURM_ARRAY_TASK_ID"',
         ]
         return "\n".join(lines) + "\n"
-
-    def _end_earlier(self) -> None:
-        """An array of an earlier run that still waits or runs is ended: its rows are in the new one."""
-        with suppress(InputDataError, ResourceError):
-            job = str(read_json(self.folder / FOLDER / JOB).get("job"))
-            if JOB_NUMBER.fullmatch(job):
-                _run("scancel", job)
 
 
 def run_part(folder: Path, number: int, progress: Callable[[str], None]) -> list[Outcome]:

@@ -11,7 +11,7 @@ from scipy import stats
 from statsmodels.stats.meta_analysis import combine_effects
 
 from palpate.cohort.statistics.scans import Scan, Usable
-from palpate.uncertainty.repeatability import within_subject_cv
+from palpate.uncertainty.intervals import within_subject_cv
 
 __all__ = ["Combined", "combined", "repeatability"]
 

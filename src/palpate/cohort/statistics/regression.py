@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, special, stats
 
-from palpate.cohort.statistics.permutation import Permutation, permutation_test
+from palpate.cohort.statistics.association import Permutation, permutation_test
 from palpate.cohort.statistics.scans import Scan
 
 __all__ = ["stage_regression"]

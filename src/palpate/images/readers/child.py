@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -30,20 +31,22 @@ else:
 def main(arguments: list[str]) -> None:
     """Read an image.
 
-    Arguments: bytes of address space, seconds of processor time, "labels" or "intensities", path, and a grid (JSON).
+    Arguments: bytes of address space, seconds of processor time and by the clock, "labels" or "intensities", path, and
+    a grid (JSON).
     """
-    memory_bytes, cpu_seconds, kind, path = int(arguments[0]), int(arguments[1]), arguments[2], Path(arguments[3])
+    memory_bytes, cpu_seconds, wall_seconds = int(arguments[0]), int(arguments[1]), float(arguments[2])
+    kind, path = arguments[3], Path(arguments[4])
     with os.fdopen(os.dup(1), "wb") as pipe:  # to the parent
         nowhere = os.open(os.devnull, os.O_WRONLY)  # where goes what a C library prints on standard output
         os.dup2(nowhere, 1)
         os.close(nowhere)
         pipe.write(GREETING)
         pipe.flush()
-        _limit(memory_bytes, cpu_seconds)
+        _limit(memory_bytes, cpu_seconds, wall_seconds)
         try:
             grid = None
-            if len(arguments) > 4:
-                (nx, ny, nz), affine = json.loads(arguments[4])
+            if len(arguments) > 5:
+                (nx, ny, nz), affine = json.loads(arguments[5])
                 grid = VoxelGrid((int(nx), int(ny), int(nz)), np.array(affine, dtype=np.float64))
             image_format = format_of(path)
             for module in image_format.needless:
@@ -66,10 +69,12 @@ def main(arguments: list[str]) -> None:
             pipe.write(values.T.data.cast("B"))
 
 
-def _limit(memory_bytes: int, cpu_seconds: int) -> None:
+def _limit(memory_bytes: int, cpu_seconds: int, wall_seconds: float) -> None:
     """No more memory or time than this, no file written, no core dumped; an earlier, lower limit stays."""
     if not LIMITED:
         return
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)  # which ends the process
+    signal.setitimer(signal.ITIMER_REAL, wall_seconds)
     for kind, value in (
         (resource.RLIMIT_AS, memory_bytes),
         (resource.RLIMIT_CPU, cpu_seconds),

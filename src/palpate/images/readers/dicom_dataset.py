@@ -19,7 +19,7 @@ from pydicom.dataset import Dataset
 from palpate.errors import InputDataError, PalpateError
 from palpate.images.input_file import read_input
 from palpate.images.label_image import VoxelGrid
-from palpate.images.readers.canonical import to_canonical
+from palpate.images.readers.values import to_canonical
 from palpate.images.readers.voxel_stream import check_size
 
 __all__ = ["LPS_TO_RAS", "Series", "read_dataset", "sentences", "series_beside"]

@@ -15,10 +15,10 @@ from palpate.errors import InputDataError
 from palpate.findings import Finding
 from palpate.images.label_image import VoxelGrid
 from palpate.images.named_labels import MAX_NAME, NamedLabel, hex_colour, printable
-from palpate.images.readers.canonical import to_canonical
 from palpate.images.readers.dicom_dataset import LPS_TO_RAS, Series, read_dataset, sentences, series_beside
 from palpate.images.readers.merged_masks import Mask, merged
 from palpate.images.readers.registry import StoredImage
+from palpate.images.readers.values import to_canonical
 from palpate.images.readers.voxel_stream import check_size
 
 __all__ = ["read"]

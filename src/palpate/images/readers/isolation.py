@@ -12,9 +12,8 @@ import re
 import signal
 import subprocess
 import sys
-import threading
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -63,73 +62,37 @@ def read_stored(
     if not image_format.read.__module__.startswith("palpate."):
         return image_format.stored(path, grid)  # the program's own code, which another process would not find
     limits = replace(limits, cpu_seconds=image_format.patience * limits.cpu_seconds)
-    with _reader(_command(path, kind, limits, grid), path, limits) as (pipe, verdict):
-        if pipe.readline(len(GREETING)) != GREETING:
-            raise _not_started(path)
-        line = pipe.readline(MAX_ANSWER)
-        try:  # a process that died before or while it wrote the line leaves none, or half of one
-            answer = json.loads(line) if line.endswith(b"\n") else None
-        except ValueError:
-            answer = None
-        stored = _stored(answer, pipe, path) if isinstance(answer, dict) else None
-        if stored is None:
-            raise verdict()
-        return stored
-
-
-@contextmanager
-def _reader(
-    command: list[str], path: Path, limits: ReadLimits
-) -> Iterator[tuple[BinaryIO, Callable[[], PalpateError]]]:
-    """The pipe from the reading process, and a function that says why it ended early."""
-    overdue = threading.Event()
-    with _started(command, path) as process:
-
-        def stop() -> None:
-            """The time is over: end the process, and remember why."""
-            overdue.set()
-            process.kill()
-
-        def verdict() -> PalpateError:
-            """Why the process ended; waits for its end."""
-            code = process.wait()
-            name = {-int(number): number.name for number in signal.Signals}.get(code, f"exit code {code}")
-            if overdue.is_set() or name == "SIGXCPU":
-                return ResourceError(
-                    f"reading '{path}' took more than {limits.cpu_seconds} s of processor time, or"
-                    f" {limits.wall_seconds:g} s in all, that one file gets; copy it to a local disk, or it is damaged:"
-                    " export it again"
-                )
-            if name == "SIGKILL":
-                return ResourceError(
-                    f"the system stopped the reading of '{path}', most often because memory is short; crop the image"
-                )
-            return InputDataError(
-                f"the reader of '{path}' crashed ({name}); the file is most likely damaged: export it again"
-            )
-
-        timer = threading.Timer(limits.wall_seconds, stop)
-        timer.start()
+    with _started(_command(path, kind, limits, grid), path) as process:
         try:
-            yield cast("BinaryIO", process.stdout), verdict
+            pipe = cast("BinaryIO", process.stdout)
+            if pipe.readline(len(GREETING)) != GREETING:
+                raise _not_started(path)
+            line = pipe.readline(MAX_ANSWER)
+            try:  # a process that died before or while it wrote the line leaves none, or half of one
+                answer = json.loads(line) if line.endswith(b"\n") else None
+            except ValueError:
+                answer = None
+            stored = _stored(answer, pipe, path) if isinstance(answer, dict) else None
+            if stored is None:
+                raise _sudden_end(process.wait(), path, limits)
+            return stored
         finally:
-            timer.cancel()
             process.kill()
 
 
 def _command(path: Path, kind: str, limits: ReadLimits, grid: VoxelGrid | None) -> list[str]:
     # -P: an image's folder, if it is the working folder, must not be searched for modules.
-    numbers = [str(limits.memory_bytes), str(limits.cpu_seconds)]
+    numbers = [str(limits.memory_bytes), str(limits.cpu_seconds), str(limits.wall_seconds)]
     place = [] if grid is None else [json.dumps([grid.shape, grid.affine.tolist()])]
     module = ["-P", "-W", "ignore", "-m", "palpate.images.readers.child"]
     return [sys.executable, *module, *numbers, kind, str(path), *place]
 
 
 def _started(command: list[str], path: Path) -> subprocess.Popen[bytes]:
+    """The process, with our places to import from, on one thread: a pool of them would eat address space."""
+    places = os.pathsep.join(str(Path(place).resolve()) for place in sys.path if place)
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     try:
-        # our places to import from; one thread, for a pool of them would eat address space
-        places = os.pathsep.join(str(Path(place).resolve()) for place in sys.path if place)
-        threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
         process = subprocess.Popen(  # noqa: S603 - our own interpreter and module, no shell
             command,
             stdin=subprocess.DEVNULL,
@@ -143,6 +106,21 @@ def _started(command: list[str], path: Path) -> subprocess.Popen[bytes]:
         with suppress(OSError):
             fcntl.fcntl(cast("BinaryIO", process.stdout), fcntl.F_SETPIPE_SZ, PIPE)
     return process
+
+
+def _sudden_end(code: int, path: Path, limits: ReadLimits) -> PalpateError:
+    """Why a process ended that sent no image, by its exit code."""
+    name = {-int(number): number.name for number in signal.Signals}.get(code, f"exit code {code}")
+    if name in ("SIGXCPU", "SIGALRM"):
+        return ResourceError(
+            f"reading '{path}' took more than {limits.cpu_seconds} s of processor time, or {limits.wall_seconds:g} s in"
+            " all, that one file gets; copy it to a local disk, or it is damaged: export it again"
+        )
+    if name == "SIGKILL":
+        return ResourceError(
+            f"the system stopped the reading of '{path}', most often because memory is short; crop the image"
+        )
+    return InputDataError(f"the reader of '{path}' crashed ({name}); the file is most likely damaged: export it again")
 
 
 def _not_started(path: Path) -> ResourceError:

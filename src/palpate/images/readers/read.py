@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from palpate.errors import InputDataError, ResourceError
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.named_labels import LabelTable, checked_table
-from palpate.images.readers.canonical import to_canonical
 from palpate.images.readers.isolation import ReadLimits, read_stored
 from palpate.images.readers.registry import StoredImage, format_of
-from palpate.images.readers.values import REDUCED
+from palpate.images.readers.values import REDUCED, to_canonical
 
 __all__ = ["read_intensities", "read_label_image"]
 
@@ -86,7 +85,8 @@ def _check_file(path: Path, kind: str) -> None:
         found = path.stat()
     except FileNotFoundError as error:
         raise InputDataError(
-            f"there is no file '{path}'; check the path, which is relative to the case file"
+            f"there is no file '{path}'; check the path, which in a case file or cohort table begins at that file, and"
+            " whether it was moved since"
         ) from error
     except (OSError, ValueError) as error:
         raise InputDataError(

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.mechanics.laws.contract import LawParameter
-from palpate.mechanics.laws.kinematics import IDENTITY4
+from palpate.mechanics.laws.finite import IDENTITY4
 
 __all__ = ["Linear"]
 

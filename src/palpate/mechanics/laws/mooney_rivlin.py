@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError
 from palpate.mechanics.laws.contract import LawParameter
-from palpate.mechanics.laws.finite import FiniteStrain
-from palpate.mechanics.laws.kinematics import IDENTITY4, cofactors, determinants, dyads, log_derivatives
+from palpate.mechanics.laws.finite import IDENTITY4, FiniteStrain, cofactors, determinants, dyads, log_derivatives
 
 __all__ = ["MooneyRivlin"]
 

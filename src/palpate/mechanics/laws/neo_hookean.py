@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.mechanics.laws.contract import LawParameter
-from palpate.mechanics.laws.finite import FiniteStrain
-from palpate.mechanics.laws.kinematics import IDENTITY4, cofactors, determinants, log_derivatives
+from palpate.mechanics.laws.finite import IDENTITY4, FiniteStrain, cofactors, determinants, log_derivatives
 
 __all__ = ["NeoHookean"]
 

@@ -56,7 +56,11 @@ def conjugate_gradients(
     for number in range(1, max_iterations + 1):
         image = times(matrix, direction)
         energy = np.einsum("ij,ij->j", direction, image)
-        _refuse_no_energy(energy, len(rhs))
+        if not np.all(energy > 0.0):
+            raise SolverError(
+                f"the stiffness of {len(rhs)} unknowns is not positive definite: a direction has the energy"
+                f" {np.min(energy):.3g}; hold the body somewhere and check for inverted tetrahedra"
+            )
         alpha = product / energy
         image *= alpha
         residual -= image
@@ -80,11 +84,3 @@ def conjugate_gradients(
         f" {max_iterations} steps for {len(rhs)} unknowns: use the direct solver ('multifrontal') or a Poisson's"
         " ratio further from 0.5"
     )
-
-
-def _refuse_no_energy(energy: NDArray[np.float64], n: int) -> None:
-    if not np.all(energy > 0.0):
-        raise SolverError(
-            f"the stiffness of {n} unknowns is not positive definite: a direction has the energy {np.min(energy):.3g};"
-            " hold the body somewhere and check for inverted tetrahedra"
-        )

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, sparse
 
+from multifrontal import twin_rows
 from palpate.errors import SolverError
 from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
 from palpate.mechanics.solvers.contract import EXACT, Expectation, Factorisation, Hints, Solver
-from palpate.mechanics.solvers.pattern import twin_rows
 from palpate.mechanics.solvers.products import times
 
 __all__ = ["SOLVER"]

@@ -9,15 +9,14 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from palpate.errors import ConfigurationError, SolverError
-from palpate.mechanics.solvers import multigrid
+from palpate.mechanics.solvers import direct, multigrid
 from palpate.mechanics.solvers.contract import EXACT, Coarser, Expectation, Factorisation, Hints
-from palpate.mechanics.solvers.multifrontal import solver as multifrontal
 from palpate.mechanics.solvers.products import times
 from palpate.memory import available_memory, total_memory
 
 __all__ = ["SOLVERS", "expected_of_size", "factorise"]
 
-SOLVERS = {solver.name: solver for solver in (multifrontal.SOLVER, multifrontal.MIXED, multigrid.SOLVER)}
+SOLVERS = {solver.name: solver for solver in (direct.SOLVER, direct.MIXED, multigrid.SOLVER)}
 TOLERANCE = 1e-8  # of a residual, relative to its right-hand side, which rounding may leave
 LARGEST_CONDITION = 1e13  # beyond it a direct solution has lost three digits of four to rounding
 USABLE = 0.8  # of the memory that is free: the rest is for what comes with the solutions

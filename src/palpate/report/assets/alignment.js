@@ -12,19 +12,11 @@ Palpate.Alignment = class extends Palpate.Planes {
 
   volumes() { return this.later.both; }
 
-  // To and fro in three seconds, with a rest at both ends.
-  play(on) {
-    clearInterval(this.timer);
-    this.timer = 0;
-    this.button.setAttribute("aria-pressed", String(on));
-    this.button.textContent = on ? "Stop" : "Fade to and fro";
-    if (!on) return;
-    const begin = performance.now() - (3000 / Math.PI) * Math.acos(1 - Number(this.fade.value) / 50);
-    this.timer = setInterval(() => {
-      const phase = ((performance.now() - begin) * Math.PI) / 3000;
-      this.fade.value = 50 * (1 - Math.min(Math.max(1.3 * Math.cos(phase), -1), 1));
-      this.draw();
-    }, 50);
+  play(on) { Palpate.play(this, on); }
+
+  draw() {
+    Palpate.tellFade(this);
+    super.draw();
   }
 
   // By the role: bones are what is aligned.

@@ -78,7 +78,9 @@ Palpate.Mesh = class {
     for (let t = 0; t < region.length; t++) {
       kept[t] = shown[region[t]] && cut.keep * (this.middles[3 * t + cut.axis] - at) > 0 ? 1 : 0;
     }
-    this.section.querySelector(".cut-value").textContent = `${"xyz"[cut.axis]} = ${at.toFixed(1)} mm`;
+    const words = `${"xyz"[cut.axis]} = ${at.toFixed(1)} mm`;
+    this.section.querySelector(".cut-value").textContent = words;
+    this.slider.setAttribute("aria-valuetext", words);
     return kept;
   }
 

@@ -47,6 +47,7 @@ Palpate.load = async () => {
     state.outlines = state.outlines.map(surface);
     state.points = state.points.map((p) => ({ near: p.near, rest: array(p.rest), observed: array(p.observed), fitted: array(p.fitted) }));
   }
+  for (const image of facts.preview) for (const key of ["organs", "whole", "greys"]) image[key] = image[key].map(volume);
   if (facts.mesh) {
     const m = facts.mesh;
     facts.mesh = {
@@ -102,6 +103,27 @@ Palpate.theme = () => {
     tell();
   });
 };
+
+// A slider that fades from one image to the other, and a button that moves it to and fro.
+Palpate.play = (figure, on) => {
+  clearInterval(figure.timer);
+  figure.timer = 0;
+  figure.button.setAttribute("aria-pressed", String(on));
+  figure.button.textContent = on ? "Stop" : "Fade to and fro";
+  if (!on) return;
+  const begin = performance.now() - (3000 / Math.PI) * Math.acos(1 - Number(figure.fade.value) / 50);
+  figure.timer = setInterval(() => { // in three seconds, with a rest at both ends
+    const phase = ((performance.now() - begin) * Math.PI) / 3000;
+    figure.fade.value = 50 * (1 - Math.min(Math.max(1.3 * Math.cos(phase), -1), 1));
+    figure.draw();
+  }, 50);
+};
+
+Palpate.tellFade = (figure) => figure.fade.setAttribute("aria-valuetext", `${Math.round(figure.fade.value)} % of ${figure.later.name}`);
+
+// When the page was scrolled last: a wheel that scrolls it does not stop at a figure that comes under the pointer.
+Palpate.scrolled = -Infinity;
+addEventListener("scroll", () => { Palpate.scrolled = performance.now(); }, { passive: true });
 
 // Buttons that put a text of the page on the clipboard; where that is not allowed, they mark it for the reader to copy.
 Palpate.copies = () => {

@@ -108,11 +108,26 @@ Palpate.Planes = class {
     const { box } = this, axis = view.normal;
     const canvas = figure.querySelector("canvas"), slider = figure.querySelector("input");
     Object.assign(slider, { min: box.low[axis], max: box.high[axis], step: 0.5, value: this.position[axis] });
-    slider.addEventListener("input", () => { this.position[axis] = Number(slider.value); this.draw(); });
+    const go = (mm) => { slider.value = mm; this.position[axis] = Number(slider.value); this.draw(); };
+    slider.addEventListener("input", () => go(slider.value));
+    canvas.addEventListener("wheel", (event) => this.wheel(event, slider, go), { passive: false });
     canvas.style.aspectRatio = `${box.high[view.across] - box.low[view.across]} / ${box.high[view.up] - box.low[view.up]}`;
     canvas.addEventListener("pointerdown", (event) => this.point(event, view, canvas));
     canvas.addEventListener("pointermove", (event) => { if (event.buttons) this.point(event, view, canvas); });
     return { canvas, slider, view, layers: new Map() };
+  }
+
+  // The wheel goes through the slices; at the last one, and while the page is being scrolled, it scrolls the page.
+  wheel(event, slider, go) {
+    if (event.ctrlKey || Math.abs(event.deltaX) > Math.abs(event.deltaY) || performance.now() - Palpate.scrolled < 300) return;
+    const end = event.deltaY > 0 ? slider.min : slider.max;
+    if (Number(slider.value) === Number(end)) return;
+    event.preventDefault();
+    this.turned = (this.turned || 0) + event.deltaY * (event.deltaMode ? 40 : 1);
+    const steps = Math.trunc(this.turned / 40); // mm
+    if (!steps) return;
+    this.turned -= 40 * steps;
+    go(Number(slider.value) - Math.max(-3, Math.min(steps, 3)));
   }
 
   // All planes through a place, mm.
@@ -167,8 +182,14 @@ Palpate.Planes = class {
   labelColours() { return [[0, 0, 0], ...this.facts.tissues.map((t) => Palpate.rgb(t.colour).map((c) => 255 * (0.06 + 0.3 * c)))]; }
 
   draw() {
-    for (const figure of this.figures) this.drawFigure(figure);
+    for (const figure of this.figures) {
+      figure.slider.setAttribute("aria-valuetext", this.place(figure.view));
+      this.drawFigure(figure);
+    }
   }
+
+  // Where a plane lies, in words.
+  place(view) { return `${"xyz"[view.normal]} = ${this.position[view.normal].toFixed(1)} mm`; }
 
   drawFigure({ canvas, view, layers }) {
     const { low, high } = this.box;
@@ -186,7 +207,7 @@ Palpate.Planes = class {
 
   // A volume on a plane, from a picture that is kept until plane or greys change.
   drawVolume(context, view, frame, volume, layers) {
-    const kept = layers.get(volume), key = `${this.position[view.normal]} ${volume.kind === "grey" ? this.window : ""}`;
+    const kept = layers.get(volume), key = `${this.position[view.normal]} ${volume.kind === "grey" ? this.window : this.colouring}`;
     if (!kept || kept.key !== key) {
       const grey = volume.kind === "grey";
       const picture = Palpate.layer(volume, view, this.position[view.normal], grey && this.greys(volume), !grey && this.labelColours());
@@ -234,7 +255,7 @@ Palpate.Planes = class {
     context.fillStyle = "#000"; context.fillRect(13, height - 17, bar * scale + 2, 5);
     context.fillStyle = "#fff"; context.fillRect(14, height - 16, bar * scale, 3);
     write(`${bar} mm`, 14, height - 27, "left", small);
-    write(`${"xyz"[view.normal]} = ${this.position[view.normal].toFixed(1)} mm`, width - 10, height - 14, "right", small);
+    write(this.place(view), width - 10, height - 14, "right", small);
     write(title, 10, 12, "left", small);
   }
 };

@@ -30,9 +30,12 @@
     const number = Number(section.dataset.later);
     if (facts.later[number].both.length) soon(section, () => new Palpate.Alignment(facts, number, section));
   }
+  for (const section of document.querySelectorAll("section.preview")) {
+    soon(section, () => new Palpate.Preview(facts, Number(section.dataset.later), section));
+  }
   const measured = [...document.querySelectorAll("section.points")].map((section) => [section, facts.measured[Number(section.dataset.measured)]]);
   for (const [section, state] of measured) soon(section.querySelector(".in-slices"), () => new Palpate.PointSlices(facts, state, section));
-  if (!Palpate.supportsWebGL()) return;
+  if (!Palpate.supportsWebGL || !Palpate.supportsWebGL()) return; // a page without bodies does not bring them
   for (const [section, state] of measured) soon(section.querySelector(".in-space"), () => new Palpate.PointBodies(facts, state, section));
   for (const section of document.querySelectorAll("section.organs")) {
     const number = Number(section.dataset.later);

@@ -1,0 +1,87 @@
+"""A matrix made ready to be solved with: what its pattern tells, once for all matrices that have it, and its factor."""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from multifrontal.dense import Matrix, blas_on_one_thread, processors
+from multifrontal.numeric import factorised, substituted
+from multifrontal.plan import Plan, make_plan
+
+__all__ = ["Factor", "analyse", "factorise"]
+
+KEPT_PLANS = 2  # of the patterns that came last
+
+
+@dataclass(frozen=True, slots=True)
+class Factor:
+    """L of A = L L^T, its numbers (factor_size,) in single or double precision laid out as the plan says."""
+
+    plan: Plan
+    numbers: Matrix
+
+    def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A^-1 rhs for one right-hand side (n,) or several (n, m), to the rounding of the factor's precision."""
+        with blas_on_one_thread():
+            found = substituted(self.plan, self.numbers, rhs[:, None] if rhs.ndim == 1 else rhs)
+        return np.asarray(found.reshape(rhs.shape), dtype=np.float64)
+
+
+class _Plans:
+    """Plans of the patterns that were analysed last."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self.kept: OrderedDict[tuple[bytes, int], Plan] = OrderedDict()
+
+    def of(self, matrix: sparse.csr_matrix[np.float64], threads: int) -> Plan:
+        """The plan for a canonical matrix, kept or new."""
+        digest = hashlib.blake2b(matrix.indptr.tobytes())
+        digest.update(matrix.indices.tobytes())
+        key = digest.digest(), threads
+        with self.lock:
+            plan = self.kept.pop(key, None) or make_plan(matrix, threads)
+            self.kept[key] = plan
+            while len(self.kept) > KEPT_PLANS:
+                self.kept.popitem(last=False)
+        return plan
+
+
+_plans = _Plans()
+
+
+def analyse(matrix: sparse.csr_matrix[np.float64], *, threads: int | None = None) -> Plan:
+    """What a factorisation of the symmetric matrix (n, n), n > 0, will do and take; only where its entries lie counts.
+
+    threads: as many as there are `processors` if nothing is said. The plans of the last two patterns are kept.
+    """
+    return _plans.of(_canonical(matrix), processors() if threads is None else threads)
+
+
+def factorise(matrix: sparse.csr_matrix[np.float64], *, dtype: type = np.float64, plan: Plan | None = None) -> Factor:
+    """The factor of the symmetric positive definite `matrix` (n, n), both of its triangles stored.
+
+    dtype: np.float64, or np.float32 for half of the memory and nearly twice the speed; the matrix' entries must then
+    be in the range of single precision. plan: that of its pattern, by `analyse`. Raises `NotPositiveDefinite`.
+    """
+    canonical = _canonical(matrix)
+    known = analyse(canonical) if plan is None else plan
+    with blas_on_one_thread():
+        return Factor(known, factorised(known, canonical.data, dtype))
+
+
+def _canonical(matrix: sparse.csr_matrix[np.float64]) -> sparse.csr_matrix[np.float64]:
+    """The matrix by rows, sorted, each entry once."""
+    by_rows = sparse.csr_matrix(matrix)
+    if by_rows.has_canonical_format:
+        return by_rows
+    copied = by_rows.copy()
+    copied.sum_duplicates()
+    return copied

@@ -1,1 +1,0 @@
-"""The demo, the paper's tables and the problems with known answers."""

@@ -1,1 +1,0 @@
-"""Multifrontal Cholesky factorisation on dense kernels of LAPACK."""

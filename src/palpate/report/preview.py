@@ -1,0 +1,365 @@
+"""The page that shows a case before it is estimated: who is who, how all lies, what is held, what can be expected."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from palpate.errors import InputDataError
+from palpate.images.label_image import VoxelGrid
+from palpate.images.readers import read_intensities
+from palpate.images.registration import length_text
+from palpate.images.tissue import Role, Tissue
+from palpate.images.tissue_colours import tissue_colours
+from palpate.progress import about
+from palpate.report.backgrounds import Grey
+from palpate.report.page import Picture, page_scripts, picture_of, policy_of, template_of, widths_of
+from palpate.report.payload import payload
+from palpate.report.preview_data import ROLE_COLOURS, PreviewImage, preview_data, preview_image
+from palpate.report.report_data import ReportData, Volume
+from palpate.report.rows import NONE, EstimateRow, estimate_rows, interval_text, number, scale_marks
+from palpate.report.slices import alignment_svg, first_planes, slice_svg
+from palpate.study.body import ImagedStates
+from palpate.study.case import Case
+from palpate.study.check import Checked, Problem
+from palpate.study.cost import ExpectedCost
+from palpate.study.first_look import FrameLook, TissueLook, frame_look, tissue_looks
+from palpate.study.prediction import Prediction
+
+__all__ = ["GENERATOR", "preview_page"]
+
+GENERATOR = '<meta name="generator" content="Palpate preview">'  # by which a page of ours is known
+SCRIPTS = ("report.js", "slices.js", "preview.js", "start.js")
+MOST_LATER = 4  # later images that are drawn
+LEAST_SHARE = 0.005  # of a variance, that is told
+MUCH = 0.05  # change of a volume that no stiffness explains
+MEANING = {
+    Role.ESTIMATE: "its stiffness is sought",
+    Role.KNOWN: "its stiffness is given",
+    Role.DRIVER: "its wall moves the others",
+    Role.RIGID: "bone; held, or moved as one body",
+    Role.VOID: "not part of the body",
+    Role.SLIDING: "the body glides along it",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class _State:
+    """A tissue in a later image, as texts: its volume with the change, its shift with its parts."""
+
+    volume: str
+    change: str
+    much: bool
+    shift: str
+    parts: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Row:
+    """A tissue, as texts."""
+
+    name: str
+    colour: str
+    role: str
+    role_colour: str
+    meaning: str
+    labels: str
+    modulus: str
+    volume: str
+    states: tuple[_State, ...]
+    frame: str
+    towards: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Later:
+    """The figures and sentences of one later image."""
+
+    name: str
+    slices: tuple[Picture, ...]
+    widths: str
+    whole: tuple[Picture, ...]
+    whole_widths: str
+    moved: bool
+    greys: bool
+    grey_volumes: tuple[Volume | None, ...]
+    factor: float
+    alignment: str
+    stands: str
+    residuals: str
+    fields: str
+
+
+def preview_page(checked: Checked, *, created: str, version: str, no_prediction: str = "") -> str:
+    """The preview of a case that was checked, one self-contained page with all names escaped.
+
+    no_prediction: why the report has no predicted intervals, where it has none. Of several pairs of images the first is
+    drawn.
+    """
+    shown = _shown_of(checked, created)
+    report, prediction = checked.report, checked.report.predicted
+    images = shown.images if shown else ()
+    scripts = page_scripts(SCRIPTS) if images else ()
+    expected, marks = _expected(prediction, shown.states if shown else None)
+    return str(
+        template_of("preview.html").render(
+            id=report.id,
+            patient=checked.case.patient if checked.case else report.id,
+            version=version,
+            created=created,
+            policy=policy_of(scripts),
+            scripts=scripts,
+            live=payload(shown.data, images) if shown and shown.data and images else None,
+            banner=_banner(report.problems, prediction),
+            problems=report.problems,
+            predicted=expected,
+            marks=marks,
+            noise=_noise(prediction),
+            no_prediction=no_prediction or "There is no prediction.",
+            cost=_cost(report.cost),
+            meshed=bool(checked.bodies),
+            tissues=_rows(shown.states, shown.looks) if shown else (),
+            names=shown.names if shown else (),
+            roles=_roles(shown.states) if shown else (),
+            held=shown.frame.held if shown else (),
+            later=tuple(_later(shown, k, image) for k, image in enumerate(images)) if shown else (),
+            left_out=_left_out(checked, len(images)),
+        )
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Shown:
+    """The first pair of images of a case as a preview shows it; data, images: where it has later ones."""
+
+    states: ImagedStates
+    names: tuple[str, ...]
+    frame: FrameLook
+    looks: tuple[TissueLook, ...]
+    data: ReportData | None = None
+    images: tuple[PreviewImage, ...] = ()
+
+
+def _shown_of(checked: Checked, created: str) -> _Shown | None:
+    """None of a case whose images cannot be read, or that comes as a mesh."""
+    case, states = checked.case, next(iter(checked.states), None)
+    if case is None or states is None or states.mesh is not None:
+        return None
+    frame, names = frame_look(case, states.before, states.after), _names(case, states)
+    looks = tissue_looks(states.before, states.after, frame.box)
+    if not states.after:
+        return _Shown(states, names, frame, looks)
+    data = preview_data(states, names, {"id": checked.report.id}, created=created)
+    data = replace(data, later=data.later[:MOST_LATER])
+    return _Shown(states, names, frame, looks, data, _images(case, states, data, looks, frame))
+
+
+def _noise(prediction: Prediction | None) -> Mapping[str, Any] | None:
+    """What the prediction takes for the noise of surfaces, as texts."""
+    if prediction is None:
+        return None
+    numbers = {"sd": prediction.noise_sd_mm, "length": prediction.correlation_mm}
+    return {name: number(mm, digits=2) for name, mm in numbers.items()} | {"stated": prediction.stated}
+
+
+def _cost(cost: ExpectedCost | None) -> Mapping[str, Any] | None:
+    """What an estimate is expected to take, as texts and counts."""
+    if cost is None:
+        return None
+    told = {"time": about(cost.seconds), "memory": number(cost.memory_gb, digits=2), "solver": cost.solver}
+    return told | {"tets": cost.tets, "unknowns": cost.unknowns, "processors": cost.processors}
+
+
+def _banner(problems: Sequence[Problem], prediction: Prediction | None) -> dict[str, Any]:
+    """What a reader must know first."""
+    refused = sum(problem.exit_code > 0 for problem in problems)
+    warned = len(problems) - refused
+    if refused:
+        title = "An estimate would refuse this case."
+        return {"kind": "bad", "title": title, "sentences": (f"{_count(refused, 'problem')} must be solved first.",)}
+    sentences = (f"{_count(warned, 'warning')} to be read first.",) if warned else ("No problem was found.",)
+    if prediction is None:
+        return {"kind": "fair" if warned else "good", "title": "The case can be estimated.", "sentences": sentences}
+    lost = [of.tissue for of in prediction.moduli if of.verdict == "not identified"]
+    weak = [of.tissue for of in prediction.moduli if of.verdict == "weak"]
+    if lost:
+        title = f"These images can hardly fix the stiffness of {' and '.join(lost)}."
+        return {"kind": "bad", "title": title, "sentences": sentences}
+    title = "The case can be estimated."
+    if weak:
+        sentences = (f"The interval of {' and '.join(weak)} will be wide.", *sentences)
+    return {"kind": "fair" if warned or weak else "good", "title": title, "sentences": sentences}
+
+
+def _count(n: int, what: str) -> str:
+    return f"{n} {what}{'' if n == 1 else 's'}"
+
+
+def _names(case: Case, states: ImagedStates) -> tuple[str, ...]:
+    """Names of the first image and of its later ones, each once."""
+    images = case.images
+    given = [] if images is None else [images.before.name, *(path.name for path in images.after)]
+    plain = ["before", *(f"after {k}" if len(states.after) > 1 else "after" for k in range(1, len(states.after) + 1))]
+    distinct = len(given) == len(plain) and len(set(given)) == len(given)
+    return tuple(given if distinct else plain)
+
+
+def _rows(states: ImagedStates, looks: Sequence[TissueLook]) -> tuple[_Row, ...]:
+    tissues = states.before.tissues
+    colours = tissue_colours(tissues)
+    return tuple(
+        _Row(
+            name=tissue.name,
+            colour=colour,
+            role=str(tissue.role),
+            role_colour=ROLE_COLOURS.get(str(tissue.role), colour),
+            meaning=MEANING[tissue.role],
+            labels=", ".join(map(str, tissue.labels)) or "all others",
+            modulus=_modulus(tissue),
+            volume=number(look.volumes_ml[0]),
+            states=tuple(_state(look, k) for k in range(len(states.after))),
+            frame=NONE if look.frame_mm is None else number(look.frame_mm, digits=2) if look.frame_mm >= 0.1 else "0",
+            towards="" if look.frame_mm is None else f"towards the {look.towards}",
+        )
+        for tissue, look, colour in zip(tissues, looks, colours, strict=True)
+    )
+
+
+def _modulus(tissue: Tissue) -> str:
+    """What is known of the modulus of a tissue."""
+    if tissue.role is Role.ESTIMATE:
+        return "sought"
+    if tissue.role is not Role.KNOWN:
+        return NONE
+    spread = f", within a factor of {np.exp(1.96 * tissue.modulus_sd):.2g}" if tissue.modulus_sd else ""
+    return f"{number(tissue.youngs_modulus_kpa)} kPa{spread}"
+
+
+def _state(look: TissueLook, after: int) -> _State:
+    first, later = look.volumes_ml[0], look.volumes_ml[after + 1]
+    change = later / first - 1.0 if first and look.middle is not None else None
+    shift = look.shifts_mm[after] if look.shifts_mm else None
+    return _State(
+        volume=number(later),
+        change="" if change is None else f"{round(100.0 * change, 1) + 0.0:+.1f} %",
+        much=change is not None and abs(change) > MUCH,
+        shift=NONE if shift is None else f"{np.linalg.norm(shift):.1f}",
+        parts="" if shift is None else "R {:+.1f}, A {:+.1f}, S {:+.1f}".format(*(np.round(shift, 1) + 0.0)),
+    )
+
+
+def _roles(states: ImagedStates) -> tuple[tuple[str, str, str], ...]:
+    """Each role of a case with its colour and its tissues."""
+    tissues = states.before.tissues
+    roles = dict.fromkeys(str(tissue.role) for tissue in tissues)
+    return tuple(
+        (role, ROLE_COLOURS.get(role, "#888888"), ", ".join(t.name for t in tissues if str(t.role) == role))
+        for role in roles
+    )
+
+
+def _expected(
+    prediction: Prediction | None, states: ImagedStates | None
+) -> tuple[tuple[tuple[EstimateRow, str, str, str], ...], tuple[tuple[float, str], ...]]:
+    """A row a modulus with its interval, guess and unit as texts, and the marks of their common scale."""
+    if prediction is None or states is None:
+        return (), ()
+    colours = dict(zip([t.name for t in states.before.tissues], tissue_colours(states.before.tissues), strict=True))
+    items = []
+    for of in prediction.moduli:
+        kpa = of.unit == "kPa"
+        interval = list(of.interval95)
+        item: dict[str, Any] = {"parameter": "youngs_modulus", "tissue": of.tissue, "unit": of.unit}
+        item |= {"value": of.guess if kpa else None, "interval95": interval if kpa else None}
+        item |= {"ratio": None if kpa else of.guess, "ratio_interval95": None if kpa else interval}
+        shares = {cause: share for cause, share in of.shares.items() if share >= LEAST_SHARE}
+        item |= {"relative_to": of.relative_to, "verdict": of.verdict, "why": of.why}
+        items.append(item | {"truth": None, "variance_shares": shares})
+    document = {"status": "converged", "estimates": items, "case": {}}
+    found = []
+    for row, of in zip(estimate_rows(document, colours), prediction.moduli, strict=True):
+        unit = "kPa" if of.unit == "kPa" else f"× {of.relative_to}"
+        found.append((row, interval_text(of.interval95), number(of.guess), unit))
+    return tuple(found), scale_marks(document)
+
+
+def _images(
+    case: Case, states: ImagedStates, data: ReportData, looks: Sequence[TissueLook], frame: FrameLook
+) -> tuple[PreviewImage, ...]:
+    box = data.references[0].slices
+    assert box is not None, "the images of a preview have a box"
+    first = _grey(case, states, None)
+    return tuple(
+        preview_image(states, k, box, looks, frame, (first, _grey(case, states, k))) for k in range(len(data.later))
+    )
+
+
+def _grey(case: Case, states: ImagedStates, after: int | None) -> Grey | None:
+    """The grey image of the first state, or of a later one brought to it; None where there is none that fits."""
+    images = case.images
+    if images is None:
+        return None
+    path = images.intensities_before if after is None else next(iter(images.intensities_after[after : after + 1]), None)
+    if path is None:
+        return None
+    try:
+        values, grid = read_intensities(path)
+    except InputDataError:  # a problem of the report, which says why
+        return None
+    if after is None or not states.alignments:
+        return Grey(values, grid)
+    back = states.alignments[after].motion.inverse().matrix
+    return Grey(values, VoxelGrid(grid.shape, back @ grid.affine))
+
+
+def _later(shown: _Shown, k: int, image: PreviewImage) -> _Later:
+    data, states, frame = shown.data, shown.states, shown.frame
+    assert data is not None, "there are later images"
+    reference, later = data.references[0], data.later[k]
+    assert reference.slices is not None, "the images of a preview have boxes"
+    assert reference.whole is not None, "the images of a preview have boxes"
+    by_role = replace(data, tissues=tuple(replace(t, colour=ROLE_COLOURS.get(t.role, t.colour)) for t in data.tissues))
+    backed = replace(by_role, references=(replace(reference, background=image.organs[0]),))
+    both = replace(later, both=image.whole[:2])
+    found = states.alignments[k] if states.alignments else None
+    first, second = frame.shared[k]
+    lay = (
+        "The images are taken as they lie; nothing was aligned." if found is None else f"{later.name} {found.in_words}."
+    )
+    bones = any(tissue.role == "rigid" for tissue in data.tissues)
+    return _Later(
+        name=later.name,
+        slices=tuple(
+            picture_of(p.view.name, partial(slice_svg, backed, p, later, name=f"s{k}{p.view.name}", model=False))
+            for p in first_planes(reference.slices)
+        ),
+        widths=widths_of(reference.slices),
+        whole=tuple(
+            picture_of(p.view.name, partial(alignment_svg, data, p, both, name=f"a{k}{p.view.name}"))
+            for p in first_planes(reference.whole)
+        ),
+        whole_widths=widths_of(image.view),
+        moved=image.motion is not None,
+        greys=any(image.greys),
+        grey_volumes=image.greys,
+        factor=image.factor,
+        alignment=lay,
+        stands="the bones stand" if bones else "what does not touch the drivers stands",
+        residuals=""
+        if found is None
+        else ", ".join(f"{name} {length_text(mm)} mm" for name, mm in found.residual_by_tissue_mm.items()),
+        fields=f"{later.name} shows {100.0 * first:.0f} % of what {reference.name} shows; {reference.name} shows"
+        f" {100.0 * second:.0f} % of what {later.name} shows.",
+    )
+
+
+def _left_out(checked: Checked, drawn: int) -> str:
+    """What the page does not show of a case with many images."""
+    later = sum(len(pair.after) for pair in checked.states)
+    if not drawn or later <= drawn:
+        return ""
+    return f"{drawn} of {later} later images are drawn, those of the first pair."

@@ -1,0 +1,142 @@
+"""Maps of stiffness on the page: three slices of a tissue, each beside its standard deviation, and the tissue cut open.
+
+Where the data removed less than half of what was not known, a slice is hatched and shows the tissue's mean.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator, StrMethodFormatter
+from numpy.typing import NDArray
+
+from palpate.mesh.locate import located
+from palpate.mesh.tet_mesh import TetMesh
+from palpate.report.pictures import BESIDE_FRONT, HEIGHT, WIDTH, face_normals, section_faces
+from palpate.report.render import Triangles, render_png
+from palpate.report.report_data import MapSlice, ReportData, TissueMap
+from palpate.report.scales import Scale
+from palpate.report.section import VIEWS, Plane
+from palpate.report.svg import INK, draw_svg
+from palpate.study.map_words import RESOLVED, map_words
+from palpate.study.result import CaseResult
+from palpate.uncertainty import StiffnessMap
+
+__all__ = ["map_png", "map_svg", "tissue_maps"]
+
+ROOM_MM = 3.0  # round the tissue
+COLOURS = "cividis"  # which is read alike by who sees no red or green
+FACTORS = (1.0, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0)
+SIDE_INCHES = 1.9
+
+
+def tissue_maps(result: CaseResult) -> tuple[TissueMap, ...]:
+    """The maps of the first reference state, cut through the region that differs, or the tissue's middle."""
+    mesh, last = result.space.mesh, len(result.displacements)
+    return tuple(_tissue_map(result, mesh, of) for of in result.estimation.maps if of.state < last)
+
+
+def _tissue_map(result: CaseResult, mesh: TetMesh, of: StiffnessMap) -> TissueMap:
+    tissue = mesh.tissue_index(of.tissue)
+    corners = mesh.nodes[mesh.tets[of.elements]].reshape(-1, 3)
+    low, high = corners.min(axis=0) - ROOM_MM, corners.max(axis=0) + ROOM_MM
+    middle = 0.5 * (low + high) if of.region is None else of.region.centre_mm
+    mean, row = float(result.stiffness[tissue]), np.full(len(mesh.tets), -1, dtype=np.int64)
+    row[of.elements] = np.arange(len(of.elements))
+    shown = mean * np.exp(np.where(of.resolution < RESOLVED, 0.0, of.log_ratio))
+    slices = []
+    for view in VIEWS:
+        plane = Plane(view, float(middle[view.normal]), low, high)
+        tets = located(mesh, plane.points.reshape(-1, 3)).tet
+        rows = np.where(tets < 0, -1, row[tets])
+        fields = (np.append(values, np.nan)[rows] for values in (shown, of.sd, of.resolution))
+        slices.append(MapSlice(*(field.reshape(plane.points.shape[:2]).astype(np.float32) for field in fields)))
+    return TissueMap(
+        tissue,
+        map_words(of),
+        mean,
+        low,
+        high,
+        middle,
+        tuple(slices),
+        of.elements.astype(np.int32),
+        shown.astype(np.float32),
+    )
+
+
+def map_scale(of: TissueMap, unit: str) -> Scale:
+    """Moduli of a map, logarithmic, as far below its tissue's mean as above it, and by a factor of 1.5 at least."""
+    factor = max(1.5, *np.exp(np.abs(np.log(np.quantile(of.moduli, [0.005, 0.995]) / of.mean))).tolist())
+    label = "Young's modulus (kPa)" if unit == "kPa" else "Young's modulus (ratio)"
+    ends = (of.mean / factor, of.mean, of.mean * factor)
+    return Scale(COLOURS, ends[0], ends[2], True, label, tuple((end, f"{end:.3g}") for end in ends))
+
+
+def map_svg(data: ReportData, of: TissueMap, *, name: str) -> str:
+    """Slices of a map, beside each the factor e^sd by which its modulus may be off, as SVG.
+
+    A length of the one colour bar is the same factor as on the other.
+    """
+    scale, tissue = map_scale(of, data.unit), data.tissues[of.tissue].name
+    spread = Scale(COLOURS, 1.0, scale.high / scale.low, True, "factor of one standard deviation", ())
+
+    def draw(figure: Figure) -> None:
+        """Two columns of three slices, and a colour bar under each."""
+        axes = figure.subplots(3, 2, gridspec_kw={"left": 0.02, "right": 0.98, "top": 0.94, "bottom": 0.14})
+        for row, (view, cut) in enumerate(zip(VIEWS, of.slices, strict=True)):
+            plane = Plane(view, float(of.position[view.normal]), of.low, of.high)
+            _slice(axes[row, 0], plane, cut, cut.modulus, scale)
+            _slice(axes[row, 1], plane, cut, np.exp(cut.sd), spread)
+            axes[row, 0].set_title(f"{view.name}, {'xyz'[view.normal]} = {plane.position:.0f} mm", loc="left")
+        for column, of_column in enumerate((scale, spread)):
+            _bar(figure, 0.06 + 0.5 * column, of_column)
+
+    says = f"Slices of the modulus inside {tissue}, and of its standard deviation. {of.words}"
+    return draw_svg(draw, size=(2.0 * SIDE_INCHES + 0.6, 3.0 * SIDE_INCHES + 1.2), name=name, says=says)
+
+
+def _slice(axes: Axes, plane: Plane, cut: MapSlice, values: NDArray[np.float32], scale: Scale) -> None:
+    across, up = plane.axes
+    shades = np.ma.masked_invalid(values.astype(np.float64))
+    extent = (float(across[0]), float(across[-1]), float(up[0]), float(up[-1]))
+    limits = LogNorm(scale.low, scale.high)
+    axes.imshow(shades, extent=extent, origin="lower", interpolation="none", norm=limits, cmap=scale.name)
+    blind = np.where(np.isfinite(cut.resolution), cut.resolution < RESOLVED, False).astype(np.float64)
+    if blind.any():
+        drawn = axes.contourf(across, up, blind, levels=[0.5, 1.5], colors="none", hatches=["////"])
+        drawn.set_edgecolor("#ffffff")
+        drawn.set_linewidth(0.0)
+    inside = np.isfinite(cut.resolution).astype(np.float64)
+    if inside.any():
+        axes.contour(across, up, inside, levels=[0.5], colors=[INK], linewidths=0.8)
+    axes.set_xlim(across[-1], across[0])  # the patient's right is on the left
+    axes.set_aspect("equal")
+    axes.set_axis_off()
+
+
+def _bar(figure: Figure, left: float, scale: Scale) -> None:
+    bar = figure.add_axes((left, 0.075, 0.38, 0.02))
+    mapped = ScalarMappable(LogNorm(scale.low, scale.high), scale.name)
+    places = [place for place, _ in scale.ticks] or [f for f in FACTORS if f <= scale.high]
+    drawn = figure.colorbar(mapped, cax=bar, orientation="horizontal", label=scale.label)
+    drawn.ax.xaxis.set_major_locator(FixedLocator(places))
+    drawn.ax.xaxis.set_minor_locator(NullLocator())
+    drawn.ax.xaxis.set_major_formatter(StrMethodFormatter("{x:.3g}"))
+    drawn.ax.xaxis.set_minor_formatter(NullFormatter())
+
+
+def map_png(data: ReportData, of: TissueMap) -> bytes:
+    """The mapped tissue cut open through the slices' sagittal plane, coloured by modulus as these are; PNG."""
+    if data.mesh is None:
+        raise ValueError("there is no mesh")
+    mesh = data.mesh
+    faces, tets = section_faces(replace(mesh, tets=mesh.tets[of.elements]), axis=0, position=float(of.position[0]))
+    corners = mesh.nodes.astype(np.float64)[faces]
+    colours = np.repeat(map_scale(of, data.unit).colours(of.moduli[tets].astype(np.float64))[:, None], 3, axis=1)
+    normals = np.repeat(face_normals(corners)[:, None], 3, axis=1)
+    return render_png(Triangles(corners, colours, normals), BESIDE_FRONT, width=WIDTH, height=HEIGHT)

@@ -1,0 +1,136 @@
+"""The preview of a case: a page that shows what will be estimated, before it is."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+
+from palpate.errors import ConfigurationError, InputDataError, PalpateError
+from palpate.images.tissue import Role
+from palpate.progress import Progress, silent
+from palpate.report.preview import GENERATOR, preview_page
+from palpate.study.case import Case
+from palpate.study.case_file import toml_key
+from palpate.study.check import Checked, CheckReport, Problem, checked_case
+from palpate.study.lock import held_folder
+from palpate.study.new_case import NewCase, write_new_case
+from palpate.study.outputs import OutputFolder, read_regular, write_text
+from palpate.study.prediction import predicted_intervals
+
+__all__ = ["PREVIEW", "checked_with_page", "new_case_with_page", "place_page", "refuse_other_page", "write_page"]
+
+LOGGER = logging.getLogger(__name__)
+PREVIEW = "preview.html"
+LARGEST_PAGE = 2**28  # bytes
+HEAD = 2000  # bytes, in which a page says whose it is
+ENDINGS = (".html", ".htm")
+AFTER_PROBLEMS = "There is no prediction: the problems come first."
+NOT_YET = "There is no prediction yet: it needs a mesh, which palpate check --html makes."
+SOME_KPA = 1.0  # a modulus, on which nothing that is drawn depends
+
+
+def checked_with_page(
+    source: Path | Case, overrides: Sequence[str] = (), *, progress: Progress = silent
+) -> tuple[CheckReport, str]:
+    """The report of a case with its predicted intervals, and its preview as a page; raises nothing for a bad case."""
+    checked = checked_case(source, overrides, progress=progress)
+    missing = AFTER_PROBLEMS
+    if checked.case is not None and checked.bodies:
+        try:
+            predicted = predicted_intervals(checked.bodies, checked.case, progress=progress)
+            checked = replace(checked, report=replace(checked.report, predicted=predicted))
+        except PalpateError as error:
+            missing = f"There is no prediction: {error}"
+    progress("drawing the preview")
+    return checked.report, _page(checked, missing)
+
+
+def write_page(case: Case, outputs: OutputFolder, *, progress: Progress = silent) -> None:
+    """Write preview.html of a case into its output folder, which this process holds; raises as `place_page` does."""
+    refuse_other_page(outputs.path / PREVIEW)
+    page = checked_with_page(case, progress=progress)[1]
+    with outputs.staged() as staging:
+        write_text(staging.area / PREVIEW, page)
+        staging.commit()
+
+
+def _new_case_page(new: NewCase, *, progress: Progress = silent) -> str:
+    """The preview of a case that `init` has written, not meshed.
+
+    A tissue whose role must be asked for is shown as void, and its question among the problems.
+    """
+    overrides = [f'tissues.{toml_key(t.name)}.role="void"' for t in new.tissues if t.role is None]
+    overrides += [
+        f"tissues.{toml_key(t.name)}.youngs_modulus_kpa={SOME_KPA}"
+        for t in new.tissues
+        if t.role is Role.KNOWN and t.youngs_modulus_kpa is None
+    ]
+    checked = checked_case(new.path, overrides, progress=progress, meshed=False)
+    asked = tuple(Problem("question", question, ConfigurationError.exit_code) for question in new.questions)
+    report = replace(checked.report, problems=(*asked, *checked.report.problems))
+    progress("drawing the preview")
+    return _page(replace(checked, report=report), NOT_YET)
+
+
+def new_case_with_page(
+    images: Sequence[Path],
+    table: Path | None,
+    outputs: OutputFolder,
+    *,
+    cts: Sequence[Path] = (),
+    progress: Progress = silent,
+) -> NewCase:
+    """Write case.toml for label images as `write_new_case` does, and beside it its preview.
+
+    The case stands without one where none can be made.
+    """
+    refuse_other_page(outputs.path / PREVIEW)
+    new = write_new_case(images, table, outputs, cts=cts)
+    try:
+        page = _new_case_page(new, progress=progress)
+    except Exception:  # a drawing never costs the case
+        LOGGER.exception("the preview could not be drawn")
+        return new
+    with outputs.staged() as staging:
+        write_text(staging.area / PREVIEW, page)
+        staging.commit()
+    return new
+
+
+def place_page(page: str, path: Path) -> None:
+    """Put a page in its place; raises as `refuse_other_page`, and `ResourceError` where the disk refuses."""
+    refuse_other_page(path)
+    with held_folder(path.parent), OutputFolder(path.parent).staged() as staging:
+        write_text(staging.area / path.name, page)
+        staging.commit()
+
+
+def refuse_other_page(path: Path) -> None:
+    """Raise `ConfigurationError` where a file that is no preview of ours has the name, or the name is no page's."""
+    if path.suffix.lower() not in ENDINGS:
+        raise ConfigurationError(f"{path} is no name of a page: give one that ends in .html")
+    OutputFolder(path.parent).require([path.name])
+    if not path.exists():
+        return
+    try:
+        ours = GENERATOR.encode() in read_regular(path, most_bytes=LARGEST_PAGE)[:HEAD]
+    except InputDataError:
+        ours = False
+    if not ours:
+        raise ConfigurationError(f"{path} is no preview that Palpate wrote, and is not replaced: choose another name")
+
+
+def _page(checked: Checked, missing: str) -> str:
+    created = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    return preview_page(checked, created=created, version=_version(), no_prediction=missing)
+
+
+def _version() -> str:
+    try:
+        return metadata.version("palpate")
+    except metadata.PackageNotFoundError:
+        return ""

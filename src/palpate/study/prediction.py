@@ -1,0 +1,158 @@
+"""What an estimate may be expected to tell, before it is run: intervals by the information of the images."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.inversion import Objective, first_noise_of, fit_coefficients
+from palpate.parallel import blas_on_one_thread
+from palpate.progress import Progress
+from palpate.study.body import Body, joint_problem, on_linear_elements
+from palpate.study.case import Case, Mechanics
+from palpate.study.estimation import verdict
+from palpate.study.run import inversion_settings
+from palpate.uncertainty import Interval, covariance_of, error_noise, log_interval
+
+__all__ = ["PredictedModulus", "Prediction", "predicted_intervals"]
+
+
+@dataclass(frozen=True, slots=True)
+class PredictedModulus:
+    """A tissue's modulus as it was guessed, in `unit` (kPa, or a ratio to `relative_to`), with its predicted interval.
+
+    interval95: what would be left of it with all that is unknown; an open end (None) reaches beyond the bounds of the
+    search; verdict: that which an estimate with this interval would have; shares: of each cause in the variance of
+    ln E.
+    """
+
+    tissue: str
+    unit: str
+    guess: float
+    interval95: Interval
+    relative_to: str
+    verdict: str
+    why: str
+    shares: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def unit_text(self) -> str:
+        """The unit behind a number."""
+        return "kPa" if self.unit == "kPa" else f"times {self.relative_to}"
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """The predicted intervals of a case's moduli, and the noise (mm) of the surfaces that they rest on.
+
+    correlation_mm: of the noise, the length of one Gaussian with its correlation area; stated: whether the case states
+    it, else the images show it.
+    """
+
+    moduli: tuple[PredictedModulus, ...]
+    noise_sd_mm: float
+    correlation_mm: float
+    stated: bool
+
+    def lines(self) -> list[str]:
+        """A line a modulus, for people."""
+        return [
+            f"predicted for {of.tissue}, if it has {of.guess:.3g} {of.unit_text}: 95 % interval"
+            f" {ends_text(of.interval95)} {of.unit_text} ({of.verdict})"
+            for of in self.moduli
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For a JSON document."""
+        return {
+            "noise": {
+                "surface_sd_mm": round(self.noise_sd_mm, 4),
+                "correlation_length_mm": round(self.correlation_mm, 2),
+                "stated": self.stated,
+            },
+            "moduli": [
+                {
+                    "tissue": of.tissue,
+                    "unit": of.unit,
+                    "guess": of.guess,
+                    "interval95": list(of.interval95),
+                    "relative_to": of.relative_to,
+                    "verdict": of.verdict,
+                    "shares": dict(of.shares),
+                }
+                for of in self.moduli
+            ],
+        }
+
+
+def ends_text(interval: Interval) -> str:
+    """As "2 to 5", an open end as a dash."""
+    low, high = ("–" if end is None else f"{end:.3g}" for end in interval)
+    return f"{low} to {high}"
+
+
+@blas_on_one_thread()
+def predicted_intervals(bodies: Sequence[Body], case: Case, *, progress: Progress) -> Prediction:
+    """The intervals that an estimate of the case may be expected to have, at guessed moduli, under the linear law.
+
+    The covariance of the log-moduli at the guess (see `covariance_of`), by the inverse of the Gauss-Newton matrix
+    J^T W J + P, which for these least squares is the Fisher information of images and prior: J needs no later image but
+    for the motion of what is prescribed. The noise in it is the one that the case states, or that the images show where
+    an estimate begins. Elements are linear ones on the given meshes, so that this takes seconds; a modulus is guessed
+    as its tissue states it, else as the middle start has it. Finite strains, layers round organs, the voxels' place and
+    the mesh are not in it. Raises as an estimate does.
+    """
+    coarse = replace(case, mechanics=Mechanics("linear", "P1", solver=case.mechanics.solver))
+    coarse = replace(coarse, discrepancy=replace(case.discrepancy, layer_sd=0.0))
+    problem = joint_problem([on_linear_elements(body, coarse) for body in bodies], coarse, progress=progress)
+    settings = inversion_settings(coarse, problem.parameters)
+    objective, nearby = first_noise_of(problem, settings, progress=progress)
+    noise_of = error_noise(nearby.evaluation)
+    progress("the information of the images at the guessed moduli")
+    guess = nearby.unknowns.copy()
+    guess[: objective.n_parameters] = _guessed(case, objective, np.median(np.stack(settings.starts), axis=0))
+    fitted = fit_coefficients(objective, guess, bounds=settings.bounds)
+    found = covariance_of(objective, fitted.evaluation, (), unknowns=fitted.unknowns, noise_of=noise_of)
+    surfaces = [noise for (_, kind), noise in noise_of.items() if kind == "surface distance"]
+    noise = surfaces[0] if surfaces else next(iter(noise_of.values()))
+    mapping, moduli = objective.parameters, list[PredictedModulus]()
+    variances = np.diag(found.total - found.mesh)
+    for i, name in enumerate(mapping.tissues):
+        value, sd = float(np.exp(guess[i])), float(np.sqrt(variances[i]))
+        limits = {"lower": float(np.exp(settings.bounds.lower[i])), "upper": float(np.exp(settings.bounds.upper[i]))}
+        interval = log_interval(value, sd, **limits)
+        word, why = verdict(interval, at_bound=False, absolute=mapping.absolute)
+        unit = mapping.scale_kpa if mapping.absolute else 1.0
+        ends = (interval[0] and unit * interval[0], interval[1] and unit * interval[1])
+        moduli.append(
+            PredictedModulus(
+                name,
+                "kPa" if mapping.absolute else "ratio",
+                unit * value,
+                ends,
+                mapping.relative_to,
+                word,
+                why,
+                replace(found, mesh=np.zeros_like(found.mesh)).shares(i),
+            )
+        )
+    return Prediction(
+        tuple(moduli),
+        noise.sd / np.sqrt(2.0),
+        float(np.sqrt(noise.correlation_area / (2.0 * np.pi))),
+        case.noise.surface_sd_mm is not None,
+    )
+
+
+def _guessed(case: Case, objective: Objective, middle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The parameters (n_parameters,) at the moduli that tissues state, at the middle start where they do not."""
+    stated = {tissue.name: tissue.modulus_kpa for tissue in case.tissues}
+    guess, scale = middle.copy(), objective.parameters.scale_kpa
+    for i, name in enumerate(objective.parameters.tissues):
+        if (kpa := stated.get(name)) is not None:
+            guess[i] = float(np.log(kpa / scale))
+    return guess

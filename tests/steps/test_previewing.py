@@ -1,0 +1,102 @@
+"""preview.html is written beside a new case and by a check; a file that is not ours is never replaced."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import palpate
+from palpate.cli import main
+from palpate.errors import ConfigurationError
+from palpate.images.label_image import LabelImage, VoxelGrid
+from palpate.images.readers import write_label_image
+from palpate.report.preview import GENERATOR
+
+NAMES = {"1": "prostate", "2": "rectum", "3": "body"}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    grid = VoxelGrid((24, 24, 24), np.diag([2.0, 2.0, 2.0, 1.0]))
+    for name, wall in (("before", 8), ("after", 9)):
+        labels = np.full(grid.shape, 3)
+        labels[8:16, 12:20, 8:16], labels[8:16, 4:wall, 4:20] = 1, 2
+        write_label_image(tmp_path / f"{name}.nii.gz", LabelImage(labels, grid))
+    (tmp_path / "names.json").write_text(json.dumps(NAMES))
+    return tmp_path
+
+
+def new_case(folder, names="names.json"):
+    images = [folder / f"{name}.nii.gz" for name in ("before", "after")]
+    return palpate.init(*images, labels=folder / names, output=folder / "case")
+
+
+def test_a_new_case_has_its_preview_beside_it(folder):
+    new_case(folder)
+    page = (folder / "case" / "preview.html").read_text(encoding="utf-8")
+    assert GENERATOR in page
+    assert "There is no prediction yet" in page
+    new_case(folder)  # whose preview is our own
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"), [(("sub-01_full", "sub-01_empty"), "sub-01"), (("before", "after"), "anna")]
+)
+def test_a_new_case_is_called_by_its_images_or_their_folder(folder, names, expected):
+    place = folder / "anna"
+    place.mkdir()
+    images = [place / f"{name}.nii.gz" for name in names]
+    for name, image in zip(("before", "after"), images, strict=True):
+        (folder / f"{name}.nii.gz").rename(image)
+    case = palpate.init(*images, labels=folder / "names.json", output=folder / "case")
+    assert palpate.read_case(case.path).id == expected
+
+
+def test_what_init_must_ask_stands_in_the_preview(folder):
+    (folder / "names.json").write_text(json.dumps({"1": "prostate", "2": "colon", "3": "body"}))
+    case = new_case(folder)
+    page = (folder / "case" / "preview.html").read_text(encoding="utf-8")
+    assert case.questions
+    assert "An estimate would refuse this case." in page
+
+
+def test_a_preview_of_somebody_else_is_left_alone(folder):
+    (folder / "case").mkdir()
+    (folder / "case" / "preview.html").write_text("<p>mine</p>")
+    with pytest.raises(ConfigurationError, match="no preview that Palpate wrote"):
+        new_case(folder)
+    assert [path.name for path in (folder / "case").iterdir()] == ["preview.html"]
+
+
+def test_a_check_writes_the_page_and_predicts(folder, capsys):
+    case = new_case(folder)
+    page = folder / "pages" / "look.html"
+    code = main(["check", str(case.path), "--html", str(page), "--json", "--set", "mesh.edge_length_mm=8"])
+    document = json.loads(capsys.readouterr().out)
+    assert code == document["exit_code"] == 0
+    assert GENERATOR in page.read_text(encoding="utf-8")
+    (modulus,) = document["predicted"]["moduli"]
+    assert modulus["tissue"] == "prostate"
+    assert page.read_text(encoding="utf-8").count("predicted: ") == 1
+    assert [path.name for path in page.parent.iterdir()] == ["look.html"]
+
+
+@pytest.mark.parametrize("name", ["case.toml", "notes.html"])
+def test_a_check_replaces_no_file_of_another_kind(folder, name):
+    case = new_case(folder)
+    (folder / "notes.html").write_text("<p>mine</p>")
+    kept = {path: path.read_bytes() for path in (case.path, folder / "notes.html")}
+    where = case.path if name == "case.toml" else folder / name
+    with pytest.raises(ConfigurationError):
+        palpate.check(case.path, html=where)
+    assert {path: path.read_bytes() for path in kept} == kept
+
+
+def test_a_case_that_is_refused_has_a_page_without_prediction(folder):
+    case = new_case(folder)
+    found = palpate.check(case.path, ["images.before=none.nii.gz"], html=folder / "look.html")
+    assert found.exit_code == 3
+    assert found.predicted is None
+    assert "the problems come first" in (folder / "look.html").read_text(encoding="utf-8")

@@ -1,0 +1,49 @@
+"""A report links to the sensitivity study beside it, if that is of its own estimate."""
+
+from __future__ import annotations
+
+import pytest
+
+from palpate.cli import main
+from palpate.steps import saving
+from palpate.study.outputs import OutputFolder, read_json
+
+LINK = 'href="sensitivity.html"'
+
+
+class Study:
+    """A sensitivity study that has only the estimates of a result."""
+
+    def __init__(self, estimates):
+        self.estimates = estimates
+
+    def to_dict(self):
+        keys = {"id": "a", "law": "linear", "element": "P2", "versions": {}, "sobol": None, "variations": []}
+        return keys | {"estimates": self.estimates, "warnings": []}
+
+
+@pytest.fixture
+def folder(case_result, tmp_path, monkeypatch):
+    monkeypatch.setattr("palpate.report.sensitivity_page", lambda document: str(document["id"]))
+    saving.save_estimate(case_result, OutputFolder(tmp_path))
+    return tmp_path
+
+
+def study_of(folder, **changes):
+    found = [dict(item) | changes for item in read_json(folder / "result.json")["estimates"]]
+    saving.save_sensitivity(Study(found), OutputFolder(folder))
+
+
+def test_the_study_of_the_same_estimate_is_linked_to(folder):
+    assert LINK not in (folder / "report.html").read_text(encoding="utf-8")
+    study_of(folder)
+    assert saving.has_study(folder)
+    assert LINK in (folder / "report.html").read_text(encoding="utf-8")
+    assert main(["report", str(folder), "--quiet"]) == 0
+    assert LINK in (folder / "report.html").read_text(encoding="utf-8")
+
+
+def test_that_of_another_one_is_not(folder):
+    study_of(folder, value=1.0)
+    assert not saving.has_study(folder)
+    assert LINK not in (folder / "report.html").read_text(encoding="utf-8")

@@ -1,0 +1,93 @@
+"""What an estimate may be expected to tell: wider where images are worse, at the moduli that were guessed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.images.segmentation import segment
+from palpate.images.tissue import Role
+from palpate.study.body import aligned, make_body
+from palpate.study.case import Case, CaseTissue, Discrepancy, DriverMotion, Images, Mechanics, MeshSettings, Noise
+from palpate.study.prediction import predicted_intervals
+from palpate.study.run import estimate_states
+from palpate.uncertainty import NORMAL_95
+from scenes import coarse_balls
+
+GIVEN = {"core": 60.0, "shell": 30.0}
+
+
+def silent(_: str) -> None:
+    """Nobody listens."""
+
+
+def case_of(scene, **changes):
+    tissues = tuple(
+        CaseTissue(t.name, t.labels or "remaining", t.role, youngs_modulus_kpa=GIVEN.get(t.name, t.youngs_modulus_kpa))
+        for t in scene.tissues
+    )
+    return Case(
+        "balls",
+        images=Images(Path("before.nii.gz"), (Path("after.nii.gz"),)),
+        tissues=tissues,
+        mesh=MeshSettings(8.0),
+        mechanics=Mechanics("linear", "P1"),
+        driver=DriverMotion(modes=12),
+        **changes,
+    )
+
+
+@pytest.fixture(scope="module")
+def states():
+    scene = coarse_balls()
+    before, after = (segment(image, scene.tissues) for image in (scene.before, scene.after))
+    return aligned(before, (after,), method="none")
+
+
+@pytest.fixture(scope="module")
+def prediction_of(states):
+    body = make_body(states, case_of(coarse_balls()), progress=silent)
+    return lambda **changes: predicted_intervals([body], case_of(coarse_balls(), **changes), progress=silent)
+
+
+def widths(prediction):
+    return np.array([np.log(of.interval95[1] / of.interval95[0]) for of in prediction.moduli])
+
+
+def noisy(sd_mm):
+    return {"noise": Noise(surface_sd_mm=sd_mm, correlation_length_mm=6.0), "discrepancy": Discrepancy(0.0, 25.0, 0.0)}
+
+
+def test_a_modulus_is_guessed_as_its_tissue_states_it(prediction_of):
+    found = prediction_of()
+    assert {of.tissue: of.guess for of in found.moduli} == pytest.approx(GIVEN)
+    for of in found.moduli:
+        low, high = of.interval95
+        assert np.sqrt(low * high) == pytest.approx(of.guess, rel=1e-6)
+        assert sum(of.shares.values()) == pytest.approx(1.0)
+    assert not found.stated
+
+
+def test_twice_the_noise_makes_intervals_at_most_twice_as_wide(prediction_of):
+    fine, coarse = (widths(prediction_of(**noisy(sd))) for sd in (0.1, 0.2))
+    assert np.all(coarse > 1.2 * fine)
+    assert np.all(coarse < 2.0 * fine * (1.0 + 1e-6))
+
+
+def test_the_noise_that_a_case_states_is_that_of_the_prediction(prediction_of):
+    found = prediction_of(**noisy(0.2))
+    assert found.stated
+    assert (found.noise_sd_mm, found.correlation_mm) == pytest.approx((0.2, 6.0))
+
+
+def test_a_prediction_is_near_what_the_estimate_then_says(states, prediction_of):
+    """Within a factor of two, of the standard deviations of a case whose truths are those that were guessed."""
+    case = case_of(coarse_balls())
+    sought = [replace(t, youngs_modulus_kpa=None) if t.role is Role.ESTIMATE else t for t in case.tissues]
+    told = estimate_states(states, replace(case, tissues=tuple(sought))).estimation
+    sd = np.sqrt(np.diag(told.covariance.total))
+    ratio = widths(prediction_of()) / (2.0 * NORMAL_95 * sd)
+    assert np.all((ratio > 0.5) & (ratio < 2.0))

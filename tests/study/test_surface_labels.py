@@ -1,0 +1,134 @@
+"""Closed surfaces as label images: the same voxels as of the bodies that they bound, whatever wrote them."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from palpate.cli import main
+from palpate.errors import ConfigurationError, InputDataError, ResourceError
+from palpate.images.readers import read_label_image
+from palpate.images.readers.stl import FACET
+from palpate.study.surface_labels import surface_labels
+
+LPS = np.array([-1.0, -1.0, 1.0])
+CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
+SIDES = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+QUADS = np.array([[[a, b, c], [a, c, d]] for a, b, c, d in SIDES]).reshape(-1, 3)
+
+
+def box(low, high):
+    """Corners (12, 3, 3) of a box's triangles, outwards, RAS mm."""
+    return (np.array(low) + (np.array(high) - low) * CUBE)[QUADS]
+
+
+def stl(path, corners, *, heading=b"SPACE=RAS", text=False):
+    if text:
+        rows = "".join(
+            "facet normal 0 0 0\nouter loop\n"
+            + "".join("vertex {} {} {}\n".format(*corner) for corner in facet)
+            + "endloop\nendfacet\n"
+            for facet in corners.tolist()
+        )
+        path.write_text(f"solid {path.stem}\n{rows}endsolid\n")
+        return path
+    facets = np.zeros(len(corners), FACET)
+    facets["corners"] = corners
+    path.write_bytes(heading.ljust(80) + np.uint32(len(corners)).tobytes() + facets.tobytes())
+    return path
+
+
+@pytest.mark.parametrize("inwards", [False, True])
+@pytest.mark.parametrize("text", [False, True])
+def test_a_box_has_the_voxels_whose_centres_it_holds(tmp_path, text, inwards):
+    corners = box([0.0, -5.0, 2.0], [10.0, 7.0, 8.0])
+    found = surface_labels([stl(tmp_path / "organ.stl", corners[:, :: 1 - 2 * inwards], text=text)], margin_mm=5.0)
+    image = found.image
+    centres = image.grid.world(np.argwhere(image.labels == 1).astype(float))
+    assert len(centres) == 10 * 12 * 6
+    assert np.all((centres > [0.0, -5.0, 2.0]) & (centres < [10.0, 7.0, 8.0]))
+    assert image.names == {1: "organ"}
+    assert image.grid.shape == (20, 22, 16)
+    assert found.volumes_mm3["organ"] == pytest.approx((720.0, 720.0))
+
+
+@pytest.mark.parametrize(("heading", "axes"), [(b"SPACE=LPS", "RAS"), (b"", "LPS")])
+def test_axes_are_those_of_the_heading_or_as_is_said(tmp_path, heading, axes):
+    corners = box([1.0, 2.0, 3.0], [9.0, 9.0, 9.0])
+    ours, theirs = (
+        surface_labels([stl(tmp_path / f"{name}.stl", of, heading=head)], axes=axes).image
+        for name, of, head in (("a", corners, b"SPACE=RAS"), ("b", corners * LPS, heading))
+    )
+    assert np.array_equal(ours.labels, theirs.labels)
+    assert ours.grid.affine == pytest.approx(theirs.grid.affine)
+
+
+def test_the_later_state_lies_on_the_grid_of_the_first_and_a_part_goes_to_itself(tmp_path):
+    """A tumour stays whole in its gland, and the overlap is told."""
+    gland, tumour = box([0.0] * 3, [20.0] * 3), box([5.0] * 3, [10.0] * 3)
+    before = surface_labels([stl(tmp_path / "gland.stl", gland), stl(tmp_path / "tumour.stl", tumour)])
+    (finding,) = before.image.findings
+    assert finding.code == "overlap"
+    assert np.count_nonzero(before.image.labels == 2) == 125
+    after = surface_labels([stl(tmp_path / "gland.stl", gland + 3.0)], like=before.image.grid).image
+    assert after.grid is before.image.grid
+    moved = np.argwhere(after.labels == 1).mean(axis=0) - np.argwhere(before.image.labels > 0).mean(axis=0)
+    assert moved == pytest.approx(np.full(3, 3.0))
+
+
+def test_a_voxel_partly_inside_counts_by_its_centre(tmp_path):
+    found = surface_labels(
+        [stl(tmp_path / "organ.stl", box([0.0] * 3, [9.4, 9.6, 9.5]))], spacing_mm=2.0, margin_mm=4.0
+    )
+    sizes = np.ptp(np.argwhere(found.image.labels), axis=0) + 1
+    assert sizes.tolist() == [5, 5, 5]
+    assert found.volumes_mm3["organ"] == pytest.approx((9.4 * 9.6 * 9.5, 1000.0))
+
+
+def test_what_is_no_closed_surface_is_refused(tmp_path):
+    whole = box([0.0] * 3, [10.0] * 3)
+    wrong = {
+        "open": (stl(tmp_path / "open.stl", whole[1:]), "is not closed"),
+        "none": (tmp_path / "none.stl", "cannot be read"),
+        "cut": (stl(tmp_path / "cut.stl", whole), "is no STL"),
+        "text": (stl(tmp_path / "text.stl", whole, text=True), "damaged text"),
+        "nan": (stl(tmp_path / "nan.stl", np.where(whole == 10.0, np.nan, whole)), "no number of millimetres"),
+        "empty": (stl(tmp_path / "empty.stl", whole[:0]), "is not closed"),
+    }
+    wrong["cut"][0].write_bytes(wrong["cut"][0].read_bytes()[:-7])
+    wrong["text"][0].write_text(wrong["text"][0].read_text().replace("10.0", "ten", 1))
+    for path, words in wrong.values():
+        with pytest.raises(InputDataError, match=words):
+            surface_labels([path])
+
+
+def test_names_that_stand_twice_and_grids_beyond_all_are_refused(tmp_path):
+    (tmp_path / "other").mkdir()
+    twice = [stl(folder / "organ.stl", box([0.0] * 3, [10.0] * 3)) for folder in (tmp_path, tmp_path / "other")]
+    with pytest.raises(ConfigurationError, match="2 surfaces are named, of 1 names"):
+        surface_labels(twice)
+    with pytest.raises(ResourceError, match="voxels"):
+        surface_labels(twice[:1], spacing_mm=0.01)
+
+
+def test_the_command_writes_an_image_and_a_table_that_a_case_takes(tmp_path, capsys):
+    paths = [
+        str(stl(tmp_path / "prostate.stl", box([0.0] * 3, [20.0] * 3))),
+        str(stl(tmp_path / "rectum.stl", box([0.0, -30.0, 0.0], [20.0, -10.0, 20.0]))),
+    ]
+    out = tmp_path / "out"
+    (tmp_path / "later_prostate").mkdir()
+    assert main(["voxelise", *paths, "--spacing", "2", "--output", str(out), "--json", "--quiet"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["labels"] == {"1": "prostate", "2": "rectum"}
+    image = read_label_image(out / "surfaces.nii.gz")
+    assert np.count_nonzero(image.labels == 1) == 1000
+    first, later = out / "surfaces.nii.gz", tmp_path / "later"
+    moved = str(stl(tmp_path / "later_prostate" / "prostate.stl", box([2.0] * 3, [22.0] * 3)))
+    assert main(["voxelise", moved, paths[1], "--like", str(first), "--output", str(later), "--quiet"]) == 0
+    arguments = ["init", str(first), str(later / "surfaces.nii.gz")]
+    assert main([*arguments, "--labels", str(out / "labels.json"), "--output", str(tmp_path / "case"), "--quiet"]) == 0
+    assert 'role = "driver"' in (tmp_path / "case" / "case.toml").read_text()
+    assert main(["voxelise", paths[0], str(tmp_path / "none.stl"), "--output", str(out), "--quiet"]) == 3

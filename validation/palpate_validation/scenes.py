@@ -1,0 +1,230 @@
+"""A table of scenes with known answers: what is computed, what was found, and how it is told.
+
+A scene is computed once, in parts: what is finished stands in a ledger at once, and an interrupted run goes on where it
+was. Parts that need the same meshes and factorisations make one job, so that one process computes them. A worker
+process has one thread of linear algebra for itself: two processes on two cores are faster than two threads in one.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from hashlib import sha256
+from multiprocessing import connection, get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
+
+from palpate.errors import ResourceError
+from palpate.parallel import processors
+from palpate.study import make_folder, own_file, software_versions, staged, write_json
+
+__all__ = ["Found", "Job", "Ledger", "Part", "Progress", "Scenes", "compute"]
+
+Part = Any  # of JSON
+Progress = Callable[[str], None]
+
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+GRACE = 5.0  # seconds that an ended process has to go
+
+
+class Found(Protocol):
+    """What all scenes say together."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `--json` prints, and what is written beside the page."""
+        ...
+
+    def text(self) -> list[list[str]]:
+        """The rows of the printed table, its heads first."""
+        ...
+
+
+FoundT = TypeVar("FoundT", bound=Found)
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """Parts (by their keys in the ledger) that one process makes one after the other, by `make(key, progress)`.
+
+    `make` travels to the process: a function of a module, or a `functools.partial` of one with plain arguments.
+    """
+
+    keys: tuple[str, ...]
+    make: Callable[[str, Progress], Part]
+
+
+@dataclass(frozen=True, slots=True)
+class Scenes(Generic[FoundT]):
+    """A table of scenes: its name, what it is made under, its jobs, what their parts say together, and its page.
+
+    `draw` writes the page, of that file ending. again: the next run computes all anew, not only what has changed.
+    """
+
+    name: str
+    settings: object
+    jobs: Sequence[Job]
+    conclude: Callable[[Mapping[str, Part]], FoundT]
+    draw: Callable[[FoundT, Path], None]
+    ending: str = ".svg"
+    again: bool = False
+
+    def found(self, ledger: Ledger, *, progress: Progress, workers: int = 1) -> FoundT:
+        """What the parts say, those of the ledger and those that it lacks; raises what a part raises."""
+        return self.conclude(compute(self.jobs, ledger, workers=workers, progress=progress))
+
+    def written(self, folder: Path, *, progress: Progress, workers: int = 1) -> FoundT:
+        """Compute what is left of it, write NAME.json and its page to `folder`, and return what was found.
+
+        Finished parts stand in NAME.parts.jsonl there, and count for the same settings and software only. `workers`:
+        processes that share the parts; a script that asks for more than one needs `if __name__ == "__main__"`.
+        Raises `PalpateError`s of meshing, solving and writing.
+        """
+        parts = f"{self.name}.parts.jsonl"
+        made_under = sha256(repr((self.settings, software_versions())).encode()).hexdigest()[:16]
+        result = self.found(Ledger(folder / parts, made_under), progress=progress, workers=workers)
+        with staged(folder) as new:
+            write_json(new.area / f"{self.name}.json", result.to_dict())
+            self.draw(result, new.area / f"{self.name}{self.ending}")
+            new.commit(retired=[parts] if self.again else [])
+        return result
+
+
+@dataclass(frozen=True, slots=True)
+class Ledger:
+    """A file of JSON lines, one a finished part; `settings` tells parts of other settings from these.
+
+    `path` None: nothing is kept.
+    """
+
+    path: Path | None
+    settings: str
+
+    def keep(self, key: str, value: Part) -> Part:
+        """Add a finished part; raises `ResourceError` on a full disk."""
+        if self.path is None:
+            return value
+        line = json.dumps({"settings": self.settings, "key": key, "value": value}, allow_nan=False)
+        make_folder(self.path.parent)
+        cut = self.path.exists() and not self.path.read_bytes().endswith(b"\n")  # an earlier run was killed here
+        try:
+            with os.fdopen(own_file(self.path), "ab") as file:
+                file.write((("\n" if cut else "") + line + "\n").encode("utf-8"))
+        except OSError as error:
+            raise ResourceError(
+                f"cannot write {self.path}: {error.strerror}; choose another --output folder"
+            ) from error
+        return value
+
+    def finished(self) -> dict[str, Part]:
+        """The finished parts by their keys."""
+        if self.path is None or not self.path.exists():
+            return {}
+        parts: dict[str, Part] = {}
+        for line in self.path.read_text(encoding="utf-8", errors="replace").splitlines():
+            try:
+                entry = json.loads(line)
+            except ValueError:  # the line at which an earlier run was killed
+                continue
+            if isinstance(entry, dict) and entry.get("settings") == self.settings:
+                parts[str(entry.get("key"))] = entry["value"]
+        return parts
+
+
+def compute(jobs: Sequence[Job], ledger: Ledger, *, workers: int, progress: Progress) -> dict[str, Part]:
+    """All parts by key: from the ledger, or made by `workers` processes (1: by this one) and written into it.
+
+    Raises what a part raises, and `ResourceError` when a process ends without a word.
+    """
+    parts = ledger.finished()
+    left = [Job(keys, job.make) for job in jobs if (keys := tuple(key for key in job.keys if key not in parts))]
+    total, count = sum(len(job.keys) for job in jobs), sum(len(job.keys) for job in left)
+    if count < total:
+        progress(f"{total - count} of {total} parts are already computed")
+    made = ((key, job.make(key, progress)) for job in left for key in job.keys)
+    if min(workers, len(left)) > 1:
+        made = _made_by(left, workers, progress)
+    for done, (key, part) in enumerate(made, start=total - count + 1):
+        parts[key] = ledger.keep(key, part)
+        progress(f"part {done} of {total} done: {key}")
+    return parts
+
+
+def _made_by(jobs: Sequence[Job], workers: int, progress: Progress) -> Generator[tuple[str, Part]]:
+    context = get_context("spawn")
+    waiting = list(jobs)
+    pipes = [context.Pipe() for _ in range(min(workers, len(jobs)))]
+    processes = [context.Process(target=_work, args=(theirs,), daemon=True) for _, theirs in pipes]
+    try:
+        with _threads(max(1, processors() // len(pipes))):
+            for process in processes:
+                process.start()
+        for _, theirs in pipes:
+            theirs.close()
+        busy = [ours for ours, _ in pipes]
+        while busy:
+            for pipe in connection.wait(busy):
+                assert isinstance(pipe, Connection)
+                yield from _heard(pipe, waiting, busy, progress)
+    finally:
+        for process in processes:
+            process.terminate()
+        for process in processes:
+            process.join(GRACE)
+
+
+def _heard(
+    pipe: Connection, waiting: list[Job], busy: list[Connection], progress: Progress
+) -> Iterator[tuple[str, Part]]:
+    """Take one message of a worker: the part in it, if it is one; the worker's next job, if it asks for it."""
+    try:
+        kind, content = pipe.recv()
+    except EOFError as error:
+        raise ResourceError(
+            "a process of the experiment ended before its part was done, most likely for want of memory; the same"
+            " command goes on with the parts that are left"
+        ) from error
+    if kind == "part":
+        yield content
+    elif kind == "progress":
+        progress(content)
+    elif kind == "error":
+        raise content
+    elif waiting:
+        pipe.send(waiting.pop(0))
+    else:
+        pipe.send(None)
+        busy.remove(pipe)
+
+
+def _work(pipe: Connection) -> None:
+    """A worker process: asks for jobs until there are none."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started this one ends it
+    with suppress(BrokenPipeError, EOFError):
+        try:
+            pipe.send(("ready", None))
+            while (job := pipe.recv()) is not None:
+                for key in job.keys:
+                    pipe.send(("part", (key, job.make(key, lambda text: pipe.send(("progress", text))))))
+                pipe.send(("ready", None))
+        except Exception as error:  # raised again where the experiment was asked for
+            pipe.send(("error", error))
+
+
+@contextmanager
+def _threads(number: int) -> Iterator[None]:
+    """Processes started meanwhile have that many threads of linear algebra each."""
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, str(number)))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
