@@ -312,7 +312,7 @@ def _evaluated(step: _Step, now: OuterIterate, rule: StopRule) -> tuple[OuterIte
     _, off, cost = model_error(objective, minimum)
     missing = float(np.max(off / (rule.model_error * tolerance), initial=0.0))
     left = float(np.max(_linearisation(objective, minimum) / tolerance, initial=0.0)) if rule.derivatives else 0.0
-    near = not step.cut and bool(np.all(moved < NEAR * posterior_sd(minimum, n)))
+    near = bool(np.all(moved < NEAR * posterior_sd(minimum, n)))
     checks = now.checks + cost
     matters = missing > max(1.0, FORCING * size / rule.model_error) or (near and max(missing, left) >= 1.0)
     value = minimum.evaluation.value

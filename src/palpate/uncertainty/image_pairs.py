@@ -26,8 +26,7 @@ from palpate.uncertainty.covariance import (
     scatter,
     shifts_by,
 )
-from palpate.uncertainty.intervals import NORMAL_95
-from palpate.uncertainty.repeatability import within_subject_cv
+from palpate.uncertainty.intervals import NORMAL_95, within_subject_cv
 
 __all__ = ["Agreement", "PairEstimates", "agreement", "pair_estimates"]
 
