@@ -13,8 +13,7 @@ from palpate.errors import InputDataError
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers import read_intensities
 from palpate.images.registration import length_text
-from palpate.images.tissue import Role, Tissue
-from palpate.images.tissue_colours import tissue_colours
+from palpate.images.tissue import Role, Tissue, tissue_colours
 from palpate.progress import about
 from palpate.report.backgrounds import Grey
 from palpate.report.page import Picture, page_scripts, picture_of, policy_of, template_of, widths_of
@@ -181,7 +180,9 @@ def _banner(problems: Sequence[Problem], prediction: Prediction | None) -> dict[
     if refused:
         title = "An estimate would refuse this case."
         return {"kind": "bad", "title": title, "sentences": (f"{_count(refused, 'problem')} must be solved first.",)}
-    sentences = (f"{_count(warned, 'warning')} to be read first.",) if warned else ("No problem was found.",)
+    sentences: tuple[str, ...] = (
+        (f"{_count(warned, 'warning')} to be read first.",) if warned else ("No problem was found.",)
+    )
     if prediction is None:
         return {"kind": "fair" if warned else "good", "title": "The case can be estimated.", "sentences": sentences}
     lost = [of.tissue for of in prediction.moduli if of.verdict == "not identified"]

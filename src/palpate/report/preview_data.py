@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from palpate.images.alignment import moved
 from palpate.images.distance import smoothing_width
 from palpate.images.segmentation import Segmentation
-from palpate.images.tissue import Role
-from palpate.images.tissue_colours import tissue_colours
+from palpate.images.tissue import Role, tissue_colours
 from palpate.mesh.anatomy import Box
 from palpate.report.backgrounds import Grey, whole_box
 from palpate.report.report_data import (

@@ -14,7 +14,7 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.mesh.anatomy import Box, domain_box
 from palpate.study.case import Case
-from palpate.study.domain import case_domain
+from palpate.study.edge_length import case_domain
 
 __all__ = ["FrameLook", "TissueLook", "frame_look", "tissue_looks"]
 
