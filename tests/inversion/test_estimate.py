@@ -123,6 +123,7 @@ def test_every_step_is_reported(twins, twin):
     invert(twins.exact_problem(twin, noise=SHARP), twins.settings(1.0), progress=lines.append)
     assert any("gland" in line for line in lines)
     assert any("1 starts" in line for line in lines)
+    assert any("objective" in line for line in lines)
 
 
 STATED = NoiseModel(np.array([0.03**2]), np.array([3.0]))

@@ -179,7 +179,8 @@ def minimised(
     region = _Region()
     for number in range(1, rule.iterations + 1):
         line = f"{title}, iteration {number}"
-        progress(f"{line}: {now.objective.parameters.in_words(now.minimum.unknowns)}")
+        lowered = f", objective {now.totals[-1][0]:.2f} to {now.totals[-1][1]:.2f}" if now.totals else ""
+        progress(f"{line}: {now.objective.parameters.in_words(now.minimum.unknowns)}{lowered}")
         now, region = _iteration(now, bounds, rule, region, held, grows=number <= GROWS)
         if now.minimum.outcome is Outcome.STUCK:
             break
