@@ -6,7 +6,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: commands install demo test quick style lint check clean pardiso benchmark-setup schemas docs dist dist-test minimum report-check export-check
+.PHONY: commands install demo test quick style lint check clean pardiso benchmark-setup schemas docs lock dist dist-test minimum report-check export-check
 
 install: $(VENV)/.installed
 
@@ -75,6 +75,13 @@ schemas: install
 docs: install
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[docs]"
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+# requirements.lock, which pins what the Dockerfile installs: the libraries, some extras, and what builds the wheel.
+LOCKED := dicom mesh itk dataframe samples sensitivity cohort
+lock: install
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check "uv>=0.5"
+	echo hatchling | $(BIN)/uv pip compile pyproject.toml - --quiet --upgrade --universal --python-version 3.11 \
+	  --no-header --no-annotate $(addprefix --extra ,$(LOCKED)) --output-file requirements.lock
 
 # Wheel and sdist in dist/.
 dist: install

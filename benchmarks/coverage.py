@@ -33,7 +33,7 @@ from scipy import stats
 
 from palpate.errors import EstimationError, PalpateError
 from palpate.images import segment
-from palpate.inversion import InverseProblem, Inversion, InversionSettings, StopRule, frozen_posterior, invert
+from palpate.inversion import InverseProblem, Inversion, InversionSettings, StopRule, invert
 from palpate.mesh import LagrangeSpace
 from palpate.observation import NoiseModel, Observation, ObservedSurface, SurfaceDistance, surface_distance
 from palpate.phantoms import Scene, target_of_truth
@@ -49,6 +49,7 @@ from palpate.study import (
     inversion_settings,
     make_body,
     released_of,
+    stated_posteriors,
 )
 from palpate.uncertainty import covariance_of, gain, noise_covariance
 
@@ -220,13 +221,11 @@ def _moduli(inversion: Inversion, body: Body, row: Row) -> list[Result]:
     """By tissue: the error of ln E, its standard deviation, the ends of its intervals less the truth, the verdict."""
     objective, minimum = inversion.objective, inversion.minimum
     errors = [[np.zeros(len(line.weights)) for line in minimum.evaluation.lines]] * NO_GRID
-    bonded = covariance = covariance_of(objective, minimum.evaluation, errors, unknowns=minimum.unknowns)
+    bonded = covariance_of(objective, minimum.evaluation, errors, unknowns=minimum.unknowns)
     released, remark = released_of(inversion, body.settings)
-    if released is not None:
-        covariance = bonded.with_released(objective, minimum, released)
-    fixed = frozen_posterior(objective, minimum.unknowns, minimum.evaluation)
-    known = intervals_of(inversion, body.settings, fixed, covariance)
-    without = intervals_of(inversion, body.settings, fixed, bonded)
+    covariance, posteriors = stated_posteriors(inversion, bonded, released)
+    known = intervals_of(inversion, body.settings, posteriors)
+    without = intervals_of(inversion, body.settings, posteriors[:1])
     estimates = estimates_of(inversion, known, covariance, truth={}, layers_told=not remark)
     limits = _limits(inversion, row)
     of_noise = None if row.limit is None else _by_true_noise(inversion, row.limit)

@@ -19,7 +19,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -31,11 +31,14 @@ from scipy import sparse
 
 import palpate
 from palpate.demo import DATA
+from palpate.export.fitted_model import fitted_model
+from palpate.export.groups import material_parts
 from palpate.mechanics import Dilatation, equilibrium
-from palpate.mesh import Constraint, TetMesh, tissue_surface
+from palpate.mesh import OUTER, Constraint, TetMesh, tissue_surface
 
 VOLUME, WARP_MM = 1e-4, 0.05
 CASES = (("linear", "P2"), ("neo-hookean", "P2"), ("neo-hookean", "auto"))
+LONG = ("Nodes", "Elements", "Surface", "NodeData", "ElementData")  # lists of FEBio's
 LPS = np.array([-1.0, -1.0, 1.0])
 
 
@@ -151,12 +154,15 @@ def under_decoupled_law(result: palpate.CaseResult, path: Path) -> NDArray[np.fl
     offset, free = np.zeros(n), np.ones(n, dtype=bool)
     offset[dofs], free[dofs] = given[:, 3], False
     constraint = Constraint(sparse.csr_matrix(sparse.identity(n, format="csc")[:, free]), np.zeros((n, 0)), offset)
-    meshed = [i for i, tissue in enumerate(result.tissues) if tissue.meshed]
-    poisson = {tissue.poisson_ratio for tissue in result.tissues if tissue.meshed}
-    assert len(poisson) == 1, "the law of the check has one Poisson's ratio"
-    moduli = result.stiffness[meshed]
-    found = equilibrium(result.space, constraint, moduli, law=Decoupled(), dilatation=Dilatation.POINTWISE)
-    return found.displacement
+    body = fitted_model(result, seal="").bodies[0]
+    parts, region = material_parts(body.mesh, body.log_ratio), np.empty_like(body.mesh.region)
+    for number, part in enumerate(parts):
+        region[part.cells] = number
+    tissues = tuple(replace(body.tissues[part.tissue], name=part.name) for part in parts)
+    mesh = replace(body.mesh, region=region, tissues=tissues, beyond=np.full_like(body.mesh.beyond, OUTER))
+    moduli = np.array([result.stiffness[part.tissue] * np.exp(part.log_ratio) for part in parts])
+    space = replace(result.space, mesh=mesh)
+    return equilibrium(space, constraint, moduli, law=Decoupled(), dilatation=Dilatation.POINTWISE).displacement
 
 
 def volumes_of(mesh: TetMesh) -> dict[str, float]:
@@ -276,11 +282,12 @@ def febio(results: Results, folder: Path) -> Iterator[Row]:
     }
     yield Row("XML", "FEBio: volume of a tissue, relative difference", worst_volume(sizes, result.space.mesh), VOLUME)
     for parent in root.iter():
-        for child in list(parent)[20:] if parent.tag in ("Nodes", "Elements", "Surface", "NodeData") else []:
+        for child in list(parent)[20:] if parent.tag in LONG else []:
             parent.remove(child)
-        if parent.tag == "value" and parent.attrib.pop("type", "") == "map":
+        if parent.attrib.get("type") == "map":
+            del parent.attrib["type"]
             parent.text = "1.0"
-        if parent.tag == "NodeSet":
+        if parent.tag in ("NodeSet", "ElementSet"):
             parent.text = ",".join(map(str, integers(parent)[:20]))
     try:
         model = module.Model.from_xml(ET.tostring(root))

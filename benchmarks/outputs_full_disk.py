@@ -132,18 +132,18 @@ def compute(bench: Bench) -> None:
     images = [bench.root / f"{name}.nii.gz" for name in ("before", "after")]
     guess = NEW_CASE.new_case(NEW_CASE.CaseImages(images[0], (images[1],)), bench.new("init"))
     pages: dict[str, str] = {}
-    first: Callable[[Any], str] = CASE_REPORT.render
+    first: Callable[..., str] = CASE_REPORT.render
 
-    def render(data: Any) -> str:
+    def render(data: Any, **options: Any) -> str:
         """The page, drawn once for each state of a result."""
-        return pages.setdefault(data.document["status"], first(data))
+        return pages.setdefault(data.document["status"], first(data, **options))
 
     with tempfile.TemporaryDirectory() as folder:
         collected = CASE_REPORT.collect(estimated)
         CASE_REPORT.render = render
         CASE_REPORT.collect = lambda _: collected
         CASE_REPORT.write_case_report(estimated, Path(folder))
-    CASE_REPORT.render = lambda data: pages.get(data.document["status"]) or first(data)
+    CASE_REPORT.render = lambda data, **options: pages.get(data.document["status"]) or first(data, **options)
     RUN.estimate = lambda *_, **__: estimated
     RUN.mesh = lambda *_, **__: meshed
     NEW_CASE.new_case = lambda *_: guess

@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
@@ -14,6 +15,7 @@ ROOT = Path(__file__).parents[1]
 BESIDE = {"security.md": "SECURITY.md", "contributing.md": "CONTRIBUTING.md", "changelog.md": "CHANGELOG.md"}
 SOURCE = "https://github.com/palpate/palpate/blob/main/"
 LINK = re.compile(r"\]\((?!https?:|#)([^)#]+)(#[^)]*)?\)")
+LOADED = re.compile(r'<(?!a\b)[^>]*?\b(?:src|href|action)="(?:https?:)?//[^>]*>|data-md-component="source"')
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -40,6 +42,14 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         return f"]({os.path.relpath(own, place.parent)}{match[2] or ''})"
 
     return LINK.sub(leading, markdown)
+
+
+def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
+    """The page as it is; raises `PluginError` for one that loads anything from elsewhere (links are only followed)."""
+    del config
+    if found := LOADED.search(output):
+        raise PluginError(f"{page.file.src_uri} would load something from elsewhere: {found[0]}")
+    return output
 
 
 def _commands() -> str:

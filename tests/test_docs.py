@@ -122,7 +122,7 @@ def requirements() -> list[str]:
 
 
 def test_every_dependency_is_used():
-    folders = ("src", "validation", "tests", "benchmarks", "docs", "examples")
+    folders = ("src", "packages", "validation", "tests", "benchmarks", "docs", "examples")
     code = "\n".join(path.read_text() for folder in folders for path in (ROOT / folder).rglob("*.py"))
     orders = (ROOT / "Makefile").read_text() + (ROOT / "mkdocs.yml").read_text()
     imported = {name.lower() for name in re.findall(r"(?:import |from |import_module\(\"|installed\(\")(\w+)", code)}

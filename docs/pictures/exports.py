@@ -1,4 +1,4 @@
-"""The pictures of docs/export: a result's files in each format, read and drawn by libraries that are not ours.
+"""The pictures of docs/export.md: a result's files in each format, read and drawn by libraries that are not ours.
 
     make demo && pip install --editable ".[export-check]" pyvista
     python docs/pictures/exports.py demo-output [--only abaqus,gmsh]

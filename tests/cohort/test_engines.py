@@ -171,9 +171,10 @@ def test_the_class_of_a_failure_is_that_of_its_exit_code(error, name):
     assert name in FAILURE_CLASSES
 
 
-@pytest.mark.parametrize(("does", "cause"), [("die 9", "lost"), ("swell 0.35", "memory")])
+@pytest.mark.parametrize(("does", "cause"), [("die 9", "lost"), ("swell 0.8", "memory")])
 def test_a_child_that_is_killed_is_taken_for_too_large_beyond_half_of_its_limit(tmp_path, does, cause):
-    assert Supervisor(STUB).attempt(task(tmp_path, does)).cause == cause
+    patient = dataclasses.replace(task(tmp_path, does), limits=Limits(0.5, 120.0))
+    assert Supervisor(STUB).attempt(patient).cause == cause
 
 
 def test_tasks_are_json(tmp_path):

@@ -28,7 +28,7 @@ youngs_modulus_kpa = 10.0
 @pytest.fixture
 def estimate(tmp_path, monkeypatch, case_result):
     """Run `palpate estimate` of a patient into the folder `out`; `meanwhile` is called in the place of the numbers."""
-    monkeypatch.setattr(case_report, "render", lambda data: f"the page of {data.document['id']}")
+    monkeypatch.setattr(case_report, "render", lambda data, **_: f"the page of {data.document['id']}")
 
     def run(patient: str, *flags: str, meanwhile=lambda: None) -> int:
         def compute(case, *, progress, truth):

@@ -132,7 +132,7 @@ def test_a_page_is_drawn_of_no_other_run_than_the_result_tells_of(estimate, out,
 
 def test_the_page_drawn_again_is_that_of_the_result(estimate, out, monkeypatch):
     assert estimate("anna", "--quiet") == 0
-    monkeypatch.setattr(case_report, "render", lambda _: "another page")
+    monkeypatch.setattr(case_report, "render", lambda *_, **__: "another page")
     assert main(["report", str(out), "--quiet"]) == 0
     assert (out / "report.html").read_text() == "another page"
     assert result(out)["files"]["report.html"]["sha256"] == hashlib.sha256(b"another page").hexdigest()

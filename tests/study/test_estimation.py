@@ -16,7 +16,14 @@ from palpate.mechanics.forward import SolveCounts
 from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimation import Observed, conclude, hull, verdict
 from palpate.study.samples import draw_moduli
-from palpate.uncertainty import FittedState, grid_position_shifts, mesh_covariance, sandwich_covariance
+from palpate.study.together import StatedPosterior
+from palpate.uncertainty import (
+    FittedState,
+    frozen_posterior,
+    grid_position_shifts,
+    mesh_covariance,
+    sandwich_covariance,
+)
 from palpate.uncertainty.covariance import scatter
 
 NOISE = NoiseModel(np.array([0.03**2]), np.array([3.0]))
@@ -356,7 +363,10 @@ def test_what_did_not_converge_is_not_sampled(inversion, settings, observed):
 
 def test_an_interval_of_samples_is_open_where_that_of_the_estimate_is(inversion, settings):
     given = {"bounds": settings.bounds, "draws": 100, "rng": np.random.default_rng(1)}
-    found = draw_moduli(inversion, 0.01 * np.eye(2), [(20.0, None), None], **given).interval95
+    minimum = inversion.minimum
+    frozen = frozen_posterior(inversion.objective, minimum.unknowns, minimum.evaluation)
+    posterior = StatedPosterior(frozen, minimum, 0.01 * np.eye(2))
+    found = draw_moduli(posterior, [(20.0, None), None], **given).interval95
     assert np.array_equal(np.isnan(found), [[False, True], [True, True]])
 
 

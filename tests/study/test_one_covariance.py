@@ -1,4 +1,4 @@
-"""Everything that is stated of the moduli has one covariance: what blocks add that are held until it is asked, too."""
+"""Everything that is stated of the moduli rests on the same posteriors: what is held until it is asked is in all."""
 
 from __future__ import annotations
 

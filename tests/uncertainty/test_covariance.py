@@ -310,17 +310,12 @@ def test_the_grid_adds_to_stated_noise_and_to_what_residuals_tell_what_that_lack
     assert np.array_equal(grid_covariance(replace(told, lines=tuple(lines)), grid, noise), grid)
 
 
-def test_an_estimate_that_moves_when_what_is_held_is_free_errs_by_as_much():
-    held, free = np.diag([0.01, 0.04]), np.diag([0.02, 0.04])
-    part = added_by(free, np.array([0.3, 0.0]), held=held)
-    assert part == pytest.approx(np.diag([0.01 + 0.09, 0.0]))
-
-
-def test_nothing_is_added_where_it_is_known_better_with_more_unknowns(rng):
+def test_nothing_is_taken_from_what_is_known_of_fewer_unknowns(rng):
     """What a second fit finds narrower, as one of other residuals may, takes nothing from the first one."""
     held = np.diag([0.04, 0.04])
-    assert added_by(0.5 * held, np.zeros(2), held=held) == pytest.approx(np.zeros((2, 2)))
+    assert added_by(0.5 * held, held=held) == pytest.approx(np.zeros((2, 2)))
+    assert added_by(np.diag([0.06, 0.01]), held=held) == pytest.approx(np.diag([0.02, 0.0]))
     wide = rng.standard_normal((2, 2))
-    total = held + added_by(wide @ wide.T, np.zeros(2), held=held)
+    total = held + added_by(wide @ wide.T, held=held)
     for less in (held, wide @ wide.T):
         assert np.linalg.eigvalsh(total - less).min() > -1e-12

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
 
-from palpate.errors import ResourceError
 from palpate.uncertainty import chain_diagnostics
 
 
@@ -44,9 +41,3 @@ def test_chains_that_never_moved_have_not_mixed():
     found = chain_diagnostics(np.ones((4, 100, 1)))
     assert np.isnan(found.r_hat[0])
     assert not found.mixed[0]
-
-
-def test_without_the_library_a_sentence_names_the_extra(monkeypatch):
-    monkeypatch.setitem(sys.modules, "arviz_stats.base", None)
-    with pytest.raises(ResourceError, match=r"pip install 'palpate\[samples\]'"):
-        chain_diagnostics(np.ones((4, 100, 1)))

@@ -42,7 +42,7 @@ SCHEMA = "palpate.verification/1"
 HEAD = """# Verification: problems with known answers
 
 Made by `palpate verify --output verification`, which computes everything below in some minutes, writes this page as
-`verification/verification.md` (copy it to `docs/`) and ends with exit code 5 when one check fails. `--quick` leaves out
+`verification/verification.md` and ends with exit code 5 when one check fails. `--quick` leaves out
 the slow ones (marked *), which are also left out by continuous integration; `--json` prints the numbers; a run that was
 interrupted goes on where it was. A problem may have several checks: the table has the worst of each, and the list below
 it has them all.

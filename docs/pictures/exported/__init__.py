@@ -1,1 +1,1 @@
-"""The pictures of docs/export, a function each: `(what was exported, the picture to write)`."""
+"""The pictures of docs/export.md, a function each: `(what was exported, the picture to write)`."""

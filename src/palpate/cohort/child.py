@@ -1,8 +1,9 @@
 """The process that works on one task: it says what comes to pass, and ends with whoever started it.
 
 Started as `python -m palpate.cohort.child MODULE:FUNCTION` in a process group of its own, it imports the work, takes a
-task as a line of JSON on its standard input, and answers on its standard output with lines of JSON: {"begun"},
-{"expected"}: memory (GB) and time (s), {"outcome"}. What it breaks, it breaks for itself alone.
+task as a line of JSON on its standard input, and answers on its standard output with lines of JSON: {"begun"}: the most
+memory (GB) held by then, {"expected"}: memory (GB) and time (s), {"outcome"}. What it breaks, it breaks for itself
+alone.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.cohort.task import Outcome, Task
+from palpate.memory import peak_memory_gb
 from palpate.study.lock import own_file
 
 __all__ = ["main"]
@@ -71,7 +73,7 @@ def main(work: str) -> None:
             resource.setrlimit(resource.RLIMIT_DATA, (n_bytes if hard < 0 else min(n_bytes, hard), hard))
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
-    say({"begun": True})
+    say({"begun": peak_memory_gb() or 0.0})
     say({"outcome": function(task, tell).to_dict()})
 
 

@@ -74,7 +74,7 @@ class Supervisor:
                             watch.hear(json.loads(line))
         finally:
             _end_group(process.pid)  # and what it has started
-            watch.ended = process.wait()
+            watch.reap()
             self._running.discard(process.pid)
             for pipe in (process.stdin, process.stdout):
                 with suppress(OSError):
@@ -101,6 +101,7 @@ class _Watch:
     process: subprocess.Popen[bytes]
     began: float = field(default_factory=time.monotonic)  # the process, then its work
     working: bool = False
+    before_gb: float = 0.0  # the most memory that was held by then, in part by whoever started it: that counts along
     expected_gb: float | None = None
     memory_gb: float = float("inf")  # limits
     seconds: float = BEFORE_PREDICTION_S
@@ -119,7 +120,7 @@ class _Watch:
     def hear(self, message: dict[str, Any]) -> None:
         """Take one message."""
         if "begun" in message:
-            self.working, self.began = True, time.monotonic()
+            self.working, self.began, self.before_gb = True, time.monotonic(), float(message["begun"])
         elif "expected" in message:
             self.expected_gb, seconds = map(float, message["expected"])
             self.memory_gb = self.task.limits.memory_for(self.expected_gb)
@@ -129,7 +130,7 @@ class _Watch:
 
     def look(self) -> None:
         """Whether the process has ended; it is ended when it runs over a limit."""
-        self.ended = self.process.poll()
+        self.reap(os.WNOHANG)
         if self.ended is not None or self.outcome is not None or self.stopped:
             return
         seconds = time.monotonic() - self.began
@@ -144,6 +145,16 @@ class _Watch:
             self.stopped = "time" if self.working else "start"
         if self.stopped:
             _end_group(self.process.pid)
+
+    def reap(self, options: int = 0) -> None:
+        """Take in how the process ended; waits for it unless the options say otherwise."""
+        if self.ended is None:
+            pid, status, usage = os.wait4(self.process.pid, options)
+            if pid:
+                self.ended = self.process.returncode = os.waitstatus_to_exitcode(status)
+                most = round(usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9, 3)
+                if self.working and most > self.before_gb:
+                    self.peak_gb = max(self.peak_gb, most)
 
     def verdict(self) -> Outcome:
         """The outcome that the child told, or what its end means."""

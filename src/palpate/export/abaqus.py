@@ -2,7 +2,7 @@
 
 Keywords: Abaqus Analysis User's Guide; CalculiX CrunchiX User's Manual 2.20, chapter 7 (which takes the same file). The
 hyperelastic laws of both are decoupled, W = C10 (J^(-2/3) I1 - 3) + C01 (J^(-4/3) I2 - 3) + (J - 1)^2 / D1, ours are
-not: C10, C01 and D1 = 2 / K give the same moduli at small strain, mu and K, and docs/export/abaqus.md the difference.
+not: C10, C01 and D1 = 2 / K give the same moduli at small strain, mu and K, and docs/export.md the difference.
 """
 
 from __future__ import annotations

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from itertools import chain
 
 from palpate.entry_points import brought
@@ -16,7 +17,7 @@ from palpate.observation.force import read_force
 from palpate.observation.landmarks import read_landmarks
 from palpate.observation.surface_distance import surface_distances
 
-__all__ = ["KINDS", "SOURCES", "SourceKind", "observations", "read_source"]
+__all__ = ["KINDS", "SOURCES", "SourceKind", "observations", "read_source", "register_brought"]
 
 OF_POINTS = ("file", "file_after", "sd_mm", "covariance_mm2", "correlation_mm", "axes")
 
@@ -39,7 +40,15 @@ SOURCES = {
     "displacement-field": SourceKind(read_displacement_field),
     "force": SourceKind(read_force, ("surface", "force_n", "direction", "sd_n"), ("offset_sd_n",), tells_scale=True),
 }
-SOURCES |= brought("palpate.data", SourceKind, taken=SOURCES)
+
+
+@cache
+def register_brought() -> None:
+    """Add the kinds of other packages to `SOURCES`; raises `ConfigurationError` where one cannot be used.
+
+    Not when this module is imported: a package may import it to say what it brings.
+    """
+    SOURCES.update(brought("palpate.data", SourceKind, taken=SOURCES))
 
 
 def read_source(file: DataFile) -> DataSource:

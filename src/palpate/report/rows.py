@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from palpate.inversion import KNOWN_MODULUS
+from palpate.inversion import FIELD, KNOWN_MODULUS
 from palpate.uncertainty import NORMAL_95, Interval
 
 __all__ = [
@@ -31,6 +31,7 @@ CAUSES = {
     "frame": "the frame's motion",
     "offset": "how surfaces are drawn",
     "heterogeneity": "tissues that are not homogeneous",
+    FIELD: "what is mapped",
     "layer": "layers round the organs",
     "poisson": "Poisson's ratios",
     "instrument": "the instruments' offsets",

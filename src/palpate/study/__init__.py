@@ -12,7 +12,15 @@ if TYPE_CHECKING:
     from palpate.study.cost import ExpectedCost, expected_cost
     from palpate.study.earlier import strange_files
     from palpate.study.edge_length import EdgeLength, edge_length_of
-    from palpate.study.estimation import Observed, conclude, estimates_of, intervals_of, released_of, verdict
+    from palpate.study.estimation import (
+        Observed,
+        conclude,
+        estimates_of,
+        intervals_of,
+        released_of,
+        stated_posteriors,
+        verdict,
+    )
     from palpate.study.lock import held_folder, own_file
     from palpate.study.outputs import make_folder, read_json, recover, staged, write_json, write_text
     from palpate.study.provenance import software_versions
@@ -61,6 +69,7 @@ __all__ = [
     "released_of",
     "software_versions",
     "staged",
+    "stated_posteriors",
     "strange_files",
     "verdict",
     "write_json",
@@ -107,6 +116,7 @@ _HOMES = {
     "released_of": "palpate.study.estimation",
     "software_versions": "palpate.study.provenance",
     "staged": "palpate.study.outputs",
+    "stated_posteriors": "palpate.study.estimation",
     "strange_files": "palpate.study.earlier",
     "verdict": "palpate.study.estimation",
     "write_json": "palpate.study.outputs",

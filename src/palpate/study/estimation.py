@@ -15,7 +15,6 @@ from palpate.inversion import (
     Inversion,
     InversionSettings,
     Iterate,
-    LeastSquares,
     Linearisation,
     Outcome,
     OuterIterate,
@@ -44,7 +43,14 @@ from palpate.study.estimate_findings import (
 from palpate.study.map_words import map_findings
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio, ratio_verdict
 from palpate.study.samples import CHAINS, ModulusSamples, draw_moduli, sample_findings
-from palpate.study.together import ImagePairs, ModulusRegion, combinations_of, image_pairs_of, regions_of
+from palpate.study.together import (
+    ImagePairs,
+    ModulusRegion,
+    StatedPosterior,
+    combinations_of,
+    image_pairs_of,
+    regions_of,
+)
 from palpate.study.variations import Variation
 from palpate.uncertainty import (
     GRID_DRAWS,
@@ -81,6 +87,7 @@ __all__ = [
     "intervals_of",
     "no_estimate",
     "released_of",
+    "stated_posteriors",
     "verdict",
 ]
 
@@ -256,24 +263,22 @@ def conclude(
     rng = np.random.default_rng(seed)
     progress(f"intervals: correlation of the residuals, and the model as {GRID_DRAWS} random voxel grids show it")
     errors = grid_errors(objective, minimum.evaluation, observed.states, rng=rng)
-    covariance = covariance_of(objective, minimum.evaluation, errors, unknowns=minimum.unknowns)
+    bonded = covariance_of(objective, minimum.evaluation, errors, unknowns=minimum.unknowns)
     released, remark = released_of(inversion, settings, progress=progress)
-    if released is not None:
-        covariance = covariance.with_released(objective, minimum, released)
+    covariance, posteriors = stated_posteriors(inversion, bonded, released)
     progress("intervals: profiles, and the fit of every surface before and after")
     pairs = image_pairs_of(inversion, settings.bounds, errors, released)
-    fixed = frozen_posterior(objective, minimum.unknowns, minimum.evaluation)
-    known = intervals_of(inversion, settings, fixed, covariance)
+    known = intervals_of(inversion, settings, posteriors)
     estimates = estimates_of(inversion, known, covariance, truth=truth, layers_told=not remark)
     of_moduli = covariance.total[: len(estimates), : len(estimates)]
     stating = {e.tissue for e in estimates if e.verdict != NOT_IDENTIFIED}
     pairs = pairs and pairs.with_intervals_of(stating)
-    regions = regions_of(inversion, fixed, of_moduli, settings.bounds, tissues=stating)
+    regions = regions_of(inversion, posteriors, settings.bounds, tissues=stating)
     drawn = None
     if samples and minimum.converged:
         progress(f"intervals: {samples} samples of the posterior in each of {CHAINS} chains")
         stated = [e.interval95 if objective.parameters.absolute else e.ratio_interval95 for e in estimates]
-        drawn = draw_moduli(inversion, covariance.total, stated, bounds=settings.bounds, draws=samples, rng=rng)
+        drawn = draw_moduli(posteriors[-1], stated, bounds=settings.bounds, draws=samples, rng=rng)
     found_discrepancy = discrepancy_of(inversion, observed.states) if minimum.converged else FoundDiscrepancy()
     maps = stiffness_maps(inversion, np.diag(covariance.total)) if minimum.converged else ()
     findings = (
@@ -304,7 +309,7 @@ def conclude(
         information=information(of_moduli),
         information_shares=_shares(inversion) if minimum.converged else {},
         discrepancy=found_discrepancy,
-        combinations=combinations_of(inversion, fixed, of_moduli, settings.bounds, within=IDENTIFIED),
+        combinations=combinations_of(inversion, posteriors[0].frozen, of_moduli, settings.bounds, within=IDENTIFIED),
         regions=regions,
         image_pairs=pairs,
         samples=drawn,
@@ -384,28 +389,46 @@ class Known:
     at_bound: bool
 
 
-def intervals_of(
-    inversion: Inversion, settings: InversionSettings, fixed: LeastSquares, covariance: Covariance
-) -> tuple[Known, ...]:
-    """Of each parameter its interval, none where nothing converged.
+def stated_posteriors(
+    inversion: Inversion, bonded: Covariance, released: OuterIterate | None
+) -> tuple[Covariance, tuple[StatedPosterior, ...]]:
+    """All that is stated rests on these: the covariance by all causes, and the posteriors, the widest last.
 
-    fixed: the posterior of which profiles are taken; covariance: by all causes (see `Covariance.with_released`), as
-    which the profiles are scaled.
+    The first is that of the estimate, with its covariance while released blocks are held (`bonded`); the other, where
+    they were `released`, is about the minimum with them free, and has what they add.
     """
+    objective, minimum = inversion.objective, inversion.minimum
+    fixed = frozen_posterior(objective, minimum.unknowns, minimum.evaluation)
+    first = StatedPosterior(fixed, minimum, bonded.total)
+    if released is None:
+        return bonded, (first,)
+    covariance = bonded.with_released(objective, minimum, released)
+    free = frozen_posterior(released.objective, released.minimum.unknowns, released.minimum.evaluation)
+    return covariance, (first, StatedPosterior(free, released.minimum, covariance.total))
+
+
+def intervals_of(
+    inversion: Inversion, settings: InversionSettings, posteriors: Sequence[StatedPosterior]
+) -> tuple[Known, ...]:
+    """Of each parameter its interval, which holds that of each of the `posteriors`; none where nothing converged."""
     if not inversion.minimum.converged:
         return ()
-    n, bounds = inversion.objective.n_parameters, settings.bounds
-    found, variances, at_bound = [], np.diag(covariance.total), bounds.reached(inversion.minimum.unknowns[:n])
+    (first, *others), n, bounds = posteriors, inversion.objective.n_parameters, settings.bounds
+    found, variances, at_bound = [], np.diag(first.covariance), bounds.reached(inversion.minimum.unknowns[:n])
     best = inversion.candidates[inversion.best]
-    others = [c for c in inversion.candidates if c is not best and c.minimum.converged]
+    minima = [c for c in inversion.candidates if c is not best and c.minimum.converged]
     scales = np.diag(inversion.minimum.evaluation.covariance_columns(n)[:n]) / variances  # of a profile's deviance
     for i in range(n):
         limits = {"lower": float(np.exp(bounds.lower[i])), "upper": float(np.exp(bounds.upper[i]))}
-        own = modulus_interval(fixed, inversion.minimum, i, variance=float(variances[i]), bounds=bounds)
+        own, *wider = (
+            modulus_interval(of.frozen, of.minimum, i, variance=float(of.covariance[i, i]), bounds=bounds)
+            for of in (first, *others)
+        )
         sd = float(np.sqrt(variances[i]))
-        good = [c.minimum.unknowns for c in others if as_good(c.value, best.value, scale=float(scales[i]))]
+        good = [c.minimum.unknowns for c in minima if as_good(c.value, best.value, scale=float(scales[i]))]
         ellipses = (log_interval(float(np.exp(x[i])), sd, **limits) for x in good)
-        found.append(Known(own, hull([own.ends, *ellipses]), bool(at_bound[i])))
+        interval = hull([own.ends, *ellipses, *(of.ends for of in wider)])
+        found.append(Known(own, interval, bool(at_bound[i])))
     return tuple(found)
 
 

@@ -15,7 +15,7 @@ import shutil
 import signal
 import stat
 import threading
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -90,10 +90,14 @@ class Staging:
         everything as it was, unless it is left `unfinished`: else it may be tried again.
         """
         names, renamed = self.names(), [f"{name}{ASIDE}" for name in aside]
-        _refuse_improper(self.folder, (*names, *renamed))
+        _refuse_improper(self.folder, (*names, *renamed, *aside))
         try:
             for name in aside:
                 shutil.copy2(self.folder / name, self.area / f"{name}{ASIDE}")
+            for name in (*names, *renamed):  # to the disk
+                with (self.area / name).open("rb+") as file:
+                    os.fsync(file.fileno())
+            _sync_folders(self.area)
             # documents that list others leave first
             leaving = [*reversed(names), *renamed, *retired, *(name for name in aside if name not in names)]
             with _interrupts_deferred():
@@ -163,14 +167,10 @@ def recover(folder: Path) -> None:
     _clear(folder)
 
 
-def _exchange(folder: Path, leaving: Iterable[str]) -> None:
+def _exchange(folder: Path, leaving: Sequence[str]) -> None:
     """Let the `leaving` files step aside and the staged ones take their places; raises `OSError` with all as it was."""
     area = folder / STAGING
     try:
-        for name in _files(area / NEW):
-            with (area / NEW / name).open("rb+") as file:
-                os.fsync(file.fileno())
-        _sync_folders(area / NEW)
         for name in leaving:
             _move(folder / name, area / OLD / name)
         _sync_folders(area / OLD, *{(folder / name).parent for name in leaving})
@@ -195,12 +195,13 @@ def _settle(folder: Path) -> bool:
     area = folder / STAGING
     decided = (area / READY).is_dir()
     source = area / (READY if decided else OLD)
-    for name in _files(source):
+    names = _files(source)
+    for name in names:
         if not is_inside(folder, name):
             raise ResourceError(f"{folder / name} leads out of the folder through a link: remove the link")
         if decided or not os.path.lexists(folder / name):
             _move(source / name, folder / name)
-            _sync_folders((folder / name).parent)
+    _sync_folders(*{(folder / name).parent for name in names})
     if decided:  # what stepped aside must not come back
         for name in _files(area / OLD):
             if (folder / name).parent != folder:

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from palpate.errors import ResourceError
 from palpate.findings import Finding
-from palpate.inversion import Bounds, Inversion, frozen_posterior
+from palpate.inversion import Bounds
 from palpate.study.case import SAMPLES, Case
+from palpate.study.together import StatedPosterior
 from palpate.uncertainty import (
     ChainDiagnostics,
     Interval,
@@ -88,28 +89,25 @@ def require_samples(case: Case) -> None:
 
 
 def draw_moduli(
-    inversion: Inversion,
-    covariance: NDArray[np.float64],
+    posterior: StatedPosterior,
     intervals: Sequence[Interval | None],
     *,
     bounds: Bounds,
     draws: int,
     rng: np.random.Generator,
 ) -> ModulusSamples:
-    """So many draws in each chain around the estimate of an inversion that has converged.
+    """So many draws in each chain around the minimum of a posterior, with its covariance (see `posterior_chains`).
 
-    covariance (n_parameters, n_parameters): by noise, prior and grid, which the draws have (see `posterior_chains`);
     intervals: of the estimates, whose ends may be open. Raises `EstimationError` where a modulus moves nothing,
     `ResourceError` as `require_arviz` does.
     """
-    mapping, minimum = inversion.objective.parameters, inversion.minimum
+    mapping, minimum = posterior.frozen.objective.parameters, posterior.minimum
     n = len(mapping.tissues)  # Poisson's ratios are drawn with them, and not stated
-    frozen = frozen_posterior(inversion.objective, minimum.unknowns, minimum.evaluation)
     chains = posterior_chains(
-        frozen,
+        posterior.frozen,
         minimum.unknowns,
         minimum.evaluation,
-        covariance,
+        posterior.covariance,
         bounds=bounds,
         chains=CHAINS,
         draws=draws,

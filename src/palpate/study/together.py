@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
-from palpate.inversion import Bounds, Inversion, LeastSquares, OuterIterate
+from palpate.inversion import Bounds, Inversion, LeastSquares, Minimum, OuterIterate
 from palpate.uncertainty import (
     NORMAL_95,
-    Agreement,
     Combination,
+    FrozenPosterior,
     GridErrors,
     agreement,
     joint_region,
@@ -21,9 +22,26 @@ from palpate.uncertainty import (
     pair_estimates,
 )
 
-__all__ = ["ImagePairs", "ModulusRegion", "PairAlone", "combinations_of", "image_pairs_of", "regions_of"]
+__all__ = [
+    "ImagePairs",
+    "ModulusRegion",
+    "PairAlone",
+    "StatedPosterior",
+    "combinations_of",
+    "image_pairs_of",
+    "regions_of",
+]
 
 MOST_REGIONS = 3  # of the pairs of moduli that are correlated most
+
+
+@dataclass(frozen=True, slots=True)
+class StatedPosterior:
+    """One that is stated: frozen, its minimum, and the covariance (n, n) of its parameters by all that is known."""
+
+    frozen: FrozenPosterior
+    minimum: Minimum
+    covariance: NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,8 +88,8 @@ class ImagePairs:
 class ModulusRegion:
     """The joint 95 % region of two tissues' moduli (kPa, or ratios): places once around the estimate.
 
-    boundary: by the profile likelihood of both; ellipse: of ln E by their covariance; open: whether the bounds of the
-    search cut the boundary.
+    boundary: by the profile likelihood of both; ellipse: of ln E by their covariance; both of what holds them all where
+    several posteriors are stated; open: whether the bounds of the search cut the boundary.
     """
 
     tissues: tuple[str, str]
@@ -91,31 +109,35 @@ def image_pairs_of(
     if len(inversion.objective.states) < 2 or not inversion.minimum.converged:
         return None
     scale, names = mapping.scale_kpa, mapping.tissues
-    every = pair_estimates(inversion.objective, inversion.minimum, bounds, errors, released)
-    if np.count_nonzero(every.converged) < 2:
+    both = pair_estimates(inversion.objective, inversion.minimum, bounds, errors, released)
+    usable = np.logical_and.reduce([every.converged for every in both])
+    if np.count_nonzero(usable) < 2:
         return None
-    pairs = every.of(every.converged, len(names))
-    found: Agreement = agreement(pairs)
+    pairs = [every.of(usable, len(names)) for every in both]
+    agreed = [agreement(of) for of in pairs]
+    found = agreed[-1]  # whether images differ is asked of what is least sure
 
     def stated(
-        theta: NDArray[np.float64], covariance: NDArray[np.float64]
+        each: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]],
     ) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
-        """Values and 95 % intervals by tissue, of log-moduli (n,) with their covariance (n, n)."""
-        half = NORMAL_95 * np.sqrt(np.diag(covariance))
-        ends = scale * np.exp(np.stack([theta - half, theta, theta + half]))
-        low, middle, high = (dict(zip(names, row.tolist(), strict=True)) for row in ends)
-        return middle, {name: (low[name], high[name]) for name in names}
+        """Values, and 95 % intervals that hold all, by tissue, of log-moduli (n,) with their covariances (n, n)."""
+        halves = [(theta, NORMAL_95 * np.sqrt(np.diag(covariance))) for theta, covariance in each]
+        low = np.min([theta - half for theta, half in halves], axis=0)
+        high = np.max([theta + half for theta, half in halves], axis=0)
+        ends = scale * np.exp(np.stack([low, each[0][0], high]))
+        lows, middle, highs = (dict(zip(names, row.tolist(), strict=True)) for row in ends)
+        return middle, {name: (lows[name], highs[name]) for name in names}
 
-    alone, left = list[PairAlone](), iter(range(len(pairs.theta)))
-    for state, converged in zip(inversion.objective.states, every.converged.tolist(), strict=True):
+    alone, left = list[PairAlone](), iter(range(np.count_nonzero(usable)))
+    for state, converged in zip(inversion.objective.states, usable.tolist(), strict=True):
         own = PairAlone({}, {}, False, {}, {kind: noise.sd for kind, noise in state.noise.items()})
         if converged:
             s = next(left)
-            values, intervals = stated(pairs.theta[s], pairs.covariance[s, :, s])
+            values, intervals = stated([(of.theta[s], of.covariance[s, :, s]) for of in pairs])
             influence = dict(zip(names, found.influence[s].tolist(), strict=True))
             own = PairAlone(values, intervals, bool(found.outlier[s]), influence, own.noise_mm)
         alone.append(own)
-    mean, mean_interval = stated(found.theta, found.covariance)
+    mean, mean_interval = stated([(of.theta, of.covariance) for of in agreed])
     within = dict(zip(names, found.within_cv.tolist(), strict=True))
     return ImagePairs(tuple(alone), found.heterogeneity, within, mean, mean_interval)
 
@@ -133,28 +155,34 @@ def combinations_of(
 
 
 def regions_of(
-    inversion: Inversion,
-    fixed: LeastSquares,
-    covariance: NDArray[np.float64],
-    bounds: Bounds,
-    *,
-    tissues: Collection[str],
+    inversion: Inversion, posteriors: Sequence[StatedPosterior], bounds: Bounds, *, tissues: Collection[str]
 ) -> tuple[ModulusRegion, ...]:
     """Of the pairs of `tissues` whose moduli are correlated most, `MOST_REGIONS` at the most.
 
-    covariance (n, n): of ln E. None is stated of a modulus that is not identified.
+    posteriors: those that an interval holds, the widest last; a region holds those of all, as the smallest that is
+    convex. None is stated of a modulus that is not identified.
     """
-    mapping, sd = inversion.objective.parameters, np.sqrt(np.diag(covariance))
+    mapping, covariance = inversion.objective.parameters, posteriors[-1].covariance
+    sd = np.sqrt(np.diag(covariance))
     correlated = -np.abs(covariance / np.outer(sd, sd))
     stated = [i for i, tissue in enumerate(mapping.tissues) if tissue in tissues]
     pairs = sorted(combinations(stated, 2), key=lambda pair: float(correlated[pair]))
     found = []
     for pair in pairs[:MOST_REGIONS]:
-        within = covariance[np.ix_(pair, pair)]
-        region = joint_region(fixed, inversion.minimum, pair, covariance=within, bounds=bounds)
-        edges = [mapping.scale_kpa * np.exp(edge) for edge in (region.boundary, region.ellipse)]
-        boundary, ellipse = (tuple((float(a), float(b)) for a, b in edge) for edge in edges)
-        found.append(
-            ModulusRegion((mapping.tissues[pair[0]], mapping.tissues[pair[1]]), boundary, ellipse, region.open)
-        )
+        regions = [
+            joint_region(of.frozen, of.minimum, pair, covariance=of.covariance[np.ix_(pair, pair)], bounds=bounds)
+            for of in posteriors
+        ]
+        edges = [_around([r.boundary for r in regions]), _around([r.ellipse for r in regions])]
+        boundary, ellipse = (tuple((float(a), float(b)) for a, b in mapping.scale_kpa * np.exp(edge)) for edge in edges)
+        names = mapping.tissues[pair[0]], mapping.tissues[pair[1]]
+        found.append(ModulusRegion(names, boundary, ellipse, any(region.open for region in regions)))
     return tuple(found)
+
+
+def _around(edges: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """The edge (n, 2) of the smallest convex region that holds all of several, (m, 2) each, or of a single one."""
+    if len(edges) == 1:
+        return edges[0]
+    points = np.concatenate(edges)
+    return np.asarray(points[ConvexHull(points).vertices])

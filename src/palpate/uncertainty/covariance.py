@@ -112,27 +112,19 @@ class Covariance:
 
         released: where the estimate ends with these blocks free.
         """
-        n, free = objective.n_parameters, released.minimum
-        rows = minimum.evaluation.covariance_columns(n).T
-        part = added_by(
-            sandwich_covariance(released.objective, free.evaluation),
-            free.unknowns[:n] - minimum.unknowns[:n],
-            held=self.noise + rows @ minimum.evaluation.prior @ rows.T,
-        )
+        rows = minimum.evaluation.covariance_columns(objective.n_parameters).T
+        held = self.noise + rows @ minimum.evaluation.prior @ rows.T
+        part = added_by(sandwich_covariance(released.objective, released.minimum.evaluation), held=held)
         cause = " and ".join(dict.fromkeys(block.cause for block in objective.parameters.blocks if block.released))
         return replace(self, prior=self.prior + part, causes={**self.causes, cause: part})
 
 
-def added_by(
-    free: NDArray[np.float64], shift: NDArray[np.float64], *, held: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """What the covariance `held` (n, n) of estimates lacks that take some unknowns for known.
+def added_by(free: NDArray[np.float64], *, held: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What a covariance `held` (n, n), with some unknowns taken for known, lacks of that with these `free` (n, n).
 
-    With these free the estimates are others, further by a `shift` d (n,), with the covariance `free`: the second moment
-    of what the first ones err by is free + d d^T. The positive part of what that is beyond `held`: with it the whole is
-    at least as large as each of the two in every direction.
+    The positive part of their difference: with it the whole is at least as large as each in every direction.
     """
-    return _positive_part(free + np.outer(shift, shift) - held)
+    return _positive_part(free - held)
 
 
 def covariance_of(

@@ -73,26 +73,28 @@ class Agreement:
 
 def pair_estimates(
     objective: Objective, minimum: Minimum, bounds: Bounds, errors: GridErrors, released: OuterIterate | None = None
-) -> PairEstimates:
+) -> tuple[PairEstimates, ...]:
     """The estimate of each later state alone, near the joint `minimum`: with its closest points, weights and prior.
 
-    errors: of the residuals on random grids (see `grid_errors`); released: where the joint estimate ends with blocks
-    free that were held, which adds to each pair's covariance as to that of all (see `added_by`). Nothing is solved; the
-    approximations of the joint estimate stand. Raises `EstimationError` where a state alone leaves a driver's motion
-    open.
+    And a second one near where the joint estimate ends with blocks free that were held, if it is `released`, its
+    covariance larger by what these add (see `added_by`). errors: of the residuals on random grids (see `grid_errors`).
+    Nothing is solved; the approximations of the joint estimate stand. Raises `EstimationError` where a state alone
+    leaves a driver's motion open.
     """
-    n, shape = objective.n_parameters, 2 * (len(objective.states), objective.n_parameters)
     alone = _each_alone(objective, minimum, bounds)
-    theta, converged = np.stack([of.unknowns[:n] for of in alone]), np.array([of.converged for of in alone])
     noise, prior = _noise_and_prior(objective, alone)
     covariance = _joint_covariance(objective, alone, errors, noise=noise, prior=prior)
+    found = [_estimates(alone, covariance)]
     if released is not None:
         free = _each_alone(released.objective, released.minimum, bounds)
-        shift = np.stack([of.unknowns[:n] for of in free]) - theta
         both = sum(_noise_and_prior(released.objective, free), np.zeros_like(noise))
-        covariance += added_by(both, shift.ravel(), held=noise + prior).reshape(shape)
-        converged &= [of.converged for of in free]
-    return PairEstimates(theta, covariance, converged)
+        found.append(_estimates(free, covariance + added_by(both, held=noise + prior).reshape(covariance.shape)))
+    return tuple(found)
+
+
+def _estimates(alone: Sequence[Minimum], covariance: NDArray[np.float64]) -> PairEstimates:
+    theta = np.stack([of.unknowns[: covariance.shape[1]] for of in alone])
+    return PairEstimates(theta, covariance, np.array([of.converged for of in alone]))
 
 
 def _each_alone(objective: Objective, minimum: Minimum, bounds: Bounds) -> list[Minimum]:

@@ -3,12 +3,11 @@
 Other packages bring theirs as entry points `palpate.readers`, each an `ImageFormat`.
 """
 
-from palpate.entry_points import brought
 from palpate.images.readers import column_tables, dicom, line_tables, mask_folder, metaimage, nrrd, table_json
 from palpate.images.readers.isolation import ReadLimits
 from palpate.images.readers.nifti import write_displacement_field, write_label_image, write_scalar_image
 from palpate.images.readers.read import read_intensities, read_label_image
-from palpate.images.readers.registry import ImageFormat, StoredImage, register
+from palpate.images.readers.registry import ImageFormat, StoredImage
 
 __all__ = [
     "ImageFormat",
@@ -27,6 +26,3 @@ __all__ = [
     "write_label_image",
     "write_scalar_image",
 ]
-
-for image_format in brought("palpate.readers", ImageFormat).values():
-    register(image_format)

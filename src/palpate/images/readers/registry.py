@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.entry_points import brought
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.findings import Finding
 from palpate.images.input_file import open_input
@@ -74,8 +76,19 @@ def register(image_format: ImageFormat) -> None:
             )
 
 
+@cache
+def _register_brought() -> None:
+    """When a file is first opened: a package may import this one to say what it brings."""
+    for image_format in brought("palpate.readers", ImageFormat).values():
+        register(image_format)
+
+
 def format_of(path: Path) -> ImageFormat:
-    """The format of a file by the longest ending that fits; raises `InputDataError` when none does."""
+    """The format of a file by the longest ending that fits; raises `InputDataError` when none does.
+
+    Raises `ConfigurationError` where another package brings a reader that cannot be used.
+    """
+    _register_brought()
     if os.path.isdir(path):  # noqa: PTH112 - a path that cannot be searched, or is too long, is no folder
         return _FORMATS[FOLDER]
     for ending in sorted(_FORMATS, key=len, reverse=True):
