@@ -58,7 +58,7 @@ def test_a_stream_that_fails_costs_no_run(images, tmp_path, after):
     assert "Traceback" not in done.stderr
     assert "Exception" not in done.stderr
     assert "größe" in (tmp_path / "out" / "case.toml").read_text(encoding="utf-8")
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["case.toml"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["case.toml", "preview.html"]
 
 
 def test_a_terminal_that_is_closed_costs_no_run(images, tmp_path):
