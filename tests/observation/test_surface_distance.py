@@ -59,11 +59,18 @@ def still(seen):
 
 def test_surfaces_count_by_their_area(sphere):
     """Under one noise model the precision of the mean square is that of so many independent residuals."""
-    small, large = seen_of(sphere, 6.0).with_noise(STATED), seen_of(sphere, 12.0).with_noise(STATED)
+    noise = NoiseModel(STATED.variances, 0.5 * STATED.lengths)
+    small, large = seen_of(sphere, 6.0).with_noise(noise), seen_of(sphere, 12.0).with_noise(noise)
     areas = [o.target.area.sum() for o in (small, large)]
     assert areas[1] > 3.5 * areas[0]
     assert small.weighting.precision / areas[0] == pytest.approx(large.weighting.precision / areas[1])
-    assert large.weighting.precision == pytest.approx(areas[1] / STATED.correlation_area / STATED.sd**2)
+    assert large.weighting.precision == pytest.approx(areas[1] / noise.correlation_area / noise.sd**2)
+
+
+def test_errors_alike_over_most_of_a_surface_leave_as_many_residuals_as_a_rigid_motion_has_freedoms(sphere):
+    """More alike they would be motion of the surface, and each fit weaker than the one before."""
+    wide = NoiseModel(STATED.variances, 10.0 * STATED.lengths)
+    assert seen_of(sphere, 6.0).with_noise(wide).weighting.count == 6.0
 
 
 def test_without_voxels_the_first_noise_is_that_of_exact_surfaces(sphere):
