@@ -31,8 +31,7 @@ from scipy import sparse
 
 import palpate
 from palpate.demo import DATA
-from palpate.export.fitted_model import fitted_model
-from palpate.export.groups import material_parts
+from palpate.export import fitted_bodies, material_parts
 from palpate.mechanics import Dilatation, equilibrium
 from palpate.mesh import OUTER, Constraint, TetMesh, tissue_surface
 
@@ -154,7 +153,7 @@ def under_decoupled_law(result: palpate.CaseResult, path: Path) -> NDArray[np.fl
     offset, free = np.zeros(n), np.ones(n, dtype=bool)
     offset[dofs], free[dofs] = given[:, 3], False
     constraint = Constraint(sparse.csr_matrix(sparse.identity(n, format="csc")[:, free]), np.zeros((n, 0)), offset)
-    body = fitted_model(result, seal="").bodies[0]
+    body = fitted_bodies(result)[0]
     parts, region = material_parts(body.mesh, body.log_ratio), np.empty_like(body.mesh.region)
     for number, part in enumerate(parts):
         region[part.cells] = number

@@ -9,8 +9,7 @@ import numpy as np
 
 import palpate
 from palpate.images import Role, Tissue
-from palpate.mechanics import choose_element, equilibrium, law_named, outer_constraint
-from palpate.mechanics.loads import gravity
+from palpate.mechanics import choose_element, equilibrium, gravity, law_named, outer_constraint
 from palpate.mesh import Anatomy, Box, lagrange_space, located, point_interpolation, tetrahedralise
 
 SILICONE = Tissue("silicone", Role.ESTIMATE, (1,))

@@ -178,7 +178,7 @@ def test_documents_pages_tables_and_exports_tell_ratios_from_moduli(with_ratio, 
         "poisson_ratio",
     ]
     table = estimates_table(document).splitlines()
-    assert table[-1].split() == ["prostate", "0.470", ">", "0.440", "not", "identified"]
+    assert ["prostate", "0.470", ">", "0.440", "not", "identified"] in [line.split() for line in table]
     page = write_case_report(with_ratio, tmp_path).read_text()
     assert "0.470" in page
     assert "nu of prostate" in page

@@ -22,7 +22,7 @@ from palpate.study.estimation import ModulusEstimate
 from palpate.study.result import CaseResult, PairResult
 from palpate.study.samples import ModulusSamples
 
-__all__ = ["FittedBody", "FittedModel", "fitted_model"]
+__all__ = ["FittedBody", "FittedModel", "fitted_bodies", "fitted_model"]
 
 HIGHEST_RATIO = 0.4999  # Poisson's, that a case may have
 
@@ -133,6 +133,11 @@ class FittedModel:
         """The units of all numbers, as a file's heading says them."""
         stress = "kPa" if self.unit == "kPa" else f"moduli are ratios to '{self.relative_to}'"
         return f"mm, {stress}; RAS coordinates"
+
+
+def fitted_bodies(result: CaseResult) -> tuple[FittedBody, ...]:
+    """The reference states of a result, each with the motions fitted to it; raises as `fitted_model` does."""
+    return fitted_model(result, seal="").bodies
 
 
 def fitted_model(result: CaseResult, *, seal: str) -> FittedModel:

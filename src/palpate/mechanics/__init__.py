@@ -17,7 +17,7 @@ from palpate.mechanics.laws.contract import Law, stress
 from palpate.mechanics.laws.registry import LAWS, law_named
 from palpate.mechanics.linear_model import LinearModel, LinearSystem, linear_model, weighted_sum
 from palpate.mechanics.linearised import LinearisedSystem
-from palpate.mechanics.loads import DeadLoad, boundary_named, pressure, traction
+from palpate.mechanics.loads import DeadLoad, boundary_named, gravity, pressure, traction
 from palpate.mechanics.newton import NewtonSettings
 from palpate.mechanics.solvers.contract import Hints
 from palpate.mechanics.solvers.registry import SOLVERS, expected_of_size, factorise
@@ -47,6 +47,7 @@ __all__ = [
     "expected_of_size",
     "factorise",
     "finite_strain_model",
+    "gravity",
     "lame_parameters",
     "law_named",
     "linear_model",
