@@ -32,11 +32,12 @@ def patchy(twins, twin):
     return replace(problem, states=(LaterState(model, problem.states[0].observations),), parameters=parameters)
 
 
-def test_estimates_with_what_is_seen_are_those_with_all_unknowns(twins, patchy, monkeypatch):
+def test_estimates_with_what_is_seen_are_those_with_all_unknowns(twins, patchy):
     settings = twins.settings(2.0)
     seen = invert(patchy, settings, progress=twins.silent)
-    monkeypatch.setattr(informed, "LEFT_OUT", -1.0)
-    whole = invert(patchy, settings, progress=twins.silent)
+    blocks = tuple(replace(block, left_out=-1.0) for block in patchy.parameters.blocks)
+    every = replace(patchy, parameters=replace(patchy.parameters, blocks=blocks))
+    whole = invert(every, settings, progress=twins.silent)
     assert whole.objective.parameters.n_unknowns == patchy.parameters.n_unknowns
     assert seen.objective.parameters.n_unknowns < 0.7 * patchy.parameters.n_unknowns
     sd = posterior_sd(whole.minimum, 2)
@@ -53,7 +54,7 @@ def test_what_is_left_out_could_explain_less_than_it_may(rng):
     assert basis.shape[1] < n
     assert inverse @ basis == pytest.approx(np.eye(basis.shape[1]), abs=1e-9)
     left = np.eye(n) - basis @ inverse
-    assert np.trace(information @ left @ covariance @ left.T) < informed.LEFT_OUT
+    assert np.trace(information @ left @ covariance @ left.T) < block.left_out
     kept = block.combined(inverse)
     narrow = basis @ np.linalg.inv(basis.T @ information @ basis + kept.precision) @ basis.T
     whole = np.linalg.inv(information + block.precision)

@@ -10,8 +10,9 @@ import pytest
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
+from palpate.mesh.anatomy import domain_box
 from palpate.study.case import Case, CaseTissue, Domain, Images
-from palpate.study.first_look import frame_look, grid_box, tissue_looks
+from palpate.study.first_look import frame_look, tissue_looks
 
 IMAGES = Images(Path("before.nii.gz"), (Path("after.nii.gz"),))
 TISSUES_OF_CASE = (CaseTissue("gland", (1,), Role.ESTIMATE),)
@@ -29,7 +30,7 @@ def block(start, size, *, shape=(40, 30, 20), spacing=2.0, origin=(0.0, 0.0, 0.0
 
 def test_shifts_volumes_and_the_way_to_the_frame_are_those_of_a_block():
     before, after = block((10, 5, 6), (6, 8, 4)), block((12, 4, 6), (6, 8, 6))
-    gland, rest = tissue_looks(before, [after], grid_box(before))
+    gland, rest = tissue_looks(before, [after], domain_box([before.grid]))
     assert gland.volumes_ml == pytest.approx((192 * 8e-3, 288 * 8e-3))
     assert gland.shifts_mm[0] == pytest.approx([4.0, -2.0, 2.0])
     assert (gland.frame_mm, gland.towards) == (pytest.approx(10.0), "back")  # five voxels of 2 mm lie behind it
@@ -38,7 +39,7 @@ def test_shifts_volumes_and_the_way_to_the_frame_are_those_of_a_block():
 
 def test_an_organ_at_the_cut_lies_no_way_from_the_frame():
     before = block((10, 5, 16), (6, 8, 4))
-    gland, _ = tissue_looks(before, [before], grid_box(before))
+    gland, _ = tissue_looks(before, [before], domain_box([before.grid]))
     assert (gland.frame_mm, gland.towards) == (0.0, "head")
 
 

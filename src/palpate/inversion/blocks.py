@@ -44,6 +44,7 @@ STILL_RIGID, MOVED_RIGID = 0.005, 0.2
 DRAWN_ALIKE, SELDOM = 0.1, 0.01  # an offset of a surface that is drawn alike, over that of others; how often not
 KNOWN_MODULUS = "known modulus"
 FIELD = "field"
+LEFT_OUT, LEFT_OUT_OF_MAP = 1.0, 0.05  # see `Block.left_out`; what is left out of a map is missing in it
 FIELD_AMPLITUDES = (1.0, 2.0)  # of a tissue that is mapped, times the standard deviation stated
 CONSIDERED = 1e8  # times its precision: an unknown that is considered does not move
 HOMOGENEOUS_SHARE, PATCHY = 1.0 / 3.0, 0.3  # sd of ln E in a tissue that is nearly homogeneous, over that stated; odds
@@ -70,8 +71,9 @@ class Block:
     considered: the images cannot tell them, so that they are held at 0, and what they may be counts in the covariance
     (Schmidt 1966). last: its prior is learned where the estimate has converged under those of the others; before it
     would take what they explain. released: held at 0 as well while an estimate is sought, and free under P where its
-    interval is. regions: numbers of the model's regions to whose ln E it is added, one unknown for all
-    of them, where it acts on moduli. Raises `ConfigurationError` for terms of another size.
+    interval is. left_out: variances of the first noise, a tenth of the found one, that what is left out of the unknowns
+    may explain (see `informed_problem`); below 0 none is. regions: numbers of the model's regions to whose ln E it is
+    added, one unknown for all of them, where it acts on moduli. Raises `ConfigurationError` for terms of another size.
     """
 
     of: str
@@ -87,6 +89,7 @@ class Block:
     released: bool = False
     unit_mm: float = 1.0
     regions: tuple[int, ...] = ()
+    left_out: float = LEFT_OUT
 
     def __post_init__(self) -> None:
         shape = (len(self.precision),) * 2
@@ -201,38 +204,28 @@ def material_blocks(
     tissue that is mapped has the amplitude that is stated until twice of it is clearly more likely. It has no less: a
     small part that differs in a tissue that is else homogeneous speaks for a small amplitude, which hides it.
     """
-    levels = [(share * heterogeneity_sd) ** 2 for share in (HOMOGENEOUS_SHARE, 1.0)]
     blocks = []
     for tissue, n in modes.sizes:
-        name, mapped = tissues[tissue].name, tissues[tissue].field
-        if n and mapped:
-            amounts = [(share * mapped.sd) ** 2 for share in FIELD_AMPLITUDES]
-            blocks.append(
-                Block(
-                    name,
-                    FIELD,
-                    Acts.MATERIAL,
-                    states,
-                    np.eye(n) / mapped.sd**2,
-                    tuple((amount * np.eye(n),) for amount in amounts),
-                    amplitudes=(1.0, 1.0),
-                    odds=(0.0,) * len(amounts),
-                )
+        if not n:
+            continue
+        cause, sd, shares, odds = "heterogeneity", heterogeneity_sd, (HOMOGENEOUS_SHARE, 1.0), float(np.log(PATCHY))
+        if mapped := tissues[tissue].field:
+            cause, sd, shares, odds = FIELD, mapped.sd, FIELD_AMPLITUDES, 0.0
+        first, *_ = levels = [(share * sd) ** 2 for share in shares]
+        blocks.append(
+            Block(
+                tissues[tissue].name,
+                cause,
+                Acts.MATERIAL,
+                states,
+                np.eye(n) / first,
+                tuple((level * np.eye(n),) for level in levels),
+                amplitudes=(1.0, 1.0),
+                odds=(0.0, odds),
+                last=mapped is None,
+                left_out=LEFT_OUT if mapped is None else LEFT_OUT_OF_MAP,
             )
-        elif n:
-            blocks.append(
-                Block(
-                    name,
-                    "heterogeneity",
-                    Acts.MATERIAL,
-                    states,
-                    np.eye(n) / levels[0],
-                    tuple((level * np.eye(n),) for level in levels),
-                    amplitudes=(1.0, 1.0),
-                    odds=(0.0, float(np.log(PATCHY))),
-                    last=True,
-                )
-            )
+        )
     if modes.poisson:
         precision = np.eye(len(modes.poisson)) / poisson_sd**2
         blocks.append(Block("all tissues", "poisson", Acts.MATERIAL, states, precision))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from palpate.inversion.blocks import FIELD, Acts, Block
+from palpate.inversion.blocks import Acts, Block
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import Objective
 from palpate.inversion.optimise import TO_THE_NOISE, Bounds, fit_coefficients
@@ -26,8 +26,6 @@ from palpate.progress import Progress
 
 __all__ = ["InformedProblem", "informed_problem"]
 
-LEFT_OUT = 1.0  # variances of the first noise, a tenth of the found one, that what a block leaves out may explain
-OF_MAP = 0.05  # likewise, of a field that is itself sought: what is left out of it is missing in the map
 SMALL = 12  # unknowns of a block, which are kept
 
 
@@ -130,7 +128,7 @@ def _informed(block: Block, information: NDArray[np.float64]) -> tuple[NDArray[n
         return np.eye(block.size), np.eye(block.size)
     root = linalg.cholesky(block.widest, lower=True)
     sizes, vectors = linalg.eigh(root.T @ information @ root)
-    left = np.cumsum(np.maximum(sizes, 0.0)) < (OF_MAP if block.cause == FIELD else LEFT_OUT)
+    left = np.cumsum(np.maximum(sizes, 0.0)) < block.left_out
     kept = vectors[:, ~left][:, ::-1]
     unit = float(np.sqrt(np.mean(np.diag(block.widest))))  # coefficients keep their size
     basis = root @ kept / unit

@@ -12,7 +12,7 @@ from palpate.images.alignment import moved
 from palpate.images.distance import smoothing_width
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, tissue_colours
-from palpate.mesh.anatomy import Box
+from palpate.mesh.anatomy import Box, domain_box
 from palpate.report.backgrounds import Grey, whole_box
 from palpate.report.report_data import (
     LaterImage,
@@ -27,7 +27,7 @@ from palpate.report.slice_box import slice_box
 from palpate.report.surfaces import MOST_TRIANGLES, image_surface
 from palpate.report.volume import MOST_VOXELS, grey_volume, label_volume
 from palpate.study.body import ImagedStates
-from palpate.study.first_look import FrameLook, TissueLook, grid_box
+from palpate.study.first_look import FrameLook, TissueLook
 
 __all__ = ["ROLE_COLOURS", "Arrow", "PreviewImage", "preview_data", "preview_image"]
 
@@ -124,7 +124,7 @@ def preview_image(
         arrows=tuple(arrows),
         factor=_factor(longest),
         frame=_corners(frame.box),
-        field=_corners(grid_box(aligned)),
+        field=_corners(domain_box([aligned.grid])),
         view=_padded(whole),
         motion=None if lay is None else lay.matrix[:3],
     )

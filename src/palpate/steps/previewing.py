@@ -6,7 +6,6 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 
 from palpate.errors import ConfigurationError, InputDataError, PalpateError
@@ -20,6 +19,7 @@ from palpate.study.lock import held_folder
 from palpate.study.new_case import NewCase, write_new_case
 from palpate.study.outputs import OutputFolder, read_regular, write_text
 from palpate.study.prediction import predicted_intervals
+from palpate.study.provenance import software_versions
 
 __all__ = ["PREVIEW", "checked_with_page", "new_case_with_page", "place_page", "refuse_other_page", "write_page"]
 
@@ -126,11 +126,4 @@ def refuse_other_page(path: Path) -> None:
 
 def _page(checked: Checked, missing: str) -> str:
     created = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-    return preview_page(checked, created=created, version=_version(), no_prediction=missing)
-
-
-def _version() -> str:
-    try:
-        return metadata.version("palpate")
-    except metadata.PackageNotFoundError:
-        return ""
+    return preview_page(checked, created=created, version=software_versions().get("palpate", ""), no_prediction=missing)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from palpate.images.checks import share_inside
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
-from palpate.mesh.anatomy import Box, domain_box
+from palpate.mesh.anatomy import Box
 from palpate.study.case import Case
 from palpate.study.edge_length import case_domain
 
@@ -79,11 +79,6 @@ def frame_look(case: Case, before: Segmentation, after: Sequence[Segmentation]) 
     around = shown.get(domain.extent, "all that the first image shows")
     meshed = f"The mesh fills a box of {size} mm, {around}. Its faces are the frame."
     return FrameLook(box, (meshed, *_held(case)), shared)
-
-
-def grid_box(image: Segmentation) -> Box:
-    """The box that an image shows, out to its voxels' outer faces."""
-    return domain_box([image.grid])
 
 
 def _held(case: Case) -> tuple[str, ...]:
