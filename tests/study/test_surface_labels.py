@@ -104,6 +104,15 @@ def test_what_is_no_closed_surface_is_refused(tmp_path):
             surface_labels([path])
 
 
+def test_a_text_too_large_to_be_taken_apart_is_refused_before_it_is(tmp_path):
+    path = tmp_path / "large.stl"
+    with path.open("wb") as file:
+        file.write(b"solid large\n")
+        file.truncate(2**26 + 1)
+    with pytest.raises(InputDataError, match="export it as a binary STL"):
+        surface_labels([path])
+
+
 def test_names_that_stand_twice_and_grids_beyond_all_are_refused(tmp_path):
     (tmp_path / "other").mkdir()
     twice = [stl(folder / "organ.stl", box([0.0] * 3, [10.0] * 3)) for folder in (tmp_path, tmp_path / "other")]

@@ -16,6 +16,7 @@ from palpate.images.label_image import LPS_TO_RAS
 __all__ = ["SurfaceFile", "read_stl"]
 
 MOST_BYTES = 2**29
+MOST_TEXT = 2**26  # bytes: its numbers take some ten times as much memory while they are read
 HEADING = 80  # bytes of a binary file, before the number of its triangles
 FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 MOST_MM = 1e6
@@ -72,6 +73,8 @@ def _corners(content: bytes, path: Path) -> NDArray[np.float64]:
         raise InputDataError(
             f"'{path}' is no STL: neither a text that begins with 'solid', nor whole triangles; export it"
         )
+    if len(content) > MOST_TEXT:
+        raise InputDataError(f"'{path}' is a text of over {MOST_TEXT // 2**20} MB; export it as a binary STL")
     found = re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", content)
     try:
         values = np.array(found, dtype=np.float64).reshape(-1, 3, 3)
