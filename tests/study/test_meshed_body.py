@@ -18,7 +18,9 @@ from palpate.errors import ConfigurationError, GeometryError, InputDataError
 from palpate.export.fitted_model import fitted_model
 from palpate.mechanics.deformation import largest_strains
 from palpate.mechanics.loads import boundary_named
-from palpate.mesh.mesh_file import read_mesh_file
+from palpate.mesh.mesh_file import plane_faces, read_mesh_file
+from palpate.mesh.tetrahedralise import boundary_of
+from palpate.phantoms.shapes import rotation_about
 from palpate.report.collect import collect
 from palpate.study.body import inverse_problem, make_body
 from palpate.study.case_file import read_case
@@ -371,3 +373,16 @@ def test_exports_repeat_each_states_motion_and_loads(folder, tmp_path):
     assert pulls == pytest.approx([1e3 * FORCE_N, -0.5e3 * FORCE_N], rel=1e-6)  # mN
     palpate.export(result, tmp_path / "febio", format="febio", linear=True)
     assert len(ET.parse(tmp_path / "febio" / "palpate.feb").findall("Step/step")) == 2
+
+
+def test_a_plane_is_no_name_for_an_end_that_leans():
+    """Of a bar that is turned by more than 15 degrees the furthest part of its end is no end."""
+    nodes, tets = box_cells((4, 4, 6), SIZE)
+    inverted = np.linalg.det(nodes[tets[:, 1:]] - nodes[tets[:, :1]]) < 0.0
+    faces = boundary_of(np.where(inverted[:, None], tets[:, [0, 2, 1, 3]], tets))
+    upright = plane_faces(nodes, faces, "z_max", 0.1)
+    leaning = nodes @ rotation_about(np.array([1.0, 0.0, 0.0]), 10.0).T
+    assert np.array_equal(plane_faces(leaning, faces, "z_max", 4.0), upright)
+    bent = nodes @ rotation_about(np.array([1.0, 0.0, 0.0]), 30.0).T
+    with pytest.raises(GeometryError, match=r"lean against that plane by \d\d degrees.*a group of faces"):
+        plane_faces(bent, faces, "z_max", 4.0)

@@ -24,6 +24,7 @@ TETRAHEDRA, TRIANGLES = ("tetra", "tetra10"), ("triangle", "triangle6")
 GROUPS = ("tissue", "label", "region", "medit:ref", "gmsh:physical", "MaterialID", "material", "CellEntityIds")
 WHOLE = "boundary"
 PLANES = tuple(f"{axis}_{end}" for axis in "xyz" for end in ("min", "max"))
+LEANS_DEG = 15.0  # of a surface against the plane that it is named by
 SLIVER = 1e-9  # volume over the cube of the longest edge
 
 
@@ -131,12 +132,24 @@ def _sound(
 def plane_faces(
     nodes: NDArray[np.float64], faces: NDArray[np.int64], plane: str, within_mm: float
 ) -> NDArray[np.bool_]:
-    """Which faces (n_faces, 3) lie within so many mm of a plane of `PLANES`, or on the `WHOLE` boundary."""
+    """Which faces (n_faces, 3) lie within so many mm of a plane of `PLANES`, or on the `WHOLE` boundary.
+
+    Raises `GeometryError` where they lean against it, as the part of a bent tip does that reaches furthest.
+    """
     if plane == WHOLE:
         return np.ones(len(faces), dtype=bool)
     axis, end = "xyz".index(plane[0]), plane[2:]
     along = nodes[:, axis] if end == "max" else -nodes[:, axis]
-    return np.asarray(along[faces].min(axis=1) >= along.max() - within_mm)
+    found = np.asarray(along[faces].min(axis=1) >= along.max() - within_mm)
+    a, b, c = np.moveaxis(nodes[faces[found]], 1, 0)
+    area = np.abs(np.cross(b - a, c - a).sum(axis=0))
+    lean = float(np.degrees(np.arccos(min(area[axis] / max(float(np.linalg.norm(area)), 1e-300), 1.0))))
+    if found.any() and lean > LEANS_DEG:
+        raise GeometryError(
+            f"the faces within {within_mm:g} mm of {plane} lean against that plane by {lean:.0f} degrees: they are part"
+            " of a surface that does not lie along it; name the surface by a group of faces of the mesh's file"
+        )
+    return found
 
 
 def body_mesh(
