@@ -19,6 +19,7 @@ from palpate.images.wall_motion import STILL_VOXELS, wall_motion
 
 __all__ = [
     "SMALL_VOXELS",
+    "VOLUME_CHANGE",
     "VOLUME_IMPLAUSIBLE",
     "check_headers",
     "check_images",

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from palpate.errors import InputDataError
+from palpate.images.checks import VOLUME_CHANGE
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers import read_intensities
 from palpate.images.registration import length_text
@@ -35,7 +36,6 @@ GENERATOR = '<meta name="generator" content="Palpate preview">'  # by which a pa
 SCRIPTS = ("report.js", "slices.js", "preview.js", "start.js")
 MOST_LATER = 4  # later images that are drawn
 LEAST_SHARE = 0.005  # of a variance, that is told
-MUCH = 0.05  # change of a volume that no stiffness explains
 MEANING = {
     Role.ESTIMATE: "its stiffness is sought",
     Role.KNOWN: "its stiffness is given",
@@ -247,7 +247,7 @@ def _state(look: TissueLook, after: int) -> _State:
     return _State(
         volume=number(later),
         change="" if change is None else f"{round(100.0 * change, 1) + 0.0:+.1f} %",
-        much=change is not None and abs(change) > MUCH,
+        much=change is not None and abs(change) > VOLUME_CHANGE,
         shift=NONE if shift is None else f"{np.linalg.norm(shift):.1f}",
         parts="" if shift is None else "R {:+.1f}, A {:+.1f}, S {:+.1f}".format(*(np.round(shift, 1) + 0.0)),
     )

@@ -48,10 +48,10 @@ class PredictedModulus:
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """The predicted intervals of a case's moduli, and the noise (mm) of the surfaces that they rest on.
+    """The predicted intervals of a case's moduli, and the noise (mm) that they rest on.
 
-    correlation_mm: of the noise, the length of one Gaussian with its correlation area; stated: whether the case states
-    it, else the images show it.
+    noise_sd_mm: of the surfaces of one image, of which a residual has two; correlation_mm: of the noise, the length of
+    one Gaussian with its correlation area; stated: whether the case states it, else the images show it.
     """
 
     moduli: tuple[PredictedModulus, ...]
