@@ -284,8 +284,8 @@ def strained_body(body: Body, strained: NDArray[np.float64], case: Case) -> Body
 
 
 def on_linear_elements(body: Body, case: Case) -> Body:
-    """The body on linear elements of its mesh, without layers or the strain of its reference: coarse, and quick."""
-    return _remade(body, case, space=lagrange_space(body.space.mesh, "P1"), layers=(), strained=None)
+    """The body on linear elements of its mesh, without the strain of its reference: coarse, and quick."""
+    return _remade(body, case, space=lagrange_space(body.space.mesh, "P1"), strained=None)
 
 
 def _remade(body: Body, case: Case, **changes: Any) -> Body:

@@ -68,6 +68,7 @@ from palpate.uncertainty import (
     information_shares,
     log_interval,
     modulus_interval,
+    sandwich_covariance,
     stiffness_maps,
 )
 
@@ -401,7 +402,8 @@ def stated_posteriors(
     first = StatedPosterior(fixed, minimum, bonded.total)
     if released is None:
         return bonded, (first,)
-    covariance = bonded.with_released(objective, minimum, released)
+    sandwich = sandwich_covariance(released.objective, released.minimum.evaluation)
+    covariance = bonded.with_released(objective, minimum.evaluation, sandwich)
     free = frozen_posterior(released.objective, released.minimum.unknowns, released.minimum.evaluation)
     return covariance, (first, StatedPosterior(free, released.minimum, covariance.total))
 

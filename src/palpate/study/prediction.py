@@ -17,7 +17,7 @@ from palpate.study.body import Body, joint_problem, on_linear_elements
 from palpate.study.case import Case, Mechanics
 from palpate.study.estimation import verdict
 from palpate.study.run import inversion_settings
-from palpate.uncertainty import Interval, covariance_of, error_noise, log_interval
+from palpate.uncertainty import Interval, covariance_of, error_noise, log_interval, sandwich_covariance
 
 __all__ = ["PredictedModulus", "Prediction", "predicted_intervals"]
 
@@ -104,11 +104,10 @@ def predicted_intervals(bodies: Sequence[Body], case: Case, *, progress: Progres
     J^T W J + P, which for these least squares is the Fisher information of images and prior: J needs no later image but
     for the motion of what is prescribed. The noise in it is the one that the case states, or that the images show where
     an estimate begins. Elements are linear ones on the given meshes, so that this takes seconds; a modulus is guessed
-    as its tissue states it, else as the middle start has it. Finite strains, layers round organs, the voxels' place and
-    the mesh are not in it. Raises as an estimate does.
+    as its tissue states it, else as the middle start has it. Layers round organs are free. Finite strains, the voxels'
+    place and the mesh are not in it. Raises as an estimate does.
     """
     coarse = replace(case, mechanics=Mechanics("linear", "P1", solver=case.mechanics.solver))
-    coarse = replace(coarse, discrepancy=replace(case.discrepancy, layer_sd=0.0))
     problem = joint_problem([on_linear_elements(body, coarse) for body in bodies], coarse, progress=progress)
     settings = inversion_settings(coarse, problem.parameters)
     objective, nearby = first_noise_of(problem, settings, progress=progress)
@@ -118,6 +117,8 @@ def predicted_intervals(bodies: Sequence[Body], case: Case, *, progress: Progres
     guess[: objective.n_parameters] = _guessed(case, objective, np.median(np.stack(settings.starts), axis=0))
     fitted = fit_coefficients(objective, guess, bounds=settings.bounds, tolerance=TO_THE_NOISE)
     found = covariance_of(objective, fitted.evaluation, (), unknowns=fitted.unknowns, noise_of=noise_of)
+    free = sandwich_covariance(*objective.released(fitted.evaluation, fitted.unknowns), noise_of)
+    found = found.with_released(objective, fitted.evaluation, free)
     surfaces = [noise for (_, kind), noise in noise_of.items() if kind == "surface distance"]
     noise = surfaces[0] if surfaces else next(iter(noise_of.values()))
     mapping, moduli = objective.parameters, list[PredictedModulus]()

@@ -15,8 +15,6 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue_distance import cropped, window_of
 from palpate.inversion.evidence import undecided_covariance
 from palpate.inversion.objective import Evaluation, Linearisation, Objective
-from palpate.inversion.optimise import Minimum
-from palpate.inversion.outer_loop import OuterIterate
 from palpate.inversion.reweighting import of_one_noise
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
@@ -108,14 +106,13 @@ class Covariance:
         shares = {name: float(part[number, number] / self.total[number, number]) for name, part in parts.items()}
         return {name: share for name, share in shares.items() if name != "prior" or share > ROUNDING}
 
-    def with_released(self, objective: Objective, minimum: Minimum, released: OuterIterate) -> Covariance:
-        """The same with what blocks add that were held while the `minimum` was sought (see `Block.released`).
+    def with_released(self, objective: Objective, evaluation: Evaluation, free: NDArray[np.float64]) -> Covariance:
+        """The same with what blocks add that were held where it is `evaluation`'s (see `Block.released`).
 
-        released: where the estimate ends with these blocks free.
+        free: the sandwich (n_parameters, n_parameters) with these blocks free.
         """
-        rows = minimum.evaluation.covariance_columns(objective.n_parameters).T
-        held = self.noise + rows @ minimum.evaluation.prior @ rows.T
-        part = added_by(sandwich_covariance(released.objective, released.minimum.evaluation), held=held)
+        rows = evaluation.covariance_columns(objective.n_parameters).T
+        part = added_by(free, held=self.noise + rows @ evaluation.prior @ rows.T)
         cause = " and ".join(dict.fromkeys(block.cause for block in objective.parameters.blocks if block.released))
         return replace(self, prior=self.prior + part, causes={**self.causes, cause: part})
 
@@ -237,7 +234,11 @@ def mesh_covariance(objective: Objective) -> NDArray[np.float64]:
     return np.diag(variances)
 
 
-def sandwich_covariance(objective: Objective, evaluation: Evaluation) -> NDArray[np.float64]:
+def sandwich_covariance(
+    objective: Objective,
+    evaluation: Evaluation,
+    noise_of: Mapping[tuple[int, str], NoiseModel] | None = None,
+) -> NDArray[np.float64]:
     """Covariance (n_parameters, n_parameters) of the log-moduli: H^-1 (J^T W C W J + P) H^-1.
 
     C is the covariance of the residuals' errors under the noise model of their image (see `error_noise`), across
@@ -245,10 +246,10 @@ def sandwich_covariance(objective: Objective, evaluation: Evaluation) -> NDArray
     read for correlated errors). A residual is the error of a later image less that of its rest state's image, each
     with half of the noise: the later ones are independent, that of the rest state is the same for all states that
     have it, at the material place, by the mean of their noise models. Later states that move alike do not average
-    it away, opposite ones do.
+    it away, opposite ones do. noise_of: the residuals' noise where it is not that of the evaluation.
     """
     rows = evaluation.covariance_columns(objective.n_parameters).T
-    noise, prior = _sandwich(objective, evaluation, rows, error_noise(evaluation))
+    noise, prior = _sandwich(objective, evaluation, rows, error_noise(evaluation) if noise_of is None else noise_of)
     return noise + prior
 
 
