@@ -15,12 +15,19 @@ from palpate.cli import main
 from palpate.errors import EstimationError
 from palpate.images.readers import write_label_image
 from palpate.inversion.estimate import REPORTED
+from palpate.mechanics.dilatation import choose_element
+from palpate.progress import silent
 from palpate.report.sensitivity_report import sensitivity_page
 from palpate.report.tornado import effect_text, sensitivity_table, tornado_rows
-from palpate.study import inverted
+from palpate.study import inverted as inverted_module
 from palpate.study import sensitivity as study
+from palpate.study.body import joint_problem, make_body
 from palpate.study.case_file import read_case
+from palpate.study.inverted import inverted
 from palpate.study.json_schema import SCHEMAS
+from palpate.study.read import read_states
+from palpate.study.run import inversion_settings
+from palpate.study.variations import fast_variations, sobol_result
 
 CASE = """
 [images]
@@ -79,7 +86,7 @@ def interrupted(case_file, tmp_path_factory):
 
     Of the variants two are left; that under a law without equilibrium is refused.
     """
-    folder, told, real = tmp_path_factory.mktemp("out"), [], inverted.invert
+    folder, told, real = tmp_path_factory.mktemp("out"), [], inverted_module.invert
     case = read_case(case_file)
     calls = []
 
@@ -101,7 +108,7 @@ def interrupted(case_file, tmp_path_factory):
     ]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(study, "variants_of", lambda *_: iter(few))
-        patch.setattr(inverted, "invert", again)
+        patch.setattr(inverted_module, "invert", again)
         with pytest.raises(KeyboardInterrupt):
             palpate.sensitivity(case, sobol=8, output=folder)
         before = len(calls)
@@ -183,6 +190,25 @@ def test_every_assumption_is_varied_by_the_method_that_serves(document):
     assert row_of(document, "known_modulus", "rest", "x 1.2")["changes"] == {GLAND: pytest.approx(np.log(1.2))}
     settings = [v["setting"] for v in document["variations"] if v["subject"] == "tube"]
     assert settings == ["-0.5 voxel", "-0.25 voxel", "+0.25 voxel", "+0.5 voxel"]
+
+
+def test_a_surface_whose_drawing_is_an_unknown_is_not_moved_beside_it(case_file):
+    """No step from an estimate with its offset free says what another offset would be found: the interval holds it."""
+    case = read_case(case_file)
+    case = replace(case, discrepancy=replace(case.discrepancy, surface_offset_mm=1.0))
+    body = make_body(read_states(case, progress=silent), case, progress=silent)
+    problem = joint_problem((body,), case, progress=silent)
+    settings = inversion_settings(case, problem.parameters)
+    inversion = inverted((body,), problem, case, settings, progress=silent)
+    tissues, linear = body.space.mesh.tissues, choose_element("P1").dilatation
+    sought = {block.of for block in problem.parameters.blocks if block.cause == "offset" and not block.considered}
+    assert sought
+    rows = fast_variations(inversion, settings, tissues, dilatation=linear, voxel_mm=1.0)
+    drawn = [row for row in rows if row.cause == "segmentation" and row.subject in sought]
+    assert {row.subject for row in drawn} == sought
+    assert all(row.changes is None and "interval holds it" in row.reason for row in drawn)
+    indices = sobol_result(inversion, settings, tissues, dilatation=linear, voxel_mm=1.0, n=2, seed=0)
+    assert not sought & {of.subject for of in indices.inputs if of.cause == "segmentation"}
 
 
 def test_what_has_no_estimate_says_why(document):

@@ -38,6 +38,7 @@ KNOWN_FACTOR = 1.2
 VOXELS = (-0.5, -0.25, 0.25, 0.5)
 PRIOR_WIDTHS = (0.5, 2.0)
 ALL = "all tissues"
+DRAWN = "how it is drawn is an unknown of the estimate, so that the interval holds it (its share: offset)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +128,7 @@ def fast_variations(
     found = [
         *_exact(inversion, tissues),
         *_varied(path, names, _inputs(inversion, equilibria, tissues, dilatation, voxel_mm)),
+        *(Variation("segmentation", name, "any", "linearised", None, reason=DRAWN) for name in _offset(inversion)),
     ]
     if inversion.objective.parameters.n_coefficients:
         for width in PRIOR_WIDTHS:
@@ -148,18 +150,15 @@ def what_would_change(
 ) -> tuple[Variation, ...]:
     """What an estimate rests on, in few lines: known modulus, surfaces by half a voxel, Poisson's ratios, frame, law.
 
-    A surface whose offset is an unknown of the estimate is none of them: no step from there says what another offset
-    would be found. laws: others than that of the estimate, which none has that seeks Poisson's ratios or measures what
+    laws: others than that of the estimate, which none has that seeks Poisson's ratios or measures what
     depends on the material directly, as a force does; otherwise as `fast_variations`.
     """
     path, minimum = fast_path(inversion.objective, inversion.minimum, settings.bounds), inversion.minimum
     names, equilibria = inversion.objective.parameters.tissues, _equilibria(inversion)
     blocks = inversion.objective.parameters.blocks
-    offsets = {block.of for block in blocks if block.cause == "offset" and not block.considered}
     inputs = [
         replace(each, amounts=(each.amounts[0], each.amounts[-1]))
         for each in _inputs(inversion, equilibria, tissues, dilatation, voxel_mm)
-        if not (each.cause == "segmentation" and each.subject in offsets)
         if each.cause != "poisson_ratio" or each.subject == ALL
     ]
 
@@ -268,7 +267,11 @@ def _varied(path: FastPath, names: tuple[str, ...], inputs: Sequence[_Input]) ->
 def _inputs(
     inversion: Inversion, equilibria: Equilibria, tissues: tuple[Tissue, ...], dilatation: Dilatation, voxel_mm: float
 ) -> tuple[_Input, ...]:
-    """Poisson's ratio of each tissue and of all, each observed surface, known moduli where several set the scale."""
+    """Poisson's ratio of each tissue and of all, each observed surface, known moduli where several set the scale.
+
+    A surface whose offset is an unknown of the estimate is none of them: no step from there says what another offset
+    would be found.
+    """
     objective, minimum = inversion.objective, inversion.minimum
     model = objective.states[0].model
     regions = [model.space.mesh.tissues[region] for region in model.regions]
@@ -283,7 +286,8 @@ def _inputs(
         steps = _poisson_steps(max(tissue.poisson_ratio for tissue in regions))
         words = tuple((step, f"{step:+.3g}") for step in steps)
         found.append(_Input("poisson_ratio", ALL, "", tuple(e.sum(axis=1) for e in by_poisson), words))
-    for name in dict.fromkeys(o.name for o in objective.observations if isinstance(o, Imaged)):
+    surfaces = dict.fromkeys(o.name for o in objective.observations if isinstance(o, Imaged))
+    for name in (name for name in surfaces if name not in _offset(inversion)):
         amounts = tuple((voxel_mm * share, f"{share:+g} voxel") for share in VOXELS)
         found.append(_Input("segmentation", name, "mm", surface_errors(minimum.evaluation, name), amounts))
     if not _exact(inversion, tissues):
@@ -296,6 +300,12 @@ def _inputs(
             if regions[own[0]].role is Role.KNOWN
         ]
     return tuple(found)
+
+
+def _offset(inversion: Inversion) -> list[str]:
+    """The surfaces whose offset is an unknown of the estimate."""
+    blocks = inversion.objective.parameters.blocks
+    return list(dict.fromkeys(block.of for block in blocks if block.cause == "offset" and not block.considered))
 
 
 def _poisson_steps(ratio: float) -> tuple[float, float]:
