@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from palpate.cohort.task import Row
     from palpate.study.outputs import OutputFolder
 
-__all__ = ["TARGETS", "cohort", "statistics", "status"]
 
 Progress = Callable[[str], None]
 

@@ -12,17 +12,6 @@ if TYPE_CHECKING:
     from palpate.study.case import Case
     from palpate.study.outputs import OutputFolder
 
-__all__ = [
-    "MESH_TARGETS",
-    "SIMULATION_TARGETS",
-    "SURFACE_TARGETS",
-    "check",
-    "init",
-    "mesh",
-    "noise",
-    "simulate",
-    "voxelise",
-]
 
 Progress = Callable[[str], None]
 

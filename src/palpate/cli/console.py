@@ -24,17 +24,6 @@ from palpate.errors import ConfigurationError, InputDataError
 from palpate.study.lock import held_folder, own_file
 from palpate.study.outputs import OutputFolder
 
-__all__ = [
-    "LOGGER",
-    "close_log",
-    "close_streams",
-    "give_up",
-    "interruptible",
-    "log_is_open",
-    "output_folder",
-    "tell",
-]
-
 LOGGER = logging.getLogger("palpate")
 LOGGER.addHandler(logging.NullHandler())  # before there is a log file, messages reach the user as sentences only
 UNLOCKED = "the file system of %s knows no locks: a second run in the folder would not be noticed, so start none there"

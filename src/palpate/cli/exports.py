@@ -16,8 +16,6 @@ from palpate.errors import ConfigurationError
 if TYPE_CHECKING:
     from palpate.study.outputs import OutputFolder
 
-__all__ = ["export", "view"]
-
 
 def export(arguments: argparse.Namespace, _: None, outputs: OutputFolder, progress: Callable[[str], None]) -> Outcome:
     """Write what an estimate left for another program."""

@@ -19,8 +19,6 @@ from palpate.errors import ConfigurationError
 from palpate.export.formats import FORMATS
 from palpate.study.schema import nearest, shown
 
-__all__ = ["make_parser", "version"]
-
 CASE_HELP = "the case: images, tissues, roles"
 EXAMPLES = {
     "demo": ("palpate demo", "palpate demo --output demo --json > demo.json"),

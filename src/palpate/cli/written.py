@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from palpate.study.outputs import OutputFolder
     from palpate.study.result import CaseResult
 
-__all__ = ["DOCUMENT", "PAGE", "SENSITIVITY_TARGETS", "TARGETS", "demo", "estimate", "report", "sensitivity"]
 
 Progress = Callable[[str], None]
 

@@ -11,8 +11,6 @@ from palpate.cohort.table import checked_rows, row_of, separated_cells
 from palpate.cohort.task import Row
 from palpate.errors import ConfigurationError
 
-__all__ = ["read_derivatives"]
-
 IMAGES, TABLE, PARTICIPANTS = "*_dseg.nii.gz", "dseg.tsv", "participants.tsv"
 
 

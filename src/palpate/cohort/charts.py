@@ -13,8 +13,6 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from palpate.report.svg import INK, draw_svg, link_url
 
-__all__ = ["MOST_IN_FOREST", "boxes_svg", "forest_svg", "scatter_svg"]
-
 SIZE = (4.4, 3.0)
 PLACE = (0.15, 0.2, 0.82, 0.74)
 ROW = 0.2  # inches of a patient in the forest

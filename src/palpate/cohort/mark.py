@@ -15,8 +15,6 @@ from palpate.study.earlier import RESULT
 from palpate.study.lock import held_folder
 from palpate.study.outputs import read_json, sha256_of, staged, write_json
 
-__all__ = ["MARK", "document_of", "held_soon", "read_mark", "write_mark"]
-
 MARK = "done.json"
 SCHEMA = "palpate.done/1"
 RETRY_S = 0.1

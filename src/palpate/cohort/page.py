@@ -15,8 +15,6 @@ from palpate.cohort.charts import boxes_svg, forest_svg, scatter_svg
 from palpate.cohort.records import Record
 from palpate.report.rows import interval_text, number
 
-__all__ = ["cohort_page"]
-
 LOGGER = logging.getLogger(__name__)
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
 MOST_ROWS = 2000  # of the table; cohort.csv has all

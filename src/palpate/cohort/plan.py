@@ -15,8 +15,6 @@ from palpate.errors import InputDataError
 from palpate.parallel import mapped
 from palpate.study.outputs import read_json, staged, write_json
 
-__all__ = ["CASES", "PLAN", "Plan", "make_plan", "read_plan", "write_plan"]
-
 PLAN, CASES = "plan.json", "cases"
 SCHEMA = "palpate.plan/1"
 KEY = re.compile("[0-9a-f]{64}")

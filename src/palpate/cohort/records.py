@@ -16,9 +16,6 @@ from palpate.inversion import KNOWN_MODULUS
 from palpate.parallel import mapped
 from palpate.uncertainty import NORMAL_95
 
-__all__ = ["Modulus", "Record", "records_of", "tissues_of"]
-
-
 NEARLY = 0.95  # of that: a profile that comes so far has reached the end
 NOT_IMAGES = ("names", "mesh")  # inputs that two patients may well share
 

@@ -24,8 +24,6 @@ from palpate.progress import Progress
 from palpate.study.outputs import STAGING, make_folder, staged, write_json, write_text
 from palpate.study.provenance import software_versions
 
-__all__ = ["STATISTICS", "Options", "close_cohort", "run_cohort"]
-
 LOGGER = logging.getLogger(__name__)
 STATISTICS, PAGE = "statistics.json", "cohort.html"
 

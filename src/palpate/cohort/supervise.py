@@ -17,8 +17,6 @@ from typing import Any, BinaryIO, cast
 from palpate.cohort.task import Outcome, Task
 from palpate.errors import ResourceError
 
-__all__ = ["ESTIMATE", "Supervisor"]
-
 ESTIMATE = "palpate.cohort.work:estimate_row"
 # One thread for each row: several would sum in another order, and the numbers would tell in their last digits how many
 # workers there were, and where.

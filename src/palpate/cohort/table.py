@@ -16,8 +16,6 @@ from palpate.images.input_file import read_input
 from palpate.images.named_labels import MAX_NAME, computed_by_spreadsheets
 from palpate.study.schema import nearest, shortened
 
-__all__ = ["checked_rows", "read_table", "row_of", "separated_cells"]
-
 LARGEST_FILE = 2**26  # bytes
 MOST_ROWS = 100_000
 MOST_COLUMNS = 500

@@ -23,8 +23,6 @@ from palpate.study.edge_length import edge_length_of
 from palpate.study.outputs import OutputFolder
 from palpate.study.read import read_states
 
-__all__ = ["RoomError", "Tell", "estimate_row"]
-
 LOGGER = logging.getLogger(__name__)
 
 Tell = Callable[[float, float], None]  # is told the predicted memory (GB) and time (s), before they are taken

@@ -33,8 +33,6 @@ from palpate.mesh.space import LagrangeSpace
 from palpate.study.case_loads import loads_on
 from palpate.study.outputs import write_text
 
-__all__ = ["write"]
-
 FACE = np.array([3, 4, 2, 1])  # Abaqus' number of each row of FACES
 LAWS = (Linear, NeoHookean, MooneyRivlin)  # that it has
 INCREMENT = 0.2  # of a step at finite strain, at first

@@ -27,8 +27,6 @@ from palpate.study.outputs import make_folder
 from palpate.study.result import CaseResult, MeshResult, Simulation
 from palpate.study.samples import POSTERIOR
 
-__all__ = ["file_name", "write_estimate_files", "write_mesh_files", "write_simulation_files"]
-
 MOST_BYTES = 60  # of a tissue's name in a file's: file systems count bytes, not letters
 
 

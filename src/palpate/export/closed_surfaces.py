@@ -21,8 +21,6 @@ from palpate.mesh.surface import tissue_surface, triangle_normals
 from palpate.observation.observed_surface import SUBTRIANGLES
 from palpate.study.outputs import write_bytes
 
-__all__ = ["ClosedSurface", "closed_surfaces", "write_obj", "write_ply", "write_stl"]
-
 HEADING = b"SPACE=RAS; lengths in mm"
 FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])  # of PLY
 FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])  # of STL

@@ -18,8 +18,6 @@ from palpate.mechanics.deformation import volumes_after
 from palpate.mesh.surface import triangle_normals
 from palpate.study.outputs import write_text
 
-__all__ = ["write"]
-
 TISSUES = (
     "tissue",
     "role",

@@ -28,7 +28,6 @@ from palpate.study.provenance import software_versions
 if TYPE_CHECKING:
     from pydicom.dataset import Dataset
 
-__all__ = ["write"]
 
 LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 MOST_SLICES = 5000

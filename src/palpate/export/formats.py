@@ -13,8 +13,6 @@ if TYPE_CHECKING:  # the command line names the formats before numpy is loaded
 
     from palpate.export.fitted_model import FittedBody, FittedModel
 
-__all__ = ["FORMATS", "Format", "Options", "Write", "format_named"]
-
 
 @dataclass(frozen=True, slots=True)
 class Options:

@@ -12,17 +12,6 @@ from palpate.images.tissue import Role
 from palpate.mesh.surface import tissue_surface
 from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh
 
-__all__ = [
-    "OFF",
-    "FaceGroup",
-    "MaterialPart",
-    "element_faces",
-    "face_groups",
-    "material_parts",
-    "plain_names",
-    "tissue_groups",
-]
-
 STEP = 0.05  # of ln E, between the materials of a tissue that is not homogeneous
 OFF = float(np.expm1(0.5 * STEP))  # of a modulus, that an element has less or more than its material, at the most
 

@@ -10,8 +10,6 @@ from palpate.images.segmentation import first_labels
 from palpate.images.tissue import Tissue, tissue_colours
 from palpate.study.outputs import write_text
 
-__all__ = ["write_label_table"]
-
 
 def write_label_table(path: Path, tissues: tuple[Tissue, ...]) -> Path:
     """Write number, name and colour of each tissue, but for the background's, as 3D Slicer's CSV.

@@ -12,8 +12,6 @@ from palpate.study.earlier import RESULT, seal_of
 from palpate.study.outputs import read_json, sha256_of
 from palpate.study.result import SCHEMA
 
-__all__ = ["MODEL", "read_model", "write_model"]
-
 MODEL = "model.npz"
 FORMAT = "palpate.model/1"
 

@@ -17,8 +17,6 @@ from palpate.export.samples import moduli_samples
 from palpate.study.outputs import write_bytes
 from palpate.study.samples import POSTERIOR
 
-__all__ = ["write", "write_posterior"]
-
 PROBABILITY = 0.95
 
 

@@ -16,8 +16,6 @@ from palpate.images.readers import write_label_image, write_scalar_image
 from palpate.images.tissue import Role, tissue_colours
 from palpate.study.result import CaseResult
 
-__all__ = ["notebook_viewer"]
-
 
 def notebook_viewer(result: CaseResult, *, background: Path | None = None, opacity: float = 0.6) -> Any:
     """A widget of the first image: `background` (a grey image) or the tissues, the modulus over it from `stiffness`.

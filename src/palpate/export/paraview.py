@@ -12,8 +12,6 @@ from palpate.export.formats import Options
 from palpate.images.segmentation import first_labels
 from palpate.study.outputs import write_json, write_text
 
-__all__ = ["write"]
-
 SCRIPT = '''"""Show what Palpate exported in ParaView: paraview --script=load_in_paraview.py
 
 (or in its Python shell: Run Script). The moved body, cut open, with Young's modulus on a logarithmic scale; the

@@ -9,8 +9,6 @@ from palpate.images.label_image import VoxelGrid
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.parallel import mapped
 
-__all__ = ["region_image", "tetrahedron_image"]
-
 CANDIDATES = 1_000_000  # voxel centres tested at once by a thread, which bounds the memory
 TOLERANCE = 1e-9  # in barycentric coordinates: a centre on a face belongs to both
 

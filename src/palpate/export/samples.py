@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from palpate.export.fitted_model import FittedModel
 from palpate.study.samples import CHAINS
 
-__all__ = ["Samples", "moduli_samples"]
-
 DRAWS = 1000
 SEED = 0
 LINEARISED = "linearised: independent draws, log-normal about the estimate"

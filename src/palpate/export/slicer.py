@@ -18,8 +18,6 @@ from palpate.images.segmentation import first_labels
 from palpate.images.tissue import tissue_colours
 from palpate.study.outputs import write_json, write_text
 
-__all__ = ["write"]
-
 SCRIPT = '''"""Load what Palpate exported into 3D Slicer: paste into its Python console
 
     exec(open(r"/path/to/load_in_slicer.py").read(), {"__file__": r"/path/to/load_in_slicer.py"})

@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["rows", "wrapped"]
-
 
 def rows(pattern: str, *columns: NDArray[Any]) -> str:
     """A line a row of `columns`, each (n,) or (n, k), by a `%` pattern with a place for each number."""

@@ -18,8 +18,6 @@ from palpate.images.segmentation import first_labels
 from palpate.mechanics.deformation import largest_strains
 from palpate.study.outputs import make_folder, write_text
 
-__all__ = ["write", "write_states"]
-
 
 def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
     """Write mesh_0.vtu (at rest), mesh_1.vtu ... (each later image), mesh.pvd, and groups.vtm with groups/*.vtp."""

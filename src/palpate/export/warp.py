@@ -25,8 +25,6 @@ from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.surface import tissue_surface
 from palpate.study.outputs import write_json
 
-__all__ = ["field_on_grid", "write"]
-
 FINEST_MM = 1.0  # of the field's grid: the motion is smooth, and images of CT would make gigabytes
 SWEEPS = 15  # of the averaging that fills what is not meshed, on each level
 INVERSIONS = 30  # steps of the fixed-point iteration for the inverse

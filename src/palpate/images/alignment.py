@@ -21,19 +21,6 @@ from palpate.images.tissue import Role
 from palpate.images.tissue_distance import tissue_distance_map
 from palpate.parallel import mapped
 
-__all__ = [
-    "TUKEY",
-    "Alignment",
-    "Motion",
-    "RigidFit",
-    "RigidMotion",
-    "align",
-    "fit_rigid_motion",
-    "moved",
-    "seen_surface",
-    "within_border",
-]
-
 BORDER_VOXELS = 3.0  # nearer to the image's border the map continues what it cannot see
 MAX_POINTS = 20_000
 MIN_POINTS = 30

@@ -17,18 +17,6 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.images.wall_motion import STILL_VOXELS, wall_motion
 
-__all__ = [
-    "SMALL_VOXELS",
-    "VOLUME_CHANGE",
-    "VOLUME_IMPLAUSIBLE",
-    "check_headers",
-    "check_images",
-    "check_pair",
-    "check_segmentation",
-    "later_names",
-    "share_inside",
-]
-
 OBSERVED = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
 VOLUME_CHANGE = 0.05  # no modulus explains a filling between the scans
 VOLUME_IMPLAUSIBLE = 0.30  # of an organ: no deformation, and hardly a filling, changes so much

@@ -10,8 +10,6 @@ from scipy import ndimage, special
 
 from palpate.images.label_image import VoxelGrid
 
-__all__ = ["DistanceMap", "distance_map", "observation_width", "smoothing_width", "terrace_noise", "terrace_power"]
-
 PROBIT_LIMIT = 2.5  # beyond so many sigma the smoothed indicator has lost the distance to rounding
 COHERENCE = 1.7  # variance times correlation area of the rounding on a patch along a grid plane, in voxel edges^4
 

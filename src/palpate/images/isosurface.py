@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from palpate.images.distance import DistanceMap
 
-__all__ = ["IsosurfacePoints", "isosurface_points"]
-
 BORDER = 1.0  # voxels: nearer to the image's border the map is a continuation, not a measurement
 
 

@@ -10,8 +10,6 @@ from palpate.images.input_file import read_input
 from palpate.images.named_labels import LabelTable, checked_table
 from palpate.images.readers.table_registry import read_rows, table_formats
 
-__all__ = ["LabelTable", "read_label_table"]
-
 MAX_BYTES = 2**20
 
 

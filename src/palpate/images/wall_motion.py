@@ -6,8 +6,6 @@ import numpy as np
 
 from palpate.images.segmentation import Segmentation
 
-__all__ = ["STILL_VOXELS", "wall_motion"]
-
 STILL_VOXELS = 0.15  # mean motion of a surface, in voxels, that the voxels' own rounding makes
 
 

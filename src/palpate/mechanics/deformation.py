@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from palpate.mechanics.element import barycentric_gradients, quadrature, shape_derivatives
 from palpate.mesh.space import LagrangeSpace
 
-__all__ = ["deformation_determinants", "largest_strains", "volumes_after"]
-
 CENTRE = np.full((1, 4), 0.25)
 
 

@@ -12,17 +12,6 @@ from scipy.special import roots_jacobi
 
 from palpate.mesh.space import TET_EDGES, TRIANGLE_EDGES
 
-__all__ = [
-    "barycentric_gradients",
-    "mean_reference_tensor",
-    "quadrature",
-    "reference_tensor",
-    "shape_derivatives",
-    "shape_functions",
-    "triangle_quadrature",
-    "triangle_slopes",
-]
-
 
 def quadrature(degree: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Points (n_q, 4) barycentric and positive weights (n_q,), sum 1, exact for polynomials up to `degree`.

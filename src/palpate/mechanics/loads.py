@@ -19,8 +19,6 @@ from palpate.mechanics.element import quadrature, shape_functions, triangle_quad
 from palpate.mesh.space import LagrangeSpace, triangle_shape
 from palpate.mesh.tet_mesh import OUTER, TetMesh
 
-__all__ = ["DeadLoad", "FollowingPressure", "Load", "boundary_named", "gravity", "pressure", "traction"]
-
 Array = NDArray[np.float64]
 
 PER_CUBIC_MILLIMETRE = 1e-6  # (kg/m^3)(m/s^2) = N/m^3 = 1e-6 mN/mm^3

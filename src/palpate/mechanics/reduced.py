@@ -17,15 +17,6 @@ from palpate.mechanics.forward import DenseEquilibrium, checked_coefficients, ch
 from palpate.mechanics.linear_model import LinearModel
 from palpate.mechanics.solvers.products import times
 
-__all__ = [
-    "Projection",
-    "ReducedEquilibrium",
-    "ReducedModel",
-    "ReducedSystem",
-    "orthonormal_basis",
-    "projection",
-]
-
 RANK_TOLERANCE = 1e-10  # of the largest singular value of the normalised snapshots
 WELL_CONDITIONED = 1e-12  # of the Gram matrix' largest eigenvalue: above it Cholesky's factor orthogonalises safely
 CHUNK = 64  # basis vectors multiplied with a stiffness at once

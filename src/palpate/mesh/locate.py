@@ -12,8 +12,6 @@ from scipy.spatial import cKDTree
 from palpate.mesh.space import TET_EDGES, LagrangeSpace
 from palpate.mesh.tet_mesh import TetMesh
 
-__all__ = ["Places", "located", "point_interpolation"]
-
 CANDIDATES = (8, 48, 240)  # tetrahedra that are tried, the ones with the nearest centroids first
 AT_ONCE = 200_000  # pairs of a point and a tetrahedron
 ON_A_FACE = 1e-9  # in barycentric coordinates

@@ -13,8 +13,6 @@ from palpate.mesh.space import lagrange_space
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.mesh.voxelise import voxelise
 
-__all__ = ["in_words", "largest_difference"]
-
 NEIGHBOURHOOD_MM = 10.0
 
 

@@ -17,8 +17,6 @@ from palpate.mesh.places import in_words, largest_difference
 from palpate.mesh.tet_mesh import FACES, TetMesh, tet_dihedrals
 from palpate.parallel import mapped
 
-__all__ = ["MeshQuality", "check_mesh", "dihedral_angles", "level_set_volumes", "mesh_figures", "mesh_quality"]
-
 MIN_DIHEDRAL_DEG = 5.0
 P5_DIHEDRAL_DEG = 25.0
 LEVEL_SET_TOLERANCE = 0.01

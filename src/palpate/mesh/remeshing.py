@@ -18,8 +18,6 @@ from palpate.mesh.cutting import Grid
 from palpate.mesh.interrupts import interrupts_held
 from palpate.mesh.tet_mesh import FACES
 
-__all__ = ["compact", "remeshed"]
-
 HOLLOW_REFERENCE = 8  # references 1 to 6 are the faces of the box, 8 any hollow tissue, the rest pairs of regions
 
 

@@ -11,8 +11,6 @@ from scipy import sparse
 from palpate.errors import ConfigurationError
 from palpate.mesh.tet_mesh import TetMesh
 
-__all__ = ["TET_EDGES", "TRIANGLE_EDGES", "LagrangeSpace", "lagrange_space", "triangle_shape"]
-
 TET_EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
 TRIANGLE_EDGES = np.array([[0, 1], [1, 2], [0, 2]])
 

@@ -19,7 +19,6 @@ from palpate.mesh.tet_mesh import OUTER, TetMesh
 
 TIES = 4  # voxels at the most whose column meets an edge that two faces round differently; a neighbour decides
 
-__all__ = ["Warp", "voxelise"]
 
 Warp = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 

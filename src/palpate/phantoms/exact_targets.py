@@ -15,8 +15,6 @@ from palpate.observation.observed_surface import ObservedSurface, observed_surfa
 from palpate.observation.target import SurfaceTarget, target_from
 from palpate.phantoms.scene import Scene
 
-__all__ = ["TriangulatedDistance", "exact_target", "target_of_truth"]
-
 
 @dataclass(frozen=True, slots=True)
 class TriangulatedDistance:

@@ -13,17 +13,6 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.phantoms.shapes import Tube
 
-__all__ = [
-    "AffineMotion",
-    "Filling",
-    "ScaledMotion",
-    "SmoothField",
-    "Swelling",
-    "WallMotion",
-    "filling_of",
-    "smooth_field",
-    "wall_filling",
-]
 ENDS = 2.2  # half the organ's length in lengths of the filling: 9 % of it is left at the ends
 BLOCK = 4096  # points at a time: the waves of a block fit into the cache
 

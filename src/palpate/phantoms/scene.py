@@ -24,21 +24,6 @@ from palpate.mesh.tetrahedralise import tetrahedralise
 from palpate.mesh.voxelise import Warp, voxelise
 from palpate.phantoms.motion import ScaledMotion, WallMotion, smooth_field
 
-__all__ = [
-    "BoundaryMotion",
-    "Noise",
-    "Scene",
-    "centred_grid",
-    "deformation_determinants",
-    "displacements",
-    "grid_box",
-    "imaged",
-    "make_scene",
-    "refuse_folded",
-    "reimaged",
-    "rescaled",
-]
-
 
 @dataclass(frozen=True, slots=True)
 class Noise:

@@ -15,8 +15,6 @@ from palpate.report.report_data import SliceBox, Volume
 from palpate.report.volume import MOST_VOXELS, grey_volume, label_volume
 from palpate.study.result import CaseResult
 
-__all__ = ["Grey", "background", "earlier_grey", "later_grey", "whole_box", "whole_images"]
-
 MOST_WHOLE_GREY = 400_000  # voxels of an image that the check of the alignment shows
 
 

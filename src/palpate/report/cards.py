@@ -13,8 +13,6 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from palpate.report.rows import NONE, estimate_rows, interval_text, main_numbers, moduli_in, ratio_rows
 
-__all__ = ["moduli_figure", "result_cards", "result_lines"]
-
 GREY = "#888888"
 ROOM = 1.6  # by which factor the axis reaches beyond all numbers, for the arrows of open ends
 STYLE = {"text.parse_math": False, "font.family": "DejaVu Sans"}  # a tissue called $x is a name, not a formula

@@ -16,8 +16,6 @@ from palpate.study.earlier import RESULT, seal_of
 from palpate.study.outputs import write_text
 from palpate.study.result import CaseResult
 
-__all__ = ["redrawn_page", "write_case_report", "write_failure_report"]
-
 PAGE_NAME = "report.html"
 DATA_NAME = "report-data.npz"
 

@@ -40,8 +40,6 @@ from palpate.study.case import Case, CaseLoad
 from palpate.study.case_data import CaseData
 from palpate.study.result import CaseResult, MeshSummary, failure_document, stated_unit
 
-__all__ = ["collect", "collect_failure"]
-
 LOGGER = logging.getLogger(__name__)
 T = TypeVar("T")
 

@@ -8,8 +8,6 @@ from typing import Any
 
 from palpate.report.rows import moduli_in
 
-__all__ = ["Headline", "headline", "listed"]
-
 FOUND = {
     "identified": "The images fix the stiffness of {}.",
     "weak": "The images say little about the stiffness of {}: use the interval, not the number alone.",

@@ -10,8 +10,6 @@ from palpate.report.pairs import ImagePair
 from palpate.report.report_data import BoneDistance, InputImage, TriangleSurface
 from palpate.study.result import CaseResult
 
-__all__ = ["bone_distances", "input_images"]
-
 BORDER_VOXELS = 3.0  # nearer to the later image's border its surface is cut
 
 

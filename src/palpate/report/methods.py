@@ -13,8 +13,6 @@ from palpate.report.report_data import MESH, ReportData
 from palpate.report.rows import moduli_in, ratio_rows
 from palpate.report.sources import SOURCES, bibtex, reference_line
 
-__all__ = ["Methods", "methods_text"]
-
 ELEMENTS = {
     "P1": "linear tetrahedra",
     "P2": "quadratic tetrahedra",

@@ -40,8 +40,6 @@ from palpate.report.slices import alignment_svg, contour_names, first_planes, po
 from palpate.report.stiffness_maps import map_png, map_svg
 from palpate.report.tornado import tornado_svg
 
-__all__ = ["Picture", "page_scripts", "picture_of", "policy_of", "render", "template_of", "widths_of"]
-
 T = TypeVar("T")
 LOGGER = logging.getLogger(__name__)
 SCRIPTS = ("three.min.js", "report.js", "slices.js", "alignment.js", "viewer.js", "organs.js", "mesh.js", "start.js")

@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 from palpate.study.case import Images
 from palpate.study.result import CaseResult, pair_names
 
-__all__ = ["ImagePair", "drawn_images", "image_pairs"]
-
 
 @dataclass(frozen=True, slots=True)
 class ImagePair:

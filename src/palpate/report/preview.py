@@ -30,8 +30,6 @@ from palpate.study.cost import ExpectedCost
 from palpate.study.first_look import FrameLook, TissueLook, frame_look, tissue_looks
 from palpate.study.prediction import Prediction
 
-__all__ = ["GENERATOR", "preview_page"]
-
 GENERATOR = '<meta name="generator" content="Palpate preview">'  # by which a page of ours is known
 SCRIPTS = ("report.js", "slices.js", "preview.js", "start.js")
 MOST_LATER = 4  # later images that are drawn

@@ -29,8 +29,6 @@ from palpate.report.volume import MOST_VOXELS, grey_volume, label_volume
 from palpate.study.body import ImagedStates
 from palpate.study.first_look import FrameLook, TissueLook
 
-__all__ = ["ROLE_COLOURS", "Arrow", "PreviewImage", "preview_data", "preview_image"]
-
 # One hue a role, apart on black and for the colour-blind; after Okabe & Ito, "Color Universal Design" (2008).
 ROLE_COLOURS = {"estimate": "#e69f00", "driver": "#56b4e9", "known": "#2ba888", "rigid": "#cfc8b8", "void": "#6d7278"}
 SHOWN = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)

@@ -10,18 +10,6 @@ from typing import Any
 from palpate.inversion import FIELD, KNOWN_MODULUS
 from palpate.uncertainty import NORMAL_95, Interval
 
-__all__ = [
-    "NONE",
-    "Bar",
-    "EstimateRow",
-    "estimate_rows",
-    "expected_share",
-    "interval_text",
-    "main_numbers",
-    "number",
-    "scale_marks",
-]
-
 NONE = "–"
 BELIEVED = "what was believed before"
 BAR = 200.0  # width of a bar, in its own units

@@ -11,8 +11,6 @@ from markupsafe import Markup
 from palpate.report.rows import interval_text, main_numbers, number
 from palpate.report.tornado import NAMES, effect_text, tornado_rows, tornado_svg
 
-__all__ = ["sensitivity_page"]
-
 
 def sensitivity_page(document: Mapping[str, Any]) -> str:
     """The page of a document sensitivity.json; all names in it are escaped."""

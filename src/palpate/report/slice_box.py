@@ -13,8 +13,6 @@ from palpate.images.tissue import Role
 from palpate.report.backgrounds import whole_box
 from palpate.report.report_data import SliceBox
 
-__all__ = ["MOVING", "slice_box"]
-
 MARGIN_MM = 15.0
 ENOUGH_VOXELS = 4_000_000
 MOVING = (Role.ESTIMATE, Role.DRIVER)

@@ -27,8 +27,6 @@ from palpate.study.map_words import RESOLVED, map_words
 from palpate.study.result import CaseResult
 from palpate.uncertainty import StiffnessMap
 
-__all__ = ["map_png", "map_svg", "tissue_maps"]
-
 ROOM_MM = 3.0  # round the tissue
 COLOURS = "cividis"  # which is read alike by who sees no red or green
 FACTORS = (1.0, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0)

@@ -10,8 +10,6 @@ import matplotlib as mpl
 from markupsafe import escape
 from matplotlib.figure import Figure
 
-__all__ = ["INK", "draw_svg", "link_url"]
-
 INK = "#010203"  # stands for the page's text colour, which differs between light and dark pages
 STYLE = {
     "svg.fonttype": "path",

@@ -13,8 +13,6 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from palpate.report.rows import interval_text, main_numbers, number
 from palpate.report.svg import INK, draw_svg
 
-__all__ = ["TornadoRow", "effect_text", "sensitivity_table", "tornado_rows", "tornado_svg"]
-
 NAMES = {
     "known_modulus": "modulus of {}",
     "poisson_ratio": "Poisson's ratio of {}",

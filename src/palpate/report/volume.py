@@ -13,8 +13,6 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue_distance import cropped, window_of
 from palpate.report.report_data import GREY_STEPS, SliceBox, Volume
 
-__all__ = ["MOST_VOXELS", "grey_volume", "label_volume"]
-
 MOST_VOXELS = 2_500_000  # what a page can carry and a telephone can hold
 CT_WINDOW = (-160.0, 240.0)  # Hounsfield units in which soft tissues differ
 CT_SPAN = (-1024.0, 3072.0)  # Hounsfield units from air to metal, which clips nothing in four to a step

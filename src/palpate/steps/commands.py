@@ -26,8 +26,6 @@ from palpate.study.sensitivity import Kept, Sensitivity
 from palpate.study.sensitivity import sensitivity as vary
 from palpate.study.surface_labels import SurfaceLabels, surface_labels
 
-__all__ = ["check", "estimate", "init", "make_mesh", "noise", "read_result", "sensitivity", "simulate", "voxelise"]
-
 PathLike = str | os.PathLike[str]
 
 

@@ -21,8 +21,6 @@ from palpate.study.outputs import OutputFolder, read_regular, write_text
 from palpate.study.prediction import predicted_intervals
 from palpate.study.provenance import software_versions
 
-__all__ = ["PREVIEW", "checked_with_page", "new_case_with_page", "place_page", "refuse_other_page", "write_page"]
-
 LOGGER = logging.getLogger(__name__)
 PREVIEW = "preview.html"
 LARGEST_PAGE = 2**28  # bytes

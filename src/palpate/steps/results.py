@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-__all__ = ["CaseResult", "SavedResult"]
 
 COLUMNS = ("patient", "id", "stage", "status")
 

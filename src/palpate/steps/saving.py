@@ -19,17 +19,6 @@ from palpate.study.outputs import OutputFolder, Staging, read_json, write_json, 
 from palpate.study.result import CaseResult, failure_document
 from palpate.study.sensitivity import Sensitivity
 
-__all__ = [
-    "DATA",
-    "PAGE",
-    "has_study",
-    "redraw_page",
-    "save_document",
-    "save_estimate",
-    "save_failure",
-    "save_sensitivity",
-]
-
 LOGGER = logging.getLogger(__name__)
 PAGE, DATA, STUDY = "report.html", "report-data.npz", "sensitivity.json"
 

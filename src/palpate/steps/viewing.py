@@ -16,8 +16,6 @@ from palpate.errors import InputDataError, ResourceError
 from palpate.study.earlier import RESULT
 from palpate.study.outputs import is_inside, read_json, read_regular
 
-__all__ = ["Viewing", "viewing"]
-
 LOOPBACK = "127.0.0.1"
 MOST_BYTES = 2**30  # of a file
 KINDS = {

@@ -22,8 +22,6 @@ from palpate.errors import InputDataError
 from palpate.images.named_labels import printable
 from palpate.study.outputs import read_regular, write_bytes
 
-__all__ = ["MAY_BE_NAN", "read_archive", "write_archive"]
-
 T = TypeVar("T")
 
 MAY_BE_NAN = {"may be": "NaN"}  # metadata of a field

@@ -18,29 +18,6 @@ from palpate.study.case_data import CaseData
 from palpate.study.schema import Rule, nearest, rule, shown
 from palpate.uncertainty.intervals import NORMAL_95
 
-__all__ = [
-    "REMAINING",
-    "SAMPLES",
-    "Case",
-    "CaseData",
-    "CaseLoad",
-    "CaseSurface",
-    "CaseTissue",
-    "Discrepancy",
-    "Domain",
-    "DriverMotion",
-    "Estimate",
-    "Images",
-    "Mechanics",
-    "MeshBody",
-    "MeshSettings",
-    "Motion",
-    "Noise",
-    "Pair",
-    "Phantom",
-    "is_tissue_name",
-]
-
 REMAINING = "remaining"
 AUTO = "auto"
 TISSUE_ROLES = tuple(str(role) for role in Role if role is not Role.SLIDING)

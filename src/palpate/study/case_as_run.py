@@ -11,8 +11,6 @@ from palpate.study.case_file import case_tables, case_text, read_case, relative_
 from palpate.study.earlier import RESULT, vouched
 from palpate.study.outputs import OutputFolder, Staging, write_text
 
-__all__ = ["CASE_NAME", "refuse_other_case", "stage_case"]
-
 CASE_NAME = "case.toml"
 
 

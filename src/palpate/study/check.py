@@ -44,8 +44,6 @@ from palpate.study.refusals import refuse_lost, refuse_unmeshable
 from palpate.study.run import refuse_what_cannot_be_estimated
 from palpate.study.samples import require_samples
 
-__all__ = ["CheckReport", "Checked", "OrganRow", "Problem", "check_case", "checked_case", "memory_problems"]
-
 T = TypeVar("T")
 OBSERVED = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
 REFUSED_FINDINGS = {"hardly-observed": GeometryError.exit_code}  # what an estimate refuses, found here as a finding

@@ -14,8 +14,6 @@ from palpate.errors import InputDataError
 from palpate.findings import Finding
 from palpate.study.outputs import Digests, is_inside, read_json, sha256_of
 
-__all__ = ["RESULT", "Earlier", "earlier_files", "seal_of", "strange_files", "vouched"]
-
 RESULT = "result.json"
 DOCUMENTS = (RESULT, "mesh.json", "simulation.json", "sensitivity.json")  # each lists the files of its run
 PAGE_FILES = ("report-data.npz", "report.html")

@@ -17,8 +17,6 @@ from palpate.mechanics.dilatation import choose_element
 from palpate.mesh.anatomy import Box, domain_box, margin_box
 from palpate.study.case import Case
 
-__all__ = ["EdgeLength", "case_domain", "edge_length_of"]
-
 ACROSS_BALL = {Role.ESTIMATE: 5.0, Role.DRIVER: 4.0}  # edges across a ball of the tissue's volume
 ACROSS_THIN = 2.5  # edges across its thickness
 SURFACE_MM = 12.0**-0.5  # standard deviation of a place in a voxel of 1 mm, for which these numbers hold

@@ -15,8 +15,6 @@ from palpate.observation.contract import Imaged, OfInstrument
 from palpate.study.together import ImagePairs
 from palpate.uncertainty import FittedState
 
-__all__ = ["data_findings", "fold_findings", "inversion_findings", "pair_findings"]
-
 STRONG_CORRELATION = 0.99
 HETEROGENEOUS = 0.01  # probability of such differences between image pairs that have the same moduli
 MISFIT = 1.5  # times the stated standard deviation: measurements that are not what they are said to be

@@ -17,8 +17,6 @@ from palpate.images.totalsegmentator import CLASSES
 from palpate.study.case import is_tissue_name
 from palpate.study.plausibility import TABLE, usual_stiffness
 
-__all__ = ["ClassNames", "GuessedTissue", "class_names", "guess_tissues"]
-
 SURROUNDINGS = "surroundings"
 BORDER_SHARE = 0.1  # of the image's border that the body, or the air around it, covers
 STILL_SHARE = 0.005  # of a label's voxels

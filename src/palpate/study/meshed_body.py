@@ -26,8 +26,6 @@ from palpate.study.body import ImagedStates
 from palpate.study.case import Case, CaseSurface, MeshBody
 from palpate.study.schema import nearest
 
-__all__ = ["mesh_states", "with_prescribed"]
-
 OUTSIDE = "outside"
 VOXELS_AN_EDGE, MOST_VOXELS, BORDER = 2.5, 4e6, 3  # of the label image that shows the mesh
 

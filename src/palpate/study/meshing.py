@@ -20,8 +20,6 @@ from palpate.study.case import Case
 from palpate.study.cost import expected_cost, lack_of_memory
 from palpate.study.edge_length import EdgeLength, case_domain, edge_length_of
 
-__all__ = ["ReferenceMesh", "mesh_reference", "refuse_edge"]
-
 FINER = 0.75  # times an edge length whose mesh is not fit: the next one's
 FINER_MESHES = 2  # at the most
 THIN_VOXELS = 4  # along some axis

@@ -23,8 +23,6 @@ from palpate.study.guess import GuessedTissue, class_names, guess_tissues
 from palpate.study.outputs import OutputFolder, read_regular, write_text
 from palpate.study.proposed_mesh import MARGIN_MM, Background, background_of, proposed_edge, proposed_window
 
-__all__ = ["CaseImages", "NewCase", "new_case", "write_new_case"]
-
 LARGEST_CASE = 1_000_000  # bytes
 WIDE_MM = 250.0  # of an image: more than the body of many, so that it must show what lies around, too
 GUESSED_WITHIN = 2.0  # times and by what a known modulus is guessed: measured ones of one tissue differ so

@@ -29,8 +29,6 @@ from palpate.progress import Progress, silent
 from palpate.study.schema import nearest
 from palpate.uncertainty import NORMAL_95
 
-__all__ = ["ALIGNMENTS", "DrawnSurface", "NullPair", "drawing_noise", "noise_of_drawings"]
-
 ALIGNMENTS = ("auto", "surfaces", "none")
 MOST_POINTS = 20_000  # of a surface
 LEAST_POINTS = 100

@@ -24,23 +24,6 @@ from typing import Any
 
 from palpate.errors import InputDataError, ResourceError
 
-__all__ = [
-    "STAGING",
-    "Digests",
-    "OutputFolder",
-    "Staging",
-    "is_inside",
-    "make_folder",
-    "read_json",
-    "read_regular",
-    "recover",
-    "sha256_of",
-    "staged",
-    "write_bytes",
-    "write_json",
-    "write_text",
-]
-
 Digests = Mapping[str, Mapping[str, str]]  # name of a file in the folder -> {"sha256": hexadecimal}
 
 STAGING = ".writing-outputs"  # the hidden folder in an output folder

@@ -29,8 +29,6 @@ from palpate.study.provenance import file_digest
 from palpate.study.refusals import refuse_large
 from palpate.study.schema import nearest, shown
 
-__all__ = ["measured", "phantom_scene", "read_pairs", "read_segmentation", "read_states"]
-
 
 def read_states(case: Case, *, progress: Progress = silent) -> ImagedStates:
     """Segmentations of the reference state and of the later states, aligned and checked.

@@ -18,8 +18,6 @@ from typing import Any, TypeVar
 from palpate.errors import ConfigurationError
 from palpate.images.named_labels import printable
 
-__all__ = ["Rule", "nearest", "read_table", "rule", "shortened", "shown"]
-
 MOST_LETTERS = 4096  # of a text: the longest path that systems take
 MOST_SHOWN = 80  # letters of a text in a sentence
 MOST_OTHERS = 15  # known names that a hint lists

@@ -32,8 +32,6 @@ from palpate.study.provenance import input_digests, software_versions
 from palpate.study.read import phantom_scene, read_states
 from palpate.study.result import MeshSummary, Provenance, Simulation
 
-__all__ = ["filled", "mesh_summary", "simulate"]
-
 Progress = Callable[[str], None]
 
 

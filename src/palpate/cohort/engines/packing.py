@@ -16,8 +16,6 @@ from palpate.cohort.mark import held_soon, write_mark
 from palpate.cohort.task import Outcome, Task
 from palpate.errors import FolderInUse, ResourceError
 
-__all__ = ["Engine", "Place", "Pool", "again", "marked", "packed"]
-
 LOST_ATTEMPTS = 3
 GRACE_S = 10.0
 COARSER = 1.3  # times the edge length: about half the unknowns

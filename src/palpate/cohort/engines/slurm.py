@@ -26,8 +26,6 @@ from palpate.study.cost import expected_cost
 from palpate.study.outputs import read_json, staged, write_json, write_text
 from palpate.study.read import read_states
 
-__all__ = ["SlurmEngine", "run_part"]
-
 FOLDER, PARTS, SCRIPT, JOB = "slurm", "parts.json", "array.sh", "job.json"
 MOST_PARTS = 1000  # SLURM's own default allows 1001
 POLL_S = 5.0

@@ -16,18 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-__all__ = [
-    "MOST_EXACT",
-    "Association",
-    "PerPatient",
-    "PerScan",
-    "Permutation",
-    "association",
-    "pearson_p",
-    "permutation_test",
-    "points_behind",
-]
-
 MOST_POINTS = 2000
 FEWEST = 3  # points of a correlation
 

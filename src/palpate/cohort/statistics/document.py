@@ -19,8 +19,6 @@ from palpate.cohort.task import Row
 from palpate.findings import MISLEADING
 from palpate.study.result import json_object
 
-__all__ = ["SCHEMA", "statistics_document"]
-
 SCHEMA = "palpate.statistics/1"
 SEED = 0
 NOTES = [

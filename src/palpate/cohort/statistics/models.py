@@ -13,8 +13,6 @@ from statsmodels.stats.meta_analysis import combine_effects
 from palpate.cohort.statistics.scans import Scan, Usable
 from palpate.uncertainty.intervals import within_subject_cv
 
-__all__ = ["Combined", "combined", "repeatability"]
-
 
 @dataclass(frozen=True, slots=True)
 class Combined:

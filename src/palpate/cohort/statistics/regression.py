@@ -13,8 +13,6 @@ from scipy import optimize, special, stats
 from palpate.cohort.statistics.association import Permutation, permutation_test
 from palpate.cohort.statistics.scans import Scan
 
-__all__ = ["stage_regression"]
-
 FEWEST = 3  # patients, and scans with a value
 LEVEL = 0.05
 LEAST_BETWEEN, LEAST_WITHIN, LARGEST = 0.01, 0.05, 3.0  # standard deviations of ln E

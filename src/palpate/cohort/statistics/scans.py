@@ -14,8 +14,6 @@ from palpate.cohort.records import Record
 from palpate.findings import Misleading
 from palpate.uncertainty import NORMAL_95
 
-__all__ = ["RULES", "UNFIT", "Scan", "Usable", "inside_fences", "usable_scans"]
-
 UNFIT: tuple[Misleading, ...] = ("mirrored", "voxel-size", "units", "large-shift", "volume-implausible", "fold-over")
 RULES = (
     "A scan enters when its row is done. One that is not identified has no value: it enters as censored, by its ends.",

@@ -13,16 +13,6 @@ from palpate.errors import InputDataError
 from palpate.images.named_labels import NamedLabel, computed_by_spreadsheets, hex_colour
 from palpate.images.readers.table_registry import TableFormat, register_table
 
-__all__ = [
-    "column_names",
-    "delimited_rows",
-    "read_bids_table",
-    "read_slicer_table",
-    "separated_by",
-    "slicer_table",
-    "whole_number",
-]
-
 COLOUR = re.compile(r"#[0-9a-f]{6}")
 COLUMNS = ("LabelValue", "Name", "Color_R", "Color_G", "Color_B", "Color_A")
 

@@ -30,7 +30,6 @@ from palpate.images.readers.voxel_stream import MAX_VOXELS, read_exactly
 if sys.platform == "linux":
     import fcntl
 
-__all__ = ["GREETING", "ReadLimits", "read_stored"]
 
 GREETING = b"palpate reads\n"
 PIPE = 2**20  # bytes that the pipe holds, where the system lets us choose

@@ -10,8 +10,6 @@ from palpate.errors import InputDataError
 from palpate.images.named_labels import NamedLabel, hex_colour
 from palpate.images.readers.table_registry import TableFormat, register_table
 
-__all__ = ["COLOURS", "begins_with", "pattern_rows", "read_ctbl_table", "read_itksnap_table"]
-
 COLOURS = r"(?P<red>[0-9]{1,3})\s+(?P<green>[0-9]{1,3})\s+(?P<blue>[0-9]{1,3})"
 CTBL_ROW = re.compile(r"\s*(?P<label>[0-9]{1,9})\s+(?P<name>\S+)\s+" + COLOURS + r"(?:\s+[0-9.]{1,20})?\s*")
 ITKSNAP_ROW = re.compile(

@@ -11,9 +11,6 @@ from palpate.errors import InputDataError
 from palpate.images.named_labels import MAX_LABEL, MAX_NAME, NamedLabel
 from palpate.images.readers.table_registry import TableFormat, register_table
 
-__all__ = ["read_json_table"]
-
-
 DIGITS = re.compile(r"[0-9]{1,9}")  # not what int() takes besides: blanks, signs, 1_0, digits of other scripts
 
 

@@ -9,8 +9,6 @@ from pathlib import Path
 from palpate.errors import InputDataError
 from palpate.images.named_labels import NamedLabel
 
-__all__ = ["TableFormat", "read_rows", "register_table", "table_formats"]
-
 
 @dataclass(frozen=True, slots=True)
 class TableFormat:

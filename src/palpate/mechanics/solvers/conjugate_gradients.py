@@ -11,8 +11,6 @@ from scipy import sparse
 from palpate.errors import SolverError
 from palpate.mechanics.solvers.products import times
 
-__all__ = ["conjugate_gradients"]
-
 ROOM = 2**28  # bytes of the vectors of columns that are iterated together
 VECTORS = 8  # that a column takes
 FEWEST = 32  # columns together, below which products with a factor are slow

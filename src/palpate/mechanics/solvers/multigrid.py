@@ -21,8 +21,6 @@ from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
 from palpate.mechanics.solvers.contract import EXACT, Expectation, Factorisation, Hints, Solver
 from palpate.mechanics.solvers.products import times
 
-__all__ = ["SOLVER"]
-
 MAX_ITERATIONS = 2000
 SMOOTHER_DEGREE = 3
 # Measured on one thread of a 2.4 GHz AMD EPYC: seconds an entry of the matrix for set-up, and for each step of one

@@ -10,8 +10,6 @@ from scipy import sparse
 
 from palpate.parallel import mapped, processors
 
-__all__ = ["times"]
-
 FEW = 8  # columns, up to which one after the other is faster: SciPy's kernel for several has no registers for so few
 WORTH_THREADS = 3_000_000  # products; below, handing them to a thread takes longer than it spares
 

@@ -14,8 +14,6 @@ from palpate.mechanics.solvers.contract import EXACT, Coarser, Expectation, Fact
 from palpate.mechanics.solvers.products import times
 from palpate.memory import available_memory, total_memory
 
-__all__ = ["SOLVERS", "expected_of_size", "factorise"]
-
 SOLVERS = {solver.name: solver for solver in (direct.SOLVER, direct.MIXED, multigrid.SOLVER)}
 TOLERANCE = 1e-8  # of a residual, relative to its right-hand side, which rounding may leave
 LARGEST_CONDITION = 1e13  # beyond it a direct solution has lost three digits of four to rounding
