@@ -124,7 +124,15 @@ def _logged(path: Path, heading: str) -> Iterator[None]:
     there = path.exists()
     file = own_file(path)
     size = os.fstat(file).st_size
-    _open_log(file)
+    # send what the library logs, and warnings of others, to a copy of the open `file`
+    stream = os.fdopen(os.dup(file), "a", encoding="utf-8", errors="backslashreplace")
+    handler = _LogFile(stream)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    logging.captureWarnings(capture=True)
+    for logger in (LOGGER, logging.getLogger("py.warnings")):
+        logger.addHandler(handler)
+        logger.propagate = False
+    LOGGER.setLevel(logging.INFO)
     LOGGER.info(heading)
     try:
         with _stdout_kept_free(file):
@@ -138,18 +146,6 @@ def _logged(path: Path, heading: str) -> Iterator[None]:
         raise
     finally:
         os.close(file)
-
-
-def _open_log(file: int) -> None:
-    """Send what the library logs, and warnings of others, to a copy of the open `file`."""
-    stream = os.fdopen(os.dup(file), "a", encoding="utf-8", errors="backslashreplace")
-    handler = _LogFile(stream)
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-    logging.captureWarnings(capture=True)
-    for logger in (LOGGER, logging.getLogger("py.warnings")):
-        logger.addHandler(handler)
-        logger.propagate = False
-    LOGGER.setLevel(logging.INFO)
 
 
 def log_is_open() -> bool:

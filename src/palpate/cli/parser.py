@@ -125,7 +125,8 @@ def make_parser() -> argparse.ArgumentParser:
     _add_results(subparsers)
     _add_cohort(subparsers)
     try:
-        _add_brought(subparsers)
+        for add in brought("palpate.commands", FunctionType, taken=EXAMPLES).values():
+            add(partial(_command, subparsers))
     except ConfigurationError as error:
         parser.error(str(error))
     return parser
@@ -256,12 +257,6 @@ def _add_cohort(subparsers: Any) -> None:
     statistics = _command(subparsers, "statistics", cohorts.statistics, what=what, folder=None)
     statistics.add_argument("output", type=Path, metavar="DIR", help="the output folder of a cohort")
     statistics.set_defaults(makes_folder=False, targets=cohorts.TARGETS)
-
-
-def _add_brought(subparsers: Any) -> None:
-    """What other packages bring: each entry point of `palpate.commands` adds one by what it is given, `_command`."""
-    for add in brought("palpate.commands", FunctionType, taken=EXAMPLES).values():
-        add(partial(_command, subparsers))
 
 
 def _add_case(command: argparse.ArgumentParser) -> None:

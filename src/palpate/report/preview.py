@@ -146,13 +146,31 @@ def _shown_of(checked: Checked, created: str) -> _Shown | None:
     case, states = checked.case, next(iter(checked.states), None)
     if case is None or states is None or states.mesh is not None:
         return None
-    frame, names = frame_look(case, states.before, states.after), _names(case, states)
+    frame = frame_look(case, states.before, states.after)
+    # names of the first image and of its later ones, each once
+    images = case.images
+    given = [] if images is None else [images.before.name, *(path.name for path in images.after)]
+    plain = ["before", *(f"after {k}" if len(states.after) > 1 else "after" for k in range(1, len(states.after) + 1))]
+    distinct = len(given) == len(plain) and len(set(given)) == len(given)
+    names = tuple(given if distinct else plain)
     looks = tissue_looks(states.before, states.after, frame.box)
     if not states.after:
         return _Shown(states, names, frame, looks)
     data = preview_data(states, names, {"id": checked.report.id}, created=created)
     data = replace(data, later=data.later[:MOST_LATER])
-    return _Shown(states, names, frame, looks, data, _images(case, states, data, looks, frame))
+    box = data.references[0].slices
+    assert box is not None, "the images of a preview have a box"
+    first = _grey(case, states, None)
+    return _Shown(
+        states,
+        names,
+        frame,
+        looks,
+        data,
+        tuple(
+            preview_image(states, k, box, looks, frame, (first, _grey(case, states, k))) for k in range(len(data.later))
+        ),
+    )
 
 
 def _noise(prediction: Prediction | None) -> Mapping[str, Any] | None:
@@ -196,15 +214,6 @@ def _banner(problems: Sequence[Problem], prediction: Prediction | None) -> dict[
 
 def _count(n: int, what: str) -> str:
     return f"{n} {what}{'' if n == 1 else 's'}"
-
-
-def _names(case: Case, states: ImagedStates) -> tuple[str, ...]:
-    """Names of the first image and of its later ones, each once."""
-    images = case.images
-    given = [] if images is None else [images.before.name, *(path.name for path in images.after)]
-    plain = ["before", *(f"after {k}" if len(states.after) > 1 else "after" for k in range(1, len(states.after) + 1))]
-    distinct = len(given) == len(plain) and len(set(given)) == len(given)
-    return tuple(given if distinct else plain)
 
 
 def _rows(states: ImagedStates, looks: Sequence[TissueLook]) -> tuple[_Row, ...]:
@@ -284,17 +293,6 @@ def _expected(
         unit = "kPa" if of.unit == "kPa" else f"× {of.relative_to}"
         found.append((row, interval_text(of.interval95), number(of.guess), unit))
     return tuple(found), scale_marks(document)
-
-
-def _images(
-    case: Case, states: ImagedStates, data: ReportData, looks: Sequence[TissueLook], frame: FrameLook
-) -> tuple[PreviewImage, ...]:
-    box = data.references[0].slices
-    assert box is not None, "the images of a preview have a box"
-    first = _grey(case, states, None)
-    return tuple(
-        preview_image(states, k, box, looks, frame, (first, _grey(case, states, k))) for k in range(len(data.later))
-    )
 
 
 def _grey(case: Case, states: ImagedStates, after: int | None) -> Grey | None:

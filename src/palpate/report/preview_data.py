@@ -113,6 +113,7 @@ def preview_image(
         if look.middle is not None
     ]
     longest = max((float(np.linalg.norm(a.end - a.start)) for a in arrows), default=0.0)
+    rim = RIM * float((whole.high - whole.low).max())
     return PreviewImage(
         organs=tuple(label_volume(image, box) for image in images),
         whole=tuple(label_volume(image, whole) for image in images),
@@ -120,10 +121,10 @@ def preview_image(
             None if g is None else grey_volume(g.values, g.grid, box, most_voxels=MOST_VOXELS / 2) for g in greys
         ),
         arrows=tuple(arrows),
-        factor=_factor(longest),
+        factor=next((f for f in (10.0, 5.0, 3.0, 2.0) if f * longest <= LONGEST_ARROW_MM), 1.0),
         frame=_corners(frame.box),
         field=_corners(domain_box([aligned.grid])),
-        view=_padded(whole),
+        view=SliceBox(whole.low - rim, whole.high + rim, whole.position),
         motion=None if lay is None else lay.matrix[:3],
     )
 
@@ -139,14 +140,3 @@ def _surfaces(image: Segmentation, most_triangles: int) -> tuple[TriangleSurface
 def _corners(box: Box) -> NDArray[np.float64]:
     """Corners (8, 3) RAS mm of a box, as their numbers count in binary along its axes."""
     return box.world(box.lengths * np.array(list(np.ndindex(2, 2, 2)), dtype=np.float64))
-
-
-def _padded(box: SliceBox) -> SliceBox:
-    """The box with a rim, in which the image's own faces are seen."""
-    rim = RIM * float((box.high - box.low).max())
-    return SliceBox(box.low - rim, box.high + rim, box.position)
-
-
-def _factor(longest_mm: float) -> float:
-    """How many times as long as it is an arrow is drawn, a round number, so that the longest is seen."""
-    return next((f for f in (10.0, 5.0, 3.0, 2.0) if f * longest_mm <= LONGEST_ARROW_MM), 1.0)

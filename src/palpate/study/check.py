@@ -245,7 +245,7 @@ def _checked(case: Case, problems: _Problems, progress: Progress, *, meshed: boo
     found = [
         (f"pair {n}: {name}" if n > 1 else name, one)
         for n, pair in enumerate(pairs, start=1)
-        for name, one in _lay(pair)
+        for name, one in zip(later_names(len(pair.after)), pair.alignments, strict=False)
     ]
     files = [(source.file, source.in_words) for pair in pairs for source in pair.data]
     measured_words = {f.name + (f", state {f.state}" if f.state > 1 else ""): words for f, words in files}
@@ -259,11 +259,6 @@ def _with_data(problems: _Problems, pair: ImagedStates, case: Case, first: int) 
         return pair
     found = problems.attempt(lambda: measured(case, pair, first=first))
     return pair if found is None else replace(pair, data=found[0])
-
-
-def _lay(pair: ImagedStates) -> list[tuple[str, Registration]]:
-    """The name of each later image with how it lay, where that was measured."""
-    return list(zip(later_names(len(pair.after)), pair.alignments, strict=False))
 
 
 def _cost(

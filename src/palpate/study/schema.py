@@ -114,7 +114,10 @@ def read_table(kind: type[T], table: Mapping[str, object], *, where: str, folder
         if isinstance(value, str):  # before an enumeration names all of its words
             _check_choice(bounds, value, place)
         converted = bounds.convert(value) if bounds.convert else _convert(hints[key], value, place)
-        _check_value(bounds, converted, place)
+        for item in converted if isinstance(converted, tuple) else (converted,):
+            _check_choice(bounds, item, place)
+        if bounds.test is not None and converted is not None and not bounds.test(converted):
+            raise ConfigurationError(f"{place} is {shown(converted)}, but it must be {bounds.wanted}")
         values[key] = converted
     return kind(**values)
 
@@ -161,13 +164,6 @@ def _check_range(bounds: Rule, value: object, place: _Place) -> None:
             raise ConfigurationError(
                 f"{place} is {shown(item)}, but it must be a number from {low:.16g} to {high:.16g}{words}"
             )
-
-
-def _check_value(bounds: Rule, value: object, place: _Place) -> None:
-    for item in value if isinstance(value, tuple) else (value,):
-        _check_choice(bounds, item, place)
-    if bounds.test is not None and value is not None and not bounds.test(value):
-        raise ConfigurationError(f"{place} is {shown(value)}, but it must be {bounds.wanted}")
 
 
 def _check_choice(bounds: Rule, value: object, place: _Place) -> None:

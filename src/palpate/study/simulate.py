@@ -48,7 +48,16 @@ def simulate(case: Case, *, progress: Progress, steps: int = 1) -> Simulation:
     if case.phantom is not None:
         scene = phantom_scene(case)
         space, tissues = scene.space, scene.tissues
-        before, after, summary, remarks = scene.before, scene.after, _plain_summary(space), tuple[Finding, ...]()
+        before, after, remarks = scene.before, scene.after, tuple[Finding, ...]()
+        smallest = tet_dihedrals(space.mesh.nodes[space.mesh.tets]).min(axis=1)
+        summary = MeshSummary(
+            len(space.mesh.nodes),
+            len(space.mesh.tets),
+            3 * len(space.points),
+            float(smallest.min()),
+            float(np.percentile(smallest, 5.0)),
+            {},
+        )
         displacements = tuple(scene.displacement * (step / steps) for step in range(1, steps + 1))
     else:
         progress("reading and aligning the images")
@@ -181,16 +190,4 @@ def mesh_summary(body: Body) -> MeshSummary:
         quality.volume_error,
         body.edge_length.mm if body.edge_length else None,
         body.edge_length.in_words if body.edge_length else "",
-    )
-
-
-def _plain_summary(space: LagrangeSpace) -> MeshSummary:
-    smallest = tet_dihedrals(space.mesh.nodes[space.mesh.tets]).min(axis=1)
-    return MeshSummary(
-        len(space.mesh.nodes),
-        len(space.mesh.tets),
-        3 * len(space.points),
-        float(smallest.min()),
-        float(np.percentile(smallest, 5.0)),
-        {},
     )
