@@ -51,11 +51,11 @@ def test_the_package_offers_what_it_names():
 @pytest.mark.parametrize("name", MODULES)
 def test_a_module_sorts_its_names_and_keeps_them(name):
     module = importlib.import_module(name)
-    names = getattr(module, "__all__", [])
+    names = vars(module).get("__all__", [])
     assert module.__doc__, f"{name} has no docstring"
     assert names == sorted(names, key=lambda word: (not word.isupper(), not word[0].isupper(), word))
     assert len(names) == len(set(names))
-    for public_name in names:
+    for public_name in [*names, *dir(module)]:
         assert hasattr(module, public_name), f"{name} names {public_name}, which is not there"
 
 
