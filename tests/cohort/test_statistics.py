@@ -14,8 +14,7 @@ from palpate.cohort.page import cohort_page
 from palpate.cohort.plan import Plan
 from palpate.cohort.records import Modulus, Record, records_of
 from palpate.cohort.statistics.document import statistics_document
-from palpate.cohort.statistics.models import combined, repeatability
-from palpate.cohort.statistics.scans import UNFIT, inside_fences, usable_scans
+from palpate.cohort.statistics.scans import UNFIT, combined, inside_fences, repeatability, usable_scans
 from palpate.cohort.tables import columns_of
 from palpate.cohort.task import Outcome, Row
 from palpate.findings import MISLEADING

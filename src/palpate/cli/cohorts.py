@@ -83,8 +83,7 @@ def statistics(_: argparse.Namespace, case: None, outputs: OutputFolder, progres
 
 
 def _rows(arguments: argparse.Namespace) -> Sequence[Row]:
-    from palpate.cohort.bids import read_derivatives
-    from palpate.cohort.table import read_table
+    from palpate.cohort.table import read_derivatives, read_table
 
     table, template = arguments.table, arguments.template
     if table is None:

@@ -100,7 +100,7 @@ def interruptible(signals: Sequence[signal.Signals], mask: Iterable[int]) -> Ite
             signal.signal(number, interrupt)
         if hasattr(signal, "pthread_sigmask"):
             # The linear algebra starts its threads while the signals are blocked, and so they are for ever for these:
-            # a signal reaches the main thread, or waits where that blocks it (`mesh.interrupts`).
+            # a signal reaches the main thread, or waits where that blocks it (`mesh.remeshing`).
             import_module("scipy.linalg")
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         yield came

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import FunctionType
 from typing import Any, NoReturn
 
-from palpate.cli import cohorts, commands, exports, written
+from palpate.cli import cohorts, commands, written
 from palpate.cli.outcome import Outcome
 from palpate.entry_points import brought
 from palpate.errors import ConfigurationError
@@ -213,7 +213,7 @@ def _add_results(subparsers: Any) -> None:
     report.add_argument("output", type=Path, metavar="DIR", help="the output folder of an estimate")
     report.set_defaults(makes_folder=False, targets=(written.DOCUMENT, written.PAGE))
     what = "write an estimate for another program: simulators, viewers, hospital systems"
-    export = _command(subparsers, "export", exports.export, what=what, folder="palpate-export")
+    export = _command(subparsers, "export", commands.export, what=what, folder="palpate-export")
     export.add_argument("result", type=Path, metavar="DIR", help="the output folder of an estimate")
     formats = "; ".join(f"{name}: {form.description}" for name, form in FORMATS.items())
     export.add_argument("--format", required=True, choices=tuple(FORMATS), help=formats)
@@ -221,7 +221,7 @@ def _add_results(subparsers: Any) -> None:
     export.add_argument("--source", type=Path, metavar="SERIES", help="dicom: the first image's DICOM series")
     export.set_defaults(logs=False)  # which would hold the command with its paths
     what = "show the report of an estimate and its files in a browser, on this machine alone"
-    view = _command(subparsers, "view", exports.view, what=what, folder=None)
+    view = _command(subparsers, "view", commands.view, what=what, folder=None)
     view.add_argument("result", type=Path, metavar="DIR", help="the output folder of an estimate")
     view.add_argument("--no-browser", action="store_true", help="print the address, open nothing")
 

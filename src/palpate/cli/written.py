@@ -30,8 +30,8 @@ def estimate(arguments: argparse.Namespace, case: Case | None, outputs: OutputFo
     from palpate.steps import commands
     from palpate.steps.previewing import PREVIEW, write_page
     from palpate.steps.saving import save_failure
-    from palpate.study.case_as_run import refuse_other_case
     from palpate.study.case_file import read_case
+    from palpate.study.earlier import refuse_other_case
     from palpate.study.new_case import write_new_case
 
     if case is not None and arguments.labels is not None:

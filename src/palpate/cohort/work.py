@@ -17,8 +17,8 @@ from palpate.memory import peak_memory_gb
 from palpate.steps.saving import save_estimate, save_failure
 from palpate.study import run
 from palpate.study.case import Case
-from palpate.study.case_as_run import refuse_other_case
 from palpate.study.cost import ExpectedCost
+from palpate.study.earlier import refuse_other_case
 from palpate.study.edge_length import edge_length_of
 from palpate.study.outputs import OutputFolder
 from palpate.study.read import read_states

@@ -22,9 +22,10 @@ from palpate.export.groups import (
     face_groups,
     material_parts,
     plain_names,
+    rows,
     tissue_groups,
+    wrapped,
 )
-from palpate.export.text_lines import rows, wrapped
 from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
 from palpate.mechanics.laws.neo_hookean import NeoHookean

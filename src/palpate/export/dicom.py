@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from palpate.errors import InputDataError, ResourceError
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.formats import Options
-from palpate.export.rasterise import region_image
 from palpate.images.input_file import read_input
 from palpate.images.segmentation import first_labels
 from palpate.images.tissue import tissue_colours
+from palpate.mesh.locate import region_image
 from palpate.study.outputs import write_bytes
 from palpate.study.provenance import software_versions
 

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.formats import Options
-from palpate.export.groups import element_faces, face_groups, tissue_groups
-from palpate.export.text_lines import rows
+from palpate.export.groups import element_faces, face_groups, rows, tissue_groups
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.outputs import write_text
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from palpate.errors import ResourceError
-from palpate.export.rasterise import region_image
 from palpate.images.label_image import LabelImage
 from palpate.images.readers import write_label_image, write_scalar_image
 from palpate.images.tissue import Role, tissue_colours
+from palpate.mesh.locate import region_image
 from palpate.study.result import CaseResult
 
 

@@ -15,6 +15,6 @@ if TYPE_CHECKING:
     from palpate.report.case_report import write_failure_report as write_failure_report
     from palpate.report.rows import interval_text as interval_text
     from palpate.report.rows import number as number
-    from palpate.report.sensitivity_report import sensitivity_page as sensitivity_page
+    from palpate.report.tornado import sensitivity_page as sensitivity_page
 
 __getattr__, __dir__ = front_door(__name__)

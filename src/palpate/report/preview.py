@@ -16,13 +16,13 @@ from palpate.images.readers import read_intensities
 from palpate.images.registration import length_text
 from palpate.images.tissue import Role, Tissue, tissue_colours
 from palpate.progress import about
-from palpate.report.backgrounds import Grey
 from palpate.report.page import Picture, page_scripts, picture_of, policy_of, template_of, widths_of
 from palpate.report.payload import payload
 from palpate.report.preview_data import ROLE_COLOURS, PreviewImage, preview_data, preview_image
 from palpate.report.report_data import ReportData, Volume
 from palpate.report.rows import NONE, EstimateRow, estimate_rows, interval_text, number, scale_marks
 from palpate.report.slices import alignment_svg, first_planes, slice_svg
+from palpate.report.volume import Grey
 from palpate.study.body import ImagedStates
 from palpate.study.case import Case
 from palpate.study.check import Checked, Problem

@@ -13,7 +13,6 @@ from palpate.images.distance import smoothing_width
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, tissue_colours
 from palpate.mesh.anatomy import Box, domain_box
-from palpate.report.backgrounds import Grey, whole_box
 from palpate.report.report_data import (
     LaterImage,
     Reference,
@@ -23,9 +22,8 @@ from palpate.report.report_data import (
     TriangleSurface,
     Volume,
 )
-from palpate.report.slice_box import slice_box
 from palpate.report.surfaces import MOST_TRIANGLES, image_surface
-from palpate.report.volume import MOST_VOXELS, grey_volume, label_volume
+from palpate.report.volume import MOST_VOXELS, Grey, grey_volume, label_volume, slice_box, whole_box
 from palpate.study.body import ImagedStates
 from palpate.study.first_look import FrameLook, TissueLook
 

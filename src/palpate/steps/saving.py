@@ -13,8 +13,7 @@ from palpate.export.case_files import write_estimate_files
 from palpate.findings import Finding, warning_rows
 from palpate.progress import during, silent
 from palpate.study.case import Case
-from palpate.study.case_as_run import stage_case
-from palpate.study.earlier import RESULT, earlier_files, vouched
+from palpate.study.earlier import RESULT, earlier_files, stage_case, vouched
 from palpate.study.outputs import OutputFolder, Staging, read_json, write_json, write_text
 from palpate.study.result import CaseResult, failure_document
 from palpate.study.sensitivity import Sensitivity

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.findings import Finding
-from palpate.images.checks import later_names
+from palpate.images.checks import STILL_VOXELS, later_names, wall_motion
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
-from palpate.images.wall_motion import STILL_VOXELS, wall_motion
 
 BEHIND, IN_FRONT = ("sacrum", "coccyx"), ("prostate", "bladder")  # in every pelvis
 LEAST_OBSERVED = 0.1  # below, an estimate is refused (see observation.observed_surface)

@@ -12,9 +12,8 @@ import numpy as np
 
 from palpate.cohort.records import Record, tissues_of
 from palpate.cohort.statistics.association import association
-from palpate.cohort.statistics.models import combined, repeatability
 from palpate.cohort.statistics.regression import stage_regression
-from palpate.cohort.statistics.scans import RULES, Scan, Usable, inside_fences, usable_scans
+from palpate.cohort.statistics.scans import RULES, Scan, Usable, combined, inside_fences, repeatability, usable_scans
 from palpate.cohort.task import Row
 from palpate.findings import MISLEADING
 from palpate.study.result import json_object

@@ -61,10 +61,7 @@ def read_stored(
     if not image_format.read.__module__.startswith("palpate."):
         return image_format.stored(path, grid)  # the program's own code, which another process would not find
     limits = replace(limits, cpu_seconds=image_format.patience * limits.cpu_seconds)
-    numbers = [str(limits.memory_bytes), str(limits.cpu_seconds), str(limits.wall_seconds)]
-    place = [] if grid is None else [json.dumps([grid.shape, grid.affine.tolist()])]
-    module = ["-P", "-W", "ignore", "-m", "palpate.images.readers.child"]
-    with _started([sys.executable, *module, *numbers, kind, str(path), *place], path) as process:
+    with _started(_command(path, kind, limits, grid), path) as process:
         try:
             pipe = cast("BinaryIO", process.stdout)
             if pipe.readline(len(GREETING)) != GREETING:
@@ -80,6 +77,14 @@ def read_stored(
             return stored
         finally:
             process.kill()
+
+
+def _command(path: Path, kind: str, limits: ReadLimits, grid: VoxelGrid | None) -> list[str]:
+    # -P: an image's folder, if it is the working folder, must not be searched for modules.
+    numbers = [str(limits.memory_bytes), str(limits.cpu_seconds), str(limits.wall_seconds)]
+    place = [] if grid is None else [json.dumps([grid.shape, grid.affine.tolist()])]
+    module = ["-P", "-W", "ignore", "-m", "palpate.images.readers.child"]
+    return [sys.executable, *module, *numbers, kind, str(path), *place]
 
 
 def _started(command: list[str], path: Path) -> subprocess.Popen[bytes]:
