@@ -9,8 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from palpate.cohort.mark import document_of
-from palpate.cohort.plan import CASES, Plan
+from palpate.cohort.plan import CASES, Plan, document_of
 from palpate.cohort.task import Outcome, Row
 from palpate.inversion import KNOWN_MODULUS
 from palpate.parallel import mapped

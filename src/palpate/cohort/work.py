@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from palpate.cohort.mark import held_soon, read_mark, write_mark
+from palpate.cohort.plan import held_soon, read_mark, write_mark
 from palpate.cohort.resolve import case_of, row_key
 from palpate.cohort.task import Outcome, Task, failure_class_of
 from palpate.errors import EstimationError, InputDataError, PalpateError

@@ -1,10 +1,6 @@
 """Scenes with a known truth: concentric spheres, pelves, and the noise of their images."""
 
-from palpate.phantoms.exact_targets import TriangulatedDistance as TriangulatedDistance
-from palpate.phantoms.exact_targets import exact_target as exact_target
-from palpate.phantoms.exact_targets import target_of_truth as target_of_truth
 from palpate.phantoms.motion import AffineMotion as AffineMotion
-from palpate.phantoms.motion import ScaledMotion as ScaledMotion
 from palpate.phantoms.motion import SmoothField as SmoothField
 from palpate.phantoms.motion import WallMotion as WallMotion
 from palpate.phantoms.motion import filling_of as filling_of
@@ -26,7 +22,6 @@ from palpate.phantoms.scene import grid_box as grid_box
 from palpate.phantoms.scene import imaged as imaged
 from palpate.phantoms.scene import refuse_folded as refuse_folded
 from palpate.phantoms.scene import reimaged as reimaged
-from palpate.phantoms.scene import rescaled as rescaled
 from palpate.phantoms.shapes import Complement as Complement
 from palpate.phantoms.shapes import Ellipsoid as Ellipsoid
 from palpate.phantoms.shapes import Tube as Tube

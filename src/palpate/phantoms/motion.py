@@ -57,18 +57,6 @@ class Filling:
         return np.asarray(amplitude * (self.filling_mm * around * spoke + self.stray.at(points)))
 
 
-@dataclass(frozen=True, slots=True)
-class ScaledMotion:
-    """`factor` times another motion."""
-
-    motion: WallMotion
-    factor: float
-
-    def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Displacement (n, 3) mm at wall points (n, 3) in RAS mm."""
-        return self.factor * self.motion.at(points)
-
-
 def filling_of(
     tube: Tube,
     *,

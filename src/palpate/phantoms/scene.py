@@ -22,7 +22,7 @@ from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.tet_mesh import OUTER, TetMesh
 from palpate.mesh.tetrahedralise import tetrahedralise
 from palpate.mesh.voxelise import Warp, voxelise
-from palpate.phantoms.motion import ScaledMotion, WallMotion, smooth_field
+from palpate.phantoms.motion import WallMotion, smooth_field
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,15 +158,6 @@ def reimaged(scene: Scene, grid: VoxelGrid, *, noise: Noise | None) -> Scene:
     """The same truth seen on another voxel grid, with other noise (drawn with the scene's seed) or none."""
     before, after = _images(scene.space, scene.displacement, grid, noise, scene.seed)
     return replace(scene, before=before, after=after)
-
-
-def rescaled(scene: Scene, factor: float) -> Scene:
-    """The scene of the linear law with `factor` times the motion everywhere, which is again in equilibrium.
-
-    The images stay those of the full motion until the scene is `reimaged`.
-    """
-    motions = {name: ScaledMotion(motion, factor) for name, motion in scene.motions.items()}
-    return replace(scene, displacement=factor * scene.displacement, motions=motions)
 
 
 def _images(

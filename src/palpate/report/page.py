@@ -27,13 +27,12 @@ from palpate.report.charts import (
     residual_svg,
     waterfall_svg,
 )
-from palpate.report.headline import headline
 from palpate.report.interval_charts import profile_svg, region_svg, repeats_svg
 from palpate.report.methods import methods_text
 from palpate.report.payload import payload
 from palpate.report.pictures import mesh_png, organs_png, points_png
 from palpate.report.report_data import LaterImage, MeasuredState, Reference, ReportData, SliceBox, TissueMap
-from palpate.report.rows import estimate_rows, moduli_in, number, ratio_rows, scale_marks
+from palpate.report.rows import estimate_rows, headline, moduli_in, number, ratio_rows, scale_marks
 from palpate.report.scales import Scale, angle_scale, distance_scale, modulus_scale, strain_scale
 from palpate.report.section import VIEWS
 from palpate.report.slices import alignment_svg, contour_names, first_planes, points_svg, slice_svg

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
-from palpate.cohort.mark import held_soon, write_mark
+from palpate.cohort.plan import held_soon, write_mark
 from palpate.cohort.task import Outcome, Task
 from palpate.errors import FolderInUse, ResourceError
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from palpate.cohort.engines.local import LocalEngine
 from palpate.cohort.engines.packing import again, marked
-from palpate.cohort.mark import read_mark
+from palpate.cohort.plan import read_mark
 from palpate.cohort.resolve import case_of
 from palpate.cohort.task import LEAST_MEMORY_GB, Outcome, Task
 from palpate.errors import InputDataError, PalpateError, ResourceError
