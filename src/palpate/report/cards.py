@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import jinja2
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from palpate.report.rows import NONE, estimate_rows, interval_text, main_numbers, moduli_in, ratio_rows
+from palpate.report.svg import template_of
 
 GREY = "#888888"
 ROOM = 1.6  # by which factor the axis reaches beyond all numbers, for the arrows of open ends
@@ -40,11 +40,8 @@ def result_cards(document: Mapping[str, Any], colours: Mapping[str, str]) -> str
 
     document: result.json; colours: tissue -> #rrggbb.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("palpate.report"), autoescape=True, undefined=jinja2.StrictUndefined
-    )
-    template = environment.get_template("cards.html")
-    return str(template.render(document=document, rows=estimate_rows(document, colours), ratios=ratio_rows(document)))
+    rows, ratios = estimate_rows(document, colours), ratio_rows(document)
+    return str(template_of("cards.html").render(document=document, rows=rows, ratios=ratios))
 
 
 def moduli_figure(document: Mapping[str, Any], colours: Mapping[str, str]) -> Figure:

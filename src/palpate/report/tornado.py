@@ -7,13 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import jinja2
 from markupsafe import Markup
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from palpate.report.rows import interval_text, main_numbers, number
-from palpate.report.svg import INK, draw_svg
+from palpate.report.svg import INK, draw_svg, template_of
 
 NAMES = {
     "known_modulus": "modulus of {}",
@@ -150,9 +149,6 @@ def tornado_svg(document: Mapping[str, Any], tissue: str, *, name: str) -> str:
 
 def sensitivity_page(document: Mapping[str, Any]) -> str:
     """The page of a document sensitivity.json; all names in it are escaped."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("palpate.report"), autoescape=True, undefined=jinja2.StrictUndefined
-    )
     tissues = []
     for place, item in enumerate(document["estimates"]):
         value, interval = main_numbers(item)
@@ -174,4 +170,4 @@ def sensitivity_page(document: Mapping[str, Any]) -> str:
                 "sobol": indices,
             }
         )
-    return str(environment.get_template("sensitivity.html").render(document=document, tissues=tissues))
+    return str(template_of("sensitivity.html").render(document=document, tissues=tissues))
