@@ -33,7 +33,12 @@ def cohort_page(records: Sequence[Record], document: Mapping[str, Any], *, creat
 
     document: statistics.json; created: when the run began.
     """
-    pages = _pages(records)
+    # address of the report of each patient's first row that has one, and what a link to it says
+    pages = dict[str, tuple[str, str]]()
+    for record in records:
+        if record.page:
+            says = f"report of {record.row.id}, patient {record.row.patient}"
+            pages.setdefault(record.row.patient, (record.page, says))
     charts = {tissue: _charts(document, tissue, place, pages) for place, tissue in enumerate(document["organs"])}
     shown = [record for record in records if record.state == "failed"] + [r for r in records if r.state != "failed"]
     page: str = template_of("cohort.html", "palpate.cohort").render(
@@ -46,16 +51,6 @@ def cohort_page(records: Sequence[Record], document: Mapping[str, Any], *, creat
         policy=POLICY,
     )
     return page
-
-
-def _pages(records: Sequence[Record]) -> dict[str, tuple[str, str]]:
-    """Address of the report of each patient's first row that has one, and what a link to it says."""
-    found = dict[str, tuple[str, str]]()
-    for record in records:
-        if record.page:
-            says = f"report of {record.row.id}, patient {record.row.patient}"
-            found.setdefault(record.row.patient, (record.page, says))
-    return found
 
 
 def _charts(

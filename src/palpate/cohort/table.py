@@ -50,7 +50,14 @@ def separated_cells(path: Path, *, delimiter: str) -> list[dict[str, str]]:
     if not lines:
         raise ConfigurationError(f"{path} is empty: its first line must name the columns: {', '.join(KNOWN)}")
     names = [name.strip() for name in lines[0]]
-    _check_names(names, path)
+    twice = sorted({name for name in names if names.count(name) > 1}) if len(names) <= MOST_COLUMNS else ["..."]
+    if twice:
+        raise ConfigurationError(f"{path} has {len(names)} columns, of them '{shortened(twice[0])}' twice; rename one")
+    for name in set(names) - set(KNOWN):
+        if not name or not name.isprintable() or len(name) > MAX_NAME or computed_by_spreadsheets(name):
+            raise ConfigurationError(f"{path}: '{shortened(name)}' cannot be the name of a column; give it another")
+        if name in COLUMNS:
+            raise ConfigurationError(f"{path}: the column '{name}' is one of the outcome's; rename it")
     complete = "id" in names and {"case", "before"} & set(names) and ("before" in names) == ("after" in names)
     if delimiter == "," and not complete:
         missing = next(name for name in ("id", "before", "after") if name not in names)
@@ -100,17 +107,6 @@ def _text(path: Path) -> str:
     if len(content) > LARGEST_FILE or "\0" in text:
         raise ConfigurationError(f"{path} is no table of a cohort: too long, or with zero bytes; give a CSV file")
     return text
-
-
-def _check_names(names: Sequence[str], path: Path) -> None:
-    twice = sorted({name for name in names if names.count(name) > 1}) if len(names) <= MOST_COLUMNS else ["..."]
-    if twice:
-        raise ConfigurationError(f"{path} has {len(names)} columns, of them '{shortened(twice[0])}' twice; rename one")
-    for name in set(names) - set(KNOWN):
-        if not name or not name.isprintable() or len(name) > MAX_NAME or computed_by_spreadsheets(name):
-            raise ConfigurationError(f"{path}: '{shortened(name)}' cannot be the name of a column; give it another")
-        if name in COLUMNS:
-            raise ConfigurationError(f"{path}: the column '{name}' is one of the outcome's; rename it")
 
 
 def row_of(cells: Mapping[str, str], folder: Path, template: Path | None) -> Row:
