@@ -19,9 +19,9 @@ from palpate.export.formats import Options
 from palpate.export.groups import element_faces
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers import write_displacement_field
-from palpate.mechanics.element import barycentric_gradients, shape_functions
+from palpate.mechanics.element import barycentric_gradients
 from palpate.mesh.locate import tetrahedron_image
-from palpate.mesh.space import LagrangeSpace
+from palpate.mesh.space import LagrangeSpace, shape_functions
 from palpate.mesh.surface import tissue_surface
 from palpate.study.outputs import write_json
 

@@ -13,8 +13,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from palpate.errors import InputDataError
-from palpate.images.distance import DistanceMap, smoothing_width
-from palpate.images.isosurface import IsosurfacePoints, isosurface_points
+from palpate.images.distance import DistanceMap, IsosurfacePoints, isosurface_points, smoothing_width
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role

@@ -9,7 +9,6 @@ from palpate.mechanics.dilatation import choose_element as choose_element
 from palpate.mechanics.element import barycentric_gradients as barycentric_gradients
 from palpate.mechanics.element import quadrature as quadrature
 from palpate.mechanics.element import shape_derivatives as shape_derivatives
-from palpate.mechanics.element import shape_functions as shape_functions
 from palpate.mechanics.element import triangle_quadrature as triangle_quadrature
 from palpate.mechanics.equilibrium import ACCURACY as ACCURACY
 from palpate.mechanics.equilibrium import equilibrium as equilibrium

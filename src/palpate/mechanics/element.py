@@ -34,18 +34,6 @@ def quadrature(degree: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return np.asarray(points.reshape(-1, 4)), np.asarray(weights.ravel())
 
 
-def shape_functions(order: int, barycentric: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shape functions (n_q, 4 or 10), dimensionless, at `barycentric` (n_q, 4) places.
-
-    P1: lambda_a; P2: lambda_a (2 lambda_a - 1) at the corners, 4 lambda_a lambda_b on the edges of TET_EDGES.
-    """
-    if order == 1:
-        return barycentric
-    corners = barycentric * (2.0 * barycentric - 1.0)
-    edges = 4.0 * barycentric[:, TET_EDGES[:, 0]] * barycentric[:, TET_EDGES[:, 1]]
-    return np.concatenate([corners, edges], axis=1)
-
-
 def shape_derivatives(order: int, barycentric: NDArray[np.float64]) -> NDArray[np.float64]:
     """Derivatives dN_a / dlambda_k (n_q, 4 or 10, 4), dimensionless, at `barycentric` (n_q, 4) places."""
     if order == 1:

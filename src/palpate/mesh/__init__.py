@@ -12,7 +12,7 @@ from palpate.mesh.locate import point_interpolation as point_interpolation
 from palpate.mesh.quality import check_mesh as check_mesh
 from palpate.mesh.space import LagrangeSpace as LagrangeSpace
 from palpate.mesh.space import lagrange_space as lagrange_space
-from palpate.mesh.space import triangle_shape as triangle_shape
+from palpate.mesh.space import shape_functions as shape_functions
 from palpate.mesh.surface import tissue_surface as tissue_surface
 from palpate.mesh.surface import triangle_normals as triangle_normals
 from palpate.mesh.surface import vertex_normals as vertex_normals

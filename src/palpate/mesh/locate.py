@@ -10,7 +10,7 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from palpate.images.label_image import VoxelGrid
-from palpate.mesh.space import TET_EDGES, LagrangeSpace
+from palpate.mesh.space import LagrangeSpace, shape_functions
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.parallel import mapped
 
@@ -63,10 +63,7 @@ def located(mesh: TetMesh, points: NDArray[np.float64]) -> Places:
 def point_interpolation(space: LagrangeSpace, places: Places) -> sparse.csr_matrix[np.float64]:
     """Matrix (n, n_points), dimensionless, of the values at places inside the mesh of a field with values at points."""
     b, cells = places.barycentric, space.cells[places.tet]
-    weights = b
-    if space.order == 2:
-        edges = 4.0 * b[:, TET_EDGES[:, 0]] * b[:, TET_EDGES[:, 1]]
-        weights = np.concatenate([b * (2.0 * b - 1.0), edges], axis=1)
+    weights = shape_functions(space.order, b)
     rows = np.repeat(np.arange(len(cells)), cells.shape[1])
     shape = (len(cells), len(space.points))
     return sparse.csr_matrix((weights.ravel(), (rows, cells.ravel())), shape=shape)

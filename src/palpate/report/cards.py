@@ -8,10 +8,9 @@ from typing import Any
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from palpate.report.rows import NONE, estimate_rows, interval_text, main_numbers, moduli_in, ratio_rows
-from palpate.report.svg import template_of
+from palpate.report.svg import mark_decades, template_of
 
 GREY = "#888888"
 ROOM = 1.6  # by which factor the axis reaches beyond all numbers, for the arrows of open ends
@@ -60,9 +59,7 @@ def moduli_figure(document: Mapping[str, Any], colours: Mapping[str, str]) -> Fi
             numbers += [value, *(interval or ())]
         known = [number for number in numbers if number]
         axes.set_xlim(min(known, default=1.0) / ROOM, max(known, default=1.0) * ROOM)
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-        axes.xaxis.set_minor_formatter(NullFormatter())
+        mark_decades(axes.xaxis)
         for row, item in enumerate(items):
             _draw_item(axes, row, item, colours.get(item["tissue"], GREY))
         axes.set_yticks(range(len(items)), [f"{item['tissue']}\n{item['verdict']}" for item in items])

@@ -10,7 +10,9 @@ from functools import cache
 import jinja2
 import matplotlib as mpl
 from markupsafe import escape
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from palpate.images.registration import length_text
 from palpate.report.rows import interval_text, number
@@ -53,6 +55,13 @@ def template_of(name: str, package: str = "palpate.report") -> jinja2.Template:
 def link_url(number: int) -> str:
     """What an artist's url is until a figure's link of that number takes its place."""
     return f"palpate-link-{number}-"
+
+
+def mark_decades(axis: Axis) -> None:
+    """1, 2 and 5 of each decade of a logarithmic axis, written plainly."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def draw_svg(

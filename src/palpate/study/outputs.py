@@ -323,7 +323,7 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises `InputDataError` when there is none, or it is something else.
     """
     try:
-        content = json.loads(read_regular(path, most_bytes=LARGEST_DOCUMENT), parse_constant=_no_constant)
+        content = json.loads(read_regular(path, most_bytes=LARGEST_DOCUMENT), parse_constant=no_constant)
         json.dumps(content, allow_nan=False)  # 1e999 is read as infinite
     except (ValueError, RecursionError) as error:
         raise InputDataError(f"{path} is no result of Palpate ({str(error)[:200]}); run the estimate again") from error
@@ -370,7 +370,8 @@ def _refuse_improper(folder: Path, names: Iterable[str]) -> None:
                 raise _refused(path, error) from error
 
 
-def _no_constant(name: str) -> float:
+def no_constant(name: str) -> float:
+    """Raise `ValueError` for what JSON does not know and Python's reader takes all the same: NaN, Infinity."""
     raise ValueError(f"it holds {name}")
 
 

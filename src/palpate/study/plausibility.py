@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
@@ -27,12 +27,12 @@ class PublishedStiffness:
     """
 
     tissue: str
-    words: tuple[str, ...]
+    words: Sequence[str]
     low: float
     high: float
     method: str
     source: str
-    unless: tuple[str, ...] = ()
+    unless: Sequence[str] = ()
 
     @property
     def usual_kpa(self) -> float:
@@ -46,18 +46,7 @@ class PublishedStiffness:
 
 
 TABLE: dict[str, list[dict[str, Any]]] = tomllib.loads((files("palpate.study") / "tissues.toml").read_text("utf-8"))
-PUBLISHED = tuple(
-    PublishedStiffness(
-        entry["tissue"],
-        tuple(entry["words"]),
-        entry["low"],
-        entry["high"],
-        entry["method"],
-        entry["source"],
-        tuple(entry.get("unless", ())),
-    )
-    for entry in TABLE["published"]
-)
+PUBLISHED = tuple(PublishedStiffness(**entry) for entry in TABLE["published"])
 
 
 def published_for(name: str) -> tuple[PublishedStiffness, ...]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from palpate.errors import ConfigurationError
 from palpate.images.named_labels import printable
@@ -24,9 +24,10 @@ MOST_OTHERS = 15  # known names that a hint lists
 MOST_COMPARED = 300  # names that are compared letter by letter with a mistyped one
 
 T = TypeVar("T")
+P = ParamSpec("P")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Rule:
     """What a key's value must be beyond its type.
 
@@ -48,19 +49,15 @@ class Rule:
     chosen: str = ""
 
 
-def rule(
-    *,
-    choices: tuple[str, ...] = (),
-    between: tuple[float, float] | None = None,
-    test: Callable[[Any], bool] | None = None,
-    wanted: str = "",
-    instead_of: str = "",
-    convert: Callable[[object], object] | None = None,
-    collects: Mapping[str, tuple[float, float]] | None = None,
-    chosen: str = "",
-) -> dict[str, Rule]:
-    """The metadata of a dataclass field that carries a `Rule`; arguments as there."""
-    return {"rule": Rule(choices, between, test, wanted, instead_of, convert, collects or {}, chosen=chosen)}
+def _metadata(make: Callable[P, Rule]) -> Callable[P, dict[str, Rule]]:
+    def metadata(*arguments: P.args, **named: P.kwargs) -> dict[str, Rule]:
+        """The metadata of a dataclass field that carries a `Rule`; arguments as there."""
+        return {"rule": make(*arguments, **named)}
+
+    return metadata
+
+
+rule = _metadata(Rule)
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
