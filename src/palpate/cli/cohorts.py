@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from palpate.cli.outcome import Outcome, columns
@@ -15,10 +15,9 @@ if TYPE_CHECKING:
     from palpate.cohort.engines.packing import Engine
     from palpate.cohort.records import Record
     from palpate.cohort.task import Row
+    from palpate.progress import Progress
     from palpate.study.outputs import OutputFolder
 
-
-Progress = Callable[[str], None]
 
 INTERRUPTED = "the plan and the rows that are done, with which --resume goes on"
 MOST_TOLD = 20  # failed rows

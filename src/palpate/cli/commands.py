@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 import webbrowser
-from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -14,11 +13,10 @@ from palpate.cli.outcome import Outcome, columns, listed, warning_lines
 from palpate.errors import ConfigurationError
 
 if TYPE_CHECKING:
+    from palpate.progress import Progress
     from palpate.study.case import Case
     from palpate.study.outputs import OutputFolder
 
-
-Progress = Callable[[str], None]
 
 MESH_TARGETS = ("mesh.json", "mesh.vtu", "labels.csv", "labels.nii.gz")
 SURFACE_TARGETS = ("surfaces.nii.gz", "labels.json")
@@ -130,11 +128,7 @@ def simulate(arguments: argparse.Namespace, case: Case, outputs: OutputFolder, p
     return Outcome(document, f"{moved}\n{warning_lines(document)}{listed(outputs)}")
 
 
-if TYPE_CHECKING:
-    from palpate.study.outputs import OutputFolder
-
-
-def export(arguments: argparse.Namespace, _: None, outputs: OutputFolder, progress: Callable[[str], None]) -> Outcome:
+def export(arguments: argparse.Namespace, _: None, outputs: OutputFolder, progress: Progress) -> Outcome:
     """Write what an estimate left for another program."""
     from palpate.export.folder import export_into
     from palpate.export.formats import Options
@@ -150,7 +144,7 @@ def export(arguments: argparse.Namespace, _: None, outputs: OutputFolder, progre
     return Outcome(document, listed(outputs))
 
 
-def view(arguments: argparse.Namespace, _: None, outputs: None, progress: Callable[[str], None]) -> Outcome:
+def view(arguments: argparse.Namespace, _: None, outputs: None, progress: Progress) -> Outcome:
     """Show the report in a browser until an interrupt ends it."""
     from palpate.steps.viewing import viewing
 

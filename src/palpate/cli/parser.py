@@ -17,6 +17,7 @@ from palpate.cli.outcome import Outcome
 from palpate.entry_points import brought
 from palpate.errors import ConfigurationError
 from palpate.export.formats import FORMATS
+from palpate.study.outputs import PAGE, RESULT
 from palpate.study.schema import nearest, shown
 
 CASE_HELP = "the case: images, tissues, roles"
@@ -211,7 +212,7 @@ def _add_results(subparsers: Any) -> None:
     what = "draw report.html of an estimate again"
     report = _command(subparsers, "report", written.report, what=what, folder=None)
     report.add_argument("output", type=Path, metavar="DIR", help="the output folder of an estimate")
-    report.set_defaults(makes_folder=False, targets=(written.DOCUMENT, written.PAGE))
+    report.set_defaults(makes_folder=False, targets=(RESULT, PAGE))
     what = "write an estimate for another program: simulators, viewers, hospital systems"
     export = _command(subparsers, "export", commands.export, what=what, folder="palpate-export")
     export.add_argument("result", type=Path, metavar="DIR", help="the output folder of an estimate")

@@ -15,9 +15,8 @@ from palpate.cohort.resolve import row_key
 from palpate.cohort.task import FAILURE_CLASSES, Limits, Outcome, Row, Task
 from palpate.errors import FolderInUse, InputDataError, ResourceError
 from palpate.parallel import mapped
-from palpate.study.earlier import RESULT
 from palpate.study.lock import held_folder
-from palpate.study.outputs import read_json, sha256_of, staged, write_json
+from palpate.study.outputs import RESULT, read_json, sha256_of, staged, write_json
 
 MARK = "done.json"
 DONE_SCHEMA = "palpate.done/1"

@@ -8,8 +8,8 @@ from palpate.errors import EstimationError, InputDataError
 from palpate.export.fitted_model import FittedModel
 from palpate.images.named_labels import printable
 from palpate.study.archive import read_archive, write_archive
-from palpate.study.earlier import RESULT, seal_of
-from palpate.study.outputs import read_json, sha256_of
+from palpate.study.earlier import seal_of
+from palpate.study.outputs import RESULT, read_json, sha256_of
 from palpate.study.result import SCHEMA
 
 MODEL = "model.npz"

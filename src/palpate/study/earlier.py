@@ -14,22 +14,22 @@ from palpate.errors import ConfigurationError, InputDataError, PalpateError
 from palpate.findings import Finding
 from palpate.study.case import Case
 from palpate.study.case_file import case_tables, case_text, read_case, relative_path
-from palpate.study.outputs import Digests, OutputFolder, Staging, is_inside, read_json, sha256_of, write_text
+from palpate.study.outputs import (
+    DATA,
+    PAGE,
+    RESULT,
+    RESULT_FILES,
+    Digests,
+    OutputFolder,
+    Staging,
+    is_inside,
+    read_json,
+    sha256_of,
+    write_text,
+)
 
 CASE_NAME = "case.toml"
-RESULT = "result.json"
 DOCUMENTS = (RESULT, "mesh.json", "simulation.json", "sensitivity.json")  # each lists the files of its run
-PAGE_FILES = ("report-data.npz", "report.html")
-RESULT_FILES = (
-    *PAGE_FILES,
-    "labels.csv",
-    "labels.nii.gz",
-    "mesh.vtu",
-    "model.npz",
-    "posterior.nc",
-    "stiffness.nii.gz",
-    "stiffness_sd.nii.gz",
-)
 UNSEALED = ("files", "warnings")  # which are added when the files take their places
 FURTHER_MESH = re.compile(r"mesh_\d+\.vtu")
 
@@ -103,7 +103,7 @@ def earlier_files(folder: Path, document: str, files: Digests) -> Earlier:
     shared = {name for listed in others.values() for name in listed}
     retired = tuple(name for name in vouched(folder, document) if name not in files and name not in shared)
     strange = [name for name in strange_files(folder, files) if name not in files and name not in retired]
-    aside = tuple(name for name in strange if name in PAGE_FILES) if document == RESULT else ()
+    aside = tuple(name for name in strange if name in (DATA, PAGE)) if document == RESULT else ()
     left = [name for name in strange if name not in aside] if document == RESULT else []
     warnings = []
     if left:

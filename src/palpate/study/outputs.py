@@ -31,6 +31,18 @@ NEW, READY, OLD = "new", "ready", "old"  # in it: being made; about to take thei
 ASIDE = ".earlier"  # behind the name of a file that is set aside
 LARGEST_DOCUMENT = 2**26  # bytes of a JSON document that is read
 SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
+RESULT, PAGE, DATA = "result.json", "report.html", "report-data.npz"  # the document of an estimate, and its report
+RESULT_FILES = (  # what else an estimate writes, with its case
+    DATA,
+    PAGE,
+    "labels.csv",
+    "labels.nii.gz",
+    "mesh.vtu",
+    "model.npz",
+    "posterior.nc",
+    "stiffness.nii.gz",
+    "stiffness_sd.nii.gz",
+)
 
 
 @dataclass(frozen=True, slots=True)

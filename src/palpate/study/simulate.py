@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,14 +25,13 @@ from palpate.mesh.tet_mesh import tet_dihedrals
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.phantoms.motion import wall_filling
+from palpate.progress import Progress
 from palpate.study.body import Body, inverse_problem, make_body, strained_body
 from palpate.study.case import Case, Mechanics
 from palpate.study.case_loads import case_loads
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.read import phantom_scene, read_states
 from palpate.study.result import MeshSummary, Provenance, Simulation
-
-Progress = Callable[[str], None]
 
 
 def simulate(case: Case, *, progress: Progress, steps: int = 1) -> Simulation:
