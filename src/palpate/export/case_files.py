@@ -19,7 +19,7 @@ from palpate.images.named_labels import NamedLabel
 from palpate.images.readers import write_label_image, write_scalar_image
 from palpate.images.segmentation import Segmentation, first_labels
 from palpate.images.tissue import Tissue, tissue_colours
-from palpate.mechanics.deformation import largest_strains
+from palpate.mechanics.element import largest_strains
 from palpate.mesh.locate import tetrahedron_image
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.surface import tissue_surface

@@ -15,7 +15,7 @@ from palpate.export.formats import Options
 from palpate.export.groups import face_groups
 from palpate.export.vtk_xml import write_pvd, write_vtp, write_vtu
 from palpate.images.segmentation import first_labels
-from palpate.mechanics.deformation import largest_strains
+from palpate.mechanics.element import largest_strains
 from palpate.study.outputs import make_folder, write_json, write_text
 
 PARAVIEW_SCRIPT = '''"""Show what Palpate exported in ParaView: paraview --script=load_in_paraview.py

@@ -12,8 +12,8 @@ from palpate.errors import GeometryError
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.tissue import Role, Tissue
 from palpate.mechanics.boundary import outer_constraint
-from palpate.mechanics.deformation import deformation_determinants
 from palpate.mechanics.dilatation import Dilatation
+from palpate.mechanics.element import deformation_determinants
 from palpate.mechanics.equilibrium import equilibrium
 from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.linear_model import linear_model

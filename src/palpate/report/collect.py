@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from palpate.errors import PalpateError
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue, tissue_colours
-from palpate.mechanics.deformation import largest_strains
+from palpate.mechanics.element import largest_strains
 from palpate.mesh.tet_mesh import tet_dihedrals
 from palpate.parallel import mapped
 from palpate.report.measured import measured_states

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from palpate.findings import Finding
 from palpate.images.checks import later_names
 from palpate.inversion import Inversion, Outcome
-from palpate.mechanics.deformation import deformation_determinants
+from palpate.mechanics.element import deformation_determinants
 from palpate.observation.contract import Imaged, OfInstrument
 from palpate.study.together import ImagePairs
 from palpate.uncertainty import FittedState

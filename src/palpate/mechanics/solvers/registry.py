@@ -10,8 +10,8 @@ from scipy import sparse
 
 from palpate.errors import ConfigurationError, SolverError
 from palpate.mechanics.solvers import direct, multigrid
+from palpate.mechanics.solvers.conjugate_gradients import times
 from palpate.mechanics.solvers.contract import EXACT, Coarser, Expectation, Factorisation, Hints
-from palpate.mechanics.solvers.products import times
 from palpate.memory import available_memory, total_memory
 
 SOLVERS = {solver.name: solver for solver in (direct.SOLVER, direct.MIXED, multigrid.SOLVER)}
