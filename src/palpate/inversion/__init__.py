@@ -18,6 +18,7 @@ from palpate.inversion.blocks import (
 from palpate.inversion.driver_fit import fit_driver
 from palpate.inversion.estimate import (
     Inversion,
+    InversionSettings,
     StartRun,
     as_good,
     continue_at_finite_strain,
@@ -25,7 +26,13 @@ from palpate.inversion.estimate import (
     invert,
     with_released,
 )
-from palpate.inversion.evidence import with_learned_prior
+from palpate.inversion.frozen_posterior import (
+    FixedCorrespondence,
+    FrozenPosterior,
+    fixed_correspondence,
+    frozen_posterior,
+)
+from palpate.inversion.hyper_parameters import with_correlations, with_first_noise, with_hyper_parameters
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import Evaluation, Linearisation, LinearisedObjective, Objective
 from palpate.inversion.optimise import (
@@ -34,14 +41,12 @@ from palpate.inversion.optimise import (
     LeastSquares,
     Minimum,
     Outcome,
-    fit_coefficients,
     gauss_newton,
     posterior_sd,
 )
-from palpate.inversion.outer_loop import InversionSettings, OuterIterate, StopRule, run_outer_loop
 from palpate.inversion.parameters import ParameterMap, eta_of_ratio, parameter_map, ratio_of_eta
 from palpate.inversion.reduced_basis import ReducedBasis, reduced_basis
-from palpate.inversion.reweighting import reweighted, with_first_noise
+from palpate.inversion.trust_region import OuterIterate, StopRule, begun, fit_coefficients, minimised
 
 __all__ = [
     "FIELD",
@@ -52,6 +57,8 @@ __all__ = [
     "Bounds",
     "Evaluation",
     "ExactApproximation",
+    "FixedCorrespondence",
+    "FrozenPosterior",
     "InverseProblem",
     "Inversion",
     "InversionSettings",
@@ -70,29 +77,32 @@ __all__ = [
     "StartRun",
     "StopRule",
     "as_good",
+    "begun",
     "continue_at_finite_strain",
     "eta_of_ratio",
     "exact_approximation",
     "first_noise_of",
     "fit_coefficients",
     "fit_driver",
+    "fixed_correspondence",
     "frame_blocks",
+    "frozen_posterior",
     "gauss_newton",
     "instrument_block",
     "invert",
     "known_modulus_blocks",
     "layer_blocks",
     "material_blocks",
+    "minimised",
     "offset_block",
     "parameter_map",
     "posterior_sd",
     "ratio_of_eta",
     "reduced_basis",
-    "reweighted",
-    "run_outer_loop",
     "unit_blocks",
     "wall_blocks",
+    "with_correlations",
     "with_first_noise",
-    "with_learned_prior",
+    "with_hyper_parameters",
     "with_released",
 ]

@@ -20,6 +20,7 @@ from palpate.inversion import (
     OuterIterate,
     StartRun,
     as_good,
+    frozen_posterior,
     ratio_of_eta,
     with_released,
 )
@@ -62,7 +63,6 @@ from palpate.uncertainty import (
     ModulusInterval,
     StiffnessMap,
     covariance_of,
-    frozen_posterior,
     grid_errors,
     information,
     information_shares,
@@ -108,7 +108,8 @@ class Iteration:
 class Start:
     """What one start did alone: moduli (kPa, or ratios) it began and ended with, its steps and how they ended.
 
-    minimum: number, from 0, of the distinct minimum that it leads to.
+    minimum: number, from 0, of the distinct minimum that it leads to; None where that was not followed, others being
+    lower.
     """
 
     start: Mapping[str, float]
@@ -116,7 +117,7 @@ class Start:
     objective_mm2: float
     status: str
     reason: str
-    minimum: int
+    minimum: int | None
     history: tuple[Iteration, ...]
 
     @property

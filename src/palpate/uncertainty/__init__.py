@@ -17,7 +17,6 @@ from palpate.uncertainty.covariance import (
     sandwich_covariance,
 )
 from palpate.uncertainty.diagnostics import ChainDiagnostics, chain_diagnostics, require_arviz
-from palpate.uncertainty.frozen_posterior import FrozenPosterior, frozen_posterior
 from palpate.uncertainty.image_pairs import Agreement, PairEstimates, agreement, pair_estimates
 from palpate.uncertainty.intervals import (
     NORMAL_95,
@@ -28,7 +27,7 @@ from palpate.uncertainty.intervals import (
     modulus_interval,
 )
 from palpate.uncertainty.joint_region import JointRegion, joint_region
-from palpate.uncertainty.profile import FixedCorrespondence, Profile, fixed_correspondence, refitted
+from palpate.uncertainty.profile import Profile, refitted
 from palpate.uncertainty.sampling import PosteriorChains, posterior_chains
 from palpate.uncertainty.sensitivity import (
     Equilibria,
@@ -58,8 +57,6 @@ __all__ = [
     "Errors",
     "FastPath",
     "FittedState",
-    "FixedCorrespondence",
-    "FrozenPosterior",
     "GridErrors",
     "Information",
     "Interval",
@@ -78,8 +75,6 @@ __all__ = [
     "error_noise",
     "exact_equilibria",
     "fast_path",
-    "fixed_correspondence",
-    "frozen_posterior",
     "gain",
     "grid_errors",
     "grid_position_shifts",

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from palpate.errors import EstimationError
+from palpate.inversion import FrozenPosterior
 from palpate.inversion.objective import Evaluation, determined
 from palpate.inversion.optimise import Bounds
-from palpate.uncertainty.frozen_posterior import FrozenPosterior
 
 __all__ = ["PosteriorChains", "posterior_chains"]
 
