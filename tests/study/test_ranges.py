@@ -76,8 +76,12 @@ def test_every_number_has_a_range_that_holds_its_default(place):
 
 
 def test_the_page_states_every_range():
-    rows = re.findall(r"^- `([\w.*]+)`: (\S+) to (\S+)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
-    stated = {key: (float(low), float(high)) for key, low, high in rows}
+    section = PAGE.read_text(encoding="utf-8").partition("## Ranges")[2].partition("\n## ")[0]
+    stated = {
+        f"{table}.{key}".lstrip("."): (float(low), float(high))
+        for table, keys in re.findall(r"^- (?:`([\w.*]+)`: )?(.*)$", section, re.MULTILINE)
+        for key, low, high in re.findall(r"`(\w+)` (\S+) to (\S+?)(?:,|$)", keys)
+    }
     assert stated.pop("tissues.*.label") == (0, MAX_LABEL)
     assert stated == {place: tuple(item.metadata["rule"].between) for place, item in NUMBERS.items()}
 
