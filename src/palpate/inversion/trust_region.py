@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from palpate.errors import NotConverged
 from palpate.inversion.approximation import Derivatives
 from palpate.inversion.hyper_parameters import with_correlations, with_hyper_parameters
-from palpate.inversion.objective import LinearisedObjective, Objective
+from palpate.inversion.objective import AS_GOOD, Evaluation, LinearisedObjective, Objective
 from palpate.inversion.optimise import Bounds, Iterate, Minimum, Outcome, gauss_newton, newton_decrement, posterior_sd
 from palpate.mechanics.forward import SolveCounts
 from palpate.progress import silent
@@ -147,13 +147,31 @@ class _Region:
 
 @dataclass(frozen=True, slots=True)
 class _Step:
-    """A minimum on linear residuals: unknowns, the hyper-parameters there, J at both ends; cut: by the trust region."""
+    """A minimum on linear residuals: unknowns, the hyper-parameters there, J at both ends; cut: by the trust region.
+
+    begin: the evaluation where it begins, under these hyper-parameters.
+    """
 
     objective: Objective
     minimum: Minimum
+    begin: Evaluation
     now: float
     then: float
     cut: bool
+
+    def reductions(self, unknowns: NDArray[np.float64], judged: Evaluation) -> tuple[float, float]:
+        """By how much J falls on a way from unknowns (n,) to where it is `judged`, and on linear residuals.
+
+        Closest points that slide over voxels are noise of J that its score, by the smooth Jacobians, does not have.
+        So a way that promises less than what tells two minima apart is judged by the scores at both of its ends,
+        -1/2 (s + s')^T d.
+        """
+        promised, d = self.now - self.then, self.minimum.unknowns - unknowns
+        if promised < AS_GOOD:
+            ends = judged.score, self.minimum.evaluation.score
+            gain, promised = (-0.5 * float((self.begin.score + end) @ d) for end in ends)
+            return gain, promised
+        return promised - (judged.value - self.minimum.evaluation.value), promised
 
 
 def minimised(
@@ -217,16 +235,16 @@ def _iteration(
         moved = np.abs(step.minimum.unknowns - before.unknowns)
         longest = float(np.max(moved[:n], initial=0.0))
         try:
-            there, value, spent = _evaluated(step, now, rule)
+            there, judged, spent = _evaluated(step, now, rule)
         except NotConverged as error:
             failure, region = error, region.after(0.0, longest, refused=True)
             continue
         failure, trial_evaluations = None, trial_evaluations + spent
-        then = step.then + value - step.minimum.evaluation.value
-        gain, promised = step.now - then, max(step.now - step.then, 1e-9)
+        then = step.then + judged.value - step.minimum.evaluation.value
+        gain, promised = step.reductions(before.unknowns, judged)
         ratio = (gain + NOISE) / (promised + NOISE)
         if ratio >= ACCEPTED:
-            share = gain / promised if longest > STRAIGHT or not grows else ratio
+            share = gain / max(promised, 1e-9) if longest > STRAIGHT or not grows else ratio
             region = region.after(share, longest, grows=grows)
             end = there.minimum
             seen, spent = end.evaluation, before.evaluations + trial_evaluations
@@ -262,7 +280,8 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
     cut = not held and (longest > STRAIGHT or _cut_short(found.unknowns[:n], near, bounds))
     there = plain(found.unknowns)
     if cut or not rule.learn:
-        return _Step(objective, replace(found, evaluation=there), objective.total(here), objective.total(there), cut)
+        ends = objective.total(here), objective.total(there)
+        return _Step(objective, replace(found, evaluation=there), here, *ends, cut)
     if rule.correlate and start.correlated < CORRELATED:
         objective = with_correlations(objective, there)
     linear, plain = replace(linear, objective=objective), replace(plain, objective=objective)
@@ -279,7 +298,8 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
         if np.all(moved < 0.1) and change < 0.01:
             break
     plain = replace(plain, objective=objective)
-    return _Step(objective, replace(found, evaluation=plain(found.unknowns)), now, total, False)
+    end = replace(found, evaluation=plain(found.unknowns))
+    return _Step(objective, end, plain(at.unknowns), now, total, False)
 
 
 def _cut_short(theta: NDArray[np.float64], near: Bounds, bounds: Bounds) -> bool:
@@ -288,11 +308,11 @@ def _cut_short(theta: NDArray[np.float64], near: Bounds, bounds: Bounds) -> bool
     return bool(np.any(low | high))
 
 
-def _evaluated(step: _Step, now: OuterIterate, rule: StopRule) -> tuple[OuterIterate, float, int]:
+def _evaluated(step: _Step, now: OuterIterate, rule: StopRule) -> tuple[OuterIterate, Evaluation, int]:
     """The objective at the end of a step, its model made exact there where its error matters.
 
-    With it the value by which the step is judged: on the model that the step began with, but where that was exact, on
-    one that is exact at both ends; and the evaluations spent.
+    With it the evaluation by which the step is judged: on the model that the step began with, but where that was exact,
+    on one that is exact at both ends; and the evaluations spent.
     """
     n, unknowns = step.objective.n_parameters, step.minimum.unknowns
     objective = step.objective.rematched(unknowns)
@@ -309,23 +329,23 @@ def _evaluated(step: _Step, now: OuterIterate, rule: StopRule) -> tuple[OuterIte
     correlated = now.correlated + (rule.learn and not step.cut)
     if np.isinf(rule.model_error):
         there = OuterIterate(objective, minimum, Convergence(wanted, 0.0, 0.0), now.checks, now.totals)
-        return replace(there, correlated=correlated), minimum.evaluation.value, spent
+        return replace(there, correlated=correlated), minimum.evaluation, spent
     _, off, cost = model_error(objective, minimum)
     missing = float(np.max(off / (rule.model_error * tolerance), initial=0.0))
     left = float(np.max(_linearisation(objective, minimum) / tolerance, initial=0.0)) if rule.derivatives else 0.0
     near = bool(np.all(moved < NEAR * posterior_sd(minimum, n)))
     checks = now.checks + cost
     matters = missing > max(1.0, FORCING * size / rule.model_error) or (near and max(missing, left) >= 1.0)
-    value = minimum.evaluation.value
+    judged = minimum.evaluation
     if matters:
         wanted_derivatives = Derivatives.DECIDING if near else Derivatives.KEPT
         places = objective.places(unknowns, minimum.evaluation, wanted_derivatives)
         pairs = zip(objective.approximations, places, strict=True)
         objective = objective.under([approximation.update(place) for approximation, place in pairs])
         minimum, spent = replace(minimum, evaluation=objective(unknowns)), 2
-        value = minimum.evaluation.value if now.exact else value
+        judged = minimum.evaluation if now.exact else judged
     there = OuterIterate(objective, minimum, Convergence(wanted, left, missing), checks, now.totals, exact=matters)
-    return replace(there, correlated=correlated), value, spent
+    return replace(there, correlated=correlated), judged, spent
 
 
 def newton_decrement_of(before: Minimum, unknowns: NDArray[np.float64]) -> float:
