@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import importlib.util
 import os
 import signal
@@ -180,6 +181,12 @@ TESTS = Path(__file__).parent
 # Files, and folders of them, with the longest tests, or a process for every one. `make quick` leaves them out; every
 # layer has others. They come first, the longest before all, so that no processor waits for another at the end.
 SLOW = (TESTS / "slow.txt").read_text(encoding="utf-8").split()
+
+
+def pytest_collection_finish():
+    """What all tests have imported and collected stays: the collector of cycles need not look at it again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_collection_modifyitems(items):

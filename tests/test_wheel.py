@@ -8,8 +8,12 @@ import sys
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hatchling.builders.wheel import WheelBuilder
+
+from palpate.images.label_image import LabelImage, VoxelGrid
+from palpate.images.readers import write_label_image
 
 ROOT = Path(__file__).parents[1]
 
@@ -31,12 +35,17 @@ def run(unpacked: Path, folder: Path, *arguments: str) -> subprocess.CompletedPr
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
 
-def test_a_case_is_made_of_the_demos_images_from_the_wheel(unpacked, tmp_path):
+def test_a_case_is_made_from_the_wheel(unpacked, tmp_path):
+    """With the demo's names: how images of that size are read is no matter of the wheel."""
     done = run(unpacked, tmp_path, "-c", "import palpate; print(palpate.__file__)")
     assert Path(done.stdout.strip()) == unpacked / "palpate" / "__init__.py"
-    data = unpacked / "palpate" / "demo" / "data"
-    images = [str(data / f"simulated_{state}.nii.gz") for state in ("before", "after")]
-    done = run(unpacked, tmp_path, "-m", "palpate", "init", *images, "--labels", str(data / "labels.json"), "--quiet")
+    names = unpacked / "palpate" / "demo" / "data" / "labels.json"
+    images = [str(tmp_path / f"{state}.nii.gz") for state in ("before", "after")]
+    places = np.stack(np.meshgrid(*[np.arange(16.0)] * 3, indexing="ij"), axis=-1)
+    for path, radius in zip(images, (3.0, 4.0), strict=True):
+        labels = (np.linalg.norm(places - 8.0, axis=-1) < radius).astype(np.int32)
+        write_label_image(Path(path), LabelImage(labels, VoxelGrid((16, 16, 16), np.eye(4))))
+    done = run(unpacked, tmp_path, "-m", "palpate", "init", *images, "--labels", str(names), "--quiet")
     assert (done.returncode, done.stderr) == (0, "")
     assert "[tissues.prostate]" in (tmp_path / "palpate-output" / "case.toml").read_text()
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from palpate.cli import main
-from palpate.cohort.engines import slurm
 from palpate.cohort.engines.slurm import SlurmEngine, run_part
 from palpate.cohort.task import Limits, Row, Task
 from palpate.errors import ResourceError
@@ -103,7 +102,6 @@ def slurm_programs(tmp_path, monkeypatch):
         path.write_text(SBATCH.format(python=sys.executable))
         path.chmod(path.stat().st_mode | stat.S_IXUSR)
     monkeypatch.setenv("PATH", f"{folder}:/usr/bin:/bin")
-    monkeypatch.setattr(slurm, "_memory_gb", lambda _: 1.0)
 
 
 @pytest.mark.usefixtures("slurm_programs")
@@ -116,7 +114,7 @@ def test_slurms_parts_leave_marks_and_what_is_lost_is_submitted_again(tmp_path):
     assert (found.state, found.failure_class, found.attempts) == ("failed", "geometry", 1)
     script = (tmp_path / "slurm/array.sh").read_text()
     assert "#SBATCH --array=0-0%3\n" in script
-    assert "#SBATCH --mem=1500M\n" in script
+    assert "#SBATCH --mem=1000M\n" in script
     assert json.loads((tmp_path / "slurm/job.json").read_text())["job"] == "17"
     assert run_part(tmp_path, 0, lambda _: None) == []  # its row has a mark
     gone = SlurmEngine(tmp_path, 3, ("true",), poll_seconds=0.01)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from children import in_a_child
 from palpate.errors import ResourceError
 from palpate.study.outputs import staged, write_bytes
 
@@ -60,23 +61,27 @@ def test_a_sub_folder_is_no_link_to_another(tmp_path):
     assert list((tmp_path / "other").iterdir()) == []
 
 
-def test_a_file_system_without_locks_is_warned_of_and_works(estimate, out, monkeypatch, capsys):
+def test_a_file_system_without_locks_is_warned_of_and_works(estimate, out, capfd):
     def unknown(*_):
         raise OSError(errno.ENOSYS, "Function not implemented")
 
-    monkeypatch.setattr(fcntl, "flock", unknown)
-    assert estimate("anna", "--quiet") == 0
-    assert "knows no locks" in capsys.readouterr().err
+    def work() -> int:
+        fcntl.flock = unknown
+        return estimate("anna", "--quiet")
+
+    assert in_a_child(work) == 0
+    assert "knows no locks" in capfd.readouterr().err
     assert (out / "result.json").exists()
 
 
-def test_a_disk_full_from_the_start_ends_with_6(estimate, out, monkeypatch, capsys):
+def test_a_disk_full_from_the_start_ends_with_6(estimate, out, capfd):
     def full(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    for place, name in ((os, "write"), (Path, "write_bytes"), (os, "fsync")):
-        monkeypatch.setattr(place, name, full)
-    monkeypatch.setattr("palpate.export.case_files.write_scalar_image", lambda *_: None)
-    assert estimate("anna", "--quiet") == 6
-    assert "No space left on device; free some space" in capsys.readouterr().err
+    def work() -> int:
+        os.write = Path.write_bytes = os.fsync = full
+        return estimate("anna", "--quiet")
+
+    assert in_a_child(work) == 6
+    assert "No space left on device; free some space" in capfd.readouterr().err
     assert {path.name for path in out.iterdir()} == {"log.txt"}

@@ -6,6 +6,7 @@ import json
 import os
 import pty
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -38,27 +39,65 @@ def init(images: Path, folder: Path, *, flags: str = "", after: str = "", **vari
     )
 
 
-@pytest.mark.parametrize(
-    "after",
-    [
-        ">/dev/full",
-        "2>/dev/full",
-        ">/dev/full 2>&1",
-        "2>&1 | head -0",
-        "| true",
-        ">&-",
-        "2>&-",
-        ">&- 2>&-",
-        "<&- >&- 2>&-",
-    ],
+AT_ONCE = """
+import os, sys
+import palpate.cli.entry, palpate.steps.commands
+from palpate.cli import main
+
+NAMES = ("stdin", "stdout", "stderr")
+children = []
+for number, redirections in enumerate(sys.argv[1:]):
+    reader, gone = os.pipe()
+    os.close(reader)
+    children.append(os.fork())
+    if children[-1]:
+        os.close(gone)
+        continue
+    os.dup2(os.open(f"words-{number}", os.O_WRONLY | os.O_CREAT), 1)
+    os.dup2(1, 2)
+    for redirection in redirections.split():
+        file, place = redirection.split(">")
+        if place == "&-":
+            os.close(int(file))
+        elif place == "gone":
+            os.dup2(gone, int(file))
+        else:
+            os.dup2(1 if place == "&1" else os.open(place, os.O_WRONLY), int(file))
+    os.closerange(3, 100)
+    for file, name in enumerate(NAMES):
+        stream = None if f"{file}>&-" in redirections else open(file, "w" if file else "r", encoding="utf-8")
+        setattr(sys, name, stream)
+    sys.argv = ["palpate", "init", "before.nii.gz", "after.nii.gz", "--labels", "names.json", "--output", str(number)]
+    sys.exit(main())
+print([os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children])
+"""
+FAILING = (
+    *("1>/dev/full", "2>/dev/full", "1>/dev/full 2>&1", "1>gone 2>&1", "1>gone"),
+    *("1>&-", "2>&-", "1>&- 2>&-", "0>&- 1>&- 2>&-"),
 )
-def test_a_stream_that_fails_costs_no_run(images, tmp_path, after):
+
+
+def test_a_stream_that_fails_costs_no_run(images, tmp_path):
+    """Each in a process of its own, of one that has imported what all need; `gone` is a pipe that nobody reads."""
+    shutil.copytree(images, tmp_path, dirs_exist_ok=True)
+    command = [sys.executable, "-c", AT_ONCE, *FAILING]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert (json.loads(done.stdout), done.stderr) == ([0] * len(FAILING), "")
+    for number, redirections in enumerate(FAILING):
+        words = (tmp_path / f"words-{number}").read_text(encoding="utf-8")
+        assert "Traceback" not in words
+        assert "Exception" not in words
+        assert ("case.toml" in words) == ("1>" not in redirections)
+        out = tmp_path / str(number)
+        assert "größe" in (out / "case.toml").read_text(encoding="utf-8")
+        assert sorted(path.name for path in out.iterdir()) == ["case.toml", "preview.html"]
+
+
+@pytest.mark.parametrize("after", ["2>&1 | head -0", "<&- >&- 2>&-"])
+def test_a_stream_that_fails_from_the_start_costs_no_run(images, tmp_path, after):
     done = init(images, tmp_path / "out", after=after)
     assert done.returncode == 0, done.stderr
-    assert "Traceback" not in done.stderr
-    assert "Exception" not in done.stderr
-    assert "größe" in (tmp_path / "out" / "case.toml").read_text(encoding="utf-8")
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["case.toml", "preview.html"]
+    assert (tmp_path / "out" / "case.toml").exists()
 
 
 def test_a_terminal_that_is_closed_costs_no_run(images, tmp_path):

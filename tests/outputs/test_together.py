@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from children import in_a_child
 from palpate.cli import main
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers import write_label_image
@@ -74,18 +75,21 @@ def test_without_its_page_a_result_keeps_its_numbers_and_has_nobody_elses(estima
     assert "estimate again" in capsys.readouterr().err
 
 
-def test_a_disk_that_is_full_after_the_page_costs_the_page_only(estimate, out, monkeypatch):
-    first, calls = outputs._exchange, []
+def test_a_disk_that_is_full_after_the_page_costs_the_page_only(estimate, out):
+    """It has room for all files but the page."""
+    first, area = os.fsync, out / outputs.STAGING / outputs.NEW
 
-    def full(folder, leaving):
-        calls.append(len(outputs.Staging(folder).names()))
-        if len(calls) == 1:
-            raise NO_SPACE
-        return first(folder, leaving)
+    def on_a_small_disk() -> int:
+        def full(file):
+            if {"report.html", "result.json"} <= {path.name for path in area.glob("*")}:
+                raise NO_SPACE
+            first(file)
 
-    monkeypatch.setattr(outputs, "_exchange", full)
-    assert estimate("bert", "--quiet") == 0
-    assert calls == [9, 7]
+        os.fsync = full
+        return estimate("bert", "--quiet")
+
+    assert in_a_child(on_a_small_disk) == 0
+    assert "report" in [warning["code"] for warning in result(out)["warnings"]]
     assert not (out / "report.html").exists()
     files = {"mesh.vtu", "model.npz", "stiffness.nii.gz", "labels.csv", "labels.nii.gz", "case.toml"}
     assert set(result(out)["files"]) == files
@@ -139,7 +143,7 @@ def test_the_page_drawn_again_is_that_of_the_result(estimate, out, monkeypatch):
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_a_signal_among_the_renames_finds_all_done_and_says_so(estimate, out, monkeypatch, capsys, number):
+def test_a_signal_among_the_renames_finds_all_done_and_says_so(estimate, out, capfd, number):
     assert estimate("anna", "--quiet") == 0
     first = Path.replace
 
@@ -149,10 +153,12 @@ def test_a_signal_among_the_renames_finds_all_done_and_says_so(estimate, out, mo
             os.kill(os.getpid(), number)
         return done
 
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "replace", interrupted)
-        assert estimate("bert", "--quiet") == 130
-    (line,) = capsys.readouterr().err.strip().splitlines()
+    def work() -> int:
+        Path.replace = interrupted
+        return estimate("bert", "--quiet")
+
+    assert in_a_child(work) == 130
+    (line,) = capfd.readouterr().err.strip().splitlines()
     assert "interrupted after these files had taken their places: " in line
     assert "result.json" in line
     assert result(out)["id"] == "bert"
@@ -160,7 +166,7 @@ def test_a_signal_among_the_renames_finds_all_done_and_says_so(estimate, out, mo
     assert (out / "report.html").read_text() == "the page of bert"
 
 
-def test_a_signal_after_the_renames_says_that_they_are_done(estimate, out, monkeypatch, capsys):
+def test_a_signal_after_the_renames_says_that_they_are_done(estimate, out, capfd):
     assert estimate("anna", "--quiet") == 0
     unlink = Path.unlink
 
@@ -169,10 +175,12 @@ def test_a_signal_after_the_renames_says_that_they_are_done(estimate, out, monke
             os.kill(os.getpid(), signal.SIGTERM)
         return unlink(path, *options, **named)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "unlink", interrupted)
-        assert estimate("bert", "--quiet") == 130
-    (line,) = capsys.readouterr().err.strip().splitlines()
+    def work() -> int:
+        Path.unlink = interrupted
+        return estimate("bert", "--quiet")
+
+    assert in_a_child(work) == 130
+    (line,) = capfd.readouterr().err.strip().splitlines()
     assert "interrupted after these files had taken their places: " in line
     assert result(out)["id"] == "bert"
 
@@ -186,25 +194,22 @@ def test_a_signal_before_the_renames_finds_none_done_and_says_so(estimate, out, 
 
 
 @pytest.mark.parametrize("turn", [0, 1, 4, 7, 8])
-def test_the_report_completes_what_a_kill_has_cut(estimate, out, monkeypatch, turn):
-    class Killed(BaseException):
-        """The end of the process."""
-
+def test_the_report_completes_what_a_kill_has_cut(estimate, out, turn):
     calls = []
     first = Path.replace
 
     def cut(path, target):
         calls.extend([target] if among_the_renames(out) else [])
         if len(calls) > turn:
-            raise Killed
+            os.kill(os.getpid(), signal.SIGKILL)
         return first(path, target)
 
+    def killed() -> int:
+        Path.replace = cut
+        return estimate("bert", "--quiet")
+
     assert estimate("anna", "--quiet") == 0
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "replace", cut)
-        patch.setattr(outputs, "_clear", lambda _: None)  # nobody clears up after a kill
-        with pytest.raises(Killed):
-            estimate("bert", "--quiet")
+    assert in_a_child(killed) == -signal.SIGKILL
     assert main(["report", str(out), "--quiet"]) == 0
     assert (out / "report.html").read_text() == "the page of bert"
     assert result(out)["id"] == "bert"
@@ -250,7 +255,7 @@ def test_an_output_never_replaces_an_input(tmp_path, capsys):
     assert contents(tmp_path) == before
 
 
-def test_a_disk_that_refuses_every_rename_leaves_all_to_the_next_run(estimate, out, monkeypatch, capsys):
+def test_a_disk_that_refuses_every_rename_leaves_all_to_the_next_run(estimate, out, capfd):
     assert estimate("anna", "--quiet") == 0
     first, calls = Path.replace, []
 
@@ -260,10 +265,12 @@ def test_a_disk_that_refuses_every_rename_leaves_all_to_the_next_run(estimate, o
             raise NO_SPACE
         return first(path, target)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "replace", refused)
-        assert estimate("bert", "--quiet") == 6
-    assert "the next command with this folder completes them" in capsys.readouterr().err
+    def work() -> int:
+        Path.replace = refused
+        return estimate("bert", "--quiet")
+
+    assert in_a_child(work) == 6
+    assert "the next command with this folder completes them" in capfd.readouterr().err
     assert main(["report", str(out), "--quiet"]) == 0
     assert (result(out)["id"], (out / "report.html").read_text()) == ("bert", "the page of bert")
     assert {path.name for path in out.iterdir()} == FILES

@@ -65,6 +65,9 @@ poisson_sd = 0.0
 [noise]
 surface_sd_mm = 0.3
 
+[driver]
+modes = 20
+
 [estimate]
 start_ratios = [4.0]
 """

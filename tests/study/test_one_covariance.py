@@ -33,7 +33,7 @@ def observed(bodies):
     return Observed(tuple(states), tuple(images))
 
 
-def concluded(twins, bodies, observed, *, layers):
+def concluded(twins, bodies, observed, *, layers, samples):
     """Two later states, with the known tissue a layer that is released, or without one."""
     settings, problem = twins.settings(2.0), twins.exact_problem(*bodies, noise=NOISE)
     if layers:
@@ -44,17 +44,17 @@ def concluded(twins, bodies, observed, *, layers):
         mapping = replace(problem.parameters, blocks=blocks, nuisance_precision=np.zeros((0, 0)))
         problem = replace(problem, parameters=mapping)
     inversion = invert(problem, settings, progress=twins.silent)
-    return conclude(inversion, settings, observed, truth={}, seed=1, samples=2000)
+    return conclude(inversion, settings, observed, truth={}, seed=1, samples=samples)
 
 
 @pytest.fixture(scope="module")
 def without(twins, bodies, observed):
-    return concluded(twins, bodies, observed, layers=False)
+    return concluded(twins, bodies, observed, layers=False, samples=0)
 
 
 @pytest.fixture(scope="module")
 def found(twins, bodies, observed):
-    return concluded(twins, bodies, observed, layers=True)
+    return concluded(twins, bodies, observed, layers=True, samples=2000)
 
 
 def half_widths(intervals):

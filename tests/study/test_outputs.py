@@ -6,20 +6,18 @@ import errno
 import itertools
 import os
 import signal
-from contextlib import suppress
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from children import in_a_child
 from palpate.errors import ResourceError
 from palpate.study.outputs import STAGING, make_folder, recover, staged, write_json, write_text
 
 OLD = {"result.json": "old", "mesh.vtu": "old", "sub/a": "old", "page": "old", "page.earlier": "older", "mine": "mine"}
+NO_SUCH_TURN = 98
 NEW = {"result.json": "new", "mesh.vtu": "new", "sub/b": "new", "page.earlier": "old", "mine": "mine"}
-
-
-class Killed(BaseException):
-    """The end of the process: nothing catches it."""
 
 
 def put(folder: Path, content: dict[str, str]) -> None:
@@ -39,24 +37,37 @@ def replace(folder: Path) -> None:
         staging.commit(retired=["sub/a"], aside=["page"])
 
 
-def fails(monkeypatch, turn: int, error: BaseException, *, only: bool) -> list[int]:
-    """Let the operation of that number (from 0) that changes the folder's names fail, or it and all after it."""
+def replace_but(folder: Path, turn: int, fail: Callable[[], None], *, only: bool = True) -> int:
+    """Replace the files; the operation of that number (from 0) that changes names fails, or it and all after it.
+
+    Gives the exit code of what came of it, `NO_SUCH_TURN` where there are fewer operations.
+    """
     count = itertools.count()
-    calls = []
 
     def wrapped(function):
         def call(*arguments, **options):
             number = next(count)
-            calls.append(number)
             if number == turn or (number > turn and not only):
-                raise error
+                fail()
             return function(*arguments, **options)
 
         return call
 
-    for module, name in ((Path, "replace"), (Path, "unlink"), (os, "fsync")):
-        monkeypatch.setattr(module, name, wrapped(getattr(module, name)))
-    return calls
+    for place, name in ((Path, "replace"), (Path, "unlink"), (os, "fsync")):
+        setattr(place, name, wrapped(getattr(place, name)))  # for this process, which ends soon
+    try:
+        replace(folder)
+    except ResourceError as error:
+        return error.exit_code
+    return 0 if next(count) > turn else NO_SUCH_TURN
+
+
+def kill() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def fill() -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 def test_files_take_their_places_together(tmp_path):
@@ -65,24 +76,20 @@ def test_files_take_their_places_together(tmp_path):
     assert content(tmp_path) == NEW
 
 
-def test_a_kill_at_any_operation_leaves_what_the_next_run_makes_whole(tmp_path, monkeypatch):
-    seen = []
-    for turn in range(60):
+def test_a_kill_at_any_operation_leaves_what_the_next_run_makes_whole(tmp_path):
+    seen, code = [], -signal.SIGKILL
+    while code == -signal.SIGKILL:
+        turn = len(seen)
         folder = tmp_path / str(turn)
         put(folder, OLD)
-        with monkeypatch.context() as patch:
-            patch.setattr("palpate.study.outputs._clear", lambda _: None)  # nobody clears up after a kill
-            calls = fails(patch, turn, Killed(), only=False)
-            with suppress(Killed):
-                replace(folder)
+        code = in_a_child(lambda folder=folder, turn=turn: replace_but(folder, turn, kill))
         visible = {name: text for name, text in content(folder).items() if not name.startswith(STAGING)}
         assert visible.get("result.json") is None or visible in (OLD, NEW)  # where the document is, its files are
         assert not {"old", "new"} <= {visible.get(name) for name in ("mesh.vtu", "sub/a", "sub/b")}
         recover(folder)
         assert content(folder) in (OLD, NEW), turn
         seen.append(content(folder) == NEW)
-        if len(calls) <= turn:
-            break
+    assert code == NO_SUCH_TURN
     assert not seen[0]
     assert seen[-1]
     assert sorted(seen) == seen  # once it is decided, it stays decided
@@ -90,38 +97,41 @@ def test_a_kill_at_any_operation_leaves_what_the_next_run_makes_whole(tmp_path, 
 
 
 @pytest.mark.parametrize("only", [True, False])
-def test_a_refused_operation_leaves_the_old_files_or_the_new_ones(tmp_path, monkeypatch, only):
-    for turn in range(60):
+def test_a_refused_operation_leaves_the_old_files_or_the_new_ones(tmp_path, only):
+    turn, code = -1, 0
+    while code != NO_SUCH_TURN:
+        turn += 1
         folder = tmp_path / str(turn)
         put(folder, OLD)
-        with monkeypatch.context() as patch:
-            calls = fails(patch, turn, OSError(errno.ENOSPC, "No space left on device"), only=only)
-            try:
-                replace(folder)
-                done = True
-            except ResourceError:
-                done = False
+        code = in_a_child(lambda folder=folder, turn=turn: replace_but(folder, turn, fill, only=only))
+        assert code in (0, ResourceError.exit_code, NO_SUCH_TURN)
+        done = code != ResourceError.exit_code
         if not (folder / STAGING).exists():
             assert content(folder) == (NEW if done else OLD), turn
         recover(folder)
         assert content(folder) in (OLD, NEW), turn
         assert not done or content(folder) == NEW
-        if len(calls) <= turn:
-            break
     assert turn > 15
 
 
-def test_an_interrupt_waits_until_the_files_have_their_places(tmp_path, monkeypatch):
+def test_an_interrupt_waits_until_the_files_have_their_places(tmp_path):
     put(tmp_path, OLD)
-    first = Path.replace
 
-    def interrupted(path, target):
-        signal.raise_signal(signal.SIGINT)
-        return first(path, target)
+    def interrupted() -> int:
+        first = Path.replace
 
-    monkeypatch.setattr(Path, "replace", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        replace(tmp_path)
+        def call(path, target):
+            signal.raise_signal(signal.SIGINT)
+            return first(path, target)
+
+        Path.replace = call
+        try:
+            replace(tmp_path)
+        except KeyboardInterrupt:
+            return 130
+        return 0
+
+    assert in_a_child(interrupted) == 130
     assert content(tmp_path) == NEW
 
 
