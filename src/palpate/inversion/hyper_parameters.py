@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, optimize
 
-from palpate.inversion.blocks import Block
+from palpate.inversion.blocks import Acts, Block
 from palpate.inversion.objective import AS_GOOD, Evaluation, Linearisation, Objective, determined, worse_driver
 from palpate.observation.contract import Observation
 from palpate.observation.noise_model import NoiseModel
@@ -165,7 +165,7 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
 
     With A = J^T W J and b = A x - J^T W r at unknowns x (n_unknowns,) the log-evidence of P is 1/2 (b^T (A + P)^-1 b -
     ln det(A + P) + ln det P) up to a constant (MacKay 1992, Neural Computation 4, 415-447, section 4), the other blocks
-    under their present prior. An alternative stays until another one is more than as good.
+    under their present prior. An alternative stays until another one is more than as good; of a material the first one.
     """
     parameters, n = objective.parameters, objective.n_parameters
     chosen = list(objective.chosen or (None,) * len(parameters.blocks))
@@ -177,7 +177,7 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
         places = parameters.columns(i)
         beliefs = _beliefs(block, places, data, prior, pull + prior @ parameters.prior_centre)
         best, present = max(range(len(beliefs)), key=lambda k: beliefs[k][0]), chosen[i]
-        if present is None and block.last:
+        if present is None and block.acts is Acts.MATERIAL:
             present = 0
         if present is None or beliefs[best][0] > beliefs[present][0] + AS_GOOD:
             present = best
