@@ -23,7 +23,8 @@ from palpate.report.methods import methods_text
 from palpate.study.case_data import CaseData
 from palpate.study.case_file import read_case
 from palpate.study.check import check_case
-from palpate.study.run import estimate, simulate
+from palpate.study.run import estimate
+from palpate.study.simulate import simulate
 
 TOY = Path(__file__).parents[1] / "observation" / "point_motion.py"
 CASE = """

@@ -14,7 +14,8 @@ from palpate.images.segmentation import first_labels
 from palpate.mechanics.element import largest_strains
 from palpate.study.case import CaseLoad
 from palpate.study.case_file import read_case
-from palpate.study.run import estimate, simulate
+from palpate.study.run import estimate
+from palpate.study.simulate import simulate
 
 CASE = """
 [images]

@@ -1,98 +1,53 @@
 """The inverse problem: from later states and what is observed of them to the moduli that explain them."""
 
-from palpate.inversion.approximation import Approximation, ExactApproximation, Place, exact_approximation
-from palpate.inversion.blocks import (
-    FIELD,
-    KNOWN_MODULUS,
-    Acts,
-    Block,
-    frame_blocks,
-    instrument_block,
-    known_modulus_blocks,
-    layer_blocks,
-    material_blocks,
-    offset_block,
-    unit_blocks,
-    wall_blocks,
-)
-from palpate.inversion.driver_fit import fit_driver
-from palpate.inversion.estimate import (
-    Inversion,
-    StartRun,
-    as_good,
-    continue_at_finite_strain,
-    first_noise_of,
-    invert,
-    with_released,
-)
-from palpate.inversion.evidence import with_learned_prior
-from palpate.inversion.later_state import InverseProblem, LaterState
-from palpate.inversion.objective import Evaluation, Linearisation, LinearisedObjective, Objective
-from palpate.inversion.optimise import (
-    Bounds,
-    Iterate,
-    LeastSquares,
-    Minimum,
-    Outcome,
-    fit_coefficients,
-    gauss_newton,
-    posterior_sd,
-)
-from palpate.inversion.outer_loop import InversionSettings, OuterIterate, StopRule, run_outer_loop
-from palpate.inversion.parameters import ParameterMap, eta_of_ratio, parameter_map, ratio_of_eta
-from palpate.inversion.reduced_basis import ReducedBasis, reduced_basis
-from palpate.inversion.reweighting import reweighted, with_first_noise
-
-__all__ = [
-    "FIELD",
-    "KNOWN_MODULUS",
-    "Acts",
-    "Approximation",
-    "Block",
-    "Bounds",
-    "Evaluation",
-    "ExactApproximation",
-    "InverseProblem",
-    "Inversion",
-    "InversionSettings",
-    "Iterate",
-    "LaterState",
-    "LeastSquares",
-    "Linearisation",
-    "LinearisedObjective",
-    "Minimum",
-    "Objective",
-    "Outcome",
-    "OuterIterate",
-    "ParameterMap",
-    "Place",
-    "ReducedBasis",
-    "StartRun",
-    "StopRule",
-    "as_good",
-    "continue_at_finite_strain",
-    "eta_of_ratio",
-    "exact_approximation",
-    "first_noise_of",
-    "fit_coefficients",
-    "fit_driver",
-    "frame_blocks",
-    "gauss_newton",
-    "instrument_block",
-    "invert",
-    "known_modulus_blocks",
-    "layer_blocks",
-    "material_blocks",
-    "offset_block",
-    "parameter_map",
-    "posterior_sd",
-    "ratio_of_eta",
-    "reduced_basis",
-    "reweighted",
-    "run_outer_loop",
-    "unit_blocks",
-    "wall_blocks",
-    "with_first_noise",
-    "with_learned_prior",
-    "with_released",
-]
+from palpate.inversion.approximation import Approximation as Approximation
+from palpate.inversion.approximation import ExactApproximation as ExactApproximation
+from palpate.inversion.approximation import Place as Place
+from palpate.inversion.approximation import exact_approximation as exact_approximation
+from palpate.inversion.blocks import FIELD as FIELD
+from palpate.inversion.blocks import KNOWN_MODULUS as KNOWN_MODULUS
+from palpate.inversion.blocks import Acts as Acts
+from palpate.inversion.blocks import Block as Block
+from palpate.inversion.blocks import frame_blocks as frame_blocks
+from palpate.inversion.blocks import instrument_block as instrument_block
+from palpate.inversion.blocks import known_modulus_blocks as known_modulus_blocks
+from palpate.inversion.blocks import layer_blocks as layer_blocks
+from palpate.inversion.blocks import material_blocks as material_blocks
+from palpate.inversion.blocks import offset_block as offset_block
+from palpate.inversion.blocks import unit_blocks as unit_blocks
+from palpate.inversion.blocks import wall_blocks as wall_blocks
+from palpate.inversion.driver_fit import fit_driver as fit_driver
+from palpate.inversion.estimate import Inversion as Inversion
+from palpate.inversion.estimate import StartRun as StartRun
+from palpate.inversion.estimate import as_good as as_good
+from palpate.inversion.estimate import continue_at_finite_strain as continue_at_finite_strain
+from palpate.inversion.estimate import first_noise_of as first_noise_of
+from palpate.inversion.estimate import invert as invert
+from palpate.inversion.estimate import with_released as with_released
+from palpate.inversion.evidence import with_learned_prior as with_learned_prior
+from palpate.inversion.later_state import InverseProblem as InverseProblem
+from palpate.inversion.later_state import LaterState as LaterState
+from palpate.inversion.objective import Evaluation as Evaluation
+from palpate.inversion.objective import Linearisation as Linearisation
+from palpate.inversion.objective import LinearisedObjective as LinearisedObjective
+from palpate.inversion.objective import Objective as Objective
+from palpate.inversion.optimise import Bounds as Bounds
+from palpate.inversion.optimise import Iterate as Iterate
+from palpate.inversion.optimise import LeastSquares as LeastSquares
+from palpate.inversion.optimise import Minimum as Minimum
+from palpate.inversion.optimise import Outcome as Outcome
+from palpate.inversion.optimise import fit_coefficients as fit_coefficients
+from palpate.inversion.optimise import gauss_newton as gauss_newton
+from palpate.inversion.optimise import posterior_sd as posterior_sd
+from palpate.inversion.outer_loop import InversionSettings as InversionSettings
+from palpate.inversion.outer_loop import OuterIterate as OuterIterate
+from palpate.inversion.outer_loop import StopRule as StopRule
+from palpate.inversion.outer_loop import run_outer_loop as run_outer_loop
+from palpate.inversion.parameters import ParameterMap as ParameterMap
+from palpate.inversion.parameters import eta_of_ratio as eta_of_ratio
+from palpate.inversion.parameters import parameter_map as parameter_map
+from palpate.inversion.parameters import ratio_of_eta as ratio_of_eta
+from palpate.inversion.reduced_basis import ReducedBasis as ReducedBasis
+from palpate.inversion.reduced_basis import reduced_basis as reduced_basis
+from palpate.inversion.reweighting import reweighted as reweighted
+from palpate.inversion.reweighting import with_first_noise as with_first_noise

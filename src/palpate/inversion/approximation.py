@@ -17,16 +17,6 @@ from palpate.mechanics.linear_model import LinearEquilibrium, LinearModel
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.constraint import Constraint
 
-__all__ = [
-    "Approximation",
-    "Derivatives",
-    "ExactApproximation",
-    "LocalModel",
-    "ModelError",
-    "Place",
-    "exact_approximation",
-]
-
 
 class LocalModel(ForwardModel, Protocol):
     """A forward model of all points that can answer at some of them only."""

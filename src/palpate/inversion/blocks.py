@@ -22,22 +22,6 @@ from palpate.observation.contract import Observation
 from palpate.observation.prescribed_motion import PrescribedMotion
 from palpate.observation.wall_modes import Wall
 
-__all__ = [
-    "FIELD",
-    "KNOWN_MODULUS",
-    "Acts",
-    "Block",
-    "frame_blocks",
-    "instrument_block",
-    "joined",
-    "known_modulus_blocks",
-    "layer_blocks",
-    "material_blocks",
-    "offset_block",
-    "unit_blocks",
-    "wall_blocks",
-]
-
 AMPLITUDES = (0.005, 2.0)  # times the coefficients' own standard deviation
 STILL, MOVES = 0.02, (1.0, 2.0)  # amplitudes of a frame that stands still, times what is stated; of one that moves
 STILL_RIGID, MOVED_RIGID = 0.005, 0.2

@@ -19,8 +19,6 @@ from palpate.inversion.reduced_basis import reduced_basis
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.observation.noise_model import SEGMENTATION_NOISE
 
-__all__ = ["fit_driver"]
-
 DECREMENT = 1e-2  # of a fit that is the result itself
 
 Motions = tuple[NDArray[np.float64], ...]

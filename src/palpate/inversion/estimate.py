@@ -39,17 +39,6 @@ from palpate.mechanics.forward import SolveCounts
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Progress, during
 
-__all__ = [
-    "Candidate",
-    "Inversion",
-    "StartRun",
-    "as_good",
-    "continue_at_finite_strain",
-    "first_noise_of",
-    "invert",
-    "with_released",
-]
-
 OTHER = 1e-2  # decrement of minima that are compared: a two-hundredth of what tells them apart
 AS_GOOD = 1.92  # of minus the log-posterior: half the 95 % quantile of chi-squared with one degree of freedom
 REPORTED = StopRule()

@@ -17,8 +17,6 @@ from scipy import linalg, optimize
 from palpate.inversion.blocks import Block
 from palpate.inversion.objective import Evaluation, Objective, determined
 
-__all__ = ["learned_precision", "undecided_covariance", "with_learned_prior"]
-
 FIRST, ELSEWHERE = 0.3, 0.05  # amplitudes of one term and of the others; one may hide the other
 LEAST_VARIANCE = 1e-3  # of a coefficient, times its variance under the block's own kernel: no mode is forbidden
 ALIKE = 2.0  # of the log-evidence

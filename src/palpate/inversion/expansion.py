@@ -24,8 +24,6 @@ from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.constraint import Constraint
 from palpate.progress import Progress, silent
 
-__all__ = ["Expansion", "coarse_equilibrium", "expansion_around"]
-
 REACH = 0.8  # of ln E, within which it is trusted
 COARSE = 3e-2  # of the forces: for the equilibrium whose stiffness is factorised
 DERIVATIVES = 1e-5  # relative residual: those of a coarse equilibrium, which others replace where they decide

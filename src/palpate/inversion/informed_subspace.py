@@ -24,8 +24,6 @@ from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import LinearModel, LinearSystem
 from palpate.progress import Progress
 
-__all__ = ["InformedProblem", "informed_problem"]
-
 SMALL = 12  # unknowns of a block, which are kept
 
 

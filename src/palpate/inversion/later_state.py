@@ -17,8 +17,6 @@ from palpate.mechanics.linear_model import LinearModel
 from palpate.observation.contract import Observation, OfMaterial
 from palpate.observation.noise_model import NoiseModel
 
-__all__ = ["InverseProblem", "LaterState"]
-
 
 @dataclass(frozen=True, slots=True)
 class LaterState:

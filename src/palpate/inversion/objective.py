@@ -18,8 +18,6 @@ from palpate.observation.contract import Observation, OfMaterial, Rematched, Res
 from palpate.observation.jacobian import Jacobian, jacobian_of
 from palpate.parallel import mapped
 
-__all__ = ["Evaluation", "Linearisation", "LinearisedObjective", "Objective", "deciding_directions", "determined"]
-
 
 @contextmanager
 def determined() -> Iterator[None]:

@@ -14,21 +14,6 @@ from scipy import optimize
 from palpate.errors import SolverError
 from palpate.inversion.objective import Evaluation, Objective, determined
 
-__all__ = [
-    "TO_THE_NOISE",
-    "Bounds",
-    "Iterate",
-    "Minimum",
-    "Outcome",
-    "ShareOfValue",
-    "fit_coefficients",
-    "gauss_newton",
-    "lbfgs",
-    "newton_decrement",
-    "posterior_sd",
-    "same_minimum",
-]
-
 AT_BOUND = 1e-6  # of ln E
 FIRST_RADIUS = 1.0  # of the log-moduli, per step: a factor e
 MAX_RADIUS = 2.0

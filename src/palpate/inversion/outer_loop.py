@@ -28,17 +28,6 @@ from palpate.inversion.optimise import (
 from palpate.inversion.reweighting import reweighted
 from palpate.mechanics.forward import SolveCounts
 
-__all__ = [
-    "Convergence",
-    "Criterion",
-    "InversionSettings",
-    "OuterIterate",
-    "StopRule",
-    "minimised",
-    "run_outer_loop",
-    "updated",
-]
-
 FORCING = 0.1  # of the last outer iteration's step: to which the next one's weights and estimate agree
 INNER = 20.0  # a minimum is found to so small a part of what a reweighting may still change
 POLISH, ROUGHLY = 1e-5, 1e-2  # decrements of a minimum by a method that does not tell how far the log-moduli are

@@ -15,8 +15,6 @@ from palpate.inversion.blocks import KNOWN_MODULUS, Acts, Block, joined
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.stiffness import lame_parts, lame_parts_by_poisson
 
-__all__ = ["OpenPoisson", "ParameterMap", "eta_of_ratio", "parameter_map", "ratio_of_eta"]
-
 LOADS = "the known loads"
 
 

@@ -18,8 +18,6 @@ from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mechanics.solvers.registry import SOLVERS, CheckedFactorisation
 from palpate.mesh.constraint import Constraint
 
-__all__ = ["SNAPSHOT", "ReducedBasis", "basis_of", "reduced_basis"]
-
 SERIES = 40  # vectors at the most
 FAR = 30.0  # spread of the moduli's ratios to the factorised ones, beyond which a new factorisation costs less
 SNAPSHOT = 1e-5  # relative residual of basis vectors: what they miss is measured at each place and added there

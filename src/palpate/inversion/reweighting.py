@@ -12,8 +12,6 @@ from palpate.inversion.objective import Evaluation, Linearisation, Objective
 from palpate.inversion.optimise import Minimum
 from palpate.observation.noise_model import NoiseModel
 
-__all__ = ["fitted_noise", "of_one_noise", "reweighted", "with_first_noise", "with_found_noise"]
-
 RIDGE = 1e-9  # of the mean diagonal: a mode that moves no observed point
 
 

@@ -22,24 +22,6 @@ from palpate.mesh.space import LagrangeSpace
 from palpate.observation.noise_model import FitResponse, NoiseModel
 from palpate.observation.robust_loss import RobustLoss
 
-__all__ = [
-    "DataFile",
-    "DataSource",
-    "Fit",
-    "Imaged",
-    "ImagedBody",
-    "Observation",
-    "OfInstrument",
-    "OfMaterial",
-    "OfPoints",
-    "PointMotions",
-    "Reaction",
-    "ReactionOf",
-    "Rematched",
-    "Residuals",
-    "Weighting",
-]
-
 
 @dataclass(frozen=True, slots=True)
 class ImagedBody:

@@ -21,8 +21,6 @@ from palpate.observation.contract import DataFile, ReactionOf
 from palpate.observation.measured_points import MeasuredPoints, PointTable, read_point_table, refuse_slips
 from palpate.observation.point_displacement import PointDisplacement, point_displacement
 
-__all__ = ["DisplacementField", "read_displacement_field"]
-
 FEWEST = 4  # points that tell a motion which is not the same everywhere
 MOST_VECTORS = 2**26  # 1.6 GB as they are read
 ROUNDING = 1e-6  # of a voxel

@@ -18,8 +18,6 @@ from palpate.observation.contract import DataFile, Fit, Reaction, ReactionOf, Re
 from palpate.observation.noise_model import FitResponse, NoiseModel
 from palpate.observation.robust_loss import Tukey
 
-__all__ = ["Force", "ForceMeasurement", "read_force"]
-
 ALONE = 1e-3  # mm: no other residual is alike
 
 

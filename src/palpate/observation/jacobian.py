@@ -12,8 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-__all__ = ["Jacobian", "jacobian_of"]
-
 ROWS = 8192  # residuals whose rows are formed at once: some 30 MB
 MANY = 4  # residuals a displacement, from which on the products of the sparse factor cost less than J itself
 

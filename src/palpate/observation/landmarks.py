@@ -28,8 +28,6 @@ from palpate.observation.measured_points import (
 )
 from palpate.observation.point_displacement import PointDisplacement, point_displacement
 
-__all__ = ["Landmarks", "read_landmarks"]
-
 TO_RAS = {"LPS": LPS_TO_RAS, "RAS": np.ones(3), "1": LPS_TO_RAS, "0": np.ones(3)}
 MOST_NAMED = 8  # points outside, by name
 

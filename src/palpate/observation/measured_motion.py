@@ -13,8 +13,6 @@ from scipy.spatial import cKDTree
 from palpate.errors import InputDataError
 from palpate.observation.measured_points import MeasuredPoints
 
-__all__ = ["MeasuredMotion", "measured_motion"]
-
 NEAREST = 100  # measured points that tell the motion of one place
 FEWEST = 4  # that tell how a surface moves, turns and stretches
 FLAT = 1e-6  # of the points' extent: they tell nothing of how the motion changes across so little

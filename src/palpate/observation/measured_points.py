@@ -20,8 +20,6 @@ from palpate.mesh.locate import located
 from palpate.mesh.space import LagrangeSpace
 from palpate.observation.contract import DataFile
 
-__all__ = ["MeasuredPoints", "PointTable", "checked_table", "read_point_table", "read_text", "refuse_slips"]
-
 MOST_BYTES = 64 * 2**20
 COLUMNS = tuple(f"{when}_{axis}" for when in ("before", "after") for axis in "xyz")
 METRES = 1000.0

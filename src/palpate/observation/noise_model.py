@@ -16,17 +16,6 @@ from scipy.spatial.distance import cdist
 from palpate.observation.jacobian import Jacobian
 from palpate.parallel import mapped
 
-__all__ = [
-    "EXACT_NOISE",
-    "SEGMENTATION_NOISE",
-    "FitResponse",
-    "NoiseModel",
-    "correlation",
-    "fit_noise_model",
-    "mean_noise",
-    "whitener",
-]
-
 LENGTHS = (0.5, 0.8, 1.2, 2.0, 3.0, 4.5, 6.5, 9.5, 14.0)  # mm
 CELL = 1.0  # mm: residuals nearer than that are averaged before they are compared
 MAX_CELLS = 2500

@@ -17,8 +17,6 @@ from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.surface import tissue_surface, triangle_normals
 from palpate.mesh.tet_mesh import OUTER
 
-__all__ = ["FieldOfView", "ObservedSurface", "field_of_view", "observed_surface", "observed_surfaces", "seen_in"]
-
 SUBTRIANGLES = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])  # of a quadratic triangle
 MIN_SHARE = 0.1
 NEEDED = (Role.ESTIMATE, Role.DRIVER)

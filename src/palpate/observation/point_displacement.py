@@ -15,8 +15,6 @@ from palpate.observation.contract import DataFile, Fit, PointMotions, Residuals,
 from palpate.observation.noise_model import FitResponse, NoiseModel, whitener
 from palpate.observation.robust_loss import Tukey
 
-__all__ = ["PointDisplacement", "point_displacement"]
-
 TUKEY = 4.685  # cutoff in standard deviations, 95 % efficient for normal errors (Huber 1981)
 MAD = 1.4826  # standard deviations of a normal law in one median absolute deviation
 ALONE = 1e-3  # mm: length over which errors that are independent are alike

@@ -15,8 +15,6 @@ from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.surface import cut_faces, tissue_surface, triangle_normals
 from palpate.observation.wall_modes import Wall, fine_modes, wall_modes, wall_of
 
-__all__ = ["FrameMotion", "PrescribedMotion", "prescribed_motion"]
-
 FRAME_LENGTHS = (0.7, 1.0)  # times the kernel of the frame's smooth motion
 FRAME_SHARE, FRAME_MODES = 0.99, 60  # of the frame's variance that its scalar modes hold; their largest number
 

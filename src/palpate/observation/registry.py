@@ -17,8 +17,6 @@ from palpate.observation.force import read_force
 from palpate.observation.landmarks import read_landmarks
 from palpate.observation.surface_distance import surface_distances
 
-__all__ = ["KINDS", "SOURCES", "SourceKind", "observations", "read_source", "register_brought"]
-
 OF_POINTS = ("file", "file_after", "sd_mm", "covariance_mm2", "correlation_mm", "axes")
 
 

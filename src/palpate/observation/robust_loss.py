@@ -9,8 +9,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Huber", "RobustLoss", "Tukey"]
-
 HUBER = 1.345  # cutoff of `Huber` in standard deviations, 95 % efficient for normal errors
 NORMAL = math.erf(HUBER / math.sqrt(2.0))  # mean of w r^2 of standard normal residuals r under that cutoff
 

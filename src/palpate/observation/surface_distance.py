@@ -28,8 +28,6 @@ from palpate.observation.surface_residuals import Correspondence, correspondence
 from palpate.observation.target import SurfaceTarget, surface_target
 from palpate.parallel import mapped
 
-__all__ = ["SurfaceDistance", "robust_loss", "surface_distance", "surface_distances"]
-
 TUKEY = 4.685  # cutoff in standard deviations, 95 % efficient for normal errors (Huber 1981)
 MAD = 1.4826  # standard deviations of a normal law in one median absolute deviation
 LEAST_CUTOFF = 5e-3  # mm

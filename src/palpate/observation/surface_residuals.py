@@ -15,8 +15,6 @@ from palpate.observation.contract import Residuals
 from palpate.observation.observed_surface import ObservedSurface
 from palpate.observation.target import SurfaceTarget, places_within, values_and_gradients
 
-__all__ = ["Correspondence", "correspondence", "surface_residuals"]
-
 T = TypeVar("T", bound=np.generic)
 ON_EDGE = 1e-9
 # Directions (8, 2, 3) in barycentric coordinates along which a closest point may slide, zero where none: by which

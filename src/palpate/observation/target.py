@@ -13,8 +13,6 @@ from palpate.mesh.anatomy import LevelSet
 from palpate.mesh.surface import triangle_normals
 from palpate.observation.observed_surface import FieldOfView, ObservedSurface
 
-__all__ = ["OneLookUp", "SurfaceTarget", "places_within", "surface_target", "target_from", "values_and_gradients"]
-
 # Strang & Fix 1973: three interior points, exact for quadratics; one point where triangles are as small as voxels
 THREE_POINTS = np.array([[4.0, 1.0, 1.0], [1.0, 4.0, 1.0], [1.0, 1.0, 4.0]]) / 6.0
 ONE_POINT = np.full((1, 3), 1.0 / 3.0)

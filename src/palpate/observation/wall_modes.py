@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from palpate.mesh.gaussian_process import RANK_TOLERANCE, karhunen_loeve, kernel_factor
 
-__all__ = ["Wall", "fine_modes", "wall_modes", "wall_of"]
-
 DRIFT_LENGTHS = (1.0, 2.0, 4.0)  # times the modes' own kernel, which they cannot go below
 SWELLING_LENGTHS = (1.0, 2.0)
 FINE_KERNEL_MM, FINE_MM = 8.0, 0.3  # of what a wall does on a finer scale than its modes

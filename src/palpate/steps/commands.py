@@ -14,6 +14,7 @@ from palpate.steps.previewing import checked_with_page, new_case_with_page, plac
 from palpate.steps.results import CaseResult, SavedResult
 from palpate.steps.saving import save_sensitivity
 from palpate.study import run
+from palpate.study import simulate as simulation
 from palpate.study.case import Case
 from palpate.study.check import CheckReport, check_case
 from palpate.study.lock import held_folder
@@ -134,7 +135,7 @@ def simulate(case: Case, *, steps: int = 1, progress: Progress = silent) -> Simu
     steps: how many states to give, each in equilibrium at its share of the motion. Raises as `make_mesh` does, and
     `ConfigurationError` when a modulus is missing, `NotConverged` where a finite-strain path ends early.
     """
-    return run.simulate(case, progress=progress, steps=steps)
+    return simulation.simulate(case, progress=progress, steps=steps)
 
 
 def estimate(

@@ -59,19 +59,6 @@ from palpate.study.meshing import ReferenceMesh, mesh_reference
 from palpate.study.poisson_ratios import with_stated_priors
 from palpate.study.refusals import refuse_lost, refuse_unmeshable
 
-__all__ = [
-    "Body",
-    "ImagedStates",
-    "aligned",
-    "brought",
-    "inverse_problem",
-    "joint_problem",
-    "make_body",
-    "on_linear_elements",
-    "stated_noise",
-    "strained_body",
-]
-
 SMALL_FRAME_MOTION = 1.0 / 3.0  # of what the organs do against each other: a smaller one is not worth a word
 LEVER_MM = 25.0  # about the size of an organ, at which a turn counts as a motion
 SEEN_MM = 0.2  # less is the measurement's own error

@@ -72,26 +72,6 @@ from palpate.uncertainty import (
     stiffness_maps,
 )
 
-__all__ = [
-    "Estimation",
-    "ForceFit",
-    "Iteration",
-    "Known",
-    "ModulusEstimate",
-    "Observed",
-    "PointFit",
-    "Start",
-    "TissueFit",
-    "conclude",
-    "estimates_of",
-    "hull",
-    "intervals_of",
-    "no_estimate",
-    "released_of",
-    "stated_posteriors",
-    "verdict",
-]
-
 IDENTIFIED, WEAK = 4.0, 10.0  # largest ratio of an interval's ends: a factor of 2 to each side, and of 3.2
 
 

@@ -17,8 +17,6 @@ from palpate.study.body import Body, joint_problem, strained_body
 from palpate.study.case import Case
 from palpate.study.case_loads import case_loads
 
-__all__ = ["inverted"]
-
 PASSES = 10
 SETTLED = 1e-3  # of ln E: what the next pass would change is less, by the strain of the reference
 

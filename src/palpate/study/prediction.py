@@ -19,8 +19,6 @@ from palpate.study.estimation import verdict
 from palpate.study.run import inversion_settings
 from palpate.uncertainty import Interval, covariance_of, error_noise, log_interval, sandwich_covariance
 
-__all__ = ["PredictedModulus", "Prediction", "predicted_intervals"]
-
 
 @dataclass(frozen=True, slots=True)
 class PredictedModulus:

@@ -29,20 +29,9 @@ from palpate.study.read import read_pairs, read_states
 from palpate.study.refusals import linear_strain_warnings
 from palpate.study.result import CaseResult, MeshResult, PairResult, Provenance, image_names
 from palpate.study.samples import require_samples
-from palpate.study.simulate import mesh_summary, simulate
+from palpate.study.simulate import mesh_summary
 from palpate.study.variations import Variation, voxel_mm, what_would_change
 from palpate.uncertainty import FittedState
-
-__all__ = [
-    "estimate",
-    "estimate_states",
-    "fitted_states",
-    "inversion_settings",
-    "mesh",
-    "refuse_what_cannot_be_estimated",
-    "simulate",
-    "strain_warnings",
-]
 
 
 def unconditional(cost: ExpectedCost) -> None:

@@ -45,8 +45,6 @@ from palpate.study.run import fitted_states, inversion_settings, refuse_what_can
 from palpate.study.variations import SobolResult, Variation, fast_variations, sobol_result, voxel_mm
 from palpate.uncertainty import require_salib
 
-__all__ = ["KEPT", "Kept", "Sensitivity", "Variant", "kept_under", "sensitivity", "variants_of"]
-
 KEPT = "variants"  # folder of the finished parts
 COARSER = 1.25  # times the mesh's edge length
 VARIED = StopRule(step_sd=0.1)  # of a variant: a change by less of its standard deviations says nothing

@@ -22,16 +22,6 @@ from palpate.uncertainty import (
     pair_estimates,
 )
 
-__all__ = [
-    "ImagePairs",
-    "ModulusRegion",
-    "PairAlone",
-    "StatedPosterior",
-    "combinations_of",
-    "image_pairs_of",
-    "regions_of",
-]
-
 MOST_REGIONS = 3  # of the pairs of moduli that are correlated most
 
 

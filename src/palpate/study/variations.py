@@ -31,8 +31,6 @@ from palpate.uncertainty import (
     surface_errors,
 )
 
-__all__ = ["Range", "SobolResult", "Variation", "fast_variations", "sobol_result", "voxel_mm", "what_would_change"]
-
 POISSON_STEP = 0.02
 KNOWN_FACTOR = 1.2
 VOXELS = (-0.5, -0.25, 0.25, 0.5)

@@ -1,107 +1,60 @@
 """What is known of an estimate: covariance by cause, profiles, intervals, samples of the posterior, sensitivity."""
 
-from palpate.uncertainty.combinations import Combination, Information, information, information_shares, known_pairs
-from palpate.uncertainty.covariance import (
-    GRID_DRAWS,
-    Covariance,
-    FittedState,
-    GridErrors,
-    covariance_of,
-    error_noise,
-    gain,
-    grid_errors,
-    grid_position_shifts,
-    imaging_errors,
-    mesh_covariance,
-    noise_covariance,
-    sandwich_covariance,
-)
-from palpate.uncertainty.diagnostics import ChainDiagnostics, chain_diagnostics, require_arviz
-from palpate.uncertainty.frozen_posterior import FrozenPosterior, frozen_posterior
-from palpate.uncertainty.image_pairs import Agreement, PairEstimates, agreement, pair_estimates
-from palpate.uncertainty.intervals import (
-    NORMAL_95,
-    Interval,
-    ModulusInterval,
-    discretisation_sd,
-    log_interval,
-    modulus_interval,
-)
-from palpate.uncertainty.joint_region import JointRegion, joint_region
-from palpate.uncertainty.profile import FixedCorrespondence, Profile, fixed_correspondence, refitted
-from palpate.uncertainty.sampling import PosteriorChains, posterior_chains
-from palpate.uncertainty.sensitivity import (
-    Equilibria,
-    Errors,
-    FastPath,
-    Shift,
-    exact_equilibria,
-    fast_path,
-    law_errors,
-    modulus_errors,
-    poisson_errors,
-    surface_errors,
-)
-from palpate.uncertainty.sobol import SobolIndices, require_salib, sobol_indices
-from palpate.uncertainty.stiffness_map import CONTRAST, DifferentRegion, StiffnessMap, stiffness_maps
-
-__all__ = [
-    "CONTRAST",
-    "GRID_DRAWS",
-    "NORMAL_95",
-    "Agreement",
-    "ChainDiagnostics",
-    "Combination",
-    "Covariance",
-    "DifferentRegion",
-    "Equilibria",
-    "Errors",
-    "FastPath",
-    "FittedState",
-    "FixedCorrespondence",
-    "FrozenPosterior",
-    "GridErrors",
-    "Information",
-    "Interval",
-    "JointRegion",
-    "ModulusInterval",
-    "PairEstimates",
-    "PosteriorChains",
-    "Profile",
-    "Shift",
-    "SobolIndices",
-    "StiffnessMap",
-    "agreement",
-    "chain_diagnostics",
-    "covariance_of",
-    "discretisation_sd",
-    "error_noise",
-    "exact_equilibria",
-    "fast_path",
-    "fixed_correspondence",
-    "frozen_posterior",
-    "gain",
-    "grid_errors",
-    "grid_position_shifts",
-    "imaging_errors",
-    "information",
-    "information_shares",
-    "joint_region",
-    "known_pairs",
-    "law_errors",
-    "log_interval",
-    "mesh_covariance",
-    "modulus_errors",
-    "modulus_interval",
-    "noise_covariance",
-    "pair_estimates",
-    "poisson_errors",
-    "posterior_chains",
-    "refitted",
-    "require_arviz",
-    "require_salib",
-    "sandwich_covariance",
-    "sobol_indices",
-    "stiffness_maps",
-    "surface_errors",
-]
+from palpate.uncertainty.combinations import Combination as Combination
+from palpate.uncertainty.combinations import Information as Information
+from palpate.uncertainty.combinations import information as information
+from palpate.uncertainty.combinations import information_shares as information_shares
+from palpate.uncertainty.combinations import known_pairs as known_pairs
+from palpate.uncertainty.covariance import GRID_DRAWS as GRID_DRAWS
+from palpate.uncertainty.covariance import Covariance as Covariance
+from palpate.uncertainty.covariance import FittedState as FittedState
+from palpate.uncertainty.covariance import GridErrors as GridErrors
+from palpate.uncertainty.covariance import covariance_of as covariance_of
+from palpate.uncertainty.covariance import error_noise as error_noise
+from palpate.uncertainty.covariance import gain as gain
+from palpate.uncertainty.covariance import grid_errors as grid_errors
+from palpate.uncertainty.covariance import grid_position_shifts as grid_position_shifts
+from palpate.uncertainty.covariance import imaging_errors as imaging_errors
+from palpate.uncertainty.covariance import mesh_covariance as mesh_covariance
+from palpate.uncertainty.covariance import noise_covariance as noise_covariance
+from palpate.uncertainty.covariance import sandwich_covariance as sandwich_covariance
+from palpate.uncertainty.diagnostics import ChainDiagnostics as ChainDiagnostics
+from palpate.uncertainty.diagnostics import chain_diagnostics as chain_diagnostics
+from palpate.uncertainty.diagnostics import require_arviz as require_arviz
+from palpate.uncertainty.frozen_posterior import FrozenPosterior as FrozenPosterior
+from palpate.uncertainty.frozen_posterior import frozen_posterior as frozen_posterior
+from palpate.uncertainty.image_pairs import Agreement as Agreement
+from palpate.uncertainty.image_pairs import PairEstimates as PairEstimates
+from palpate.uncertainty.image_pairs import agreement as agreement
+from palpate.uncertainty.image_pairs import pair_estimates as pair_estimates
+from palpate.uncertainty.intervals import NORMAL_95 as NORMAL_95
+from palpate.uncertainty.intervals import Interval as Interval
+from palpate.uncertainty.intervals import ModulusInterval as ModulusInterval
+from palpate.uncertainty.intervals import discretisation_sd as discretisation_sd
+from palpate.uncertainty.intervals import log_interval as log_interval
+from palpate.uncertainty.intervals import modulus_interval as modulus_interval
+from palpate.uncertainty.joint_region import JointRegion as JointRegion
+from palpate.uncertainty.joint_region import joint_region as joint_region
+from palpate.uncertainty.profile import FixedCorrespondence as FixedCorrespondence
+from palpate.uncertainty.profile import Profile as Profile
+from palpate.uncertainty.profile import fixed_correspondence as fixed_correspondence
+from palpate.uncertainty.profile import refitted as refitted
+from palpate.uncertainty.sampling import PosteriorChains as PosteriorChains
+from palpate.uncertainty.sampling import posterior_chains as posterior_chains
+from palpate.uncertainty.sensitivity import Equilibria as Equilibria
+from palpate.uncertainty.sensitivity import Errors as Errors
+from palpate.uncertainty.sensitivity import FastPath as FastPath
+from palpate.uncertainty.sensitivity import Shift as Shift
+from palpate.uncertainty.sensitivity import exact_equilibria as exact_equilibria
+from palpate.uncertainty.sensitivity import fast_path as fast_path
+from palpate.uncertainty.sensitivity import law_errors as law_errors
+from palpate.uncertainty.sensitivity import modulus_errors as modulus_errors
+from palpate.uncertainty.sensitivity import poisson_errors as poisson_errors
+from palpate.uncertainty.sensitivity import surface_errors as surface_errors
+from palpate.uncertainty.sobol import SobolIndices as SobolIndices
+from palpate.uncertainty.sobol import require_salib as require_salib
+from palpate.uncertainty.sobol import sobol_indices as sobol_indices
+from palpate.uncertainty.stiffness_map import CONTRAST as CONTRAST
+from palpate.uncertainty.stiffness_map import DifferentRegion as DifferentRegion
+from palpate.uncertainty.stiffness_map import StiffnessMap as StiffnessMap
+from palpate.uncertainty.stiffness_map import stiffness_maps as stiffness_maps

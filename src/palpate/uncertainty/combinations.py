@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from palpate.inversion import Bounds, Evaluation, LeastSquares, Minimum
 from palpate.uncertainty.intervals import NORMAL_95, modulus_interval
 
-__all__ = ["Combination", "Information", "information", "information_shares", "known_pairs"]
-
 
 @dataclass(frozen=True, slots=True)
 class Information:

@@ -24,27 +24,6 @@ from palpate.observation.noise_model import FitResponse, NoiseModel, mean_noise
 from palpate.parallel import mapped
 from palpate.uncertainty.intervals import discretisation_sd
 
-__all__ = [
-    "GRID_DRAWS",
-    "Covariance",
-    "FittedState",
-    "GridErrors",
-    "added_by",
-    "covariance_among",
-    "covariance_of",
-    "error_noise",
-    "gain",
-    "grid_covariance",
-    "grid_errors",
-    "grid_position_shifts",
-    "imaging_errors",
-    "mesh_covariance",
-    "noise_covariance",
-    "sandwich_covariance",
-    "scatter",
-    "shifts_by",
-]
-
 GridErrors = Sequence[Sequence[NDArray[np.float64]]]
 """Errors (n,) mm of the residuals of each observation, of each draw of a grid."""
 

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from palpate.errors import ResourceError
 
-__all__ = ["ChainDiagnostics", "chain_diagnostics", "require_arviz"]
-
 LARGEST_R_HAT = 1.01
 LEAST_ESS = 400.0  # of the bulk, for R-hat itself is a number of chance with fewer
 TAILS = (0.05, 0.95)  # quantiles

@@ -18,8 +18,6 @@ from palpate.mechanics.curved import CurvedModel
 from palpate.mechanics.reduced import ReducedModel
 from palpate.uncertainty.profile import fixed_correspondence
 
-__all__ = ["FrozenPosterior", "frozen_posterior"]
-
 ONE = np.ones(1)  # the coordinate of what no unknown moves
 
 

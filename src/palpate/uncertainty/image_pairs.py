@@ -29,8 +29,6 @@ from palpate.uncertainty.covariance import (
 from palpate.uncertainty.intervals import NORMAL_95, within_subject_cv
 from palpate.uncertainty.profile import fixed_correspondence
 
-__all__ = ["Agreement", "PairEstimates", "agreement", "pair_estimates"]
-
 OUTLIER = 0.01  # probability, over all pairs together, of calling one an outlier that is none
 MOST_OUTLIERS = 4  # one of so many: where more contradict the others the pairs differ, and none is wrong
 LEAST_PAIRS = 3  # of two that differ nobody can say which is wrong

@@ -13,16 +13,6 @@ from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.surface import tissue_surface, triangle_normals
 from palpate.uncertainty.profile import Profile, profile
 
-__all__ = [
-    "NORMAL_95",
-    "Interval",
-    "ModulusInterval",
-    "discretisation_sd",
-    "log_interval",
-    "modulus_interval",
-    "within_subject_cv",
-]
-
 Interval = tuple[float | None, float | None]
 
 NORMAL_95 = 1.959964

@@ -11,8 +11,6 @@ from scipy import special
 from palpate.inversion import Bounds, LeastSquares, Minimum, gauss_newton
 from palpate.uncertainty.profile import Ray
 
-__all__ = ["JointRegion", "joint_region"]
-
 DIRECTIONS = 16
 LEVEL = float(np.sqrt(special.chdtri(2, 0.05)))  # root deviance on the boundary: chi-squared of two degrees of freedom
 

@@ -29,8 +29,6 @@ from palpate.mechanics.curved import CurvedModel
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import ForwardModel
 
-__all__ = ["PASSES", "FixedCorrespondence", "Profile", "Ray", "fixed_correspondence", "profile", "refitted"]
-
 TRIALS = 12  # points on a ray from the estimate
 TRIES = 3  # at a point, of as many steps as a minimum has
 NEAR = 0.05  # of the level, to which an end is found before a line to the estimate corrects it

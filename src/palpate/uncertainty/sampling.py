@@ -13,8 +13,6 @@ from palpate.inversion.objective import Evaluation, determined
 from palpate.inversion.optimise import Bounds
 from palpate.uncertainty.frozen_posterior import FrozenPosterior
 
-__all__ = ["PosteriorChains", "posterior_chains"]
-
 STEP = 0.35  # of a proposal, in standard deviations of the posterior
 THIN = 10  # steps of a draw that is kept
 SHRUNK = 1.0 - 1e-9  # of a start's distance: one at a bound lies inside whatever rounding does

@@ -25,19 +25,6 @@ from palpate.mechanics.newton import NewtonSettings
 from palpate.observation.contract import Imaged, OfMaterial
 from palpate.uncertainty.profile import PASSES, FixedCorrespondence, fixed_correspondence, refitted
 
-__all__ = [
-    "Equilibria",
-    "Errors",
-    "FastPath",
-    "Shift",
-    "exact_equilibria",
-    "fast_path",
-    "law_errors",
-    "modulus_errors",
-    "poisson_errors",
-    "surface_errors",
-]
-
 TOLERANCE = 1e-6  # decrement of a minimum
 STEPS = 120  # at the most: a modulus that runs away has far to go
 COARSE = NewtonSettings(tolerance=2e-3, step_tolerance=1e-2)  # of the forces, under another law

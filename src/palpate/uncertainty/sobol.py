@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from palpate.errors import ResourceError
 
-__all__ = ["SobolIndices", "require_salib", "sobol_indices"]
-
 
 @dataclass(frozen=True, slots=True)
 class SobolIndices:

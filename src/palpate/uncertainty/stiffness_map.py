@@ -16,8 +16,6 @@ from palpate.mesh.tet_mesh import FACES, TetMesh
 from palpate.uncertainty.covariance import covariance_among
 from palpate.uncertainty.intervals import NORMAL_95, Interval
 
-__all__ = ["CONTRAST", "DifferentRegion", "StiffnessMap", "stiffness_maps"]
-
 CONTRAST = 1.5  # from which a part of a tissue is another stiffness, and not its own scatter
 CERTAIN, LIKELY = 0.95, 0.5  # posterior probability of that: somewhere in a region that is reported, all over it
 MM3_PER_ML = 1000.0
