@@ -219,6 +219,23 @@ def coarse_pictures():
         yield
 
 
+@pytest.fixture
+def environment(monkeypatch):
+    """Sets variables of the environment by their names; None takes one away."""
+
+    def put(**variables: str | None) -> None:
+        for name, value in variables.items():
+            monkeypatch.delenv(name, raising=False) if value is None else monkeypatch.setenv(name, value)
+
+    return put
+
+
+@pytest.fixture
+def without(monkeypatch):
+    """Makes a library one that is not installed."""
+    return lambda name: monkeypatch.setitem(sys.modules, name, None)
+
+
 @pytest.fixture(scope="session")
 def twins():
     """The module `twins`, loaded by its path: tests are no package."""

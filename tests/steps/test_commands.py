@@ -78,12 +78,10 @@ def test_a_mesh_is_made_of_a_case_whatever_its_path_is(folder, kind):
 
 
 @pytest.mark.parametrize(("module", "name"), [("arviz_stats.base", "arviz-stats"), ("h5netcdf", "h5netcdf")])
-def test_samples_without_their_libraries_are_refused_before_anything_is_read(
-    tmp_path, monkeypatch, capfd, module, name
-):
+def test_samples_without_their_libraries_are_refused_before_anything_is_read(tmp_path, without, capfd, module, name):
     path = tmp_path / "case.toml"
     path.write_text(CASE)
-    monkeypatch.setitem(sys.modules, module, None)
+    without(module)
     with pytest.raises(ResourceError, match=rf"{name}, which is not installed: pip install 'palpate\[samples\]'"):
         palpate.estimate(palpate.read_case(path), samples=1000)
     assert main(["estimate", str(path), "--output", str(tmp_path / "out"), "--samples", "1000", "--quiet"]) == 6
