@@ -15,12 +15,10 @@ from palpate.phantoms import (
     Noise,
     PelvisOptions,
     Scene,
-    exact_target,
     pelvis,
     pelvis_anatomy,
     pelvis_grid,
     reimaged,
-    rescaled,
 )
 from palpate.study import (
     Body,
@@ -36,6 +34,7 @@ from palpate.study import (
     inversion_settings,
     make_body,
 )
+from palpate_validation.truth import exact_target, rescaled
 
 __all__ = ["NOISE", "ROWS", "Posed", "Row", "Truths", "from_voxels", "posed", "truth_of"]
 

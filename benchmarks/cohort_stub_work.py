@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from palpate.cohort.mark import held_soon, read_mark, write_mark
+from palpate.cohort.plan import held_soon, read_mark, write_mark
 from palpate.cohort.task import Outcome, Task
 from palpate.study import staged, write_json
 

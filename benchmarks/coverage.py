@@ -36,7 +36,7 @@ from palpate.images import segment
 from palpate.inversion import InverseProblem, Inversion, InversionSettings, StopRule, invert
 from palpate.mesh import LagrangeSpace
 from palpate.observation import NoiseModel, Observation, ObservedSurface, SurfaceDistance, surface_distance
-from palpate.phantoms import Scene, target_of_truth
+from palpate.phantoms import Scene
 from palpate.study import (
     Case,
     Mechanics,
@@ -52,6 +52,7 @@ from palpate.study import (
     stated_posteriors,
 )
 from palpate.uncertainty import covariance_of, gain, noise_covariance
+from palpate_validation.truth import target_of_truth
 
 Array = NDArray[np.float64]
 Result = dict[str, Any]  # a line of JSON

@@ -41,7 +41,6 @@ from palpate.phantoms import (
     BoundaryMotion,
     Ellipsoid,
     PelvisOptions,
-    ScaledMotion,
     Scene,
     SmoothField,
     SpheresOptions,
@@ -60,6 +59,7 @@ from palpate.phantoms import (
     spheres,
 )
 from palpate_validation.mismatch import patched
+from palpate_validation.truth import ScaledMotion
 
 __all__ = ["NOISES", "POINTS", "ROWS", "TRUTHS", "Points", "Row", "Skin", "measured_points", "skins_of"]
 

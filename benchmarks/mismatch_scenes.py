@@ -28,7 +28,6 @@ from palpate.phantoms import (
     AffineMotion,
     BoundaryMotion,
     PelvisOptions,
-    ScaledMotion,
     WallMotion,
     displacements,
     grid_box,
@@ -41,6 +40,7 @@ from palpate.phantoms import (
     smooth_field,
 )
 from palpate_validation.mismatch import Grown, patched, redrawn
+from palpate_validation.truth import ScaledMotion
 
 __all__ = ["KINDS", "SceneKey", "scene_folder"]
 

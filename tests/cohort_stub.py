@@ -7,7 +7,7 @@ import signal
 import time
 from pathlib import Path
 
-from palpate.cohort.mark import held_soon, read_mark, write_mark
+from palpate.cohort.plan import held_soon, read_mark, write_mark
 from palpate.cohort.task import Outcome, Task
 from palpate.errors import GeometryError
 from palpate.study.outputs import staged, write_json

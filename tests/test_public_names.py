@@ -21,9 +21,8 @@ SHAPE = re.compile(rf"\({COUNT}(?:,|(?:, {COUNT})+)\)")  # (n, 3), (n_nodes,), (
 
 def public(module: ModuleType):
     """Name and object of each public function and method that the module itself defines."""
-    for name in getattr(module, "__all__", ()):
-        thing = getattr(module, name)
-        if getattr(thing, "__module__", None) != module.__name__:
+    for name, thing in vars(module).items():
+        if name.startswith("_") or getattr(thing, "__module__", None) != module.__name__:
             continue
         if inspect.isfunction(thing):
             yield name, thing, ""
@@ -52,19 +51,19 @@ def test_the_package_offers_what_it_names():
 @pytest.mark.parametrize("name", MODULES)
 def test_a_module_sorts_its_names_and_keeps_them(name):
     module = importlib.import_module(name)
-    names = getattr(module, "__all__", [])
+    names = vars(module).get("__all__", [])
     assert module.__doc__, f"{name} has no docstring"
     assert names == sorted(names, key=lambda word: (not word.isupper(), not word[0].isupper(), word))
     assert len(names) == len(set(names))
-    for public_name in names:
+    for public_name in [*names, *dir(module)]:
         assert hasattr(module, public_name), f"{name} names {public_name}, which is not there"
 
 
 @pytest.mark.parametrize("name", MODULES)
 def test_every_public_class_and_function_says_what_it_is(name):
     module = importlib.import_module(name)
-    things = [getattr(module, public_name) for public_name in getattr(module, "__all__", ())]
-    silent = [thing for thing in things if inspect.isclass(thing) and not inspect.getdoc(thing)]
+    own = {key: thing for key, thing in vars(module).items() if getattr(thing, "__module__", None) == name}
+    silent = [key for key, thing in own.items() if inspect.isclass(thing) and key[0] != "_" and not thing.__doc__]
     silent += [label for label, function, _ in public(module) if not inspect.getdoc(function)]
     assert not silent
 

@@ -8,8 +8,6 @@ from typing import TypeVar
 
 from palpate.errors import ConfigurationError
 
-__all__ = ["brought"]
-
 T = TypeVar("T")
 
 

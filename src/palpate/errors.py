@@ -14,19 +14,6 @@ PalpateError
 
 from __future__ import annotations
 
-__all__ = [
-    "ConfigurationError",
-    "EstimationError",
-    "FolderInUse",
-    "GeometryError",
-    "InputDataError",
-    "MeshQualityError",
-    "NotConverged",
-    "PalpateError",
-    "ResourceError",
-    "SolverError",
-]
-
 
 class PalpateError(Exception):
     """Anything that Palpate refuses or fails to do; the text says what, where, with which numbers, what to do."""

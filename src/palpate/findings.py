@@ -9,20 +9,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal, cast, get_args
 
-__all__ = [
-    "CODES",
-    "HARMLESS",
-    "MISLEADING",
-    "WIDENING",
-    "Code",
-    "Finding",
-    "known_code",
-    "of_pair",
-    "one_a_cause",
-    "rank",
-    "warning_rows",
-]
-
 Misleading = Literal[
     "mirrored",
     "frame-moves",

@@ -15,7 +15,6 @@ except ImportError:  # Windows
 else:
     TOLD = True
 
-__all__ = ["available_memory", "peak_memory_gb", "total_memory"]
 
 STATED = "PALPATE_MEMORY_GB"  # in the environment: what others leave of a machine that is shared without control groups
 MACHINE = Path("/proc/meminfo")

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Literal, get_args
 
-__all__ = ["STAGES", "Forecast", "Progress", "Stage", "Told", "about", "during", "silent"]
-
 Progress = Callable[[str], None]  # is called with a sentence
 Stage = Literal["reading", "meshing", "linear law", "finite strain", "intervals", "report"]
 STAGES: tuple[Stage, ...] = get_args(Stage)

@@ -15,7 +15,7 @@ import pytest
 
 from palpate.cohort.engines.local import LocalEngine
 from palpate.cohort.engines.packing import Place, packed
-from palpate.cohort.mark import read_mark
+from palpate.cohort.plan import read_mark
 from palpate.cohort.progress import status_of
 from palpate.cohort.run import Options, run_cohort
 from palpate.cohort.supervise import Supervisor

@@ -9,13 +9,11 @@ import re
 import numpy as np
 import pytest
 
-from palpate.cohort.mark import write_mark
 from palpate.cohort.page import cohort_page
-from palpate.cohort.plan import Plan
+from palpate.cohort.plan import Plan, write_mark
 from palpate.cohort.records import Modulus, Record, records_of
 from palpate.cohort.statistics.document import statistics_document
-from palpate.cohort.statistics.models import combined, repeatability
-from palpate.cohort.statistics.scans import UNFIT, inside_fences, usable_scans
+from palpate.cohort.statistics.scans import UNFIT, combined, inside_fences, repeatability, usable_scans
 from palpate.cohort.tables import columns_of
 from palpate.cohort.task import Outcome, Row
 from palpate.findings import MISLEADING

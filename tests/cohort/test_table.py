@@ -8,10 +8,9 @@ from pathlib import Path
 import pyarrow.parquet
 import pytest
 
-from palpate.cohort.bids import read_derivatives
 from palpate.cohort.records import Modulus, Record
 from palpate.cohort.resolve import case_of, row_key
-from palpate.cohort.table import read_table
+from palpate.cohort.table import read_derivatives, read_table
 from palpate.cohort.tables import write_csv, write_parquet
 from palpate.cohort.task import Row
 from palpate.errors import ConfigurationError

@@ -12,13 +12,12 @@ import pytest
 from scipy import stats
 
 from palpate.cli import main
-from palpate.cohort.statistics.association import pearson_p, points_behind
 from palpate.errors import ConfigurationError, GeometryError, ResourceError
 from palpate.mesh.anatomy import Box
 from palpate_validation.paper.cohort import ORGANS, PatientResult
 from palpate_validation.paper.figure4 import LAW, Figure4, Point, draw_figure4
 from palpate_validation.paper.real_pelvis import grid_within
-from palpate_validation.paper.staging import Staging, draw_staging, paper_remark, with_stage
+from palpate_validation.paper.staging import Staging, draw_staging, paper_remark, pearson_p, points_behind, with_stage
 from palpate_validation.paper.table import (
     COLUMNS,
     PAPER_STAGING,

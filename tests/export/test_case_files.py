@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from palpate.export.case_files import file_name, write_estimate_files, write_mesh_files, write_simulation_files
-from palpate.export.rasterise import region_image
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.label_table import read_label_table
 from palpate.images.tissue import Role
+from palpate.mesh.locate import region_image
 from palpate.study.result import MeshResult, Simulation
 
 

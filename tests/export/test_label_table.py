@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from palpate.export.label_table import write_label_table
+from palpate.export.case_files import write_label_table
 from palpate.images.label_table import read_label_table
 from palpate.images.segmentation import first_labels
 from palpate.images.tissue import Role, Tissue, tissue_colours

@@ -7,8 +7,7 @@ import pytest
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from palpate.images.distance import DistanceMap, distance_map
-from palpate.images.isosurface import isosurface_points
+from palpate.images.distance import DistanceMap, distance_map, isosurface_points
 from palpate.images.label_image import VoxelGrid
 
 CENTRE = np.array([0.3, -0.4, 0.2])

@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from palpate.errors import InputDataError
-from palpate.images.label_table import read_label_table
+from palpate.images.label_table import read_label_table, slicer_table
 from palpate.images.named_labels import NamedLabel
-from palpate.images.readers.column_tables import slicer_table
 
 
 @pytest.mark.parametrize(

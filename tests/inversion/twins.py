@@ -29,10 +29,10 @@ from palpate.observation.observed_surface import observed_surface
 from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.observation.surface_distance import surface_distance
 from palpate.observation.target import surface_target
-from palpate.phantoms.exact_targets import exact_target, target_of_truth
 from palpate.phantoms.motion import smooth_field
 from palpate.phantoms.scene import Scene, centred_grid, imaged
 from palpate.phantoms.shapes import ball
+from palpate_validation.truth import exact_target, target_of_truth
 
 BALLS = (ball([0.0, -9.0, -4.0], 8.0), ball([0.0, -4.0, 11.0], 7.0), ball([0.0, 9.0, -2.0], 7.0))
 BOX = Box(np.full(3, -22.0), np.eye(3), np.full(3, 44.0))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.mechanics.deformation import deformation_determinants, largest_strains, volumes_after
+from palpate.mechanics.element import deformation_determinants, largest_strains, volumes_after
 from palpate.mesh.space import lagrange_space
 
 TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])  # a proper rotation

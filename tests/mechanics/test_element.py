@@ -13,9 +13,8 @@ from palpate.mechanics.element import (
     quadrature,
     reference_tensor,
     shape_derivatives,
-    shape_functions,
 )
-from palpate.mesh.space import TET_EDGES
+from palpate.mesh.space import TET_EDGES, shape_functions
 
 ORDERS = (1, 2)
 

@@ -7,14 +7,14 @@ import threading
 
 import pytest
 
-from palpate.mesh import interrupts
-from palpate.mesh.interrupts import interrupts_held
+from palpate.mesh import remeshing
+from palpate.mesh.remeshing import interrupts_held
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_waits_and_finds_the_earlier_handler(number, monkeypatch):
     monkeypatch.setattr(
-        interrupts, "_others_take_none", lambda _: True
+        remeshing, "_others_take_none", lambda _: True
     )  # other threads of the tests never take this signal
     seen = []
     earlier = signal.signal(number, lambda *_: seen.append("ours"))

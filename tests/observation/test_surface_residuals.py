@@ -10,7 +10,7 @@ import pytest
 
 from palpate.images.distance import distance_map
 from palpate.images.label_image import VoxelGrid
-from palpate.mesh.space import triangle_shape
+from palpate.mesh.space import shape_functions
 from palpate.mesh.surface import triangle_normals
 from palpate.observation.observed_surface import SUBTRIANGLES, ObservedSurface
 from palpate.observation.surface_residuals import Correspondence, correspondence, surface_residuals
@@ -246,6 +246,6 @@ def curved_volume(vertices, faces, n):
     cells = [(number[i, j], number[i + 1, j], number[i, j + 1]) for i, j in lattice if i + j < n]
     cells += [(number[i + 1, j], number[i + 1, j + 1], number[i, j + 1]) for i, j in lattice if i + j < n - 1]
     b1, b2 = np.array(lattice).T / n
-    points = np.einsum("lk,fka->fla", triangle_shape(2, np.column_stack([1.0 - b1 - b2, b1, b2])), vertices[faces])
+    points = np.einsum("lk,fka->fla", shape_functions(2, np.column_stack([1.0 - b1 - b2, b1, b2])), vertices[faces])
     pieces = points[:, np.array(cells)].reshape(-1, 3, 3)
     return volume(pieces.reshape(-1, 3), np.arange(3 * len(pieces)).reshape(-1, 3))

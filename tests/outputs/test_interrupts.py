@@ -35,7 +35,7 @@ from palpate.cli import entry, main
 from palpate.cli.outcome import Outcome
 def run(*_):
     import pathlib, signal, palpate.study.run
-    from palpate.mesh.interrupts import _others_take_none
+    from palpate.mesh.remeshing import _others_take_none
     threads = len(list(pathlib.Path("/proc/self/task").iterdir()))
     own = signal.pthread_sigmask(signal.SIG_BLOCK, ())
     return Outcome({{}}, f"{{threads > 1}} {{_others_take_none((signal.SIGINT, signal.SIGTERM))}} {{sorted(own)}}")

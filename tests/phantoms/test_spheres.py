@@ -5,7 +5,7 @@ import pytest
 
 from palpate.errors import ConfigurationError, GeometryError
 from palpate.images.tissue import Role
-from palpate.mechanics.deformation import deformation_determinants
+from palpate.mechanics.element import deformation_determinants
 from palpate.phantoms.scene import Noise, imaged
 from palpate.phantoms.spheres import SPHERES_KINDS, SpheresOptions, spheres
 

@@ -9,10 +9,10 @@ import pytest
 
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers import write_scalar_image
-from palpate.report.backgrounds import whole_box, whole_images
 from palpate.report.collect import collect
 from palpate.report.section import cut_image
 from palpate.report.slices import first_planes
+from palpate.report.volume import whole_box, whole_images
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from palpate.report.headline import headline, listed
+from palpate.report.rows import headline, listed
 
 
 def document(*verdicts, status="converged", warnings=0, minima=(0, 0)):

@@ -10,7 +10,7 @@ import zlib
 import numpy as np
 import pytest
 
-from palpate.mechanics.deformation import largest_strains
+from palpate.mechanics.element import largest_strains
 from palpate.report.collect import collect
 from palpate.report.payload import payload, script_json
 

@@ -12,7 +12,7 @@ from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.images.tissue_distance import tissue_distance_map
-from palpate.report.inputs import bone_distances
+from palpate.report.pairs import bone_distances
 from palpate.report.surfaces import carried_outline, image_surface, model_surface
 
 TURNED = np.array([[0, 1.5, 0, -5.0], [1.0, 0, 0, -5.0], [0, 0, -2.0, 50.0], [0, 0, 0, 1]])

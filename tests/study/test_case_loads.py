@@ -11,7 +11,7 @@ from palpate.errors import ConfigurationError
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers import write_label_image
 from palpate.images.segmentation import first_labels
-from palpate.mechanics.deformation import largest_strains
+from palpate.mechanics.element import largest_strains
 from palpate.study.case import CaseLoad
 from palpate.study.case_file import read_case
 from palpate.study.run import estimate, simulate

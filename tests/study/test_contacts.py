@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from palpate.errors import GeometryError, InputDataError
+from palpate.images.checks import wall_motion
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.segmentation import Segmentation, segment
 from palpate.images.tissue import Role, Tissue
-from palpate.images.wall_motion import wall_motion
 from palpate.study.contacts import contact_findings, front_findings, motion_findings, sides_findings
 from palpate.study.refusals import refuse_lost, refuse_unmeshable
 

@@ -16,7 +16,7 @@ from bodies import box_cells
 from palpate.cli import main
 from palpate.errors import ConfigurationError, GeometryError, InputDataError
 from palpate.export.fitted_model import fitted_model
-from palpate.mechanics.deformation import largest_strains
+from palpate.mechanics.element import largest_strains
 from palpate.mechanics.loads import boundary_named
 from palpate.mesh.mesh_file import plane_faces, read_mesh_file
 from palpate.mesh.tetrahedralise import boundary_of

@@ -17,8 +17,7 @@ from palpate.images.readers import write_label_image
 from palpate.inversion.estimate import REPORTED
 from palpate.mechanics.dilatation import choose_element
 from palpate.progress import silent
-from palpate.report.sensitivity_report import sensitivity_page
-from palpate.report.tornado import effect_text, sensitivity_table, tornado_rows
+from palpate.report.tornado import effect_text, sensitivity_page, sensitivity_table, tornado_rows
 from palpate.study import inverted as inverted_module
 from palpate.study import sensitivity as study
 from palpate.study.body import joint_problem, make_body

@@ -13,7 +13,7 @@ from palpate.errors import GeometryError
 from palpate.images import LabelImage
 from palpate.mesh import LagrangeSpace, LevelSet, TetMesh
 from palpate.observation import observed_surface
-from palpate.phantoms import TriangulatedDistance
+from palpate_validation.truth import TriangulatedDistance
 
 __all__ = ["Grown", "patched", "redrawn"]
 

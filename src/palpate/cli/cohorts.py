@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from palpate.cli.outcome import Outcome, columns
@@ -15,11 +15,9 @@ if TYPE_CHECKING:
     from palpate.cohort.engines.packing import Engine
     from palpate.cohort.records import Record
     from palpate.cohort.task import Row
+    from palpate.progress import Progress
     from palpate.study.outputs import OutputFolder
 
-__all__ = ["TARGETS", "cohort", "statistics", "status"]
-
-Progress = Callable[[str], None]
 
 INTERRUPTED = "the plan and the rows that are done, with which --resume goes on"
 MOST_TOLD = 20  # failed rows
@@ -84,8 +82,7 @@ def statistics(_: argparse.Namespace, case: None, outputs: OutputFolder, progres
 
 
 def _rows(arguments: argparse.Namespace) -> Sequence[Row]:
-    from palpate.cohort.bids import read_derivatives
-    from palpate.cohort.table import read_table
+    from palpate.cohort.table import read_derivatives, read_table
 
     table, template = arguments.table, arguments.template
     if table is None:

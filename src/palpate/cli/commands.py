@@ -1,30 +1,22 @@
-"""The sub-commands around an estimate: init, check, noise, voxelise, mesh, simulate."""
+"""The sub-commands around an estimate: init, check, noise, voxelise, mesh, simulate, export, view."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+import sys
+import webbrowser
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
+from palpate.cli.console import tell
 from palpate.cli.outcome import Outcome, columns, listed, warning_lines
+from palpate.errors import ConfigurationError
 
 if TYPE_CHECKING:
+    from palpate.progress import Progress
     from palpate.study.case import Case
     from palpate.study.outputs import OutputFolder
 
-__all__ = [
-    "MESH_TARGETS",
-    "SIMULATION_TARGETS",
-    "SURFACE_TARGETS",
-    "check",
-    "init",
-    "mesh",
-    "noise",
-    "simulate",
-    "voxelise",
-]
-
-Progress = Callable[[str], None]
 
 MESH_TARGETS = ("mesh.json", "mesh.vtu", "labels.csv", "labels.nii.gz")
 SURFACE_TARGETS = ("surfaces.nii.gz", "labels.json")
@@ -134,3 +126,34 @@ def simulate(arguments: argparse.Namespace, case: Case, outputs: OutputFolder, p
         save_document(staging, "simulation.json", document)
     moved = f"the largest displacement is {document['largest_displacement_mm']:.2f} mm"
     return Outcome(document, f"{moved}\n{warning_lines(document)}{listed(outputs)}")
+
+
+def export(arguments: argparse.Namespace, _: None, outputs: OutputFolder, progress: Progress) -> Outcome:
+    """Write what an estimate left for another program."""
+    from palpate.export.folder import export_into
+    from palpate.export.formats import Options
+    from palpate.export.model_file import read_model
+
+    if outputs.same_files([""], [arguments.result]):
+        raise ConfigurationError(f"{outputs.path} is the folder of the result itself: choose another --output")
+    progress("reading the result")
+    model = read_model(arguments.result)
+    progress(f"writing for {arguments.format}")
+    export_into(outputs, model, arguments.format, Options(arguments.linear, arguments.source))
+    document = {"schema": "palpate.export/1", "format": arguments.format, "files": list(outputs.written)}
+    return Outcome(document, listed(outputs))
+
+
+def view(arguments: argparse.Namespace, _: None, outputs: None, progress: Progress) -> Outcome:
+    """Show the report in a browser until an interrupt ends it."""
+    from palpate.steps.viewing import viewing
+
+    del outputs  # it writes nothing
+    found = viewing(arguments.result)
+    progress("the report is at the address below, for this machine alone; Ctrl-C ends it")
+    tell(found.report, sys.stderr)
+    if not arguments.no_browser:
+        webbrowser.open(found.report)
+    with suppress(KeyboardInterrupt):
+        found.serve()
+    return Outcome({"schema": "palpate.view/1", "url": found.url, "report": found.report}, "")

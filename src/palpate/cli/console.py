@@ -24,17 +24,6 @@ from palpate.errors import ConfigurationError, InputDataError
 from palpate.study.lock import held_folder, own_file
 from palpate.study.outputs import OutputFolder
 
-__all__ = [
-    "LOGGER",
-    "close_log",
-    "close_streams",
-    "give_up",
-    "interruptible",
-    "log_is_open",
-    "output_folder",
-    "tell",
-]
-
 LOGGER = logging.getLogger("palpate")
 LOGGER.addHandler(logging.NullHandler())  # before there is a log file, messages reach the user as sentences only
 UNLOCKED = "the file system of %s knows no locks: a second run in the folder would not be noticed, so start none there"
@@ -111,7 +100,7 @@ def interruptible(signals: Sequence[signal.Signals], mask: Iterable[int]) -> Ite
             signal.signal(number, interrupt)
         if hasattr(signal, "pthread_sigmask"):
             # The linear algebra starts its threads while the signals are blocked, and so they are for ever for these:
-            # a signal reaches the main thread, or waits where that blocks it (`mesh.interrupts`).
+            # a signal reaches the main thread, or waits where that blocks it (`mesh.remeshing`).
             import_module("scipy.linalg")
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         yield came
@@ -135,7 +124,15 @@ def _logged(path: Path, heading: str) -> Iterator[None]:
     there = path.exists()
     file = own_file(path)
     size = os.fstat(file).st_size
-    _open_log(file)
+    # send what the library logs, and warnings of others, to a copy of the open `file`
+    stream = os.fdopen(os.dup(file), "a", encoding="utf-8", errors="backslashreplace")
+    handler = _LogFile(stream)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    logging.captureWarnings(capture=True)
+    for logger in (LOGGER, logging.getLogger("py.warnings")):
+        logger.addHandler(handler)
+        logger.propagate = False
+    LOGGER.setLevel(logging.INFO)
     LOGGER.info(heading)
     try:
         with _stdout_kept_free(file):
@@ -149,18 +146,6 @@ def _logged(path: Path, heading: str) -> Iterator[None]:
         raise
     finally:
         os.close(file)
-
-
-def _open_log(file: int) -> None:
-    """Send what the library logs, and warnings of others, to a copy of the open `file`."""
-    stream = os.fdopen(os.dup(file), "a", encoding="utf-8", errors="backslashreplace")
-    handler = _LogFile(stream)
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-    logging.captureWarnings(capture=True)
-    for logger in (LOGGER, logging.getLogger("py.warnings")):
-        logger.addHandler(handler)
-        logger.propagate = False
-    LOGGER.setLevel(logging.INFO)
 
 
 def log_is_open() -> bool:

@@ -23,7 +23,6 @@ from palpate.study.outputs import OutputFolder
 if TYPE_CHECKING:
     from palpate.study.case import Case
 
-__all__ = ["run"]
 
 UNEXPECTED = 1
 INTERRUPTED = 130  # as a shell has it

@@ -14,8 +14,6 @@ from palpate.images.named_labels import printable
 if TYPE_CHECKING:
     from palpate.study.outputs import OutputFolder
 
-__all__ = ["Outcome", "columns", "estimates_table", "listed", "printable_lines", "warning_lines"]
-
 
 GAP = "  "  # between columns
 MOST_LETTERS, LEAST_LETTERS = 100, 20  # of a line in a terminal; of a column that is broken

@@ -12,14 +12,13 @@ from pathlib import Path
 from types import FunctionType
 from typing import Any, NoReturn
 
-from palpate.cli import cohorts, commands, exports, written
+from palpate.cli import cohorts, commands, written
 from palpate.cli.outcome import Outcome
 from palpate.entry_points import brought
 from palpate.errors import ConfigurationError
 from palpate.export.formats import FORMATS
+from palpate.study.outputs import PAGE, RESULT
 from palpate.study.schema import nearest, shown
-
-__all__ = ["make_parser", "version"]
 
 CASE_HELP = "the case: images, tissues, roles"
 EXAMPLES = {
@@ -127,7 +126,8 @@ def make_parser() -> argparse.ArgumentParser:
     _add_results(subparsers)
     _add_cohort(subparsers)
     try:
-        _add_brought(subparsers)
+        for add in brought("palpate.commands", FunctionType, taken=EXAMPLES).values():
+            add(partial(_command, subparsers))
     except ConfigurationError as error:
         parser.error(str(error))
     return parser
@@ -212,9 +212,9 @@ def _add_results(subparsers: Any) -> None:
     what = "draw report.html of an estimate again"
     report = _command(subparsers, "report", written.report, what=what, folder=None)
     report.add_argument("output", type=Path, metavar="DIR", help="the output folder of an estimate")
-    report.set_defaults(makes_folder=False, targets=(written.DOCUMENT, written.PAGE))
+    report.set_defaults(makes_folder=False, targets=(RESULT, PAGE))
     what = "write an estimate for another program: simulators, viewers, hospital systems"
-    export = _command(subparsers, "export", exports.export, what=what, folder="palpate-export")
+    export = _command(subparsers, "export", commands.export, what=what, folder="palpate-export")
     export.add_argument("result", type=Path, metavar="DIR", help="the output folder of an estimate")
     formats = "; ".join(f"{name}: {form.description}" for name, form in FORMATS.items())
     export.add_argument("--format", required=True, choices=tuple(FORMATS), help=formats)
@@ -222,7 +222,7 @@ def _add_results(subparsers: Any) -> None:
     export.add_argument("--source", type=Path, metavar="SERIES", help="dicom: the first image's DICOM series")
     export.set_defaults(logs=False)  # which would hold the command with its paths
     what = "show the report of an estimate and its files in a browser, on this machine alone"
-    view = _command(subparsers, "view", exports.view, what=what, folder=None)
+    view = _command(subparsers, "view", commands.view, what=what, folder=None)
     view.add_argument("result", type=Path, metavar="DIR", help="the output folder of an estimate")
     view.add_argument("--no-browser", action="store_true", help="print the address, open nothing")
 
@@ -258,12 +258,6 @@ def _add_cohort(subparsers: Any) -> None:
     statistics = _command(subparsers, "statistics", cohorts.statistics, what=what, folder=None)
     statistics.add_argument("output", type=Path, metavar="DIR", help="the output folder of a cohort")
     statistics.set_defaults(makes_folder=False, targets=cohorts.TARGETS)
-
-
-def _add_brought(subparsers: Any) -> None:
-    """What other packages bring: each entry point of `palpate.commands` adds one by what it is given, `_command`."""
-    for add in brought("palpate.commands", FunctionType, taken=EXAMPLES).values():
-        add(partial(_command, subparsers))
 
 
 def _add_case(command: argparse.ArgumentParser) -> None:

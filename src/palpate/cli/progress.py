@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from rich.live import Live
     from rich.table import Table
 
-__all__ = ["PATIENCE_S", "Bar", "Place", "place", "progress_on_stderr"]
 
 TRUST = 0.1  # of the predicted time: how much of it must be over before its own pace outweighs the prediction
 STEADY = 0.75  # of a stage: beyond, its share creeps, as nobody knows how much longer it takes

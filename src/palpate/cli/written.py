@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from palpate.cli.outcome import Outcome, columns, estimates_table, listed, warning_lines
 from palpate.errors import ConfigurationError, EstimationError
+from palpate.study.outputs import ASIDE, DATA, PAGE, RESULT, RESULT_FILES
 
 if TYPE_CHECKING:
+    from palpate.progress import Progress
     from palpate.study.case import Case
     from palpate.study.outputs import OutputFolder
     from palpate.study.result import CaseResult
 
-__all__ = ["DOCUMENT", "PAGE", "SENSITIVITY_TARGETS", "TARGETS", "demo", "estimate", "report", "sensitivity"]
 
-Progress = Callable[[str], None]
-
-DOCUMENT, PAGE, DATA = "result.json", "report.html", "report-data.npz"
-ASIDE = tuple(f"{name}.earlier" for name in (PAGE, DATA))
+SET_ASIDE = tuple(f"{name}{ASIDE}" for name in (PAGE, DATA))
 SENSITIVITY_TARGETS = ("sensitivity.json", "sensitivity.html")
-LABELS = ("labels.csv", "labels.nii.gz")
-NUMBERS = ("mesh.vtu", "model.npz", "posterior.nc", "stiffness.nii.gz", "stiffness_sd.nii.gz")
-TARGETS = (DOCUMENT, PAGE, DATA, *ASIDE, *NUMBERS, *LABELS, "case.toml")
+TARGETS = (RESULT, *RESULT_FILES, *SET_ASIDE, "case.toml")
 
 
 def estimate(arguments: argparse.Namespace, case: Case | None, outputs: OutputFolder, progress: Progress) -> Outcome:
@@ -31,8 +26,8 @@ def estimate(arguments: argparse.Namespace, case: Case | None, outputs: OutputFo
     from palpate.steps import commands
     from palpate.steps.previewing import PREVIEW, write_page
     from palpate.steps.saving import save_failure
-    from palpate.study.case_as_run import refuse_other_case
     from palpate.study.case_file import read_case
+    from palpate.study.earlier import refuse_other_case
     from palpate.study.new_case import write_new_case
 
     if case is not None and arguments.labels is not None:
@@ -65,9 +60,7 @@ def demo(_: argparse.Namespace, case: None, outputs: OutputFolder, progress: Pro
     return _write_estimate(run_demo(outputs.path, progress), outputs, progress)
 
 
-def sensitivity(
-    arguments: argparse.Namespace, case: Case, outputs: OutputFolder, progress: Callable[[str], None]
-) -> Outcome:
+def sensitivity(arguments: argparse.Namespace, case: Case, outputs: OutputFolder, progress: Progress) -> Outcome:
     """How each modulus depends on what it rests on, the largest effect first."""
     from palpate.report.tornado import sensitivity_table
     from palpate.steps.saving import save_sensitivity

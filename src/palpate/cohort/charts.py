@@ -9,11 +9,8 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from palpate.report.svg import INK, draw_svg, link_url
-
-__all__ = ["MOST_IN_FOREST", "boxes_svg", "forest_svg", "scatter_svg"]
+from palpate.report.svg import INK, draw_svg, link_url, mark_decades
 
 SIZE = (4.4, 3.0)
 PLACE = (0.15, 0.2, 0.82, 0.74)
@@ -138,9 +135,7 @@ def forest_svg(patients: Patients, tissue: str, unit: str, *, name: str, pages: 
             range(len(own)), [f"{p['patient'][:24]}{stage}" for p, stage in zip(own, stages, strict=True)], fontsize=7.5
         )
         axes.set_ylim(len(own) - 0.5, -0.5)
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-        axes.xaxis.set_minor_formatter(NullFormatter())
+        mark_decades(axes.xaxis)
         axes.set_xlabel(_axis(unit))
 
     says = f"{tissue}: each patient's {_axis(unit)} with its 95 % interval, by stage"
@@ -184,6 +179,4 @@ def _axis(unit: str) -> str:
 def _label(axes: Axes, unit: str) -> None:
     axes.set_xlabel("stage")
     axes.set_ylabel(_axis(unit))
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-    axes.yaxis.set_minor_formatter(NullFormatter())
+    mark_decades(axes.yaxis)

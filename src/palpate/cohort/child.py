@@ -23,8 +23,6 @@ from palpate.cohort.task import Outcome, Task
 from palpate.memory import peak_memory_gb
 from palpate.study.lock import own_file
 
-__all__ = ["main"]
-
 try:
     import resource
 except ImportError:  # Windows

@@ -8,14 +8,11 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import jinja2
 from markupsafe import Markup
 
 from palpate.cohort.charts import boxes_svg, forest_svg, scatter_svg
 from palpate.cohort.records import Record
-from palpate.report.rows import interval_text, number
-
-__all__ = ["cohort_page"]
+from palpate.report.svg import template_of
 
 LOGGER = logging.getLogger(__name__)
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
@@ -36,14 +33,15 @@ def cohort_page(records: Sequence[Record], document: Mapping[str, Any], *, creat
 
     document: statistics.json; created: when the run began.
     """
-    loader = jinja2.ChoiceLoader([jinja2.PackageLoader("palpate.cohort"), jinja2.PackageLoader("palpate.report")])
-    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
-    environment.filters["number"] = number
-    environment.filters["interval"] = lambda ends: interval_text(None if ends is None else tuple(ends))
-    pages = _pages(records)
+    # address of the report of each patient's first row that has one, and what a link to it says
+    pages = dict[str, tuple[str, str]]()
+    for record in records:
+        if record.page:
+            says = f"report of {record.row.id}, patient {record.row.patient}"
+            pages.setdefault(record.row.patient, (record.page, says))
     charts = {tissue: _charts(document, tissue, place, pages) for place, tissue in enumerate(document["organs"])}
     shown = [record for record in records if record.state == "failed"] + [r for r in records if r.state != "failed"]
-    page: str = environment.get_template("cohort.html").render(
+    page: str = template_of("cohort.html", "palpate.cohort").render(
         records=shown[:MOST_ROWS],
         left_out=len(shown[MOST_ROWS:]),
         document=document,
@@ -53,16 +51,6 @@ def cohort_page(records: Sequence[Record], document: Mapping[str, Any], *, creat
         policy=POLICY,
     )
     return page
-
-
-def _pages(records: Sequence[Record]) -> dict[str, tuple[str, str]]:
-    """Address of the report of each patient's first row that has one, and what a link to it says."""
-    found = dict[str, tuple[str, str]]()
-    for record in records:
-        if record.page:
-            says = f"report of {record.row.id}, patient {record.row.patient}"
-            found.setdefault(record.row.patient, (record.page, says))
-    return found
 
 
 def _charts(

@@ -13,8 +13,6 @@ from palpate.cohort.task import Outcome
 from palpate.progress import about
 from palpate.study.lock import is_held
 
-__all__ = ["Status", "Tally", "status_of"]
-
 
 @dataclass(frozen=True, slots=True)
 class Status:

@@ -9,15 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from palpate.cohort.mark import document_of
-from palpate.cohort.plan import CASES, Plan
+from palpate.cohort.plan import CASES, Plan, document_of
 from palpate.cohort.task import Outcome, Row
 from palpate.inversion import KNOWN_MODULUS
 from palpate.parallel import mapped
 from palpate.uncertainty import NORMAL_95
-
-__all__ = ["Modulus", "Record", "records_of", "tissues_of"]
-
 
 NEARLY = 0.95  # of that: a profile that comes so far has reached the end
 NOT_IMAGES = ("names", "mesh")  # inputs that two patients may well share
@@ -93,7 +89,21 @@ def _record(plan: Plan, folder: Path, marks: Sequence[Outcome | None], number: i
         return Record(row, "waiting")
     moduli = tuple(_modulus(item) for item in document["estimates"] if item["parameter"] == "youngs_modulus")
     codes = tuple(dict.fromkeys(warning["code"] for warning in document.get("warnings", ())))
-    return Record(row, "done", "", mark.message, moduli, *took, codes, _images(document.get("inputs", {})))
+    inputs = document.get("inputs", {})
+    return Record(
+        row,
+        "done",
+        "",
+        mark.message,
+        moduli,
+        *took,
+        codes,
+        {
+            key: found["sha256"]
+            for key, found in inputs.items()
+            if key not in NOT_IMAGES and f"{key}.voxels" not in inputs
+        },
+    )
 
 
 def _modulus(item: Mapping[str, Any]) -> Modulus:
@@ -119,10 +129,3 @@ def _ends_of_profile(profile: Sequence[Sequence[float]]) -> tuple[End, End]:
         value, root = min(reached, key=lambda point: abs(point[1] - NORMAL_95), default=(centre, 0.0))
         ends.append(centre * math.exp(math.log(value / centre) * NORMAL_95 / root) if reached else None)
     return ends[0], ends[1]
-
-
-def _images(inputs: Mapping[str, Mapping[str, str]]) -> dict[str, str]:
-    """Digests of a result's images; of one that lies beside its header, that of its voxels alone."""
-    return {
-        key: found["sha256"] for key, found in inputs.items() if key not in NOT_IMAGES and f"{key}.voxels" not in inputs
-    }

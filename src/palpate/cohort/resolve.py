@@ -16,8 +16,6 @@ from palpate.study.case import Case
 from palpate.study.case_file import case_tables, read_case
 from palpate.study.provenance import file_digest, software_versions
 
-__all__ = ["case_of", "row_key"]
-
 KEPT_IMAGES = ("names", "align")  # what a template's [images] says of all rows; its images are another body's
 NOT_NUMERICAL = ("python", "matplotlib", "pydicom", "highdicom")  # versions that do not touch a number
 HEADERS = (".mhd", ".nhdr", ".dcm", ".ima", "")  # files that are read together with others of their folder

@@ -11,9 +11,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from palpate.cohort.engines.packing import Engine
-from palpate.cohort.mark import MARK, held_soon
 from palpate.cohort.page import cohort_page
-from palpate.cohort.plan import CASES, PLAN, Plan, make_plan, write_plan
+from palpate.cohort.plan import CASES, MARK, PLAN, Plan, held_soon, make_plan, write_plan
 from palpate.cohort.progress import Tally
 from palpate.cohort.records import Record, records_of
 from palpate.cohort.statistics.document import statistics_document
@@ -23,8 +22,6 @@ from palpate.errors import ConfigurationError, FolderInUse, PalpateError
 from palpate.progress import Progress
 from palpate.study.outputs import STAGING, make_folder, staged, write_json, write_text
 from palpate.study.provenance import software_versions
-
-__all__ = ["STATISTICS", "Options", "close_cohort", "run_cohort"]
 
 LOGGER = logging.getLogger(__name__)
 STATISTICS, PAGE = "statistics.json", "cohort.html"

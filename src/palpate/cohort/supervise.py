@@ -16,13 +16,9 @@ from typing import Any, BinaryIO, cast
 
 from palpate.cohort.task import Outcome, Task
 from palpate.errors import ResourceError
-
-__all__ = ["ESTIMATE", "Supervisor"]
+from palpate.parallel import environment_of_child, name_of_end
 
 ESTIMATE = "palpate.cohort.work:estimate_row"
-# One thread for each row: several would sum in another order, and the numbers would tell in their last digits how many
-# workers there were, and where.
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 LOOK_S = 0.1  # how often memory is looked at
 START_S = 600.0  # for the process to import what it needs
 BEFORE_PREDICTION_S = 3600.0  # for the images, each of which has limits of its own
@@ -46,9 +42,10 @@ class Supervisor:
 
         Raises `ResourceError` where no process can be started.
         """
-        places = os.pathsep.join(str(Path(place).resolve()) for place in sys.path if place)
-        environment = {**os.environ, **dict.fromkeys(THREADS, "1"), "PYTHONPATH": places}
         command = [sys.executable, "-P", "-W", "ignore", "-m", "palpate.cohort.child", self.work]
+        # On one thread: several would sum in another order, and the numbers would tell in their last digits how many
+        # workers there were, and where.
+        environment = environment_of_child()
         try:
             process = subprocess.Popen(  # noqa: S603 - our own interpreter and module, no shell
                 command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, process_group=0
@@ -174,7 +171,7 @@ class _Watch:
             text = f"the system ended it at {self.peak_gb:.1f} GB of memory, most likely for want of more"
             return Outcome.failed(task, "resources", text, cause="memory")
         code = self.ended or 0
-        name = {-int(number): number.name for number in signal.Signals}.get(code, f"exit code {code}")
+        name = name_of_end(code)
         if code in (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGHUP, -signal.SIGINT):
             return Outcome.failed(task, "lost", f"something ended the process that computed it ({name})", cause="lost")
         return Outcome.failed(task, "crash", f"the process that computed it crashed ({name}); its log.txt may tell why")

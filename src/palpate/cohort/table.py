@@ -1,4 +1,4 @@
-"""The table of a cohort: its columns, and what each line says."""
+"""The rows of a cohort: from the lines of a table, or from a folder of BIDS derivatives."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import io
 import os
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from palpate.cohort.tables import COLUMNS
@@ -16,8 +17,6 @@ from palpate.images.input_file import read_input
 from palpate.images.named_labels import MAX_NAME, computed_by_spreadsheets
 from palpate.study.schema import nearest, shortened
 
-__all__ = ["checked_rows", "read_table", "row_of", "separated_cells"]
-
 LARGEST_FILE = 2**26  # bytes
 MOST_ROWS = 100_000
 MOST_COLUMNS = 500
@@ -26,6 +25,7 @@ IDENTIFIER = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 STAGE = re.compile(r"[0-9]{1,4}")
 LATER = ";"  # between several later images in one cell
+IMAGES, TABLE, PARTICIPANTS = "*_dseg.nii.gz", "dseg.tsv", "participants.tsv"
 
 
 def read_table(path: Path, template: Path | None) -> tuple[Row, ...]:
@@ -50,7 +50,14 @@ def separated_cells(path: Path, *, delimiter: str) -> list[dict[str, str]]:
     if not lines:
         raise ConfigurationError(f"{path} is empty: its first line must name the columns: {', '.join(KNOWN)}")
     names = [name.strip() for name in lines[0]]
-    _check_names(names, path)
+    twice = sorted({name for name in names if names.count(name) > 1}) if len(names) <= MOST_COLUMNS else ["..."]
+    if twice:
+        raise ConfigurationError(f"{path} has {len(names)} columns, of them '{shortened(twice[0])}' twice; rename one")
+    for name in set(names) - set(KNOWN):
+        if not name or not name.isprintable() or len(name) > MAX_NAME or computed_by_spreadsheets(name):
+            raise ConfigurationError(f"{path}: '{shortened(name)}' cannot be the name of a column; give it another")
+        if name in COLUMNS:
+            raise ConfigurationError(f"{path}: the column '{name}' is one of the outcome's; rename it")
     complete = "id" in names and {"case", "before"} & set(names) and ("before" in names) == ("after" in names)
     if delimiter == "," and not complete:
         missing = next(name for name in ("id", "before", "after") if name not in names)
@@ -102,17 +109,6 @@ def _text(path: Path) -> str:
     return text
 
 
-def _check_names(names: Sequence[str], path: Path) -> None:
-    twice = sorted({name for name in names if names.count(name) > 1}) if len(names) <= MOST_COLUMNS else ["..."]
-    if twice:
-        raise ConfigurationError(f"{path} has {len(names)} columns, of them '{shortened(twice[0])}' twice; rename one")
-    for name in set(names) - set(KNOWN):
-        if not name or not name.isprintable() or len(name) > MAX_NAME or computed_by_spreadsheets(name):
-            raise ConfigurationError(f"{path}: '{shortened(name)}' cannot be the name of a column; give it another")
-        if name in COLUMNS:
-            raise ConfigurationError(f"{path}: the column '{name}' is one of the outcome's; rename it")
-
-
 def row_of(cells: Mapping[str, str], folder: Path, template: Path | None) -> Row:
     """The row that a line's cells (column -> text) make; paths are relative to `folder`."""
     case, before, after = (cells.get(name, "") for name in ("case", "before", "after"))
@@ -143,3 +139,63 @@ def row_of(cells: Mapping[str, str], folder: Path, template: Path | None) -> Row
 
 def _place(text: str, folder: Path) -> str:
     return str(folder / os.path.expanduser(text)) if text else ""  # noqa: PTH111 - as the paths of a case are read
+
+
+def read_derivatives(folder: Path, template: Path | None, *, reference: str | None = None) -> tuple[Row, ...]:
+    """A row for each session of each patient but the reference, whose image is the rest state of them all.
+
+    reference: "ses-X" or "X"; None: each patient's first session, numbers in their order. Labels are named by the
+    dseg.tsv beside the image or above it; stage and covariates come from participants.tsv, where it has them. Raises
+    `ConfigurationError` where there is no patient with two sessions, or the template is missing.
+    """
+    if template is None:
+        raise ConfigurationError(f"{folder} is a folder of images: --template case.toml must say who is who in them")
+    people: dict[str, dict[str, str]] = {}  # patient -> the columns of participants.tsv; "n/a" is nothing
+    if (folder / PARTICIPANTS).is_file():
+        for cells in separated_cells(folder / PARTICIPANTS, delimiter="\t"):
+            plain = {name: "" if text == "n/a" else text for name, text in cells.items()}
+            people[plain.pop("participant_id", "")] = plain
+    rows: list[Row] = []
+    for patient in _sorted(folder, "sub-*"):
+        sessions = [path for path in _sorted(patient, "ses-*") if any(path.rglob(IMAGES))]
+        rest = sessions[:1] if reference is None else [path for path in sessions if path.name == _session(reference)]
+        later = [session for session in sessions if rest and session != rest[0]]
+        rows += [_row(rest[0], session, folder, template, people.get(patient.name, {})) for session in later]
+    if not rows:
+        wanted = "two sessions (sub-*/ses-*/*_dseg.nii.gz)"
+        raise ConfigurationError(
+            f"{folder} has no patient with {wanted}{f', one of them {_session(reference)}' if reference else ''}"
+        )
+    return checked_rows(rows, folder)
+
+
+def _row(rest: Path, session: Path, root: Path, template: Path, person: Mapping[str, str]) -> Row:
+    cells = {
+        **{name: text for name, text in person.items() if name not in ("id", "patient", "session", "names", "case")},
+        "id": f"{session.parent.name}_{session.name}",
+        "patient": session.parent.name,
+        "session": session.name,
+    }
+    found = [sorted(path.rglob(IMAGES)) for path in (rest, session)]
+    images = {"before": str(found[0][0].absolute()), "after": str(found[1][0].absolute())}
+    row = row_of(cells | images, root, template)
+    if any(len(paths) > 1 for paths in found):
+        return replace(row, problem=f"{rest.name} or {session.name} has several images {IMAGES}; leave one in each")
+    image = found[0][0]  # whose label table has its own name, or is dseg.tsv in its folder or one above
+    own = image.with_name(image.name.removesuffix(".nii.gz") + ".tsv")
+    above = [folder / TABLE for folder in image.parents if folder == root or root in folder.parents]
+    return replace(row, names=str(next((path.absolute() for path in (own, *above) if path.is_file()), "")))
+
+
+def _sorted(folder: Path, pattern: str) -> list[Path]:
+    """Folders of a pattern, numbers in their names in their order."""
+
+    def order(path: Path) -> list[tuple[int, str]]:
+        """Text and numbers in turn."""
+        return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]{1,9})", path.name)]
+
+    return sorted((path for path in folder.glob(pattern) if path.is_dir()), key=order)
+
+
+def _session(name: str) -> str:
+    return name if name.startswith("ses-") else f"ses-{name}"

@@ -17,8 +17,6 @@ from palpate.errors import ResourceError
 from palpate.images.named_labels import computed_by_spreadsheets, printable
 from palpate.study.outputs import write_text
 
-__all__ = ["COLUMNS", "CSV", "PARQUET", "columns_of", "require_tables", "write_csv", "write_parquet"]
-
 CSV, PARQUET = "cohort.csv", "cohort.parquet"
 COLUMNS = ("id", "patient", "session", "stage", "state", "failure_class", "message")
 UNITS = {"kPa": "kpa", "ratio": "ratio"}

@@ -16,8 +16,6 @@ from palpate.errors import (
     ResourceError,
 )
 
-__all__ = ["FAILURE_CLASSES", "Limits", "Outcome", "Row", "Task", "failure_class_of"]
-
 CLASS_OF_EXIT_CODE = {
     ConfigurationError.exit_code: "usage",
     InputDataError.exit_code: "input",

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from palpate.cohort.mark import held_soon, read_mark, write_mark
+from palpate.cohort.plan import held_soon, read_mark, write_mark
 from palpate.cohort.resolve import case_of, row_key
 from palpate.cohort.task import Outcome, Task, failure_class_of
 from palpate.errors import EstimationError, InputDataError, PalpateError
@@ -17,13 +17,11 @@ from palpate.memory import peak_memory_gb
 from palpate.steps.saving import save_estimate, save_failure
 from palpate.study import run
 from palpate.study.case import Case
-from palpate.study.case_as_run import refuse_other_case
 from palpate.study.cost import ExpectedCost
+from palpate.study.earlier import refuse_other_case
 from palpate.study.edge_length import edge_length_of
 from palpate.study.outputs import OutputFolder
 from palpate.study.read import read_states
-
-__all__ = ["RoomError", "Tell", "estimate_row"]
 
 LOGGER = logging.getLogger(__name__)
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 from palpate.images import Role, Tissue
+from palpate.progress import Progress
 from palpate.study import CaseResult, estimate, read_case
 
 __all__ = ["DATA", "FILLING_MM", "LAW", "TISSUES", "TRUTH_EDGE_MM", "run_demo"]
@@ -33,7 +33,7 @@ NOTE = (
 )
 
 
-def run_demo(output: Path, progress: Callable[[str], None]) -> CaseResult:
+def run_demo(output: Path, progress: Progress) -> CaseResult:
     """Estimate prostate and bladder of the simulated pelvis and set the truth beside them.
 
     `output` is where the caller writes the result; the images come with the package.

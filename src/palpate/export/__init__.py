@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import sys
-from importlib import import_module
 from types import ModuleType
+
+from palpate.front_door import front_door
 
 TYPE_CHECKING = False  # the module typing takes longer to import than all that is needed here
 if TYPE_CHECKING:
     from pathlib import Path
     from typing import Any
 
-    from palpate.export.fitted_model import fitted_bodies
-    from palpate.export.groups import material_parts
-
-__all__ = ["fitted_bodies", "material_parts"]
-
-_HOMES = {"fitted_bodies": "palpate.export.fitted_model", "material_parts": "palpate.export.groups"}
+    from palpate.export.fitted_model import fitted_bodies as fitted_bodies
+    from palpate.export.groups import material_parts as material_parts
 
 
 class _Callable(ModuleType):
@@ -29,11 +26,7 @@ class _Callable(ModuleType):
         return export(*arguments, **options)
 
 
-def __getattr__(name: str) -> Any:
-    """Import a name when it is first used."""
-    if name not in _HOMES:
-        raise AttributeError(f"module 'palpate.export' has no attribute '{name}'")
-    return getattr(import_module(_HOMES[name]), name)
+__getattr__, __dir__ = front_door(__name__)
 
 
 sys.modules[__name__].__class__ = _Callable

@@ -22,9 +22,10 @@ from palpate.export.groups import (
     face_groups,
     material_parts,
     plain_names,
+    rows,
     tissue_groups,
+    wrapped,
 )
-from palpate.export.text_lines import rows, wrapped
 from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
 from palpate.mechanics.laws.neo_hookean import NeoHookean
@@ -32,8 +33,6 @@ from palpate.mechanics.loads import FollowingPressure, Load
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.case_loads import loads_on
 from palpate.study.outputs import write_text
-
-__all__ = ["write"]
 
 FACE = np.array([3, 4, 2, 1])  # Abaqus' number of each row of FACES
 LAWS = (Linear, NeoHookean, MooneyRivlin)  # that it has

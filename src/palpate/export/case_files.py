@@ -10,26 +10,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.export.fitted_model import fitted_model
-from palpate.export.label_table import write_label_table
 from palpate.export.model_file import MODEL, write_model
 from palpate.export.netcdf import write_posterior
-from palpate.export.rasterise import tetrahedron_image
 from palpate.export.vtk_xml import write_pvd, write_vtp, write_vtu
 from palpate.images.label_image import LabelImage
+from palpate.images.label_table import slicer_table
+from palpate.images.named_labels import NamedLabel
 from palpate.images.readers import write_label_image, write_scalar_image
 from palpate.images.segmentation import Segmentation, first_labels
-from palpate.mechanics.deformation import largest_strains
+from palpate.images.tissue import Tissue, tissue_colours
+from palpate.mechanics.element import largest_strains
+from palpate.mesh.locate import tetrahedron_image
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.surface import tissue_surface
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.study.earlier import seal_of
-from palpate.study.outputs import make_folder
+from palpate.study.outputs import make_folder, write_text
 from palpate.study.result import CaseResult, MeshResult, Simulation
 from palpate.study.samples import POSTERIOR
 
-__all__ = ["file_name", "write_estimate_files", "write_mesh_files", "write_simulation_files"]
-
 MOST_BYTES = 60  # of a tissue's name in a file's: file systems count bytes, not letters
+
+
+def write_label_table(path: Path, tissues: tuple[Tissue, ...]) -> Path:
+    """Write number, name and colour of each tissue, but for the background's, as 3D Slicer's CSV.
+
+    Returns the path; raises `ResourceError` when the disk refuses.
+    """
+    described = zip(first_labels(tissues), tissues, tissue_colours(tissues), strict=True)
+    rows = [NamedLabel(int(number), tissue.name, colour) for number, tissue, colour in described if number]
+    write_text(path, slicer_table(sorted(rows, key=lambda row: row.label)))
+    return path
 
 
 def write_estimate_files(result: CaseResult, folder: Path) -> tuple[Path, ...]:

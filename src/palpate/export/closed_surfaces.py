@@ -15,13 +15,11 @@ from numpy.typing import NDArray
 from palpate.export.case_files import file_name
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.formats import Options
-from palpate.export.text_lines import rows
+from palpate.export.groups import rows
 from palpate.images.tissue import Role
 from palpate.mesh.surface import tissue_surface, triangle_normals
 from palpate.observation.observed_surface import SUBTRIANGLES
 from palpate.study.outputs import write_bytes
-
-__all__ = ["ClosedSurface", "closed_surfaces", "write_obj", "write_ply", "write_stl"]
 
 HEADING = b"SPACE=RAS; lengths in mm"
 FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])  # of PLY

@@ -14,8 +14,6 @@ from palpate.mechanics.boundary import outer_constraint
 from palpate.mesh.space import LagrangeSpace
 from palpate.observation.prescribed_motion import prescribed_motion
 
-__all__ = ["Prescribed", "prescribed"]
-
 IN_FRAME = 1e-6  # by which a held direction may lie off an axis: the image's faces are planes along its own axes
 
 

@@ -12,13 +12,11 @@ import numpy as np
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.formats import Options
 from palpate.export.groups import face_groups
-from palpate.export.samples import moduli_samples
+from palpate.export.netcdf import moduli_samples
 from palpate.images.segmentation import first_labels
-from palpate.mechanics.deformation import volumes_after
+from palpate.mechanics.element import volumes_after
 from palpate.mesh.surface import triangle_normals
 from palpate.study.outputs import write_text
-
-__all__ = ["write"]
 
 TISSUES = (
     "tissue",

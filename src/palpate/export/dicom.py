@@ -18,17 +18,16 @@ from numpy.typing import NDArray
 from palpate.errors import InputDataError, ResourceError
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.formats import Options
-from palpate.export.rasterise import region_image
 from palpate.images.input_file import read_input
 from palpate.images.segmentation import first_labels
 from palpate.images.tissue import tissue_colours
+from palpate.mesh.locate import region_image
 from palpate.study.outputs import write_bytes
 from palpate.study.provenance import software_versions
 
 if TYPE_CHECKING:
     from pydicom.dataset import Dataset
 
-__all__ = ["write"]
 
 LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 MOST_SLICES = 5000
@@ -217,17 +216,13 @@ def _series(folder: Path, body: FittedBody) -> list[Dataset]:
         raise InputDataError(
             f"{folder} holds the slices of {len(series)} series; put those of the one that was segmented there"
         )
-    _refuse_elsewhere(found, folder, body)
-    return found
-
-
-def _refuse_elsewhere(slices: list[Dataset], folder: Path, body: FittedBody) -> None:
-    """Raise `InputDataError` where the middle of the first image does not lie within the series."""
-    across, down = np.array(slices[0].ImageOrientationPatient, dtype=float).reshape(2, 3)
+    # raise `InputDataError` where the middle of the first image does not lie within the series
+    across, down = np.array(found[0].ImageOrientationPatient, dtype=float).reshape(2, 3)
     axes = np.stack([across, down, np.cross(across, down)])
-    places = np.array([head.ImagePositionPatient for head in slices], dtype=float) @ axes.T
-    rows, columns = (float(spacing) for spacing in slices[0].PixelSpacing)
-    size = np.array([columns * slices[0].Columns, rows * slices[0].Rows, 0.0])
+    places = np.array([head.ImagePositionPatient for head in found], dtype=float) @ axes.T
+    rows, columns = (float(spacing) for spacing in found[0].PixelSpacing)
+    size = np.array([columns * found[0].Columns, rows * found[0].Rows, 0.0])
     middle = LPS[:3, :3] @ body.grid.world(0.5 * (np.array(body.grid.shape) - 1.0)[None])[0] @ axes.T
     if not ((places.min(axis=0) <= middle) & (middle <= places.max(axis=0) + size)).all():
         raise InputDataError(f"the series in {folder} does not lie where the first image of the result does")
+    return found

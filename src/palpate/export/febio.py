@@ -27,8 +27,6 @@ from palpate.mesh.space import LagrangeSpace
 from palpate.study.case_loads import loads_on
 from palpate.study.outputs import write_bytes
 
-__all__ = ["write"]
-
 Element = ET.Element
 AXES = "xyz"
 LAWS = (Linear, NeoHookean, MooneyRivlin)  # that it has

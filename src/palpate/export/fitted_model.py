@@ -22,8 +22,6 @@ from palpate.study.estimation import ModulusEstimate
 from palpate.study.result import CaseResult, PairResult
 from palpate.study.samples import ModulusSamples
 
-__all__ = ["FittedBody", "FittedModel", "fitted_bodies", "fitted_model"]
-
 HIGHEST_RATIO = 0.4999  # Poisson's, that a case may have
 
 

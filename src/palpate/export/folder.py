@@ -14,8 +14,6 @@ from palpate.study.lock import held_folder
 from palpate.study.outputs import OutputFolder, make_folder
 from palpate.study.result import CaseResult
 
-__all__ = ["export", "export_into"]
-
 PathLike = str | os.PathLike[str]
 
 

@@ -13,8 +13,6 @@ if TYPE_CHECKING:  # the command line names the formats before numpy is loaded
 
     from palpate.export.fitted_model import FittedBody, FittedModel
 
-__all__ = ["FORMATS", "Format", "Options", "Write", "format_named"]
-
 
 @dataclass(frozen=True, slots=True)
 class Options:
@@ -58,7 +56,7 @@ FORMATS = {
     "gmsh": Format("gmsh", "gmsh 4.1 with physical groups, .msh"),
     "netcdf": Format("netcdf", "posterior samples for ArviZ and xarray, .nc", every_pair=False),
     "obj": Format("closed_surfaces", "Wavefront surfaces before and after, .obj", function="write_obj"),
-    "paraview": Format("paraview", "a ParaView script with its data, .py"),
+    "paraview": Format("vtu", "a ParaView script with its data, .py", function="write_paraview"),
     "ply": Format("closed_surfaces", "polygon surfaces before and after, .ply", function="write_ply"),
     "slicer": Format("slicer", "a 3D Slicer script with its data, .py"),
     "sofa": Format("sofa", "a SOFA scene with its mesh, .py"),

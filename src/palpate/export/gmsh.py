@@ -12,12 +12,9 @@ from numpy.typing import NDArray
 
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.formats import Options
-from palpate.export.groups import element_faces, face_groups, tissue_groups
-from palpate.export.text_lines import rows
+from palpate.export.groups import element_faces, face_groups, rows, tissue_groups
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.outputs import write_text
-
-__all__ = ["write"]
 
 TETRAHEDRON, TRIANGLE = {1: 4, 2: 11}, {1: 2, 2: 9}  # gmsh's element types by order
 EDGES = np.array([0, 1, 2, 3, 4, 5, 6, 7, 9, 8])  # gmsh has the last two edges the other way round

@@ -1,9 +1,10 @@
-"""The named parts of a fitted body that every simulator's file has: tissues, walls, the cut of the image."""
+"""What every simulator's file has: the named parts of a fitted body, and rows of numbers as lines of text."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,19 +13,22 @@ from palpate.images.tissue import Role
 from palpate.mesh.surface import tissue_surface
 from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh
 
-__all__ = [
-    "OFF",
-    "FaceGroup",
-    "MaterialPart",
-    "element_faces",
-    "face_groups",
-    "material_parts",
-    "plain_names",
-    "tissue_groups",
-]
-
 STEP = 0.05  # of ln E, between the materials of a tissue that is not homogeneous
 OFF = float(np.expm1(0.5 * STEP))  # of a modulus, that an element has less or more than its material, at the most
+
+
+def rows(pattern: str, *columns: NDArray[Any]) -> str:
+    """A line a row of `columns`, each (n,) or (n, k), by a `%` pattern with a place for each number."""
+    parts = [column[:, None] if column.ndim == 1 else column for column in columns]
+    cells = [list(map(tuple, part.tolist())) for part in parts]
+    return "".join(f"{pattern % sum(row, ())}\n" for row in zip(*cells, strict=True))
+
+
+def wrapped(numbers: NDArray[np.int64], *, width: int = 12) -> str:
+    """Numbers (n,) with commas between them, `width` on a line."""
+    return "".join(
+        ", ".join(map(str, numbers[start : start + width].tolist())) + "\n" for start in range(0, len(numbers), width)
+    )
 
 
 @dataclass(frozen=True, slots=True)

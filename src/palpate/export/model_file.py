@@ -8,11 +8,9 @@ from palpate.errors import EstimationError, InputDataError
 from palpate.export.fitted_model import FittedModel
 from palpate.images.named_labels import printable
 from palpate.study.archive import read_archive, write_archive
-from palpate.study.earlier import RESULT, seal_of
-from palpate.study.outputs import read_json, sha256_of
+from palpate.study.earlier import seal_of
+from palpate.study.outputs import RESULT, read_json, sha256_of
 from palpate.study.result import SCHEMA
-
-__all__ = ["MODEL", "read_model", "write_model"]
 
 MODEL = "model.npz"
 FORMAT = "palpate.model/1"

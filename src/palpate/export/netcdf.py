@@ -1,9 +1,10 @@
-"""NetCDF 4: the moduli's posterior samples in the groups that ArviZ and xarray know (dims chain, draw, tissue)."""
+"""Samples of the moduli's posterior, and NetCDF 4 in the groups of ArviZ and xarray (dims chain, draw, tissue)."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Iterator
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 
@@ -13,13 +14,46 @@ from numpy.typing import NDArray
 from palpate.errors import ResourceError
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.formats import Options
-from palpate.export.samples import moduli_samples
 from palpate.study.outputs import write_bytes
-from palpate.study.samples import POSTERIOR
+from palpate.study.samples import CHAINS, POSTERIOR
 
-__all__ = ["write", "write_posterior"]
-
+DRAWS = 1000
+SEED = 0
+LINEARISED = "linearised: independent draws, log-normal about the estimate"
+SAMPLED = "sampled: Markov chains around the estimate, stretched to the covariance of its interval"
 PROBABILITY = 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """moduli (chains, draws, n) of n `tissues` in the model's unit; kind: what they are, in words.
+
+    log_density (chains, draws): of their logarithms; of chains, of all unknowns and but for a constant.
+    """
+
+    tissues: tuple[str, ...]
+    moduli: NDArray[np.float64]
+    log_density: NDArray[np.float64]
+    kind: str
+
+
+def moduli_samples(model: FittedModel) -> Samples:
+    """The model's own chains; without any, draws with ln E normal about the estimates under their covariance.
+
+    The latter are independent, in chains for programs that compare chains.
+    """
+    if model.samples is not None:
+        found = model.samples
+        return Samples(found.tissues, found.moduli, found.log_density, SAMPLED)
+    centre = np.log([item.value if model.unit == "kPa" else item.ratio for item in model.estimates])  # type: ignore
+    n = len(centre)
+    normal = np.random.default_rng(SEED).standard_normal((CHAINS, DRAWS, n))
+    values, vectors = np.linalg.eigh(model.covariance)
+    spread = np.sqrt(np.maximum(values, 0.0))
+    logarithms = centre + (normal * spread) @ vectors.T
+    scale = float(np.log(spread[spread > 0.0]).sum()) + 0.5 * n * np.log(2.0 * np.pi)
+    density = -0.5 * (normal**2).sum(axis=2) - scale
+    return Samples(tuple(item.tissue for item in model.estimates), np.exp(logarithms), density, LINEARISED)
 
 
 def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:

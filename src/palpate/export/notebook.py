@@ -10,13 +10,11 @@ from typing import Any
 import numpy as np
 
 from palpate.errors import ResourceError
-from palpate.export.rasterise import region_image
 from palpate.images.label_image import LabelImage
 from palpate.images.readers import write_label_image, write_scalar_image
 from palpate.images.tissue import Role, tissue_colours
+from palpate.mesh.locate import region_image
 from palpate.study.result import CaseResult
-
-__all__ = ["notebook_viewer"]
 
 
 def notebook_viewer(result: CaseResult, *, background: Path | None = None, opacity: float = 0.6) -> Any:

@@ -7,18 +7,16 @@ from pathlib import Path
 import numpy as np
 
 from palpate.export import warp
+from palpate.export.case_files import write_label_table
 from palpate.export.closed_surfaces import closed_surfaces, write_ply
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.formats import Options
-from palpate.export.label_table import write_label_table
-from palpate.export.rasterise import region_image
 from palpate.images.label_image import LabelImage
 from palpate.images.readers import write_label_image, write_scalar_image
 from palpate.images.segmentation import first_labels
 from palpate.images.tissue import tissue_colours
+from palpate.mesh.locate import region_image
 from palpate.study.outputs import write_json, write_text
-
-__all__ = ["write"]
 
 SCRIPT = '''"""Load what Palpate exported into 3D Slicer: paste into its Python console
 

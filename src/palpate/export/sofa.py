@@ -21,8 +21,6 @@ from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
 from palpate.mechanics.laws.neo_hookean import NeoHookean
 from palpate.study.outputs import write_bytes, write_json, write_text
 
-__all__ = ["write"]
-
 SCENE = '''"""A body that Palpate fitted, as a SOFA scene: runSofa -l SofaPython3 scene.py
 
 Millimetres and kPa (or ratios, as "units" in model.json says); RAS coordinates. Beside it: model.npz (arrays) and

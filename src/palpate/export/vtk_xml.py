@@ -21,8 +21,6 @@ from palpate.errors import InputDataError
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.outputs import write_bytes
 
-__all__ = ["write_pvd", "write_vtp", "write_vtu"]
-
 Arrays = Mapping[str, NDArray[Any]]
 
 VTK_TETRA = {1: 10, 2: 24}  # linear and quadratic tetrahedron; VTK numbers the edges as TET_EDGES does

@@ -17,15 +17,13 @@ from scipy import ndimage
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.formats import Options
 from palpate.export.groups import element_faces
-from palpate.export.rasterise import tetrahedron_image
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers import write_displacement_field
-from palpate.mechanics.element import barycentric_gradients, shape_functions
-from palpate.mesh.space import LagrangeSpace
+from palpate.mechanics.element import barycentric_gradients
+from palpate.mesh.locate import tetrahedron_image
+from palpate.mesh.space import LagrangeSpace, shape_functions
 from palpate.mesh.surface import tissue_surface
 from palpate.study.outputs import write_json
-
-__all__ = ["field_on_grid", "write"]
 
 FINEST_MM = 1.0  # of the field's grid: the motion is smooth, and images of CT would make gigabytes
 SWEEPS = 15  # of the averaging that fills what is not meshed, on each level

@@ -9,8 +9,6 @@ from scipy import ndimage
 from palpate.errors import InputDataError
 from palpate.images.label_image import VoxelGrid
 
-__all__ = ["outside_body", "shows_air"]
-
 AIR_HU = -400.0  # half way from air to fat and muscle
 CERTAINLY_AIR_HU = -500.0  # which a CT of a body has and an MR image has not
 COARSE_MM = 2.0  # voxels are left out so that those that are looked at are about as large

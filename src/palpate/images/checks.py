@@ -15,20 +15,8 @@ from palpate.findings import Finding
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
-from palpate.images.wall_motion import STILL_VOXELS, wall_motion
 
-__all__ = [
-    "SMALL_VOXELS",
-    "VOLUME_CHANGE",
-    "VOLUME_IMPLAUSIBLE",
-    "check_headers",
-    "check_images",
-    "check_pair",
-    "check_segmentation",
-    "later_names",
-    "share_inside",
-]
-
+STILL_VOXELS = 0.15  # mean motion of a surface, in voxels, that the voxels' own rounding makes
 OBSERVED = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
 VOLUME_CHANGE = 0.05  # no modulus explains a filling between the scans
 VOLUME_IMPLAUSIBLE = 0.30  # of an organ: no deformation, and hardly a filling, changes so much
@@ -47,6 +35,31 @@ VOID_STILL = 2.0  # times the motion that the voxels' own rounding makes
 DIRECTIONS = ("left-right", "front-back", "head-foot")
 SAME_SPACING, NEARLY_SAME_SPACING = 5e-4, 0.02  # relative: rounding in a header, and what no other protocol explains
 HALF_VOXEL = 0.02  # voxels, by which an offset is half of one
+
+
+def wall_motion(before: Segmentation, after: Segmentation, tissue: int) -> float:
+    """Mean normal motion of a tissue's surface, mm: the volume that it gains and loses, by its area.
+
+    The area is that of the voxels' faces times 2/3, its mean over all directions of a plane (Cauchy).
+    """
+    lost = _outside(before, after, tissue) * before.grid.voxel_volume
+    gained = _outside(after, before, tissue) * after.grid.voxel_volume
+    faces = 0.0
+    spacing = before.grid.spacing
+    mask = before.mask(tissue)
+    for axis in range(3):
+        faces += np.count_nonzero(np.diff(mask, axis=axis)) * float(np.prod(spacing) / spacing[axis])
+    return float((lost + gained) / max(2.0 / 3.0 * faces, 1e-9))
+
+
+def _outside(one: Segmentation, other: Segmentation, tissue: int) -> int:
+    """Number of the tissue's voxels in one image that are not its own in the other, within that one's field of view."""
+    count = 0
+    for voxels in one.voxels(tissue):
+        index = np.rint(other.grid.index(one.grid.world(voxels.astype(float)))).astype(np.int64)
+        inside = ((index >= 0) & (index < other.grid.shape)).all(axis=1)
+        count += int(np.count_nonzero(other.index[tuple(index[inside].T)] != tissue))
+    return count
 
 
 def check_images(before: Segmentation, after: Sequence[Segmentation]) -> tuple[Finding, ...]:

@@ -10,8 +10,6 @@ import stat
 from pathlib import Path
 from typing import Any
 
-__all__ = ["InputFile", "open_input", "read_input"]
-
 CHUNK = 2**20  # bytes
 NO_WAIT = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)  # a pipe that nobody writes to does not hold us
 FLAGS = os.O_RDONLY | NO_WAIT | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)

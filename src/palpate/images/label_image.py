@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from palpate.errors import InputDataError
 from palpate.findings import Finding
 
-__all__ = ["LPS_TO_RAS", "LabelImage", "VoxelGrid", "corners_apart"]
-
 LPS_TO_RAS = np.array([-1.0, -1.0, 1.0])  # signs of x, y and z, and back
 NARROW = (np.uint8, np.uint16)  # an image of a whole body has half a billion voxels
 

@@ -9,17 +9,6 @@ from pathlib import Path
 
 from palpate.errors import InputDataError
 
-__all__ = [
-    "MAX_LABEL",
-    "MAX_NAME",
-    "LabelTable",
-    "NamedLabel",
-    "checked_table",
-    "computed_by_spreadsheets",
-    "hex_colour",
-    "printable",
-]
-
 MAX_LABEL = 65535
 MAX_NAME = 200
 FORMULA = ("=", "+", "-", "@")  # a spreadsheet would compute a cell that begins so

@@ -14,9 +14,6 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.surface_alignment import residuals_by_tissue
 from palpate.images.tissue import Role, Tissue
 
-__all__ = ["ON", "Registration", "length_text", "registration"]
-
-
 LEAST_MM = 0.01  # no image shows less
 ROUNDING = 1e-3  # mm, degrees: of a motion that a solver finds where there is none
 ON = {"rigid-tissues": "the rigid tissues", "surfaces": "all surfaces that both images show"}

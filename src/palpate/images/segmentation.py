@@ -14,8 +14,6 @@ from palpate.findings import Finding
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.tissue import Role, Tissue
 
-__all__ = ["Segmentation", "first_labels", "segment"]
-
 
 @dataclass(frozen=True, slots=True)
 class Segmentation:

@@ -20,8 +20,6 @@ from palpate.images.tissue import Role
 from palpate.images.tissue_distance import tissue_distance_map
 from palpate.parallel import mapped
 
-__all__ = ["align_surfaces", "residuals_by_tissue", "shown_tissues"]
-
 SMOOTHER = 2.0  # times the usual smoothing: it takes the stairs of the voxels, and does the same to both images
 MOST_POINTS = 400  # of one surface: those between them say the same
 LEAST_POINTS = 30

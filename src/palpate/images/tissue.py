@@ -9,8 +9,6 @@ from enum import StrEnum
 
 from palpate.errors import ConfigurationError
 
-__all__ = ["FieldPrior", "Role", "Tissue", "tissue_colours"]
-
 # They stay apart on black, on white and for the colour-blind; after Okabe & Ito, "Color Universal Design" (2008).
 ORGANS = ("#e69f00", "#56b4e9", "#cc79a7", "#2ba888", "#d55e00", "#8f8ff0", "#c5b800")
 KNOWN = ("#6d7278", "#85786c", "#6c8075", "#7b6f85")

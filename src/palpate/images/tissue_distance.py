@@ -11,8 +11,6 @@ from palpate.images.distance import DistanceMap, distance_map
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 
-__all__ = ["REACH_MM", "cropped", "tissue_distance_map", "window_around", "window_of"]
-
 REACH_MM = 25.0  # organs that move further are not found again
 
 

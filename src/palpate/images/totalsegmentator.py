@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-__all__ = ["CLASSES"]
-
 
 def _sides(names: str, sides: tuple[str, str] = ("left", "right")) -> list[str]:
     return [f"{name}_{side}" for name in names.split() for side in sides]

@@ -1,63 +1,37 @@
 """Elastic equilibrium: stiffness, boundary conditions, linear solvers, forward models and their derivatives."""
 
-from palpate.mechanics.boundary import outer_constraint
-from palpate.mechanics.conditions import Conditions
-from palpate.mechanics.dilatation import ELEMENTS, Dilatation, ElementChoice, choose_element
-from palpate.mechanics.element import (
-    barycentric_gradients,
-    quadrature,
-    shape_derivatives,
-    shape_functions,
-    triangle_quadrature,
-)
-from palpate.mechanics.equilibrium import ACCURACY, equilibrium
-from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_model
-from palpate.mechanics.forward import ForwardModel
-from palpate.mechanics.laws.contract import Law, stress
-from palpate.mechanics.laws.registry import LAWS, law_named
-from palpate.mechanics.linear_model import LinearModel, LinearSystem, linear_model, weighted_sum
-from palpate.mechanics.linearised import LinearisedSystem
-from palpate.mechanics.loads import DeadLoad, boundary_named, gravity, pressure, traction
-from palpate.mechanics.newton import NewtonSettings
-from palpate.mechanics.solvers.contract import Hints
-from palpate.mechanics.solvers.registry import SOLVERS, expected_of_size, factorise
-from palpate.mechanics.stiffness import lame_parameters
-
-__all__ = [
-    "ACCURACY",
-    "ELEMENTS",
-    "LAWS",
-    "SOLVERS",
-    "Conditions",
-    "DeadLoad",
-    "Dilatation",
-    "ElementChoice",
-    "FiniteStrainModel",
-    "ForwardModel",
-    "Hints",
-    "Law",
-    "LinearModel",
-    "LinearSystem",
-    "LinearisedSystem",
-    "NewtonSettings",
-    "barycentric_gradients",
-    "boundary_named",
-    "choose_element",
-    "equilibrium",
-    "expected_of_size",
-    "factorise",
-    "finite_strain_model",
-    "gravity",
-    "lame_parameters",
-    "law_named",
-    "linear_model",
-    "outer_constraint",
-    "pressure",
-    "quadrature",
-    "shape_derivatives",
-    "shape_functions",
-    "stress",
-    "traction",
-    "triangle_quadrature",
-    "weighted_sum",
-]
+from palpate.mechanics.boundary import outer_constraint as outer_constraint
+from palpate.mechanics.conditions import Conditions as Conditions
+from palpate.mechanics.dilatation import ELEMENTS as ELEMENTS
+from palpate.mechanics.dilatation import Dilatation as Dilatation
+from palpate.mechanics.dilatation import ElementChoice as ElementChoice
+from palpate.mechanics.dilatation import choose_element as choose_element
+from palpate.mechanics.element import barycentric_gradients as barycentric_gradients
+from palpate.mechanics.element import quadrature as quadrature
+from palpate.mechanics.element import shape_derivatives as shape_derivatives
+from palpate.mechanics.element import triangle_quadrature as triangle_quadrature
+from palpate.mechanics.equilibrium import ACCURACY as ACCURACY
+from palpate.mechanics.equilibrium import equilibrium as equilibrium
+from palpate.mechanics.finite_strain import FiniteStrainModel as FiniteStrainModel
+from palpate.mechanics.finite_strain import finite_strain_model as finite_strain_model
+from palpate.mechanics.forward import ForwardModel as ForwardModel
+from palpate.mechanics.laws.contract import Law as Law
+from palpate.mechanics.laws.contract import stress as stress
+from palpate.mechanics.laws.registry import LAWS as LAWS
+from palpate.mechanics.laws.registry import law_named as law_named
+from palpate.mechanics.linear_model import LinearModel as LinearModel
+from palpate.mechanics.linear_model import LinearSystem as LinearSystem
+from palpate.mechanics.linear_model import linear_model as linear_model
+from palpate.mechanics.linear_model import weighted_sum as weighted_sum
+from palpate.mechanics.linearised import LinearisedSystem as LinearisedSystem
+from palpate.mechanics.loads import DeadLoad as DeadLoad
+from palpate.mechanics.loads import boundary_named as boundary_named
+from palpate.mechanics.loads import gravity as gravity
+from palpate.mechanics.loads import pressure as pressure
+from palpate.mechanics.loads import traction as traction
+from palpate.mechanics.newton import NewtonSettings as NewtonSettings
+from palpate.mechanics.solvers.contract import Hints as Hints
+from palpate.mechanics.solvers.registry import SOLVERS as SOLVERS
+from palpate.mechanics.solvers.registry import expected_of_size as expected_of_size
+from palpate.mechanics.solvers.registry import factorise as factorise
+from palpate.mechanics.stiffness import lame_parameters as lame_parameters

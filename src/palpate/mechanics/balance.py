@@ -17,8 +17,6 @@ from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mechanics.solvers.registry import factorise
 from palpate.mesh.space import LagrangeSpace
 
-__all__ = ["TissueBalance"]
-
 Array = NDArray[np.float64]
 
 

@@ -13,8 +13,6 @@ from palpate.mesh.constraint import Constraint
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.surface import cut_faces, triangle_normals
 
-__all__ = ["outer_constraint"]
-
 OUTER_KINDS = ("moving", "fixed", "sliding", "free")
 SAME_PLANE = 0.07  # share of the normals' second moment: faces at less than 30 deg are of one smooth surface
 

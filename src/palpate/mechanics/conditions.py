@@ -12,8 +12,6 @@ from palpate.mechanics.loads import Load
 from palpate.mesh.constraint import Constraint
 from palpate.mesh.space import LagrangeSpace
 
-__all__ = ["Conditions"]
-
 
 @dataclass(frozen=True, slots=True)
 class Conditions:

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from palpate.mechanics.first_order import FirstOrderModel, expanded
 from palpate.mechanics.forward import DenseEquilibrium, Equilibrium, ForwardModel
 
-__all__ = ["CurvedModel"]
-
 
 @dataclass(frozen=True, slots=True)
 class CurvedModel:

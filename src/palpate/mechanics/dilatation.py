@@ -15,8 +15,6 @@ from enum import StrEnum
 
 from palpate.errors import ConfigurationError
 
-__all__ = ["Dilatation", "ElementChoice", "choose_element", "pointwise_lame", "pointwise_lame_slope"]
-
 BLEND = 3.0  # c: where lambda = c mu (nu = 0.375) half of it acts at the points; docs/mechanics.md has the trials
 
 

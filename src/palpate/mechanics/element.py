@@ -1,4 +1,4 @@
-"""Linear and quadratic reference tetrahedra: quadrature, shape functions and their derivatives.
+"""Linear and quadratic tetrahedra: quadrature, derivatives of shape functions, and how a displacement deforms them.
 
 Everything is written in barycentric coordinates (lambda_0, ..., lambda_3) of a straight-sided tetrahedron.
 Zienkiewicz & Taylor, The Finite Element Method, vol. 1, 5th ed., section 8.8.2.
@@ -10,18 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import roots_jacobi
 
-from palpate.mesh.space import TET_EDGES, TRIANGLE_EDGES
+from palpate.mesh.space import TET_EDGES, TRIANGLE_EDGES, LagrangeSpace
 
-__all__ = [
-    "barycentric_gradients",
-    "mean_reference_tensor",
-    "quadrature",
-    "reference_tensor",
-    "shape_derivatives",
-    "shape_functions",
-    "triangle_quadrature",
-    "triangle_slopes",
-]
+CENTRE = np.full((1, 4), 0.25)
 
 
 def quadrature(degree: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -43,18 +34,6 @@ def quadrature(degree: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     first, second, third = x, (1.0 - x) * y, (1.0 - x) * (1.0 - y) * z
     points = np.stack([1.0 - first - second - third, first, second, third], axis=-1)
     return np.asarray(points.reshape(-1, 4)), np.asarray(weights.ravel())
-
-
-def shape_functions(order: int, barycentric: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shape functions (n_q, 4 or 10), dimensionless, at `barycentric` (n_q, 4) places.
-
-    P1: lambda_a; P2: lambda_a (2 lambda_a - 1) at the corners, 4 lambda_a lambda_b on the edges of TET_EDGES.
-    """
-    if order == 1:
-        return barycentric
-    corners = barycentric * (2.0 * barycentric - 1.0)
-    edges = 4.0 * barycentric[:, TET_EDGES[:, 0]] * barycentric[:, TET_EDGES[:, 1]]
-    return np.concatenate([corners, edges], axis=1)
 
 
 def shape_derivatives(order: int, barycentric: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -121,3 +100,39 @@ def triangle_slopes(order: int, barycentric: NDArray[np.float64]) -> NDArray[np.
     edges = np.einsum("qe,ed->qed", barycentric[:, first], by_place[second])
     edges += np.einsum("qe,ed->qed", barycentric[:, second], by_place[first])
     return np.concatenate([corners, 4.0 * edges], axis=1)
+
+
+def deformation_determinants(space: LagrangeSpace, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Determinant (n_tets, 5) of F = I + grad u at corners and centres of the tetrahedra.
+
+    displacement (n_points, 3) mm. Positive at all of them: no element is turned inside out.
+    """
+    return np.asarray(np.linalg.det(_gradients(space, displacement, np.vstack([np.eye(4), CENTRE]))))
+
+
+def largest_strains(space: LagrangeSpace, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Largest absolute principal Green-Lagrange strain (n_tets,), dimensionless, at the tetrahedra's centres.
+
+    displacement (n_points, 3) mm. E = (F^T F - I) / 2 with F = I + grad u: no rotation counts as strain (Bonet & Wood,
+    Nonlinear Continuum Mechanics, 2nd ed. 2008, section 4.5). NaN where a displacement is not finite.
+    """
+    deformation = _gradients(space, displacement, CENTRE)[:, 0]
+    strains = 0.5 * (np.swapaxes(deformation, 1, 2) @ deformation - np.eye(3))
+    finite = np.isfinite(strains.sum(axis=(1, 2)))
+    principal = np.linalg.eigvalsh(np.where(finite[:, None, None], strains, 0.0))
+    return np.where(finite, np.abs(principal).max(axis=1), np.nan)
+
+
+def volumes_after(space: LagrangeSpace, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Volumes (n_tets,) mm^3 of the tetrahedra moved by (n_points, 3) mm: the integral of det F, exact."""
+    points, weights = quadrature(3 * (space.order - 1))
+    return np.asarray(space.mesh.volumes * (np.linalg.det(_gradients(space, displacement, points)) @ weights))
+
+
+def _gradients(
+    space: LagrangeSpace, displacement: NDArray[np.float64], places: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """F = I + grad u (n_tets, n_places, 3, 3), dimensionless, at barycentric places (n_places, 4)."""
+    gradients, _ = barycentric_gradients(space.mesh.nodes, space.mesh.tets)
+    by_barycentric = np.einsum("qak,nai->nqik", shape_derivatives(space.order, places), displacement[space.cells])
+    return np.asarray(np.eye(3) + by_barycentric @ gradients[:, None])

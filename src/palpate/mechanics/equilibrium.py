@@ -16,8 +16,6 @@ from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.constraint import Constraint
 from palpate.mesh.space import LagrangeSpace
 
-__all__ = ["ACCURACY", "equilibrium", "from_linear", "from_start"]
-
 ACCURACY = 1e-7  # of the forces: the displacement's error is some nanometres
 
 

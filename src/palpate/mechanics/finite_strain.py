@@ -30,8 +30,6 @@ from palpate.mechanics.stiffness import lame_parts, lame_parts_by_poisson
 from palpate.mesh.constraint import Constraint
 from palpate.mesh.space import LagrangeSpace
 
-__all__ = ["FiniteStrainEquilibrium", "FiniteStrainModel", "finite_strain_model"]
-
 Array = NDArray[np.float64]
 
 FACTORISATION_IN_SOLVES = 30  # right-hand sides that cost as much as a factorisation

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from palpate.mechanics.forward import DenseEquilibrium, Equilibrium, checked_coefficients, checked_moduli
 
-__all__ = ["FirstOrderEquilibrium", "FirstOrderModel", "expanded"]
-
 
 @dataclass(frozen=True, slots=True)
 class FirstOrderModel:

@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from palpate.errors import ConfigurationError
 
-__all__ = ["DenseEquilibrium", "Equilibrium", "ForwardModel", "SolveCounts", "checked_coefficients", "checked_moduli"]
-
 
 @dataclass(frozen=True, slots=True)
 class SolveCounts:

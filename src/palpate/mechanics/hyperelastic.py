@@ -21,8 +21,6 @@ from palpate.mechanics.stiffness import checked_gradients
 from palpate.mesh.space import LagrangeSpace
 from palpate.parallel import mapped
 
-__all__ = ["Elements", "Moduli", "elements_of"]
-
 Array = NDArray[np.float64]
 
 CHUNK = 2048  # elements at once: some 15 MB of tangents at their quadrature points

@@ -34,15 +34,6 @@ from palpate.mesh.constraint import Constraint
 from palpate.mesh.space import LagrangeSpace
 from palpate.parallel import mapped
 
-__all__ = [
-    "LinearEquilibrium",
-    "LinearModel",
-    "LinearSystem",
-    "linear_model",
-    "poisson_tangents",
-    "weighted_sum",
-]
-
 LINEAR = Linear()
 OF_ERROR = 1e-4  # relative residual of the solution that an error is made of
 AT_ONCE = 64  # right-hand sides, where few of the answers are kept

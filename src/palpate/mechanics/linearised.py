@@ -13,8 +13,6 @@ from palpate.errors import SolverError
 from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
 from palpate.mechanics.solvers.contract import Factorisation
 
-__all__ = ["TIGHT", "LinearisedSystem", "symmetric_part"]
-
 TIGHT = 1e-12  # of the residual, relative
 ACCEPTED = 1e-9  # where rounding stops it
 MAX_ITERATIONS = 100

@@ -15,11 +15,9 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from palpate.errors import ConfigurationError
-from palpate.mechanics.element import quadrature, shape_functions, triangle_quadrature, triangle_slopes
-from palpate.mesh.space import LagrangeSpace, triangle_shape
+from palpate.mechanics.element import quadrature, triangle_quadrature, triangle_slopes
+from palpate.mesh.space import LagrangeSpace, shape_functions
 from palpate.mesh.tet_mesh import OUTER, TetMesh
-
-__all__ = ["DeadLoad", "FollowingPressure", "Load", "boundary_named", "gravity", "pressure", "traction"]
 
 Array = NDArray[np.float64]
 
@@ -165,7 +163,7 @@ def boundary_named(mesh: TetMesh, name: str) -> NDArray[np.int64]:
 def _face_rule(order: int) -> tuple[Array, Array, Array]:
     """Shape functions (n_q, n_a), their slopes (n_q, n_a, 2) along xi and eta, weights (n_q,) that sum to 1/2."""
     points, weights = triangle_quadrature(2 if order == 1 else 4)
-    return triangle_shape(order, points), triangle_slopes(order, points), 0.5 * weights
+    return shape_functions(order, points), triangle_slopes(order, points), 0.5 * weights
 
 
 def _summed(cells: NDArray[np.int64], nodal: Array, n_points: int) -> Array:

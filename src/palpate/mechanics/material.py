@@ -13,8 +13,6 @@ from palpate.mechanics.hyperelastic import Elements, Moduli
 from palpate.mesh.gaussian_process import karhunen_loeve, matern
 from palpate.mesh.tet_mesh import TetMesh
 
-__all__ = ["HOMOGENEOUS", "MaterialModes", "field_modes", "material_forces", "material_modes"]
-
 SHARE, SHARE_OF_MAP = 0.95, 0.9995  # of the variance of a tissue's ln E that its modes hold, and of one that is mapped
 MOST, MOST_OF_MAP = 120, 400  # modes of a tissue, and of one that is mapped
 

@@ -34,8 +34,6 @@ from palpate.mechanics.pattern import Stiffness
 from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
 from palpate.mechanics.solvers.contract import Factorisation
 
-__all__ = ["Balance", "NewtonPath", "NewtonSettings", "follow"]
-
 Array = NDArray[np.float64]
 
 KEPT_VOLUME = 0.1  # of the smallest J before: no step of a line search goes below

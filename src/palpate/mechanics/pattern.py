@@ -11,8 +11,6 @@ from scipy import sparse
 
 from palpate.mesh.constraint import Constraint
 
-__all__ = ["BlockPattern", "Restriction", "Stiffness", "block_pattern", "restriction"]
-
 Stiffness: TypeAlias = "sparse.bsr_matrix[np.float64] | sparse.csr_matrix[np.float64]"  # in blocks of points, or not
 
 

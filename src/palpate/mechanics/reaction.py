@@ -16,8 +16,6 @@ from palpate.mechanics.material import HOMOGENEOUS, MaterialModes
 from palpate.mesh.constraint import Constraint
 from palpate.mesh.space import LagrangeSpace
 
-__all__ = ["SurfaceReaction", "surface_reaction"]
-
 NEWTON = 1e-3  # of a mN
 
 

@@ -15,16 +15,7 @@ from scipy import linalg, sparse
 from palpate.errors import ConfigurationError, SolverError
 from palpate.mechanics.forward import DenseEquilibrium, checked_coefficients, checked_moduli
 from palpate.mechanics.linear_model import LinearModel
-from palpate.mechanics.solvers.products import times
-
-__all__ = [
-    "Projection",
-    "ReducedEquilibrium",
-    "ReducedModel",
-    "ReducedSystem",
-    "orthonormal_basis",
-    "projection",
-]
+from palpate.mechanics.solvers.conjugate_gradients import times
 
 RANK_TOLERANCE = 1e-10  # of the largest singular value of the normalised snapshots
 WELL_CONDITIONED = 1e-12  # of the Gram matrix' largest eigenvalue: above it Cholesky's factor orthogonalises safely

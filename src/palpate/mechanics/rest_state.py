@@ -14,8 +14,6 @@ from palpate.mechanics.finite_strain import FiniteStrainModel
 from palpate.mechanics.loads import DeadLoad, Load
 from palpate.mesh.constraint import Constraint
 
-__all__ = ["unloaded_displacement"]
-
 TOLERANCE = 1e-8  # of the body's size, by which the loaded body may miss what was seen
 FORCES = 1e-10  # of the forces: to which each equilibrium is found on the way
 MOST = 60

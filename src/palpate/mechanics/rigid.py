@@ -12,8 +12,6 @@ from palpate.mechanics.solvers.contract import Coarser
 from palpate.mesh.constraint import Constraint
 from palpate.mesh.space import LagrangeSpace
 
-__all__ = ["linear_displacements", "refuse_floating", "rigid_modes"]
-
 AXES = ("x (right)", "y (anterior)", "z (superior)")
 NAMES = tuple(f"translation along {axis}" for axis in AXES) + tuple(f"rotation about {axis}" for axis in AXES)
 SUPPORTED = 1e-6  # of the motion, root mean square over the points: below, a motion moves no supported point

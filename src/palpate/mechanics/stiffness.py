@@ -12,17 +12,6 @@ from palpate.mechanics.element import barycentric_gradients, mean_reference_tens
 from palpate.mechanics.pattern import block_pattern
 from palpate.mesh.space import LagrangeSpace
 
-__all__ = [
-    "checked_gradients",
-    "lame_by_poisson",
-    "lame_parameters",
-    "lame_parts",
-    "lame_parts_by_poisson",
-    "stiffness_by_poisson",
-    "stiffness_parts",
-    "tissue_stiffness",
-]
-
 CHUNK = 4096  # elements at once: some 30 MB of P2 blocks
 
 

@@ -18,8 +18,6 @@ from palpate.images.tissue import Role, Tissue
 from palpate.images.tissue_distance import cropped, window_around
 from palpate.parallel import mapped
 
-__all__ = ["Anatomy", "Box", "LevelSet", "anatomy_of", "domain_box", "margin_box", "volume_preserving"]
-
 ON_FACE_MM = 1e-4  # rounding in the coordinates of nodes on the faces of a box
 HELD_SMOOTHING = 2.0  # bones and air are not observed to hundredths of a millimetre; their roughness costs elements
 MOST_SHIFT = 0.5  # of the smoothing width

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from palpate.mesh.anatomy import Anatomy, Box, LevelSet
 
-__all__ = ["closed"]
-
 STEEPNESS = 3.0  # how much faster than the gap a closed surface approaches: makes it cross the other, not graze it
 PARALLEL, CROSSING = np.cos(np.radians([20.0, 45.0]))  # surfaces at less than 20 degrees are closed, over 45 are not
 

@@ -8,8 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-__all__ = ["Constraint"]
-
 
 @dataclass(frozen=True, slots=True)
 class Constraint:

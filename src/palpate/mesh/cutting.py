@@ -13,8 +13,6 @@ from palpate.mesh.anatomy import Box, LevelSet
 from palpate.mesh.space import TET_EDGES
 from palpate.mesh.tet_mesh import FACES
 
-__all__ = ["Grid", "cut", "edge_lengths", "face_pieces", "graded_grid", "signed_volumes", "within_faces"]
-
 MAX_ROUNDS = 60
 CUBE_PATHS = np.array([[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]])
 

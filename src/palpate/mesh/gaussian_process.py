@@ -8,8 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-__all__ = ["RANK_TOLERANCE", "gaussian", "karhunen_loeve", "kernel_factor", "matern"]
-
 RANK_TOLERANCE = 1e-12
 Kernel = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 RANK = 400  # of a factor whose leading modes are sought, at the most

@@ -13,8 +13,6 @@ from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.surface import tissue_surface
 from palpate.mesh.tet_mesh import TetMesh
 
-__all__ = ["Layer", "layer_thickness_mm", "layered_space", "layers_round_organs"]
-
 
 @dataclass(frozen=True, slots=True)
 class Layer:

@@ -1,4 +1,4 @@
-"""Where points lie in a mesh: the tetrahedron of each, and the values of a displacement there."""
+"""Where points lie in a mesh: the tetrahedron of each, that of each voxel, and the values of a displacement there."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial import cKDTree
 
-from palpate.mesh.space import TET_EDGES, LagrangeSpace
+from palpate.images.label_image import VoxelGrid
+from palpate.mesh.space import LagrangeSpace, shape_functions
 from palpate.mesh.tet_mesh import TetMesh
-
-__all__ = ["Places", "located", "point_interpolation"]
+from palpate.parallel import mapped
 
 CANDIDATES = (8, 48, 240)  # tetrahedra that are tried, the ones with the nearest centroids first
 AT_ONCE = 200_000  # pairs of a point and a tetrahedron
 ON_A_FACE = 1e-9  # in barycentric coordinates
+VOXELS_AT_ONCE = 1_000_000  # voxel centres tested at once by a thread, which bounds the memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,10 +63,40 @@ def located(mesh: TetMesh, points: NDArray[np.float64]) -> Places:
 def point_interpolation(space: LagrangeSpace, places: Places) -> sparse.csr_matrix[np.float64]:
     """Matrix (n, n_points), dimensionless, of the values at places inside the mesh of a field with values at points."""
     b, cells = places.barycentric, space.cells[places.tet]
-    weights = b
-    if space.order == 2:
-        edges = 4.0 * b[:, TET_EDGES[:, 0]] * b[:, TET_EDGES[:, 1]]
-        weights = np.concatenate([b * (2.0 * b - 1.0), edges], axis=1)
+    weights = shape_functions(space.order, b)
     rows = np.repeat(np.arange(len(cells)), cells.shape[1])
     shape = (len(cells), len(space.points))
     return sparse.csr_matrix((weights.ravel(), (rows, cells.ravel())), shape=shape)
+
+
+def region_image(mesh: TetMesh, grid: VoxelGrid) -> NDArray[np.int16]:
+    """Region (n_x, n_y, n_z) of the tetrahedron at each voxel centre of `grid`: index into `mesh.tissues`; -1: none."""
+    return np.append(mesh.region, -1).astype(np.int16)[tetrahedron_image(mesh, grid)]
+
+
+def tetrahedron_image(mesh: TetMesh, grid: VoxelGrid) -> NDArray[np.int32]:
+    """Number (n_x, n_y, n_z) of the tetrahedron at each voxel centre of `grid`; -1: none."""
+    image = np.full(grid.shape, -1, dtype=np.int32)
+    corners = grid.index(mesh.nodes)[mesh.tets]
+    low = np.maximum(np.ceil(corners.min(axis=1) - ON_A_FACE), 0).astype(np.int64)
+    high = np.minimum(np.floor(corners.max(axis=1) + ON_A_FACE), np.array(grid.shape) - 1).astype(np.int64)
+    size = np.maximum(high - low + 1, 0)
+    count = size.prod(axis=1)
+    to_barycentric = np.linalg.inv(corners[:, 1:] - corners[:, :1])  # rows: edges; x - x0 = b @ edges
+
+    def centres_of(tets: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Voxels (n, 3) whose centres lie in some of the tetrahedra, and in which (n,)."""
+        owner = np.repeat(tets, count[tets])
+        step = np.arange(len(owner)) - np.repeat(np.cumsum(count[tets]) - count[tets], count[tets])
+        rest, z = np.divmod(step, size[owner, 2])  # from the step's number in the box of the tetrahedron
+        x, y = np.divmod(rest, size[owner, 1])
+        voxel = low[owner] + np.stack([x, y, z], axis=1)
+        b = np.einsum("na,nab->nb", voxel - corners[owner, 0], to_barycentric[owner])
+        inside = (b >= -ON_A_FACE).all(axis=1) & (b.sum(axis=1) <= 1.0 + ON_A_FACE)
+        return voxel[inside], owner[inside]
+
+    ends = np.cumsum(count)
+    parts = np.split(np.arange(len(count)), np.searchsorted(ends, np.arange(VOXELS_AT_ONCE, ends[-1], VOXELS_AT_ONCE)))
+    for voxel, owner in mapped(centres_of, parts):
+        image[tuple(voxel.T)] = owner
+    return image

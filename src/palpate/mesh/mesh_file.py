@@ -17,8 +17,6 @@ from palpate.images.tissue import Tissue
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.mesh.tetrahedralise import boundary_of
 
-__all__ = ["PLANES", "WHOLE", "MeshFile", "body_mesh", "plane_faces", "read_mesh_file"]
-
 MOST_BYTES = 4 * 2**30
 TETRAHEDRA, TRIANGLES = ("tetra", "tetra10"), ("triangle", "triangle6")
 GROUPS = ("tissue", "label", "region", "medit:ref", "gmsh:physical", "MaterialID", "material", "CellEntityIds")

@@ -10,8 +10,6 @@ from palpate.mesh.cutting import Grid, signed_volumes, within_faces
 from palpate.mesh.snapping import Contacts
 from palpate.mesh.tet_mesh import tet_dihedrals
 
-__all__ = ["smoothed"]
-
 SHARPNESS_DEG = 4.0  # in the penalty sum exp(-angle / sharpness): small, so that the worst angles dominate
 INVERTED_DEG = -60.0  # what an inverted tetrahedron's angles count as
 TRIALS = 12

@@ -11,8 +11,6 @@ from palpate.mesh.anatomy import Anatomy, Box, LevelSet
 from palpate.mesh.cutting import Grid, signed_volumes, within_faces
 from palpate.mesh.tet_mesh import FACES
 
-__all__ = ["Contacts", "contacts_of", "debiased", "snapped"]
-
 GRAZING = 0.25  # two surfaces that meet at a smaller (relative) angle count as one where they meet
 SHRINK_LIMIT = 0.25  # a move that leaves less of a tetrahedron's volume is cut back
 MAX_HALVINGS = 6

@@ -11,8 +11,6 @@ from scipy import sparse
 from palpate.errors import ConfigurationError
 from palpate.mesh.tet_mesh import TetMesh
 
-__all__ = ["TET_EDGES", "TRIANGLE_EDGES", "LagrangeSpace", "lagrange_space", "triangle_shape"]
-
 TET_EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
 TRIANGLE_EDGES = np.array([[0, 1], [1, 2], [0, 2]])
 
@@ -45,7 +43,7 @@ class LagrangeSpace:
     ) -> sparse.csr_matrix[np.float64]:
         """Matrix (n_faces, n_points), dimensionless: values at `barycentric` (n_faces, 3) of triangles (n_faces, 3)."""
         facets = self.facets(triangles)
-        weights = triangle_shape(self.order, barycentric)
+        weights = shape_functions(self.order, barycentric)
         rows = np.repeat(np.arange(len(facets)), facets.shape[1])
         shape = (len(facets), len(self.points))
         return sparse.csr_matrix((weights.ravel(), (rows, facets.ravel())), shape=shape)
@@ -66,10 +64,13 @@ def lagrange_space(mesh: TetMesh, element: str) -> LagrangeSpace:
     return LagrangeSpace(mesh, 2, points, cells, edges)
 
 
-def triangle_shape(order: int, barycentric: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shape functions (n, 3 or 6), dimensionless, at `barycentric` (n, 3) places of a triangle."""
+def shape_functions(order: int, barycentric: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Shape functions (n, n_points), dimensionless, at `barycentric` places (n, 3) of a triangle or (n, 4) of a tet.
+
+    P1: lambda_a; P2: lambda_a (2 lambda_a - 1) at the corners, 4 lambda_a lambda_b on TRIANGLE_EDGES or TET_EDGES.
+    """
     if order == 1:
         return barycentric
+    first, second = (TET_EDGES if barycentric.shape[1] == 4 else TRIANGLE_EDGES).T
     corners = barycentric * (2.0 * barycentric - 1.0)
-    edges = 4.0 * barycentric[:, TRIANGLE_EDGES[:, 0]] * barycentric[:, TRIANGLE_EDGES[:, 1]]
-    return np.concatenate([corners, edges], axis=1)
+    return np.concatenate([corners, 4.0 * barycentric[:, first] * barycentric[:, second]], axis=1)

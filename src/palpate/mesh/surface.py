@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from palpate.images.tissue import Role
 from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh
 
-__all__ = ["Surface", "cut_faces", "mean_curvature", "tissue_surface", "triangle_normals", "vertex_normals"]
-
 
 @dataclass(frozen=True, slots=True)
 class Surface:

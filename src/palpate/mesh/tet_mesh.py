@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from palpate.errors import GeometryError
 from palpate.images.tissue import Tissue
 
-__all__ = ["FACES", "OUTER", "TetMesh", "tet_dihedrals"]
-
 OUTER = -1  # what lies beyond the domain's own border: the cut of the image
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])  # faces of a tetrahedron, seen from outside
 FACE_PAIRS = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])

@@ -19,8 +19,6 @@ from palpate.mesh.snapping import contacts_of, debiased, snapped
 from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh, tet_dihedrals
 from palpate.progress import Progress, silent
 
-__all__ = ["SizeField", "boundary_of", "tetrahedralise"]
-
 COARSEST = 4.0  # longest edge far from all surfaces, in the longest of organs
 GRADING = 0.45  # growth of the edge length with the distance from a surface, mm per mm
 GRID_FACTOR = 1.5  # longest over mean edge of the grid's tetrahedra

@@ -13,13 +13,12 @@ from scipy.spatial import KDTree
 
 from palpate.errors import GeometryError
 from palpate.images.label_image import VoxelGrid
-from palpate.mesh.space import LagrangeSpace, triangle_shape
+from palpate.mesh.space import LagrangeSpace, shape_functions
 from palpate.mesh.surface import tissue_surface
 from palpate.mesh.tet_mesh import OUTER, TetMesh
 
 TIES = 4  # voxels at the most whose column meets an edge that two faces round differently; a neighbour decides
 
-__all__ = ["Warp", "voxelise"]
 
 Warp = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
@@ -144,7 +143,7 @@ def _pieces(
     shares = np.array(lattice) / n
     barycentric = np.column_stack([1.0 - shares.sum(axis=1), shares])
     moved = (space.points + displacement)[space.facets(triangles)]
-    points = np.einsum("lk,fkd->fld", triangle_shape(space.order, barycentric), moved)
+    points = np.einsum("lk,fkd->fld", shape_functions(space.order, barycentric), moved)
     if warp is not None:
         distinct, place = np.unique(np.round(points.reshape(-1, 3), 9), axis=0, return_inverse=True)
         points = warp(distinct)[place.reshape(-1)].reshape(points.shape)

@@ -8,8 +8,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.images.distance import DistanceMap, terrace_noise
-from palpate.images.isosurface import IsosurfacePoints, isosurface_points
+from palpate.images.distance import DistanceMap, IsosurfacePoints, isosurface_points, terrace_noise
 from palpate.mesh.anatomy import LevelSet
 from palpate.mesh.surface import triangle_normals
 from palpate.observation.observed_surface import FieldOfView, ObservedSurface

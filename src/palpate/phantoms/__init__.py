@@ -1,65 +1,31 @@
 """Scenes with a known truth: concentric spheres, pelves, and the noise of their images."""
 
-from palpate.phantoms.exact_targets import TriangulatedDistance, exact_target, target_of_truth
-from palpate.phantoms.motion import (
-    AffineMotion,
-    ScaledMotion,
-    SmoothField,
-    WallMotion,
-    filling_of,
-    smooth_field,
-    wall_filling,
-)
-from palpate.phantoms.pelvis import PelvisOptions, pelvis, pelvis_anatomy, pelvis_grid, pelvis_motions
-from palpate.phantoms.pelvis_shapes import PelvisShapes, draw_pelvis
-from palpate.phantoms.scene import (
-    BoundaryMotion,
-    Noise,
-    Scene,
-    centred_grid,
-    displacements,
-    grid_box,
-    imaged,
-    refuse_folded,
-    reimaged,
-    rescaled,
-)
-from palpate.phantoms.shapes import Complement, Ellipsoid, Tube, ball, rotation_about
-from palpate.phantoms.spheres import SpheresOptions, spheres
-
-__all__ = [
-    "AffineMotion",
-    "BoundaryMotion",
-    "Complement",
-    "Ellipsoid",
-    "Noise",
-    "PelvisOptions",
-    "PelvisShapes",
-    "ScaledMotion",
-    "Scene",
-    "SmoothField",
-    "SpheresOptions",
-    "TriangulatedDistance",
-    "Tube",
-    "WallMotion",
-    "ball",
-    "centred_grid",
-    "displacements",
-    "draw_pelvis",
-    "exact_target",
-    "filling_of",
-    "grid_box",
-    "imaged",
-    "pelvis",
-    "pelvis_anatomy",
-    "pelvis_grid",
-    "pelvis_motions",
-    "refuse_folded",
-    "reimaged",
-    "rescaled",
-    "rotation_about",
-    "smooth_field",
-    "spheres",
-    "target_of_truth",
-    "wall_filling",
-]
+from palpate.phantoms.motion import AffineMotion as AffineMotion
+from palpate.phantoms.motion import SmoothField as SmoothField
+from palpate.phantoms.motion import WallMotion as WallMotion
+from palpate.phantoms.motion import filling_of as filling_of
+from palpate.phantoms.motion import smooth_field as smooth_field
+from palpate.phantoms.motion import wall_filling as wall_filling
+from palpate.phantoms.pelvis import PelvisOptions as PelvisOptions
+from palpate.phantoms.pelvis import pelvis as pelvis
+from palpate.phantoms.pelvis import pelvis_anatomy as pelvis_anatomy
+from palpate.phantoms.pelvis import pelvis_grid as pelvis_grid
+from palpate.phantoms.pelvis import pelvis_motions as pelvis_motions
+from palpate.phantoms.pelvis_shapes import PelvisShapes as PelvisShapes
+from palpate.phantoms.pelvis_shapes import draw_pelvis as draw_pelvis
+from palpate.phantoms.scene import BoundaryMotion as BoundaryMotion
+from palpate.phantoms.scene import Noise as Noise
+from palpate.phantoms.scene import Scene as Scene
+from palpate.phantoms.scene import centred_grid as centred_grid
+from palpate.phantoms.scene import displacements as displacements
+from palpate.phantoms.scene import grid_box as grid_box
+from palpate.phantoms.scene import imaged as imaged
+from palpate.phantoms.scene import refuse_folded as refuse_folded
+from palpate.phantoms.scene import reimaged as reimaged
+from palpate.phantoms.shapes import Complement as Complement
+from palpate.phantoms.shapes import Ellipsoid as Ellipsoid
+from palpate.phantoms.shapes import Tube as Tube
+from palpate.phantoms.shapes import ball as ball
+from palpate.phantoms.shapes import rotation_about as rotation_about
+from palpate.phantoms.spheres import SpheresOptions as SpheresOptions
+from palpate.phantoms.spheres import spheres as spheres

@@ -13,17 +13,6 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.phantoms.shapes import Tube
 
-__all__ = [
-    "AffineMotion",
-    "Filling",
-    "ScaledMotion",
-    "SmoothField",
-    "Swelling",
-    "WallMotion",
-    "filling_of",
-    "smooth_field",
-    "wall_filling",
-]
 ENDS = 2.2  # half the organ's length in lengths of the filling: 9 % of it is left at the ends
 BLOCK = 4096  # points at a time: the waves of a block fit into the cache
 
@@ -66,18 +55,6 @@ class Filling:
         around = _around(spoke, self.towards, self.lean)
         amplitude = np.exp(-((along - self.fullest_mm) ** 2) / (2.0 * self.length_mm**2))[:, None]
         return np.asarray(amplitude * (self.filling_mm * around * spoke + self.stray.at(points)))
-
-
-@dataclass(frozen=True, slots=True)
-class ScaledMotion:
-    """`factor` times another motion."""
-
-    motion: WallMotion
-    factor: float
-
-    def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Displacement (n, 3) mm at wall points (n, 3) in RAS mm."""
-        return self.factor * self.motion.at(points)
 
 
 def filling_of(

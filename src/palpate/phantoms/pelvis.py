@@ -17,8 +17,6 @@ from palpate.phantoms.pelvis_shapes import PelvisShapes, draw_pelvis
 from palpate.phantoms.scene import Noise, Scene, centred_grid, grid_box, make_scene
 from palpate.phantoms.shapes import rotation_about
 
-__all__ = ["PelvisOptions", "pelvis", "pelvis_anatomy", "pelvis_grid", "pelvis_motions"]
-
 SURROUNDINGS_KPA = 10.0
 STRAY = 0.05  # non-radial motion of the rectum's wall, standard deviation a component in parts of the filling
 STRAY_LENGTH_MM = 20.0

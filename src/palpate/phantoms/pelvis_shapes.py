@@ -11,8 +11,6 @@ from palpate.errors import ConfigurationError
 from palpate.mesh.anatomy import Box
 from palpate.phantoms.shapes import Ellipsoid, Tube, Union, rotation_about
 
-__all__ = ["PelvisShapes", "draw_pelvis"]
-
 DRAWS = 40
 MARGIN_MM, RECTUM_MARGIN_MM = 5.0, 13.0  # to the border of the image; the rectum is going to fill
 GAP_MM = 3.0  # of bones to anything else

@@ -12,8 +12,8 @@ from palpate.errors import GeometryError
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.tissue import Role, Tissue
 from palpate.mechanics.boundary import outer_constraint
-from palpate.mechanics.deformation import deformation_determinants
 from palpate.mechanics.dilatation import Dilatation
+from palpate.mechanics.element import deformation_determinants
 from palpate.mechanics.equilibrium import equilibrium
 from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.linear_model import linear_model
@@ -22,22 +22,7 @@ from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.tet_mesh import OUTER, TetMesh
 from palpate.mesh.tetrahedralise import tetrahedralise
 from palpate.mesh.voxelise import Warp, voxelise
-from palpate.phantoms.motion import ScaledMotion, WallMotion, smooth_field
-
-__all__ = [
-    "BoundaryMotion",
-    "Noise",
-    "Scene",
-    "centred_grid",
-    "deformation_determinants",
-    "displacements",
-    "grid_box",
-    "imaged",
-    "make_scene",
-    "refuse_folded",
-    "reimaged",
-    "rescaled",
-]
+from palpate.phantoms.motion import WallMotion, smooth_field
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,15 +158,6 @@ def reimaged(scene: Scene, grid: VoxelGrid, *, noise: Noise | None) -> Scene:
     """The same truth seen on another voxel grid, with other noise (drawn with the scene's seed) or none."""
     before, after = _images(scene.space, scene.displacement, grid, noise, scene.seed)
     return replace(scene, before=before, after=after)
-
-
-def rescaled(scene: Scene, factor: float) -> Scene:
-    """The scene of the linear law with `factor` times the motion everywhere, which is again in equilibrium.
-
-    The images stay those of the full motion until the scene is `reimaged`.
-    """
-    motions = {name: ScaledMotion(motion, factor) for name, motion in scene.motions.items()}
-    return replace(scene, displacement=factor * scene.displacement, motions=motions)
 
 
 def _images(

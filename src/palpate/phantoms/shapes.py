@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial import KDTree
 
-__all__ = ["Complement", "Ellipsoid", "Shape", "Tube", "Union", "ball", "rotation_about"]
-
 NEWTON_STEPS = 40  # for the closest point of an ellipsoid; the iteration is monotone and rarely needs ten
 PLACES = 401  # along a tube, of which one is near every point's closest
 STEP_MM = 1e-4  # of the differences that give a tube's gradient

@@ -16,8 +16,6 @@ from palpate.phantoms.motion import AffineMotion, Swelling, WallMotion, smooth_f
 from palpate.phantoms.scene import Noise, Scene, centred_grid, grid_box, make_scene
 from palpate.phantoms.shapes import Complement, ball
 
-__all__ = ["SPHERES_KINDS", "SpheresOptions", "spheres", "spheres_anatomy"]
-
 SPHERES_KINDS = ("squeezed", "pushed", "tumour")
 CORE, SHELL, OUTSIDE = 10.0, 20.0, 30.0  # radii, mm
 MODULI_KPA = {"core": 60.0, "shell": 30.0, "organ": 30.0, "tumour": 75.0, "surroundings": 10.0}

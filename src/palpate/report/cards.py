@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import jinja2
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from palpate.report.rows import NONE, estimate_rows, interval_text, main_numbers, moduli_in, ratio_rows
-
-__all__ = ["moduli_figure", "result_cards", "result_lines"]
+from palpate.report.svg import mark_decades, template_of
 
 GREY = "#888888"
 ROOM = 1.6  # by which factor the axis reaches beyond all numbers, for the arrows of open ends
@@ -42,11 +39,8 @@ def result_cards(document: Mapping[str, Any], colours: Mapping[str, str]) -> str
 
     document: result.json; colours: tissue -> #rrggbb.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("palpate.report"), autoescape=True, undefined=jinja2.StrictUndefined
-    )
-    template = environment.get_template("cards.html")
-    return str(template.render(document=document, rows=estimate_rows(document, colours), ratios=ratio_rows(document)))
+    rows, ratios = estimate_rows(document, colours), ratio_rows(document)
+    return str(template_of("cards.html").render(document=document, rows=rows, ratios=ratios))
 
 
 def moduli_figure(document: Mapping[str, Any], colours: Mapping[str, str]) -> Figure:
@@ -65,9 +59,7 @@ def moduli_figure(document: Mapping[str, Any], colours: Mapping[str, str]) -> Fi
             numbers += [value, *(interval or ())]
         known = [number for number in numbers if number]
         axes.set_xlim(min(known, default=1.0) / ROOM, max(known, default=1.0) * ROOM)
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-        axes.xaxis.set_minor_formatter(NullFormatter())
+        mark_decades(axes.xaxis)
         for row, item in enumerate(items):
             _draw_item(axes, row, item, colours.get(item["tissue"], GREY))
         axes.set_yticks(range(len(items)), [f"{item['tissue']}\n{item['verdict']}" for item in items])

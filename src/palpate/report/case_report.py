@@ -12,14 +12,9 @@ from palpate.report.collect import collect, collect_failure
 from palpate.report.page import render
 from palpate.report.report_data import ReportData
 from palpate.study.case import Case
-from palpate.study.earlier import RESULT, seal_of
-from palpate.study.outputs import write_text
+from palpate.study.earlier import seal_of
+from palpate.study.outputs import DATA, PAGE, RESULT, write_text
 from palpate.study.result import CaseResult
-
-__all__ = ["redrawn_page", "write_case_report", "write_failure_report"]
-
-PAGE_NAME = "report.html"
-DATA_NAME = "report-data.npz"
 
 
 def write_case_report(result: CaseResult, folder: Path) -> Path:
@@ -42,11 +37,11 @@ def redrawn_page(folder: Path, *, document: Mapping[str, Any], sha256: str | Non
     data are missing, damaged, or of another run, when they cannot be drawn, and when the document says other numbers
     than they do.
     """
-    path = folder / DATA_NAME
+    path = folder / DATA
     data = ReportData.load(path, sha256=sha256)
     if seal_of(data.document) != seal_of(document):
         raise InputDataError(
-            f"the numbers in {folder / RESULT} are not those of the run that wrote {DATA_NAME}: one was changed since;"
+            f"the numbers in {folder / RESULT} are not those of the run that wrote {DATA}: one was changed since;"
             " run the estimate again"
         )
     try:
@@ -61,7 +56,7 @@ def redrawn_page(folder: Path, *, document: Mapping[str, Any], sha256: str | Non
 
 
 def _write(data: ReportData, folder: Path) -> Path:
-    data.save(folder / DATA_NAME)
-    path = folder / PAGE_NAME
+    data.save(folder / DATA)
+    path = folder / PAGE
     write_text(path, render(data))
     return path

@@ -15,16 +15,6 @@ from palpate.report.rows import number
 from palpate.report.svg import INK, draw_svg
 from palpate.uncertainty import NORMAL_95
 
-__all__ = [
-    "START_COLOURS",
-    "angle_svg",
-    "forces_svg",
-    "modulus_svg",
-    "objective_svg",
-    "residual_svg",
-    "waterfall_svg",
-]
-
 SIZE = (3.9, 2.5)
 DASHED = (0, (4, 3))
 BINS = 41

@@ -15,13 +15,11 @@ from numpy.typing import NDArray
 from palpate.errors import PalpateError
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue, tissue_colours
-from palpate.mechanics.deformation import largest_strains
+from palpate.mechanics.element import largest_strains
 from palpate.mesh.tet_mesh import tet_dihedrals
 from palpate.parallel import mapped
-from palpate.report.backgrounds import Grey, background, earlier_grey, later_grey, whole_box, whole_images
-from palpate.report.inputs import bone_distances, input_images
 from palpate.report.measured import measured_states
-from palpate.report.pairs import ImagePair, drawn_images, image_pairs
+from palpate.report.pairs import ImagePair, bone_distances, drawn_images, image_pairs, input_images
 from palpate.report.report_data import (
     MESH,
     LaterImage,
@@ -33,14 +31,12 @@ from palpate.report.report_data import (
     TissueMap,
     TriangleSurface,
 )
-from palpate.report.slice_box import MOVING, slice_box
 from palpate.report.stiffness_maps import tissue_maps
 from palpate.report.surfaces import MOST_TRIANGLES, carried_outline, contour_width, image_surface, model_surface
+from palpate.report.volume import MOVING, Grey, background, earlier_grey, later_grey, slice_box, whole_box, whole_images
 from palpate.study.case import Case, CaseLoad
 from palpate.study.case_data import CaseData
 from palpate.study.result import CaseResult, MeshSummary, failure_document, stated_unit
-
-__all__ = ["collect", "collect_failure"]
 
 LOGGER = logging.getLogger(__name__)
 T = TypeVar("T")

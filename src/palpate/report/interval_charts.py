@@ -17,8 +17,6 @@ from palpate.report.rows import interval_text, main_numbers, moduli_in, number
 from palpate.report.svg import INK, draw_svg
 from palpate.uncertainty import NORMAL_95
 
-__all__ = ["profile_svg", "region_svg", "repeats_svg"]
-
 SIZE = (3.9, 2.5)
 DASHED = (0, (4, 3))
 LIMIT = NORMAL_95**2  # deviance at the ends of a 95 % interval

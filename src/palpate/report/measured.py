@@ -23,8 +23,6 @@ from palpate.report.surfaces import carried_outline
 from palpate.study.estimation import PointFit
 from palpate.study.result import CaseResult, pair_names
 
-__all__ = ["evenly", "measured_points", "measured_states", "nice_factor"]
-
 OF_BOX = 0.1  # of the slices' longest edge: how long an arrow is drawn that is longer than all but some
 USUAL = 95.0  # per cent of the arrows that are no longer than that
 LARGEST_FACTOR = 1000.0

@@ -8,12 +8,9 @@ from typing import Any
 
 from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.laws.registry import LAWS, law_from, law_parameters
-from palpate.report.headline import listed
 from palpate.report.report_data import MESH, ReportData
-from palpate.report.rows import moduli_in, ratio_rows
+from palpate.report.rows import listed, moduli_in, ratio_rows
 from palpate.report.sources import SOURCES, bibtex, reference_line
-
-__all__ = ["Methods", "methods_text"]
 
 ELEMENTS = {
     "P1": "linear tetrahedra",

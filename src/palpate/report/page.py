@@ -7,16 +7,14 @@ import hashlib
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from importlib import resources
-from typing import TypeVar
+from typing import Any, TypeVar
 
-import jinja2
 import numpy as np
 from markupsafe import Markup, escape
 
 from palpate.findings import HARMLESS, WIDENING
-from palpate.images.registration import length_text
 from palpate.parallel import mapped
 from palpate.report.charts import (
     START_COLOURS,
@@ -27,20 +25,18 @@ from palpate.report.charts import (
     residual_svg,
     waterfall_svg,
 )
-from palpate.report.headline import headline
 from palpate.report.interval_charts import profile_svg, region_svg, repeats_svg
 from palpate.report.methods import methods_text
 from palpate.report.payload import payload
 from palpate.report.pictures import mesh_png, organs_png, points_png
-from palpate.report.report_data import LaterImage, MeasuredState, Reference, ReportData, SliceBox, TissueMap
-from palpate.report.rows import estimate_rows, moduli_in, number, ratio_rows, scale_marks
+from palpate.report.report_data import LaterImage, MeasuredState, ReportData, SliceBox, TissueMap
+from palpate.report.rows import estimate_rows, headline, moduli_in, ratio_rows, scale_marks
 from palpate.report.scales import Scale, angle_scale, distance_scale, modulus_scale, strain_scale
 from palpate.report.section import VIEWS
 from palpate.report.slices import alignment_svg, contour_names, first_planes, points_svg, slice_svg
 from palpate.report.stiffness_maps import map_png, map_svg
+from palpate.report.svg import template_of
 from palpate.report.tornado import tornado_svg
-
-__all__ = ["Picture", "page_scripts", "picture_of", "policy_of", "render", "template_of", "widths_of"]
 
 T = TypeVar("T")
 LOGGER = logging.getLogger(__name__)
@@ -69,52 +65,29 @@ class Picture:
     missing: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class _Later:
-    """The figures of one later image."""
-
-    name: str
-    alignment: tuple[Picture, ...]
-    whole_widths: str
-    slices: tuple[Picture, ...]
-    organs: tuple[Picture, ...]
-    residuals: tuple[Picture, ...]
-    scale: Scale
-    reference: Reference
-    widths: str
-
-
-@dataclass(frozen=True, slots=True)
-class _Map:
-    """The figures of one map of stiffness."""
-
-    tissue: str
-    words: str
-    slices: Picture
-    space: tuple[Picture, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class _Measured:
-    """The figures of the points that were measured in one later state."""
-
-    state: MeasuredState
-    reference: Reference
-    slices: tuple[Picture, ...]
-    space: tuple[Picture, ...]
-    widths: str
-
-
 def render(data: ReportData, *, study: bool = False) -> str:
     """The whole page of a report; a figure that cannot be drawn leaves a sentence in its place.
 
     study: whether its sensitivity.html lies beside it.
     """
     live = _attempt("the moving figures", lambda: payload(data))
-    scripts = _scripts(data) if live is not None and (data.later or data.measured or data.mesh) else ()
+    names = (*SCRIPTS[:-1], OF_POINTS, SCRIPTS[-1]) if data.measured else SCRIPTS
+    scripts = page_scripts(names) if live is not None and (data.later or data.measured or data.mesh) else ()
     colours = {tissue.name: tissue.colour for tissue in data.tissues}
     found = moduli_in(data.document) if data.document["status"] == "converged" else []
     fixed = {item["tissue"] for item in found if item["verdict"] != "not identified"}  # of others no range is drawn
+
+    def of_moduli(
+        title: str, draw: Callable[..., str], name: str, has: Callable[[Mapping[str, Any]], Any]
+    ) -> tuple[Picture, ...]:
+        """The figure of each modulus that the images fix, where its entry `has` what is drawn."""
+        items = [(i, item) for i, item in enumerate(moduli_in(data.document)) if item["tissue"] in fixed and has(item)]
+        return tuple(picture_of(title.format(e["tissue"]), partial(draw, data, i, name=f"{name}{i}")) for i, e in items)
+
+    def tornado(data: ReportData, i: int, *, name: str) -> str:
+        """What each assumption does to one modulus (its number)."""
+        return tornado_svg(data.document, moduli_in(data.document)[i]["tissue"], name=name)
+
     page = template_of("case.html").render(
         data=data,
         study=study,
@@ -148,26 +121,14 @@ def render(data: ReportData, *, study: bool = False) -> str:
         mesh_pictures=_mesh_pictures(data),
         moduli=_attempt("the scale of the moduli", lambda: modulus_scale(data)) if data.mesh else None,
         curves=_curves(data),
-        profiles=tuple(
-            picture_of(f"Profile of {item['tissue']}", partial(profile_svg, data, i, name=f"profile{i}"))
-            for i, item in enumerate(moduli_in(data.document))
-            if item["tissue"] in fixed and item.get("profile")
-        ),
+        profiles=of_moduli("Profile of {}", profile_svg, "profile", lambda item: item.get("profile")),
         regions=tuple(
             picture_of(" and ".join(region["tissues"]), partial(region_svg, data, i, name=f"region{i}"))
             for i, region in enumerate(data.document.get("regions", ()))
             if fixed.issuperset(region["tissues"])
         ),
-        tornados=tuple(
-            picture_of(item["tissue"], partial(tornado_svg, data.document, item["tissue"], name=f"change{i}"))
-            for i, item in enumerate(moduli_in(data.document))
-            if item["tissue"] in fixed and data.document.get("variations")
-        ),
-        repeats=tuple(
-            picture_of(f"Repeats of {item['tissue']}", partial(repeats_svg, data, i, name=f"repeats{i}"))
-            for i, item in enumerate(moduli_in(data.document))
-            if item["tissue"] in fixed and data.document["image_pairs"]
-        ),
+        tornados=of_moduli("{}", tornado, "change", lambda _: data.document.get("variations")),
+        repeats=of_moduli("Repeats of {}", repeats_svg, "repeats", lambda _: data.document["image_pairs"]),
         angles=(
             picture_of("Dihedral angles of the mesh", partial(angle_svg, data.mesh.angles, name="angles"))
             if data.mesh
@@ -181,11 +142,6 @@ def render(data: ReportData, *, study: bool = False) -> str:
         gradient=_gradient,
     )
     return str(page)
-
-
-def _scripts(data: ReportData) -> tuple[Markup, ...]:
-    """The page's scripts, ours and three.js."""
-    return page_scripts((*SCRIPTS[:-1], OF_POINTS, SCRIPTS[-1]) if data.measured else SCRIPTS)
 
 
 def page_scripts(names: Sequence[str]) -> tuple[Markup, ...]:
@@ -213,61 +169,64 @@ def _warnings(data: ReportData) -> tuple[tuple[str, tuple[tuple[str, tuple[str, 
     return tuple((caption, codes) for caption, codes in costs if codes)
 
 
-def _later(data: ReportData, k: int, later: LaterImage) -> _Later:
+def _later(data: ReportData, k: int, later: LaterImage) -> Mapping[str, Any]:
+    """The figures of one later image."""
     reference = data.references[later.reference]
     planes = first_planes(reference.slices) if reference.slices else ()
     whole = reference.whole if later.both else None
-    return _Later(
-        name=later.name,
-        alignment=tuple(
+    return {
+        "name": later.name,
+        "alignment": tuple(
             picture_of(plane.view.name, partial(alignment_svg, data, plane, later, name=f"a{k}{plane.view.name}"))
             for plane in (first_planes(whole) if whole else ())
         ),
-        whole_widths=widths_of(whole),
-        slices=tuple(
+        "whole_widths": widths_of(whole),
+        "slices": tuple(
             picture_of(plane.view.name, partial(slice_svg, data, plane, later, name=f"s{k}{plane.view.name}"))
             for plane in planes
         ),
-        organs=_photographs(
+        "organs": _photographs(
             {
                 f"as in {reference.name}": partial(organs_png, data, later, fitted=False),
                 f"fitted to {later.name}": partial(organs_png, data, later, fitted=True),
             }
         ),
-        residuals=tuple(
+        "residuals": tuple(
             picture_of(
                 data.tissues[model.tissue].name,
                 partial(residual_svg, data, model, voxel_mm=reference.voxel_mm, name=f"r{k}t{model.tissue}"),
             )
             for model in later.model
         ),
-        scale=distance_scale(reference.voxel_mm),
-        reference=reference,
-        widths=widths_of(reference.slices),
-    )
+        "scale": distance_scale(reference.voxel_mm),
+        "reference": reference,
+        "widths": widths_of(reference.slices),
+    }
 
 
-def _measured(data: ReportData, k: int, state: MeasuredState) -> _Measured:
-    return _Measured(
-        state=state,
-        reference=data.references[state.reference],
-        slices=tuple(
+def _measured(data: ReportData, k: int, state: MeasuredState) -> Mapping[str, Any]:
+    """The figures of the points that were measured in one later state."""
+    return {
+        "state": state,
+        "reference": data.references[state.reference],
+        "slices": tuple(
             picture_of(plane.view.name, partial(points_svg, data, plane, state, name=f"p{k}{plane.view.name}"))
             for plane in first_planes(state.box)
         ),
-        space=_photographs({f"motion to {state.name}": partial(points_png, data, state)}),
-        widths=widths_of(state.box),
-    )
+        "space": _photographs({f"motion to {state.name}": partial(points_png, data, state)}),
+        "widths": widths_of(state.box),
+    }
 
 
-def _map(data: ReportData, k: int, of: TissueMap) -> _Map:
-    name = data.tissues[of.tissue].name
-    return _Map(
-        name,
-        of.words,
-        picture_of(f"{name}: modulus and its standard deviation", partial(map_svg, data, of, name=f"map{k}")),
-        _photographs({f"{name}, cut open": partial(map_png, data, of)}),
-    )
+def _map(data: ReportData, k: int, of: TissueMap) -> Mapping[str, Any]:
+    """The figures of one map of stiffness."""
+    name, draw = data.tissues[of.tissue].name, partial(map_svg, data, of, name=f"map{k}")
+    return {
+        "tissue": name,
+        "words": of.words,
+        "slices": picture_of(f"{name}: modulus and its standard deviation", draw),
+        "space": _photographs({f"{name}, cut open": partial(map_png, data, of)}),
+    }
 
 
 def widths_of(box: SliceBox | None) -> str:
@@ -316,16 +275,6 @@ def _photographs(drawings: Mapping[str, Callable[[], bytes]]) -> tuple[Picture, 
         return f'<img alt="{escape(title)}" src="data:image/png;base64,{source}">'
 
     return tuple(mapped(lambda title: picture_of(title, partial(element, title)), drawings))
-
-
-@cache
-def template_of(name: str) -> jinja2.Template:
-    """A page's template, which takes a quarter of a page's time to compile."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("palpate.report"), autoescape=True, undefined=jinja2.StrictUndefined
-    )
-    environment.filters |= {"number": number, "length_text": length_text}
-    return environment.get_template(name)
 
 
 def picture_of(title: str, draw: Callable[[], str]) -> Picture:

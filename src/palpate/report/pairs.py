@@ -1,14 +1,19 @@
-"""The pairs of images of a result, each as if the result were of it alone."""
+"""The pairs of images of a result, each as if it were of that alone; their voxels, and how well their bones lie."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import igl
+import numpy as np
+
+from palpate.images.tissue import Role
+from palpate.report.report_data import BoneDistance, InputImage, TriangleSurface
 from palpate.study.case import Images
 from palpate.study.result import CaseResult, pair_names
 
-__all__ = ["ImagePair", "drawn_images", "image_pairs"]
+BORDER_VOXELS = 3.0  # nearer to the later image's border its surface is cut
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,3 +55,41 @@ def drawn_images(counts: Sequence[int], most: int) -> tuple[tuple[int, int], ...
     """
     every = [(pair, after) for pair, count in enumerate(counts) for after in range(count)]
     return tuple(sorted(sorted(every, key=lambda item: item[1])[:most]))
+
+
+def input_images(pairs: tuple[ImagePair, ...]) -> tuple[InputImage, ...]:
+    """Every label image of the pairs with its voxels and its organs' volumes."""
+    found = []
+    for number, pair in enumerate(pairs):
+        key = "" if number == 0 else f"pairs[{number - 1}]."
+        keys = (f"{key}before", *(f"{key}after[{i}]" for i in range(len(pair.after))))
+        images = (pair.result.before, *pair.result.after)
+        digests = [pair.result.provenance.inputs.get(name, "") for name in keys]
+        for later, (name, image, sha256) in enumerate(zip((pair.before, *pair.after), images, digests, strict=True)):
+            counts = np.bincount(image.index.ravel(), minlength=len(image.tissues))
+            x, y, z = (float(edge) for edge in image.grid.spacing)
+            volumes = tuple((counts * (image.grid.voxel_volume / 1000.0)).tolist())
+            found.append(InputImage(name, number, later > 0, image.grid.shape, (x, y, z), volumes, sha256))
+    return tuple(found)
+
+
+def bone_distances(
+    result: CaseResult, after: int, earlier: tuple[TriangleSurface, ...], later: tuple[TriangleSurface, ...]
+) -> tuple[BoneDistance, ...]:
+    """Distances (mm) of the rigid tissues' surfaces from those of the aligned later image, where that shows them."""
+    grid, target = result.after[after].grid, {surface.tissue: surface for surface in later}
+    found = []
+    for surface in earlier:
+        if result.tissues[surface.tissue].role is not Role.RIGID or surface.tissue not in target:
+            continue
+        points = surface.points.astype(np.float64)
+        place = grid.index(points)
+        points = points[((place > BORDER_VOXELS) & (place < np.array(grid.shape) - 1 - BORDER_VOXELS)).all(axis=1)]
+        if len(points):
+            other = target[surface.tissue]
+            squared = igl.point_mesh_squared_distance(
+                points, other.points.astype(np.float64), other.triangles.astype(np.int64)
+            )[0]
+            distance = np.sqrt(squared)
+            found.append(BoneDistance(surface.tissue, float(distance.mean()), float(np.percentile(distance, 95.0))))
+    return tuple(found)

@@ -28,8 +28,6 @@ from palpate.report.report_data import (
 from palpate.report.scales import Scale, angle_scale, distance_scale, modulus_scale, strain_scale
 from palpate.report.section import VIEWS
 
-__all__ = ["Payload", "payload"]
-
 MOST_TETS = 120_000  # of a mesh that a page can turn
 LEVELS = 65_535
 STRAIN_STEP = 0.2  # per cent, in a byte: up to 51 %

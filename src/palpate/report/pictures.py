@@ -12,19 +12,6 @@ from palpate.report.render import Camera, Triangles, render_png
 from palpate.report.report_data import LaterImage, MeasuredState, MeshPicture, ReportData
 from palpate.report.scales import Scale, distance_scale, modulus_scale, strain_scale
 
-__all__ = [
-    "BESIDE_FRONT",
-    "HEIGHT",
-    "WIDTH",
-    "arrow_triangles",
-    "face_normals",
-    "mesh_png",
-    "organs_png",
-    "points_png",
-    "section_faces",
-    "tissue_shades",
-]
-
 WIDTH, HEIGHT = 620, 460
 BESIDE = Camera.looking((-1.0, 0.3, 0.15))  # the patient's left side, a little from the front
 AT_THE_SIDE = Camera.looking((-1.0, 0.35, 0.25))  # of the sagittal cut, whose far half is kept

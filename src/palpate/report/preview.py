@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -14,23 +14,21 @@ from palpate.images.checks import VOLUME_CHANGE
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers import read_intensities
 from palpate.images.registration import length_text
-from palpate.images.tissue import Role, Tissue, tissue_colours
+from palpate.images.tissue import Role, tissue_colours
 from palpate.progress import about
-from palpate.report.backgrounds import Grey
-from palpate.report.page import Picture, page_scripts, picture_of, policy_of, template_of, widths_of
+from palpate.report.page import page_scripts, picture_of, policy_of, widths_of
 from palpate.report.payload import payload
 from palpate.report.preview_data import ROLE_COLOURS, PreviewImage, preview_data, preview_image
-from palpate.report.report_data import ReportData, Volume
+from palpate.report.report_data import ReportData
 from palpate.report.rows import NONE, EstimateRow, estimate_rows, interval_text, number, scale_marks
 from palpate.report.slices import alignment_svg, first_planes, slice_svg
+from palpate.report.svg import template_of
+from palpate.report.volume import Grey
 from palpate.study.body import ImagedStates
 from palpate.study.case import Case
 from palpate.study.check import Checked, Problem
-from palpate.study.cost import ExpectedCost
 from palpate.study.first_look import FrameLook, TissueLook, frame_look, tissue_looks
 from palpate.study.prediction import Prediction
-
-__all__ = ["GENERATOR", "preview_page"]
 
 GENERATOR = '<meta name="generator" content="Palpate preview">'  # by which a page of ours is known
 SCRIPTS = ("report.js", "slices.js", "preview.js", "start.js")
@@ -46,53 +44,6 @@ MEANING = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class _State:
-    """A tissue in a later image, as texts: its volume with the change, its shift with its parts."""
-
-    volume: str
-    change: str
-    much: bool
-    shift: str
-    parts: str
-
-
-@dataclass(frozen=True, slots=True)
-class _Row:
-    """A tissue, as texts."""
-
-    name: str
-    colour: str
-    role: str
-    role_colour: str
-    meaning: str
-    labels: str
-    modulus: str
-    volume: str
-    states: tuple[_State, ...]
-    frame: str
-    towards: str
-
-
-@dataclass(frozen=True, slots=True)
-class _Later:
-    """The figures and sentences of one later image."""
-
-    name: str
-    slices: tuple[Picture, ...]
-    widths: str
-    whole: tuple[Picture, ...]
-    whole_widths: str
-    moved: bool
-    greys: bool
-    grey_volumes: tuple[Volume | None, ...]
-    factor: float
-    alignment: str
-    stands: str
-    residuals: str
-    fields: str
-
-
 def preview_page(checked: Checked, *, created: str, version: str, no_prediction: str = "") -> str:
     """The preview of a case that was checked, one self-contained page with all names escaped.
 
@@ -103,6 +54,8 @@ def preview_page(checked: Checked, *, created: str, version: str, no_prediction:
     report, prediction = checked.report, checked.report.predicted
     images = shown.images if shown else ()
     scripts = page_scripts(SCRIPTS) if images else ()
+    cost, drawn, later = report.cost, len(images), sum(len(pair.after) for pair in checked.states)
+    tissues = shown.states.before.tissues if shown else ()
     expected, marks = _expected(prediction, shown.states if shown else None)
     return str(
         template_of("preview.html").render(
@@ -117,16 +70,34 @@ def preview_page(checked: Checked, *, created: str, version: str, no_prediction:
             problems=report.problems,
             predicted=expected,
             marks=marks,
-            noise=_noise(prediction),
+            noise=prediction
+            and {
+                "sd": number(prediction.noise_sd_mm, digits=2),
+                "length": number(prediction.correlation_mm, digits=2),
+                "stated": prediction.stated,
+            },
             no_prediction=no_prediction or "There is no prediction.",
-            cost=_cost(report.cost),
+            cost=cost
+            and {
+                "time": about(cost.seconds),
+                "memory": number(cost.memory_gb, digits=2),
+                "solver": cost.solver,
+                "tets": cost.tets,
+                "unknowns": cost.unknowns,
+                "processors": cost.processors,
+            },
             meshed=bool(checked.bodies),
-            tissues=_rows(shown.states, shown.looks) if shown else (),
+            tissues=tuple(_rows(shown.states, shown.looks)) if shown else (),
             names=shown.names if shown else (),
-            roles=_roles(shown.states) if shown else (),
+            roles=[
+                (role, ROLE_COLOURS.get(role, "#888888"), ", ".join(t.name for t in tissues if str(t.role) == role))
+                for role in dict.fromkeys(str(tissue.role) for tissue in tissues)
+            ],
             held=shown.frame.held if shown else (),
             later=tuple(_later(shown, k, image) for k, image in enumerate(images)) if shown else (),
-            left_out=_left_out(checked, len(images)),
+            left_out=f"{drawn} of {later} later images are drawn, those of the first pair."
+            if 0 < drawn < later
+            else "",
         )
     )
 
@@ -148,29 +119,31 @@ def _shown_of(checked: Checked, created: str) -> _Shown | None:
     case, states = checked.case, next(iter(checked.states), None)
     if case is None or states is None or states.mesh is not None:
         return None
-    frame, names = frame_look(case, states.before, states.after), _names(case, states)
+    frame = frame_look(case, states.before, states.after)
+    # names of the first image and of its later ones, each once
+    images = case.images
+    given = [] if images is None else [images.before.name, *(path.name for path in images.after)]
+    plain = ["before", *(f"after {k}" if len(states.after) > 1 else "after" for k in range(1, len(states.after) + 1))]
+    distinct = len(given) == len(plain) and len(set(given)) == len(given)
+    names = tuple(given if distinct else plain)
     looks = tissue_looks(states.before, states.after, frame.box)
     if not states.after:
         return _Shown(states, names, frame, looks)
     data = preview_data(states, names, {"id": checked.report.id}, created=created)
     data = replace(data, later=data.later[:MOST_LATER])
-    return _Shown(states, names, frame, looks, data, _images(case, states, data, looks, frame))
-
-
-def _noise(prediction: Prediction | None) -> Mapping[str, Any] | None:
-    """What the prediction takes for the noise of surfaces, as texts."""
-    if prediction is None:
-        return None
-    numbers = {"sd": prediction.noise_sd_mm, "length": prediction.correlation_mm}
-    return {name: number(mm, digits=2) for name, mm in numbers.items()} | {"stated": prediction.stated}
-
-
-def _cost(cost: ExpectedCost | None) -> Mapping[str, Any] | None:
-    """What an estimate is expected to take, as texts and counts."""
-    if cost is None:
-        return None
-    told = {"time": about(cost.seconds), "memory": number(cost.memory_gb, digits=2), "solver": cost.solver}
-    return told | {"tets": cost.tets, "unknowns": cost.unknowns, "processors": cost.processors}
+    box = data.references[0].slices
+    assert box is not None, "the images of a preview have a box"
+    first = _grey(case, states, None)
+    return _Shown(
+        states,
+        names,
+        frame,
+        looks,
+        data,
+        tuple(
+            preview_image(states, k, box, looks, frame, (first, _grey(case, states, k))) for k in range(len(data.later))
+        ),
+    )
 
 
 def _banner(problems: Sequence[Problem], prediction: Prediction | None) -> dict[str, Any]:
@@ -200,67 +173,43 @@ def _count(n: int, what: str) -> str:
     return f"{n} {what}{'' if n == 1 else 's'}"
 
 
-def _names(case: Case, states: ImagedStates) -> tuple[str, ...]:
-    """Names of the first image and of its later ones, each once."""
-    images = case.images
-    given = [] if images is None else [images.before.name, *(path.name for path in images.after)]
-    plain = ["before", *(f"after {k}" if len(states.after) > 1 else "after" for k in range(1, len(states.after) + 1))]
-    distinct = len(given) == len(plain) and len(set(given)) == len(given)
-    return tuple(given if distinct else plain)
-
-
-def _rows(states: ImagedStates, looks: Sequence[TissueLook]) -> tuple[_Row, ...]:
+def _rows(states: ImagedStates, looks: Sequence[TissueLook]) -> Iterator[Mapping[str, Any]]:
+    """Each tissue, as texts: who it is, what is known of it, where it lies in the images."""
     tissues = states.before.tissues
-    colours = tissue_colours(tissues)
-    return tuple(
-        _Row(
-            name=tissue.name,
-            colour=colour,
-            role=str(tissue.role),
-            role_colour=ROLE_COLOURS.get(str(tissue.role), colour),
-            meaning=MEANING[tissue.role],
-            labels=", ".join(map(str, tissue.labels)) or "all others",
-            modulus=_modulus(tissue),
-            volume=number(look.volumes_ml[0]),
-            states=tuple(_state(look, k) for k in range(len(states.after))),
-            frame=NONE if look.frame_mm is None else number(look.frame_mm, digits=2) if look.frame_mm >= 0.1 else "0",
-            towards="" if look.frame_mm is None else f"towards the {look.towards}",
+    for tissue, look, colour in zip(tissues, looks, tissue_colours(tissues), strict=True):
+        modulus = {Role.ESTIMATE: "sought", Role.KNOWN: f"{number(tissue.youngs_modulus_kpa)} kPa"}.get(
+            tissue.role, NONE
         )
-        for tissue, look, colour in zip(tissues, looks, colours, strict=True)
-    )
+        if tissue.role is Role.KNOWN and tissue.modulus_sd:
+            modulus += f", within a factor of {np.exp(1.96 * tissue.modulus_sd):.2g}"
+        frame = "" if look.frame_mm is None else number(look.frame_mm, digits=2) if look.frame_mm >= 0.1 else "0"
+        yield {
+            "name": tissue.name,
+            "colour": colour,
+            "role": str(tissue.role),
+            "role_colour": ROLE_COLOURS.get(str(tissue.role), colour),
+            "meaning": MEANING[tissue.role],
+            "labels": ", ".join(map(str, tissue.labels)) or "all others",
+            "modulus": modulus,
+            "volume": number(look.volumes_ml[0]),
+            "states": tuple(_state(look, k) for k in range(len(states.after))),
+            "frame": frame or NONE,
+            "towards": frame and f"towards the {look.towards}",
+        }
 
 
-def _modulus(tissue: Tissue) -> str:
-    """What is known of the modulus of a tissue."""
-    if tissue.role is Role.ESTIMATE:
-        return "sought"
-    if tissue.role is not Role.KNOWN:
-        return NONE
-    spread = f", within a factor of {np.exp(1.96 * tissue.modulus_sd):.2g}" if tissue.modulus_sd else ""
-    return f"{number(tissue.youngs_modulus_kpa)} kPa{spread}"
-
-
-def _state(look: TissueLook, after: int) -> _State:
+def _state(look: TissueLook, after: int) -> Mapping[str, Any]:
+    """A tissue in a later image, as texts: its volume with the change, its shift with its parts."""
     first, later = look.volumes_ml[0], look.volumes_ml[after + 1]
     change = later / first - 1.0 if first and look.middle is not None else None
     shift = look.shifts_mm[after] if look.shifts_mm else None
-    return _State(
-        volume=number(later),
-        change="" if change is None else f"{round(100.0 * change, 1) + 0.0:+.1f} %",
-        much=change is not None and abs(change) > VOLUME_CHANGE,
-        shift=NONE if shift is None else f"{np.linalg.norm(shift):.1f}",
-        parts="" if shift is None else "R {:+.1f}, A {:+.1f}, S {:+.1f}".format(*(np.round(shift, 1) + 0.0)),
-    )
-
-
-def _roles(states: ImagedStates) -> tuple[tuple[str, str, str], ...]:
-    """Each role of a case with its colour and its tissues."""
-    tissues = states.before.tissues
-    roles = dict.fromkeys(str(tissue.role) for tissue in tissues)
-    return tuple(
-        (role, ROLE_COLOURS.get(role, "#888888"), ", ".join(t.name for t in tissues if str(t.role) == role))
-        for role in roles
-    )
+    return {
+        "volume": number(later),
+        "change": "" if change is None else f"{round(100.0 * change, 1) + 0.0:+.1f} %",
+        "much": change is not None and abs(change) > VOLUME_CHANGE,
+        "shift": NONE if shift is None else f"{np.linalg.norm(shift):.1f}",
+        "parts": "" if shift is None else "R {:+.1f}, A {:+.1f}, S {:+.1f}".format(*(np.round(shift, 1) + 0.0)),
+    }
 
 
 def _expected(
@@ -288,17 +237,6 @@ def _expected(
     return tuple(found), scale_marks(document)
 
 
-def _images(
-    case: Case, states: ImagedStates, data: ReportData, looks: Sequence[TissueLook], frame: FrameLook
-) -> tuple[PreviewImage, ...]:
-    box = data.references[0].slices
-    assert box is not None, "the images of a preview have a box"
-    first = _grey(case, states, None)
-    return tuple(
-        preview_image(states, k, box, looks, frame, (first, _grey(case, states, k))) for k in range(len(data.later))
-    )
-
-
 def _grey(case: Case, states: ImagedStates, after: int | None) -> Grey | None:
     """The grey image of the first state, or of a later one brought to it; None where there is none that fits."""
     images = case.images
@@ -317,7 +255,8 @@ def _grey(case: Case, states: ImagedStates, after: int | None) -> Grey | None:
     return Grey(values, VoxelGrid(grid.shape, back @ grid.affine))
 
 
-def _later(shown: _Shown, k: int, image: PreviewImage) -> _Later:
+def _later(shown: _Shown, k: int, image: PreviewImage) -> Mapping[str, Any]:
+    """The figures and sentences of one later image."""
     data, states, frame = shown.data, shown.states, shown.frame
     assert data is not None, "there are later images"
     reference, later = data.references[0], data.later[k]
@@ -332,35 +271,27 @@ def _later(shown: _Shown, k: int, image: PreviewImage) -> _Later:
         "The images are taken as they lie; nothing was aligned." if found is None else f"{later.name} {found.in_words}."
     )
     bones = any(tissue.role == "rigid" for tissue in data.tissues)
-    return _Later(
-        name=later.name,
-        slices=tuple(
+    return {
+        "name": later.name,
+        "slices": tuple(
             picture_of(p.view.name, partial(slice_svg, backed, p, later, name=f"s{k}{p.view.name}", model=False))
             for p in first_planes(reference.slices)
         ),
-        widths=widths_of(reference.slices),
-        whole=tuple(
+        "widths": widths_of(reference.slices),
+        "whole": tuple(
             picture_of(p.view.name, partial(alignment_svg, data, p, both, name=f"a{k}{p.view.name}"))
             for p in first_planes(reference.whole)
         ),
-        whole_widths=widths_of(image.view),
-        moved=image.motion is not None,
-        greys=any(image.greys),
-        grey_volumes=image.greys,
-        factor=image.factor,
-        alignment=lay,
-        stands="the bones stand" if bones else "what does not touch the drivers stands",
-        residuals=""
+        "whole_widths": widths_of(image.view),
+        "moved": image.motion is not None,
+        "greys": any(image.greys),
+        "grey_volumes": image.greys,
+        "factor": image.factor,
+        "alignment": lay,
+        "stands": "the bones stand" if bones else "what does not touch the drivers stands",
+        "residuals": ""
         if found is None
         else ", ".join(f"{name} {length_text(mm)} mm" for name, mm in found.residual_by_tissue_mm.items()),
-        fields=f"{later.name} shows {100.0 * first:.0f} % of what {reference.name} shows; {reference.name} shows"
+        "fields": f"{later.name} shows {100.0 * first:.0f} % of what {reference.name} shows; {reference.name} shows"
         f" {100.0 * second:.0f} % of what {later.name} shows.",
-    )
-
-
-def _left_out(checked: Checked, drawn: int) -> str:
-    """What the page does not show of a case with many images."""
-    later = sum(len(pair.after) for pair in checked.states)
-    if not drawn or later <= drawn:
-        return ""
-    return f"{drawn} of {later} later images are drawn, those of the first pair."
+    }

@@ -13,7 +13,6 @@ from palpate.images.distance import smoothing_width
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, tissue_colours
 from palpate.mesh.anatomy import Box, domain_box
-from palpate.report.backgrounds import Grey, whole_box
 from palpate.report.report_data import (
     LaterImage,
     Reference,
@@ -23,13 +22,10 @@ from palpate.report.report_data import (
     TriangleSurface,
     Volume,
 )
-from palpate.report.slice_box import slice_box
 from palpate.report.surfaces import MOST_TRIANGLES, image_surface
-from palpate.report.volume import MOST_VOXELS, grey_volume, label_volume
+from palpate.report.volume import MOST_VOXELS, Grey, grey_volume, label_volume, slice_box, whole_box
 from palpate.study.body import ImagedStates
 from palpate.study.first_look import FrameLook, TissueLook
-
-__all__ = ["ROLE_COLOURS", "Arrow", "PreviewImage", "preview_data", "preview_image"]
 
 # One hue a role, apart on black and for the colour-blind; after Okabe & Ito, "Color Universal Design" (2008).
 ROLE_COLOURS = {"estimate": "#e69f00", "driver": "#56b4e9", "known": "#2ba888", "rigid": "#cfc8b8", "void": "#6d7278"}
@@ -115,6 +111,7 @@ def preview_image(
         if look.middle is not None
     ]
     longest = max((float(np.linalg.norm(a.end - a.start)) for a in arrows), default=0.0)
+    rim = RIM * float((whole.high - whole.low).max())
     return PreviewImage(
         organs=tuple(label_volume(image, box) for image in images),
         whole=tuple(label_volume(image, whole) for image in images),
@@ -122,10 +119,10 @@ def preview_image(
             None if g is None else grey_volume(g.values, g.grid, box, most_voxels=MOST_VOXELS / 2) for g in greys
         ),
         arrows=tuple(arrows),
-        factor=_factor(longest),
+        factor=next((f for f in (10.0, 5.0, 3.0, 2.0) if f * longest <= LONGEST_ARROW_MM), 1.0),
         frame=_corners(frame.box),
         field=_corners(domain_box([aligned.grid])),
-        view=_padded(whole),
+        view=SliceBox(whole.low - rim, whole.high + rim, whole.position),
         motion=None if lay is None else lay.matrix[:3],
     )
 
@@ -141,14 +138,3 @@ def _surfaces(image: Segmentation, most_triangles: int) -> tuple[TriangleSurface
 def _corners(box: Box) -> NDArray[np.float64]:
     """Corners (8, 3) RAS mm of a box, as their numbers count in binary along its axes."""
     return box.world(box.lengths * np.array(list(np.ndindex(2, 2, 2)), dtype=np.float64))
-
-
-def _padded(box: SliceBox) -> SliceBox:
-    """The box with a rim, in which the image's own faces are seen."""
-    rim = RIM * float((box.high - box.low).max())
-    return SliceBox(box.low - rim, box.high + rim, box.position)
-
-
-def _factor(longest_mm: float) -> float:
-    """How many times as long as it is an arrow is drawn, a round number, so that the longest is seen."""
-    return next((f for f in (10.0, 5.0, 3.0, 2.0) if f * longest_mm <= LONGEST_ARROW_MM), 1.0)

@@ -9,8 +9,6 @@ import matplotlib.image as mpimg
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Camera", "Triangles", "render_png"]
-
 FINE = 2  # samples a pixel edge; the picture is averaged down by it
 DENSITIES = np.array([2, 3, 4, 6, 8, 11, 15, 20, 28, 40, 56, 80, 112, 160, 224, 320, 448, 640, 1280])
 DEPTHS, SAMPLES = 2**24 - 1, 2**38  # a depth and a sample's number share an integer, whose largest is the nearest

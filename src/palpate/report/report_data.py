@@ -13,27 +13,6 @@ from numpy.typing import NDArray
 from palpate.images.label_image import VoxelGrid
 from palpate.study.archive import MAY_BE_NAN, read_archive, write_archive
 
-__all__ = [
-    "GREY_STEPS",
-    "MESH",
-    "MOST_ARROWS",
-    "BoneDistance",
-    "InputImage",
-    "LaterImage",
-    "MapSlice",
-    "MeasuredPoints",
-    "MeasuredState",
-    "MeshPicture",
-    "ModelSurface",
-    "Reference",
-    "ReportData",
-    "ReportTissue",
-    "SliceBox",
-    "TissueMap",
-    "TriangleSurface",
-    "Volume",
-]
-
 MESH = "a mesh"  # the setting "body" of a case without images
 
 FORMAT = "palpate.report-data/4"

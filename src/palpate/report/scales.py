@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from palpate.report.report_data import ReportData
 from palpate.study.refusals import LINEAR_RANGE
 
-__all__ = ["Scale", "angle_scale", "distance_scale", "modulus_scale", "strain_scale"]
-
 UNSEEN = (0.62, 0.63, 0.66)  # where there is no value
 
 

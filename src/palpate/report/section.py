@@ -12,8 +12,6 @@ from scipy import ndimage
 from palpate.images.label_image import VoxelGrid
 from palpate.images.tissue_distance import window_of
 
-__all__ = ["VIEWS", "Plane", "View", "cut_image", "cut_triangles", "joined"]
-
 PIXEL_MM = 0.8
 
 

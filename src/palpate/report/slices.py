@@ -24,8 +24,6 @@ from palpate.report.report_data import (
 from palpate.report.section import VIEWS, Plane, cut_image, joined
 from palpate.report.svg import draw_svg
 
-__all__ = ["alignment_svg", "contour_names", "first_planes", "points_svg", "slice_svg"]
-
 WIDTH_INCHES = 4.6
 SEEN, FITTED = ("#f0e442", 0.045), ("#4da3ff", 0.018)  # colour and width (inches) of arrows on black
 ROLE_LEVELS = {"rigid": 1.0, "estimate": 0.6, "driver": 0.4, "known": 0.2, "void": 0.0}  # bones are what is aligned

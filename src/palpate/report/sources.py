@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-__all__ = ["REPOSITORY", "SOURCES", "Source", "bibtex", "reference_line"]
-
 REPOSITORY = "https://github.com/palpate/palpate"
 
 

@@ -27,8 +27,6 @@ from palpate.study.map_words import RESOLVED, map_words
 from palpate.study.result import CaseResult
 from palpate.uncertainty import StiffnessMap
 
-__all__ = ["map_png", "map_svg", "tissue_maps"]
-
 ROOM_MM = 3.0  # round the tissue
 COLOURS = "cividis"  # which is read alike by who sees no red or green
 FACTORS = (1.0, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0)
@@ -94,7 +92,14 @@ def map_svg(data: ReportData, of: TissueMap, *, name: str) -> str:
             _slice(axes[row, 1], plane, cut, np.exp(cut.sd), spread)
             axes[row, 0].set_title(f"{view.name}, {'xyz'[view.normal]} = {plane.position:.0f} mm", loc="left")
         for column, of_column in enumerate((scale, spread)):
-            _bar(figure, 0.06 + 0.5 * column, of_column)
+            bar = figure.add_axes(((0.06 + 0.5 * column), 0.075, 0.38, 0.02))
+            mapped = ScalarMappable(LogNorm(of_column.low, of_column.high), of_column.name)
+            places = [place for place, _ in of_column.ticks] or [f for f in FACTORS if f <= of_column.high]
+            drawn = figure.colorbar(mapped, cax=bar, orientation="horizontal", label=of_column.label)
+            drawn.ax.xaxis.set_major_locator(FixedLocator(places))
+            drawn.ax.xaxis.set_minor_locator(NullLocator())
+            drawn.ax.xaxis.set_major_formatter(StrMethodFormatter("{x:.3g}"))
+            drawn.ax.xaxis.set_minor_formatter(NullFormatter())
 
     says = f"Slices of the modulus inside {tissue}, and of its standard deviation. {of.words}"
     return draw_svg(draw, size=(2.0 * SIDE_INCHES + 0.6, 3.0 * SIDE_INCHES + 1.2), name=name, says=says)
@@ -117,17 +122,6 @@ def _slice(axes: Axes, plane: Plane, cut: MapSlice, values: NDArray[np.float32],
     axes.set_xlim(across[-1], across[0])  # the patient's right is on the left
     axes.set_aspect("equal")
     axes.set_axis_off()
-
-
-def _bar(figure: Figure, left: float, scale: Scale) -> None:
-    bar = figure.add_axes((left, 0.075, 0.38, 0.02))
-    mapped = ScalarMappable(LogNorm(scale.low, scale.high), scale.name)
-    places = [place for place, _ in scale.ticks] or [f for f in FACTORS if f <= scale.high]
-    drawn = figure.colorbar(mapped, cax=bar, orientation="horizontal", label=scale.label)
-    drawn.ax.xaxis.set_major_locator(FixedLocator(places))
-    drawn.ax.xaxis.set_minor_locator(NullLocator())
-    drawn.ax.xaxis.set_major_formatter(StrMethodFormatter("{x:.3g}"))
-    drawn.ax.xaxis.set_minor_formatter(NullFormatter())
 
 
 def map_png(data: ReportData, of: TissueMap) -> bytes:

@@ -16,8 +16,6 @@ from palpate.observation.observed_surface import observed_surface
 from palpate.report.report_data import ModelSurface, TriangleSurface
 from palpate.study.result import CaseResult
 
-__all__ = ["MOST_TRIANGLES", "carried_outline", "contour_width", "image_surface", "model_surface"]
-
 MOST_TRIANGLES = 40_000  # of one surface
 ROOM_MM = 10.0  # around a surface, so that what lies beyond its distance map changes nothing there
 TRIANGLES_A_VOXEL = 2.5  # of marching cubes, for each voxel on the surface

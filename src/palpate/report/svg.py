@@ -1,16 +1,21 @@
-"""Matplotlib figures as SVG that stands in an HTML page and takes the page's colours."""
+"""The templates of pages, and matplotlib figures as SVG that stands in them and takes their colours."""
 
 from __future__ import annotations
 
 import io
 import re
 from collections.abc import Callable, Sequence
+from functools import cache
 
+import jinja2
 import matplotlib as mpl
 from markupsafe import escape
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-__all__ = ["INK", "draw_svg", "link_url"]
+from palpate.images.registration import length_text
+from palpate.report.rows import interval_text, number
 
 INK = "#010203"  # stands for the page's text colour, which differs between light and dark pages
 STYLE = {
@@ -37,9 +42,26 @@ STYLE = {
 }
 
 
+@cache
+def template_of(name: str, package: str = "palpate.report") -> jinja2.Template:
+    """A page's template, of that package or ours, all that is put into it escaped; a quarter of a page's time."""
+    loader = jinja2.ChoiceLoader([jinja2.PackageLoader(package), jinja2.PackageLoader("palpate.report")])
+    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
+    environment.filters |= {"number": number, "length_text": length_text}
+    environment.filters["interval"] = lambda ends: interval_text(None if ends is None else tuple(ends))
+    return environment.get_template(name)
+
+
 def link_url(number: int) -> str:
     """What an artist's url is until a figure's link of that number takes its place."""
     return f"palpate-link-{number}-"
+
+
+def mark_decades(axis: Axis) -> None:
+    """1, 2 and 5 of each decade of a logarithmic axis, written plainly."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def draw_svg(
@@ -71,9 +93,9 @@ def draw_svg(
     element = re.sub(r'\bid="', f'id="{name}-', element)
     element = re.sub(r"url\(#", f"url(#{name}-", element)
     element = re.sub(r'(xlink:)?href="#', f'href="#{name}-', element)
-    for number, (address, words) in enumerate(links):
+    for k, (address, words) in enumerate(links):
         link = f'<a href="{escape(address)}" aria-label="{escape(words)}">'
-        element = element.replace(f'<a xlink:href="{link_url(number)}" target="_blank">', link)
+        element = element.replace(f'<a xlink:href="{link_url(k)}" target="_blank">', link)
     role = "group" if links else "img"  # an image hides what is in it from who cannot see
     element = element.replace("<svg", f'<svg role="{role}" aria-label="{escape(says)}"', 1)
     return element.replace(INK, "currentColor")

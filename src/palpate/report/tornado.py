@@ -1,4 +1,4 @@
-"""What each assumption does to a modulus, largest effect first: as rows and as a tornado chart."""
+"""What each assumption does to a modulus, largest effect first: as rows, as a tornado chart, as sensitivity.html."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from markupsafe import Markup
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from palpate.report.rows import interval_text, main_numbers, number
-from palpate.report.svg import INK, draw_svg
-
-__all__ = ["TornadoRow", "effect_text", "sensitivity_table", "tornado_rows", "tornado_svg"]
+from palpate.report.svg import INK, draw_svg, template_of
 
 NAMES = {
     "known_modulus": "modulus of {}",
@@ -146,3 +145,29 @@ def tornado_svg(document: Mapping[str, Any], tissue: str, *, name: str) -> str:
 
     told = "; ".join(f"{row.label}: {effect_text(row)}" for row in rows)
     return draw_svg(draw, size=(7.2, height), name=name, says=f"Tornado of {tissue}: {told}.")
+
+
+def sensitivity_page(document: Mapping[str, Any]) -> str:
+    """The page of a document sensitivity.json; all names in it are escaped."""
+    tissues = []
+    for place, item in enumerate(document["estimates"]):
+        value, interval = main_numbers(item)
+        tissue, sobol = item["tissue"], document["sobol"]
+        indices = []  # name of each input with its first and total index, the largest total first
+        if sobol is not None:
+            parts = [sobol[key][tissue] for key in ("total", "total_half", "first", "first_half")]
+            named = zip([NAMES[of["cause"]].format(of["subject"]) for of in sobol["inputs"]], *parts, strict=True)
+            ranked = sorted(named, key=lambda row: -row[1])
+            indices = [(name, f"{a:.3f} ± {ah:.3f}", f"{b:.3f} ± {bh:.3f}") for name, b, bh, a, ah in ranked]
+        tissues.append(
+            {
+                "name": tissue,
+                "value": number(value),
+                "unit": "kPa" if item["unit"] == "kPa" else f"× {item['relative_to']}",
+                "interval": interval_text(interval),
+                "chart": Markup(tornado_svg(document, tissue, name=f"tornado{place}")),  # noqa: S704 - ours
+                "rows": [(row, effect_text(row)) for row in tornado_rows(document, tissue)],
+                "sobol": indices,
+            }
+        )
+    return str(template_of("sensitivity.html").render(document=document, tissues=tissues))

@@ -1,7 +1,9 @@
-"""The images behind the slices, as whole numbers on a grid along the axes of the world."""
+"""What slices show, and where: grey images or labels, as whole numbers on a grid along the axes of the world."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -9,11 +11,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from palpate.images.label_image import VoxelGrid
+from palpate.images.readers import read_intensities
 from palpate.images.segmentation import Segmentation
+from palpate.images.tissue import Role
 from palpate.images.tissue_distance import cropped, window_of
 from palpate.report.report_data import GREY_STEPS, SliceBox, Volume
-
-__all__ = ["MOST_VOXELS", "grey_volume", "label_volume"]
+from palpate.study.result import CaseResult
 
 MOST_VOXELS = 2_500_000  # what a page can carry and a telephone can hold
 CT_WINDOW = (-160.0, 240.0)  # Hounsfield units in which soft tissues differ
@@ -21,6 +24,10 @@ CT_SPAN = (-1024.0, 3072.0)  # Hounsfield units from air to metal, which clips n
 CT_AIR = -500.0  # an image with less is a CT
 MOST_TISSUES = 254
 AWAY_FROM_TIES = 5e-4  # voxels: half-way between two voxels images that differ by rounding show the same one
+MOST_WHOLE_GREY = 400_000  # voxels of an image that the check of the alignment shows
+MARGIN_MM = 15.0
+ENOUGH_VOXELS = 4_000_000
+MOVING = (Role.ESTIMATE, Role.DRIVER)
 
 
 def grey_volume(values: NDArray[Any], grid: VoxelGrid, box: SliceBox, *, most_voxels: float = MOST_VOXELS) -> Volume:
@@ -79,3 +86,131 @@ def _cut(
         cval=np.nan,
     )
     return np.asarray(cut)
+
+
+@dataclass(frozen=True, slots=True)
+class Grey:
+    """A grey image: values (n_x, n_y, n_z) in its own unit on `grid`."""
+
+    values: NDArray[Any]
+    grid: VoxelGrid
+
+
+def earlier_grey(result: CaseResult) -> Grey | None:
+    """The grey image of the reference state, if the case gives one; raises as `read_intensities` does."""
+    images = result.case.images
+    if images is None or images.intensities_before is None:
+        return None
+    digest = result.provenance.inputs.get("intensities_before")
+    return Grey(*read_intensities(images.intensities_before, sha256=digest))
+
+
+def later_grey(result: CaseResult, after: int) -> Grey | None:
+    """The grey image of later image number `after`, where its label image was brought to.
+
+    That is known when both have one grid; raises `ValueError` when they have not, else as `read_intensities` does.
+    """
+    images, aligned = result.case.images, result.after[after].grid
+    if images is None or after >= len(images.intensities_after):
+        return None
+    digest = result.provenance.inputs.get(f"intensities_after[{after}]")
+    values, grid = read_intensities(images.intensities_after[after], sha256=digest)
+    if values.shape != aligned.shape or not np.allclose(grid.spacing, aligned.spacing, rtol=1e-3):
+        raise ValueError("the later grey image is not on the grid of its label image")
+    return Grey(values, aligned)
+
+
+def background(
+    result: CaseResult, grey: Grey | None, image: Segmentation, box: SliceBox, *, labels: bool = False
+) -> Volume | None:
+    """What the slices of an image show in `box`: its grey values; its labels where the case has no grey image; or None.
+
+    Nothing is better than the grey values of another state under the name of this one. labels: they stand in for a grey
+    image that could not be read.
+    """
+    images = result.case.images
+    given = 0 if images is None else (images.intensities_before is not None) + len(images.intensities_after)
+    if grey is not None:
+        return grey_volume(grey.values, grey.grid, box, most_voxels=MOST_VOXELS / given)
+    return None if given and not labels else label_volume(image, box)
+
+
+def whole_box(image: Segmentation, position: NDArray[np.float64] | None = None) -> SliceBox:
+    """The box around an image but for its border; the first planes go through `position` (3,) mm, or its middle.
+
+    It begins and ends in the middle of voxels: half-way between two the one that is shown would be the rounding's, and
+    another one in each image.
+    """
+    corners = np.array(np.meshgrid(*[[n > 3, n - 1 - (n > 3)] for n in image.grid.shape])).reshape(3, -1).T
+    places = image.grid.world(corners)
+    low, high = places.min(axis=0), places.max(axis=0)
+    return SliceBox(low, high, 0.5 * (low + high) if position is None else position)
+
+
+def whole_images(
+    box: SliceBox, earlier: tuple[Segmentation, Grey | None], later: tuple[Segmentation, Grey | None]
+) -> tuple[Volume, Volume]:
+    """Both images in `box`, the grey values if both have them, else the labels, so that like lies over like."""
+    if earlier[1] is not None and later[1] is not None:
+        first, second = (
+            grey_volume(grey.values, grey.grid, box, most_voxels=MOST_WHOLE_GREY) for grey in (earlier[1], later[1])
+        )
+        return first, second
+    first, second = (label_volume(image, box, most_voxels=MOST_VOXELS) for image, _ in (earlier, later))
+    return first, second
+
+
+def slice_box(image: Segmentation, later: Sequence[Segmentation]) -> SliceBox:
+    """A box around all estimated tissues and drivers of an image and of those brought to it, and the first planes.
+
+    These show as much of every tissue as possible. Of an image without later ones the box is the whole of it.
+    """
+    moving = tuple(i for i, tissue in enumerate(image.tissues) if tissue.role in MOVING)
+    boxes = [_extent(_thinned(each), moving) for each in (image, *later)]
+    border = np.array([_range(image.grid, axis) for axis in range(3)])
+    low = np.maximum(np.min([pair[0] for pair in boxes], axis=0) - MARGIN_MM, border[:, 0])
+    high = np.minimum(np.max([pair[1] for pair in boxes], axis=0) + MARGIN_MM, border[:, 1])
+    before = _thinned(image)
+    position = np.array([_richest(before, moving, axis) for axis in range(3)])
+    return SliceBox(low, high, position) if later else whole_box(image, position)
+
+
+def _extent(image: Segmentation, tissues: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Corners (3,) mm of the box around the tissues' voxels; the whole image when there are none."""
+    index = np.argwhere(np.isin(image.index, tissues)).astype(np.float64)
+    if not len(index):
+        index = np.array([[0.0, 0.0, 0.0], [*image.grid.shape]])
+    points = image.grid.world(index)
+    return points.min(axis=0), points.max(axis=0)
+
+
+def _thinned(image: Segmentation) -> Segmentation:
+    """Every n-th voxel along each axis of a large image: enough to see where the organs are."""
+    step = int(np.ceil((image.index.size / ENOUGH_VOXELS) ** (1.0 / 3.0)))
+    index = image.index[::step, ::step, ::step]
+    affine = image.grid.affine.copy()
+    affine[:3, :3] *= step
+    nx, ny, nz = index.shape
+    return Segmentation(index, VoxelGrid((nx, ny, nz), affine), image.tissues)
+
+
+def _richest(image: Segmentation, tissues: tuple[int, ...], axis: int) -> float:
+    """Position (mm) along a world axis that shows much of every tissue, each measured by its own largest section."""
+    grid = image.grid
+    low, high = _range(grid, axis)
+    bins = np.linspace(low, high, max(round((high - low) / float(grid.spacing.max())), 1) + 1)
+    score = np.zeros(len(bins) - 1)
+    for tissue in tissues:
+        places = grid.world(np.argwhere(image.index == tissue).astype(np.float64))[:, axis]
+        area = np.histogram(places, bins)[0]
+        weight = 3.0 if image.tissues[tissue].role is Role.ESTIMATE else 1.0
+        score += weight * np.log(0.03 + area / max(area.max(), 1))  # what is absent costs more than what is small
+    best = int(np.argmax(score))
+    return float(0.5 * (bins[best] + bins[best + 1]))
+
+
+def _range(grid: VoxelGrid, axis: int) -> tuple[float, float]:
+    """Outer faces of the grid along a world axis, mm."""
+    corners = np.array(np.meshgrid(*[[-0.5, n - 0.5] for n in grid.shape])).reshape(3, -1).T
+    places = grid.world(corners)[:, axis]
+    return float(places.min()), float(places.max())

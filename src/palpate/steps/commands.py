@@ -16,17 +16,14 @@ from palpate.steps.saving import save_sensitivity
 from palpate.study import run
 from palpate.study.case import Case
 from palpate.study.check import CheckReport, check_case
-from palpate.study.earlier import RESULT
 from palpate.study.lock import held_folder
 from palpate.study.new_case import NewCase
 from palpate.study.null_pair import NullPair, drawing_noise
-from palpate.study.outputs import OutputFolder, read_json
+from palpate.study.outputs import RESULT, OutputFolder, read_json
 from palpate.study.result import SCHEMA, MeshResult, Simulation
 from palpate.study.sensitivity import Kept, Sensitivity
 from palpate.study.sensitivity import sensitivity as vary
 from palpate.study.surface_labels import SurfaceLabels, surface_labels
-
-__all__ = ["check", "estimate", "init", "make_mesh", "noise", "read_result", "sensitivity", "simulate", "voxelise"]
 
 PathLike = str | os.PathLike[str]
 

@@ -21,8 +21,6 @@ from palpate.study.outputs import OutputFolder, read_regular, write_text
 from palpate.study.prediction import predicted_intervals
 from palpate.study.provenance import software_versions
 
-__all__ = ["PREVIEW", "checked_with_page", "new_case_with_page", "place_page", "refuse_other_page", "write_page"]
-
 LOGGER = logging.getLogger(__name__)
 PREVIEW = "preview.html"
 LARGEST_PAGE = 2**28  # bytes
@@ -58,24 +56,6 @@ def write_page(case: Case, outputs: OutputFolder, *, progress: Progress = silent
         staging.commit()
 
 
-def _new_case_page(new: NewCase, *, progress: Progress = silent) -> str:
-    """The preview of a case that `init` has written, not meshed.
-
-    A tissue whose role must be asked for is shown as void, and its question among the problems.
-    """
-    overrides = [f'tissues.{toml_key(t.name)}.role="void"' for t in new.tissues if t.role is None]
-    overrides += [
-        f"tissues.{toml_key(t.name)}.youngs_modulus_kpa={SOME_KPA}"
-        for t in new.tissues
-        if t.role is Role.KNOWN and t.youngs_modulus_kpa is None
-    ]
-    checked = checked_case(new.path, overrides, progress=progress, meshed=False)
-    asked = tuple(Problem("question", question, ConfigurationError.exit_code) for question in new.questions)
-    report = replace(checked.report, problems=(*asked, *checked.report.problems))
-    progress("drawing the preview")
-    return _page(replace(checked, report=report), NOT_YET)
-
-
 def new_case_with_page(
     images: Sequence[Path],
     table: Path | None,
@@ -91,7 +71,18 @@ def new_case_with_page(
     refuse_other_page(outputs.path / PREVIEW)
     new = write_new_case(images, table, outputs, cts=cts)
     try:
-        page = _new_case_page(new, progress=progress)
+        # the preview of a case that `init` has written, not meshed
+        overrides = [f'tissues.{toml_key(t.name)}.role="void"' for t in new.tissues if t.role is None]
+        overrides += [
+            f"tissues.{toml_key(t.name)}.youngs_modulus_kpa={SOME_KPA}"
+            for t in new.tissues
+            if t.role is Role.KNOWN and t.youngs_modulus_kpa is None
+        ]
+        checked = checked_case(new.path, overrides, progress=progress, meshed=False)
+        asked = tuple(Problem("question", question, ConfigurationError.exit_code) for question in new.questions)
+        report = replace(checked.report, problems=(*asked, *checked.report.problems))
+        progress("drawing the preview")
+        page = _page(replace(checked, report=report), NOT_YET)
     except Exception:  # a drawing never costs the case
         LOGGER.exception("the preview could not be drawn")
         return new

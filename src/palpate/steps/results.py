@@ -16,7 +16,7 @@ from palpate.images.tissue import Role, Tissue, tissue_colours
 from palpate.report.rows import moduli_in
 from palpate.steps.saving import save_estimate
 from palpate.study import result
-from palpate.study.case_as_run import refuse_other_case
+from palpate.study.earlier import refuse_other_case
 from palpate.study.lock import held_folder
 from palpate.study.outputs import OutputFolder
 
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-__all__ = ["CaseResult", "SavedResult"]
 
 COLUMNS = ("patient", "id", "stage", "status")
 

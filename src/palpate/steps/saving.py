@@ -11,32 +11,18 @@ from palpate import report
 from palpate.errors import EstimationError, InputDataError, ResourceError
 from palpate.export.case_files import write_estimate_files
 from palpate.findings import Finding, warning_rows
-from palpate.progress import during, silent
+from palpate.progress import Progress, during, silent
 from palpate.study.case import Case
-from palpate.study.case_as_run import stage_case
-from palpate.study.earlier import RESULT, earlier_files, vouched
-from palpate.study.outputs import OutputFolder, Staging, read_json, write_json, write_text
+from palpate.study.earlier import earlier_files, stage_case, vouched
+from palpate.study.outputs import DATA, PAGE, RESULT, OutputFolder, Staging, read_json, write_json, write_text
 from palpate.study.result import CaseResult, failure_document
 from palpate.study.sensitivity import Sensitivity
 
-__all__ = [
-    "DATA",
-    "PAGE",
-    "has_study",
-    "redraw_page",
-    "save_document",
-    "save_estimate",
-    "save_failure",
-    "save_sensitivity",
-]
-
 LOGGER = logging.getLogger(__name__)
-PAGE, DATA, STUDY = "report.html", "report-data.npz", "sensitivity.json"
+STUDY = "sensitivity.json"
 
 
-def save_estimate(
-    result: CaseResult, outputs: OutputFolder, *, progress: Callable[[str], None] = silent
-) -> dict[str, Any]:
+def save_estimate(result: CaseResult, outputs: OutputFolder, *, progress: Progress = silent) -> dict[str, Any]:
     """Put all files of an estimate in place in a folder that this process holds; gives the document result.json.
 
     Where the page cannot be made, a warning of the document says so instead. Raises `ResourceError` where the disk

@@ -13,10 +13,7 @@ from pathlib import Path
 from urllib.parse import quote, unquote
 
 from palpate.errors import InputDataError, ResourceError
-from palpate.study.earlier import RESULT
-from palpate.study.outputs import is_inside, read_json, read_regular
-
-__all__ = ["Viewing", "viewing"]
+from palpate.study.outputs import RESULT, is_inside, read_json, read_regular
 
 LOOPBACK = "127.0.0.1"
 MOST_BYTES = 2**30  # of a file

@@ -20,9 +20,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
 from palpate.images.named_labels import printable
-from palpate.study.outputs import read_regular, write_bytes
-
-__all__ = ["MAY_BE_NAN", "read_archive", "write_archive"]
+from palpate.study.outputs import no_constant, read_regular, write_bytes
 
 T = TypeVar("T")
 
@@ -59,7 +57,7 @@ def read_archive(kind: type[T], path: Path, *, version: str, sha256: str | None 
         )
     try:
         arrays = _arrays(content)
-        plain = json.loads(arrays["json"].tobytes(), parse_constant=_no_number)
+        plain = json.loads(arrays["json"].tobytes(), parse_constant=no_constant)
         if plain["format"] != version:
             raise ValueError(f"its format is {str(plain['format'])[:40]!r}, not '{version}'")
         return typing.cast("T", _decode(kind, plain["value"], arrays, finite or None))
@@ -109,11 +107,6 @@ def _encode(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
     if isinstance(value, list | tuple):
         return [_encode(item, arrays) for item in value]
     return (value if math.isfinite(value) else None) if isinstance(value, float) else value
-
-
-def _no_number(name: str) -> float:
-    """What JSON does not know and Python's reader takes all the same: NaN, Infinity."""
-    raise ValueError(f"{name} is no number")
 
 
 def _decode(hint: Any, value: Any, arrays: Mapping[str, NDArray[Any]], finite: bool | None) -> Any:

@@ -15,31 +15,8 @@ from palpate.mechanics.laws.registry import LAWS, law_from, law_parameters
 from palpate.mechanics.solvers.registry import SOLVERS
 from palpate.observation.contract import DataFile
 from palpate.study.case_data import CaseData
-from palpate.study.schema import Rule, nearest, rule, shown
+from palpate.study.schema import nearest, rule, shown
 from palpate.uncertainty.intervals import NORMAL_95
-
-__all__ = [
-    "REMAINING",
-    "SAMPLES",
-    "Case",
-    "CaseData",
-    "CaseLoad",
-    "CaseSurface",
-    "CaseTissue",
-    "Discrepancy",
-    "Domain",
-    "DriverMotion",
-    "Estimate",
-    "Images",
-    "Mechanics",
-    "MeshBody",
-    "MeshSettings",
-    "Motion",
-    "Noise",
-    "Pair",
-    "Phantom",
-    "is_tissue_name",
-]
 
 REMAINING = "remaining"
 AUTO = "auto"
@@ -497,7 +474,7 @@ class Case:
     noise: Noise = Noise()
     discrepancy: Discrepancy = Discrepancy()
     estimate: Estimate = Estimate()
-    overrides: tuple[str, ...] = field(default=(), compare=False, metadata={"rule": Rule(unwritten=True)})
+    overrides: tuple[str, ...] = field(default=(), compare=False, metadata=rule(unwritten=True))
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "patient", self.patient or self.id)

@@ -12,8 +12,6 @@ from palpate.observation.contract import DataFile
 from palpate.observation.registry import SOURCES, register_brought
 from palpate.study.schema import rule
 
-__all__ = ["CaseData"]
-
 Row = tuple[float, float, float]
 FORCES_N = (-1e9, 1e9)
 register_brought()  # before the words that a case may use are listed

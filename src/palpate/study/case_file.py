@@ -18,17 +18,6 @@ from palpate.images.tissue import Role
 from palpate.study.case import POISSON_RATIO, RATIO_SD, Case, CaseTissue
 from palpate.study.schema import Rule, read_table, shortened
 
-__all__ = [
-    "case_tables",
-    "case_text",
-    "lasting_path",
-    "read_case",
-    "relative_path",
-    "toml_key",
-    "toml_text",
-    "toml_value",
-]
-
 LARGEST_FILE = 100_000  # bytes; a case is a page of text, and one of a hundred tissues has 40 000
 MOST_DOTS = 100  # in a line: keys of thousands of parts would take the parser minutes
 HEADING = (

@@ -14,8 +14,6 @@ from palpate.mechanics.loads import Load, boundary_named, gravity, pressure, tra
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.case import Case, CaseLoad
 
-__all__ = ["case_loads", "load_warnings", "loads_on"]
-
 
 def case_loads(case: Case, space: LagrangeSpace, state: int, *, share: float = 1.0) -> tuple[Load, ...]:
     """What `case` adds in the later state with a number, from 1, to the loads of the reference, or a `share` of it.

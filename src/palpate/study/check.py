@@ -44,8 +44,6 @@ from palpate.study.refusals import refuse_lost, refuse_unmeshable
 from palpate.study.run import refuse_what_cannot_be_estimated
 from palpate.study.samples import require_samples
 
-__all__ = ["CheckReport", "Checked", "OrganRow", "Problem", "check_case", "checked_case", "memory_problems"]
-
 T = TypeVar("T")
 OBSERVED = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
 REFUSED_FINDINGS = {"hardly-observed": GeometryError.exit_code}  # what an estimate refuses, found here as a finding
@@ -247,7 +245,7 @@ def _checked(case: Case, problems: _Problems, progress: Progress, *, meshed: boo
     found = [
         (f"pair {n}: {name}" if n > 1 else name, one)
         for n, pair in enumerate(pairs, start=1)
-        for name, one in _lay(pair)
+        for name, one in zip(later_names(len(pair.after)), pair.alignments, strict=False)
     ]
     files = [(source.file, source.in_words) for pair in pairs for source in pair.data]
     measured_words = {f.name + (f", state {f.state}" if f.state > 1 else ""): words for f, words in files}
@@ -261,11 +259,6 @@ def _with_data(problems: _Problems, pair: ImagedStates, case: Case, first: int) 
         return pair
     found = problems.attempt(lambda: measured(case, pair, first=first))
     return pair if found is None else replace(pair, data=found[0])
-
-
-def _lay(pair: ImagedStates) -> list[tuple[str, Registration]]:
-    """The name of each later image with how it lay, where that was measured."""
-    return list(zip(later_names(len(pair.after)), pair.alignments, strict=False))
 
 
 def _cost(

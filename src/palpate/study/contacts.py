@@ -8,12 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.findings import Finding
-from palpate.images.checks import later_names
+from palpate.images.checks import STILL_VOXELS, later_names, wall_motion
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
-from palpate.images.wall_motion import STILL_VOXELS, wall_motion
-
-__all__ = ["contact_findings", "every_finding", "front_findings", "motion_findings", "sides_findings"]
 
 BEHIND, IN_FRONT = ("sacrum", "coccyx"), ("prostate", "bladder")  # in every pelvis
 LEAST_OBSERVED = 0.1  # below, an estimate is refused (see observation.observed_surface)

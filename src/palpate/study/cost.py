@@ -22,21 +22,6 @@ from palpate.progress import STAGES, Stage
 from palpate.study.case import Case
 from palpate.study.edge_length import EdgeLength, case_domain, edge_length_of
 
-__all__ = [
-    "LESS_MEMORY",
-    "MEMORY_FACTOR",
-    "ExpectedCost",
-    "cost_of_meshes",
-    "expected_cost",
-    "expected_size",
-    "expected_tets",
-    "free_memory_gb",
-    "image_memory_gb",
-    "lack_of_memory",
-    "machine_memory_gb",
-    "tets_by_edge_length",
-]
-
 MEMORY_FACTOR = 1.5  # how far the predicted memory may be off
 
 LATTICE = 64  # points of the lattice along the longest side, on which edge lengths are summed

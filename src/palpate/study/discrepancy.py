@@ -14,17 +14,6 @@ from palpate.inversion import Inversion
 from palpate.mesh.surface import cut_faces
 from palpate.uncertainty import NORMAL_95, FittedState
 
-__all__ = [
-    "FittedMaterial",
-    "FoundDiscrepancy",
-    "FrameFound",
-    "HeterogeneityFound",
-    "OffsetFound",
-    "discrepancy_findings",
-    "discrepancy_of",
-    "fitted_materials",
-]
-
 TOLD = 2.0  # standard deviations, from which an offset is said in words
 LEAST_TOLD_MM = 0.1
 

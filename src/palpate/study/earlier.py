@@ -10,27 +10,76 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from palpate.errors import InputDataError
+from palpate.errors import ConfigurationError, InputDataError, PalpateError
 from palpate.findings import Finding
-from palpate.study.outputs import Digests, is_inside, read_json, sha256_of
-
-__all__ = ["RESULT", "Earlier", "earlier_files", "seal_of", "strange_files", "vouched"]
-
-RESULT = "result.json"
-DOCUMENTS = (RESULT, "mesh.json", "simulation.json", "sensitivity.json")  # each lists the files of its run
-PAGE_FILES = ("report-data.npz", "report.html")
-RESULT_FILES = (
-    *PAGE_FILES,
-    "labels.csv",
-    "labels.nii.gz",
-    "mesh.vtu",
-    "model.npz",
-    "posterior.nc",
-    "stiffness.nii.gz",
-    "stiffness_sd.nii.gz",
+from palpate.study.case import Case
+from palpate.study.case_file import case_tables, case_text, read_case, relative_path
+from palpate.study.outputs import (
+    DATA,
+    PAGE,
+    RESULT,
+    RESULT_FILES,
+    Digests,
+    OutputFolder,
+    Staging,
+    is_inside,
+    read_json,
+    sha256_of,
+    write_text,
 )
+
+CASE_NAME = "case.toml"
+DOCUMENTS = (RESULT, "mesh.json", "simulation.json", "sensitivity.json")  # each lists the files of its run
 UNSEALED = ("files", "warnings")  # which are added when the files take their places
 FURTHER_MESH = re.compile(r"mesh_\d+\.vtu")
+
+
+def refuse_other_case(case: Case, outputs: OutputFolder) -> None:
+    """Raise `ConfigurationError` where the folder has a case.toml of somebody's own that says something else.
+
+    One that this run or an earlier one has written may be replaced.
+    """
+    path = outputs.path / CASE_NAME
+    if CASE_NAME in outputs.written or not path.exists():
+        return
+    if not _says(path, case) and CASE_NAME not in vouched(outputs.path, RESULT):
+        raise ConfigurationError(
+            f"{path} is another case than that of this run, whose own case.toml would come to stand there: choose"
+            " another --output folder, or move that file"
+        )
+
+
+def stage_case(case: Case, staging: Staging) -> tuple[Finding, ...]:
+    """Stage case.toml as it was run, unless one of somebody's own in the folder says the same.
+
+    Gives the warnings of a result without it: it was changed meanwhile, or a path cannot be written in TOML.
+    """
+    path = staging.folder / CASE_NAME
+    own = not path.exists() or CASE_NAME in vouched(staging.folder, RESULT)
+    if not own and _says(path, case):
+        return ()
+    if not own and not (case.overrides and CASE_NAME in staging.written):  # by `palpate init`, in the same run
+        text = f"{path.name} in the output folder was changed during the run and is not the case of it"
+        return (Finding("case-file", text),)
+    try:
+        write_text(staging.area / CASE_NAME, case_text(case, staging.folder))
+    except ConfigurationError as error:
+        return (Finding("case-file", f"the case of this run could not be written: {error}"),)
+    return ()
+
+
+def _says(path: Path, case: Case) -> bool:
+    """Whether the case file at `path` says what `case` says."""
+    try:
+        found = read_case(path)
+    except PalpateError:
+        return False
+
+    def place(file: Path) -> str:
+        """A file from the folder of both."""
+        return relative_path(file, path.parent)
+
+    return case_tables(found, place) == case_tables(case, place)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +103,7 @@ def earlier_files(folder: Path, document: str, files: Digests) -> Earlier:
     shared = {name for listed in others.values() for name in listed}
     retired = tuple(name for name in vouched(folder, document) if name not in files and name not in shared)
     strange = [name for name in strange_files(folder, files) if name not in files and name not in retired]
-    aside = tuple(name for name in strange if name in PAGE_FILES) if document == RESULT else ()
+    aside = tuple(name for name in strange if name in (DATA, PAGE)) if document == RESULT else ()
     left = [name for name in strange if name not in aside] if document == RESULT else []
     warnings = []
     if left:

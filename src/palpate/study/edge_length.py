@@ -6,18 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
-from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.images.tissue_distance import window_around
 from palpate.mechanics.dilatation import choose_element
 from palpate.mesh.anatomy import Box, domain_box, margin_box
 from palpate.study.case import Case
-
-__all__ = ["EdgeLength", "case_domain", "edge_length_of"]
 
 ACROSS_BALL = {Role.ESTIMATE: 5.0, Role.DRIVER: 4.0}  # edges across a ball of the tissue's volume
 ACROSS_THIN = 2.5  # edges across its thickness
@@ -64,7 +60,12 @@ def edge_length_of(case: Case, before: Segmentation, after: Sequence[Segmentatio
     of_organs = dict[str, tuple[float, str]]()
     for i, tissue in enumerate(before.tissues):
         if tissue.role in ACROSS_BALL and (mask := before.mask(i)).any():
-            ball, thickness = (6.0 * before.volume(i) / np.pi) ** (1.0 / 3.0), _thickness(mask, before.grid)
+            ball = (6.0 * before.volume(i) / np.pi) ** (1.0 / 3.0)
+            # diameter of the largest ball inside, in every second, ... voxel of a large tissue
+            part = mask[window_around(mask, before.grid, reach_mm=0.0)]
+            steps = [-(-n // MOST_VOXELS) for n in part.shape]
+            part = np.pad(part[:: steps[0], :: steps[1], :: steps[2]], 1)
+            thickness = 2.0 * float(ndimage.distance_transform_edt(part, sampling=steps * before.grid.spacing).max())
             across, thin = ACROSS_BALL[tissue.role] / factor, ACROSS_THIN / factor
             of_organs[tissue.name] = min(
                 longest,
@@ -90,14 +91,6 @@ def edge_length_of(case: Case, before: Segmentation, after: Sequence[Segmentatio
 def _rounded(mm: float) -> float:
     """Down to a step."""
     return STEP_MM * float(np.floor(mm / STEP_MM + 1e-9))
-
-
-def _thickness(mask: NDArray[np.bool_], grid: VoxelGrid) -> float:
-    """Diameter (mm) of the largest ball inside `mask` (n_x, n_y, n_z); of a large tissue on every second, ... voxel."""
-    part = mask[window_around(mask, grid, reach_mm=0.0)]
-    steps = [-(-n // MOST_VOXELS) for n in part.shape]
-    part = np.pad(part[:: steps[0], :: steps[1], :: steps[2]], 1)
-    return 2.0 * float(ndimage.distance_transform_edt(part, sampling=steps * grid.spacing).max())
 
 
 def case_domain(before: Segmentation, case: Case) -> Box:

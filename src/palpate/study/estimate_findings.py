@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 from palpate.findings import Finding
 from palpate.images.checks import later_names
 from palpate.inversion import Inversion, Outcome
-from palpate.mechanics.deformation import deformation_determinants
+from palpate.mechanics.element import deformation_determinants
 from palpate.observation.contract import Imaged, OfInstrument
 from palpate.study.together import ImagePairs
 from palpate.uncertainty import FittedState
-
-__all__ = ["data_findings", "fold_findings", "inversion_findings", "pair_findings"]
 
 STRONG_CORRELATION = 0.99
 HETEROGENEOUS = 0.01  # probability of such differences between image pairs that have the same moduli

@@ -16,8 +16,6 @@ from palpate.mesh.anatomy import Box
 from palpate.study.case import Case
 from palpate.study.edge_length import case_domain
 
-__all__ = ["FrameLook", "TissueLook", "frame_look", "tissue_looks"]
-
 SEEN = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
 TOWARDS = (("left side", "right side"), ("back", "front"), ("feet", "head"))  # low and high end of each RAS axis
 HELD = {

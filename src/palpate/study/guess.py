@@ -17,8 +17,6 @@ from palpate.images.totalsegmentator import CLASSES
 from palpate.study.case import is_tissue_name
 from palpate.study.plausibility import TABLE, usual_stiffness
 
-__all__ = ["ClassNames", "GuessedTissue", "class_names", "guess_tissues"]
-
 SURROUNDINGS = "surroundings"
 BORDER_SHARE = 0.1  # of the image's border that the body, or the air around it, covers
 STILL_SHARE = 0.005  # of a label's voxels
@@ -99,7 +97,16 @@ def guess_tissues(before: LabelImage, after: Sequence[LabelImage] = ()) -> tuple
     organs.sort(key=lambda g: (g not in tumours, roles.index(g.role), sum(sizes[label] for label in g.labels)))
     known = [g for g in organs if g.role is Role.KNOWN]
     others = [g for g in organs if g.role is not Role.KNOWN]
-    return tuple(_renamed([*others, *_surroundings(rest, before), *known, *outside]))
+    # every name once, and none that a case file does not take for a tissue
+    found: list[GuessedTissue] = []
+    taken: set[str] = set()
+    for guess in [*others, *_surroundings(rest, before), *known, *outside]:
+        number = guess.labels[0] if guess.labels else "rest"
+        name = guess.name if is_tissue_name(guess.name) else f"label {number}"
+        name = name if name not in taken else f"{name[: MAX_NAME - 10]} {number}"
+        taken.add(name)
+        found.append(replace(guess, name=name))
+    return tuple(found)
 
 
 def _guess(label: int, before: LabelImage, after: Sequence[LabelImage], border: dict[int, float]) -> GuessedTissue:
@@ -220,19 +227,6 @@ def _surroundings(rest: list[GuessedTissue], before: LabelImage) -> list[Guessed
         f" ({muscle.reference})"
     )
     return [GuessedTissue(SURROUNDINGS, (), Role.KNOWN, reason, value)]
-
-
-def _renamed(guesses: Sequence[GuessedTissue]) -> list[GuessedTissue]:
-    """Every name once, and none that a case file does not take for a tissue."""
-    found: list[GuessedTissue] = []
-    taken: set[str] = set()
-    for guess in guesses:
-        number = guess.labels[0] if guess.labels else "rest"
-        name = guess.name if is_tissue_name(guess.name) else f"label {number}"
-        name = name if name not in taken else f"{name[: MAX_NAME - 10]} {number}"
-        taken.add(name)
-        found.append(replace(guess, name=name))
-    return found
 
 
 @dataclass(frozen=True, slots=True)

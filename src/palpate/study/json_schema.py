@@ -15,8 +15,6 @@ from palpate.images.named_labels import MAX_LABEL, MAX_NAME
 from palpate.study.case import Case, CaseTissue
 from palpate.study.schema import MOST_LETTERS, Rule
 
-__all__ = ["DIALECT", "SCHEMAS", "case_schema"]
-
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 SCHEMAS = resources.files("palpate.study") / "schemas"  # case, result and sensitivity, as they are shipped
 LABEL = {

@@ -16,7 +16,6 @@ from palpate.study.outputs import make_folder, recover
 if sys.platform != "win32":
     import fcntl
 
-__all__ = ["folder_lock", "held_folder", "is_held", "own_file"]
 
 NAME = ".palpate.lock"
 FLAGS = ("O_CREAT", "O_APPEND", "O_NOFOLLOW", "O_NONBLOCK", "O_NOCTTY", "O_CLOEXEC")  # Windows lacks some

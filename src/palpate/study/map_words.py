@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from palpate.findings import Finding
 from palpate.uncertainty import CONTRAST, StiffnessMap
 
-__all__ = ["RESOLVED", "map_findings", "map_words"]
-
 RESOLVED = 0.5  # share of the prior's variance that data must remove for a map to be theirs
 
 

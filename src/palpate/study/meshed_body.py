@@ -26,8 +26,6 @@ from palpate.study.body import ImagedStates
 from palpate.study.case import Case, CaseSurface, MeshBody
 from palpate.study.schema import nearest
 
-__all__ = ["mesh_states", "with_prescribed"]
-
 OUTSIDE = "outside"
 VOXELS_AN_EDGE, MOST_VOXELS, BORDER = 2.5, 4e6, 3  # of the label image that shows the mesh
 
@@ -40,7 +38,13 @@ def mesh_states(body: MeshBody, case: Case, *, progress: Progress) -> ImagedStat
     file = read_mesh_file(body.mesh, data=body.tissue_data)
     progress(f"'{body.mesh.name}': {len(file.tets)} tetrahedra, {len(file.nodes)} nodes")
     mesh = _mesh(file, case)
-    grid = _grid(mesh)
+    # voxels that show the mesh: some along an edge, and a border around
+    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    size = max(mesh.usual_edge_mm / VOXELS_AN_EDGE, float(np.cbrt(np.prod(high - low) / MOST_VOXELS)))
+    shape = np.ceil((high - low) / size).astype(int) + 2 * BORDER
+    affine = np.diag([size, size, size, 1.0])
+    affine[:3, 3] = 0.5 * (low + high) - 0.5 * size * (shape - 1)
+    grid = VoxelGrid((int(shape[0]), int(shape[1]), int(shape[2])), affine)
     index = voxelise(lagrange_space(mesh, "P1"), np.zeros_like(mesh.nodes), grid, crossing=True)
     before = Segmentation(index, grid, mesh.tissues)
     bones = tuple(dict[int, Motion]() for _ in range(case.n_states))
@@ -107,13 +111,3 @@ def _faces(file: MeshFile, faces: NDArray[np.int64], surface: CaseSurface) -> ND
         raise ConfigurationError(f"[[surfaces]] '{surface.name}': the mesh has no surface '{surface.where}': {known}")
     own = {tuple(face) for face in np.sort(file.surfaces[surface.where], axis=1).tolist()}
     return np.array([tuple(face) in own for face in np.sort(faces, axis=1).tolist()], dtype=bool)
-
-
-def _grid(mesh: TetMesh) -> VoxelGrid:
-    """Voxels that show the mesh: some along an edge, and a border around."""
-    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
-    size = max(mesh.usual_edge_mm / VOXELS_AN_EDGE, float(np.cbrt(np.prod(high - low) / MOST_VOXELS)))
-    shape = np.ceil((high - low) / size).astype(int) + 2 * BORDER
-    affine = np.diag([size, size, size, 1.0])
-    affine[:3, 3] = 0.5 * (low + high) - 0.5 * size * (shape - 1)
-    return VoxelGrid((int(shape[0]), int(shape[1]), int(shape[2])), affine)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.errors import GeometryError, ResourceError
 from palpate.findings import Finding
@@ -19,8 +18,6 @@ from palpate.progress import Progress
 from palpate.study.case import Case
 from palpate.study.cost import expected_cost, lack_of_memory
 from palpate.study.edge_length import EdgeLength, case_domain, edge_length_of
-
-__all__ = ["ReferenceMesh", "mesh_reference", "refuse_edge"]
 
 FINER = 0.75  # times an edge length whose mesh is not fit: the next one's
 FINER_MESHES = 2  # at the most
@@ -108,7 +105,13 @@ def _fit_mesh(
             ' domain smaller (domain.extent = "margin")'
         ) from error
     progress("measuring the mesh against its gate")
-    counts = _counts_inside(before, anatomy.box)
+    # voxels of each tissue with their centre in the box, a layer of the image at a time
+    counts = np.zeros(len(before.tissues), dtype=np.int64)
+    for i, layer in enumerate(before.index):
+        places = np.argwhere(np.ones(layer.shape, dtype=bool))
+        local = anatomy.box.local(before.grid.world(np.column_stack([np.full(len(places), float(i)), places])))
+        inside = np.all((local > 0.0) & (local < anatomy.box.lengths), axis=1)
+        counts += np.bincount(layer.ravel()[inside], minlength=len(counts))
     volumes, thin = dict[str, float](), list[str]()
     for i, tissue in enumerate(before.tissues):
         if tissue.meshed:
@@ -118,14 +121,3 @@ def _fit_mesh(
             if min(span[-1] - span[0] + 1 for span in spans if len(span)) < THIN_VOXELS:
                 thin.append(tissue.name)
     return mesh, check_mesh(mesh, anatomy, voxel_volumes=volumes, thin=tuple(thin), image=before)
-
-
-def _counts_inside(image: Segmentation, box: Box) -> NDArray[np.int64]:
-    """Number (n_tissues,) of each tissue's voxels with their centre in the box; a layer of the image at a time."""
-    counts = np.zeros(len(image.tissues), dtype=np.int64)
-    for i, layer in enumerate(image.index):
-        places = np.argwhere(np.ones(layer.shape, dtype=bool))
-        local = box.local(image.grid.world(np.column_stack([np.full(len(places), float(i)), places])))
-        inside = np.all((local > 0.0) & (local < box.lengths), axis=1)
-        counts += np.bincount(layer.ravel()[inside], minlength=len(counts))
-    return counts

@@ -17,13 +17,11 @@ from palpate.images.named_labels import MAX_NAME, printable
 from palpate.images.readers import read_intensities, read_label_image
 from palpate.images.tissue import Role
 from palpate.study.case import REMAINING
-from palpate.study.case_as_run import CASE_NAME
 from palpate.study.case_file import relative_path, toml_key, toml_text
+from palpate.study.earlier import CASE_NAME
 from palpate.study.guess import GuessedTissue, class_names, guess_tissues
 from palpate.study.outputs import OutputFolder, read_regular, write_text
 from palpate.study.proposed_mesh import MARGIN_MM, Background, background_of, proposed_edge, proposed_window
-
-__all__ = ["CaseImages", "NewCase", "new_case", "write_new_case"]
 
 LARGEST_CASE = 1_000_000  # bytes
 WIDE_MM = 250.0  # of an image: more than the body of many, so that it must show what lies around, too

@@ -15,8 +15,7 @@ from palpate.errors import ConfigurationError, InputDataError
 from palpate.findings import Finding, warning_rows
 from palpate.images.alignment import RigidMotion, fit_rigid_motion, moved, seen_surface, within_border
 from palpate.images.checks import check_pair
-from palpate.images.distance import DistanceMap, observation_width
-from palpate.images.isosurface import IsosurfacePoints
+from palpate.images.distance import DistanceMap, IsosurfacePoints, observation_width
 from palpate.images.label_image import LabelImage
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_label_image
@@ -28,8 +27,6 @@ from palpate.observation.noise_model import FitResponse, NoiseModel, fit_noise_m
 from palpate.progress import Progress, silent
 from palpate.study.schema import nearest
 from palpate.uncertainty import NORMAL_95
-
-__all__ = ["ALIGNMENTS", "DrawnSurface", "NullPair", "drawing_noise", "noise_of_drawings"]
 
 ALIGNMENTS = ("auto", "surfaces", "none")
 MOST_POINTS = 20_000  # of a surface

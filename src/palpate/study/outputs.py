@@ -24,23 +24,6 @@ from typing import Any
 
 from palpate.errors import InputDataError, ResourceError
 
-__all__ = [
-    "STAGING",
-    "Digests",
-    "OutputFolder",
-    "Staging",
-    "is_inside",
-    "make_folder",
-    "read_json",
-    "read_regular",
-    "recover",
-    "sha256_of",
-    "staged",
-    "write_bytes",
-    "write_json",
-    "write_text",
-]
-
 Digests = Mapping[str, Mapping[str, str]]  # name of a file in the folder -> {"sha256": hexadecimal}
 
 STAGING = ".writing-outputs"  # the hidden folder in an output folder
@@ -48,6 +31,18 @@ NEW, READY, OLD = "new", "ready", "old"  # in it: being made; about to take thei
 ASIDE = ".earlier"  # behind the name of a file that is set aside
 LARGEST_DOCUMENT = 2**26  # bytes of a JSON document that is read
 SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
+RESULT, PAGE, DATA = "result.json", "report.html", "report-data.npz"  # the document of an estimate, and its report
+RESULT_FILES = (  # what else an estimate writes, with its case
+    DATA,
+    PAGE,
+    "labels.csv",
+    "labels.nii.gz",
+    "mesh.vtu",
+    "model.npz",
+    "posterior.nc",
+    "stiffness.nii.gz",
+    "stiffness_sd.nii.gz",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -340,7 +335,7 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises `InputDataError` when there is none, or it is something else.
     """
     try:
-        content = json.loads(read_regular(path, most_bytes=LARGEST_DOCUMENT), parse_constant=_no_constant)
+        content = json.loads(read_regular(path, most_bytes=LARGEST_DOCUMENT), parse_constant=no_constant)
         json.dumps(content, allow_nan=False)  # 1e999 is read as infinite
     except (ValueError, RecursionError) as error:
         raise InputDataError(f"{path} is no result of Palpate ({str(error)[:200]}); run the estimate again") from error
@@ -387,7 +382,8 @@ def _refuse_improper(folder: Path, names: Iterable[str]) -> None:
                 raise _refused(path, error) from error
 
 
-def _no_constant(name: str) -> float:
+def no_constant(name: str) -> float:
+    """Raise `ValueError` for what JSON does not know and Python's reader takes all the same: NaN, Infinity."""
     raise ValueError(f"it holds {name}")
 
 

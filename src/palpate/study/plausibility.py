@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
@@ -13,17 +13,6 @@ from palpate.findings import Finding
 from palpate.images.tissue import Role
 from palpate.study.case import Case
 from palpate.study.estimation import Estimation
-
-__all__ = [
-    "PUBLISHED",
-    "TABLE",
-    "PublishedStiffness",
-    "estimate_warnings",
-    "plausibility_warnings",
-    "published_for",
-    "unit_warnings",
-    "usual_stiffness",
-]
 
 MARGIN = 3.0  # methods differ by ten to a hundred times: an estimate is doubtful only well outside what was published
 SOFT_TISSUE_KPA = (0.05, 1000.0)  # of a tissue for whose name nothing was published, with room on both sides
@@ -38,12 +27,12 @@ class PublishedStiffness:
     """
 
     tissue: str
-    words: tuple[str, ...]
+    words: Sequence[str]
     low: float
     high: float
     method: str
     source: str
-    unless: tuple[str, ...] = ()
+    unless: Sequence[str] = ()
 
     @property
     def usual_kpa(self) -> float:
@@ -57,18 +46,7 @@ class PublishedStiffness:
 
 
 TABLE: dict[str, list[dict[str, Any]]] = tomllib.loads((files("palpate.study") / "tissues.toml").read_text("utf-8"))
-PUBLISHED = tuple(
-    PublishedStiffness(
-        entry["tissue"],
-        tuple(entry["words"]),
-        entry["low"],
-        entry["high"],
-        entry["method"],
-        entry["source"],
-        tuple(entry.get("unless", ())),
-    )
-    for entry in TABLE["published"]
-)
+PUBLISHED = tuple(PublishedStiffness(**entry) for entry in TABLE["published"])
 
 
 def published_for(name: str) -> tuple[PublishedStiffness, ...]:

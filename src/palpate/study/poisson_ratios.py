@@ -12,15 +12,6 @@ from palpate.mesh.space import LagrangeSpace
 from palpate.study.case import RATIO_SD, Case
 from palpate.uncertainty import Interval
 
-__all__ = [
-    "NOT_IDENTIFIED",
-    "PoissonRatioEstimate",
-    "no_ratio",
-    "ratio_verdict",
-    "with_found_ratios",
-    "with_stated_priors",
-]
-
 NOT_IDENTIFIED = "not identified"  # the verdict of what has no interval
 IDENTIFIED, WEAK = 0.05, 0.2  # largest width of an interval; soft tissue is usually given 0.40 to 0.49
 BELIEVED = 0.8  # of the prior's standard deviation: one that is not below it is the prior's

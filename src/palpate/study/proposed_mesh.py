@@ -19,8 +19,6 @@ from palpate.study.cost import MEMORY_FACTOR, cost_of_meshes, expected_size, mac
 from palpate.study.edge_length import edge_length_of
 from palpate.study.guess import GuessedTissue
 
-__all__ = ["MARGIN_MM", "Background", "background_of", "proposed_edge", "proposed_window"]
-
 MARGIN_MM = 40.0
 CROP_BELOW = 0.6  # a domain of the margin's box is proposed when it saves so much of the image
 STEP_MM, LONGEST_MM = 0.5, 12.0  # in which edges grow until the memory does, and where that ends

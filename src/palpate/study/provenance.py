@@ -11,8 +11,6 @@ from palpate.errors import InputDataError
 from palpate.images.input_file import open_input
 from palpate.study.case import Case
 
-__all__ = ["file_digest", "input_digests", "software_versions"]
-
 PACKAGES = (
     "palpate",
     "numpy",

@@ -23,13 +23,11 @@ from palpate.phantoms.scene import Scene
 from palpate.phantoms.spheres import SpheresOptions, spheres, spheres_anatomy
 from palpate.progress import Progress, silent
 from palpate.study.body import ImagedStates, aligned
-from palpate.study.case import Case, CaseTissue
+from palpate.study.case import Case
 from palpate.study.meshed_body import mesh_states, with_prescribed
 from palpate.study.provenance import file_digest
 from palpate.study.refusals import refuse_large
 from palpate.study.schema import nearest, shown
-
-__all__ = ["measured", "phantom_scene", "read_pairs", "read_segmentation", "read_states"]
 
 
 def read_states(case: Case, *, progress: Progress = silent) -> ImagedStates:
@@ -107,21 +105,6 @@ def phantom_scene(case: Case) -> Scene:
         raise ConfigurationError(f"case '{case.id}' has no [phantom]")
     pelvic = case.phantom.kind == "pelvis"
     options = PelvisOptions(case.phantom.seed) if pelvic else SpheresOptions(case.phantom.seed)
-    meshed = _phantom_tissues(case, options)
-    options = replace(
-        options,
-        law=case.phantom.law or case.mechanics.law,
-        law_parameters=case.mechanics.law_parameters,
-        moduli_kpa={t.name: t.modulus_kpa for t in meshed if t.modulus_kpa is not None},
-        poisson_ratio={t.name: t.poisson_ratio for t in meshed if t.poisson_ratio is not None},
-    )
-    if isinstance(options, PelvisOptions):
-        return pelvis(replace(options, filling_mm=case.motion.filling_mm) if case.motion else options)
-    return spheres(replace(options, push_mm=case.motion.filling_mm) if case.motion else options)
-
-
-def _phantom_tissues(case: Case, options: PelvisOptions | SpheresOptions) -> tuple[CaseTissue, ...]:
-    """Those of the case's tissues that its phantom meshes; raises `ConfigurationError` for one that it has not so."""
     anatomy = pelvis_anatomy(options) if isinstance(options, PelvisOptions) else spheres_anatomy(options)
     own = {tissue.name: tissue for tissue in anatomy.tissues}
     for tissue in case.tissues:
@@ -133,7 +116,17 @@ def _phantom_tissues(case: Case, options: PelvisOptions | SpheresOptions) -> tup
                 f"the phantom's tissue '{tissue.name}' has the role {role} and that name for its label; the case cannot"
                 f" give it the role {tissue.role} and the label {shown(tissue.label)}"
             )
-    return tuple(tissue for tissue in case.tissues if own[tissue.name].meshed)
+    meshed = tuple(tissue for tissue in case.tissues if own[tissue.name].meshed)
+    options = replace(
+        options,
+        law=case.phantom.law or case.mechanics.law,
+        law_parameters=case.mechanics.law_parameters,
+        moduli_kpa={t.name: t.modulus_kpa for t in meshed if t.modulus_kpa is not None},
+        poisson_ratio={t.name: t.poisson_ratio for t in meshed if t.poisson_ratio is not None},
+    )
+    if isinstance(options, PelvisOptions):
+        return pelvis(replace(options, filling_mm=case.motion.filling_mm) if case.motion else options)
+    return spheres(replace(options, push_mm=case.motion.filling_mm) if case.motion else options)
 
 
 def measured(case: Case, states: ImagedStates, *, first: int) -> tuple[tuple[DataSource, ...], dict[str, str]]:

@@ -14,12 +14,10 @@ from palpate.findings import Finding
 from palpate.images.checks import SMALL_VOXELS, VOLUME_IMPLAUSIBLE
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
-from palpate.mechanics.deformation import largest_strains
+from palpate.mechanics.element import largest_strains
 from palpate.mechanics.laws.contract import Law
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.cost import image_memory_gb, machine_memory_gb
-
-__all__ = ["LINEAR_RANGE", "linear_strain_warnings", "refuse_large", "refuse_lost", "refuse_unmeshable"]
 
 ORGANS = (Role.ESTIMATE, Role.DRIVER)
 LINEAR_RANGE = 0.10  # principal strain: beyond it the squares that the linear law leaves out are tenths of it

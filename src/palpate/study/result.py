@@ -26,23 +26,6 @@ from palpate.study.map_words import map_words
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio
 from palpate.uncertainty import StiffnessMap
 
-__all__ = [
-    "SCHEMA",
-    "CaseResult",
-    "MeshResult",
-    "MeshSummary",
-    "PairResult",
-    "Provenance",
-    "Simulation",
-    "closing",
-    "distinct_names",
-    "failure_document",
-    "image_names",
-    "json_object",
-    "pair_names",
-    "stated_unit",
-]
-
 SCHEMA = "palpate.result/1"
 
 

@@ -23,8 +23,6 @@ from palpate.uncertainty import (
     require_arviz,
 )
 
-__all__ = ["CHAINS", "POSTERIOR", "ModulusSamples", "draw_moduli", "require_samples", "sample_findings"]
-
 POSTERIOR = "posterior.nc"
 CHAINS = 4
 TAIL = 0.025  # on either side of a 95 % interval

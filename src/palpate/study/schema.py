@@ -13,12 +13,10 @@ from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from palpate.errors import ConfigurationError
 from palpate.images.named_labels import printable
-
-__all__ = ["Rule", "nearest", "read_table", "rule", "shortened", "shown"]
 
 MOST_LETTERS = 4096  # of a text: the longest path that systems take
 MOST_SHOWN = 80  # letters of a text in a sentence
@@ -26,9 +24,10 @@ MOST_OTHERS = 15  # known names that a hint lists
 MOST_COMPARED = 300  # names that are compared letter by letter with a mistyped one
 
 T = TypeVar("T")
+P = ParamSpec("P")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Rule:
     """What a key's value must be beyond its type.
 
@@ -50,19 +49,15 @@ class Rule:
     chosen: str = ""
 
 
-def rule(
-    *,
-    choices: tuple[str, ...] = (),
-    between: tuple[float, float] | None = None,
-    test: Callable[[Any], bool] | None = None,
-    wanted: str = "",
-    instead_of: str = "",
-    convert: Callable[[object], object] | None = None,
-    collects: Mapping[str, tuple[float, float]] | None = None,
-    chosen: str = "",
-) -> dict[str, Rule]:
-    """The metadata of a dataclass field that carries a `Rule`; arguments as there."""
-    return {"rule": Rule(choices, between, test, wanted, instead_of, convert, collects or {}, chosen=chosen)}
+def _metadata(make: Callable[P, Rule]) -> Callable[P, dict[str, Rule]]:
+    def metadata(*arguments: P.args, **named: P.kwargs) -> dict[str, Rule]:
+        """The metadata of a dataclass field that carries a `Rule`; arguments as there."""
+        return {"rule": make(*arguments, **named)}
+
+    return metadata
+
+
+rule = _metadata(Rule)
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
@@ -116,7 +111,10 @@ def read_table(kind: type[T], table: Mapping[str, object], *, where: str, folder
         if isinstance(value, str):  # before an enumeration names all of its words
             _check_choice(bounds, value, place)
         converted = bounds.convert(value) if bounds.convert else _convert(hints[key], value, place)
-        _check_value(bounds, converted, place)
+        for item in converted if isinstance(converted, tuple) else (converted,):
+            _check_choice(bounds, item, place)
+        if bounds.test is not None and converted is not None and not bounds.test(converted):
+            raise ConfigurationError(f"{place} is {shown(converted)}, but it must be {bounds.wanted}")
         values[key] = converted
     return kind(**values)
 
@@ -163,13 +161,6 @@ def _check_range(bounds: Rule, value: object, place: _Place) -> None:
             raise ConfigurationError(
                 f"{place} is {shown(item)}, but it must be a number from {low:.16g} to {high:.16g}{words}"
             )
-
-
-def _check_value(bounds: Rule, value: object, place: _Place) -> None:
-    for item in value if isinstance(value, tuple) else (value,):
-        _check_choice(bounds, item, place)
-    if bounds.test is not None and value is not None and not bounds.test(value):
-        raise ConfigurationError(f"{place} is {shown(value)}, but it must be {bounds.wanted}")
 
 
 def _check_choice(bounds: Rule, value: object, place: _Place) -> None:

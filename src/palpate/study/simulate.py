@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,16 +25,13 @@ from palpate.mesh.tet_mesh import tet_dihedrals
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.phantoms.motion import wall_filling
+from palpate.progress import Progress
 from palpate.study.body import Body, inverse_problem, make_body, strained_body
 from palpate.study.case import Case, Mechanics
 from palpate.study.case_loads import case_loads
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.read import phantom_scene, read_states
 from palpate.study.result import MeshSummary, Provenance, Simulation
-
-__all__ = ["filled", "mesh_summary", "simulate"]
-
-Progress = Callable[[str], None]
 
 
 def simulate(case: Case, *, progress: Progress, steps: int = 1) -> Simulation:
@@ -50,7 +47,16 @@ def simulate(case: Case, *, progress: Progress, steps: int = 1) -> Simulation:
     if case.phantom is not None:
         scene = phantom_scene(case)
         space, tissues = scene.space, scene.tissues
-        before, after, summary, remarks = scene.before, scene.after, _plain_summary(space), tuple[Finding, ...]()
+        before, after, remarks = scene.before, scene.after, tuple[Finding, ...]()
+        smallest = tet_dihedrals(space.mesh.nodes[space.mesh.tets]).min(axis=1)
+        summary = MeshSummary(
+            len(space.mesh.nodes),
+            len(space.mesh.tets),
+            3 * len(space.points),
+            float(smallest.min()),
+            float(np.percentile(smallest, 5.0)),
+            {},
+        )
         displacements = tuple(scene.displacement * (step / steps) for step in range(1, steps + 1))
     else:
         progress("reading and aligning the images")
@@ -183,16 +189,4 @@ def mesh_summary(body: Body) -> MeshSummary:
         quality.volume_error,
         body.edge_length.mm if body.edge_length else None,
         body.edge_length.in_words if body.edge_length else "",
-    )
-
-
-def _plain_summary(space: LagrangeSpace) -> MeshSummary:
-    smallest = tet_dihedrals(space.mesh.nodes[space.mesh.tets]).min(axis=1)
-    return MeshSummary(
-        len(space.mesh.nodes),
-        len(space.mesh.tets),
-        3 * len(space.points),
-        float(smallest.min()),
-        float(np.percentile(smallest, 5.0)),
-        {},
     )

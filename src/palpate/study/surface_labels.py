@@ -19,8 +19,6 @@ from palpate.images.readers.merged_masks import Mask, merged
 from palpate.images.readers.stl import SurfaceFile, read_stl
 from palpate.progress import Progress, silent
 
-__all__ = ["SurfaceLabels", "surface_labels"]
-
 MOST_VOXELS = 2**28
 MOST_SURFACES = 500
 AT_ONCE = 2**20  # voxels of a surface that are asked together

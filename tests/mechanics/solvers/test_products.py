@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from palpate.mechanics.solvers import products
-from palpate.mechanics.solvers.products import FEW, times
+from palpate.mechanics.solvers import conjugate_gradients
+from palpate.mechanics.solvers.conjugate_gradients import FEW, times
 
 
 @pytest.mark.parametrize("n_columns", [0, 1, 3, FEW - 1, FEW, FEW + 5])
@@ -26,6 +26,6 @@ def test_threads_change_not_a_bit_of_it(threads, monkeypatch):
     rng = np.random.default_rng(3)
     matrix = sparse.csr_matrix(sparse.random_array((700, 600), density=0.2, rng=rng))
     vectors = rng.standard_normal((600, FEW))
-    monkeypatch.setattr(products, "WORTH_THREADS", 1)
-    monkeypatch.setattr(products, "processors", lambda: threads)
+    monkeypatch.setattr(conjugate_gradients, "WORTH_THREADS", 1)
+    monkeypatch.setattr(conjugate_gradients, "processors", lambda: threads)
     assert np.array_equal(times(matrix, vectors), matrix @ vectors)

@@ -33,9 +33,9 @@ from palpate.phantoms import (
     filling_of,
     grid_box,
     smooth_field,
-    target_of_truth,
 )
 from palpate.study import DriverMotion
+from palpate_validation.truth import target_of_truth
 
 __all__ = ["ORGANS", "CohortSettings", "PatientResult", "estimate_patient", "patient_space", "true_moduli"]
 

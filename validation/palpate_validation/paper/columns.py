@@ -13,11 +13,12 @@ from palpate.inversion import Bounds, Inversion, InversionSettings, ParameterMap
 from palpate.mechanics import LinearModel
 from palpate.mesh import LagrangeSpace
 from palpate.observation import Observation, observed_surface, surface_distance
-from palpate.phantoms import imaged, target_of_truth
+from palpate.phantoms import imaged
 from palpate.study import Body, ImagedStates, Observed, aligned, conclude, fitted_states, verdict
 from palpate.uncertainty import log_interval, sandwich_covariance
 from palpate_validation.paper.paper_method import paper_estimate, paper_target
 from palpate_validation.paper.table import Entry
+from palpate_validation.truth import target_of_truth
 
 __all__ = [
     "entries_by_the_paper",

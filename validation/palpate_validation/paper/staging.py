@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from scipy import stats
 
-from palpate.cohort.statistics.association import association, pearson_p, points_behind
+from palpate.cohort.statistics.association import association
 from palpate.cohort.statistics.regression import stage_regression
 from palpate.cohort.statistics.scans import Scan
 from palpate.report import interval_text, number
@@ -20,7 +21,9 @@ from palpate_validation.paper.cohort import ORGANS, CohortSettings, PatientResul
 from palpate_validation.paper.table import COLOURS, PAPER_STAGING, save_figure
 from palpate_validation.scenes import Job, Part, Progress, Scenes
 
-__all__ = ["Staging", "draw_staging", "paper_remark", "staging", "with_stage"]
+__all__ = ["Staging", "draw_staging", "paper_remark", "pearson_p", "points_behind", "staging", "with_stage"]
+
+MOST_POINTS = 2000
 
 KEYS = ("per_scan", "per_patient", "regression")
 NOTES = (
@@ -132,3 +135,15 @@ def draw_staging(result: Staging, path: Path) -> None:
             axes.set_ylabel("Young's modulus, kPa")
 
     save_figure(draw, path, width=8.5)
+
+
+def pearson_p(r: float, n: int) -> float:
+    """Two-tailed p of Pearson's r between n independent points: t = r sqrt((n - 2) / (1 - r^2)), Student's t."""
+    t = abs(r) * np.sqrt((n - 2) / (1.0 - r**2))
+    return float(2.0 * stats.t.sf(t, n - 2))
+
+
+def points_behind(r: float, p: float) -> int:
+    """The number n of points at which Pearson's r has the two-tailed p that is nearest to `p` (on a log scale)."""
+    counts = range(3, MOST_POINTS)
+    return min(counts, key=lambda n: abs(np.log(max(pearson_p(r, n), 1e-300) / p)))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.mechanics import linear_model, triangle_quadrature
-from palpate.mesh import LagrangeSpace, lagrange_space, triangle_normals, triangle_shape
+from palpate.mesh import LagrangeSpace, lagrange_space, shape_functions, triangle_normals
 from palpate_validation.conditions import held_components, loaded
 from palpate_validation.problems.contract import Check, Problem
 from palpate_validation.structured_meshes import known, octant_mesh
@@ -83,7 +83,7 @@ def hertz_depth(space: LagrangeSpace, contact: float, peak: float) -> Array:
     away = np.linalg.norm(np.einsum("qk,fki->fqi", places, mesh.nodes[faces])[:, :, :2], axis=2)
     pressure = peak * np.sqrt(np.maximum(1.0 - (away / contact) ** 2, 0.0))
     area = 0.5 * np.linalg.norm(2.0 * triangle_normals(mesh.nodes, faces), axis=1)
-    nodal = np.einsum("f,q,fq,qa->fa", area, weights, pressure, triangle_shape(space.order, places))
+    nodal = np.einsum("f,q,fq,qa->fa", area, weights, pressure, shape_functions(space.order, places))
     load = np.zeros_like(space.points)
     np.add.at(load[:, 2], space.facets(faces), nodal)
     u = _under(space, load)

@@ -21,10 +21,9 @@ from palpate.mechanics import (
     lame_parameters,
     quadrature,
     shape_derivatives,
-    shape_functions,
     stress,
 )
-from palpate.mesh import Constraint, LagrangeSpace, lagrange_space
+from palpate.mesh import Constraint, LagrangeSpace, lagrange_space, shape_functions
 from palpate_validation.conditions import held_components, loaded
 from palpate_validation.problems.contract import Check, Problem
 from palpate_validation.structured_meshes import box_mesh, known

@@ -18,8 +18,6 @@ from palpate.cohort.task import Outcome, Task
 from palpate.errors import ResourceError
 from palpate.parallel import processors
 
-__all__ = ["DaskEngine", "attempt_on_worker"]
-
 LOOPBACK = "127.0.0.1"
 PATIENCE_S = 600.0  # for a first worker, and for another when all are gone
 MOMENT_S = 1.0

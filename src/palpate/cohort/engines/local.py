@@ -14,8 +14,6 @@ from palpate.errors import ResourceError
 from palpate.memory import available_memory
 from palpate.parallel import processors
 
-__all__ = ["LocalEngine"]
-
 HERE = "here"
 UNKNOWN_GB = 1e6  # where the system does not tell what is free
 SHARE = 0.9  # of the free memory: predictions are rough, and other programs run, too

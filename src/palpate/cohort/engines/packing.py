@@ -12,11 +12,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
-from palpate.cohort.mark import held_soon, write_mark
+from palpate.cohort.plan import held_soon, write_mark
 from palpate.cohort.task import Outcome, Task
 from palpate.errors import FolderInUse, ResourceError
-
-__all__ = ["Engine", "Place", "Pool", "again", "marked", "packed"]
 
 LOST_ATTEMPTS = 3
 GRACE_S = 10.0

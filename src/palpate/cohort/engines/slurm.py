@@ -10,23 +10,22 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from palpate.cohort.engines.local import LocalEngine
 from palpate.cohort.engines.packing import again, marked
-from palpate.cohort.mark import read_mark
+from palpate.cohort.plan import read_mark
 from palpate.cohort.resolve import case_of
 from palpate.cohort.task import LEAST_MEMORY_GB, Outcome, Task
 from palpate.errors import InputDataError, PalpateError, ResourceError
 from palpate.parallel import mapped
+from palpate.progress import Progress
 from palpate.study.cost import expected_cost
 from palpate.study.outputs import read_json, staged, write_json, write_text
 from palpate.study.read import read_states
-
-__all__ = ["SlurmEngine", "run_part"]
 
 FOLDER, PARTS, SCRIPT, JOB = "slurm", "parts.json", "array.sh", "job.json"
 MOST_PARTS = 1000  # SLURM's own default allows 1001
@@ -127,7 +126,7 @@ class SlurmEngine:
         return "\n".join(lines) + "\n"
 
 
-def run_part(folder: Path, number: int, progress: Callable[[str], None]) -> list[Outcome]:
+def run_part(folder: Path, number: int, progress: Progress) -> list[Outcome]:
     """Compute part `number` of the job array in a cohort's folder, as one of its jobs; rows that are done are left.
 
     Raises `InputDataError` when there is no such part.

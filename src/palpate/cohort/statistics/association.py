@@ -16,19 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-__all__ = [
-    "MOST_EXACT",
-    "Association",
-    "PerPatient",
-    "PerScan",
-    "Permutation",
-    "association",
-    "pearson_p",
-    "permutation_test",
-    "points_behind",
-]
-
-MOST_POINTS = 2000
 FEWEST = 3  # points of a correlation
 
 Array = NDArray[np.float64]
@@ -91,18 +78,6 @@ def association(lows: Sequence[Array], highs: Sequence[Array], stages: Array) ->
         return Association(per_scan, PerPatient(None, None, tau, n, open_medians))
     rho = _r(stats.rankdata(stages), stats.rankdata(below))
     return Association(per_scan, PerPatient(_r(stages, below), rho, tau, n))
-
-
-def pearson_p(r: float, n: int) -> float:
-    """Two-tailed p of Pearson's r between n independent points: t = r sqrt((n - 2) / (1 - r^2)), Student's t."""
-    t = abs(r) * np.sqrt((n - 2) / (1.0 - r**2))
-    return float(2.0 * stats.t.sf(t, n - 2))
-
-
-def points_behind(r: float, p: float) -> int:
-    """The number n of points at which Pearson's r has the two-tailed p that is nearest to `p` (on a log scale)."""
-    counts = range(3, MOST_POINTS)
-    return min(counts, key=lambda n: abs(np.log(max(pearson_p(r, n), 1e-300) / p)))
 
 
 def _signs(below: Array, above: Array) -> Array:

@@ -12,14 +12,11 @@ import numpy as np
 
 from palpate.cohort.records import Record, tissues_of
 from palpate.cohort.statistics.association import association
-from palpate.cohort.statistics.models import combined, repeatability
 from palpate.cohort.statistics.regression import stage_regression
-from palpate.cohort.statistics.scans import RULES, Scan, Usable, inside_fences, usable_scans
+from palpate.cohort.statistics.scans import RULES, Scan, Usable, combined, inside_fences, repeatability, usable_scans
 from palpate.cohort.task import Row
 from palpate.findings import MISLEADING
 from palpate.study.result import json_object
-
-__all__ = ["SCHEMA", "statistics_document"]
 
 SCHEMA = "palpate.statistics/1"
 SEED = 0
@@ -72,6 +69,14 @@ def _organ(usable: Usable, records: Sequence[Record]) -> dict[str, Any]:
     warned = len(clean) < len(usable.scans)
     censored = sum(scan.value is None for scan in usable.scans)
     adjusted = stage_regression(usable.scans, covariates=covariates, seed=SEED) if covariates else None
+    # quartiles of the scans of each stage
+    found = []
+    for stage in sorted({scan.stage for scan in usable.scans if scan.stage is not None}):
+        scans = [scan for scan in usable.scans if scan.stage == stage]
+        low, middle, high = _quantiles(scans)
+        counts = {"n_patients": len({scan.patient for scan in scans}), "n_scans": len(scans)}
+        counts["n_censored"] = sum(scan.value is None for scan in scans)
+        found.append({"stage": stage, **counts, "q25": low, "median": middle, "q75": high})
     return {
         "unit": usable.unit,
         "used": {"scans": len(usable.scans), "patients": len(usable.patients), "censored": censored},
@@ -84,7 +89,7 @@ def _organ(usable: Usable, records: Sequence[Record]) -> dict[str, Any]:
         "regression_adjusted": adjusted if adjusted is None or adjusted.get("covariates", True) else None,
         "regression_without_warned": _untested(stage_regression(clean, seed=SEED)) if warned else None,
         "repeatability": repeatability(usable),
-        "by_stage": _by_stage(usable),
+        "by_stage": found,
     }
 
 
@@ -154,18 +159,6 @@ def _as_the_paper(usable: Usable) -> dict[str, Any]:
     if len(values) < 3 or len(set(stages)) < 2 or len(set(values)) < 2:
         return {"r": None, "n": len(values), "undefined": "undefined: too few scans, or all of one stage"}
     return {"r": float(np.corrcoef(stages, values)[0, 1]), "n": len(values)}
-
-
-def _by_stage(usable: Usable) -> list[dict[str, Any]]:
-    """Quartiles of the scans of each stage."""
-    found = []
-    for stage in sorted({scan.stage for scan in usable.scans if scan.stage is not None}):
-        scans = [scan for scan in usable.scans if scan.stage == stage]
-        low, middle, high = _quantiles(scans)
-        counts = {"n_patients": len({scan.patient for scan in scans}), "n_scans": len(scans)}
-        counts["n_censored"] = sum(scan.value is None for scan in scans)
-        found.append({"stage": stage, **counts, "q25": low, "median": middle, "q75": high})
-    return found
 
 
 def _quantiles(scans: Sequence[Scan]) -> list[float | None]:

@@ -13,8 +13,6 @@ from scipy import optimize, special, stats
 from palpate.cohort.statistics.association import Permutation, permutation_test
 from palpate.cohort.statistics.scans import Scan
 
-__all__ = ["stage_regression"]
-
 FEWEST = 3  # patients, and scans with a value
 LEVEL = 0.05
 LEAST_BETWEEN, LEAST_WITHIN, LARGEST = 0.01, 0.05, 3.0  # standard deviations of ln E
@@ -142,7 +140,12 @@ class _Data:
         held, of_held = np.unique(self.of_censored, return_inverse=True)
         at = (centre[held, None] + spread[held, None] * PLACES)[of_held]
         inside = np.tile(WEIGHTS, (len(held), 1))
-        chances = _log_probability((self.lows[:, None] - at) / within, (self.highs[:, None] - at) / within)
+        # logarithm of the standard normal probability of (low, high), without loss in either tail
+        low = (self.lows[:, None] - at) / within
+        high = (self.highs[:, None] - at) / within
+        below, above = np.where(low > 0.0, -high, low), np.where(low > 0.0, -low, high)
+        largest = special.log_ndtr(above)
+        chances = np.asarray(largest + np.log1p(-np.exp(np.minimum(special.log_ndtr(below) - largest, -1e-12))))
         np.add.at(inside, of_held, chances)
         found[held] += special.logsumexp(inside, axis=1)
         return np.asarray(found)
@@ -225,13 +228,6 @@ class _Regression:
         return np.asarray(
             optimize.minimize(negative, start if near is None else near, bounds=bounds, method="L-BFGS-B").x
         )
-
-
-def _log_probability(low: Array, high: Array) -> Array:
-    """Logarithm of the standard normal probability of (low, high), without loss in either tail."""
-    below, above = np.where(low > 0.0, -high, low), np.where(low > 0.0, -low, high)
-    largest = special.log_ndtr(above)
-    return np.asarray(largest + np.log1p(-np.exp(np.minimum(special.log_ndtr(below) - largest, -1e-12))))
 
 
 def _means(scans: Sequence[Scan], patients: Sequence[str], of: Mapping[str, float]) -> Array | None:

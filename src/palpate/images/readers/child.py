@@ -18,8 +18,6 @@ from palpate.images.readers.isolation import GREETING
 from palpate.images.readers.registry import format_of
 from palpate.images.readers.values import REDUCED
 
-__all__ = ["main"]
-
 try:
     import resource
 except ImportError:  # Windows: the process still keeps a crash to itself

@@ -16,8 +16,6 @@ from palpate.images.label_image import VoxelGrid
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
 from palpate.images.readers.voxel_stream import damaged
 
-__all__ = ["read_dicom", "refused_series"]
-
 MARK = b"DICM"  # at byte 128
 SOP_CLASS = re.compile(rb"\x02\x00\x02\x00UI(..)([0-9.]{1,64})\0?", re.DOTALL)  # in the file meta information
 READERS = {

@@ -23,8 +23,6 @@ from palpate.images.readers.dicom_dataset import Series, read_dataset, sentences
 from palpate.images.readers.merged_masks import Mask, merged
 from palpate.images.readers.registry import StoredImage
 
-__all__ = ["read"]
-
 CLOSED = ("CLOSED_PLANAR", "CLOSEDPLANAR_XOR")
 ON_EDGE = 0.01  # of a voxel: contours are written with some six digits
 MOST_TRIED = 20  # contours of a structure, to see how slices lie

@@ -22,8 +22,6 @@ from palpate.images.label_image import VoxelGrid
 from palpate.images.readers.values import to_canonical
 from palpate.images.readers.voxel_stream import check_size
 
-__all__ = ["LPS_TO_RAS", "Series", "read_dataset", "sentences", "series_beside"]
-
 LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 MOST_FILES = 5000  # in the folder of a segmentation and those in it
 MOST_BYTES = 2**31  # of a segmentation

@@ -21,8 +21,6 @@ from palpate.images.readers.registry import StoredImage
 from palpate.images.readers.values import to_canonical
 from palpate.images.readers.voxel_stream import check_size
 
-__all__ = ["read"]
-
 MOST_SEGMENTS = 1000
 SAME_PLACE = 0.01  # of a voxel
 

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import re
-import signal
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -26,11 +24,11 @@ from palpate.images.label_image import VoxelGrid
 from palpate.images.named_labels import NamedLabel, printable
 from palpate.images.readers.registry import ImageFormat, StoredImage
 from palpate.images.readers.voxel_stream import MAX_VOXELS, read_exactly
+from palpate.parallel import environment_of_child, name_of_end
 
 if sys.platform == "linux":
     import fcntl
 
-__all__ = ["GREETING", "ReadLimits", "read_stored"]
 
 GREETING = b"palpate reads\n"
 PIPE = 2**20  # bytes that the pipe holds, where the system lets us choose
@@ -89,16 +87,14 @@ def _command(path: Path, kind: str, limits: ReadLimits, grid: VoxelGrid | None) 
 
 
 def _started(command: list[str], path: Path) -> subprocess.Popen[bytes]:
-    """The process, with our places to import from, on one thread: a pool of them would eat address space."""
-    places = os.pathsep.join(str(Path(place).resolve()) for place in sys.path if place)
-    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    """The process, on one thread: a pool of them would eat address space."""
     try:
         process = subprocess.Popen(  # noqa: S603 - our own interpreter and module, no shell
             command,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            env={**os.environ, **threads, "PYTHONPATH": places},
+            env=environment_of_child(),
         )
     except OSError as error:
         raise _not_started(path) from error
@@ -110,7 +106,7 @@ def _started(command: list[str], path: Path) -> subprocess.Popen[bytes]:
 
 def _sudden_end(code: int, path: Path, limits: ReadLimits) -> PalpateError:
     """Why a process ended that sent no image, by its exit code."""
-    name = {-int(number): number.name for number in signal.Signals}.get(code, f"exit code {code}")
+    name = name_of_end(code)
     if name in ("SIGXCPU", "SIGALRM"):
         return ResourceError(
             f"reading '{path}' took more than {limits.cpu_seconds} s of processor time, or {limits.wall_seconds:g} s in"

@@ -21,8 +21,6 @@ from palpate.images.readers.registry import FOLDER, ImageFormat, StoredImage, fo
 from palpate.images.readers.values import label_values
 from palpate.images.totalsegmentator import CLASSES
 
-__all__ = ["read_mask_folder"]
-
 ENDINGS = (".nii.gz", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd")
 MOST_FILES = 10_000  # of any kind in the folder
 MOST_MASKS = 500

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from palpate.findings import Finding
 from palpate.images.named_labels import NamedLabel, printable
 
-__all__ = ["Mask", "merged"]
-
 BODY = frozenset(("body", "external", "outline", "skin"))  # words of a name: all organs lie in that mask
 MOST_SHOWN = 3  # pairs of organs in the sentence
 

@@ -24,8 +24,6 @@ from palpate.images.readers.registry import ImageFormat, StoredImage, register
 from palpate.images.readers.text_header import beside, counts, header_line, numbers
 from palpate.images.readers.voxel_stream import MAX_OFFSET, VoxelBlock, bytes_to_skip, damaged, read_block
 
-__all__ = ["read_metaimage"]
-
 SYNONYMS = {
     "rotation": "transformmatrix",
     "orientation": "transformmatrix",

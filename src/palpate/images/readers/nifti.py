@@ -26,8 +26,6 @@ from palpate.images.readers.nifti_extension import extension_names
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
 from palpate.images.readers.voxel_stream import MAX_OFFSET, VoxelBlock, check_end, check_size, damaged, read_exactly
 
-__all__ = ["read_nifti", "write_displacement_field", "write_label_image", "write_scalar_image"]
-
 MILLIMETRES = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}  # xyzt_units: unknown, metre, millimetre, micrometre
 HEADERS = {348: "Nifti1Header", 540: "Nifti2Header"}  # by nibabel, which is imported when an image comes
 MAGIC = {348: b"n+1\0", 540: b"n+2\0\r\n\032\n"}

@@ -15,8 +15,6 @@ from palpate.errors import InputDataError
 from palpate.images.named_labels import MAX_NAME, NamedLabel, printable
 from palpate.images.readers.text_header import unit_colour
 
-__all__ = ["extension_names"]
-
 ROOT = "CaretExtension"
 LABEL = (ROOT, "VolumeInformation", "LabelTable", "Label")
 MOST_BYTES = 2**20  # as of a label table

@@ -25,8 +25,6 @@ from palpate.images.readers.segments import flattened, segments_of
 from palpate.images.readers.text_header import beside, counts, header_line, numbers
 from palpate.images.readers.voxel_stream import MAX_OFFSET, VoxelBlock, bytes_to_skip, damaged, read_block
 
-__all__ = ["read_nrrd"]
-
 SYNONYMS = {"datafile": "data file", "lineskip": "line skip", "byteskip": "byte skip"}
 RAS_SIGNS = {  # of the three world axes
     "right-anterior-superior": (1, 1, 1),

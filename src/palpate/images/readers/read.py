@@ -17,8 +17,6 @@ from palpate.images.readers.isolation import ReadLimits, read_stored
 from palpate.images.readers.registry import StoredImage, format_of
 from palpate.images.readers.values import REDUCED, to_canonical
 
-__all__ = ["read_intensities", "read_label_image"]
-
 MAX_SHEAR = 1e-3  # cosine between two axes; distances are computed on a rectangular grid
 LIMITS = ReadLimits()
 

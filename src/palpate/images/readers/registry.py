@@ -19,8 +19,6 @@ from palpate.images.input_file import open_input
 from palpate.images.label_image import VoxelGrid
 from palpate.images.named_labels import NamedLabel
 
-__all__ = ["FOLDER", "ImageFormat", "StoredImage", "format_of", "marked_format", "register"]
-
 FOLDER = "/"  # no file's name ends so
 
 

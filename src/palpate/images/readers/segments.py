@@ -18,8 +18,6 @@ from palpate.errors import InputDataError
 from palpate.images.named_labels import MAX_LABEL, MAX_NAME, NamedLabel, printable
 from palpate.images.readers.text_header import unit_colour
 
-__all__ = ["Segment", "flattened", "segments_of"]
-
 KEY = re.compile(r"Segment([0-9]{1,5})_(\w+)")
 
 

@@ -13,8 +13,6 @@ from palpate.errors import InputDataError
 from palpate.images.input_file import read_input
 from palpate.images.label_image import LPS_TO_RAS
 
-__all__ = ["SurfaceFile", "read_stl"]
-
 MOST_BYTES = 2**29
 MOST_TEXT = 2**26  # bytes: its numbers take some ten times as much memory while they are read
 HEADING = 80  # bytes of a binary file, before the number of its triangles

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from palpate.errors import InputDataError
 from palpate.images.named_labels import hex_colour, printable
 
-__all__ = ["beside", "counts", "header_line", "numbers", "unit_colour"]
-
 # Not what float() takes besides: nan, inf, 1_0, digits of other scripts.
 NUMBER = re.compile(r"[+-]?([0-9]{1,400}\.?[0-9]{0,400}|\.[0-9]{1,400})([eE][+-]?[0-9]{1,9})?")
 MAX_LINE = 2**16

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from palpate.errors import InputDataError
 from palpate.images.named_labels import MAX_LABEL
 
-__all__ = ["REDUCED", "intensity_values", "label_values", "to_canonical"]
-
 INTEGRAL_TOLERANCE = 1e-3  # resampling and 32-bit scaling leave 0.9999; more is a probability map or a grey image
 
 

@@ -16,18 +16,6 @@ from numpy.typing import NDArray
 from palpate.errors import InputDataError
 from palpate.images.input_file import InputFile
 
-__all__ = [
-    "MAX_OFFSET",
-    "MAX_VOXELS",
-    "VoxelBlock",
-    "bytes_to_skip",
-    "check_end",
-    "check_size",
-    "damaged",
-    "read_block",
-    "read_exactly",
-]
-
 MAX_VOXELS = 2**29  # 512 x 512 x 2048, a whole body at 1 mm; a distance map of it would take 4 GiB
 MAX_OFFSET = 2**26  # bytes that may stand between header and voxels
 MAX_DEFLATE_RATIO = 1032  # no deflate stream expands further (zlib's technical notes)

@@ -18,8 +18,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Law", "LawParameter", "energy", "stress", "tangent"]
-
 Array = NDArray[np.float64]
 
 

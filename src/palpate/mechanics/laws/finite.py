@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["IDENTITY4", "FiniteStrain", "cofactor_derivatives", "cofactors", "determinants", "dyads", "log_derivatives"]
-
 Array = NDArray[np.float64]
 
 IDENTITY4 = np.einsum("ik,jl->ijkl", np.eye(3), np.eye(3))  # dF_ij / dF_kl

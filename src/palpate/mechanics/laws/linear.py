@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from palpate.mechanics.laws.contract import LawParameter
 from palpate.mechanics.laws.finite import IDENTITY4
 
-__all__ = ["Linear"]
-
 Array = NDArray[np.float64]
 
 SYMMETRIC = IDENTITY4 + np.einsum("il,jk->ijkl", np.eye(3), np.eye(3))

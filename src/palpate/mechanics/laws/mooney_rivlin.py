@@ -15,8 +15,6 @@ from palpate.errors import ConfigurationError
 from palpate.mechanics.laws.contract import LawParameter
 from palpate.mechanics.laws.finite import IDENTITY4, FiniteStrain, cofactors, determinants, dyads, log_derivatives
 
-__all__ = ["MooneyRivlin"]
-
 Array = NDArray[np.float64]
 
 C01_OVER_C10 = LawParameter("c01_over_c10", 0.25, 0.0, 1000.0, "ratio of the law's two constants; 0 is neo-hookean")

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from palpate.mechanics.laws.contract import LawParameter
 from palpate.mechanics.laws.finite import IDENTITY4, FiniteStrain, cofactors, determinants, log_derivatives
 
-__all__ = ["NeoHookean"]
-
 Array = NDArray[np.float64]
 
 

@@ -10,8 +10,6 @@ from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
 from palpate.mechanics.laws.neo_hookean import NeoHookean
 
-__all__ = ["LAWS", "law_from", "law_named", "law_parameters"]
-
 REGISTERED = (Linear, NeoHookean, MooneyRivlin)  # a new law is a file, and its class here
 
 LAWS: dict[str, Law] = {law.name: law for law in (kind() for kind in REGISTERED)}

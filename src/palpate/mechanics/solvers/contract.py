@@ -10,8 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-__all__ = ["EXACT", "Coarser", "Expectation", "Factorisation", "Factoriser", "Hints", "Solver"]
-
 EXACT = 1e-10  # relative residual of a solution of which nothing else is asked
 
 

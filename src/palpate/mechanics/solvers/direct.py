@@ -17,8 +17,6 @@ from palpate.mechanics.solvers.contract import EXACT, Expectation, Factorisation
 from palpate.memory import available_memory
 from palpate.parallel import processors
 
-__all__ = ["MIXED", "SOLVER"]
-
 HOPELESS = 4.0  # times the free memory; a pattern of such a size is not analysed to know more exactly
 MAX_REFINEMENTS = 8  # steps of conjugate gradients; where they do not suffice, double precision costs less
 # Measured on one thread of a 2.4 GHz AMD EPYC, 29 631 and 111 273 unknowns, blocks of right-hand sides: operations a

@@ -17,11 +17,8 @@ from scipy import linalg, sparse
 
 from multifrontal import twin_rows
 from palpate.errors import SolverError
-from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
+from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients, times
 from palpate.mechanics.solvers.contract import EXACT, Expectation, Factorisation, Hints, Solver
-from palpate.mechanics.solvers.products import times
-
-__all__ = ["SOLVER"]
 
 MAX_ITERATIONS = 2000
 SMOOTHER_DEGREE = 3

@@ -10,11 +10,9 @@ from scipy import sparse
 
 from palpate.errors import ConfigurationError, SolverError
 from palpate.mechanics.solvers import direct, multigrid
+from palpate.mechanics.solvers.conjugate_gradients import times
 from palpate.mechanics.solvers.contract import EXACT, Coarser, Expectation, Factorisation, Hints
-from palpate.mechanics.solvers.products import times
 from palpate.memory import available_memory, total_memory
-
-__all__ = ["SOLVERS", "expected_of_size", "factorise"]
 
 SOLVERS = {solver.name: solver for solver in (direct.SOLVER, direct.MIXED, multigrid.SOLVER)}
 TOLERANCE = 1e-8  # of a residual, relative to its right-hand side, which rounding may leave

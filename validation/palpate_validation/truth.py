@@ -1,21 +1,33 @@
-"""The truth's own surfaces as targets: what an image without voxels would say."""
+"""The truth of a scene as a target without voxels, and the same truth with more or less motion."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import igl
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.mesh.space import LagrangeSpace
-from palpate.mesh.surface import triangle_normals
-from palpate.mesh.voxelise import Warp
-from palpate.observation.observed_surface import ObservedSurface, observed_surface
-from palpate.observation.target import SurfaceTarget, target_from
-from palpate.phantoms.scene import Scene
+from palpate.mesh import LagrangeSpace, triangle_normals
+from palpate.observation import ObservedSurface, SurfaceTarget, observed_surface, target_from
+from palpate.phantoms import Scene, WallMotion
 
-__all__ = ["TriangulatedDistance", "exact_target", "target_of_truth"]
+__all__ = ["ScaledMotion", "TriangulatedDistance", "exact_target", "rescaled", "target_of_truth"]
+
+Warp = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+
+@dataclass(frozen=True, slots=True)
+class ScaledMotion:
+    """`factor` times another motion."""
+
+    motion: WallMotion
+    factor: float
+
+    def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Displacement (n, 3) mm at wall points (n, 3) in RAS mm."""
+        return self.factor * self.motion.at(points)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,3 +88,12 @@ def target_of_truth(
     seen = truth.triangles[truth.observed]
     area = np.linalg.norm(triangle_normals(deformed, seen), axis=1)
     return target_from(surface, before, after, level=0.0, image=(deformed[seen].mean(axis=1), area))
+
+
+def rescaled(scene: Scene, factor: float) -> Scene:
+    """The scene of the linear law with `factor` times the motion everywhere, which is again in equilibrium.
+
+    The images stay those of the full motion until the scene is `reimaged`.
+    """
+    motions = {name: ScaledMotion(motion, factor) for name, motion in scene.motions.items()}
+    return replace(scene, displacement=factor * scene.displacement, motions=motions)
