@@ -40,8 +40,8 @@ CELLS = 10
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
-if "PYTEST_XDIST_WORKER" in os.environ:  # `make test` lets its own processes keep freed memory, not those they start
-    for variable in ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_"):
+if "PYTEST_XDIST_WORKER" in os.environ:  # how `make test` lets its own processes hold memory, not those they start
+    for variable in ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_", "GLIBC_TUNABLES"):
         os.environ.pop(variable, None)
 
 
