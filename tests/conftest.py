@@ -40,8 +40,8 @@ CELLS = 10
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
-if "PYTEST_XDIST_WORKER" in os.environ:  # `make test` lets its own processes keep freed memory, not those they start
-    for variable in ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_"):
+if "PYTEST_XDIST_WORKER" in os.environ:  # how `make test` lets its own processes hold memory, not those they start
+    for variable in ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_", "GLIBC_TUNABLES"):
         os.environ.pop(variable, None)
 
 
@@ -217,6 +217,23 @@ def coarse_pictures():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(render, "FINE", 1)
         yield
+
+
+@pytest.fixture
+def environment(monkeypatch):
+    """Sets variables of the environment by their names; None takes one away."""
+
+    def put(**variables: str | None) -> None:
+        for name, value in variables.items():
+            monkeypatch.delenv(name, raising=False) if value is None else monkeypatch.setenv(name, value)
+
+    return put
+
+
+@pytest.fixture
+def without(monkeypatch):
+    """Makes a library one that is not installed."""
+    return lambda name: monkeypatch.setitem(sys.modules, name, None)
 
 
 @pytest.fixture(scope="session")

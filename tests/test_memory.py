@@ -47,8 +47,8 @@ def test_nothing_is_said_where_the_system_does_not_tell(tmp_path):
 
 
 @pytest.mark.parametrize(("stated", "left"), [("0.25", 2.5e8), ("3", 5e8), ("-1", 5e8), ("much", 5e8), ("", 5e8)])
-def test_what_the_environment_states_is_a_limit_if_it_is_a_plain_number(group, monkeypatch, stated, left):
-    monkeypatch.setenv("PALPATE_MEMORY_GB", stated)
+def test_what_the_environment_states_is_a_limit_if_it_is_a_plain_number(group, environment, stated, left):
+    environment(PALPATE_MEMORY_GB=stated)
     assert memory.available_memory(**group) == left
     assert memory.total_memory(**group) == (left if stated == "0.25" else 1e9)
 
@@ -88,12 +88,12 @@ def test_check_takes_ten_bytes_a_voxel_of_an_empty_pair(tmp_path):
     assert peak < 3e8 + 13.0 * size**3  # the program itself takes 0.25 GB
 
 
-def test_images_that_this_machine_cannot_hold_are_refused_with_the_numbers(monkeypatch):
+def test_images_that_this_machine_cannot_hold_are_refused_with_the_numbers(environment):
     index = np.zeros((40, 40, 40), dtype=np.int16)
     index[10:30, 10:30, 10:30] = 1
     tissues = (Tissue("rest", Role.VOID), Tissue("organ", Role.ESTIMATE, (1,)))
     image = Segmentation(index, VoxelGrid((40, 40, 40), np.eye(4)), tissues)
     refusals.refuse_large(image, "before.nii.gz")
-    monkeypatch.setenv("PALPATE_MEMORY_GB", "0.005")
+    environment(PALPATE_MEMORY_GB="0.005")
     with pytest.raises(ResourceError, match=r"40 x 40 x 40 voxels.*0\.0 GB of memory.*crop the images"):
         refusals.refuse_large(image, "before.nii.gz")

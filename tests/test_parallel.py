@@ -20,8 +20,8 @@ def test_what_a_call_raises_is_raised():
         mapped(lambda n: 1 // n, [2, 1, 0])
 
 
-def test_the_limit_of_the_linear_algebra_holds(monkeypatch):
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+def test_the_limit_of_the_linear_algebra_holds(environment):
+    environment(OMP_NUM_THREADS="1")
     assert processors() == 1
 
 
@@ -31,7 +31,6 @@ def test_nothing_else_counts_the_processors():
     assert counting == []  # but `multifrontal`, whose `processors` all use
 
 
-def test_a_limit_that_is_no_plain_number_is_none(monkeypatch):
-    monkeypatch.setenv("MKL_NUM_THREADS", "1")
-    monkeypatch.setenv("OMP_NUM_THREADS", "\u00b2")
+def test_a_limit_that_is_no_plain_number_is_none(environment):
+    environment(MKL_NUM_THREADS="1", OMP_NUM_THREADS="\u00b2")
     assert processors() == 1

@@ -48,14 +48,15 @@ def test_two_runs_in_one_folder_are_refused(table, tmp_path, capsys):
     assert "another run of palpate" in capsys.readouterr().err
 
 
-def test_a_missing_library_is_named_before_anything_is_computed(table, tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "statsmodels", None)
-    assert main(["cohort", str(table), "--output", str(tmp_path / "out")]) == 6
-    assert "pip install 'palpate[cohort]'" in capsys.readouterr().err
-    monkeypatch.undo()
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    assert main(["cohort", str(table), "--engine", "dask", "--output", str(tmp_path / "out")]) == 6
-    assert "pip install 'palpate[cluster]'" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("library", "flags", "extra"), [("statsmodels", [], "cohort"), ("distributed", ["--engine", "dask"], "cluster")]
+)
+def test_a_missing_library_is_named_before_anything_is_computed(
+    table, tmp_path, capsys, without, library, flags, extra
+):
+    without(library)
+    assert main(["cohort", str(table), *flags, "--output", str(tmp_path / "out")]) == 6
+    assert f"pip install 'palpate[{extra}]'" in capsys.readouterr().err
 
 
 def test_a_table_of_somebodys_own_is_never_replaced(table, tmp_path, capsys):
@@ -93,7 +94,7 @@ slurm.run_part(Path(sys.argv[sys.argv.index("--output") + 1]), int(sys.argv[-1])
 
 
 @pytest.fixture
-def slurm_programs(tmp_path, monkeypatch):
+def slurm_programs(tmp_path, environment):
     """Programs called sbatch, squeue and scancel; the first runs all parts of an array at once."""
     folder = tmp_path / "bin"
     folder.mkdir()
@@ -101,7 +102,7 @@ def slurm_programs(tmp_path, monkeypatch):
         path = folder / name
         path.write_text(SBATCH.format(python=sys.executable))
         path.chmod(path.stat().st_mode | stat.S_IXUSR)
-    monkeypatch.setenv("PATH", f"{folder}:/usr/bin:/bin")
+    environment(PATH=f"{folder}:/usr/bin:/bin")
 
 
 @pytest.mark.usefixtures("slurm_programs")
@@ -123,7 +124,7 @@ def test_slurms_parts_leave_marks_and_what_is_lost_is_submitted_again(tmp_path):
     assert (outcome.failure_class, outcome.attempts) == ("lost", 3)
 
 
-def test_without_slurm_its_engine_says_so(tmp_path, monkeypatch):
-    monkeypatch.setenv("PATH", str(tmp_path))
+def test_without_slurm_its_engine_says_so(tmp_path, environment):
+    environment(PATH=str(tmp_path))
     with pytest.raises(ResourceError, match="needs SLURM's sbatch"):
         next(SlurmEngine(tmp_path).outcomes([Task(Row("a", "P"), "nowhere")]))

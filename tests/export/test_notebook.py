@@ -6,7 +6,6 @@ import base64
 import gzip
 import io
 import shutil
-import sys
 from pathlib import Path
 
 import matplotlib.image as mpimg
@@ -33,8 +32,8 @@ def test_the_widget_holds_tissues_and_moduli_on_the_image(case_result):
     assert (over.cal_min, over.cal_max) == (pytest.approx(5.0), pytest.approx(58.9))
 
 
-def test_without_its_library_a_sentence_says_what_to_install(case_result, monkeypatch):
-    monkeypatch.setitem(sys.modules, "ipyniivue", None)
+def test_without_its_library_a_sentence_says_what_to_install(case_result, without):
+    without("ipyniivue")
     with pytest.raises(ResourceError, match=r"pip install 'palpate\[notebook\]'"):
         notebook_viewer(case_result)
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 IMPORTS = """
 import os, signal, sys
 class Finder:
@@ -51,9 +52,14 @@ def script(text: str, **words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False, env=threads)
 
 
-@pytest.mark.parametrize("signal", ["SIGINT", "SIGTERM", "SIGHUP"])
-@pytest.mark.parametrize("module", ["argparse", "palpate.cli.console", "numpy", "palpate.study.check"])
-def test_a_signal_while_modules_are_imported_ends_with_130_and_a_sentence(signal, module):
+@pytest.mark.parametrize(
+    ("module", "signal"),
+    [
+        *((module, name) for module in ("argparse", "palpate.cli.console", "numpy") for name in SIGNALS),
+        ("palpate.study.check", "SIGHUP"),  # as late, after many others
+    ],
+)
+def test_a_signal_while_modules_are_imported_ends_with_130_and_a_sentence(module, signal):
     done = script(IMPORTS, module=module, signal=signal)
     assert (done.returncode, done.stdout) == (130, ""), done.stderr
     (line,) = done.stderr.strip().splitlines()
@@ -72,7 +78,7 @@ def test_a_signal_that_something_makes_another_exception_of_is_still_one():
     assert (done.returncode, "interrupted" in done.stderr, "bug" in done.stderr) == (130, True, False)
 
 
-@pytest.mark.parametrize("signal", ["SIGINT", "SIGTERM", "SIGHUP"])
+@pytest.mark.parametrize("signal", SIGNALS)
 def test_a_signal_after_the_last_word_changes_nothing(signal):
     done = script(ENDING, signal=signal)
     assert (done.returncode, done.stderr) == (0, "")

@@ -6,6 +6,7 @@ import dataclasses
 import os
 import subprocess
 import sys
+from contextlib import chdir
 from pathlib import Path
 
 import numpy as np
@@ -26,12 +27,12 @@ def ball(place: float) -> LabelImage:
 
 
 @pytest.fixture
-def images(tmp_path, monkeypatch):
+def images(tmp_path):
     """The working folder with the two images that `init` needs."""
-    monkeypatch.chdir(tmp_path)
     for name, place in (("before", 7.0), ("after", 8.0)):
         write_label_image(tmp_path / f"{name}.nii.gz", ball(place))
-    return ["before.nii.gz", "after.nii.gz"]
+    with chdir(tmp_path):
+        yield ["before.nii.gz", "after.nii.gz"]
 
 
 def sentence(capsys) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 from dataclasses import fields
 
 import pytest
@@ -46,8 +45,8 @@ def test_a_table_of_what_did_not_converge_has_no_number(result):
     assert set(table["status"]) == {"not converged"}
 
 
-def test_without_pandas_a_sentence_says_what_to_install(result, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pandas", None)
+def test_without_pandas_a_sentence_says_what_to_install(result, without):
+    without("pandas")
     with pytest.raises(ResourceError, match=r"pip install 'palpate\[dataframe\]'"):
         result.to_dataframe()
 

@@ -105,8 +105,8 @@ def test_the_nearest_of_45000_names_is_found(case_file):
         read_case(case_file).resolve_tissues(names)
 
 
-def test_a_home_in_a_path_is_found_and_a_file_whose_name_looks_like_one_is_no_home(case_file, monkeypatch):
-    monkeypatch.setenv("HOME", "/home/somebody")
+def test_a_home_in_a_path_is_found_and_a_file_whose_name_looks_like_one_is_no_home(case_file, environment):
+    environment(HOME="/home/somebody")
     paths = [
         read_case(case_file, [f"images.before='{name}'"]).images.before for name in ("~/a.nii", "./~b.nii", "~x/c.nii")
     ]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import sys
 
 import pytest
 
@@ -25,7 +24,7 @@ def silent(_: str) -> None:
     """Nobody listens."""
 
 
-def test_every_problem_is_listed_and_the_worst_class_is_the_exit_code(tmp_path, monkeypatch):
+def test_every_problem_is_listed_and_the_worst_class_is_the_exit_code(tmp_path, without):
     for name in ("before.nii.gz", "after.nii.gz"):
         (tmp_path / name).write_bytes(b"")
     (tmp_path / "case.toml").write_text(
@@ -33,7 +32,7 @@ def test_every_problem_is_listed_and_the_worst_class_is_the_exit_code(tmp_path, 
         'role = "estimate"\n[tissues.rest]\nlabel = "remaining"\nrole = "known"\nyoungs_modulus_kpa = 1e5\n'
         "[estimate]\nsamples = 1000\n"
     )
-    monkeypatch.setitem(sys.modules, "arviz_stats.base", None)
+    without("arviz_stats.base")
     found = check_case(tmp_path / "case.toml", (), progress=silent)
     words = (
         "nothing moves this body",
@@ -64,7 +63,7 @@ def test_half_the_edge_length_costs_about_eight_times_the_tetrahedra(case_result
     assert 4.0 < fine / coarse < 10.0
 
 
-def test_cost_grows_with_modes_images_and_pairs_and_shrinks_with_processors(case_result, monkeypatch):
+def test_cost_grows_with_modes_images_and_pairs_and_shrinks_with_processors(case_result, environment):
     case, before, after = case_result.case, case_result.before, case_result.after
     plain = expected_cost(case, before, after, n_pairs=1)
     fewer = dataclasses.replace(case, driver=dataclasses.replace(case.driver, modes=10))
@@ -74,14 +73,14 @@ def test_cost_grows_with_modes_images_and_pairs_and_shrinks_with_processors(case
     sampled = dataclasses.replace(case, estimate=Estimate(samples=10_000))
     assert expected_cost(sampled, before, after, n_pairs=1).seconds > plain.seconds + 30.0
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        monkeypatch.delenv(name, raising=False)
+        environment(**{name: None})
     shared = expected_cost(case, before, after, n_pairs=1)
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    environment(OMP_NUM_THREADS="1")
     alone = expected_cost(case, before, after, n_pairs=1)
     assert (shared.seconds < alone.seconds) == (shared.processors > 1)
 
 
-def test_cost_is_that_of_the_solver_that_will_run(case_result, monkeypatch):
+def test_cost_is_that_of_the_solver_that_will_run(case_result, environment):
     case, before, after = case_result.case, case_result.before, case_result.after
     plain = expected_cost(case, before, after, n_pairs=1)
     asked = dataclasses.replace(case, mechanics=dataclasses.replace(case.mechanics, solver="multigrid"))
@@ -89,7 +88,7 @@ def test_cost_is_that_of_the_solver_that_will_run(case_result, monkeypatch):
     assert plain.solver.startswith("multifrontal")
     assert iterated.solver == "multigrid"
     assert iterated.seconds > plain.seconds
-    monkeypatch.setenv("PALPATE_MEMORY_GB", "0.001")
+    environment(PALPATE_MEMORY_GB="0.001")
     assert expected_cost(case, before, after, n_pairs=1).solver != "multifrontal"
 
 
@@ -118,8 +117,8 @@ def test_an_estimate_is_refused_for_the_memory_that_a_check_refuses_it_for(tmp_p
 
 
 @pytest.mark.parametrize(("share", "code"), [(100.0, None), (1.0, 0), (0.1, 6)])
-def test_memory_that_will_not_do_is_told_before(case_result, monkeypatch, share, code):
+def test_memory_that_will_not_do_is_told_before(case_result, environment, share, code):
     needed = expected_cost(case_result.case, case_result.before, case_result.after, n_pairs=1)
-    monkeypatch.setenv("PALPATE_MEMORY_GB", f"{share * needed.memory_gb:.6f}")
+    environment(PALPATE_MEMORY_GB=f"{share * needed.memory_gb:.6f}")
     found = [problem.exit_code for problem in check.memory_problems(needed)]
     assert found == ([] if code is None else [code])

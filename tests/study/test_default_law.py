@@ -25,7 +25,7 @@ surroundings = { label = "remaining", role = "known", youngs_modulus_kpa = 10.0 
 [mesh]
 edge_length_mm = 8.0
 [driver]
-modes = 30
+modes = 20
 [estimate]
 start_ratios = [3.0]
 """

@@ -71,8 +71,8 @@ def test_after_two_finer_meshes_the_last_refusal_stands_with_all_that_was_tried(
     assert len(tried) == 3
 
 
-def test_no_finer_mesh_is_tried_that_the_machine_has_no_memory_for(case_result, tried, monkeypatch):
-    monkeypatch.setenv("PALPATE_MEMORY_GB", "0.01")
+def test_no_finer_mesh_is_tried_that_the_machine_has_no_memory_for(case_result, tried, environment):
+    environment(PALPATE_MEMORY_GB="0.01")
     with pytest.raises(GeometryError, match=r"at 4 mm; a mesh of 3 mm was not tried: about .* GB of memory would be"):
         mesh_of(case_result, 4.0)
     assert tried == [4.0]

@@ -231,7 +231,7 @@ def test_a_background_without_a_body_is_no_air():
     assert guess_tissues(LabelImage(array, GRID, {0: "air", **NAMES}))[-1].role is Role.VOID
 
 
-def test_the_proposed_mesh_fits_the_memory_of_the_machine(folder, monkeypatch):
+def test_the_proposed_mesh_fits_the_memory_of_the_machine(folder, monkeypatch, environment):
     has_gb = 1.0
     monkeypatch.setattr(cost, "LATTICE", 24)
     images = CaseImages(folder / "b.nii.gz", (folder / "a.nii.gz",), folder / "names.json")
@@ -246,7 +246,7 @@ def test_the_proposed_mesh_fits_the_memory_of_the_machine(folder, monkeypatch):
         return check.memory_problems(expected_cost(case, states.before, states.after, n_pairs=1))
 
     roomy, _ = edge_and_memory(new_case(images, folder).text)
-    monkeypatch.setenv("PALPATE_MEMORY_GB", f"{has_gb:g}")
+    environment(PALPATE_MEMORY_GB=f"{has_gb:g}")
     text = new_case(images, folder).text
     edge, problems = edge_and_memory(text)
     assert edge > roomy

@@ -26,7 +26,7 @@ def drawing(rng, *, sd_mm, length_mm, larger_mm=0.0, grid=GRID, label=1) -> Labe
     """A ball whose surface is drawn with smooth noise, and larger."""
     away = grid.world(np.argwhere(np.ones(grid.shape, dtype=bool)).astype(float)) - CENTRE
     distance = np.linalg.norm(away, axis=1)
-    near = np.abs(distance - RADIUS_MM) < 2.0  # the noise moves no place so far
+    near = np.abs(distance - RADIUS_MM) < 5.0 * sd_mm  # the noise moves no place so far
     field = smooth_field(rng, sd_mm=sd_mm, correlation_mm=length_mm, features=500)
     distance[near] = np.linalg.norm(field.warp(away[near]), axis=1)
     inside = (distance < RADIUS_MM + larger_mm).reshape(grid.shape)

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import signal
 import struct
-import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import nibabel
 import numpy as np
 import pytest
 
+from children import in_a_child
 from palpate.errors import InputDataError, ResourceError
 from palpate.images.readers import ReadLimits, isolation, nifti, read_intensities, read_label_image
 from palpate.images.readers.isolation import GREETING
@@ -29,9 +31,30 @@ def saved(path: Path, shape: tuple[int, ...] = (4, 5, 6)) -> Path:
     return path
 
 
-def stand_in(monkeypatch: pytest.MonkeyPatch, code: str) -> None:
-    """The reading process runs `code` instead of the reader."""
-    monkeypatch.setattr(isolation, "_command", lambda *_: [sys.executable, "-c", f"import os, sys, time\n{code}"])
+@pytest.fixture
+def stand_in(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Says which Python code the reading process runs instead: in the place of our interpreter stands a script."""
+    python, folder = sys.executable, tmp_path_factory.mktemp("stand-in")
+
+    def put(code: str) -> None:
+        (folder / "code.py").write_text(f"import os, sys, time\n{code}", encoding="utf-8")
+        (folder / "python").write_text(
+            f"#!/bin/sh\nexec {shlex.quote(python)} {shlex.quote(str(folder / 'code.py'))}\n"
+        )
+        (folder / "python").chmod(0o700)
+        monkeypatch.setattr(sys, "executable", str(folder / "python"))
+
+    return put
+
+
+def reading(path: Path, code: str, *, cpu_seconds: int = 20, wall_seconds: float = 900.0) -> str:
+    """The code of a process that reads under our limits, with a reader that runs `code` first."""
+    return (
+        "import palpate.images.readers.child as child\n"
+        f"plain = child.format_of\ndef looked_up(path):\n    {code}\n    return plain(path)\n"
+        "child.format_of = looked_up\n"
+        f"child.main([str(2**33), '{cpu_seconds}', '{wall_seconds}', 'labels', {str(path)!r}])"
+    )
 
 
 def greet(answer: object, tail: str = "") -> str:
@@ -71,34 +94,34 @@ def test_a_refusal_there_is_the_same_refusal_here(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["SIGSEGV", "SIGABRT", "SIGBUS", "SIGFPE"])
-def test_a_crash_is_a_sentence_that_names_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_a_crash_is_a_sentence_that_names_the_file(tmp_path: Path, stand_in: Callable[[str], None], name: str) -> None:
     path = saved(tmp_path / "a.nii")
     for begin in ("", greet({"shape": [4, 5, 6], "dtype": "|u1", "affine": AFFINE.tolist(), "names": []})):
         code = begin or f"sys.stdout.buffer.write({GREETING!r}); sys.stdout.buffer.flush()"
-        stand_in(monkeypatch, f"{code}\nos.kill(os.getpid(), {int(getattr(signal, name))})")
+        stand_in(f"{code}\nos.kill(os.getpid(), {int(getattr(signal, name))})")
         with pytest.raises(InputDataError, match=rf"a\.nii' crashed \({name}\)"):
             read_label_image(path)
 
 
-def test_a_reader_killed_by_the_system_is_short_of_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stand_in(monkeypatch, f"sys.stdout.buffer.write({GREETING!r}); sys.stdout.flush(); os.kill(os.getpid(), 9)")
+def test_a_reader_killed_by_the_system_is_short_of_memory(tmp_path: Path, stand_in: Callable[[str], None]) -> None:
+    stand_in(f"sys.stdout.buffer.write({GREETING!r}); sys.stdout.flush(); os.kill(os.getpid(), 9)")
     with pytest.raises(ResourceError, match=r"a\.nii'.*memory"):
         read_label_image(saved(tmp_path / "a.nii"))
 
 
-def test_a_reader_that_hangs_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    limit = "from palpate.images.readers.child import _limit; _limit(2**34, 100, 0.5)"
-    stand_in(monkeypatch, f"sys.stdout.buffer.write({GREETING!r}); sys.stdout.flush()\n{limit}\ntime.sleep(60)")
-    with pytest.raises(ResourceError, match=r"a\.nii' took more than"):
-        read_label_image(saved(tmp_path / "a.nii"), limits=ReadLimits(wall_seconds=0.5))
-
-
-def test_a_process_that_cannot_start_is_a_resource_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reader_that_hangs_is_stopped(tmp_path: Path, stand_in: Callable[[str], None]) -> None:
     path = saved(tmp_path / "a.nii")
-    stand_in(monkeypatch, "raise SystemExit(1)")
+    stand_in(reading(path, "time.sleep(60)", wall_seconds=0.5))
+    with pytest.raises(ResourceError, match=r"a\.nii' took more than"):
+        read_label_image(path, limits=ReadLimits(wall_seconds=0.5))
+
+
+def test_a_process_that_cannot_start_is_a_resource_error(tmp_path: Path, stand_in: Callable[[str], None]) -> None:
+    path = saved(tmp_path / "a.nii")
+    stand_in("raise SystemExit(1)")
     with pytest.raises(ResourceError, match="did not start"):
         read_label_image(path)
-    monkeypatch.setattr(isolation, "_command", lambda *_: [str(tmp_path / "no-python")])
+    Path(sys.executable).unlink()
     with pytest.raises(ResourceError, match="did not start"):
         read_label_image(path)
 
@@ -120,9 +143,9 @@ def test_a_process_that_cannot_start_is_a_resource_error(tmp_path: Path, monkeyp
     ],
 )
 def test_an_answer_of_a_process_gone_wrong_is_not_believed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: object
+    tmp_path: Path, stand_in: Callable[[str], None], answer: object
 ) -> None:
-    stand_in(monkeypatch, greet(answer))
+    stand_in(greet(answer))
     with pytest.raises(InputDataError) as caught:
         read_label_image(saved(tmp_path / "a.nii"))
     assert str(caught.value).isprintable()
@@ -140,56 +163,46 @@ def test_memory_beyond_the_limit_is_a_resource_error(tmp_path: Path) -> None:
 
 
 @needs_limits
-def test_processor_time_beyond_the_limit_is_a_resource_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    limit = "from palpate.images.readers.child import _limit; _limit(2**34, 1, 900.0)"
-    stand_in(monkeypatch, f"sys.stdout.buffer.write({GREETING!r}); sys.stdout.flush()\n{limit}\nwhile True: pass")
+def test_processor_time_beyond_the_limit_is_a_resource_error(tmp_path: Path, stand_in: Callable[[str], None]) -> None:
+    path = saved(tmp_path / "a.nii")
+    stand_in(reading(path, "while True: pass", cpu_seconds=1))
     with pytest.raises(ResourceError, match=r"a\.nii' took more than"):
-        read_label_image(saved(tmp_path / "a.nii"))
+        read_label_image(path)
 
 
 @needs_limits
-def test_the_process_can_write_no_file(tmp_path: Path) -> None:
-    code = (
-        "from palpate.images.readers.child import _limit; _limit(2**34, 10, 900.0)\n"
-        "import signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
-        "open('written', 'wb', buffering=0).write(b'x')"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert "File too large" in done.stderr
-    assert (tmp_path / "written").stat().st_size == 0
+def test_the_process_can_write_no_file(tmp_path: Path, stand_in: Callable[[str], None]) -> None:
+    path, place = saved(tmp_path / "a.nii"), tmp_path / "written"
+    ignored = "import signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN)"
+    stand_in(reading(path, f"{ignored}; open({str(place)!r}, 'wb', buffering=0).write(b'x')"))
+    with pytest.raises(InputDataError, match="File too large"):
+        read_label_image(path)
+    assert place.stat().st_size == 0
 
 
-def test_modules_in_the_working_folder_are_not_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_modules_in_the_working_folder_are_not_imported(tmp_path: Path) -> None:
     path = saved(tmp_path / "a.nii")
     for module in ("numpy", "nibabel", "json", "palpate"):
         (tmp_path / f"{module}.py").write_text("import pathlib; pathlib.Path('trapped').touch()")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", ["", *sys.path])
-    assert read_label_image(path.name).labels.shape == (4, 5, 6)
+
+    def read() -> int:
+        os.chdir(tmp_path)
+        sys.path.insert(0, "")
+        return 0 if read_label_image(path.name).labels.shape == (4, 5, 6) else 1
+
+    assert in_a_child(read) == 0
     assert not (tmp_path / "trapped").exists()
 
 
-def test_what_a_library_prints_does_not_reach_the_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_library_prints_does_not_reach_the_answer(tmp_path: Path, stand_in: Callable[[str], None]) -> None:
     path = saved(tmp_path / "a.nii")
-    code = (
-        "import palpate.images.readers.child as child, palpate.images.readers.registry as registry\n"
-        "plain = child.format_of\n"
-        f"child.format_of = lambda path: (os.write(1, b'noise'), print('noise', flush=True), plain(path))[-1]\n"
-        f"child.main([str(2**33), '20', '900', 'labels', {str(path)!r}])"
-    )
-    stand_in(monkeypatch, code)
+    stand_in(reading(path, "os.write(1, b'noise'); print('noise', flush=True)"))
     assert read_label_image(path).labels.shape == (4, 5, 6)
 
 
-def test_a_flaw_of_a_reader_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_flaw_of_a_reader_is_a_sentence(tmp_path: Path, stand_in: Callable[[str], None]) -> None:
     path = saved(tmp_path / "a.nii")
-    code = (
-        "import palpate.images.readers.child as child\n"
-        "def broken(path): raise ZeroDivisionError('by zero')\n"
-        "child.format_of = broken\n"
-        f"child.main([str(2**33), '20', '900', 'labels', {str(path)!r}])"
-    )
-    stand_in(monkeypatch, code)
+    stand_in(reading(path, "raise ZeroDivisionError('by zero')"))
     with pytest.raises(InputDataError, match=r"reader of '.*a\.nii' failed \(ZeroDivisionError: by zero\)"):
         read_label_image(path)
 

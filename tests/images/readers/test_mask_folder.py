@@ -117,13 +117,15 @@ def test_masks_that_cannot_be_are_refused_with_their_names_and_numbers(tmp_path:
         read_label_image(tmp_path / "none")
 
 
-def test_counts_are_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = save(tmp_path / "masks", a=box(0, 1), b=box(1, 2), c=box(2, 3))
-    monkeypatch.setattr(mask_folder, "MOST_MASKS", 2)
-    with pytest.raises(InputDataError, match="has 3 masks"):
+def test_counts_are_limited(tmp_path: Path) -> None:
+    folder = save(tmp_path / "masks", a=box(0, 1))
+    for number in range(mask_folder.MOST_MASKS):
+        os.link(folder / "a.nii.gz", folder / f"{number}.nii.gz")
+    with pytest.raises(InputDataError, match="has 501 masks"):
         read_label_image(folder)
-    monkeypatch.setattr(mask_folder, "MOST_FILES", 2)
-    with pytest.raises(InputDataError, match="over 2 files"):
+    for number in range(mask_folder.MOST_FILES - mask_folder.MOST_MASKS):
+        (folder / f"{number}.txt").touch()
+    with pytest.raises(InputDataError, match="over 10000 files"):
         read_label_image(folder)
 
 
