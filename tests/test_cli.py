@@ -19,6 +19,7 @@ from palpate.cli.parser import EXAMPLES, make_parser
 from palpate.images.label_image import LabelImage
 from palpate.report import case_report
 from palpate.study import run
+from palpate.study import simulate as simulation
 from palpate.study.earlier import strange_files
 from palpate.study.result import MeshResult, Simulation
 
@@ -69,7 +70,7 @@ def runner(monkeypatch, case_result):
 
     def install(**functions):
         for name, function in ({"estimate": estimate} | functions).items():
-            monkeypatch.setattr(run, name, function)
+            monkeypatch.setattr(simulation if name == "simulate" else run, name, function)
 
     install()
     return install

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from palpate.inversion import FIELD, Acts, Block, Inversion
 from palpate.mechanics.material import field_modes
@@ -165,7 +165,7 @@ def _region(mesh: TetMesh, elements: NDArray[np.int64], field: _Field) -> Differ
     """The largest connected part that is likely another stiffness, and certainly so somewhere; None: there is none."""
     sd, found = np.sqrt(np.maximum(field.variance, 1e-300)), list[DifferentRegion]()
     for sign in (1.0, -1.0):
-        probability = norm.cdf((sign * field.mean - np.log(CONTRAST)) / sd)
+        probability = ndtr((sign * field.mean - np.log(CONTRAST)) / sd)
         likely = np.flatnonzero(probability > LIKELY)
         _, part = connected_components(_neighbours(mesh.tets[elements[likely]]))
         for label in np.unique(part[probability[likely] > CERTAIN]):
