@@ -36,7 +36,7 @@ start_ratios = [1.0, 4.0]
 
 def write_case(folder: Path) -> Path:
     """Write both label images (1 mm voxels) and the case that names them."""
-    scene = spheres(SpheresOptions(seed=2, spacing_mm=(1.0, 1.0, 1.0), truth_edge_mm=5.0))
+    scene = spheres(SpheresOptions(seed=2, spacing_mm=(1.0, 1.0, 1.0), truth_edge_mm=4.0))
     write_label_image(folder / "before.nii.gz", scene.before)
     write_label_image(folder / "after.nii.gz", scene.after)
     (folder / "case.toml").write_text(CASE)

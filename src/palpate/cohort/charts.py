@@ -65,7 +65,9 @@ def boxes_svg(patients: Patients, tissue: str, unit: str, *, name: str, pages: P
             for place, (patient, median) in zip(stage + _beside(len(medians)), medians, strict=True):
                 points = axes.plot(place, median, "o", color=COLOUR, markersize=4.5, alpha=0.85)
                 _link(points[0], patient, links)
-            labels.append(f"{stage}\n{len(own)} patients\n{len(scans) + len(censored)} scans")
+            n = len(scans) + len(censored)
+            who = f"{len(own)} patient{'s' * (len(own) != 1)}"
+            labels.append(f"{stage}\n{who}\n{n} scan{'s' * (n != 1)}")
         axes.set_xticks(stages, labels)
         axes.set_xlim(min(stages) - 0.6, max(stages) + 0.6)
         _label(axes, unit)
