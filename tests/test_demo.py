@@ -13,6 +13,7 @@ from palpate.cli import main
 from palpate.demo import DATA, run_demo
 from palpate.progress import STAGES, Forecast, Told
 from palpate.study import read_case
+from palpate.study.outputs import RESULT, RESULT_FILES
 
 ROOT = Path(__file__).parents[1]
 TUTORIAL = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
@@ -98,3 +99,6 @@ def test_the_tutorials_steps_lead_to_the_demos_case(tmp_path, monkeypatch, capsy
     }
     same = {name: getattr(demos, name) for name in ("id", "patient", "images", "tissues")}
     assert replace(case, **same) == demos
+    (written,) = re.findall(r"^written to out: (.*)$", SHOWN[-1], flags=re.MULTILINE)
+    asked_for = {"posterior.nc", "stiffness_sd.nii.gz"}  # samples, and a map
+    assert {*written.split(", ")} == {*RESULT_FILES, RESULT, "case.toml", "log.txt"} - asked_for

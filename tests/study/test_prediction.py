@@ -71,6 +71,14 @@ def test_a_modulus_is_guessed_as_its_tissue_states_it(prediction_of):
     assert not found.stated
 
 
+def test_what_a_case_rules_out_has_no_share(states):
+    case = case_of(coarse_balls(), discrepancy=Discrepancy(0.0, 25.0, 0.0, 0.0, layer_sd=0.0))
+    found = predicted_intervals([make_body(states, case, progress=silent)], case, progress=silent)
+    for of in found.moduli:
+        assert set(of.shares) == {"noise", "driver", "grid", "mesh"}
+        assert sum(of.shares.values()) == pytest.approx(1.0)
+
+
 def test_twice_the_noise_makes_intervals_at_most_twice_as_wide(prediction_of):
     fine, coarse = (widths(prediction_of(**noisy(sd))) for sd in (0.1, 0.2))
     assert np.all(coarse > 1.2 * fine)

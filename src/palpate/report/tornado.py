@@ -79,12 +79,15 @@ def tornado_rows(document: Mapping[str, Any], tissue: str) -> tuple[TornadoRow, 
 
 
 def effect_text(row: TornadoRow, *, reasons: bool = False) -> str:
-    """What each setting does, in per cent of the modulus: "0.43: -3 %, 0.47: +4 %"; with `reasons` why one does not."""
+    """What each setting does, in per cent of the modulus: "0.43: -3 %, 0.47: +4 %".
+
+    Of one without a change "no estimate", or, with `reasons`, why there is none.
+    """
     words = []
     for setting, change in row.effects.items():
         end = " (at the search's bound)" if setting in row.at_bound else ""
         words.append(f"{setting}: {100.0 * math.expm1(change):+.3g} %{end}")
-    words += [f"{setting}: no estimate" + (f" ({why})" if reasons else "") for setting, why in row.failed.items()]
+    words += [f"{setting}: {why if reasons else 'no estimate'}" for setting, why in row.failed.items()]
     return ", ".join(words)
 
 

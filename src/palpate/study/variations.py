@@ -36,7 +36,7 @@ KNOWN_FACTOR = 1.2
 VOXELS = (-0.5, -0.25, 0.25, 0.5)
 PRIOR_WIDTHS = (0.5, 2.0)
 ALL = "all tissues"
-DRAWN = "how it is drawn is an unknown of the estimate, so that the interval holds it (its share: offset)"
+DRAWN = "not moved, as how it is drawn is an unknown of the estimate: the interval holds it"
 
 
 @dataclass(frozen=True, slots=True)

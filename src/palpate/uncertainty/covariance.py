@@ -90,10 +90,12 @@ class Covariance:
 
         free: the sandwich (n_parameters, n_parameters) with these blocks free.
         """
+        causes = dict.fromkeys(block.cause for block in objective.parameters.blocks if block.released)
+        if not causes:
+            return self
         rows = evaluation.covariance_columns(objective.n_parameters).T
         part = added_by(free, held=self.noise + rows @ evaluation.prior @ rows.T)
-        cause = " and ".join(dict.fromkeys(block.cause for block in objective.parameters.blocks if block.released))
-        return replace(self, prior=self.prior + part, causes={**self.causes, cause: part})
+        return replace(self, prior=self.prior + part, causes={**self.causes, " and ".join(causes): part})
 
 
 def added_by(free: NDArray[np.float64], *, held: NDArray[np.float64]) -> NDArray[np.float64]:
