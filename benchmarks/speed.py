@@ -26,7 +26,7 @@ import speed_direct as direct
 import speed_peers as peers
 from memory import peak_mb
 from numpy.typing import NDArray
-from speed_default import default_case, other_signals
+from speed_default import default_case, measured_field, other_signals
 from speed_stages import shares_of_stages
 
 from palpate.images import segment
@@ -57,7 +57,7 @@ from palpate.study import (
 )
 from palpate.uncertainty import frozen_posterior, posterior_chains, sandwich_covariance
 
-PARTS = ("solver", "linear", "nonlinear", "gradient", "posterior", "scaling", "front_end", "default", "signals")
+PARTS = "solver,linear,nonlinear,gradient,posterior,scaling,front_end,default,signals,field"
 IN_A_ROW = 20  # gradients, as an optimiser asks for them
 STARTS = (0.5, 1.0, 2.0, 4.0, 8.0)  # moduli to the surroundings'
 SCALING_EDGES = (9.0, 6.0, 4.0, 2.7, 1.85, 1.65)  # mm: 30 k to 1 M unknowns
@@ -85,7 +85,7 @@ QUICK = Sizes(10.0, 9.0, 9.0, 10.0, (12.0, 9.0), 1, 5_000)
 def main() -> int:
     """Run the parts that were asked for and print one JSON document."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--parts", default=",".join(PARTS))
+    parser.add_argument("--parts", default=PARTS)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--edge", type=float, help="edge length (mm) of the linear and the nonlinear part")
     parser.add_argument("--sizes", help="edge lengths (mm) of the scaling, with commas")
@@ -349,6 +349,12 @@ def _signals(sizes: Sizes, seed: int, say: Say) -> Result:
     return {"signals": other_signals(seed, quick=sizes == QUICK)}
 
 
+def _field(sizes: Sizes, seed: int, say: Say) -> Result:
+    """The same with a measured displacement field beside its surfaces."""
+    del say
+    return {"field": measured_field(seed, quick=sizes == QUICK)}
+
+
 def _one_size(edge_mm: float, seed: int) -> Result:
     """Assembly, one forward solve and two modulus sensitivities with multigrid."""
     options = PelvisOptions(seed=seed)
@@ -404,6 +410,7 @@ PART = {
     "front_end": _front_end,
     "default": _default,
     "signals": _signals,
+    "field": _field,
 }
 
 if __name__ == "__main__":

@@ -11,11 +11,14 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from cost import write_case
+from scipy.ndimage import gaussian_filter
 
-from palpate.phantoms import Noise, PelvisOptions, pelvis
+from palpate.mesh import located, point_interpolation
+from palpate.phantoms import Noise, PelvisOptions, Scene, pelvis
 
-__all__ = ["default_case", "other_signals"]
+__all__ = ["default_case", "measured_field", "other_signals"]
 
 LAWS = ("linear", "neo-hookean")
 FIELD_MM, QUICK_FIELD_MM = 140.0, 110.0
@@ -26,6 +29,8 @@ HELD = (  # what the model leaves out known, and the frame held
     "discrepancy.poisson_sd=0",
     "discrepancy.surface_offset_mm=0",
 )
+N_POINTS = 100_000  # of a measured field, on a lattice
+FIELD_SD_MM, ALIKE_MM = 0.5, 5.0  # of its errors
 BODIES: dict[str, dict[str, Any]] = {
     DEFAULT: {},
     "small motion": {"filling_mm": 3.0},
@@ -67,15 +72,31 @@ def other_signals(seed: int, *, quick: bool) -> dict[str, Any]:
     return found
 
 
+def measured_field(seed: int, *, quick: bool) -> dict[str, Any]:
+    """The default case by its surfaces alone and with a field of 100 000 points, under each law, and their ratios."""
+    found: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        _make(folder, DEFAULT, seed, quick=quick)
+        for law in LAWS:
+            alone = _ended(*_started(folder, law, quick=quick))
+            beside = _ended(*_started(folder, law, quick=quick, case="field.toml"))
+            ratios = {f"{key}_ratio": round(beside[key] / alone[key], 2) for key in ("seconds", "peak_mb")}
+            found[law] = {"surfaces": alone, "field": beside, **ratios}
+    return found
+
+
 def _make(folder: Path, body: str, seed: int, *, quick: bool) -> None:
     """The case's files, by a process of its own: their truth needs more memory than an estimate."""
     subprocess.run([sys.executable, __file__, str(folder), body, str(seed), str(int(quick))], check=True)
 
 
-def _started(folder: Path, law: str, *, quick: bool, held: bool = False) -> tuple[subprocess.Popen[bytes], Path, float]:
-    """An estimate of the case in a folder: its process, where it writes, when it began."""
-    output = folder / (f"{law}-held" if held else law)
-    command = [sys.executable, "-m", "palpate", "estimate", str(folder / "case.toml"), "--quiet"]
+def _started(
+    folder: Path, law: str, *, quick: bool, held: bool = False, case: str = "case.toml"
+) -> tuple[subprocess.Popen[bytes], Path, float]:
+    """An estimate of a case in a folder: its process, where it writes, when it began."""
+    output = folder / f"{law}-{Path(case).stem}{'-held' if held else ''}"
+    command = [sys.executable, "-m", "palpate", "estimate", str(folder / case), "--quiet"]
     command += [part for key in HELD if held for part in ("--set", key)]
     command += ["--set", f'mechanics.law="{law}"', "--output", str(output)]
     command += ["--set", "mesh.edge_length_mm=10"] if quick else []
@@ -104,6 +125,27 @@ def _write(folder: Path, body: str, seed: int, *, quick: bool) -> None:
     field = (side, max(side, 120.0), max(side, 120.0))
     scene = pelvis(PelvisOptions(seed=seed, truth_edge_mm=4.0, **{"field_mm": field, **BODIES[body]}))
     write_case(folder, scene, unnamed=BODIES[body].get("moduli_kpa", ()))
+    if body == DEFAULT:
+        _write_field(folder, scene)
+
+
+def _write_field(folder: Path, scene: Scene) -> None:
+    """A case beside the case: with a table of the displacements on a lattice, whose errors are alike nearby."""
+    low, high = scene.mesh.nodes.min(axis=0), scene.mesh.nodes.max(axis=0)
+    spacing = float(np.prod(high - low) / N_POINTS) ** (1.0 / 3.0)
+    n = np.ceil((high - low) / spacing).astype(int)
+    axes = [a + (b - a) * (np.arange(k) + 0.5) / k for a, b, k in zip(low, high, n, strict=True)]
+    lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    errors = np.random.default_rng(scene.seed).standard_normal(lattice.shape)
+    errors = gaussian_filter(errors, ALIKE_MM / spacing, axes=(0, 1, 2))
+    places = located(scene.mesh, lattice.reshape(-1, 3))
+    before = lattice.reshape(-1, 3)[places.inside]
+    moved = point_interpolation(scene.space, places.of(places.inside)) @ scene.displacement
+    after = before + moved + FIELD_SD_MM * (errors / errors.std()).reshape(-1, 3)[places.inside]
+    names = ",".join(f"{state}_{axis}" for state in ("before", "after") for axis in "xyz")
+    np.savetxt(folder / "field.csv", np.hstack([before, after]), fmt="%.4f", delimiter=",", header=names, comments="")
+    kind = f'kind = "displacement-field"\nfile = "field.csv"\nsd_mm = {FIELD_SD_MM}\ncorrelation_mm = {ALIKE_MM}\n'
+    (folder / "field.toml").write_text(f"{(folder / 'case.toml').read_text()}\n[[data]]\n{kind}")
 
 
 if __name__ == "__main__":
