@@ -24,7 +24,7 @@ from palpate.inversion import (
     with_released,
 )
 from palpate.mesh.voxelise import voxelise
-from palpate.observation.contract import Fit, Imaged, OfInstrument, OfPoints, PointMotions
+from palpate.observation.contract import Fit, Imaged, OfInstrument, OfPoints, PointMotions, seen_by
 from palpate.progress import Progress, silent
 from palpate.study.discrepancy import (
     FittedMaterial,
@@ -603,7 +603,7 @@ def _points(inversion: Inversion, observed: Observed) -> tuple[PointFit, ...]:
     for line in inversion.minimum.evaluation.lines:
         seen = line.observation
         if isinstance(seen, OfPoints):
-            motions = seen.point_motions(observed.states[line.state].displacement.ravel()[line.observation.dofs])
+            motions = seen.point_motions(seen_by(line.observation, observed.states[line.state].displacement.ravel()))
             stated = line.observation.first_noise((line.observation,)).sd
             misfit = float(np.sqrt(np.mean(line.residuals.values**2))) / stated
             found.append(PointFit(line.observation.name, line.state, motions, misfit))
