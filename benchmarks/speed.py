@@ -26,7 +26,8 @@ import speed_direct as direct
 import speed_peers as peers
 from memory import peak_mb
 from numpy.typing import NDArray
-from speed_default import default_case, measured_field, other_signals
+from speed_default import default_case, mapped_organ, measured_field, other_signals
+from speed_maps import beside_a_peer
 from speed_stages import shares_of_stages
 
 from palpate.images import segment
@@ -57,7 +58,7 @@ from palpate.study import (
 )
 from palpate.uncertainty import frozen_posterior, posterior_chains, sandwich_covariance
 
-PARTS = "solver,linear,nonlinear,gradient,posterior,scaling,front_end,default,signals,field"
+PARTS = "solver,linear,nonlinear,gradient,posterior,scaling,front_end,default,signals,field,map"
 IN_A_ROW = 20  # gradients, as an optimiser asks for them
 STARTS = (0.5, 1.0, 2.0, 4.0, 8.0)  # moduli to the surroundings'
 SCALING_EDGES = (9.0, 6.0, 4.0, 2.7, 1.85, 1.65)  # mm: 30 k to 1 M unknowns
@@ -77,9 +78,10 @@ class Sizes:
     repeats: int = 3
     evaluations: int = 100_000
     starts_of_peers: int = 1
+    map: tuple[float, int] = (8.0, 200)  # and modes: 10 k unknowns
 
 
-QUICK = Sizes(10.0, 9.0, 9.0, 10.0, (12.0, 9.0), 1, 5_000)
+QUICK = Sizes(10.0, 9.0, 9.0, 10.0, (12.0, 9.0), 1, 5_000, map=(12.0, 30))
 
 
 def main() -> int:
@@ -355,6 +357,12 @@ def _field(sizes: Sizes, seed: int, say: Say) -> Result:
     return {"field": measured_field(seed, quick=sizes == QUICK)}
 
 
+def _map(sizes: Sizes, seed: int, say: Say) -> Result:
+    """What a map of the prostate's stiffness adds to that, and a small one beside torch-fem's of the same data."""
+    peer = beside_a_peer(*sizes.map, seed, say)
+    return {"map": mapped_organ(seed, quick=sizes == QUICK), "map_beside_torch_fem": peer}
+
+
 def _one_size(edge_mm: float, seed: int) -> Result:
     """Assembly, one forward solve and two modulus sensitivities with multigrid."""
     options = PelvisOptions(seed=seed)
@@ -411,6 +419,7 @@ PART = {
     "default": _default,
     "signals": _signals,
     "field": _field,
+    "map": _map,
 }
 
 if __name__ == "__main__":

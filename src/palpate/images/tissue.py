@@ -32,11 +32,13 @@ class Role(StrEnum):
 class FieldPrior:
     """What is believed of ln E inside a tissue whose modulus is a field.
 
-    sd: standard deviation, dimensionless; length_mm: of its kernel, Matern's with one derivative, mm.
+    sd: standard deviation, dimensionless; length_mm: of its kernel, Matern's with one derivative, mm; modes: so many
+    at the most make it.
     """
 
     sd: float
     length_mm: float
+    modes: int = 400
 
 
 @dataclass(frozen=True, slots=True)

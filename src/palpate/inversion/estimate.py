@@ -241,9 +241,11 @@ def _linear(
     """
     objective, rest, fitted, nearby = _nearby(objective, begin, settings, progress)
     n = objective.n_parameters
+    fitted, nearby = _remembered(fitted), _remembered(nearby)
     minima = _from_starts(objective, settings, nearby.unknowns[n:], progress)
     first = _best(minima)
     start = [updated(objective, replace(minima[first], evaluations=0), rule)]
+    minima = [_remembered(minimum) for minimum in minima]
     del objective  # and with it its approximations, which are large, when others take their place
     followed = [run_outer_loop(start.pop(), settings, rule, progress=progress, title="linear law")]
     found = followed[0].minimum.evaluation  # minima may lie apart under the first noise and be one under what was found
@@ -390,6 +392,11 @@ def _values(distinct: Sequence[OuterIterate], settings: InversionSettings) -> tu
         values.append(there.evaluation.value)
         evaluations += there.evaluations
     return values, evaluations
+
+
+def _remembered(minimum: Minimum) -> Minimum:
+    """The minimum without its residuals and their derivatives, which are large where many unknowns are seen."""
+    return replace(minimum, evaluation=replace(minimum.evaluation, lines=()))
 
 
 def _best(minima: Sequence[Minimum]) -> int:

@@ -65,6 +65,14 @@ def informed_problem(
         states[s] = replace(state, observed=found[s].seen(state, q))
     evaluation = replace(objective, states=tuple(states))(fitted.unknowns)
     data, columns = evaluation.matrix - evaluation.prior, [parameters.columns(i) for i in range(len(parameters.blocks))]
+    middle, evaluations = fitted.unknowns, fitted.evaluations + 1
+    del (
+        objective,
+        states,
+        state,
+        fitted,
+        evaluation,
+    )  # and with them the derivatives of all that is seen by all unknowns
     bases = [_informed(b, data[np.ix_(own, own)]) for b, own in zip(parameters.blocks, columns, strict=True)]
     blocks = tuple(b.combined(inverse) for b, (_, inverse) in zip(parameters.blocks, bases, strict=True))
     reduced, kept = list[LaterState](), list[ReducedBasis]()
@@ -77,11 +85,11 @@ def informed_problem(
         n_poisson = len(state.model.material.poisson)
         fields = material[: material.shape[0] - n_poisson, : material.shape[1] - n_poisson]
         reduced.append(state.combined(boundary, fields))
-        kept.append(found[s].combined(reduced[-1].model, boundary, material))
-    theta = fitted.unknowns[: parameters.n_parameters]
-    fit = [inverse @ fitted.unknowns[own] for own, (_, inverse) in zip(columns, bases, strict=True)]
+        kept.append(found.pop(0).combined(reduced[-1].model, boundary, material))
+    theta = middle[: parameters.n_parameters]
+    fit = [inverse @ middle[own] for own, (_, inverse) in zip(columns, bases, strict=True)]
     seen = InverseProblem(tuple(reduced), replace(parameters, blocks=blocks, nuisance_precision=np.zeros((0, 0))))
-    return InformedProblem(seen, tuple(kept), np.concatenate([theta, *fit]), fitted.evaluations + 1)
+    return InformedProblem(seen, tuple(kept), np.concatenate([theta, *fit]), evaluations)
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,6 +29,7 @@ from palpate.mechanics.loads import boundary_named as boundary_named
 from palpate.mechanics.loads import gravity as gravity
 from palpate.mechanics.loads import pressure as pressure
 from palpate.mechanics.loads import traction as traction
+from palpate.mechanics.material import material_modes as material_modes
 from palpate.mechanics.newton import NewtonSettings as NewtonSettings
 from palpate.mechanics.solvers.contract import Hints as Hints
 from palpate.mechanics.solvers.registry import SOLVERS as SOLVERS

@@ -22,7 +22,7 @@ from palpate.mechanics.hyperelastic import Elements, Moduli, elements_of
 from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.linearised import TIGHT, LinearisedSystem
 from palpate.mechanics.loads import Load
-from palpate.mechanics.material import HOMOGENEOUS, MaterialModes, material_forces
+from palpate.mechanics.material import HOMOGENEOUS, MaterialForces, MaterialModes, material_forces
 from palpate.mechanics.newton import NewtonPath, NewtonSettings, follow
 from palpate.mechanics.pattern import BlockPattern, Restriction, Stiffness, block_pattern, restriction
 from palpate.mechanics.solvers.contract import Factorisation
@@ -35,6 +35,7 @@ Array = NDArray[np.float64]
 FACTORISATION_IN_SOLVES = 30  # right-hand sides that cost as much as a factorisation
 NEARLY_INCOMPRESSIBLE = 0.4999  # no coefficient leads Poisson's ratio beyond
 LACKING = 1e-2  # relative residual of a correction to derivatives of a like state
+AT_ONCE = 64  # right-hand sides: what a solution takes beside its answer is a multiple of that
 REFINEMENTS = 12  # solutions with an old factorisation that an exact one takes
 
 
@@ -148,18 +149,12 @@ class FiniteStrainModel:
         return self._spread(moduli, material, lame_parts_by_poisson)
 
     def material_forces(
-        self,
-        values: NDArray[np.float64],
-        moduli: NDArray[np.float64],
-        material: NDArray[np.float64],
-        directions: NDArray[np.float64] | None = None,
-    ) -> NDArray[np.float64]:
-        """Derivatives of the internal forces (n_dof, k), mN, by the material's coefficients (n_material,).
+        self, values: NDArray[np.float64], moduli: NDArray[np.float64], material: NDArray[np.float64]
+    ) -> MaterialForces:
+        """Derivatives of the internal forces by the material's coefficients (n_material,).
 
-        At u (n_dof,) mm and moduli (n_regions,) kPa; directions (n_material, k), by default each coefficient alone.
+        At u (n_dof,) mm and moduli (n_regions,) kPa.
         """
-        if not self.material.n_modes:
-            return np.zeros((len(values), 0 if directions is None else directions.shape[1]))
         return material_forces(
             self.elements,
             self.material,
@@ -167,7 +162,6 @@ class FiniteStrainModel:
             self.moduli_of(moduli, material),
             by_poisson=self.moduli_by_poisson(moduli, material),
             tissue=np.array(self.regions)[self.element_region],
-            directions=directions,
         )
 
     def under(self, conditions: Conditions) -> FiniteStrainModel:
@@ -287,11 +281,14 @@ class FiniteStrainEquilibrium:
         tolerance: of the relative residual of each.
         """
         stiffness = self._stiffness()
-        loads = self._parameter_loads(stiffness)
-        system = self._system(stiffness, loads.shape[1])
-        result = np.asarray(self.balance.free @ system.solve(loads, tolerance=tolerance))
-        first = self.model.n_regions
-        result[:, first : first + self.model.constraint.n_modes] += self.model.constraint.modes
+        first, modes = self.model.n_regions, self.model.constraint.modes
+        each, along = np.eye(first + self.model.n_modes), self._parameter_forces(stiffness)
+        system, result = self._system(stiffness, len(each)), np.zeros((len(self.values), len(each)))
+        for start in range(0, len(each), AT_ONCE):
+            some = slice(start, start + AT_ONCE)
+            loads = -np.asarray(self.balance.free.T @ along(each[:, some]))
+            result[:, some] = self.balance.free @ system.solve(loads, tolerance=tolerance)
+        result[:, first : first + modes.shape[1]] += modes
         return result
 
     def tangent_along(self, directions: NDArray[np.float64], guess: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -300,13 +297,10 @@ class FiniteStrainEquilibrium:
         guess (n_dof, k) mm: the same of a like state; what it lacks is found to a hundredth, without a factorisation.
         """
         stiffness, free = self._stiffness(), self.balance.free
-        ends = np.cumsum([self.model.n_regions, self.model.constraint.n_modes])
-        by_modulus, by_mode, by_material = np.split(directions, ends)
-        prescribed = np.asarray(self.model.constraint.modes @ by_mode)
-        forces = self.balance.region_forces(self.values, self.balance.moduli) @ by_modulus
-        forces += self._material_forces(by_material)
+        first, modes = self.model.n_regions, self.model.constraint.modes
+        prescribed = np.asarray(modes @ directions[first : first + modes.shape[1]])
         system, known = self._system(stiffness, 1), np.asarray(free.T @ guess)
-        lacking = -np.asarray(free.T @ (forces + stiffness @ prescribed)) - system.matrix @ known
+        lacking = -np.asarray(free.T @ self._parameter_forces(stiffness)(directions)) - system.matrix @ known
         return np.asarray(free @ (known + system.solve(lacking, tolerance=LACKING))) + prescribed
 
     def poisson_tangents(self) -> NDArray[np.float64]:
@@ -321,9 +315,10 @@ class FiniteStrainEquilibrium:
         stiffness = self._stiffness()
         load = np.asarray(self.balance.free.T @ gradient)
         dual = self._system(stiffness, 1).transposed().solve(load[:, None])[:, 0]
-        result, first = np.asarray(self._parameter_loads(stiffness).T @ dual), self.model.n_regions
-        result[first : first + self.model.constraint.n_modes] += self.model.constraint.modes.T @ gradient
-        return result
+        everywhere, modes = np.asarray(self.balance.free @ dual), self.model.constraint.modes
+        by_modulus = -self.balance.region_forces(self.values, self.balance.moduli).T @ everywhere
+        by_mode = modes.T @ (gradient - stiffness.T @ everywhere)
+        return np.concatenate([by_modulus, by_mode, -self._by_material.work(everywhere)])
 
     def _stiffness(self) -> Stiffness:
         if not self.converged:
@@ -344,17 +339,24 @@ class FiniteStrainEquilibrium:
             ready = ready.nearby
         return LinearisedSystem(self.balance.restricted(stiffness), ready, symmetric=self.balance.symmetric)
 
-    def _parameter_loads(self, stiffness: Stiffness) -> Array:
-        """-F^T [dR / d ln E_r, K M, dR / dc_k] (n_free, n_regions + n_modes), mN."""
-        forces = self.balance.region_forces(self.values, self.balance.moduli)
-        moved = np.asarray(stiffness @ self.model.constraint.modes)
-        both = np.concatenate([forces, moved, self._material_forces()], axis=1)
-        return -np.asarray(self.balance.free.T @ both)
+    def _parameter_forces(self, stiffness: Stiffness) -> Callable[[Array], Array]:
+        """[dR / d ln E_r, K M, dR / dc_k] d (n_dof, k), mN, as a function of directions d (n_regions + n_modes, k)."""
+        by_region, by_material = self.balance.region_forces(self.values, self.balance.moduli), self._by_material
+        ends = np.cumsum([self.model.n_regions, self.model.constraint.n_modes])
 
-    def _material_forces(self, directions: Array | None = None) -> Array:
-        """Derivatives of R (n_dof, k), mN, along directions (n_material, k) of the material modes, or by each alone."""
+        def along(directions: Array) -> Array:
+            """Those of several directions."""
+            of_moduli, of_modes, of_material = np.split(directions, ends)
+            moved = stiffness @ np.asarray(self.model.constraint.modes @ of_modes)
+            return np.asarray(by_region @ of_moduli + moved + by_material.along(of_material))
+
+        return along
+
+    @property
+    def _by_material(self) -> MaterialForces:
+        """Derivatives of R by the material's coefficients."""
         material = self.coefficients[self.model.constraint.n_modes :]
-        return self.model.material_forces(self.values, self.moduli, material, directions)
+        return self.model.material_forces(self.values, self.moduli, material)
 
 
 def finite_strain_model(

@@ -7,6 +7,7 @@ K_ff z = F^T f - F^T K (M q + o) with K_ff = F^T K F and dead loads f.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +20,7 @@ from palpate.mechanics.forward import SolveCounts, checked_coefficients, checked
 from palpate.mechanics.hyperelastic import Elements, Moduli, elements_of
 from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.loads import Load
-from palpate.mechanics.material import HOMOGENEOUS, MaterialModes, material_forces
+from palpate.mechanics.material import HOMOGENEOUS, MaterialForces, MaterialModes, material_forces
 from palpate.mechanics.rigid import linear_displacements, rigid_modes
 from palpate.mechanics.solvers.contract import EXACT, Factorisation
 from palpate.mechanics.solvers.registry import factorise
@@ -36,7 +37,7 @@ from palpate.parallel import mapped
 
 LINEAR = Linear()
 OF_ERROR = 1e-4  # relative residual of the solution that an error is made of
-AT_ONCE = 64  # right-hand sides, where few of the answers are kept
+AT_ONCE = 64  # right-hand sides: what a solution takes beside its answer is a multiple of that
 FURTHER = 10  # right-hand sides a modulus, beside one for each mode: sensitivities, series
 
 
@@ -140,18 +141,14 @@ class LinearModel:
             total += modulus * (matrix @ displacements)
         return total
 
-    def tangent_loads(
-        self, moduli: NDArray[np.float64], values: NDArray[np.float64], directions: NDArray[np.float64] | None = None
-    ) -> NDArray[np.float64]:
-        """Loads (n_free, k), mN, whose responses are the free part of the tangent at an equilibrium u (n_dof,) mm.
+    def tangent_loads(self, moduli: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Loads (n_free, n_regions + n_modes), mN, whose responses are the free part of the tangent.
 
-        directions (n_regions + n_modes, k) of (ln E, q, c), by default each of them alone; moduli (n_regions,) kPa.
+        At an equilibrium u (n_dof,) mm and moduli (n_regions,) kPa.
         """
-        n = self.n_regions + self.constraint.n_modes
-        of_boundary, of_material = (None, None) if directions is None else np.split(directions, [n])
-        boundary = self.boundary_loads(moduli, values, of_boundary)
-        material = -np.asarray(self.constraint.free.T @ self.material_forces(moduli, values, of_material))
-        return np.concatenate([boundary, material], axis=1) if of_material is None else np.asarray(boundary + material)
+        forces = self.material_forces(moduli, values, np.eye(self.material.n_modes))
+        material = -np.asarray(self.constraint.free.T @ forces)
+        return np.concatenate([self.boundary_loads(moduli, values), material], axis=1)
 
     def boundary_loads(
         self, moduli: NDArray[np.float64], values: NDArray[np.float64], directions: NDArray[np.float64] | None = None
@@ -165,14 +162,18 @@ class LinearModel:
         return -np.asarray(by_modulus @ directions[: self.n_regions] + by_mode @ directions[self.n_regions :])
 
     def material_forces(
-        self, moduli: NDArray[np.float64], values: NDArray[np.float64], directions: NDArray[np.float64] | None = None
+        self, moduli: NDArray[np.float64], values: NDArray[np.float64], directions: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Derivatives (n_dof, k), mN, of the nodal forces at u (n_dof,) mm along directions (n_material, k).
 
-        Of the material coefficients, by default each of them alone; moduli (n_regions,) kPa.
+        Of the material coefficients; moduli (n_regions,) kPa.
         """
+        return self.by_material(moduli, values).along(directions)
+
+    def by_material(self, moduli: NDArray[np.float64], values: NDArray[np.float64]) -> MaterialForces:
+        """Derivatives of the nodal forces at u (n_dof,) mm and moduli (n_regions,) kPa by the material coefficients."""
         if self.elements is None:
-            return np.zeros((len(values), 0 if directions is None else directions.shape[1]))
+            return MaterialForces(len(values), ())
         tissue, dilatation = self.space.mesh.region, self.elements.dilatation
         lame, slopes = (np.zeros((3, len(tissue))) for _ in range(2))
         for modulus, region, weight in zip(moduli, self.regions, self.weights, strict=True):
@@ -186,7 +187,6 @@ class LinearModel:
             Moduli(*lame),
             by_poisson=Moduli(*slopes),
             tissue=tissue,
-            directions=directions,
         )
 
 
@@ -239,8 +239,11 @@ class LinearSystem:
 
         directions (n_material, k): sums of them instead; tolerance: of the relative residual.
         """
-        free, forces = self.model.constraint.free, self.model.material_forces(self.moduli, values, directions)
-        return np.asarray(free @ self.factorisation.solve(-np.asarray(free.T @ forces), tolerance=tolerance))
+        along = np.eye(self.model.material.n_modes) if directions is None else directions
+        found = np.zeros((len(values), along.shape[1]))
+        for some, responses in self._material_responses(values, along, tolerance):
+            found[:, some] = responses
+        return found
 
     def single_responses(self, *, tolerance: float = EXACT) -> NDArray[np.float32]:
         """As `responses`, in single precision, some modes at a time: the largest thing there is, at half its size."""
@@ -261,10 +264,19 @@ class LinearSystem:
         """As `material_responses` at u (n_dof,) mm, in single precision, some modes at a time."""
         each = np.eye(self.model.material.n_modes)
         found = np.zeros((len(values), len(each)), dtype=np.float32)
-        for start in range(0, len(each), AT_ONCE):
-            some = slice(start, start + AT_ONCE)
-            found[:, some] = self.material_responses(values, each[:, some], tolerance=tolerance)
+        for some, responses in self._material_responses(values, each, tolerance):
+            found[:, some] = responses
         return found
+
+    def _material_responses(
+        self, values: NDArray[np.float64], along: NDArray[np.float64], tolerance: float
+    ) -> Iterator[tuple[slice, NDArray[np.float64]]]:
+        """Some columns at a time of the responses (n_dof, k) at u (n_dof,) mm along directions (n_material, k)."""
+        free, by_material = self.model.constraint.free, self.model.by_material(self.moduli, values)
+        for start in range(0, along.shape[1], AT_ONCE):
+            some = slice(start, start + AT_ONCE)
+            forces = np.asarray(free.T @ by_material.along(along[:, some]))
+            yield some, np.asarray(free @ self.factorisation.solve(-forces, tolerance=tolerance))
 
     def solve(self, coefficients: NDArray[np.float64]) -> LinearEquilibrium:
         """Equilibrium at coefficients (n_modes,), dimensionless: one right-hand side, or two with material modes."""
@@ -331,11 +343,12 @@ class LinearEquilibrium:
 
     def adjoint(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
         """T^T g (n_regions + n_modes,) for g (n_dof,): one solve K_ff p = F^T g, then p^T of the tangent's loads."""
-        constraint = self.system.model.constraint
+        model, moduli, constraint = self.system.model, self.system.moduli, self.system.model.constraint
         load = np.asarray(constraint.free.T @ gradient)
         adjoint = self.system.factorisation.solve(load[:, None])[:, 0]
-        result = np.asarray(self.system.model.tangent_loads(self.system.moduli, self.values).T @ adjoint)
-        first = self.system.model.n_regions
+        by_boundary = np.asarray(model.boundary_loads(moduli, self.values).T @ adjoint)
+        by_material = -model.by_material(moduli, self.values).work(np.asarray(constraint.free @ adjoint))
+        result, first = np.concatenate([by_boundary, by_material]), model.n_regions
         result[first : first + constraint.n_modes] += constraint.modes.T @ gradient
         return result
 

@@ -14,7 +14,7 @@ from palpate.mesh.gaussian_process import karhunen_loeve, matern
 from palpate.mesh.tet_mesh import TetMesh
 
 SHARE, SHARE_OF_MAP = 0.95, 0.9995  # of the variance of a tissue's ln E that its modes hold, and of one that is mapped
-MOST, MOST_OF_MAP = 120, 400  # modes of a tissue, and of one that is mapped
+MOST = 120  # modes of a tissue that is not mapped
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,8 +86,35 @@ def field_modes(mesh: TetMesh, tissue: int, *, length_mm: float) -> NDArray[np.f
     if prior is None:
         return karhunen_loeve(centres, volumes, kernel_mm=length_mm, share=SHARE, most=MOST)
     return karhunen_loeve(
-        centres, volumes, kernel_mm=prior.length_mm, share=SHARE_OF_MAP, most=MOST_OF_MAP, kernel=matern
+        centres, volumes, kernel_mm=prior.length_mm, share=SHARE_OF_MAP, most=prior.modes, kernel=matern
     )
+
+
+@dataclass(frozen=True, slots=True)
+class MaterialForces:
+    """Derivatives G = sum_p S_p A_p (n_dof, n_modes), mN, of internal forces by a material's coefficients; not formed.
+
+    parts: of fields and of Poisson's ratios, in the order of the coefficients, S (n_dof, n_cells) mN, an element's
+    nodal forces in each column, and A (n_cells, n), how much of them a coefficient is. A matrix of all unknowns by all
+    modes would be the largest thing there is.
+    """
+
+    n_dof: int
+    parts: tuple[tuple[sparse.csc_matrix[np.float64], sparse.csr_matrix[np.float64]], ...]
+
+    def along(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """G d (n_dof, k) for directions d (n_modes, k)."""
+        total, start = np.zeros((self.n_dof, directions.shape[1])), 0
+        for scatter, amounts in self.parts:
+            end = start + amounts.shape[1]
+            total += scatter @ np.asarray(amounts @ directions[start:end])
+            start = end
+        return total
+
+    def work(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+        """G^T p (n_modes,), mN mm, of the forces along p (n_dof,) mm."""
+        parts = [np.asarray(amounts.T @ (scatter.T @ displacement)) for scatter, amounts in self.parts]
+        return np.concatenate([np.zeros(0), *parts])
 
 
 def material_forces(
@@ -98,28 +125,21 @@ def material_forces(
     *,
     by_poisson: Moduli,
     tissue: NDArray[np.int64],
-    directions: NDArray[np.float64] | None = None,
-) -> NDArray[np.float64]:
-    """Derivatives (n_dof, k), mN, of the internal forces at u (n_dof,) mm along directions of the coefficients.
+) -> MaterialForces:
+    """Derivatives of the internal forces at u (n_dof,) mm by the coefficients of the modes.
 
-    directions (n_modes, k), by default each coefficient alone; moduli: Lame's constants of the elements there;
-    by_poisson: their derivatives by Poisson's ratio; tissue (n_tets,): of which tissue each element is.
+    moduli: Lame's constants of the elements there; by_poisson: their derivatives by Poisson's ratio; tissue (n_tets,):
+    of which tissue each element is.
     """
     nodal, n_dof = displacement.reshape(-1, 3), len(displacement)
 
-    def summed(forces: NDArray[np.float64], amounts: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Nodal forces (n_dof, k) of element forces (n_cells, n_a, 3) times amounts (n_cells, k)."""
+    def scatter(forces: NDArray[np.float64]) -> sparse.csc_matrix[np.float64]:
+        """Element forces (n_cells, n_a, 3) at the unknowns they act on (n_dof, n_cells)."""
         rows = (3 * elements.cells[:, :, None] + np.arange(3)).reshape(len(elements.cells), -1)
         ends = rows.shape[1] * np.arange(len(rows) + 1)
-        scatter = sparse.csc_matrix((forces.ravel(), rows.ravel(), ends), shape=(n_dof, len(rows)))
-        return np.asarray(scatter @ amounts)
+        return sparse.csc_matrix((forces.ravel(), rows.ravel(), ends), shape=(n_dof, len(rows)))
 
-    n_fields = int(modes.fields.shape[1])
-    along = np.eye(modes.n_modes) if directions is None else directions
-    total = np.zeros((n_dof, along.shape[1]))
-    if n_fields:
-        total += summed(elements.forces(nodal, moduli), np.asarray(modes.fields @ along[:n_fields]))
-    if modes.poisson:
-        own = np.stack([np.isin(tissue, group) for group in modes.poisson], axis=1).astype(np.float64)
-        total += summed(elements.forces(nodal, by_poisson), own @ along[n_fields:])
-    return total
+    own = np.array([np.isin(tissue, group) for group in modes.poisson], dtype=np.float64).reshape(-1, len(tissue))
+    every = ((modes.fields, moduli), (sparse.csr_matrix(own.T), by_poisson))
+    found = [(scatter(elements.forces(nodal, of)), amounts) for amounts, of in every if amounts.shape[1]]
+    return MaterialForces(n_dof, tuple(found))

@@ -54,7 +54,7 @@ class SurfaceReaction:
             )
         by_region = self.virtual @ balance.region_forces(whole, balance.moduli)
         by_displacement = np.asarray(balance.stiffness(whole).T @ self.virtual)[self.dofs]
-        by_material = self.virtual @ self.model.material_forces(whole, moduli, coefficients)
+        by_material = self.model.material_forces(whole, moduli, coefficients).work(self.virtual)
         return (
             NEWTON * float(by_region.sum()),
             NEWTON * by_displacement,

@@ -10,7 +10,7 @@ from scipy import linalg
 
 RANK_TOLERANCE = 1e-12
 Kernel = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-RANK = 400  # of a factor whose leading modes are sought, at the most
+RANK = 400  # of a factor whose leading modes are sought, at the least
 
 
 def gaussian(squares: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -70,7 +70,9 @@ def karhunen_loeve(
     """
     if not len(points):
         return np.zeros((0, 0))
-    factor = kernel_factor(points, kernel_mm, min(len(points), RANK), tolerance=0.1 * (1.0 - share), kernel=kernel)
+    factor = kernel_factor(
+        points, kernel_mm, min(len(points), max(RANK, most)), tolerance=0.1 * (1.0 - share), kernel=kernel
+    )
     sizes, vectors = linalg.eigh(factor.T @ (weights[:, None] * factor), check_finite=False)
     held = np.cumsum(sizes[::-1]) / float(weights.sum())
     keep = min(int(np.searchsorted(held, share)) + 1, most, len(sizes))
