@@ -176,6 +176,33 @@ def test_the_gradient_alone_is_that_of_the_whole_evaluation(objective, rng):
     assert gradient == pytest.approx(whole.gradient, rel=1e-9, abs=1e-9 * np.abs(whole.gradient).max())
 
 
+class Counted:
+    """A model, or its equilibrium, that counts what is asked of it."""
+
+    def __init__(self, of, asked):
+        self.of, self.asked = of, asked
+
+    def solve(self, *where):
+        self.asked.append("forward")
+        return Counted(self.of.solve(*where), self.asked)
+
+    def adjoint(self, gradient):
+        self.asked.append("adjoint")
+        return self.of.adjoint(gradient)
+
+    @property
+    def values(self):
+        return self.of.values
+
+
+def test_a_gradient_takes_one_solve_and_one_adjoint_solve_of_each_states_model(objective, rng):
+    asked, unknowns = [], 0.3 * rng.standard_normal(objective.parameters.n_unknowns)
+    states = tuple(replace(state, observed=Counted(state.observed, asked)) for state in objective.states)
+    _, gradient = replace(objective, states=states).value_and_gradient(unknowns)
+    assert asked == ["forward", "adjoint"] * len(states)
+    assert gradient == pytest.approx(objective.value_and_gradient(unknowns)[1], rel=1e-12)
+
+
 def test_a_known_tissue_released_as_a_whole_is_a_prior_of_the_scale(twins, twin):
     """Moduli scaled together leave u unchanged: ln E of all organs then varies by as much as that of the tissue."""
     problem, sd = twins.voxel_problem(twin), 0.4
