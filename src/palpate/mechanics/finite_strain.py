@@ -287,7 +287,7 @@ class FiniteStrainEquilibrium:
         for start in range(0, len(each), AT_ONCE):
             some = slice(start, start + AT_ONCE)
             loads = -np.asarray(self.balance.free.T @ along(each[:, some]))
-            result[:, some] = self.balance.free @ system.solve(loads, tolerance=tolerance)
+            result[:, some] = np.asarray(self.balance.free @ system.solve(loads, tolerance=tolerance))
         result[:, first : first + modes.shape[1]] += modes
         return result
 
