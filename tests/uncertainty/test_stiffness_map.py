@@ -64,7 +64,7 @@ def mapped(twins, twin, body, displacement, rng, sd_mm=SD_MM, law=None):
     model = linear_model(space, constraint, material=modes)
     finite = law and finite_strain_model(space, constraint, law, material=modes)
     state = LaterState(model, (observed(body, displacement, rng, sd_mm),), finite)
-    blocks = material_blocks(modes, space.mesh.tissues, (0,), heterogeneity_sd=0.3, poisson_sd=0.0)
+    blocks = material_blocks(modes, space.mesh, (0,), heterogeneity_sd=0.3, poisson_sd=0.0)
     parameters = parameter_map(space.mesh.tissues, model.regions, [*unit_blocks(model.constraint.n_modes), *blocks])
     problem = InverseProblem((state,), parameters)
     inversion = invert(problem, twins.settings(3.0), progress=twins.silent)

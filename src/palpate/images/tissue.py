@@ -33,10 +33,13 @@ class FieldPrior:
     """What is believed of ln E inside a tissue whose modulus is a field.
 
     sd: standard deviation, dimensionless; length_mm: of its kernel, Matern's with one derivative, mm.
+    total_variation: whether it is not Gaussian, but has its total variation, on the scale of both, for a prior: the
+    field may have edges.
     """
 
     sd: float
     length_mm: float
+    total_variation: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -122,7 +122,8 @@ class _Responses:
 def _informed(block: Block, information: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Combinations (n, k) of a block's unknowns that data of an information (n, n) see, and their inverse (k, n)."""
     ratios = block.acts is Acts.MATERIAL and not block.alternatives  # Poisson's, one of each tissue, are no field
-    if block.size <= SMALL or block.acts is Acts.RESIDUALS or ratios:
+    edges = block.variation is not None  # which are made of what data see and what they do not see alone
+    if block.size <= SMALL or block.acts is Acts.RESIDUALS or ratios or edges:
         return np.eye(block.size), np.eye(block.size)
     root = linalg.cholesky(block.widest, lower=True)
     sizes, vectors = linalg.eigh(root.T @ information @ root)
