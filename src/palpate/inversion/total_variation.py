@@ -37,7 +37,7 @@ class TotalVariation:
 
     def gradient(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Its gradient (n,)."""
-        return self.lagged(x) @ x
+        return np.asarray(self.jumps.T @ (self.weights * (self.jumps @ x) / self._sizes(x)) + self.weak @ x)
 
     def curvature(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Its second derivative (n, n): w e^2 / (j^2 + e^2)^(3/2) of a jump j, almost none across an edge."""
