@@ -1,7 +1,7 @@
 """Young's moduli of bodies whose stiffness, or its ratio, was measured otherwise: no simulation in it.
 
-    python benchmarks/measured.py NAME --data FOLDER [--fit STEPS] [--predict STEPS] [--foot N] [--map] [--json]
-        [--plot FILE.svg]
+    python benchmarks/measured.py NAME --data FOLDER [--fit STEPS] [--predict STEPS] [--foot N] [--map] [--alike UM]
+        [--bead-sd UM] [--json] [--plot FILE.svg]
 
 NAME is one of
 
@@ -15,7 +15,8 @@ NAME is one of
             static_markers_mm.csv. One modulus from each weight, with the clamp's motion unknown and with it held.
     beads   beads in a homogeneous hydrogel that a ball is pressed into (Yang et al., SoftwareX 2022). FOLDER holds
             beads.npz. The modulus of the gel's inner part over that of the rest, which is 1, and the misfit. With
-            --map the inner part's modulus is a field: how far it is from flat, beside its own intervals.
+            --map the inner part's modulus is a field: how far it is from flat, beside its own intervals. --bead-sd
+            (0.2) and --alike (0): standard deviation of the errors, and length over which they are alike, um.
 
 Nothing of FOLDER is copied anywhere. Needs meshio: pip install 'palpate[mesh]'.
 """
@@ -77,12 +78,15 @@ def main() -> int:
     parser.add_argument("--predict", default="1", help="steps, with commas; '' for none")
     parser.add_argument("--foot", type=float, default=FOOT_N, help="sd (N) of the load cell's offset of tpu; 0: none")
     parser.add_argument("--map", action="store_true", help="map the inner part of beads")
+    parser.add_argument("--bead-sd", type=float, default=BEAD_SD, help="sd (um) of the errors of beads")
+    parser.add_argument("--alike", type=float, default=0.0, help="length (um) over which errors of beads are alike")
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     parser.add_argument("--plot", type=Path, metavar="FILE.svg", help="values with their 95 %% intervals")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         fit, predict = ([int(s) for s in text.split(",") if s] for text in (arguments.fit, arguments.predict))
-        options = Options(arguments.data, Path(folder), fit, predict, arguments.foot, mapped=arguments.map)
+        options = Options(arguments.data, Path(folder), fit, predict, arguments.foot)
+        options = replace(options, mapped=arguments.map, bead_sd=arguments.bead_sd, alike=arguments.alike)
         found = EXPERIMENTS[arguments.name](options)
     sys.stdout.write(json.dumps(found, indent=None if arguments.json else 1) + "\n")
     if arguments.plot:
@@ -94,7 +98,7 @@ def main() -> int:
 class Options:
     """Where the data are, a folder to work in, the steps, and the standard deviation (N) of a load cell's offset.
 
-    mapped: whether the gel's inner part is.
+    mapped: whether the gel's inner part is; bead_sd, alike: of the beads' errors, um.
     """
 
     data: Path
@@ -103,6 +107,8 @@ class Options:
     predict: Sequence[int]
     foot_n: float
     mapped: bool = False
+    bead_sd: float = BEAD_SD
+    alike: float = 0.0
 
 
 def tpu(options: Options) -> dict[str, Any]:
@@ -288,7 +294,8 @@ def beads(options: Options) -> dict[str, Any]:
         '[tissues.rest]\nlabel = 2\nrole = "known"\npoisson_ratio = 0.475\n'
         "youngs_modulus_kpa = 1.0\n[driver]\nmodes = 300\nkernel_mm = 30.0\nprior_mm = 10.0\n[discrepancy]\n"
         "heterogeneity_sd = 0.0\npoisson_sd = 0.01\n"
-        f'[[data]]\nkind = "displacement-field"\nfile = "beads.csv"\nsd_mm = {BEAD_SD}\n'
+        f'[[data]]\nkind = "displacement-field"\nfile = "beads.csv"\nsd_mm = {options.bead_sd}\n'
+        f"correlation_mm = {options.alike}\n"
     )
     result = estimate(read_case(folder / "case.toml")).estimation
     (item,) = result.estimates

@@ -216,7 +216,7 @@ def material_blocks(
                 odds=() if edges else (0.0, odds),
                 last=mapped is None,
                 left_out=LEFT_OUT if mapped is None else LEFT_OUT_OF_MAP,
-                variation=edges and total_variation(mesh, modes.fields[:, start:end], edges),
+                variation=total_variation(mesh, modes.fields[:, start:end], edges) if edges else None,
             )
         )
     if modes.poisson:

@@ -102,6 +102,12 @@ class ParameterMap:
                     f" need {default.shape}"
                 )
 
+        if self.nuisance_mean.size not in (0, self.n_coefficients):
+            raise ConfigurationError(
+                f"nuisance_mean has the shape {self.nuisance_mean.shape}; {self.n_coefficients} unknowns in blocks need"
+                " one each, or none where all means are 0"
+            )
+
     @property
     def by_load(self) -> bool:
         """Whether known loads, and no known modulus, set the scale."""
@@ -249,7 +255,7 @@ class ParameterMap:
         own = np.concatenate([np.arange(self.n_parameters), *(self.columns(i) for i in kept)])
         nuisance = own[self.n_parameters :] - self.n_parameters
         precision = self.nuisance_precision[np.ix_(nuisance, nuisance)]
-        mean = self.prior_centre[nuisance + self.n_parameters]
+        mean = self.nuisance_mean[nuisance] if self.nuisance_mean.size else self.nuisance_mean
         return replace(self, blocks=blocks, nuisance_precision=precision, nuisance_mean=mean), own
 
     def _model_columns(self, state: int) -> NDArray[np.int64]:

@@ -105,7 +105,7 @@ class _Field:
         Morrison 1950).
         """
         weighted = volumes[:, None] * self.seen
-        precision = np.linalg.inv(self.prior)
+        precision = np.asarray(np.linalg.inv(self.prior), dtype=np.float64)
         gram = weighted.T @ self.seen
         h = np.linalg.solve(gram + SMOOTH * np.trace(gram) / np.trace(precision) * precision, weighted.T @ shape)
         if self.variation:
