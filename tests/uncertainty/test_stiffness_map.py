@@ -82,6 +82,14 @@ def mapped(twins, twin, body, displacement, rng, sd_mm=SD_MM, law=None):
     return found, inversion
 
 
+def slopes(inversion):
+    """The pull (n,) at the estimate of the normal law that stands for a variation, and that of the variation."""
+    parameters = inversion.objective.parameters
+    number, block = next((i, b) for i, b in enumerate(parameters.blocks) if b.variation)
+    own = parameters.columns(number)
+    return inversion.minimum.evaluation.prior_score[own], block.variation.gradient(inversion.minimum.unknowns[own])
+
+
 def each_element(body):
     """Modes of the material, one for each element of the gland."""
     space, own = body[0], body[1]
@@ -156,17 +164,21 @@ def test_intervals_of_elements_hold_what_was_drawn_from_the_prior(twins, twin, b
     assert 0.90 < np.mean(inside) < 0.98
 
 
-def test_a_part_is_found_under_a_law_of_finite_strain(twins, twin, body, rng):
+def test_a_part_is_found_under_a_law_of_finite_strain(twins, twin, body, edged, rng):
     own, centres = body[1], body[2]
     middle = centres[own].mean(axis=0) + np.array([3.0, 0.0, 0.0])
     log_ratio = np.log(3.0) * (np.linalg.norm(centres[own] - middle, axis=1) < 4.5)
     displacement = true_displacement(twin, body, log_ratio, NeoHookean(), share=0.4)
     found, inversion = mapped(twins, twin, body, displacement, rng, 0.004, NeoHookean())
-    assert inversion.minimum.converged
-    assert found.region is not None
-    assert np.linalg.norm(found.region.centre_mm - middle) < 3.0
+    varied, by_variation = mapped(twins, twin, edged, displacement, rng, 0.004, NeoHookean())
+    for of, its in ((found, inversion), (varied, by_variation)):
+        assert its.minimum.converged
+        assert of.region is not None
+        assert np.linalg.norm(of.region.centre_mm - middle) < 3.0
     low, high = found.region.interval95
     assert low < 3.0 < high
+    used, exact = slopes(by_variation)
+    assert used == pytest.approx(exact, abs=1e-4 * np.abs(exact).max())
 
 
 def test_a_part_three_times_as_stiff_is_found_where_the_field_tells_and_not_where_it_does_not(twins, twin, body, rng):
@@ -216,10 +228,7 @@ def test_total_variation_draws_a_part_with_less_loss_and_wider_intervals_than_a_
         held.append(tuple((np.abs(e) < NORMAL_95 * of.sd).mean() for e, (of, _) in zip(errors, pair, strict=True)))
         found, inversion = pair[1]
         assert inversion.minimum.converged
-        block = next(b for b in inversion.objective.parameters.blocks if b.cause == "field")
-        own_columns = inversion.objective.parameters.columns(inversion.objective.parameters.blocks.index(block))
-        exact = block.variation.gradient(inversion.minimum.unknowns[own_columns])
-        used = inversion.minimum.evaluation.prior_score[own_columns]
+        used, exact = slopes(inversion)
         assert used == pytest.approx(exact, abs=1e-4 * np.abs(exact).max())  # the variation itself is what is least
         assert found.region is not None
         assert found.region.whole
