@@ -15,7 +15,7 @@ from palpate.images.distance import distance_map
 from palpate.images.label_image import VoxelGrid
 from palpate.mesh.locate import located
 from palpate.mesh.space import lagrange_space
-from palpate.observation.contract import DataFile, Observation, OfMaterial, OfPoints, Rematched, Weighting
+from palpate.observation.contract import DataFile, Observation, OfMaterial, OfPoints, Rematched, Weighting, n_seen
 from palpate.observation.force import Force
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.observed_surface import ObservedSurface
@@ -159,7 +159,7 @@ class Case:
 @pytest.fixture(params=CASES)
 def case(request, sphere, point_motion, rng):
     seen = CASES[request.param](sphere, point_motion)
-    return Case(seen, 0.3 * rng.standard_normal(len(seen.dofs)))
+    return Case(seen, 0.3 * rng.standard_normal(n_seen(seen)))
 
 
 def test_residuals_have_the_shapes_that_are_promised(case):
@@ -169,7 +169,7 @@ def test_residuals_have_the_shapes_that_are_promised(case):
         assert triple.shape == (n, 3)
     assert np.linalg.norm(found.normals, axis=1) == pytest.approx(np.ones(n))
     for jacobian in (found.jacobian, found.smooth_jacobian):
-        assert jacobian.shape == (n, len(case.seen.dofs))
+        assert jacobian.shape == (n, n_seen(case.seen))
     assert case.seen.kind
     assert case.seen.name
     assert 0.0 < case.seen.observed_share <= 1.0
@@ -179,7 +179,7 @@ def test_residuals_have_the_shapes_that_are_promised(case):
 def test_the_exact_jacobian_leaves_a_remainder_of_second_order(make, sphere, point_motion, rng):
     """Of nine residuals in ten: of the others the closest point jumps to another triangle."""
     seen = make(sphere, point_motion)
-    place, direction = 0.3 * rng.standard_normal((2, len(seen.dofs)))
+    place, direction = 0.3 * rng.standard_normal((2, n_seen(seen)))
     start = seen.residuals(place)
     slope = start.jacobian @ direction
     remainders = [
@@ -193,7 +193,7 @@ def test_the_exact_jacobian_leaves_a_remainder_of_second_order(make, sphere, poi
 def test_a_changed_jacobian_would_leave_one_of_first_order(sphere, point_motion, rng):
     """The law above can fail."""
     seen = of_smooth_surfaces(sphere, point_motion)
-    place, direction = 0.3 * rng.standard_normal((2, len(seen.dofs)))
+    place, direction = 0.3 * rng.standard_normal((2, n_seen(seen)))
     start = seen.residuals(place)
     slope = 1.001 * (start.jacobian @ direction)
     remainders = [
@@ -257,7 +257,7 @@ def test_the_fit_is_a_length(case):
 def test_a_bias_of_both_distance_maps_changes_nothing(make, sphere, point_motion, rng):
     """Of every observation that is made of them."""
     plain, biased = (make(sphere, point_motion, bias) for bias in (0.0, 0.35))
-    place = 0.3 * rng.standard_normal(len(plain.dofs)) + np.tile([1.0, 0.0, 0.0], len(plain.dofs) // 3)
+    place = 0.3 * rng.standard_normal(n_seen(plain)) + np.tile([1.0, 0.0, 0.0], n_seen(plain) // 3)
     for change in (lambda o: o, lambda o: o.rematched(place), lambda o: o.reweighted(o.residuals(place))):
         found = [change(seen).residuals(place) for seen in (plain, biased)]
         assert found[1].values == pytest.approx(found[0].values, abs=1e-9)
@@ -274,13 +274,13 @@ def test_points_that_are_drawn_move_as_their_residuals_say(make, sphere, point_m
     """Displacements that the points were measured to have leave none."""
     seen = make(sphere, point_motion)
     assert isinstance(seen, OfPoints)
-    place = 0.3 * rng.standard_normal(len(seen.dofs))
+    place = 0.3 * rng.standard_normal(n_seen(seen))
     motions, found = seen.point_motions(place), seen.residuals(place)
     n = len(motions.rest)
     assert motions.rest.shape == motions.observed.shape == motions.fitted.shape == (n, 3)
     assert np.linalg.norm(motions.fitted - motions.observed, axis=1) == pytest.approx(found.distances)
     shift = np.array([0.3, -0.1, 0.2])
-    uniform = seen.point_motions(np.tile(shift, len(seen.dofs) // 3)).fitted
+    uniform = seen.point_motions(np.tile(shift, n_seen(seen) // 3)).fitted
     assert uniform == pytest.approx(np.tile(shift, (n, 1)))
     assert not isinstance(of_smooth_surfaces(sphere, point_motion), OfPoints)
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import SimpleITK
+from scipy.spatial import cKDTree
 
 from palpate.errors import InputDataError
 from palpate.images.alignment import RigidMotion
@@ -16,7 +17,7 @@ from palpate.images.readers.nifti import write_displacement_field
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.mesh.space import lagrange_space
-from palpate.observation.contract import DataFile
+from palpate.observation.contract import DataFile, seen_by
 from palpate.observation.displacement_field import read_displacement_field
 from palpate.observation.landmarks import read_landmarks
 from palpate_validation.structured_meshes import box_mesh
@@ -95,7 +96,7 @@ def test_fcsv_says_its_coordinate_system(tmp_path, points, system):
 def test_the_term_is_zero_where_the_body_moves_as_measured(tmp_path, space, points):
     source = read(csv_of(tmp_path / "m.csv", points, moved(points)))
     term, findings = source.on(space, no_force)
-    motion = (moved(space.points) - space.points).ravel()[term.dofs]
+    motion = seen_by(term, (moved(space.points) - space.points).ravel())
     assert findings == ()
     assert np.abs(term.residuals(motion).values).max() < 1e-7
     assert term.fit(term.residuals(0.0 * motion)).rms_mm == pytest.approx(
@@ -113,7 +114,7 @@ def test_points_move_with_the_alignment(tmp_path, points):
 def test_points_outside_are_named_and_left_out(tmp_path, space, points):
     far = np.concatenate([points, points[:1] + 500.0])
     term, (finding,) = read(csv_of(tmp_path / "m.csv", far, moved(far))).on(space, no_force)
-    assert len(term.data) == 3 * len(points)
+    assert len(term.measured) == 3 * len(points)
     assert finding.code == "points-outside"
     assert "number 26" in finding.message
 
@@ -192,8 +193,27 @@ def test_a_field_is_read_from_what_itk_writes(tmp_path, space, ending):
     assert len(source.table.before) == 9 * 12 * 12
     np.testing.assert_allclose(source.table.after, moved(source.table.before), atol=1e-4)
     term, _ = source.on(space, no_force)
-    motion = (moved(space.points) - space.points).ravel()[term.dofs]
+    motion = seen_by(term, (moved(space.points) - space.points).ravel())
     assert np.abs(term.residuals(motion).values).max() < 1e-3
+
+
+def test_means_are_of_more_points_the_further_an_organ_is(tmp_path):
+    """Every point counts once; near the organ no mean is wider than its elements, far away none than the way there."""
+    mesh = box_mesh(8, size=160.0)
+    inside = np.linalg.norm(mesh.nodes[mesh.tets].mean(axis=1) - 80.0, axis=1) < 25.0
+    tissues = tuple(replace(mesh.tissues[0], name=role.value, role=role) for role in (Role.KNOWN, Role.ESTIMATE))
+    mesh = replace(mesh, tissues=tissues, region=inside.astype(mesh.region.dtype))
+    space = lagrange_space(mesh, "P1")
+    points = np.stack(np.meshgrid(*[np.arange(4.0, 160.0, 4.0)] * 3), axis=-1).reshape(-1, 3)  # on nodes, too
+    source = read(csv_of(tmp_path / "f.csv", points, moved(points)), kind="displacement-field", correlation_mm=2.0)
+    term, _ = source.on(space, no_force)
+    assert np.abs(term.residuals(seen_by(term, (moved(space.points) - space.points).ravel())).values).max() < 1e-6
+    away = cKDTree(mesh.nodes[np.unique(mesh.tets[inside])]).query(term.material[::3])[0]
+    apart = cKDTree(term.material[::3]).query(term.material[::3], k=2)[0][:, 1]
+    size = 0.6 * mesh.usual_edge_mm
+    near, far = apart[away < 0.5 * size], apart[away > 4.0 * size]
+    assert np.median(near) < size
+    assert 1.5 * np.median(near) < np.median(far) < 4.0 * size
 
 
 def itk_field(low, high, spacing, slope, shift):

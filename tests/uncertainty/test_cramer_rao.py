@@ -14,7 +14,7 @@ import pytest
 from palpate.inversion import Evaluation, LaterState, Objective, ParameterMap, unit_blocks
 from palpate.inversion.objective import Linearisation
 from palpate.mesh import lagrange_space, located, point_interpolation
-from palpate.observation.contract import DataFile, Residuals, Weighting
+from palpate.observation.contract import DataFile, Residuals, Weighting, seen_by
 from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.point_displacement import point_displacement
@@ -121,9 +121,9 @@ def test_points_tell_what_their_stated_covariance_leaves(limits, smooth):
     file = DataFile("landmarks", "landmarks", (), 1, 0.4, covariance_mm2=root @ root.T + 0.1 * np.eye(3))
     places = located(space.mesh, points)
     term = point_displacement(space, points, np.zeros((20, 3)), places, file=file, description="")
-    seen_by = Jacobian.of(term.operator @ tangent[term.dofs])
+    told = Jacobian.of(term.whitening @ seen_by(term, tangent))
     doubtful = term.with_noise(NoiseModel(np.array([4.0]), np.array([1.0])))
-    line = Linearisation(doubtful, 0, None, np.arange(5), seen_by, np.full(60, 1.0 / 60.0), None)
+    line = Linearisation(doubtful, 0, None, np.arange(5), told, np.full(60, 1.0 / 60.0), None)
     evaluation = replace(smooth[1], lines=(*smooth[1].lines, line))
     whole = np.kron(point_interpolation(space, places).toarray(), np.eye(3)) @ tangent
     expected = whole.T @ np.linalg.solve(np.kron(np.eye(20), file.covariance_mm2), whole)

@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 from palpate.mechanics.equilibrium import from_start
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
 from palpate.mechanics.first_order import FirstOrderModel, expanded
-from palpate.mechanics.forward import ForwardModel, SolveCounts
+from palpate.mechanics.forward import ForwardModel, Outputs, SolveCounts
 from palpate.mechanics.linear_model import LinearEquilibrium, LinearModel
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.constraint import Constraint
 
 
 class LocalModel(ForwardModel, Protocol):
-    """A forward model of all points that can answer at some of them only."""
+    """A forward model of all points that can answer with what is seen of them only."""
 
-    def at(self, dofs: NDArray[np.int64]) -> ForwardModel:
-        """The same model with the outputs `dofs` (n,) only."""
+    def outputs(self, seen: Outputs) -> ForwardModel:
+        """The same model with the outputs that a linear map makes of its own."""
         ...
 
 

@@ -58,9 +58,10 @@ class Block:
     (Schmidt 1966). last: its prior is learned where the estimate has converged under those of the others; before it
     would take what they explain. released: held at 0 as well while an estimate is sought, and free under P where its
     interval is. left_out: variances of the first noise, a tenth of the found one, that what is left out of the unknowns
-    may explain (see `informed_problem`); below 0 none is. regions: numbers of the model's regions to whose ln E it is
-    added, one unknown for all of them, where it acts on moduli. variation: -ln of what is believed where that is not
-    normal; an estimate begins with P then. Raises `ConfigurationError` for terms of another size.
+    may explain (see `informed_problem`); below 0 none is. regions: numbers of the model's regions whose moduli it
+    multiplies, one unknown x for all of them, where it acts on moduli: a `share` s of each region, in series with the
+    rest of it, is e^x times as stiff, and the whole 1 / (1 + s (e^-x - 1)) times. variation: -ln of what is believed
+    where that is not normal; an estimate begins with P then. Raises `ConfigurationError` for terms of another size.
     """
 
     of: str
@@ -76,6 +77,7 @@ class Block:
     released: bool = False
     unit_mm: float = 1.0
     regions: tuple[int, ...] = ()
+    share: float = 1.0
     left_out: float = LEFT_OUT
     variation: TotalVariation | None = None
 
@@ -228,11 +230,10 @@ def material_blocks(
 def layer_blocks(
     layers: Sequence[tuple[str, tuple[int, ...], float]], states: tuple[int, ...], *, sd: float, thickness_mm: float
 ) -> tuple[Block, ...]:
-    """By how much ln E of the layer of elements round each organ differs from that of its tissue: one unknown each.
+    """By how much ln E of a layer round each organ differs from that of its tissue: one unknown each.
 
-    layers: of each organ its name, the numbers of the model's regions, and how thick its elements are there, h mm. What
-    is believed is of a layer of t = `thickness_mm`, or of the elements where these are thinner: in series with the rest
-    of them, a share s = min(t / h, 1) that is softer by e^sd makes them softer by 1 + s (e^sd - 1). A capsule, a film
+    layers: of each organ its name, the numbers of the model's regions, and how thick its elements are there, h mm. The
+    layer is t = `thickness_mm` of them, or all where these are thinner: a share min(t / h, 1). A capsule, a film
     of fat or a plane on which an organ slides is hardly seen by its surface, while the organ's modulus hangs on it: as
     an unknown of the estimate it costs accuracy where there is none, and an interval that leaves it out does not hold
     where there is one.
@@ -243,9 +244,10 @@ def layer_blocks(
             "layer",
             Acts.MODULI,
             states,
-            np.full((1, 1), np.log1p(min(thickness_mm / h, 1.0) * np.expm1(sd)) ** -2.0),
+            np.full((1, 1), sd**-2.0),
             released=True,
             regions=regions,
+            share=min(thickness_mm / h, 1.0),
         )
         for organ, regions, h in layers
     )

@@ -158,10 +158,12 @@ def with_edges(objective: Objective, evaluation: Evaluation, unknowns: NDArray[n
     H^-1 g, H^-1). The minimum is that of the variation itself, and its posterior Laplace's.
     """
     parameters, n = objective.parameters, objective.n_parameters
+    numbers = [i for i, block in enumerate(parameters.blocks) if block.variation]
+    if not numbers:
+        return objective
     prior, centre = parameters.prior_matrix, parameters.prior_centre
     data = evaluation.matrix - evaluation.prior
     pull = data @ unknowns - (evaluation.score - evaluation.prior_score)
-    numbers = [i for i, block in enumerate(parameters.blocks) if block.variation]
     for i in numbers:
         places, variation = parameters.columns(i), parameters.blocks[i].variation
         assert variation is not None
@@ -171,8 +173,6 @@ def with_edges(objective: Objective, evaluation: Evaluation, unknowns: NDArray[n
             x = variation.least(seen.information, seen.pull, unknowns[places])
             prior[np.ix_(places, places)] = curvature = variation.curvature(x)
             centre[places] = x - linalg.solve(curvature, variation.gradient(x), assume_a="pos")
-    if not numbers:
-        return objective
     believed = replace(parameters, nuisance_precision=prior[n:, n:], nuisance_mean=centre[n:])
     return replace(objective, parameters=believed)
 

@@ -100,11 +100,11 @@ class _Responses:
 
     def seen(self, state: LaterState, coefficients: NDArray[np.float64]) -> FirstOrderModel:
         """What is observed of them, to first order around coefficients (n_modes,); moduli move nothing."""
-        model, moduli, dofs = self.system.model, self.system.moduli, state.dofs
-        by_boundary = self.boundary[dofs].astype(np.float64)
-        by_material = np.zeros((len(dofs), model.material.n_modes))
-        by_material[:, : self.material.shape[1]] = self.material[dofs] if self.material.size else 0.0
-        tangent = np.concatenate([np.zeros((len(dofs), len(moduli))), by_boundary[:, :-1], by_material], axis=1)
+        model, moduli = self.system.model, self.system.moduli
+        by_boundary = state.seen(self.boundary).astype(np.float64)
+        by_material = np.zeros((len(by_boundary), model.material.n_modes))
+        by_material[:, : self.material.shape[1]] = state.seen(self.material) if self.material.size else 0.0
+        tangent = np.concatenate([np.zeros((len(by_boundary), len(moduli))), by_boundary[:, :-1], by_material], axis=1)
         values = by_boundary[:, -1] + tangent[:, len(moduli) :] @ coefficients
         return FirstOrderModel(model.names, moduli, coefficients, values, tangent)
 

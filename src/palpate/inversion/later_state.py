@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from palpate.inversion.parameters import ParameterMap
 from palpate.mechanics.finite_strain import FiniteStrainModel
 from palpate.mechanics.forward import ForwardModel
 from palpate.mechanics.linear_model import LinearModel
-from palpate.observation.contract import Observation, OfMaterial
+from palpate.observation.contract import Float, Observation, OfMaterial, n_seen, seen_by
 from palpate.observation.noise_model import NoiseModel
 
 
@@ -24,7 +25,7 @@ class LaterState:
 
     model: the body under the linear law; finite_strain: under the law that the estimate is continued to, None where
     that is the linear one; reference: number of the rest state that it belongs to; observed: the approximation's model
-    at the observed unknowns alone, one observation after the other; bending: the linear law's one, whose curvature an
+    of what is observed alone, one observation after the other; bending: the linear law's one, whose curvature an
     expansion under another law lacks.
     """
 
@@ -44,13 +45,12 @@ class LaterState:
     @property
     def slices(self) -> list[slice]:
         """Rows of the `observed` answer that belong to each observation."""
-        ends = np.cumsum([len(observation.dofs) for observation in self.observations])
-        return [slice(e - len(o.dofs), e) for e, o in zip(ends.tolist(), self.observations, strict=True)]
+        ends = np.cumsum([0, *map(n_seen, self.observations)]).tolist()
+        return [slice(start, end) for start, end in pairwise(ends)]
 
-    @property
-    def dofs(self) -> NDArray[np.int64]:
-        """Numbers (n_observed,) of the displacement's unknowns that are observed, one observation after the other."""
-        return np.concatenate([observation.dofs for observation in self.observations])
+    def seen(self, displacement: NDArray[Float]) -> NDArray[Float]:
+        """What is observed (n_observed, ...) of displacements (n_dof, ...) mm, one observation after the other."""
+        return np.concatenate([seen_by(observation, displacement) for observation in self.observations])
 
     def combined(self, boundary: NDArray[np.float64], fields: NDArray[np.float64]) -> LaterState:
         """The same state with models on combinations of boundary modes (n_boundary, k) and of fields (n_fields, l)."""
@@ -64,7 +64,7 @@ class LaterState:
 
     def with_approximation(self, approximation: Approximation) -> LaterState:
         """The same state with another approximation of its model."""
-        return replace(self, approximation=approximation, observed=approximation.model.at(self.dofs))
+        return replace(self, approximation=approximation, observed=approximation.model.outputs(self.seen))
 
     def with_observations(self, observations: Sequence[Observation]) -> LaterState:
         """The same state with the same observations otherwise weighted or matched."""

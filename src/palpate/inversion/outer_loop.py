@@ -27,6 +27,7 @@ from palpate.inversion.optimise import (
 )
 from palpate.inversion.reweighting import reweighted
 from palpate.mechanics.forward import SolveCounts
+from palpate.observation.contract import seen_by
 
 FORCING = 0.1  # of the last outer iteration's step: to which the next one's weights and estimate agree
 INNER = 20.0  # a minimum is found to so small a part of what a reweighting may still change
@@ -461,7 +462,7 @@ def _model_error(objective: Objective, minimum: Minimum) -> tuple[float, NDArray
         return np.inf, np.full(objective.n_parameters, np.inf), cost
     pull = np.zeros(len(minimum.unknowns))
     for line in minimum.evaluation.lines:
-        du = errors[line.state].missing[line.observation.dofs]
+        du = seen_by(line.observation, errors[line.state].missing)
         missing = np.asarray(line.residuals.smooth_jacobian @ du)
         pull[line.columns] += line.jacobian.transposed_times(line.precision * line.weights * missing)
     off = np.abs(minimum.evaluation.covariance_columns(objective.n_parameters).T @ pull)

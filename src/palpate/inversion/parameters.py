@@ -185,7 +185,7 @@ class ParameterMap:
         """
         logarithms = self.selection @ unknowns[: self.n_parameters]
         if len(unknowns) > self.n_parameters:
-            logarithms = logarithms + self._by_blocks @ unknowns[self.acting_on_moduli]
+            logarithms = logarithms - self._of_blocks @ np.log1p(self._shares * np.expm1(-self._on_moduli(unknowns)))
         moduli = np.asarray(self.base * np.exp(logarithms))
         for open_ in self.poisson:
             moduli[list(open_.regions)] *= open_.weights(unknowns)[0]
@@ -199,17 +199,28 @@ class ParameterMap:
         by_theta = self.selection.copy()
         for open_ in self.poisson:
             by_theta[list(open_.regions), open_.column] = open_.weights(unknowns)[1]
-        return np.concatenate([by_theta, self._by_blocks], axis=1)
+        softer = self._shares * np.exp(-self._on_moduli(unknowns))
+        return np.concatenate([by_theta, self._of_blocks * (softer / (1.0 - self._shares + softer))], axis=1)
 
     @property
     def acting_on_moduli(self) -> NDArray[np.int64]:
-        """Numbers (n,) of the blocks' unknowns that are added to ln E of regions, in every later state."""
+        """Numbers (n,) of the blocks' unknowns by which moduli of regions differ, in every later state."""
         own = [self.columns(i) for i, block in enumerate(self.blocks) if block.acts is Acts.MODULI]
         return np.concatenate([np.zeros(0, dtype=np.int64), *own])
 
+    def _on_moduli(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Those (n,) of unknowns (n_unknowns,) that act on moduli; 0 where there is theta alone."""
+        own = self.acting_on_moduli
+        return unknowns[own] if len(unknowns) > self.n_parameters else np.zeros(len(own))
+
     @property
-    def _by_blocks(self) -> NDArray[np.float64]:
-        """1 where an unknown that acts on moduli is added to a region's ln E, (n_regions, n)."""
+    def _shares(self) -> NDArray[np.float64]:
+        """Of the regions of each unknown that acts on moduli, the share (n,) that it is of."""
+        return np.array([block.share for block in self.blocks if block.acts is Acts.MODULI])
+
+    @property
+    def _of_blocks(self) -> NDArray[np.float64]:
+        """1 where an unknown that acts on moduli is one of a region, (n_regions, n)."""
         blocks = [block for block in self.blocks if block.acts is Acts.MODULI]
         columns = [np.isin(np.arange(len(self.base)), block.regions) for block in blocks]
         return np.array(columns, dtype=np.float64).reshape(len(columns), len(self.base)).T

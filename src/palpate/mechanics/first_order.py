@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.mechanics.forward import DenseEquilibrium, Equilibrium, checked_coefficients, checked_moduli
+from palpate.mechanics.forward import DenseEquilibrium, Equilibrium, Outputs, checked_coefficients, checked_moduli
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +34,9 @@ class FirstOrderModel:
         """Number of boundary modes."""
         return len(self.coefficients)
 
-    def at(self, dofs: NDArray[np.int64]) -> FirstOrderModel:
-        """The same model with the outputs `dofs` (n,) only, by their place among the present outputs."""
-        return replace(self, values=self.values[dofs], derivatives=self.derivatives[dofs])
+    def outputs(self, seen: Outputs) -> FirstOrderModel:
+        """The same model with the outputs that a linear map makes of the present ones."""
+        return replace(self, values=seen(self.values), derivatives=seen(self.derivatives))
 
     def solve(self, moduli: NDArray[np.float64], coefficients: NDArray[np.float64]) -> FirstOrderEquilibrium:
         """The expansion at moduli (n_regions,) kPa and mode coefficients (n_modes,)."""

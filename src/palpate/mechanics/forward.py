@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -10,6 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from palpate.errors import ConfigurationError
+
+Outputs = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+"""A linear map of displacements (n_dof, ...) to a model's outputs (n_outputs, ...): what is seen of them."""
 
 
 @dataclass(frozen=True, slots=True)

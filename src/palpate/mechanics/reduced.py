@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from palpate.errors import ConfigurationError, SolverError
-from palpate.mechanics.forward import DenseEquilibrium, checked_coefficients, checked_moduli
+from palpate.mechanics.forward import DenseEquilibrium, Outputs, checked_coefficients, checked_moduli
 from palpate.mechanics.linear_model import LinearModel
 from palpate.mechanics.solvers.conjugate_gradients import times
 
@@ -61,14 +61,14 @@ class ReducedModel:
         """Number m of basis vectors."""
         return int(self.stiffness.shape[1])
 
-    def at(self, dofs: NDArray[np.int64]) -> ReducedModel:
-        """The same model with the outputs `dofs` (n,) only, by their place among the present outputs."""
+    def outputs(self, seen: Outputs) -> ReducedModel:
+        """The same model with the outputs that a linear map makes of the present ones."""
         return replace(
             self,
-            output_basis=self.output_basis[dofs],
-            output_modes=self.output_modes[dofs],
-            output_offset=self.output_offset[dofs],
-            output_material=self.output_material[dofs],
+            output_basis=seen(self.output_basis),
+            output_modes=seen(self.output_modes),
+            output_offset=seen(self.output_offset),
+            output_material=seen(self.output_material),
         )
 
     def system(self, moduli: NDArray[np.float64]) -> ReducedSystem:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, Self, runtime_checkable
+from typing import Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,8 @@ from palpate.images.segmentation import Segmentation
 from palpate.mesh.space import LagrangeSpace
 from palpate.observation.noise_model import FitResponse, NoiseModel
 from palpate.observation.robust_loss import RobustLoss
+
+Float = TypeVar("Float", np.float32, np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +46,7 @@ class Residuals:
 
     values (n,) mm, or the observation's unit; weights (n,), dimensionless, their sum 1; places (n, 3) mm in the
     deformed body and normals (n, 3): where each was taken and along which direction; material (n, 3) mm: the same
-    places at rest. jacobian (n, n_dofs): the exact d values / d displacement of the unknowns that the observation sees.
+    places at rest. jacobian (n, n_seen): the exact d values / d displacement of what the observation sees.
     smooth_jacobian: the same without what only image noise makes of it (that of the exact one where there is no such
     thing). distances (m,) mm: of what is compared, where the residuals are not these themselves. direct (n, n_regions +
     n_material): their derivatives by ln E and the material's coefficients at a held displacement, where they have any.
@@ -132,7 +134,9 @@ class Observation(Protocol):
         ...
 
     def residuals(self, displacement: NDArray[np.float64], offset: float = 0.0) -> Residuals:
-        """Residuals at displacements (n_dofs,) mm of what it sees; their derivative by the `offset` is 1 each.
+        """Residuals at displacements (n_seen,) mm of what it sees; their derivative by the `offset` is 1 each.
+
+        These are those of its unknowns, or what it makes of them (`Interpolated`).
 
         offset: by how much the image shows more than what is there, in the residuals' unit: how much further out a
         surface is drawn.
@@ -164,6 +168,29 @@ class Observation(Protocol):
     def fit(self, residuals: Residuals) -> Fit:
         """How well the model fits, by its residuals; without Dice's overlap."""
         ...
+
+
+@runtime_checkable
+class Interpolated(Protocol):
+    """An observation of the displacement between nodes, which has fewer points than the elements round them nodes."""
+
+    @property
+    def interpolation(self) -> sparse.csr_matrix[np.float64]:
+        """What it sees of the displacements of its unknowns (n_seen, n_dofs), dimensionless."""
+        ...
+
+
+def seen_by(observation: Observation, displacement: NDArray[Float]) -> NDArray[Float]:
+    """What an observation sees (n_seen, ...) of displacements (n_dof, ...) mm of the whole mesh."""
+    own = displacement[observation.dofs]
+    if not isinstance(observation, Interpolated):
+        return own
+    return np.asarray(observation.interpolation.astype(own.dtype, copy=False) @ own)
+
+
+def n_seen(observation: Observation) -> int:
+    """Number of displacements that an observation sees."""
+    return int(observation.interpolation.shape[0] if isinstance(observation, Interpolated) else len(observation.dofs))
 
 
 @runtime_checkable

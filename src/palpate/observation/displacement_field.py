@@ -10,13 +10,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.findings import Finding
 from palpate.images.input_file import open_input
 from palpate.images.label_image import LPS_TO_RAS
+from palpate.images.tissue import Role
 from palpate.mesh.locate import located
 from palpate.mesh.space import LagrangeSpace
+from palpate.mesh.tet_mesh import TetMesh
 from palpate.observation.contract import DataFile, ReactionOf
 from palpate.observation.measured_points import MeasuredPoints, PointTable, read_point_table, refuse_slips
 from palpate.observation.point_displacement import PointDisplacement, point_displacement
@@ -24,6 +27,7 @@ from palpate.observation.point_displacement import PointDisplacement, point_disp
 FEWEST = 4  # points that tell a motion which is not the same everywhere
 MOST_VECTORS = 2**26  # 1.6 GB as they are read
 ROUNDING = 1e-6  # of a voxel
+COARSER = 2  # times
 OF_LENGTH, OF_EDGE = 0.5, 0.6  # edge of a cell, over the correlation length and over an edge of the mesh
 
 
@@ -34,7 +38,9 @@ class DisplacementField(MeasuredPoints):
     def on(self, space: LagrangeSpace, reaction_of: ReactionOf) -> tuple[PointDisplacement, tuple[Finding, ...]]:
         """The term of the points in the mesh, in means of some that are near each other; raises `InputDataError`.
 
-        What is nearer than half a correlation length, or six tenths of an edge, says the same.
+        What is nearer than half a correlation length, or six tenths of an edge, says the same. How an organ's stiffness
+        moves what lies outside varies over as much as lies between (Saint-Venant): there means are of twice as much at
+        each twofold distance.
         """
         del reaction_of
         places = located(space.mesh, self.table.before)
@@ -48,6 +54,8 @@ class DisplacementField(MeasuredPoints):
             )
         points, moved = self.table.before[inside], self.table.moved[inside]
         size = max(OF_LENGTH * self.file.correlation_mm, OF_EDGE * space.mesh.usual_edge_mm)
+        doublings = np.floor(np.log2(np.maximum(_away(space.mesh, points) / size, 1.0)))
+        sizes = size * 2.0 ** np.minimum(doublings, COARSER)
         term = point_displacement(
             space,
             points,
@@ -55,9 +63,16 @@ class DisplacementField(MeasuredPoints):
             places.of(inside),
             file=self.file,
             description="the difference between the model's displacement and a measured field",
-            cells=np.floor((points - points.min(axis=0)) / size).astype(np.int64),
+            cells=np.floor(np.column_stack([(points - points.min(axis=0)) / sizes[:, None], sizes])).astype(np.int64),
         )
         return term, ()
+
+
+def _away(mesh: TetMesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distances (n,) mm of points (n, 3) mm to the nearest node of a tissue whose modulus is sought."""
+    sought = [number for number, tissue in enumerate(mesh.tissues) if tissue.role is Role.ESTIMATE]
+    nodes = np.unique(mesh.tets[np.isin(mesh.region, sought)])
+    return np.asarray(cKDTree(mesh.nodes[nodes]).query(points)[0])
 
 
 def read_displacement_field(file: DataFile) -> DisplacementField:

@@ -26,20 +26,18 @@ TOGETHER = 6  # points of one cell whose mean is compared, of errors that are al
 class PointDisplacement:
     """Residuals r = W (N u - d) of points with measured displacements d; implements `Observation`.
 
-    operator: W N (n, n_dofs) with the interpolation N to the points, or to means of several, and W, which makes their
-    errors independent, each with the standard deviation stated; data: W d (n,) mm. shown: N (3 n_shown, n_dofs),
-    measured: d (3 n_shown,) mm; material (n, 3) mm: the point that a residual is of; axes (n, 3): along which;
-    labels (n_shown,): names of the points, () where they have none.
+    interpolation: N (n, n_dofs) to the points, or to means of several; measured: d (n,) mm; whitening: W (n, n), which
+    makes their errors independent, each with the standard deviation stated. material (n, 3) mm: the point that a
+    residual is of; axes (n, 3): along which; labels (n / 3,): names of the points, () where they have none.
     """
 
     kind: str
     description: str
     name: str
     dofs: NDArray[np.int64]
-    operator: sparse.csr_matrix[np.float64]
-    data: NDArray[np.float64]
-    shown: sparse.csr_matrix[np.float64]
+    interpolation: sparse.csr_matrix[np.float64]
     measured: NDArray[np.float64]
+    whitening: sparse.csr_matrix[np.float64]
     material: NDArray[np.float64]
     axes: NDArray[np.float64]
     observed_share: float
@@ -59,22 +57,21 @@ class PointDisplacement:
         return False
 
     def residuals(self, displacement: NDArray[np.float64], offset: float = 0.0) -> Residuals:
-        """Residuals and their derivative at displacements (n_dofs,) mm; they are linear, and have no `offset`."""
-        n = len(self.data)
-        values = self.operator @ displacement - self.data + offset
+        """Residuals and their derivative at displacements (n,) mm of the points; linear, and without an `offset`."""
+        n = len(self.measured)
+        values = np.asarray(self.whitening @ (displacement - self.measured)) + offset
         weights = np.full(n, 1.0 / n)
         motions = self.point_motions(displacement)
         away = np.linalg.norm(motions.fitted - motions.observed, axis=1)
-        return Residuals(values, weights, self.material, self.axes, self.material, self.operator, self.operator, away)
+        return Residuals(values, weights, self.material, self.axes, self.material, self.whitening, self.whitening, away)
 
     def point_motions(self, displacement: NDArray[np.float64]) -> PointMotions:
-        """The points, or means of some, as measured and at displacements (n_dofs,) mm."""
-        fitted = np.asarray(self.shown @ displacement).reshape(-1, 3)
-        return PointMotions(self.material[::3], self.measured.reshape(-1, 3), fitted, self.labels)
+        """The points, or means of some, as measured and at their displacements (n,) mm."""
+        return PointMotions(self.material[::3], self.measured.reshape(-1, 3), displacement.reshape(-1, 3), self.labels)
 
     def with_noise(self, noise: NoiseModel) -> PointDisplacement:
         """All points count, by the variance of the noise."""
-        return replace(self, noise_model=noise, weighting=Weighting(len(self.data) / noise.sd**2, Tukey()))
+        return replace(self, noise_model=noise, weighting=Weighting(len(self.measured) / noise.sd**2, Tukey()))
 
     def reweighted(self, residuals: Residuals, beyond_modes: NDArray[np.float64] | None = None) -> PointDisplacement:
         """The same with Tukey's loss: a point that was mistaken for another counts less, or not at all."""
@@ -118,24 +115,20 @@ def point_displacement(
     """
     number = np.arange(len(points)) if cells is None else np.unique(cells, axis=0, return_inverse=True)[1].ravel()
     mean, mixed = _means(points, number, file.correlation_mm)
-    interpolation = sparse.csr_matrix(mean @ point_interpolation(space, places))
-    seen = np.unique(interpolation.indices)
-    shown = sparse.csr_matrix(sparse.kron(interpolation[:, seen], sparse.eye_array(3)))
-    measured, n = np.asarray(mean @ moved).ravel(), mean.shape[0]
+    of_nodes, n = sparse.csr_matrix(mean @ point_interpolation(space, places)), mean.shape[0]
+    seen = np.unique(of_nodes.indices)
     apart = np.eye(3)
     if file.covariance_mm2 is not None:
         apart = file.sd_mm * np.linalg.inv(np.linalg.cholesky(file.covariance_mm2))
-    independent = sparse.csr_matrix(sparse.kron(mixed, apart))
     stated = NoiseModel(np.array([file.sd_mm**2]), np.array([ALONE]))
     return PointDisplacement(
         kind=file.name,
         description=description,
         name=file.name,
         dofs=(3 * seen[:, None] + np.arange(3)).ravel(),
-        operator=sparse.csr_matrix(independent @ shown),
-        data=np.asarray(independent @ measured),
-        shown=shown,
-        measured=measured,
+        interpolation=sparse.csr_matrix(sparse.kron(of_nodes[:, seen], sparse.eye_array(3))),
+        measured=np.asarray(mean @ moved).ravel(),
+        whitening=sparse.csr_matrix(sparse.kron(mixed, apart)),
         material=np.repeat(np.asarray(mean @ points), 3, axis=0),
         axes=np.tile(np.eye(3), (n, 1)),
         observed_share=1.0,

@@ -167,7 +167,7 @@ class Discrepancy:
     heterogeneity_length_mm: float = field(default=25.0, metadata=rule(between=(1.0, 1e3)))
     poisson_sd: float = field(default=0.02, metadata=rule(between=(0.0, 0.2)))
     surface_offset_mm: float = field(default=0.5, metadata=rule(between=(0.0, 100.0)))
-    layer_sd: float = field(default=1.3, metadata=rule(between=(0.0, 5.0)))
+    layer_sd: float = field(default=1.5, metadata=rule(between=(0.0, 5.0)))
     layer_mm: float = field(default=3.0, metadata=rule(between=(0.01, 1000.0)))
 
 

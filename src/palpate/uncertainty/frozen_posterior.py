@@ -129,7 +129,7 @@ def frozen_posterior(
             answer[:, modes] += rest[:, model.n_regions :]
             answer = np.concatenate([answer[:, : modes.stop], rest[:, : model.n_regions]], axis=1)
         offsets = parameters.offsets(unknowns, s)
-        bare = FrozenState(reduced.at(np.zeros(0, dtype=np.int64)), expanded, np.zeros((0, 0)))
+        bare = FrozenState(reduced.outputs(lambda values: values[:0]), expanded, np.zeros((0, 0)))
         z = bare.coordinates(moduli, coefficients[s], offsets)
         form = np.zeros((len(z), len(z)))
         for rows, line in zip(objective.states[s].slices, lines, strict=True):

@@ -22,7 +22,7 @@ from palpate.mechanics.hyperelastic import elements_of
 from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.linear_model import LinearEquilibrium, poisson_tangents
 from palpate.mechanics.newton import NewtonSettings
-from palpate.observation.contract import Imaged, OfMaterial
+from palpate.observation.contract import Imaged, OfMaterial, seen_by
 from palpate.uncertainty.profile import PASSES, FixedCorrespondence, fixed_correspondence, refitted
 
 TOLERANCE = 1e-6  # decrement of a minimum
@@ -130,7 +130,7 @@ def _by_poisson(line: Linearisation, there: LinearEquilibrium | FiniteStrainEqui
     if not isinstance(seen, OfMaterial):
         return 0.0
     material = there.coefficients[system.model.constraint.n_modes :]
-    return seen.under(system.moduli, material).by_poisson(there.values[seen.dofs])
+    return seen.under(system.moduli, material).by_poisson(seen_by(seen, there.values))
 
 
 def law_errors(
@@ -150,7 +150,7 @@ def law_errors(
 def _of_displacements(evaluation: Evaluation, changes: Sequence[NDArray[np.float64]]) -> Errors:
     """Changes of each observation's residuals, mm, by changes (n_dof, ...) mm of the states' displacements."""
     return tuple(
-        np.asarray(line.residuals.smooth_jacobian @ changes[line.state][line.observation.dofs])
+        np.asarray(line.residuals.smooth_jacobian @ seen_by(line.observation, changes[line.state]))
         for line in evaluation.lines
     )
 
