@@ -1,7 +1,7 @@
 """Young's moduli of bodies whose stiffness, or its ratio, was measured otherwise: no simulation in it.
 
-    python benchmarks/measured.py NAME --data FOLDER [--fit STEPS] [--predict STEPS] [--foot N] [--json]
-        [--plot FILE.svg]
+    python benchmarks/measured.py NAME --data FOLDER [--fit STEPS] [--predict STEPS] [--foot N] [--map] [--alike UM]
+        [--bead-sd UM] [--json] [--plot FILE.svg]
 
 NAME is one of
 
@@ -14,7 +14,9 @@ NAME is one of
             al., "Sim-to-Real for Differentiable Projective Dynamics on Soft Robots"). FOLDER holds
             static_markers_mm.csv. One modulus from each weight, with the clamp's motion unknown and with it held.
     beads   beads in a homogeneous hydrogel that a ball is pressed into (Yang et al., SoftwareX 2022). FOLDER holds
-            beads.npz. The modulus of the gel's inner part over that of the rest, which is 1, and the misfit.
+            beads.npz. The modulus of the gel's inner part over that of the rest, which is 1, and the misfit. With
+            --map the inner part's modulus is a field: how far it is from flat, beside its own intervals. --bead-sd
+            (0.2) and --alike (0): standard deviation of the errors, and length over which they are alike, um.
 
 Nothing of FOLDER is copied anywhere. Needs meshio: pip install 'palpate[mesh]'.
 """
@@ -37,6 +39,7 @@ from numpy.typing import NDArray
 
 from palpate.inversion import Inversion, invert
 from palpate.study import Case, estimate, inverse_problem, inversion_settings, make_body, read_case, read_states
+from palpate.uncertainty import StiffnessMap
 
 Array = NDArray[np.float64]
 
@@ -62,6 +65,7 @@ FACE_SD_MM = 0.05  # of a face's points, which follow three markers as a rigid b
 GEL_LOW, GEL_HIGH = np.array([60.0, 60.0, 16.0]), np.array([350.0, 350.0, 68.0])
 GEL_CELLS = (14, 14, 4)
 GEL_INNER = 0.5  # of the half width along x and y
+GEL_FIELD = 'modulus = "field"\nfield_sd = 0.7\nfield_length_mm = 30.0\n'  # of the inner part, with --map
 BEAD_SD = 0.2  # scatter of the beads about a local affine fit: 0.13 in the median, 0.43 in the 95th percentile
 
 
@@ -73,12 +77,16 @@ def main() -> int:
     parser.add_argument("--fit", default="2", help="steps, with commas")
     parser.add_argument("--predict", default="1", help="steps, with commas; '' for none")
     parser.add_argument("--foot", type=float, default=FOOT_N, help="sd (N) of the load cell's offset of tpu; 0: none")
+    parser.add_argument("--map", action="store_true", help="map the inner part of beads")
+    parser.add_argument("--bead-sd", type=float, default=BEAD_SD, help="sd (um) of the errors of beads")
+    parser.add_argument("--alike", type=float, default=0.0, help="length (um) over which errors of beads are alike")
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     parser.add_argument("--plot", type=Path, metavar="FILE.svg", help="values with their 95 %% intervals")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         fit, predict = ([int(s) for s in text.split(",") if s] for text in (arguments.fit, arguments.predict))
         options = Options(arguments.data, Path(folder), fit, predict, arguments.foot)
+        options = replace(options, mapped=arguments.map, bead_sd=arguments.bead_sd, alike=arguments.alike)
         found = EXPERIMENTS[arguments.name](options)
     sys.stdout.write(json.dumps(found, indent=None if arguments.json else 1) + "\n")
     if arguments.plot:
@@ -88,13 +96,19 @@ def main() -> int:
 
 @dataclass(frozen=True)
 class Options:
-    """Where the data are, a folder to work in, the steps, and the standard deviation (N) of a load cell's offset."""
+    """Where the data are, a folder to work in, the steps, and the standard deviation (N) of a load cell's offset.
+
+    mapped: whether the gel's inner part is; bead_sd, alike: of the beads' errors, um.
+    """
 
     data: Path
     folder: Path
     fit: Sequence[int]
     predict: Sequence[int]
     foot_n: float
+    mapped: bool = False
+    bead_sd: float = BEAD_SD
+    alike: float = 0.0
 
 
 def tpu(options: Options) -> dict[str, Any]:
@@ -276,14 +290,17 @@ def beads(options: Options) -> dict[str, Any]:
     _pairs(folder / "beads.csv", before[inside], (after - before)[inside])
     (folder / "case.toml").write_text(
         '[body]\nmesh = "gel.vtu"\n[[surfaces]]\nname = "border"\nwhere = "boundary"\n[tissues.inner]\nlabel = 1\n'
-        'role = "estimate"\npoisson_ratio = 0.475\n[tissues.rest]\nlabel = 2\nrole = "known"\npoisson_ratio = 0.475\n'
+        f'role = "estimate"\npoisson_ratio = 0.475\n{GEL_FIELD if options.mapped else ""}'
+        '[tissues.rest]\nlabel = 2\nrole = "known"\npoisson_ratio = 0.475\n'
         "youngs_modulus_kpa = 1.0\n[driver]\nmodes = 300\nkernel_mm = 30.0\nprior_mm = 10.0\n[discrepancy]\n"
         "heterogeneity_sd = 0.0\npoisson_sd = 0.01\n"
-        f'[[data]]\nkind = "displacement-field"\nfile = "beads.csv"\nsd_mm = {BEAD_SD}\n'
+        f'[[data]]\nkind = "displacement-field"\nfile = "beads.csv"\nsd_mm = {options.bead_sd}\n'
+        f"correlation_mm = {options.alike}\n"
     )
     result = estimate(read_case(folder / "case.toml")).estimation
     (item,) = result.estimates
-    return {
+    by_map = {"map": _flatness(of, float(item.value))} if (of := next(iter(result.maps), None)) and item.value else {}
+    return by_map | {
         "beads": int(inside.sum()),
         "ratio": item.value,
         "interval95": item.interval95,
@@ -291,6 +308,28 @@ def beads(options: Options) -> dict[str, Any]:
         "misfit_rms_um": round(result.fits[0][0].end.rms_mm, 4),
         "information_shares": result.information_shares,
         "status": result.status,
+    }
+
+
+def _flatness(found: StiffnessMap, mean: float) -> dict[str, Any]:
+    """How far a map, with the geometric mean of its moduli, is from the value 1 that all of them have."""
+    moduli = mean * np.exp(found.log_ratio)
+    inside = np.abs(np.log(moduli)) < NORMAL_95 * found.sd
+    return {
+        "elements": len(moduli),
+        "inside_95": round(float(inside.mean()), 3),
+        "moduli_2.5_50_97.5_percent": np.percentile(moduli, (2.5, 50.0, 97.5)).round(2).tolist(),
+        "sd_ln_modulus_50_percent": round(float(np.median(found.sd)), 3),
+        "resolved": round(found.resolved, 3),
+        "prior_sd": round(found.prior_sd, 3),
+        "region": found.region
+        and {
+            "probability": round(found.region.probability, 4),
+            "volume_um3": round(1e3 * found.region.volume_ml),
+            "centre_um": found.region.centre_mm.round(1).tolist(),
+            "contrast": round(found.region.contrast, 2),
+            "interval95": [round(end, 2) for end in found.region.interval95 if end is not None],
+        },
     }
 
 

@@ -114,7 +114,7 @@ def beside_a_peer(edge_mm: float, n_modes: int, seed: int, say: Say) -> dict[str
 
 def _task(edge_mm: float, n_modes: int, rng: np.random.Generator) -> _Task:
     """A body that was moved on a finer mesh, seen on a lattice in and round its organ, meshed for the estimate."""
-    prior = FieldPrior(PRIOR_SD, PRIOR_MM, n_modes)
+    prior = FieldPrior(PRIOR_SD, PRIOR_MM, modes=n_modes)
     tissues = (
         Tissue(WALL, Role.DRIVER, (1,)),
         Tissue(ORGAN, Role.ESTIMATE, (2,), youngs_modulus_kpa=ORGAN_KPA, field=prior),

@@ -78,7 +78,7 @@ def test_the_frame_is_what_the_image_cuts_and_moves_as_its_kernel_says(gelatine,
 
 def test_blocks_stand_in_the_order_in_which_the_model_takes_them(gelatine, motion):
     modes = material_modes(gelatine.mesh, (0, 1), length_mm=12.0, poisson=((0,), (1,)))
-    material = material_blocks(modes, gelatine.mesh.tissues, (0, 1), heterogeneity_sd=0.3, poisson_sd=0.02)
+    material = material_blocks(modes, gelatine.mesh, (0, 1), heterogeneity_sd=0.3, poisson_sd=0.02)
     frames = [block for state in (0, 1) for block in frame_blocks(motion, state)]
     mapping = parameter_map(gelatine.mesh.tissues, (0, 1), [*frames, *material])
     n_frame = sum(block.size for block in frame_blocks(motion, 0))

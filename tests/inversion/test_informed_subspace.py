@@ -26,7 +26,7 @@ def patchy(twins, twin):
     space = twin.model.space
     modes = material_modes(space.mesh, (0, 1, 3), length_mm=9.0)
     model = linear_model(space, twin.model.constraint, material=modes)
-    blocks = material_blocks(modes, space.mesh.tissues, (0,), heterogeneity_sd=0.3, poisson_sd=0.0)
+    blocks = material_blocks(modes, space.mesh, (0,), heterogeneity_sd=0.3, poisson_sd=0.0)
     problem = twins.voxel_problem(twin)
     parameters = parameter_map(twin.scene.tissues, model.regions, [*unit_blocks(model.constraint.n_modes), *blocks])
     return replace(problem, states=(LaterState(model, problem.states[0].observations),), parameters=parameters)

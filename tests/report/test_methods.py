@@ -47,6 +47,23 @@ def test_the_finite_strain_law_is_told_with_its_start(case_result):
         assert ("The linear law gave the start" in text) is told
 
 
+def test_the_prior_of_a_map_is_told_with_its_source(case_result):
+    for prior, told, cited in (
+        ("gaussian", "Gaussian, Matern's kernel", False),
+        ("total-variation", "total variation", True),
+    ):
+        first, *others = case_result.case.tissues
+        mapped = dataclasses.replace(first, modulus="field", field_prior=prior)
+        case = dataclasses.replace(case_result.case, tissues=(mapped, *others))
+        text = methods_text(collect(dataclasses.replace(case_result, case=case)))
+        assert f"Inside {first.name} ({told}, sd 0.7 of ln E, length 8 mm) ln E was a field" in " ".join(
+            text.paragraphs
+        )
+        assert any("total variation based noise removal" in source for source in text.sources) is cited
+        test_citations_and_sources_belong_together(dataclasses.replace(case_result, case=case))
+    assert "ln E was a field" not in " ".join(methods_text(collect(case_result)).paragraphs)
+
+
 def test_a_known_load_sets_the_scale(case_result):
     data = collect(case_result)
     unknown = tuple(dataclasses.replace(tissue, given_kpa=None) for tissue in data.tissues)

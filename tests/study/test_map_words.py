@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from palpate.study.map_words import map_findings, map_words
@@ -16,8 +18,18 @@ def map_of(resolved, region=None):
 def test_a_part_is_told_with_its_volume_place_contrast_and_probability():
     region = DifferentRegion(np.arange(2), 1.44, np.array([1.2, -30.4, 8.0]), 0.4, (0.3, 0.55), 0.9931)
     words = map_words(map_of(0.8, region))
-    for told in ("'prostate'", "1.4 ml", "(1, -30, 8) mm", "0.4 times", "0.3 to 0.55", "softer", "99.3 %"):
+    for told in (
+        "'prostate'",
+        "1.4 ml",
+        "(1, -30, 8) mm",
+        "0.4 times",
+        "0.3 to 0.55",
+        "softer",
+        "99.3 %",
+        "its core is",
+    ):
         assert told in words
+    assert "its core" not in map_words(map_of(0.8, replace(region, whole=True)))
     assert "stiffer" in map_words(map_of(0.8, DifferentRegion(np.arange(2), 1.0, np.zeros(3), 3.0, (2.0, 4.0), 0.97)))
 
 

@@ -51,3 +51,4 @@ from palpate.inversion.reduced_basis import ReducedBasis as ReducedBasis
 from palpate.inversion.reduced_basis import reduced_basis as reduced_basis
 from palpate.inversion.reweighting import reweighted as reweighted
 from palpate.inversion.reweighting import with_first_noise as with_first_noise
+from palpate.inversion.total_variation import TotalVariation as TotalVariation

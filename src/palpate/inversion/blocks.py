@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role, Tissue
+from palpate.inversion.total_variation import TotalVariation, total_variation
 from palpate.mechanics.material import MaterialModes
+from palpate.mesh.tet_mesh import TetMesh
 from palpate.observation.contract import Observation
 from palpate.observation.prescribed_motion import PrescribedMotion
 from palpate.observation.wall_modes import Wall
@@ -58,8 +60,8 @@ class Block:
     interval is. left_out: variances of the first noise, a tenth of the found one, that what is left out of the unknowns
     may explain (see `informed_problem`); below 0 none is. regions: numbers of the model's regions whose moduli it
     multiplies, one unknown x for all of them, where it acts on moduli: a `share` s of each region, in series with the
-    rest of it, is e^x times as stiff, and the whole 1 / (1 + s (e^-x - 1)) times. Raises `ConfigurationError` for terms
-    of another size.
+    rest of it, is e^x times as stiff, and the whole 1 / (1 + s (e^-x - 1)) times. variation: -ln of what is believed
+    where that is not normal; an estimate begins with P then. Raises `ConfigurationError` for terms of another size.
     """
 
     of: str
@@ -77,6 +79,7 @@ class Block:
     regions: tuple[int, ...] = ()
     share: float = 1.0
     left_out: float = LEFT_OUT
+    variation: TotalVariation | None = None
 
     def __post_init__(self) -> None:
         shape = (len(self.precision),) * 2
@@ -110,7 +113,8 @@ class Block:
         covariance = inverse @ np.linalg.inv(self.precision) @ inverse.T
         alternatives = tuple(tuple(inverse @ term @ inverse.T for term in terms) for terms in self.alternatives)
         precision = np.asarray(np.linalg.inv(0.5 * (covariance + covariance.T)), dtype=np.float64)
-        return replace(self, precision=precision, alternatives=alternatives)
+        variation = self.variation and self.variation.combined(np.linalg.inv(self.precision) @ inverse.T @ precision)
+        return replace(self, precision=precision, alternatives=alternatives, variation=variation)
 
 
 def unit_blocks(*n_modes: int) -> tuple[Block, ...]:
@@ -178,7 +182,7 @@ def instrument_block(name: str, state: int, *, sd: float) -> Block:
 
 def material_blocks(
     modes: MaterialModes,
-    tissues: Sequence[Tissue],
+    mesh: TetMesh,
     states: tuple[int, ...],
     *,
     heterogeneity_sd: float,
@@ -189,16 +193,19 @@ def material_blocks(
     A tissue is nearly homogeneous, by a third of what is stated, or patchy by all of it, of which the evidence chooses;
     surfaces hardly tell the two apart, so that the former stays until the latter is clearly more likely. The field of a
     tissue that is mapped has the amplitude that is stated until twice of it is clearly more likely. It has no less: a
-    small part that differs in a tissue that is else homogeneous speaks for a small amplitude, which hides it.
+    small part that differs in a tissue that is else homogeneous speaks for a small amplitude, which hides it. Where its
+    prior is the total variation nothing is chosen.
     """
-    blocks = []
+    blocks, tissues, end = [], mesh.tissues, 0
     for tissue, n in modes.sizes:
+        start, end = end, end + n
         if not n:
             continue
         cause, sd, shares, odds = "heterogeneity", heterogeneity_sd, (HOMOGENEOUS_SHARE, 1.0), float(np.log(PATCHY))
         if mapped := tissues[tissue].field:
             cause, sd, shares, odds = FIELD, mapped.sd, FIELD_AMPLITUDES, 0.0
         first, *_ = levels = [(share * sd) ** 2 for share in shares]
+        edges = mapped if mapped and mapped.total_variation else None
         blocks.append(
             Block(
                 tissues[tissue].name,
@@ -206,11 +213,12 @@ def material_blocks(
                 Acts.MATERIAL,
                 states,
                 np.eye(n) / first,
-                tuple((level * np.eye(n),) for level in levels),
+                () if edges else tuple((level * np.eye(n),) for level in levels),
                 amplitudes=(1.0, 1.0),
-                odds=(0.0, odds),
+                odds=() if edges else (0.0, odds),
                 last=mapped is None,
                 left_out=LEFT_OUT if mapped is None else LEFT_OUT_OF_MAP,
+                variation=total_variation(mesh, modes.fields[:, start:end], edges) if edges else None,
             )
         )
     if modes.poisson:

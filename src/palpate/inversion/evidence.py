@@ -150,6 +150,33 @@ def with_learned_prior(objective: Objective, evaluation: Evaluation, unknowns: N
     return replace(objective, parameters=replace(objective.parameters, nuisance_precision=precision))
 
 
+def with_edges(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> Objective:
+    """The objective with a normal law for the total variation of each block that has one: to second order.
+
+    Where, with the residuals linear around unknowns (n_unknowns,), the block's x is likeliest, block after block, the
+    others following: with the gradient g and the curvature H there of minus the logarithm of what is believed, N(x -
+    H^-1 g, H^-1). The minimum is that of the variation itself, and its posterior Laplace's.
+    """
+    parameters, n = objective.parameters, objective.n_parameters
+    numbers = [i for i, block in enumerate(parameters.blocks) if block.variation]
+    if not numbers:
+        return objective
+    prior, centre = parameters.prior_matrix, parameters.prior_centre
+    data = evaluation.matrix - evaluation.prior
+    pull = data @ unknowns - (evaluation.score - evaluation.prior_score)
+    for i in numbers:
+        places, variation = parameters.columns(i), parameters.blocks[i].variation
+        assert variation is not None
+        centre[places] = 0.0
+        with determined():
+            seen = _seen(data + prior, data, pull + prior @ centre, places)
+            x = variation.least(seen.information, seen.pull, unknowns[places])
+            prior[np.ix_(places, places)] = curvature = variation.curvature(x)
+            centre[places] = x - linalg.solve(curvature, variation.gradient(x), assume_a="pos")
+    believed = replace(parameters, nuisance_precision=prior[n:, n:], nuisance_mean=centre[n:])
+    return replace(objective, parameters=believed)
+
+
 def _seen(
     matrix: NDArray[np.float64], data: NDArray[np.float64], pull: NDArray[np.float64], places: NDArray[np.int64]
 ) -> _Seen:

@@ -66,13 +66,8 @@ def informed_problem(
     evaluation = replace(objective, states=tuple(states))(fitted.unknowns)
     data, columns = evaluation.matrix - evaluation.prior, [parameters.columns(i) for i in range(len(parameters.blocks))]
     middle, evaluations = fitted.unknowns, fitted.evaluations + 1
-    del (
-        objective,
-        states,
-        state,
-        fitted,
-        evaluation,
-    )  # and with them the derivatives of all that is seen by all unknowns
+    # with them go the derivatives of all that is seen by all unknowns, which are large
+    del objective, states, state, fitted, evaluation
     bases = [_informed(b, data[np.ix_(own, own)]) for b, own in zip(parameters.blocks, columns, strict=True)]
     blocks = tuple(b.combined(inverse) for b, (_, inverse) in zip(parameters.blocks, bases, strict=True))
     reduced, kept = list[LaterState](), list[ReducedBasis]()
@@ -130,7 +125,8 @@ class _Responses:
 def _informed(block: Block, information: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Combinations (n, k) of a block's unknowns that data of an information (n, n) see, and their inverse (k, n)."""
     ratios = block.acts is Acts.MATERIAL and not block.alternatives  # Poisson's, one of each tissue, are no field
-    if block.size <= SMALL or block.acts is Acts.RESIDUALS or ratios:
+    edges = block.variation is not None  # which are made of what data see and what they do not see alone
+    if block.size <= SMALL or block.acts is Acts.RESIDUALS or ratios or edges:
         return np.eye(block.size), np.eye(block.size)
     root = linalg.cholesky(block.widest, lower=True)
     sizes, vectors = linalg.eigh(root.T @ information @ root)

@@ -49,7 +49,7 @@ class LaterState:
         return [slice(start, end) for start, end in pairwise(ends)]
 
     def seen(self, displacement: NDArray[Float]) -> NDArray[Float]:
-        """What is observed (n_observed, ...) of displacements (n_dof, ...) mm, one observation after the other."""
+        """What is observed (n_observed,) or (n_observed, k) of displacements (n_dof,) or (n_dof, k) mm, in order."""
         return np.concatenate([seen_by(observation, displacement) for observation in self.observations])
 
     def combined(self, boundary: NDArray[np.float64], fields: NDArray[np.float64]) -> LaterState:

@@ -68,8 +68,9 @@ class ParameterMap:
     state takes its `coefficients`: of its boundary modes, then of its material modes, in the order of the blocks.
 
     The prior is normal: theta with `prior_mean` (n_parameters,) and `prior_precision` (n_parameters, n_parameters),
-    flat by default, the blocks' unknowns with mean 0 and `nuisance_precision` (n_coefficients, n_coefficients), by
-    default what the blocks believe. Raises `ConfigurationError` for a prior of another shape.
+    flat by default, the blocks' unknowns with `nuisance_mean` (n_coefficients,), by default 0, and `nuisance_precision`
+    (n_coefficients, n_coefficients), by default what the blocks believe. Raises `ConfigurationError` for a prior of
+    another shape.
     """
 
     base: NDArray[np.float64]
@@ -81,6 +82,7 @@ class ParameterMap:
     prior_mean: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     prior_precision: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
     nuisance_precision: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    nuisance_mean: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     poisson: tuple[OpenPoisson, ...] = ()
 
     def __post_init__(self) -> None:
@@ -99,6 +101,12 @@ class ParameterMap:
                     f"{name} has the shape {given.shape}; {n} parameters and {self.n_coefficients} unknowns in blocks"
                     f" need {default.shape}"
                 )
+
+        if self.nuisance_mean.size not in (0, self.n_coefficients):
+            raise ConfigurationError(
+                f"nuisance_mean has the shape {self.nuisance_mean.shape}; {self.n_coefficients} unknowns in blocks need"
+                " one each, or none where all means are 0"
+            )
 
     @property
     def by_load(self) -> bool:
@@ -167,7 +175,8 @@ class ParameterMap:
     @property
     def prior_centre(self) -> NDArray[np.float64]:
         """Mean (n_unknowns,) of all unknowns before the images are seen."""
-        return np.concatenate([self.prior_mean, np.zeros(self.n_coefficients)])
+        of_blocks = self.nuisance_mean if self.nuisance_mean.size else np.zeros(self.n_coefficients)
+        return np.concatenate([self.prior_mean, of_blocks])
 
     def moduli(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """The regions' moduli (n_regions,) kPa at unknowns (n_unknowns,), or at theta (n_parameters,) alone.
@@ -257,7 +266,8 @@ class ParameterMap:
         own = np.concatenate([np.arange(self.n_parameters), *(self.columns(i) for i in kept)])
         nuisance = own[self.n_parameters :] - self.n_parameters
         precision = self.nuisance_precision[np.ix_(nuisance, nuisance)]
-        return replace(self, blocks=blocks, nuisance_precision=precision), own
+        mean = self.nuisance_mean[nuisance] if self.nuisance_mean.size else self.nuisance_mean
+        return replace(self, blocks=blocks, nuisance_precision=precision, nuisance_mean=mean), own
 
     def _model_columns(self, state: int) -> NDArray[np.int64]:
         return np.concatenate([self.acting(Acts.BOUNDARY, state), self.acting(Acts.MATERIAL, state)])

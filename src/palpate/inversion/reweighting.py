@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inversion.evidence import with_learned_prior
+from palpate.inversion.evidence import with_edges, with_learned_prior
 from palpate.inversion.objective import Evaluation, Linearisation, Objective
 from palpate.inversion.optimise import Minimum
 from palpate.observation.noise_model import NoiseModel
@@ -28,13 +28,13 @@ def with_found_noise(objective: Objective, minimum: Minimum) -> Objective:
 
 
 def reweighted(objective: Objective, minimum: Minimum) -> Objective:
-    """What the residuals at a minimum of `objective` say: their noise, the drivers' prior, robust losses.
+    """What the residuals at a minimum of `objective` say: their noise, the blocks' prior, robust losses.
 
     The next minimum is sought under the objective that is returned, once that is `rematched`; an estimate has converged
     when that is the same. Raises `EstimationError` where the images leave a driver's motion open.
     """
     evaluation = minimum.evaluation
-    believed = with_learned_prior(objective, evaluation, minimum.unknowns)
+    believed = with_edges(with_learned_prior(objective, evaluation, minimum.unknowns), evaluation, minimum.unknowns)
     by_noise = _by_noise(believed, fitted_noise(evaluation))
     pairs = zip(by_noise.observations, evaluation.lines, strict=True)
     n = objective.n_parameters

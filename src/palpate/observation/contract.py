@@ -181,7 +181,7 @@ class Interpolated(Protocol):
 
 
 def seen_by(observation: Observation, displacement: NDArray[Float]) -> NDArray[Float]:
-    """What an observation sees (n_seen, ...) of displacements (n_dof, ...) mm of the whole mesh."""
+    """What an observation sees (n_seen,) or (n_seen, k) of displacements (n_dof,) or (n_dof, k) mm of all points."""
     own = displacement[observation.dofs]
     if not isinstance(observation, Interpolated):
         return own

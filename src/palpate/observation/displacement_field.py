@@ -54,7 +54,8 @@ class DisplacementField(MeasuredPoints):
             )
         points, moved = self.table.before[inside], self.table.moved[inside]
         size = max(OF_LENGTH * self.file.correlation_mm, OF_EDGE * space.mesh.usual_edge_mm)
-        sizes = size * 2.0 ** np.clip(np.floor(np.log2(_away(space.mesh, points) / size)), 0, COARSER)
+        doublings = np.floor(np.log2(np.maximum(_away(space.mesh, points) / size, 1.0)))
+        sizes = size * 2.0 ** np.minimum(doublings, COARSER)
         term = point_displacement(
             space,
             points,

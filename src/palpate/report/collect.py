@@ -14,14 +14,16 @@ from numpy.typing import NDArray
 
 from palpate.errors import PalpateError
 from palpate.images.segmentation import Segmentation
-from palpate.images.tissue import Role, Tissue, tissue_colours
+from palpate.images.tissue import FieldPrior, Role, Tissue, tissue_colours
 from palpate.mechanics.element import largest_strains
 from palpate.mesh.tet_mesh import tet_dihedrals
 from palpate.parallel import mapped
 from palpate.report.measured import measured_states
 from palpate.report.pairs import ImagePair, bone_distances, drawn_images, image_pairs, input_images
 from palpate.report.report_data import (
+    MAP_OF,
     MESH,
+    VARIATION,
     LaterImage,
     MeasuredState,
     MeshPicture,
@@ -155,6 +157,7 @@ def _settings(case: Case, mesh: MeshSummary | None = None) -> tuple[tuple[str, s
     starts, bounds = options.starts_kpa or options.start_ratios, options.bounds_kpa or options.bounds_ratio
     loads = [("known load", _load(load)) for load in case.loads]
     loads += [("measurement", _measured(data)) for data in case.data]
+    loads += [(f"{MAP_OF}{t.name}", _field(of)) for t in case.tissues if (of := t.with_labels(()).field)]
     loads += [("body", MESH)] if case.body is not None else []
     noise = case.noise
     return (
@@ -179,6 +182,12 @@ def _settings(case: Case, mesh: MeshSummary | None = None) -> tuple[tuple[str, s
         ),
         ("seed", str(case.seed)),
     )
+
+
+def _field(prior: FieldPrior) -> str:
+    """What is believed of ln E inside a tissue that is mapped."""
+    law = VARIATION if prior.total_variation else "Gaussian, Matern's kernel"
+    return f"{law}, sd {prior.sd:g} of ln E, length {prior.length_mm:g} mm"
 
 
 def _measured(data: CaseData) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.laws.registry import LAWS, law_from, law_parameters
-from palpate.report.report_data import MESH, ReportData
+from palpate.report.report_data import MAP_OF, MESH, VARIATION, ReportData
 from palpate.report.rows import listed, moduli_in, ratio_rows
 from palpate.report.sources import SOURCES, bibtex, reference_line
 
@@ -128,8 +128,16 @@ def _model(data: ReportData, cite: _Citations) -> str:
         " each was one solid, so that the modulus of an organ with a wall around a fluid, as a bladder, is an effective"
         f" one, not its wall's. The outer boundary: {settings['outer boundary']}. The motion of the drivers' walls was"
         f" a Gaussian process in its leading modes ({settings['driver motion']}) {cite('kernel')}, estimated together"
-        f" with the moduli.{acted}"
+        f" with the moduli.{_mapped(data, cite)}{acted}"
     )
+
+
+def _mapped(data: ReportData, cite: _Citations) -> str:
+    """Tissues whose modulus is a field, each with its prior."""
+    priors = {key.removeprefix(MAP_OF): prior for key, prior in data.settings if key.startswith(MAP_OF)}
+    source = f" {cite('variation')}" if any(VARIATION in prior for prior in priors.values()) else ""
+    told = listed([f"{name} ({prior})" for name, prior in priors.items()])
+    return f" Inside {told} ln E was a field{source}." if priors else ""
 
 
 def _law(data: ReportData) -> Law | None:

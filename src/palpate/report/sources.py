@@ -47,6 +47,12 @@ SOURCES = {
         "On the low-rank approximation by the pivoted Cholesky decomposition",
         {"journal": "Applied Numerical Mathematics", "volume": "62", "year": "2012", "pages": "428-440"},
     ),
+    "variation": Source(
+        "article",
+        (("Rudin", "L. I."), ("Osher", "S."), ("Fatemi", "E.")),
+        "Nonlinear total variation based noise removal algorithms",
+        {"journal": "Physica D", "volume": "60", "year": "1992", "pages": "259-268"},
+    ),
     "huber": Source("book", (("Huber", "P. J."),), "Robust Statistics", {"publisher": "Wiley", "year": "1981"}),
     "nocedal": Source(
         "book",

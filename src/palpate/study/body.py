@@ -375,7 +375,7 @@ def _blocks(
         model = pairs[states[0]][0]
         blocks += material_blocks(
             model.material,
-            model.space.mesh.tissues,
+            model.space.mesh,
             states,
             heterogeneity_sd=case.discrepancy.heterogeneity_sd,
             poisson_sd=case.discrepancy.poisson_sd,

@@ -20,6 +20,7 @@ from palpate.uncertainty.intervals import NORMAL_95
 
 REMAINING = "remaining"
 AUTO = "auto"
+FIELD_PRIORS = ("gaussian", "total-variation")
 TISSUE_ROLES = tuple(str(role) for role in Role if role is not Role.SLIDING)
 HELD = ("fixed", "sliding")  # outer boundaries that leave a body no rigid motion
 SURFACE_ROLES = {  # of what lies behind a surface of a mesh
@@ -177,7 +178,8 @@ class CaseTissue:
     `poisson_ratio` None: 0.45, or what a phantom draws; `poisson_ratio_sd`: standard deviation of what is believed of
     it where it is sought, None: 0.03. `youngs_modulus_kpa`: a number, or the 95 % range of what is believed of a
     `known` one. `modulus` "field": it varies in the tissue and is mapped; `field_sd`: prior standard deviation of ln E
-    inside, `field_length_mm`: of its kernel, `field_modes`: how many make it at the most.
+    inside, `field_length_mm`: of its kernel; `field_prior`: Gaussian, or by its total variation; `field_modes`: how
+    many modes make it at the most.
     """
 
     name: str
@@ -199,6 +201,7 @@ class CaseTissue:
     modulus: str = field(default="one", metadata=rule(choices=("one", "field")))
     field_sd: float = field(default=0.7, metadata=rule(between=(0.01, 3.0)))
     field_length_mm: float = field(default=8.0, metadata=rule(between=(1.0, 1e3)))
+    field_prior: str = field(default="gaussian", metadata=rule(choices=FIELD_PRIORS))
     field_modes: int = field(default=400, metadata=rule(between=(1, 2000)))
 
     def __post_init__(self) -> None:
@@ -231,7 +234,10 @@ class CaseTissue:
     def with_labels(self, labels: tuple[int, ...]) -> Tissue:
         """The tissue with its labels; raises `ConfigurationError` when its constants are impossible."""
         ratio = POISSON_RATIO if self.poisson_ratio is None else self.poisson_ratio
-        mapped = FieldPrior(self.field_sd, self.field_length_mm, self.field_modes) if self.modulus == "field" else None
+        believed = FieldPrior(
+            self.field_sd, self.field_length_mm, self.field_prior == FIELD_PRIORS[1], self.field_modes
+        )
+        mapped = believed if self.modulus == "field" else None
         return Tissue(self.name, self.role, labels, ratio, self.modulus_kpa, modulus_sd=self.modulus_sd, field=mapped)
 
     @property

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ from palpate.inversion import (
 )
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit, Imaged, OfInstrument, OfPoints, PointMotions, seen_by
+from palpate.parallel import both, mapped
 from palpate.progress import Progress, silent
 from palpate.study.discrepancy import (
     FittedMaterial,
@@ -57,6 +59,7 @@ from palpate.uncertainty import (
     Combination,
     Covariance,
     FittedState,
+    GridErrors,
     Information,
     Interval,
     ModulusInterval,
@@ -242,9 +245,15 @@ def conclude(
     objective, minimum = inversion.objective, inversion.minimum
     rng = np.random.default_rng(seed)
     progress(f"intervals: correlation of the residuals, and the model as {GRID_DRAWS} random voxel grids show it")
-    errors = grid_errors(objective, minimum.evaluation, observed.states, rng=rng)
-    bonded = covariance_of(objective, minimum.evaluation, errors, unknowns=minimum.unknowns)
-    released, remark = released_of(inversion, settings, progress=progress)
+
+    def with_layers_held() -> tuple[GridErrors, Covariance]:
+        """The errors that random grids make, and the covariance with them."""
+        errors = grid_errors(objective, minimum.evaluation, observed.states, rng=rng)
+        return errors, covariance_of(objective, minimum.evaluation, errors, unknowns=minimum.unknowns)
+
+    (errors, bonded), (released, remark) = both(
+        with_layers_held, lambda: released_of(inversion, settings, progress=progress)
+    )
     covariance, posteriors = stated_posteriors(inversion, bonded, released)
     progress("intervals: profiles, and the fit of every surface before and after")
     pairs = image_pairs_of(inversion, settings.bounds, errors, released)
@@ -394,17 +403,20 @@ def intervals_of(
     """Of each parameter its interval, which holds that of each of the `posteriors`; none where nothing converged."""
     if not inversion.minimum.converged:
         return ()
-    (first, *others), n, bounds = posteriors, inversion.objective.n_parameters, settings.bounds
+    first, n, bounds = posteriors[0], inversion.objective.n_parameters, settings.bounds
     found, variances, at_bound = [], np.diag(first.covariance), bounds.reached(inversion.minimum.unknowns[:n])
+    every = mapped(
+        lambda of: modulus_interval(
+            of[1].frozen, of[1].minimum, of[0], variance=float(of[1].covariance[of[0], of[0]]), bounds=bounds
+        ),
+        product(range(n), posteriors),
+    )
     best = inversion.candidates[inversion.best]
     minima = [c for c in inversion.candidates if c is not best and c.minimum.converged]
     scales = np.diag(inversion.minimum.evaluation.covariance_columns(n)[:n]) / variances  # of a profile's deviance
     for i in range(n):
         limits = {"lower": float(np.exp(bounds.lower[i])), "upper": float(np.exp(bounds.upper[i]))}
-        own, *wider = (
-            modulus_interval(of.frozen, of.minimum, i, variance=float(of.covariance[i, i]), bounds=bounds)
-            for of in (first, *others)
-        )
+        own, *wider = every[i * len(posteriors) : (i + 1) * len(posteriors)]
         sd = float(np.sqrt(variances[i]))
         good = [c.minimum.unknowns for c in minima if as_good(c.value, best.value, scale=float(scales[i]))]
         ellipses = (log_interval(float(np.exp(x[i])), sd, **limits) for x in good)

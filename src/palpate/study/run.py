@@ -14,7 +14,7 @@ from palpate.images.tissue import Role
 from palpate.inversion import Bounds, Inversion, InversionSettings, ParameterMap, eta_of_ratio
 from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.laws.registry import law_named
-from palpate.parallel import blas_on_one_thread
+from palpate.parallel import blas_on_one_thread, both
 from palpate.progress import Forecast, Progress, about, during, silent
 from palpate.study.body import Body, ImagedStates, joint_problem, make_body
 from palpate.study.case import LAW_NAMES, SOUGHT_RATIOS, Case, Mechanics
@@ -103,18 +103,15 @@ def estimate_states(
     images = tuple(image.index if image else None for pair in bodies for image in pair.states.later)
     observed = Observed(fitted_states(inversion, *bodies), images)
     stating = during("intervals", progress)
-    estimation = conclude(
-        inversion,
-        settings,
-        observed,
-        truth=truth or {},
-        seed=case.seed,
-        samples=case.estimate.samples,
-        progress=stating,
+    stating("what would change the answer: surfaces, constants, frame and law by a step each")
+    samples = case.estimate.samples
+    estimation, variations = both(
+        lambda: conclude(
+            inversion, settings, observed, truth=truth or {}, seed=case.seed, samples=samples, progress=stating
+        ),
+        lambda: _what_would_change(inversion, settings, case, bodies),
     )
-    if inversion.minimum.converged:
-        stating("what would change the answer: surfaces, constants, frame and law by a step each")
-        estimation = replace(estimation, variations=_what_would_change(inversion, settings, case, bodies))
+    estimation = replace(estimation, variations=variations)
     clock.append(time.perf_counter())
     stages = np.diff(clock)
     seconds = {"read": read_seconds, "mesh": stages[0], "assemble": stages[1], "estimate": stages[2]}
@@ -152,11 +149,13 @@ def mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
 def _what_would_change(
     inversion: Inversion, settings: InversionSettings, case: Case, bodies: tuple[Body, ...]
 ) -> tuple[Variation, ...]:
-    """What the estimate of a case rests on; nothing where not even the estimate itself can be followed.
+    """What the estimate of a case rests on; nothing where there is none, or it cannot be followed itself.
 
     A law at finite strain is held against the others of its kind, the linear one against the default: from a finite
     strain no step leads to the linear law, nor to any where it would also find another reference state.
     """
+    if not inversion.minimum.converged:
+        return ()
     mechanics, later = case.mechanics, [image for body in bodies for image in body.states.after]
     finite = [name for name in LAW_NAMES if law_named(name).finite and name != mechanics.law]
     others = [law_named(name) for name in (finite if mechanics.material_law.finite else (Mechanics().law,))]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -11,11 +12,13 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from palpate.inversion import Bounds, Inversion, LeastSquares, Minimum, OuterIterate
+from palpate.parallel import mapped
 from palpate.uncertainty import (
     NORMAL_95,
     Combination,
     FrozenPosterior,
     GridErrors,
+    JointRegion,
     agreement,
     joint_region,
     known_pairs,
@@ -159,15 +162,17 @@ def regions_of(
     pairs = sorted(combinations(stated, 2), key=lambda pair: float(correlated[pair]))
     found = []
     for pair in pairs[:MOST_REGIONS]:
-        regions = [
-            joint_region(of.frozen, of.minimum, pair, covariance=of.covariance[np.ix_(pair, pair)], bounds=bounds)
-            for of in posteriors
-        ]
+        regions = mapped(partial(_region, pair=pair, bounds=bounds), posteriors)
         edges = [_around([r.boundary for r in regions]), _around([r.ellipse for r in regions])]
         boundary, ellipse = (tuple((float(a), float(b)) for a, b in mapping.scale_kpa * np.exp(edge)) for edge in edges)
         names = mapping.tissues[pair[0]], mapping.tissues[pair[1]]
         found.append(ModulusRegion(names, boundary, ellipse, any(region.open for region in regions)))
     return tuple(found)
+
+
+def _region(of: StatedPosterior, *, pair: tuple[int, int], bounds: Bounds) -> JointRegion:
+    """That of two moduli by one posterior."""
+    return joint_region(of.frozen, of.minimum, pair, covariance=of.covariance[np.ix_(pair, pair)], bounds=bounds)
 
 
 def _around(edges: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:

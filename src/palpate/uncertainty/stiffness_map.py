@@ -10,7 +10,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.special import ndtr
 
-from palpate.inversion import FIELD, Acts, Block, Inversion
+from palpate.inversion import FIELD, Acts, Block, Inversion, TotalVariation
 from palpate.mechanics.material import field_modes
 from palpate.mesh.tet_mesh import FACES, TetMesh
 from palpate.uncertainty.covariance import covariance_among
@@ -27,9 +27,10 @@ class DifferentRegion:
     """The largest connected part of a tissue that is likely stiffer, or softer, than the tissue by `CONTRAST`.
 
     elements (n,): its tetrahedra; volume_ml; centre_mm (3,), RAS; contrast: geometric mean of E where that is certain,
-    in its core, over that outside of the whole region, with its 95 % interval, as if nothing had been believed of how
-    much it differs (what is believed draws the map to the tissue's mean); probability: the largest posterior
-    probability, of an element in it.
+    in its core (in all of it where the prior is a total variation, which keeps its border), over that outside of the
+    whole region, with its 95 % interval, as if nothing had been believed of how much it differs (what is believed draws
+    the map to the tissue's mean); probability: the largest posterior probability, of an element in it; whole: whether
+    the contrast is that of all of it.
     """
 
     elements: NDArray[np.int64]
@@ -38,6 +39,7 @@ class DifferentRegion:
     contrast: float
     interval95: Interval
     probability: float
+    whole: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,17 +67,19 @@ class StiffnessMap:
 class _Field:
     """Posterior of a field at its elements: F x, and its covariance F C F^T + R R^T - F P^-1 F^T + r.
 
-    seen (n, k): F, the modes that the data tell, with coefficients x (k,) of covariance C (k, k), P^-1 (k, k) before
-    them; every (n, m): R, all modes of the prior times its standard deviation; left (n,): r, the variance that none of
-    them holds.
+    seen (n, k): F, the modes that the data tell, with coefficients x (k,) of covariance C (k, k), of a mean (k,) and a
+    covariance P^-1 (k, k) before them; every (n, m): R, all modes of the prior times its standard deviation; left (n,):
+    r, the variance that none of them holds; variation: the prior of which N(mean, P^-1) is the second order, if one is.
     """
 
     coefficients: NDArray[np.float64]
+    centre: NDArray[np.float64]
     seen: NDArray[np.float64]
     posterior: NDArray[np.float64]
     prior: NDArray[np.float64]
     every: NDArray[np.float64]
     left: NDArray[np.float64]
+    variation: TotalVariation | None = None
 
     @property
     def mean(self) -> NDArray[np.float64]:
@@ -97,17 +101,39 @@ class _Field:
         """The posterior if nothing were believed beforehand of how much of a `shape` (n,) the field has.
 
         With h the shape's coefficients, by volumes (n,), and P h = p: the prior's precision is P - p p^T / h^T p then,
-        so that x gains C p (p^T x) / d and C gains C p p^T C / d, d = p^T (h - C p) (Sherman and Morrison 1950).
+        so that x gains C p p^T (x - m) / d, m its mean, and C gains C p p^T C / d, d = p^T (h - C p) (Sherman and
+        Morrison 1950).
         """
         weighted = volumes[:, None] * self.seen
-        precision = np.linalg.inv(self.prior)
+        precision = np.asarray(np.linalg.inv(self.prior), dtype=np.float64)
         gram = weighted.T @ self.seen
         h = np.linalg.solve(gram + SMOOTH * np.trace(gram) / np.trace(precision) * precision, weighted.T @ shape)
+        if self.variation:
+            return self._varied_along(h, precision, self.variation)
         p = precision @ h
         back = self.posterior @ p
         share = max(float(p @ (h - back)), np.finfo(float).tiny)
-        x = self.coefficients + back * float(p @ self.coefficients) / share
+        x = self.coefficients + back * float(p @ (self.coefficients - self.centre)) / share
         return replace(self, coefficients=x, posterior=self.posterior + np.outer(back, back) / share)
+
+    def _varied_along(
+        self, h: NDArray[np.float64], precision: NDArray[np.float64], variation: TotalVariation
+    ) -> _Field:
+        """The same where the prior is a variation, of the field less so much of the shape as leaves the least of it.
+
+        x = y + a h with a free and y under the prior, of data with the information A = C^-1 - P and the pull A x + P (x
+        - m): A' = A - A h h^T A / h^T A h is what they say of y, to second order about where it is likeliest.
+        """
+        sizes, axes = np.linalg.eigh(np.linalg.inv(self.posterior) - precision)
+        information = (axes * np.maximum(sizes, 0.0)) @ axes.T
+        pull = information @ self.coefficients + precision @ (self.coefficients - self.centre)
+        by_shape = information @ h
+        size = max(float(h @ by_shape), np.finfo(float).tiny)
+        others = information - np.outer(by_shape, by_shape) / size
+        y = variation.least(others, pull - by_shape * float(h @ pull) / size, self.coefficients)
+        along = np.eye(len(h)) - np.outer(h, by_shape) / size
+        posterior = along @ np.linalg.inv(others + variation.curvature(y)) @ along.T + np.outer(h, h) / size
+        return replace(self, coefficients=along @ y + h * float(h @ pull) / size, posterior=posterior)
 
     def variance_of(self, weights: NDArray[np.float64]) -> float:
         """Of the sum of the field times weights (n,)."""
@@ -140,12 +166,15 @@ def _map(inversion: Inversion, number: int, block: Block, variances: NDArray[np.
     learned = np.asarray(np.linalg.inv(parameters.nuisance_precision[np.ix_(own - n, own - n)]), dtype=np.float64)
     stated = mesh.tissues[tissue].field
     assert stated is not None
-    amplitude = float(np.sqrt(np.trace(learned) / np.trace(np.linalg.inv(block.precision))))
+    amplitude = 1.0 if block.variation else float(np.sqrt(np.trace(learned) / np.trace(np.linalg.inv(block.precision))))
     sd = amplitude * stated.sd
     modes, volumes = field_modes(mesh, tissue, length_mm=stated.length_mm), mesh.volumes[elements]
     left = sd**2 * np.maximum(1.0 - (modes**2).sum(axis=1), 0.0)
     every = sd * (modes - (volumes @ modes) / volumes.sum())
-    field = _Field(minimum.unknowns[own], seen, covariance[1:, 1:], learned, every, left)
+    if block.variation:  # all of its modes are unknowns
+        every = np.asarray(seen @ np.linalg.cholesky(learned))
+    centre = parameters.prior_centre[own]
+    field = _Field(minimum.unknowns[own], centre, seen, covariance[1:, 1:], learned, every, left, block.variation)
     whole = field.variance + variances[theta] + 2.0 * seen @ covariance[1:, 0]
     resolution = np.clip(1.0 - field.variance / field.prior_variance, 0.0, 1.0)
     return StiffnessMap(
@@ -181,7 +210,8 @@ def _different(
     probability: NDArray[np.float64],
 ) -> DifferentRegion:
     volumes, outside = mesh.volumes[elements], ~np.isin(np.arange(len(elements)), inside)
-    core = ~outside & (probability > CERTAIN)
+    # A normal law blurs the border: the core alone is all of the part. A variation draws it: the core would be chance.
+    core = ~outside & ((probability > CERTAIN) | (field.variation is not None))
     weights = core * volumes / volumes[core].sum() - outside * volumes / max(float(volumes[outside].sum()), 1e-300)
     free = field.free_along(core - np.average(core, weights=volumes), volumes)
     contrast, half = float(weights @ free.mean), NORMAL_95 * float(np.sqrt(free.variance_of(weights)))
@@ -193,6 +223,7 @@ def _different(
         float(np.exp(contrast)),
         (float(np.exp(contrast - half)), float(np.exp(contrast + half))),
         float(probability[inside].max()),
+        field.variation is not None,
     )
 
 
