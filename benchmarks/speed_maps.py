@@ -80,7 +80,7 @@ def beside_a_peer(edge_mm: float, n_modes: int, seed: int, say: Say) -> dict[str
     constraint = outer_constraint(task.space, outer="fixed", modes=none, offset=task.offset, prescribed=task.wall)
     model = linear_model(task.space, constraint, material=modes)
     tissues = task.space.mesh.tissues
-    field = material_blocks(modes, tissues, (0,), heterogeneity_sd=0.0, poisson_sd=0.0)
+    field = material_blocks(modes, task.space.mesh, (0,), heterogeneity_sd=0.0, poisson_sd=0.0)
     parameters = parameter_map(tissues, model.regions, [*unit_blocks(0), *field])
     problem = InverseProblem((LaterState(model, (task.seen,)),), parameters)
     bounds = Bounds(np.log([0.02]), np.log([200.0]))
