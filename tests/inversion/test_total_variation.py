@@ -117,19 +117,19 @@ def test_its_normal_law_at_the_least_is_the_posterior_to_a_quarter_of_its_width(
     pull = information @ (truth + 0.4 * rng.normal(size=len(own)))
     least = variation.least(information, pull, np.zeros(len(own)))
     curvature = information + variation.curvature(least)
-    root = np.linalg.cholesky(curvature)
-    drawn = np.array(sampled(lambda x: information @ x - pull + variation.gradient(x), least, root, rng))
+    whiten = np.linalg.inv(np.linalg.cholesky(curvature))
+    drawn = np.array(sampled(lambda x: information @ x - pull + variation.gradient(x), least, whiten, rng))
     ratio = np.sqrt(np.diag(np.linalg.inv(curvature))) / drawn.std(axis=0)
     assert 0.75 < np.median(ratio) < 1.02
 
 
-def sampled(slope, start, root, rng, draws=1200, leaps=8, step=0.3):
+def sampled(slope, start, whiten, rng, draws=1200, leaps=8, step=0.3):
     """Draws of the density with this slope of minus its logarithm, by Hamiltonian paths too short to need a refusal."""
     x, found = start, []
     for _ in range(draws):
-        push = rng.normal(size=len(x)) - 0.5 * step * np.linalg.solve(root, slope(x))
+        push = rng.normal(size=len(x)) - 0.5 * step * whiten @ slope(x)
         for _ in range(leaps):
-            x = x + step * np.linalg.solve(root.T, push)
-            push = push - step * np.linalg.solve(root, slope(x))
+            x = x + step * (whiten.T @ push)
+            push = push - step * (whiten @ slope(x))
         found.append(x)
     return found
