@@ -274,6 +274,17 @@ def known_modulus_blocks(
     )
 
 
+def of_series(x: NDArray[np.float64], shares: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How much stiffer, in ln (n,), regions are of which shares s (n,) are e^x times so: y = -ln(1 + s (e^-x - 1))."""
+    return np.asarray(-np.log1p(shares * np.expm1(-x)))
+
+
+def in_series(y: NDArray[np.float64], shares: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The x (n,) of y = `of_series`; infinite where no stiffness of the share makes the region so stiff."""
+    left = np.expm1(-y) / shares
+    return np.asarray(-np.log1p(np.maximum(left, -1.0), where=left > -1.0, out=np.full_like(left, -np.inf)))
+
+
 def joined(blocks: Sequence[Block]) -> NDArray[np.float64]:
     """Precision (n, n) of the unknowns of several blocks, one after the other."""
     total = sum(block.size for block in blocks)

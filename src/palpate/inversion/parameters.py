@@ -11,7 +11,7 @@ from scipy import linalg
 
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role, Tissue
-from palpate.inversion.blocks import KNOWN_MODULUS, Acts, Block, joined
+from palpate.inversion.blocks import KNOWN_MODULUS, Acts, Block, joined, of_series
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.stiffness import lame_parts, lame_parts_by_poisson
 
@@ -185,7 +185,7 @@ class ParameterMap:
         """
         logarithms = self.selection @ unknowns[: self.n_parameters]
         if len(unknowns) > self.n_parameters:
-            logarithms = logarithms - self._of_blocks @ np.log1p(self._shares * np.expm1(-self._on_moduli(unknowns)))
+            logarithms = logarithms + self._of_blocks @ of_series(self._on_moduli(unknowns), self.shares_on_moduli)
         moduli = np.asarray(self.base * np.exp(logarithms))
         for open_ in self.poisson:
             moduli[list(open_.regions)] *= open_.weights(unknowns)[0]
@@ -199,8 +199,8 @@ class ParameterMap:
         by_theta = self.selection.copy()
         for open_ in self.poisson:
             by_theta[list(open_.regions), open_.column] = open_.weights(unknowns)[1]
-        softer = self._shares * np.exp(-self._on_moduli(unknowns))
-        return np.concatenate([by_theta, self._of_blocks * (softer / (1.0 - self._shares + softer))], axis=1)
+        softer = self.shares_on_moduli * np.exp(-self._on_moduli(unknowns))
+        return np.concatenate([by_theta, self._of_blocks * (softer / (1.0 - self.shares_on_moduli + softer))], axis=1)
 
     @property
     def acting_on_moduli(self) -> NDArray[np.int64]:
@@ -214,7 +214,7 @@ class ParameterMap:
         return unknowns[own] if len(unknowns) > self.n_parameters else np.zeros(len(own))
 
     @property
-    def _shares(self) -> NDArray[np.float64]:
+    def shares_on_moduli(self) -> NDArray[np.float64]:
         """Of the regions of each unknown that acts on moduli, the share (n,) that it is of."""
         return np.array([block.share for block in self.blocks if block.acts is Acts.MODULI])
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from palpate.errors import EstimationError
+from palpate.inversion.blocks import in_series, of_series
 from palpate.inversion.objective import Evaluation, determined
 from palpate.inversion.optimise import Bounds
 from palpate.uncertainty.frozen_posterior import FrozenPosterior
@@ -54,9 +55,13 @@ def posterior_chains(
     is the last of ten steps: x' = c + sqrt(1 - b^2) (x - c) + b L xi with L L^T = H^-1, preconditioned Crank-Nicolson,
     which a posterior that is exactly normal always accepts (Cotter, Roberts, Stuart & White, Stat. Sci. 28 (2013)
     424-446). Raises `EstimationError` where a modulus moves nothing.
+
+    Steps are made in y of what acts on moduli in series with the rest of a region (see `of_series`), not in its x: the
+    log-moduli that go with it lie on a curve in x, and nearly on a line in y.
     """
-    n = frozen.objective.n_parameters
-    laplace = _laplace(start, evaluation)
+    n, straight = frozen.objective.n_parameters, _Straight.of(frozen)
+    laplace = _laplace(straight, start, evaluation)
+    start = laplace.centre
     with determined():
         own = np.linalg.cholesky(evaluation.covariance_columns(n)[:n])
         stretch = np.asarray(np.linalg.cholesky(covariance) @ np.linalg.inv(own), dtype=np.float64)
@@ -69,7 +74,7 @@ def posterior_chains(
         parts = []
         for done in range(0, warm + steps, BLOCK):
             several = min(BLOCK, warm + steps - done)
-            parts.append(_chain(frozen, laplace, now, bounds=bounds, steps=several, rng=generator, stretch=stretch))
+            parts.append(_chain(straight, laplace, now, bounds=bounds, steps=several, rng=generator, stretch=stretch))
             now = parts[-1].end
         kept = slice(warm + THIN - 1, None, THIN)
         theta = np.concatenate([part.theta for part in parts])[kept]
@@ -80,9 +85,46 @@ def posterior_chains(
     return PosteriorChains(np.stack(thetas), np.stack(densities), np.array(shares))
 
 
-def _laplace(start: NDArray[np.float64], evaluation: Evaluation) -> _Laplace:
+@dataclass(frozen=True, slots=True)
+class _Straight:
+    """A frozen posterior of the unknowns z, x but for y in place of those with numbers `columns` (n,)."""
+
+    frozen: FrozenPosterior
+    columns: NDArray[np.int64]
+    shares: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, frozen: FrozenPosterior) -> _Straight:
+        parameters = frozen.objective.parameters
+        return cls(frozen, parameters.acting_on_moduli, parameters.shares_on_moduli)
+
+    def slopes(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivatives dz / dx (n_unknowns,) at unknowns x (n_unknowns,)."""
+        found, softer = np.ones(len(unknowns)), self.shares * np.exp(-unknowns[self.columns])
+        found[self.columns] = softer / (1.0 - self.shares + softer)
+        return found
+
+    def straightened(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The z (n_unknowns,) of x (n_unknowns,)."""
+        found = unknowns.copy()
+        found[self.columns] = of_series(unknowns[self.columns], self.shares)
+        return found
+
+    def energy(self, straight: NDArray[np.float64]) -> tuple[float, float]:
+        """Minus the log-density at z (n_unknowns,), of z and of x; infinite where there is no x."""
+        unknowns = straight.copy()
+        unknowns[self.columns] = in_series(straight[self.columns], self.shares)
+        if not np.isfinite(unknowns).all():
+            return np.inf, np.inf
+        value = self.frozen.value(unknowns)
+        return value + float(np.log(self.slopes(unknowns)[self.columns]).sum()), value
+
+
+def _laplace(straight: _Straight, start: NDArray[np.float64], evaluation: Evaluation) -> _Laplace:
+    slopes = straight.slopes(start)
     try:
-        return _Laplace(start, linalg.cholesky(evaluation.matrix, lower=True))
+        factor = linalg.cholesky(evaluation.matrix / np.outer(slopes, slopes), lower=True)
+        return _Laplace(straight.straightened(start), factor)
     except linalg.LinAlgError as error:
         raise EstimationError(
             f"the Gauss-Newton matrix is not positive definite ({error}): some modulus moves nothing at this place, so"
@@ -122,7 +164,7 @@ class _Stretch:
 
 
 def _chain(
-    frozen: FrozenPosterior,
+    straight: _Straight,
     laplace: _Laplace,
     start: NDArray[np.float64],
     *,
@@ -131,19 +173,19 @@ def _chain(
     rng: np.random.Generator,
     stretch: NDArray[np.float64],
 ) -> _Stretch:
-    """So many steps from unknowns (n,); `stretch` (n_parameters, n_parameters): A of `posterior_chains`."""
-    n = frozen.objective.n_parameters
-    centre = laplace.centre[:n]
+    """So many steps from unknowns z (n,); `stretch` (n_parameters, n_parameters): A of `posterior_chains`."""
+    centre = laplace.centre[: len(stretch)]
+    n = len(centre)
     theta, energy, accepted = np.empty((steps, n)), np.empty(steps), 0
-    now, value = start, frozen.value(start)
-    level = value - laplace.energy(start)
+    now, (own, value) = start, straight.energy(start)
+    level = own - laplace.energy(start)
     draws, thresholds = laplace.draws(steps, rng), np.log(rng.random(steps))
     for k in range(steps):
         trial = laplace.centre + np.sqrt(1.0 - STEP**2) * (now - laplace.centre) + STEP * draws[k]
         stretched = centre + stretch @ (trial[:n] - centre)
         if np.all((stretched >= bounds.lower) & (stretched <= bounds.upper)):
-            there = frozen.value(trial)
-            above = there - laplace.energy(trial)
+            own, there = straight.energy(trial)
+            above = own - laplace.energy(trial)
             if thresholds[k] < level - above:
                 now, value, level, accepted = trial, there, above, accepted + 1
         theta[k], energy[k] = centre + stretch @ (now[:n] - centre), value
