@@ -16,11 +16,10 @@ from typing import TypeVar
 
 from multifrontal import blas_on_one_thread, processors
 
-__all__ = ["blas_on_one_thread", "both", "mapped", "processors"]
+__all__ = ["blas_on_one_thread", "mapped", "processors"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-Other = TypeVar("Other")
 
 
 def mapped(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
@@ -32,18 +31,6 @@ def mapped(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Re
         return [function(item) for item in items]
     with ThreadPoolExecutor(max_workers=processors()) as pool:
         return list(pool.map(function, items))
-
-
-def both(first: Callable[[], Result], second: Callable[[], Other]) -> tuple[Result, Other]:
-    """What two works that do not need each other give, side by side where there are processors for them.
-
-    The exception that the first raises is raised, else that of the second.
-    """
-    if processors() == 1:
-        return first(), second()
-    with ThreadPoolExecutor(max_workers=1) as pool:
-        beside = pool.submit(second)
-        return first(), beside.result()
 
 
 def environment_of_child() -> dict[str, str]:

@@ -26,7 +26,7 @@ from palpate.inversion import (
 )
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit, Imaged, OfInstrument, OfPoints, PointMotions, seen_by
-from palpate.parallel import both, mapped
+from palpate.parallel import mapped
 from palpate.progress import Progress, silent
 from palpate.study.discrepancy import (
     FittedMaterial,
@@ -59,7 +59,6 @@ from palpate.uncertainty import (
     Combination,
     Covariance,
     FittedState,
-    GridErrors,
     Information,
     Interval,
     ModulusInterval,
@@ -245,15 +244,9 @@ def conclude(
     objective, minimum = inversion.objective, inversion.minimum
     rng = np.random.default_rng(seed)
     progress(f"intervals: correlation of the residuals, and the model as {GRID_DRAWS} random voxel grids show it")
-
-    def with_layers_held() -> tuple[GridErrors, Covariance]:
-        """The errors that random grids make, and the covariance with them."""
-        errors = grid_errors(objective, minimum.evaluation, observed.states, rng=rng)
-        return errors, covariance_of(objective, minimum.evaluation, errors, unknowns=minimum.unknowns)
-
-    (errors, bonded), (released, remark) = both(
-        with_layers_held, lambda: released_of(inversion, settings, progress=progress)
-    )
+    errors = grid_errors(objective, minimum.evaluation, observed.states, rng=rng)
+    bonded = covariance_of(objective, minimum.evaluation, errors, unknowns=minimum.unknowns)
+    released, remark = released_of(inversion, settings, progress=progress)
     covariance, posteriors = stated_posteriors(inversion, bonded, released)
     progress("intervals: profiles, and the fit of every surface before and after")
     pairs = image_pairs_of(inversion, settings.bounds, errors, released)

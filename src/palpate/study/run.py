@@ -14,7 +14,7 @@ from palpate.images.tissue import Role
 from palpate.inversion import Bounds, Inversion, InversionSettings, ParameterMap, eta_of_ratio
 from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.laws.registry import law_named
-from palpate.parallel import blas_on_one_thread, both
+from palpate.parallel import blas_on_one_thread
 from palpate.progress import Forecast, Progress, about, during, silent
 from palpate.study.body import Body, ImagedStates, joint_problem, make_body
 from palpate.study.case import LAW_NAMES, SOUGHT_RATIOS, Case, Mechanics
@@ -103,14 +103,12 @@ def estimate_states(
     images = tuple(image.index if image else None for pair in bodies for image in pair.states.later)
     observed = Observed(fitted_states(inversion, *bodies), images)
     stating = during("intervals", progress)
-    stating("what would change the answer: surfaces, constants, frame and law by a step each")
     samples = case.estimate.samples
-    estimation, variations = both(
-        lambda: conclude(
-            inversion, settings, observed, truth=truth or {}, seed=case.seed, samples=samples, progress=stating
-        ),
-        lambda: _what_would_change(inversion, settings, case, bodies),
+    estimation = conclude(
+        inversion, settings, observed, truth=truth or {}, seed=case.seed, samples=samples, progress=stating
     )
+    stating("what would change the answer: surfaces, constants, frame and law by a step each")
+    variations = _what_would_change(inversion, settings, case, bodies)
     estimation = replace(estimation, variations=variations)
     clock.append(time.perf_counter())
     stages = np.diff(clock)
