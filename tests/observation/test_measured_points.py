@@ -197,23 +197,33 @@ def test_a_field_is_read_from_what_itk_writes(tmp_path, space, ending):
     assert np.abs(term.residuals(motion).values).max() < 1e-3
 
 
-def test_means_are_of_more_points_the_further_an_organ_is(tmp_path):
-    """Every point counts once; near the organ no mean is wider than its elements, far away none than the way there."""
-    mesh = box_mesh(8, size=160.0)
-    inside = np.linalg.norm(mesh.nodes[mesh.tets].mean(axis=1) - 80.0, axis=1) < 25.0
+def round_an_organ(folder, scale):
+    """A field on a lattice, which has nodes of an organ in the middle of a box, and its term; all lengths scaled."""
+    mesh = box_mesh(8, size=160.0 * scale)
+    inside = np.linalg.norm(mesh.nodes[mesh.tets].mean(axis=1) / scale - 80.0, axis=1) < 25.0
     tissues = tuple(replace(mesh.tissues[0], name=role.value, role=role) for role in (Role.KNOWN, Role.ESTIMATE))
-    mesh = replace(mesh, tissues=tissues, region=inside.astype(mesh.region.dtype))
-    space = lagrange_space(mesh, "P1")
-    points = np.stack(np.meshgrid(*[np.arange(4.0, 160.0, 4.0)] * 3), axis=-1).reshape(-1, 3)  # on nodes, too
-    source = read(csv_of(tmp_path / "f.csv", points, moved(points)), kind="displacement-field", correlation_mm=2.0)
-    term, _ = source.on(space, no_force)
+    space = lagrange_space(replace(mesh, tissues=tissues, region=inside.astype(mesh.region.dtype)), "P1")
+    points = scale * np.stack(np.meshgrid(*[np.arange(4.0, 160.0, 4.0)] * 3), axis=-1).reshape(-1, 3)
+    table = csv_of(folder / f"{scale}.csv", points, moved(points))
+    source = read(table, kind="displacement-field", correlation_mm=2.0 * scale)
+    return source.on(space, no_force)[0], space, cKDTree(space.mesh.nodes[np.unique(space.mesh.tets[inside])])
+
+
+def test_means_are_of_more_points_the_further_an_organ_is(tmp_path):
+    """Near the organ they are as narrow as its elements, far away wider, but not as wide as the way there."""
+    term, space, organ = round_an_organ(tmp_path, 1.0)
     assert np.abs(term.residuals(seen_by(term, (moved(space.points) - space.points).ravel())).values).max() < 1e-6
-    away = cKDTree(mesh.nodes[np.unique(mesh.tets[inside])]).query(term.material[::3])[0]
-    apart = cKDTree(term.material[::3]).query(term.material[::3], k=2)[0][:, 1]
-    size = 0.6 * mesh.usual_edge_mm
+    means = term.material[::3]
+    away, apart = organ.query(means)[0], cKDTree(means).query(means, k=2)[0][:, 1]
+    size = 0.6 * space.mesh.usual_edge_mm
     near, far = apart[away < 0.5 * size], apart[away > 4.0 * size]
     assert np.median(near) < size
     assert 1.5 * np.median(near) < np.median(far) < 4.0 * size
+
+
+def test_means_of_a_body_a_fiftieth_as_large_are_the_same(tmp_path):
+    (large, *_), (small, *_) = (round_an_organ(tmp_path, scale) for scale in (1.0, 0.02))
+    assert small.material / 0.02 == pytest.approx(large.material, abs=1e-5)
 
 
 def itk_field(low, high, spacing, slope, shift):

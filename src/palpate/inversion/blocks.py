@@ -274,13 +274,19 @@ def known_modulus_blocks(
     )
 
 
-def of_series(x: NDArray[np.float64], shares: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How much stiffer, in ln (n,), regions are of which shares s (n,) are e^x times so: y = -ln(1 + s (e^-x - 1))."""
+def in_series(x: NDArray[np.float64], shares: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Change y of ln E (n,) of regions of which shares s (n,) are e^x times as stiff: y = -ln(1 + s (e^-x - 1))."""
     return np.asarray(-np.log1p(shares * np.expm1(-x)))
 
 
-def in_series(y: NDArray[np.float64], shares: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The x (n,) of y = `of_series`; infinite where no stiffness of the share makes the region so stiff."""
+def in_series_slopes(x: NDArray[np.float64], shares: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Derivatives dy / dx = s e^-x / (1 - s + s e^-x), (n,), of `in_series`."""
+    softer = shares * np.exp(-x)
+    return np.asarray(softer / (1.0 - shares + softer))
+
+
+def of_series(y: NDArray[np.float64], shares: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The x (n,) of which y (n,) is `in_series`; infinite where no stiffness of the share makes a region so stiff."""
     left = np.expm1(-y) / shares
     return np.asarray(-np.log1p(np.maximum(left, -1.0), where=left > -1.0, out=np.full_like(left, -np.inf)))
 

@@ -11,7 +11,7 @@ from scipy import linalg
 
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role, Tissue
-from palpate.inversion.blocks import KNOWN_MODULUS, Acts, Block, joined, of_series
+from palpate.inversion.blocks import KNOWN_MODULUS, Acts, Block, in_series, in_series_slopes, joined
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.stiffness import lame_parts, lame_parts_by_poisson
 
@@ -185,7 +185,7 @@ class ParameterMap:
         """
         logarithms = self.selection @ unknowns[: self.n_parameters]
         if len(unknowns) > self.n_parameters:
-            logarithms = logarithms + self._of_blocks @ of_series(self._on_moduli(unknowns), self.shares_on_moduli)
+            logarithms = logarithms + self._of_blocks @ in_series(self._on_moduli(unknowns), self.shares_on_moduli)
         moduli = np.asarray(self.base * np.exp(logarithms))
         for open_ in self.poisson:
             moduli[list(open_.regions)] *= open_.weights(unknowns)[0]
@@ -199,8 +199,8 @@ class ParameterMap:
         by_theta = self.selection.copy()
         for open_ in self.poisson:
             by_theta[list(open_.regions), open_.column] = open_.weights(unknowns)[1]
-        softer = self.shares_on_moduli * np.exp(-self._on_moduli(unknowns))
-        return np.concatenate([by_theta, self._of_blocks * (softer / (1.0 - self.shares_on_moduli + softer))], axis=1)
+        slopes = in_series_slopes(self._on_moduli(unknowns), self.shares_on_moduli)
+        return np.concatenate([by_theta, self._of_blocks * slopes], axis=1)
 
     @property
     def acting_on_moduli(self) -> NDArray[np.int64]:

@@ -25,7 +25,7 @@ from palpate.mechanics.loads import Load
 from palpate.mechanics.material import HOMOGENEOUS, MaterialForces, MaterialModes, material_forces
 from palpate.mechanics.newton import NewtonPath, NewtonSettings, follow
 from palpate.mechanics.pattern import BlockPattern, Restriction, Stiffness, block_pattern, restriction
-from palpate.mechanics.solvers.contract import Factorisation
+from palpate.mechanics.solvers.contract import AT_ONCE, Factorisation
 from palpate.mechanics.stiffness import lame_parts, lame_parts_by_poisson
 from palpate.mesh.constraint import Constraint
 from palpate.mesh.space import LagrangeSpace
@@ -35,7 +35,6 @@ Array = NDArray[np.float64]
 FACTORISATION_IN_SOLVES = 30  # right-hand sides that cost as much as a factorisation
 NEARLY_INCOMPRESSIBLE = 0.4999  # no coefficient leads Poisson's ratio beyond
 LACKING = 1e-2  # relative residual of a correction to derivatives of a like state
-AT_ONCE = 64  # right-hand sides: what a solution takes beside its answer is a multiple of that
 REFINEMENTS = 12  # solutions with an old factorisation that an exact one takes
 
 

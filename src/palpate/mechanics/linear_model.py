@@ -22,7 +22,7 @@ from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.loads import Load
 from palpate.mechanics.material import HOMOGENEOUS, MaterialForces, MaterialModes, material_forces
 from palpate.mechanics.rigid import linear_displacements, rigid_modes
-from palpate.mechanics.solvers.contract import EXACT, Factorisation
+from palpate.mechanics.solvers.contract import AT_ONCE, EXACT, Factorisation
 from palpate.mechanics.solvers.registry import factorise
 from palpate.mechanics.stiffness import (
     lame_parts,
@@ -37,7 +37,6 @@ from palpate.parallel import mapped
 
 LINEAR = Linear()
 OF_ERROR = 1e-4  # relative residual of the solution that an error is made of
-AT_ONCE = 64  # right-hand sides: what a solution takes beside its answer is a multiple of that
 FURTHER = 10  # right-hand sides a modulus, beside one for each mode: sensitivities, series
 
 

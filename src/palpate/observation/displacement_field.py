@@ -27,7 +27,7 @@ from palpate.observation.point_displacement import PointDisplacement, point_disp
 FEWEST = 4  # points that tell a motion which is not the same everywhere
 MOST_VECTORS = 2**26  # 1.6 GB as they are read
 ROUNDING = 1e-6  # of a voxel
-COARSER = 2  # times
+COARSER = 2  # times the edge of a cell is doubled, at the most
 OF_LENGTH, OF_EDGE = 0.5, 0.6  # edge of a cell, over the correlation length and over an edge of the mesh
 
 
@@ -54,8 +54,7 @@ class DisplacementField(MeasuredPoints):
             )
         points, moved = self.table.before[inside], self.table.moved[inside]
         size = max(OF_LENGTH * self.file.correlation_mm, OF_EDGE * space.mesh.usual_edge_mm)
-        doublings = np.floor(np.log2(np.maximum(_away(space.mesh, points) / size, 1.0)))
-        sizes = size * 2.0 ** np.minimum(doublings, COARSER)
+        level = np.minimum(np.floor(np.log2(np.maximum(_away(space.mesh, points) / size, 1.0))), COARSER)[:, None]
         term = point_displacement(
             space,
             points,
@@ -63,7 +62,7 @@ class DisplacementField(MeasuredPoints):
             places.of(inside),
             file=self.file,
             description="the difference between the model's displacement and a measured field",
-            cells=np.floor(np.column_stack([(points - points.min(axis=0)) / sizes[:, None], sizes])).astype(np.int64),
+            cells=np.floor(np.hstack([(points - points.min(axis=0)) / (size * 2.0**level), level])).astype(np.int64),
         )
         return term, ()
 

@@ -20,7 +20,7 @@ from palpate.uncertainty.intervals import NORMAL_95
 
 REMAINING = "remaining"
 AUTO = "auto"
-FIELD_PRIORS = ("gaussian", "total-variation")
+GAUSSIAN, TOTAL_VARIATION = FIELD_PRIORS = ("gaussian", "total-variation")
 TISSUE_ROLES = tuple(str(role) for role in Role if role is not Role.SLIDING)
 HELD = ("fixed", "sliding")  # outer boundaries that leave a body no rigid motion
 SURFACE_ROLES = {  # of what lies behind a surface of a mesh
@@ -201,7 +201,7 @@ class CaseTissue:
     modulus: str = field(default="one", metadata=rule(choices=("one", "field")))
     field_sd: float = field(default=0.7, metadata=rule(between=(0.01, 3.0)))
     field_length_mm: float = field(default=8.0, metadata=rule(between=(1.0, 1e3)))
-    field_prior: str = field(default="gaussian", metadata=rule(choices=FIELD_PRIORS))
+    field_prior: str = field(default=GAUSSIAN, metadata=rule(choices=FIELD_PRIORS))
     field_modes: int = field(default=400, metadata=rule(between=(1, 2000)))
 
     def __post_init__(self) -> None:
@@ -235,7 +235,7 @@ class CaseTissue:
         """The tissue with its labels; raises `ConfigurationError` when its constants are impossible."""
         ratio = POISSON_RATIO if self.poisson_ratio is None else self.poisson_ratio
         believed = FieldPrior(
-            self.field_sd, self.field_length_mm, self.field_prior == FIELD_PRIORS[1], self.field_modes
+            self.field_sd, self.field_length_mm, self.field_prior == TOTAL_VARIATION, self.field_modes
         )
         mapped = believed if self.modulus == "field" else None
         return Tissue(self.name, self.role, labels, ratio, self.modulus_kpa, modulus_sd=self.modulus_sd, field=mapped)

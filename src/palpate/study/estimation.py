@@ -398,12 +398,14 @@ def intervals_of(
         return ()
     first, n, bounds = posteriors[0], inversion.objective.n_parameters, settings.bounds
     found, variances, at_bound = [], np.diag(first.covariance), bounds.reached(inversion.minimum.unknowns[:n])
-    every = mapped(
-        lambda of: modulus_interval(
-            of[1].frozen, of[1].minimum, of[0], variance=float(of[1].covariance[of[0], of[0]]), bounds=bounds
-        ),
-        product(range(n), posteriors),
-    )
+
+    def interval(of: tuple[int, StatedPosterior]) -> ModulusInterval:
+        """That of one parameter by one posterior."""
+        number, by = of
+        variance = float(by.covariance[number, number])
+        return modulus_interval(by.frozen, by.minimum, number, variance=variance, bounds=bounds)
+
+    every = mapped(interval, product(range(n), posteriors))
     best = inversion.candidates[inversion.best]
     minima = [c for c in inversion.candidates if c is not best and c.minimum.converged]
     scales = np.diag(inversion.minimum.evaluation.covariance_columns(n)[:n]) / variances  # of a profile's deviance
@@ -413,8 +415,8 @@ def intervals_of(
         sd = float(np.sqrt(variances[i]))
         good = [c.minimum.unknowns for c in minima if as_good(c.value, best.value, scale=float(scales[i]))]
         ellipses = (log_interval(float(np.exp(x[i])), sd, **limits) for x in good)
-        interval = hull([own.ends, *ellipses, *(of.ends for of in wider)])
-        found.append(Known(own, interval, bool(at_bound[i])))
+        whole = hull([own.ends, *ellipses, *(of.ends for of in wider)])
+        found.append(Known(own, whole, bool(at_bound[i])))
     return tuple(found)
 
 

@@ -103,13 +103,18 @@ def estimate_states(
     images = tuple(image.index if image else None for pair in bodies for image in pair.states.later)
     observed = Observed(fitted_states(inversion, *bodies), images)
     stating = during("intervals", progress)
-    samples = case.estimate.samples
     estimation = conclude(
-        inversion, settings, observed, truth=truth or {}, seed=case.seed, samples=samples, progress=stating
+        inversion,
+        settings,
+        observed,
+        truth=truth or {},
+        seed=case.seed,
+        samples=case.estimate.samples,
+        progress=stating,
     )
-    stating("what would change the answer: surfaces, constants, frame and law by a step each")
-    variations = _what_would_change(inversion, settings, case, bodies)
-    estimation = replace(estimation, variations=variations)
+    if inversion.minimum.converged:
+        stating("what would change the answer: surfaces, constants, frame and law by a step each")
+        estimation = replace(estimation, variations=_what_would_change(inversion, settings, case, bodies))
     clock.append(time.perf_counter())
     stages = np.diff(clock)
     seconds = {"read": read_seconds, "mesh": stages[0], "assemble": stages[1], "estimate": stages[2]}
@@ -147,13 +152,11 @@ def mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
 def _what_would_change(
     inversion: Inversion, settings: InversionSettings, case: Case, bodies: tuple[Body, ...]
 ) -> tuple[Variation, ...]:
-    """What the estimate of a case rests on; nothing where there is none, or it cannot be followed itself.
+    """What the estimate of a case rests on; nothing where not even the estimate itself can be followed.
 
     A law at finite strain is held against the others of its kind, the linear one against the default: from a finite
     strain no step leads to the linear law, nor to any where it would also find another reference state.
     """
-    if not inversion.minimum.converged:
-        return ()
     mechanics, later = case.mechanics, [image for body in bodies for image in body.states.after]
     finite = [name for name in LAW_NAMES if law_named(name).finite and name != mechanics.law]
     others = [law_named(name) for name in (finite if mechanics.material_law.finite else (Mechanics().law,))]

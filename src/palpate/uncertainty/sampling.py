@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from palpate.errors import EstimationError
-from palpate.inversion.blocks import in_series, of_series
+from palpate.inversion.blocks import in_series, in_series_slopes, of_series
 from palpate.inversion.objective import Evaluation, determined
 from palpate.inversion.optimise import Bounds
 from palpate.uncertainty.frozen_posterior import FrozenPosterior
@@ -56,7 +56,7 @@ def posterior_chains(
     which a posterior that is exactly normal always accepts (Cotter, Roberts, Stuart & White, Stat. Sci. 28 (2013)
     424-446). Raises `EstimationError` where a modulus moves nothing.
 
-    Steps are made in y of what acts on moduli in series with the rest of a region (see `of_series`), not in its x: the
+    Steps are made in y of what acts on moduli in series with the rest of a region (see `in_series`), not in its x: the
     log-moduli that go with it lie on a curve in x, and nearly on a line in y.
     """
     n, straight = frozen.objective.n_parameters, _Straight.of(frozen)
@@ -100,20 +100,20 @@ class _Straight:
 
     def slopes(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Derivatives dz / dx (n_unknowns,) at unknowns x (n_unknowns,)."""
-        found, softer = np.ones(len(unknowns)), self.shares * np.exp(-unknowns[self.columns])
-        found[self.columns] = softer / (1.0 - self.shares + softer)
+        found = np.ones(len(unknowns))
+        found[self.columns] = in_series_slopes(unknowns[self.columns], self.shares)
         return found
 
     def straightened(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """The z (n_unknowns,) of x (n_unknowns,)."""
         found = unknowns.copy()
-        found[self.columns] = of_series(unknowns[self.columns], self.shares)
+        found[self.columns] = in_series(unknowns[self.columns], self.shares)
         return found
 
     def energy(self, straight: NDArray[np.float64]) -> tuple[float, float]:
         """Minus the log-density at z (n_unknowns,), of z and of x; infinite where there is no x."""
         unknowns = straight.copy()
-        unknowns[self.columns] = in_series(straight[self.columns], self.shares)
+        unknowns[self.columns] = of_series(straight[self.columns], self.shares)
         if not np.isfinite(unknowns).all():
             return np.inf, np.inf
         value = self.frozen.value(unknowns)

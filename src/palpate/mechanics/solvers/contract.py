@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+AT_ONCE = 64  # right-hand sides of many: what a solution takes beside its answer is a multiple of that
 EXACT = 1e-10  # relative residual of a solution of which nothing else is asked
 
 
