@@ -6,7 +6,6 @@ the prior. The wall's motion is known, a displacement field is measured on a lat
 
 from __future__ import annotations
 
-import importlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -16,6 +15,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, sparse
+from speed_peers import torch_fem_modules
 
 from palpate.images import FieldPrior, Role, Tissue
 from palpate.inversion import (
@@ -161,12 +161,9 @@ def _torch_fem(task: _Task, fields: Array, free: NDArray[np.int32]) -> dict[str,
     fields (n, n_modes): of the elements, times the prior's standard deviation the modes of independent unknowns of
     variance 1; free (n_free,): numbers of the displacement's free unknowns.
     """
-    try:
-        torch, solid = importlib.import_module("torch"), importlib.import_module("torchfem.solid")
-        elastic = importlib.import_module("torchfem.materials.elasticity")
-    except ImportError:
+    if (modules := torch_fem_modules()) is None:
         return None
-    torch.set_default_dtype(torch.float64)
+    torch, solid, elastic = modules
     torch.sparse.check_sparse_tensor_invariants.disable()
     space, seen, mesh = task.space, task.seen, task.space.mesh
     prior = mesh.tissues[_number(space, ORGAN)].field

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,14 +84,22 @@ def reduced(objective: Objective, frozen: FrozenMisfit, unknowns: Array) -> Grad
     return gradient
 
 
-def torch_fem(problem: InverseProblem, frozen: FrozenMisfit, unknowns: Array) -> Gradient | None:
-    """Backward through torch-fem's solve: P2 tetrahedra, the moduli by tissue, the wall's modes as displacements."""
+def torch_fem_modules() -> tuple[Any, Any, Any] | None:
+    """Torch in double precision, torch-fem's solid and its elasticity; None where they are not installed."""
     try:
         torch, solid = importlib.import_module("torch"), importlib.import_module("torchfem.solid")
         elastic = importlib.import_module("torchfem.materials.elasticity")
     except ImportError:
         return None
     torch.set_default_dtype(torch.float64)
+    return torch, solid, elastic
+
+
+def torch_fem(problem: InverseProblem, frozen: FrozenMisfit, unknowns: Array) -> Gradient | None:
+    """Backward through torch-fem's solve: P2 tetrahedra, the moduli by tissue, the wall's modes as displacements."""
+    if (modules := torch_fem_modules()) is None:
+        return None
+    torch, solid, elastic = modules
     model, mapping = problem.states[0].model, problem.parameters
     space, constraint = model.space, model.constraint
     n_dof, n = 3 * len(space.points), mapping.n_parameters
