@@ -14,7 +14,6 @@ import numpy as np
 
 from palpate.errors import PalpateError
 from palpate.images.label_image import VoxelGrid
-from palpate.images.readers.isolation import GREETING
 from palpate.images.readers.registry import format_of
 from palpate.images.readers.values import REDUCED
 
@@ -38,8 +37,6 @@ def main(arguments: list[str]) -> None:
         nowhere = os.open(os.devnull, os.O_WRONLY)  # where goes what a C library prints on standard output
         os.dup2(nowhere, 1)
         os.close(nowhere)
-        pipe.write(GREETING)
-        pipe.flush()
         _limit(memory_bytes, cpu_seconds, wall_seconds)
         try:
             grid = None

@@ -7,9 +7,7 @@ size, type, place and packing is taken from the header; names and comments in it
 from __future__ import annotations
 
 import re
-import zlib
 from collections.abc import Mapping
-from contextlib import ExitStack
 from pathlib import Path
 from typing import BinaryIO
 
@@ -17,12 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
-from palpate.images.input_file import open_input
 from palpate.images.label_image import LPS_TO_RAS
 from palpate.images.named_labels import printable
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
-from palpate.images.readers.text_header import beside, counts, header_line, numbers
-from palpate.images.readers.voxel_stream import MAX_OFFSET, VoxelBlock, bytes_to_skip, damaged, read_block
+from palpate.images.readers.text_header import counts, header_line, numbers, voxels_of
+from palpate.images.readers.voxel_stream import MAX_OFFSET, VoxelBlock, bytes_to_skip, opened, read_block
 
 SYNONYMS = {
     "rotation": "transformmatrix",
@@ -50,19 +47,11 @@ LAST = "elementdatafile"
 
 def read_metaimage(path: Path) -> StoredImage:
     """Read one image of three axes from `path`; raises `InputDataError` with a sentence for whatever is wrong."""
-    try:
-        with ExitStack() as stack:
-            file = stack.enter_context(open_input(path))
-            files = [file]
-            header = _header(file, path)
-            block, affine = _block(header, path), _affine(header, path)
-            if header[LAST].upper() != "LOCAL":
-                file = stack.enter_context(open_input(beside(path, header[LAST])))
-                files.append(file)
-            values = read_block(file, block, path)
-            digests = {part: each.sha256() for part, each in zip(("", "voxels"), files, strict=False)}
-    except (OSError, EOFError, zlib.error) as error:
-        raise damaged(path, error) from error
+    with opened(path) as file:
+        header = _header(file, path)
+        block, affine = _block(header, path), _affine(header, path)
+        name = None if header[LAST].upper() == "LOCAL" else header[LAST]
+        values, digests = voxels_of(file, path, name, lambda rest: read_block(rest, block, path))
     return StoredImage(values.reshape(block.shape[:3], order="F"), affine, digests=digests)
 
 

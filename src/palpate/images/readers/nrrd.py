@@ -7,23 +7,21 @@ header, and of a segmentation the names, colours, values and layers of its segme
 from __future__ import annotations
 
 import re
-import zlib
 from collections.abc import Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
-from palpate.images.input_file import open_input
+from palpate.images.input_file import InputFile
 from palpate.images.named_labels import printable
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
 from palpate.images.readers.segments import flattened, segments_of
-from palpate.images.readers.text_header import beside, counts, header_line, numbers
-from palpate.images.readers.voxel_stream import MAX_OFFSET, VoxelBlock, bytes_to_skip, damaged, read_block
+from palpate.images.readers.text_header import counts, header_line, numbers, voxels_of
+from palpate.images.readers.voxel_stream import MAX_OFFSET, VoxelBlock, bytes_to_skip, opened, read_block
 
 SYNONYMS = {"datafile": "data file", "lineskip": "line skip", "byteskip": "byte skip"}
 RAS_SIGNS = {  # of the three world axes
@@ -88,25 +86,20 @@ def read_nrrd(path: Path) -> StoredImage:
 
     Layers that do not overlap become one label image. Raises `InputDataError` with a sentence for whatever is wrong.
     """
-    try:
-        with ExitStack() as stack:
-            file = stack.enter_context(open_input(path))
-            files = [file]
-            header = _header(file, path)
-            block, place = _block(header), _place(header)
-            name = header.fields.get("data file")
-            if name is not None:
-                file = stack.enter_context(open_input(beside(path, name)))
-                files.append(file)
-            text = header.fields.get("line skip", "0")
-            if not (text.isascii() and text.isdigit() and len(text) <= 4):
-                raise header.refused("line skip", "it must lie between 0 and 9999; export the image again")
+    with opened(path) as file:
+        header = _header(file, path)
+        block, place = _block(header), _place(header)
+        text = header.fields.get("line skip", "0")
+        if not (text.isascii() and text.isdigit() and len(text) <= 4):
+            raise header.refused("line skip", "it must lie between 0 and 9999; export the image again")
+
+        def voxels(rest: InputFile) -> NDArray[Any]:
+            """Those behind the lines that are to be skipped."""
             for _ in range(int(text)):
-                header_line(file, header.path)
-            values = read_block(file, block, path)
-            digests = {part: each.sha256() for part, each in zip(("", "voxels"), files, strict=False)}
-    except (OSError, EOFError, zlib.error) as error:
-        raise damaged(path, error) from error
+                header_line(rest, path)
+            return read_block(rest, block, path)
+
+        values, digests = voxels_of(file, path, header.fields.get("data file"), voxels)
     segments = segments_of(header.keys, path)
     lists = [k for k in place.list_axes if values.shape[k] > 1]
     if len(lists) > 1 or (lists and not segments):

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
+from palpate.images.input_file import InputFile, open_input
 from palpate.images.named_labels import hex_colour, printable
 
 # Not what float() takes besides: nan, inf, 1_0, digits of other scripts.
@@ -69,6 +70,16 @@ def counts(text: str, path: Path, *, field: str) -> tuple[int, ...]:
     if math.prod(sizes) == 0:
         raise InputDataError(f"the header of '{path}' has a size of zero in '{field}'; export the image again")
     return sizes
+
+
+def voxels_of(
+    file: InputFile, path: Path, name: str | None, read: Callable[[InputFile], NDArray[Any]]
+) -> tuple[NDArray[Any], dict[str, str]]:
+    """What `read` makes of the rest of the file at `path`, or of the file `name` beside it; the digests of both."""
+    if name is None:
+        return read(file), {"": file.sha256()}
+    with open_input(beside(path, name)) as other:
+        return read(other), {"": file.sha256(), "voxels": other.sha256()}
 
 
 def beside(path: Path, name: str) -> Path:
