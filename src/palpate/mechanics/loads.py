@@ -8,7 +8,7 @@ held (Bonet & Wood, Nonlinear Continuum Mechanics, 2nd ed. 2008, sections 8.5.2 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,12 +45,9 @@ class Load(Protocol):
 class DeadLoad:
     """Nodal forces (n_dof,) mN that stay what they are."""
 
-    nodal: Array
+    follows: ClassVar[bool] = False
 
-    @property
-    def follows(self) -> bool:
-        """Dead: no."""
-        return False
+    nodal: Array
 
     def forces(self, displacement: Array) -> Array:
         """Nodal forces (n_dof,) mN, the same at every u (n_points, 3)."""
@@ -66,14 +63,11 @@ class DeadLoad:
 class FollowingPressure:
     """A pressure (kPa) on faces (n_faces, 3 or 6) of `space`, normals out of the body; it pushes along -n."""
 
+    follows: ClassVar[bool] = True  # it turns and grows with its surface
+
     space: LagrangeSpace
     faces: NDArray[np.int64]
     kilopascal: float
-
-    @property
-    def follows(self) -> bool:
-        """It turns and grows with its surface."""
-        return True
 
     def forces(self, displacement: Array) -> Array:
         """Nodal forces (n_dof,) mN at u (n_points, 3) mm."""
