@@ -65,7 +65,7 @@ def methods_text(data: ReportData) -> Methods:
     )
     own = SOURCES["palpate"]
     version = {"version": str(data.document["versions"].get("palpate", ""))}
-    sources = SOURCES | {"palpate": replace(own, fields={**version, **own.fields})}
+    sources = SOURCES | {"palpate": replace(own, fields={**own.fields, **version})}
     return Methods(
         paragraphs,
         tuple(reference_line(sources[key]) for key in cite.cited),
