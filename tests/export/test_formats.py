@@ -25,7 +25,7 @@ from dicom_files import PLANTED, TILTED, ct_slices, save_series
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.export import abaqus, febio
 from palpate.export.fitted_model import fitted_model
-from palpate.export.formats import Options, format_named
+from palpate.export.formats import format_named
 from palpate.export.groups import OFF, element_faces, face_groups, plain_names
 from palpate.images.alignment import RigidMotion
 from palpate.images.label_image import VoxelGrid
@@ -562,7 +562,7 @@ def test_elements_of_a_tissue_that_is_not_homogeneous_have_their_own_moduli_in_e
     wanted = 58.9 * np.exp(logs[own])
     np.testing.assert_allclose(body.element_moduli(model.moduli)[own], wanted)
     for name in ("abaqus", "febio", "gmsh", "sofa"):
-        format_named(name).write(model, body, tmp_path, Options(linear=False))
+        format_named(name).write(model, body, tmp_path)
 
     parts = parts_of(tmp_path / "palpate.inp")
     assert sorted(np.concatenate([cells for cells, _ in parts]).tolist()) == list(range(len(mesh.region)))

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from palpate.export.case_files import file_name
 from palpate.export.fitted_model import FittedBody, FittedModel
-from palpate.export.formats import Options
 from palpate.export.groups import rows
 from palpate.images.tissue import Role
 from palpate.mesh.surface import tissue_surface, triangle_normals
@@ -71,9 +70,9 @@ def closed_surfaces(body: FittedBody) -> Iterator[ClosedSurface]:
             yield ClosedSurface(stem, tissue.name, state, own, closed)
 
 
-def write_obj(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
+def write_obj(model: FittedModel, body: FittedBody, folder: Path) -> None:
     """Write NN_tissue_before.obj and NN_tissue_after.obj, Wavefront's text; the tissue's name is its object's."""
-    del model, options
+    del model
 
     def content(surface: ClosedSurface) -> bytes:
         """Points, then triangles that count them from 1."""
@@ -84,9 +83,9 @@ def write_obj(model: FittedModel, body: FittedBody, folder: Path, options: Optio
     _write_surfaces(body, folder, "obj", content)
 
 
-def write_ply(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
+def write_ply(model: FittedModel, body: FittedBody, folder: Path) -> None:
     """Write NN_tissue_before.ply and NN_tissue_after.ply, binary little-endian, double precision."""
-    del model, options
+    del model
 
     def content(surface: ClosedSurface) -> bytes:
         """A heading that describes the rows of numbers after it."""
@@ -102,9 +101,9 @@ def write_ply(model: FittedModel, body: FittedBody, folder: Path, options: Optio
     _write_surfaces(body, folder, "ply", content)
 
 
-def write_stl(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
+def write_stl(model: FittedModel, body: FittedBody, folder: Path) -> None:
     """Write NN_tissue_before.stl and NN_tissue_after.stl, binary."""
-    del model, options
+    del model
 
     def content(surface: ClosedSurface) -> bytes:
         """80 bytes of heading, the number of facets, and each with its normal."""

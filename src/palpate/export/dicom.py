@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from palpate.errors import InputDataError, ResourceError
 from palpate.export.fitted_model import FittedBody, FittedModel
-from palpate.export.formats import Options
 from palpate.images.input_file import read_input
 from palpate.images.segmentation import first_labels
 from palpate.images.tissue import tissue_colours
@@ -43,7 +42,7 @@ ORGANS = {  # SNOMED CT, by words in a tissue's name
 }
 
 
-def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
+def write(model: FittedModel, body: FittedBody, folder: Path, source: Path | None = None) -> None:
     """Write stiffness.dcm and segmentation.dcm.
 
     Raises `ResourceError` without the extra `dicom`, `InputDataError` where the series of `--source` cannot be read or
@@ -55,7 +54,7 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
         raise ResourceError(
             "DICOM files are written by highdicom, which is not installed: pip install 'palpate[dicom]'"
         ) from error
-    slices = [_placeholder()] if options.source is None else _series(options.source, body)
+    slices = [_placeholder()] if source is None else _series(source, body)
     frame = str(slices[0].FrameOfReferenceUID)
     affine = LPS @ body.grid.affine[:, [2, 1, 0, 3]]  # slices, rows, columns
     across, down = np.reshape(np.array(slices[0].ImageOrientationPatient, dtype=float), (2, 3))
@@ -82,7 +81,7 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
         "segmentation.dcm": _segmentation(highdicom, slices, volume, body, common),
     }
     for name, dataset in made.items():
-        if options.source is None:
+        if source is None:
             _forget_source(dataset)
         content = io.BytesIO()
         dataset.save_as(content, enforce_file_format=True)

@@ -75,7 +75,7 @@ class FollowingPressure:
         along = np.einsum("qad,fai->dfqi", slopes, self._corners(displacement))
         normals = np.cross(along[0], along[1])
         nodal = -self.kilopascal * np.einsum("q,qa,fqi->fai", weights, shape, normals, optimize=True)
-        return _summed(self.faces, nodal, len(self.space.points))
+        return summed(self.faces, nodal, len(self.space.points))
 
     def stiffness(self, displacement: Array) -> sparse.csr_matrix[np.float64]:
         """Derivative of the forces (n_dof, n_dof) mN/mm at u (n_points, 3) mm."""
@@ -119,7 +119,7 @@ def traction(space: LagrangeSpace, triangles: NDArray[np.int64], kilopascal: Arr
     along = np.einsum("qad,fai->dfqi", slopes, space.points[faces])
     areas = np.linalg.norm(np.cross(along[0], along[1]), axis=2)
     nodal = np.einsum("q,qa,fq,i->fai", weights, shape, areas, vector, optimize=True)
-    return DeadLoad(_summed(faces, nodal, len(space.points)))
+    return DeadLoad(summed(faces, nodal, len(space.points)))
 
 
 def gravity(space: LagrangeSpace, densities: Array, acceleration: Array) -> DeadLoad:
@@ -137,7 +137,7 @@ def gravity(space: LagrangeSpace, densities: Array, acceleration: Array) -> Dead
     points, weights = quadrature(2)
     shares = weights @ shape_functions(space.order, points)
     heavy = PER_CUBIC_MILLIMETRE * mass[space.mesh.region] * space.mesh.volumes
-    return DeadLoad(_summed(space.cells, np.einsum("e,a,i->eai", heavy, shares, vector), len(space.points)))
+    return DeadLoad(summed(space.cells, np.einsum("e,a,i->eai", heavy, shares, vector), len(space.points)))
 
 
 def boundary_named(mesh: TetMesh, name: str) -> NDArray[np.int64]:
@@ -160,8 +160,8 @@ def _face_rule(order: int) -> tuple[Array, Array, Array]:
     return shape_functions(order, points), triangle_slopes(order, points), 0.5 * weights
 
 
-def _summed(cells: NDArray[np.int64], nodal: Array, n_points: int) -> Array:
-    """Nodal forces (n_dof,) of forces (n_cells, n_a, 3)."""
+def summed(cells: NDArray[np.int64], nodal: Array, n_points: int) -> Array:
+    """Nodal forces (n_dof,), mN, of forces (n_cells, n_a, 3) on the points of cells (n_cells, n_a)."""
     flat = nodal.reshape(-1, 3)
     columns = [np.bincount(cells.ravel(), flat[:, axis], minlength=n_points) for axis in range(3)]
     return np.stack(columns, axis=1).ravel().astype(np.float64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import matplotlib.image as mpimg
@@ -27,10 +28,10 @@ class Camera:
     back: NDArray[np.float64]
 
     @classmethod
-    def looking(cls, back: tuple[float, float, float], up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Camera:
-        """The camera that stands in the direction `back` and holds `up` upright; neither needs unit length."""
+    def looking(cls, back: tuple[float, float, float]) -> Camera:
+        """The camera that stands in the direction `back`, of any length, and holds the head upright."""
         towards = np.array(back) / np.linalg.norm(back)
-        right = np.cross(np.array(up), towards)
+        right = np.cross([0.0, 0.0, 1.0], towards)
         right /= np.linalg.norm(right)
         return cls(right, np.cross(towards, right), towards)
 
@@ -54,12 +55,36 @@ class Triangles:
     edges: bool = False
 
 
-def render_png(triangles: Triangles, camera: Camera, *, width: int, height: int, fill: float = 0.94) -> bytes:
-    """A PNG of `width` x `height` pixels, transparent where nothing is; the triangles take up `fill` of it."""
-    flat = triangles.corners @ camera.axes.T  # (n, 3 corners, 3): across, up, depth
-    low, high = flat.reshape(-1, 3).min(axis=0), flat.reshape(-1, 3).max(axis=0)
+@dataclass(frozen=True, slots=True)
+class Arrows:
+    """Arrows from `feet` (n, 3) mm along `ways` (n, 3) mm, of one colour, so thick (pixels); before all triangles."""
+
+    feet: NDArray[np.float64]
+    ways: NDArray[np.float64]
+    colour: str
+    thick: float
+
+
+def render_png(
+    triangles: Triangles,
+    camera: Camera,
+    *,
+    width: int,
+    height: int,
+    fill: float = 0.94,
+    arrows: Sequence[Arrows] = (),
+) -> bytes:
+    """A PNG of `width` x `height` pixels, transparent where nothing is; what is drawn takes up `fill` of it."""
+    ends = [end for of in arrows for end in (of.feet, of.feet + of.ways)]
+    every = np.concatenate([triangles.corners.reshape(-1, 3), *ends]) @ camera.axes.T
+    low, high = every.min(axis=0), every.max(axis=0)
     scale = fill * min(width / max(high[0] - low[0], 1e-9), height / max(high[1] - low[1], 1e-9))
-    flat = (flat - 0.5 * (low + high)) * scale
+
+    def projected(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Pixels across and up from the picture's middle, and depth, of points (..., 3) mm."""
+        return np.asarray((points @ camera.axes.T - 0.5 * (low + high)) * scale)
+
+    flat = projected(triangles.corners)
     # a lamp beside the viewer, normals to either side
     lamp = camera.back + 0.35 * camera.up - 0.3 * camera.right
     cosine = np.abs(triangles.normals @ (lamp / np.linalg.norm(lamp)))
@@ -74,10 +99,14 @@ def render_png(triangles: Triangles, camera: Camera, *, width: int, height: int,
         faces = shades[drawn].mean(axis=1)
         style = {"facecolors": faces, "edgecolors": EDGE_SHADE * faces, "linewidths": EDGE_WIDTH}
         axes.add_collection(PolyCollection(flat[drawn, :, :2], joinstyle="round", **style), autolim=False)
-    else:
+    elif len(drawn):
         places, corners = flat[drawn, :, :2].reshape(-1, 2), np.arange(3 * len(drawn)).reshape(-1, 3)
         mesh = TriMesh(Triangulation(*places.T, corners), facecolors=shades[drawn].reshape(-1, 3))
         axes.add_collection(mesh, autolim=False)
+    for of in arrows:
+        feet, tips = projected(of.feet), projected(of.feet + of.ways)
+        way = {"angles": "xy", "scale_units": "xy", "scale": 1.0, "units": "dots", "minlength": 0.5}
+        axes.quiver(*feet.T[:2], *(tips - feet).T[:2], color=of.colour, width=FINE * of.thick, zorder=3.0, **way)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     # the mean over FINE x FINE samples, with straight alpha
