@@ -476,12 +476,12 @@ def test_each_later_image_bears_its_own_loads(model, tmp_path):
     pressed = CaseLoad("pressure", surface="outer", pressure_kpa=2.0)
     linear = model.bodies[0].with_linear_tetrahedra()
     body = dataclasses.replace(linear, displacements=2 * linear.displacements, loads=((weight, pressed), (pressed,)))
-    febio.write(model, body, tmp_path, None)
+    febio.write(model, body, tmp_path)
     root = ET.parse(tmp_path / "palpate.feb").getroot()
     curves = {c.get("id"): [pt.text for pt in c.find("points")] for c in root.find("LoadData")}
     of_load = [[node.get("lc") for node in load.iter() if node.get("lc")] for load in root.find("Loads")]
     assert [curves[of[0]] for of in of_load] == [["0,0", "1,1", "2,0"], ["0,0", "1,1", "2,1"]]
-    abaqus.write(model, body, tmp_path, None)
+    abaqus.write(model, body, tmp_path)
     first, second = (tmp_path / "palpate.inp").read_text().split("*STEP")[1:]
     assert "*CLOAD\n" in first
     assert "*DLOAD\n" in first

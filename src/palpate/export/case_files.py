@@ -59,7 +59,7 @@ def write_estimate_files(result: CaseResult, folder: Path) -> tuple[Path, ...]:
     element = tetrahedron_image(result.space.mesh, grid)
     for path, values in zip(paths[1:], images, strict=False):
         write_scalar_image(path, np.append(values, np.nan)[element], grid)  # -1, outside the mesh, takes the last entry
-    paths += _write_labels(result.before, folder)
+    paths += write_labels(result.before, folder)
     for number, pair in enumerate(result.further, start=2):
         paths.append(folder / f"mesh_{number}.vtu")
         _write_fitted(paths[-1], result, number - 1, pair.space, pair.displacements)
@@ -106,7 +106,7 @@ def write_mesh_files(result: MeshResult, folder: Path) -> tuple[Path, ...]:
     path = folder / "mesh.vtu"
     still = np.zeros_like(space.points)
     write_vtu(path, space, point_data={"displacement_mm": still}, cell_data=cell_data(mesh, given[mesh.region]))
-    labels = _write_labels(result.before, folder)
+    labels = write_labels(result.before, folder)
     return (path, *labels, *_write_surfaces(space, still, folder / "surfaces", ending="before"))
 
 
@@ -137,8 +137,11 @@ def write_simulation_files(result: Simulation, folder: Path) -> tuple[Path, ...]
     return tuple(paths)
 
 
-def _write_labels(before: Segmentation, folder: Path) -> tuple[Path, Path]:
-    """The earlier image with our numbers of the tissues, and the table that names them."""
+def write_labels(before: Segmentation, folder: Path) -> tuple[Path, Path]:
+    """Write labels.nii.gz, the earlier image with our numbers of the tissues, and labels.csv, which names them.
+
+    Returns the paths; raises `ResourceError` when the disk refuses.
+    """
     image, numbers = folder / "labels.nii.gz", first_labels(before.tissues)
     write_label_image(image, LabelImage(numbers[before.index], before.grid))
     return image, write_label_table(folder / "labels.csv", before.tissues)

@@ -20,7 +20,7 @@ from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.images.input_file import read_input
 from palpate.images.segmentation import first_labels
 from palpate.images.tissue import tissue_colours
-from palpate.mesh.locate import region_image
+from palpate.mesh.locate import modulus_image
 from palpate.study.outputs import write_bytes
 from palpate.study.provenance import software_versions
 
@@ -66,8 +66,7 @@ def write(model: FittedModel, body: FittedBody, folder: Path, source: Path | Non
         found = highdicom.Volume(turned, affine, coordinate_system="PATIENT", frame_of_reference_uid=frame)
         return found.to_patient_orientation(axes)
 
-    moduli = np.nan_to_num(np.append(model.moduli, 0.0)).astype(np.float32)  # 0 where nothing is meshed
-    stiffness = volume(moduli[region_image(body.mesh, body.grid)])
+    stiffness = volume(modulus_image(body.mesh, body.grid, model.moduli).astype(np.float32))
     common = {
         "manufacturer": "Palpate",
         "manufacturer_model_name": "Palpate",

@@ -93,11 +93,7 @@ def _material(
     """A tissue's law with its constants in kPa; those that differ between its elements, (n,) each."""
     cells = tissue_groups(body.mesh)[name]
     index = int(body.mesh.region[cells[0]])
-    modulus, ratio, law = (
-        float(model.moduli[index]),
-        body.tissues[index].poisson_ratio,
-        model.law_among(Linear, NeoHookean, MooneyRivlin),
-    )
+    modulus, ratio, law = float(model.moduli[index]), body.tissues[index].poisson_ratio, model.law_among(*LAWS)
     log_ratio = np.zeros(1) if body.log_ratio is None else body.log_ratio[cells]
     scale = np.exp(log_ratio) if np.ptp(log_ratio) > 0.0 else np.ones(1)
     constants = {"E": modulus, "v": ratio}

@@ -7,25 +7,21 @@ from pathlib import Path
 import numpy as np
 
 from palpate.export import warp
-from palpate.export.case_files import write_label_table
+from palpate.export.case_files import write_labels
 from palpate.export.closed_surfaces import closed_surfaces, write_ply
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.groups import write_script
-from palpate.images.label_image import LabelImage
-from palpate.images.readers import write_label_image, write_scalar_image
-from palpate.images.segmentation import first_labels
+from palpate.images.readers import write_scalar_image
+from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import tissue_colours
-from palpate.mesh.locate import region_image
+from palpate.mesh.locate import modulus_image
 from palpate.study.outputs import write_json
 
 
 def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
     """Write load_in_slicer.py, labels.nii.gz and .csv, stiffness.nii.gz, the surfaces (.ply), the warp, scene.json."""
-    numbers = first_labels(body.tissues)
-    write_label_image(folder / "labels.nii.gz", LabelImage(numbers[body.index], body.grid))
-    write_label_table(folder / "labels.csv", body.tissues)
-    moduli = np.nan_to_num(np.append(model.moduli, 0.0))  # 0 where nothing is meshed: Slicer shows NaN as anything
-    write_scalar_image(folder / "stiffness.nii.gz", moduli[region_image(body.mesh, body.grid)], body.grid)
+    write_labels(Segmentation(body.index, body.grid, body.tissues), folder)
+    write_scalar_image(folder / "stiffness.nii.gz", modulus_image(body.mesh, body.grid, model.moduli), body.grid)
     write_ply(model, body, folder)
     warp.write(model, body, folder)
     shown = zip(body.tissues, tissue_colours(body.tissues), strict=True)

@@ -170,22 +170,17 @@ def slice_box(image: Segmentation, later: Sequence[Segmentation]) -> SliceBox:
     These show as much of every tissue as possible. Of an image without later ones the box is the whole of it.
     """
     moving = tuple(i for i, tissue in enumerate(image.tissues) if tissue.role in MOVING)
-    boxes = [_extent(_thinned(each), moving) for each in (image, *later)]
+    boxes = []  # of each image the corners (3,) mm of the box around their voxels; the whole of it when there are none
+    for each in map(_thinned, (image, *later)):
+        index = np.argwhere(np.isin(each.index, moving)).astype(np.float64)
+        points = each.grid.world(index if len(index) else np.array([[0.0, 0.0, 0.0], [*each.grid.shape]]))
+        boxes.append((points.min(axis=0), points.max(axis=0)))
     border = np.array([_range(image.grid, axis) for axis in range(3)])
     low = np.maximum(np.min([pair[0] for pair in boxes], axis=0) - MARGIN_MM, border[:, 0])
     high = np.minimum(np.max([pair[1] for pair in boxes], axis=0) + MARGIN_MM, border[:, 1])
     before = _thinned(image)
     position = np.array([_richest(before, moving, axis) for axis in range(3)])
     return SliceBox(low, high, position) if later else whole_box(image, position)
-
-
-def _extent(image: Segmentation, tissues: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Corners (3,) mm of the box around the tissues' voxels; the whole image when there are none."""
-    index = np.argwhere(np.isin(image.index, tissues)).astype(np.float64)
-    if not len(index):
-        index = np.array([[0.0, 0.0, 0.0], [*image.grid.shape]])
-    points = image.grid.world(index)
-    return points.min(axis=0), points.max(axis=0)
 
 
 def _thinned(image: Segmentation) -> Segmentation:
