@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
-from palpate.cohort.engines.packing import Engine
+from palpate.cohort.engines.attempts import Engine
 from palpate.cohort.page import cohort_page
 from palpate.cohort.plan import CASES, MARK, PLAN, Plan, held_soon, make_plan, write_plan
 from palpate.cohort.progress import Tally
