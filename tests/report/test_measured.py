@@ -19,7 +19,7 @@ from palpate.report.payload import payload
 from palpate.report.pictures import arrow_triangles
 from palpate.report.report_data import MOST_ARROWS, ReportData
 from palpate.study.case_data import CaseData
-from palpate.study.estimation import ForceFit, PointFit
+from palpate.study.estimated import ForceFit, PointFit
 
 EVIL = '</script><img src=x onerror=alert(1)>$\\frac{"&'
 rng = np.random.default_rng(3)

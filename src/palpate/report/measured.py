@@ -20,7 +20,7 @@ from palpate.report.report_data import (
     TriangleSurface,
 )
 from palpate.report.surfaces import carried_outline
-from palpate.study.estimation import PointFit
+from palpate.study.estimated import PointFit
 from palpate.study.result import CaseResult, pair_names
 
 OF_BOX = 0.1  # of the slices' longest edge: how long an arrow is drawn that is longer than all but some

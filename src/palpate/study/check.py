@@ -20,7 +20,7 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.observation.observed_surface import field_of_view, observed_surfaces, seen_in
 from palpate.progress import Progress
-from palpate.study.body import Body, ImagedStates, brought, make_body
+from palpate.study.body import Body, make_body
 from palpate.study.case import Case
 from palpate.study.case_file import read_case
 from palpate.study.case_loads import load_warnings
@@ -36,6 +36,7 @@ from palpate.study.cost import (
     machine_memory_gb,
 )
 from palpate.study.edge_length import case_domain, edge_length_of
+from palpate.study.imaged import ImagedStates, brought
 from palpate.study.meshing import refuse_edge
 from palpate.study.plausibility import unit_warnings
 from palpate.study.prediction import Prediction

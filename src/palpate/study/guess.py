@@ -14,7 +14,7 @@ from palpate.images.label_image import LabelImage
 from palpate.images.named_labels import MAX_NAME
 from palpate.images.tissue import Role
 from palpate.images.totalsegmentator import CLASSES
-from palpate.study.case import is_tissue_name
+from palpate.study.case_tissue import is_tissue_name
 from palpate.study.plausibility import TABLE, usual_stiffness
 
 SURROUNDINGS = "surroundings"

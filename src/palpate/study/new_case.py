@@ -16,8 +16,8 @@ from palpate.images.label_table import read_label_table
 from palpate.images.named_labels import MAX_NAME, printable
 from palpate.images.readers import read_intensities, read_label_image
 from palpate.images.tissue import Role
-from palpate.study.case import REMAINING
 from palpate.study.case_file import relative_path, toml_key, toml_text
+from palpate.study.case_tissue import REMAINING
 from palpate.study.earlier import CASE_NAME
 from palpate.study.guess import GuessedTissue, class_names, guess_tissues
 from palpate.study.outputs import OutputFolder, read_regular, write_text

@@ -15,8 +15,8 @@ from palpate.parallel import blas_on_one_thread
 from palpate.progress import Progress
 from palpate.study.body import Body, joint_problem, on_linear_elements
 from palpate.study.case import Case, Mechanics
-from palpate.study.estimation import verdict
 from palpate.study.run import inversion_settings
+from palpate.study.verdicts import verdict
 from palpate.uncertainty import Interval, covariance_of, error_noise, log_interval, sandwich_covariance
 
 

@@ -22,8 +22,8 @@ from palpate.phantoms.pelvis import PelvisOptions, pelvis, pelvis_anatomy
 from palpate.phantoms.scene import Scene
 from palpate.phantoms.spheres import SpheresOptions, spheres, spheres_anatomy
 from palpate.progress import Progress, silent
-from palpate.study.body import ImagedStates, aligned
 from palpate.study.case import Case
+from palpate.study.imaged import ImagedStates, aligned
 from palpate.study.meshed_body import mesh_states, with_prescribed
 from palpate.study.provenance import file_digest
 from palpate.study.refusals import refuse_large

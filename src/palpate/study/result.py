@@ -18,10 +18,11 @@ from palpate.images.registration import Registration
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.mesh.space import LagrangeSpace
-from palpate.study.case import Case, CaseTissue
+from palpate.study.case import Case
 from palpate.study.case_file import case_tables
+from palpate.study.case_tissue import CaseTissue
 from palpate.study.discrepancy import FoundDiscrepancy
-from palpate.study.estimation import Estimation, ModulusEstimate, TissueFit, no_estimate
+from palpate.study.estimated import Estimation, ModulusEstimate, TissueFit, no_estimate
 from palpate.study.map_words import map_words
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio
 from palpate.uncertainty import StiffnessMap

@@ -16,11 +16,14 @@ from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.laws.registry import law_named
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Forecast, Progress, about, during, silent
-from palpate.study.body import Body, ImagedStates, joint_problem, make_body
-from palpate.study.case import LAW_NAMES, SOUGHT_RATIOS, Case, Mechanics
+from palpate.study.body import Body, joint_problem, make_body
+from palpate.study.case import SOUGHT_RATIOS, Case, Mechanics
+from palpate.study.case_body import LAW_NAMES
 from palpate.study.case_loads import load_warnings
 from palpate.study.cost import LESS_MEMORY, ExpectedCost, cost_of_meshes, expected_cost, lack_of_memory
-from palpate.study.estimation import Estimation, Observed, conclude
+from palpate.study.estimated import Estimation
+from palpate.study.estimation import Observed, conclude
+from palpate.study.imaged import ImagedStates
 from palpate.study.inverted import inverted
 from palpate.study.plausibility import estimate_warnings, unit_warnings
 from palpate.study.poisson_ratios import with_found_ratios

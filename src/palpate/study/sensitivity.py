@@ -31,11 +31,13 @@ from palpate.inversion import Inversion, InversionSettings, StopRule
 from palpate.mechanics.dilatation import choose_element
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Progress, silent
-from palpate.study.body import Body, ImagedStates, joint_problem, make_body
-from palpate.study.case import LAW_NAMES, Case
+from palpate.study.body import Body, joint_problem, make_body
+from palpate.study.case import Case
+from palpate.study.case_body import LAW_NAMES
 from palpate.study.case_file import case_tables
 from palpate.study.edge_length import edge_length_of
 from palpate.study.estimation import Observed, conclude
+from palpate.study.imaged import ImagedStates
 from palpate.study.inverted import inverted
 from palpate.study.outputs import OutputFolder, read_json, write_json
 from palpate.study.provenance import input_digests, software_versions
