@@ -13,8 +13,8 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TextIO, cast
 
@@ -92,10 +92,17 @@ def progress_on_stderr(*, quiet: bool, patience_s: float = PATIENCE_S) -> Iterat
                 tell(fitted(words, stream), stream)
 
     stream = None if quiet else _duplicate(sys.stderr)  # before any library takes the place of standard error
+    over = threading.Event()
+    thread = threading.Thread(target=remind, args=(over,), daemon=True)
     try:
-        with nullcontext() if quiet else _beside(remind):
-            yield progress
+        if not quiet:
+            with _signals_blocked():  # which never reach it
+                thread.start()
+        yield progress
     finally:
+        over.set()
+        if not quiet:
+            thread.join()
         bar.close()
         if stream is not sys.stderr and stream is not None:
             stream.close()
@@ -122,20 +129,6 @@ def _duplicate(stream: TextIO | None) -> TextIO | None:
         return None if stream is None else os.fdopen(os.dup(stream.fileno()), "w", encoding=stream.encoding)
     except (OSError, ValueError):  # closed, or no file
         return stream
-
-
-@contextmanager
-def _beside(work: Callable[[threading.Event], None]) -> Iterator[None]:
-    """While the block works, `work` does in a thread that no signal reaches; it is told when the block is over."""
-    over = threading.Event()
-    thread = threading.Thread(target=work, args=(over,), daemon=True)
-    with _signals_blocked():
-        thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
 
 
 class Bar:

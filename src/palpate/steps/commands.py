@@ -8,6 +8,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 from palpate.errors import ConfigurationError, InputDataError
+from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_label_image
 from palpate.progress import Progress, silent
 from palpate.steps.previewing import checked_with_page, new_case_with_page, place_page, refuse_other_page
@@ -19,7 +20,7 @@ from palpate.study.case import Case
 from palpate.study.check import CheckReport, check_case
 from palpate.study.lock import held_folder
 from palpate.study.new_case import NewCase
-from palpate.study.null_pair import NullPair, drawing_noise
+from palpate.study.null_pair import NullPair, noise_of_drawings
 from palpate.study.outputs import RESULT, OutputFolder, read_json
 from palpate.study.result import SCHEMA, MeshResult, Simulation
 from palpate.study.sensitivity import Kept, Sensitivity
@@ -98,8 +99,9 @@ def noise(
     is given are the blocks [noise] and [discrepancy] of a case. Raises `InputDataError` for images that cannot be used,
     are the same, or cannot be of one state.
     """
-    table = None if labels is None else Path(labels)
-    return drawing_noise(Path(first), Path(second), labels=table, align=align, progress=progress)
+    table = None if labels is None else read_label_table(Path(labels))
+    progress("reading the images")
+    return noise_of_drawings(*(read_label_image(Path(path), names=table) for path in (first, second)), align=align)
 
 
 def voxelise(

@@ -155,7 +155,11 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
     bodies = [body if body.layers == shared else _remade(body, case, layers=shared) for body in bodies]
     progress("distances to the surfaces of all images")
     noise = stated_noise(case)
-    imaged = [(r, o) for r, body in enumerate(bodies) for o in _seen(body, noise)]
+    shown = [  # nothing of states that are not imaged
+        observations(body.imaged(noise)) if body.states.after else tuple(() for _ in body.states.bones)
+        for body in bodies
+    ]
+    imaged = [(r, o) for r, of_body in enumerate(shown) for o in of_body]
     measured = [of for body in bodies for of in body.measured]
     seen = [(r, (*o, *(term for s, term in measured if s == n))) for n, (r, o) in enumerate(imaged, start=1)]
     progress("assembling one stiffness matrix a tissue")
@@ -186,11 +190,6 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
         dilatation=choose_element(case.mechanics.element).dilatation,
     )
     return InverseProblem(states, with_stated_priors(parameters, case))
-
-
-def _seen(body: Body, noise: NoiseModel | None) -> tuple[tuple[Observation, ...], ...]:
-    """What each later image shows; nothing of states that are not imaged."""
-    return observations(body.imaged(noise)) if body.states.after else tuple(() for _ in body.states.bones)
 
 
 def _blocks(

@@ -90,6 +90,10 @@ def conclude(
         drawn = draw_moduli(posteriors[-1], stated, bounds=settings.bounds, draws=samples, rng=rng)
     found_discrepancy = discrepancy_of(inversion, observed.states) if minimum.converged else FoundDiscrepancy()
     maps = stiffness_maps(inversion, np.diag(covariance.total)) if minimum.converged else ()
+    shares = dict[str, Mapping[str, float]]()
+    if minimum.converged:  # of each kind of data in what is known of a tissue's modulus
+        of_tissues = information_shares(minimum.evaluation, objective.n_parameters)
+        shares = dict(zip(objective.parameters.tissues, of_tissues, strict=False))
     findings = (
         *inversion_findings(inversion, covariance.total),
         *remark,
@@ -116,7 +120,7 @@ def conclude(
         remarks=findings,
         observations={observation.kind: observation.description for observation in objective.observations},
         information=information(of_moduli),
-        information_shares=_shares(inversion) if minimum.converged else {},
+        information_shares=shares,
         discrepancy=found_discrepancy,
         combinations=combinations_of(inversion, posteriors[0].frozen, of_moduli, settings.bounds, within=IDENTIFIED),
         regions=regions,
@@ -237,12 +241,6 @@ def _points(inversion: Inversion, observed: Observed) -> tuple[PointFit, ...]:
             misfit = float(np.sqrt(np.mean(line.residuals.values**2))) / stated
             found.append(PointFit(line.observation.name, line.state, motions, misfit))
     return tuple(found)
-
-
-def _shares(inversion: Inversion) -> dict[str, Mapping[str, float]]:
-    """By tissue, the share of each kind of data in what is known of its modulus."""
-    shares = information_shares(inversion.minimum.evaluation, inversion.objective.n_parameters)
-    return dict(zip(inversion.objective.parameters.tissues, shares, strict=False))
 
 
 def _fits(inversion: Inversion, observed: Observed) -> tuple[tuple[TissueFit, ...], ...]:

@@ -22,7 +22,7 @@ from palpate.study.case import Case
 from palpate.study.case_file import case_tables
 from palpate.study.case_tissue import CaseTissue
 from palpate.study.discrepancy import FoundDiscrepancy
-from palpate.study.estimated import Estimation, ModulusEstimate, TissueFit, no_estimate
+from palpate.study.estimated import Estimation, ModulusEstimate, no_estimate
 from palpate.study.map_words import map_words
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio
 from palpate.uncertainty import StiffnessMap
@@ -171,7 +171,18 @@ class CaseResult:
             "image_pairs": pairs and _plain(pairs) | {"alone": alone},
             "samples": drawn and drawn.to_dict(),
             "alignment": [found.row(name) for name, found in zip(names, self.every_alignment, strict=False)],
-            "fit": [_fit(name, fits) for name, fits in zip(names, estimation.fits, strict=False)],
+            "fit": [
+                {"after": name}
+                | {
+                    fit.tissue: {
+                        "start": _plain(fit.start),
+                        "end": _plain(fit.end),
+                        "observed_share": fit.observed_share,
+                    }
+                    for fit in fits
+                }
+                for name, fits in zip(names, estimation.fits, strict=False)
+            ],
             "forces": [
                 {"after": names[force.state], **{k: v for k, v in _plain(force).items() if k != "state"}}
                 for force in estimation.forces
@@ -383,14 +394,6 @@ def _discrepancy(found: FoundDiscrepancy, names: Sequence[str]) -> dict[str, Any
         ],
         "heterogeneity": [_plain(of) for of in found.heterogeneity],
     }
-
-
-def _fit(name: str, fits: tuple[TissueFit, ...]) -> dict[str, Any]:
-    entries = {
-        fit.tissue: {"start": _plain(fit.start), "end": _plain(fit.end), "observed_share": fit.observed_share}
-        for fit in fits
-    }
-    return {"after": name} | entries
 
 
 def image_names(case: Case) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -37,17 +37,12 @@ from palpate.study.variations import Variation, voxel_mm, what_would_change
 from palpate.uncertainty import FittedState
 
 
-def unconditional(cost: ExpectedCost) -> None:
-    """An estimate goes on once its images are read, whatever it costs."""
-    del cost
-
-
 def estimate(
     case: Case,
     *,
     progress: Progress = silent,
     truth: Mapping[str, float] | None = None,
-    condition: Callable[[ExpectedCost], None] = unconditional,
+    condition: Callable[[ExpectedCost], None] | None = None,
 ) -> CaseResult:
     """Estimate the Young's modulus of every `estimate` tissue of a case, from its images or its phantom.
 
@@ -65,7 +60,8 @@ def estimate(
     cost = expected_cost(case, states.before, states.after, n_pairs=1 + len(further), mesh=states.mesh)
     if lack := lack_of_memory(cost):
         raise ResourceError(f"{lack}; {LESS_MEMORY}")
-    condition(cost)
+    if condition is not None:
+        condition(cost)
     progress(_forecast(cost))
     if case.phantom:
         stated = [(t.name, t.youngs_modulus_kpa) for t in states.before.tissues if t.role is Role.ESTIMATE]
@@ -103,13 +99,11 @@ def estimate_states(
     clock.append(time.perf_counter())
     settings = inversion_settings(case, problem.parameters)
     inversion = inverted(bodies, problem, case, settings, progress=progress)
-    images = tuple(image.index if image else None for pair in bodies for image in pair.states.later)
-    observed = Observed(fitted_states(inversion, *bodies), images)
     stating = during("intervals", progress)
     estimation = conclude(
         inversion,
         settings,
-        observed,
+        observed_of(inversion, bodies),
         truth=truth or {},
         seed=case.seed,
         samples=case.estimate.samples,
@@ -194,6 +188,12 @@ def inversion_settings(case: Case, parameters: ParameterMap) -> InversionSetting
     ]
     begin = tuple(np.concatenate([np.full(n, np.log(start)), given]) for start in starts)
     return InversionSettings(begin, Bounds(*ends), options.method)
+
+
+def observed_of(inversion: Inversion, bodies: Sequence[Body]) -> Observed:
+    """The fitted states of bodies, with the images that they are held against."""
+    images = tuple(image.index if image else None for body in bodies for image in body.states.later)
+    return Observed(fitted_states(inversion, *bodies), images)
 
 
 def fitted_states(inversion: Inversion, *bodies: Body) -> tuple[FittedState, ...]:
