@@ -29,13 +29,13 @@ LOGGER.addHandler(logging.NullHandler())  # before there is a log file, messages
 UNLOCKED = "the file system of %s knows no locks: a second run in the folder would not be noticed, so start none there"
 
 
-def tell(text: str, stream: TextIO | None) -> OSError | None:
+def tell(text: str, stream: TextIO | None, *, end: str = "\n") -> OSError | None:
     """Print lines on a standard stream; letters that it cannot hold are escaped. Gives why they were not printed."""
     if stream is None:  # closed from the start
         return OSError(errno.EBADF, "it is closed")
     encoding = getattr(stream, "encoding", None) or "utf-8"
     try:
-        stream.write(text.encode(encoding, "backslashreplace").decode(encoding) + "\n")
+        stream.write(text.encode(encoding, "backslashreplace").decode(encoding) + end)
         stream.flush()
     except (OSError, ValueError) as error:  # ValueError: closed meanwhile
         give_up(stream)

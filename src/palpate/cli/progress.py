@@ -16,22 +16,19 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TextIO, cast
+from typing import TextIO
 
 from palpate.cli.console import LOGGER, give_up, tell
 from palpate.images.named_labels import printable
 from palpate.progress import Forecast, Progress, Stage, Told, about
 
-if TYPE_CHECKING:
-    from rich.live import Live
-    from rich.table import Table
-
-
 TRUST = 0.1  # of the predicted time: how much of it must be over before its own pace outweighs the prediction
 STEADY = 0.75  # of a stage: beyond, its share creeps, as nobody knows how much longer it takes
 MOST = 0.99
 PATIENCE_S = 8.0
-WIDTH = 32
+WIDTH, MARKS = 32, "━─"  # of the bar
+ERASED = "\r\x1b[2K"  # the line of the bar, whose place the next one takes
+MOMENT_S = 0.25
 INDENT = 11  # of what follows the time
 
 
@@ -70,7 +67,8 @@ def progress_on_stderr(*, quiet: bool, patience_s: float = PATIENCE_S) -> Iterat
     Where no bar moves there, a line follows every `patience_s` seconds without a sentence: a library that factorises or
     remeshes says nothing while it works.
     """
-    bar, began = Bar(), time.monotonic()
+    stream = None if quiet else _duplicate(sys.stderr)  # before any library takes the place of standard error
+    bar, began = Bar(stream), time.monotonic()
     said: list[tuple[str, float]] = []
 
     def progress(sentence: str) -> None:
@@ -81,17 +79,18 @@ def progress_on_stderr(*, quiet: bool, patience_s: float = PATIENCE_S) -> Iterat
             bar.tell(sentence, fitted(f"[{time.monotonic() - began:6.1f} s] {printable(sentence)}", sys.stderr))
 
     def remind(over: threading.Event) -> None:
-        """Say that the last thing still goes on."""
+        """Draw the bar, or say that the last thing still goes on."""
         reminded = began
-        while not over.wait(0.1 * patience_s):
+        while not over.wait(min(0.1 * patience_s, MOMENT_S)):
             sentence, since = said[-1] if said else ("starting", began)
             now = time.monotonic()
-            if now - max(since, reminded) > patience_s and not bar.moves:
+            if bar.moves:
+                bar.draw()
+            elif now - max(since, reminded) > patience_s:
                 reminded = now
                 words = f"[{now - began:6.1f} s] still, after {now - since:.0f} s: {printable(sentence)}"
                 tell(fitted(words, stream), stream)
 
-    stream = None if quiet else _duplicate(sys.stderr)  # before any library takes the place of standard error
     over = threading.Event()
     thread = threading.Thread(target=remind, args=(over,), daemon=True)
     try:
@@ -101,7 +100,7 @@ def progress_on_stderr(*, quiet: bool, patience_s: float = PATIENCE_S) -> Iterat
         yield progress
     finally:
         over.set()
-        if not quiet:
+        if thread.is_alive():
             thread.join()
         bar.close()
         if stream is not sys.stderr and stream is not None:
@@ -110,17 +109,20 @@ def progress_on_stderr(*, quiet: bool, patience_s: float = PATIENCE_S) -> Iterat
 
 def fitted(line: str, stream: TextIO | None) -> str:
     """A line broken between words, where `stream` is a terminal that is narrower; what follows is set in."""
-    try:
-        if stream is None or not stream.isatty():
-            return line
-        width = os.get_terminal_size(stream.fileno()).columns
-    except (OSError, ValueError):  # closed, or no terminal after all
-        return line
+    width = _width(stream)
     if not width // 2 > INDENT or len(line) < width:
         return line
     wrapper = textwrap.TextWrapper(width - 1, subsequent_indent=" " * INDENT)
     wrapper.break_long_words = wrapper.break_on_hyphens = False
     return wrapper.fill(line)
+
+
+def _width(stream: TextIO | None) -> int:
+    """Letters of a line of a terminal; 0 where a stream is none."""
+    try:
+        return os.get_terminal_size(stream.fileno()).columns if stream is not None and stream.isatty() else 0
+    except (OSError, ValueError):  # closed, or no terminal after all
+        return 0
 
 
 def _duplicate(stream: TextIO | None) -> TextIO | None:
@@ -132,18 +134,16 @@ def _duplicate(stream: TextIO | None) -> TextIO | None:
 
 
 class Bar:
-    """A bar on stderr, below the lines of a run, once a forecast has come; none where that is no terminal."""
+    """A bar on a terminal, below the lines of a run, once a forecast has come; none where `stream` is no terminal.
 
-    def __init__(self) -> None:
+    What a terminal does not take costs no run.
+    """
+
+    def __init__(self, stream: TextIO | None) -> None:
+        self._stream, self._lock, self._share = stream, threading.Lock(), 0.0
         self._begun: Mapping[Stage, float] = {}
         self._seconds: Mapping[Stage, float] = {}
-        self._share = 0.0
-        self._live: Live | None = None
-
-    @property
-    def moves(self) -> bool:
-        """Whether it is seen."""
-        return self._live is not None
+        self.moves = False
 
     def tell(self, sentence: str, line: str) -> None:
         """Take in what a sentence says of the run, and print its line."""
@@ -151,65 +151,58 @@ class Bar:
             self._begun = {sentence.stage: time.monotonic(), **self._begun}  # a stage has begun once
         if isinstance(sentence, Forecast) and sum(sentence.seconds.values()) > 0.0:
             self._seconds = sentence.seconds
-            if self._live is None and self._begun.keys() & sentence.seconds:
-                self._live = _started(self)
-        if self._live is None:
+            self.moves = self.moves or (bool(self._begun.keys() & sentence.seconds) and _takes_back(self._stream))
+        if not self.moves:
             tell(line, sys.stderr)
-        else:
-            with _signals_blocked():  # an interrupt in the midst of a line would leave the bar there
-                self._live.console.print(line, markup=False, highlight=False, soft_wrap=True)
+            return
+        with _signals_blocked(), self._lock:  # an interrupt in the midst of a line would leave the bar there
+            self._write(f"{line}\n")
+            self._draw()
+
+    def draw(self) -> None:
+        """Draw it as it is at this moment."""
+        with self._lock:
+            self._draw()
+
+    def _draw(self) -> None:
+        if self.moves:
+            at = place(self._seconds, self._begun, time.monotonic())
+            self._share = max(self._share, at.share)
+            done, marks = math.floor(WIDTH * self._share), _marks(self._stream)
+            marks = marks[0] * done + marks[1] * (WIDTH - done)
+            text = f"{at.stage:13} {marks} {math.floor(100.0 * self._share)} % {about(at.left)} left"
+            self._write(text[: (_width(self._stream) or 80) - 1])
+
+    def _write(self, text: str) -> None:
+        """Write in the place of what stands there; where that fails, nothing more is said on standard error."""
+        if tell(f"{ERASED}{text}", self._stream, end="") is not None and sys.stderr is not None:
+            give_up(sys.stderr)
 
     def close(self) -> None:
         """Take the bar away."""
-        live, self._live = self._live, None
-        if live is not None:
-            with _signals_blocked():
-                live.stop()
-
-    def __rich__(self) -> Table:
-        """The bar as it is at this moment."""
-        from rich.progress_bar import ProgressBar
-        from rich.table import Table
-
-        at = place(self._seconds, self._begun, time.monotonic())
-        self._share = max(self._share, at.share)
-        row = Table.grid(padding=(0, 1))
-        bar = ProgressBar(total=1.0, completed=self._share, width=WIDTH, complete_style="green")
-        row.add_row(f"{at.stage:13}", bar, f"{math.floor(100.0 * self._share)} %", f"{about(at.left)} left")
-        return row
+        with _signals_blocked(), self._lock:
+            if self.moves:
+                self._write("")
+            self.moves = False
 
 
-def _started(bar: Bar) -> Live | None:
-    """The bar at work; None where stderr is no terminal that can be written over."""
+def _takes_back(stream: TextIO | None) -> bool:
+    """Whether what is written to a stream can be written over."""
     try:
-        if sys.stderr is None or not sys.stderr.isatty():
-            return None
+        seen = stream is not None and stream.isatty()
     except ValueError:  # closed
-        return None
-    from rich.console import Console
-    from rich.live import Live
+        return False
+    known = os.name != "nt" or "WT_SESSION" in os.environ or "TERM" in os.environ
+    return seen and known and os.environ.get("TERM", "").lower() not in ("dumb", "unknown")
 
-    class Terminal(Console):
-        """One whose cursor stays: a process that is killed cannot bring it back."""
 
-        def show_cursor(self, show: bool = True) -> bool:
-            """Leave it."""
-            del show
-            return False
-
-    console = Terminal(file=cast("TextIO", _Unfailing(sys.stderr)), force_terminal=True)
-    if not console.is_interactive:
-        return None
-    live = Live(
-        bar, console=console, refresh_per_second=2, transient=True, redirect_stdout=False, redirect_stderr=False
-    )
+def _marks(stream: TextIO | None) -> str:
+    """What is done and what is not, in letters that the stream has."""
     try:
-        with _signals_blocked():  # for ever in the bar's own thread: they reach the main one
-            live.start()
-    except BaseException:
-        live.stop()
-        raise
-    return live
+        MARKS.encode(getattr(stream, "encoding", None) or "ascii")
+    except UnicodeEncodeError:
+        return "#-"
+    return MARKS
 
 
 @contextmanager
@@ -222,27 +215,3 @@ def _signals_blocked() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-
-
-class _Unfailing:
-    """A terminal that takes what it can: one that is closed, or lacks a letter, costs no run."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-
-    @property
-    def encoding(self) -> str:
-        """That of the stream."""
-        return self._stream.encoding or "utf-8"
-
-    def flush(self) -> None:
-        """What is written is flushed."""
-
-    def write(self, text: str) -> int:
-        """Write what the stream can hold, letters that it lacks escaped."""
-        try:
-            self._stream.write(text.encode(self.encoding, "backslashreplace").decode(self.encoding))
-            self._stream.flush()
-        except (OSError, ValueError):
-            give_up(self._stream)
-        return len(text)

@@ -11,7 +11,8 @@ import numpy as np
 from palpate.images.tissue import Role
 from palpate.report.report_data import BoneDistance, InputImage, TriangleSurface
 from palpate.study.case_body import Images
-from palpate.study.result import CaseResult, pair_names
+from palpate.study.provenance import pair_names
+from palpate.study.result import CaseResult
 
 BORDER_VOXELS = 3.0  # nearer to the later image's border its surface is cut
 

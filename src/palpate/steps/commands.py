@@ -1,4 +1,4 @@
-"""The steps of the commands: a new case, its check, its mesh, a simulation, an estimate."""
+"""The steps of the commands: a new case, its check, an estimate, what its images and their noise tell."""
 
 from __future__ import annotations
 
@@ -15,14 +15,13 @@ from palpate.steps.previewing import checked_with_page, new_case_with_page, plac
 from palpate.steps.results import CaseResult, SavedResult
 from palpate.steps.saving import save_sensitivity
 from palpate.study import run
-from palpate.study import simulate as simulation
 from palpate.study.case import Case
 from palpate.study.check import CheckReport, check_case
 from palpate.study.lock import held_folder
 from palpate.study.new_case import NewCase
 from palpate.study.null_pair import NullPair, noise_of_drawings
 from palpate.study.outputs import RESULT, OutputFolder, read_json
-from palpate.study.result import SCHEMA, MeshResult, Simulation
+from palpate.study.result import SCHEMA
 from palpate.study.sensitivity import Kept, Sensitivity
 from palpate.study.sensitivity import sensitivity as vary
 from palpate.study.surface_labels import SurfaceLabels, surface_labels
@@ -120,24 +119,6 @@ def voxelise(
     grid = None if like is None else read_label_image(Path(like)).grid
     paths = [Path(path) for path in surfaces]
     return surface_labels(paths, spacing_mm=spacing_mm, margin_mm=margin_mm, axes=axes, like=grid, progress=progress)
-
-
-def make_mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
-    """The tetrahedra of a case's reference image, passed through the gate on their quality, as `palpate mesh` has them.
-
-    progress: is called with a sentence at each stage. Raises `InputDataError` for images that cannot be used,
-    `GeometryError` for organs that cannot be meshed, `MeshQualityError` for a mesh that fails its gate.
-    """
-    return run.mesh(case, progress=progress)
-
-
-def simulate(case: Case, *, steps: int = 1, progress: Progress = silent) -> Simulation:
-    """A later state of a case whose tissues all state their `youngs_modulus_kpa`, under its law, motion and loads.
-
-    steps: how many states to give, each in equilibrium at its share of the motion. Raises as `make_mesh` does, and
-    `ConfigurationError` when a modulus is missing, `NotConverged` where a finite-strain path ends early.
-    """
-    return simulation.simulate(case, progress=progress, steps=steps)
 
 
 def estimate(

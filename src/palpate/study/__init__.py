@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from palpate.study.cost import ExpectedCost as ExpectedCost
     from palpate.study.cost import expected_cost as expected_cost
     from palpate.study.earlier import strange_files as strange_files
-    from palpate.study.edge_length import EdgeLength as EdgeLength
     from palpate.study.edge_length import edge_length_of as edge_length_of
     from palpate.study.estimation import Observed as Observed
     from palpate.study.estimation import conclude as conclude
@@ -37,7 +36,6 @@ if TYPE_CHECKING:
     from palpate.study.outputs import recover as recover
     from palpate.study.outputs import staged as staged
     from palpate.study.outputs import write_json as write_json
-    from palpate.study.outputs import write_text as write_text
     from palpate.study.provenance import software_versions as software_versions
     from palpate.study.read import read_states as read_states
     from palpate.study.result import CaseResult as CaseResult
@@ -46,7 +44,6 @@ if TYPE_CHECKING:
     from palpate.study.run import estimate_states as estimate_states
     from palpate.study.run import fitted_states as fitted_states
     from palpate.study.run import inversion_settings as inversion_settings
-    from palpate.study.run import mesh as mesh
     from palpate.study.simulate import filled as filled
     from palpate.study.verdicts import estimates_of as estimates_of
     from palpate.study.verdicts import intervals_of as intervals_of

@@ -53,6 +53,11 @@ from palpate.study.imaged import ImagedStates
 from palpate.study.meshing import ReferenceMesh, mesh_reference
 from palpate.study.poisson_ratios import with_stated_priors
 
+NOTHING_MOVES = (
+    'nothing moves this body: no tissue has role = "driver" (or "rigid", and moves between the images), so no'
+    " modulus can be estimated; give the role driver to the hollow organ whose wall deforms the others"
+)
+
 
 @dataclass(frozen=True, slots=True)
 class Body:
@@ -167,10 +172,7 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
     pairs = [pair for body, first in zip(bodies, numbers, strict=False) for pair in _models(body, case, first)]
     models = tuple(model for model, _ in pairs)
     if not case.known_force and not any(motion.walls or model.constraint.offset.any() for model, motion in pairs):
-        raise ConfigurationError(  # at rest every modulus explains the images equally badly
-            'nothing moves this body: no tissue has role = "driver" and no `rigid` tissue moves between the images, so'
-            " no modulus can be estimated; give the role driver to the hollow organ whose wall deforms the others"
-        )
+        raise ConfigurationError(NOTHING_MOVES)  # at rest every modulus explains the images equally badly
     strained = [body.strained for body in bodies for _ in range(body.states.n_later)]
     finite = _finite_strain(models, strained, case)
     states = tuple(

@@ -12,7 +12,7 @@ import numpy as np
 
 from palpate.errors import GeometryError, InputDataError, PalpateError, ResourceError
 from palpate.findings import Finding, of_pair, one_a_cause, rank
-from palpate.images.checks import check_pair, check_segmentation, later_names
+from palpate.images.checks import OBSERVED, check_pair, check_segmentation, later_names
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_intensities
 from palpate.images.registration import Registration, length_text
@@ -46,7 +46,6 @@ from palpate.study.run import refuse_what_cannot_be_estimated
 from palpate.study.samples import require_samples
 
 T = TypeVar("T")
-OBSERVED = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
 REFUSED_FINDINGS = {"hardly-observed": GeometryError.exit_code}  # what an estimate refuses, found here as a finding
 
 

@@ -94,6 +94,7 @@ def conclude(
     if minimum.converged:  # of each kind of data in what is known of a tissue's modulus
         of_tissues = information_shares(minimum.evaluation, objective.n_parameters)
         shares = dict(zip(objective.parameters.tissues, of_tissues, strict=False))
+    forces, points = _measured(inversion, observed)
     findings = (
         *inversion_findings(inversion, covariance.total),
         *remark,
@@ -112,8 +113,8 @@ def conclude(
         covariance=covariance,
         starts=tuple(_start(inversion, start) for start in inversion.starts),
         fits=_fits(inversion, observed),
-        forces=_forces(inversion),
-        points=_points(inversion, observed),
+        forces=forces,
+        points=points,
         displacements=tuple(state.displacement for state in observed.states),
         counts=asdict(inversion.counts) | {"evaluations": inversion.evaluations},
         outer_loop=tuple(_iteration(inversion, iterate) for iterate in minimum.history),
@@ -218,29 +219,20 @@ def _fit(line: Linearisation, modelled: NDArray[np.int16] | None, image: NDArray
     return replace(found, dice=overlap)
 
 
-def _forces(inversion: Inversion) -> tuple[ForceFit, ...]:
-    """The readings of instruments beside what the fitted model says."""
-    found = []
+def _measured(inversion: Inversion, observed: Observed) -> tuple[tuple[ForceFit, ...], tuple[PointFit, ...]]:
+    """Readings of instruments, and the points of all observations that have some, beside what the fitted model says."""
+    forces, points = list[ForceFit](), list[PointFit]()
     for line in inversion.minimum.evaluation.lines:
-        seen = line.observation
+        seen, name = line.observation, line.observation.name
         if isinstance(seen, OfInstrument):
             fitted = seen.measured + float(line.residuals.values[0])
-            sd = line.observation.noise_model.sd
-            found.append(ForceFit(line.observation.name, line.state, seen.measured, fitted, sd))
-    return tuple(found)
-
-
-def _points(inversion: Inversion, observed: Observed) -> tuple[PointFit, ...]:
-    """The points of every observation that has some, as measured and as the fitted states move them."""
-    found = []
-    for line in inversion.minimum.evaluation.lines:
-        seen = line.observation
-        if isinstance(seen, OfPoints):
+            forces.append(ForceFit(name, line.state, seen.measured, fitted, line.observation.noise_model.sd))
+        elif isinstance(seen, OfPoints):
             motions = seen.point_motions(seen_by(line.observation, observed.states[line.state].displacement.ravel()))
             stated = line.observation.first_noise((line.observation,)).sd
             misfit = float(np.sqrt(np.mean(line.residuals.values**2))) / stated
-            found.append(PointFit(line.observation.name, line.state, motions, misfit))
-    return tuple(found)
+            points.append(PointFit(name, line.state, motions, misfit))
+    return tuple(forces), tuple(points)
 
 
 def _fits(inversion: Inversion, observed: Observed) -> tuple[tuple[TissueFit, ...], ...]:

@@ -145,7 +145,12 @@ def new_case(images: CaseImages, folder: Path) -> NewCase:
         notes.append(background.in_words)
     from_ct = background is not None and background.has_air
     named_by = _identifier([images.before, *images.after])
-    blocks = [f"{_heading(questions, notes)}\nid = {toml_text(named_by)}", _images(images, folder, from_ct=from_ct)]
+    heading = ["# Made by `palpate init`. Every role is a guess: read the reasons, correct what is wrong."]
+    heading += [f"# {line}" for line in ROLES]
+    heading += [_comment(f"QUESTION: {question}") for question in questions]
+    heading += [_comment(f"NOTE: {note}") for note in notes]
+    heading.append(f"id = {toml_text(named_by)}")
+    blocks = ["\n".join(heading), _images(images, folder, from_ct=from_ct)]
     share = float(np.prod([s.stop - s.start for s in window]) / before.labels.size)
     if share < 1.0:
         blocks.append(f'[domain]\nextent = "margin"  # {MARGIN_MM:g} mm around the organs: {share:.0%} of the image')
@@ -188,14 +193,6 @@ def _questions(tissues: Sequence[GuessedTissue]) -> tuple[str, ...]:
             " youngs_modulus_kpa to get kPa"
         )
     return tuple(asked)
-
-
-def _heading(questions: Sequence[str], notes: Sequence[str]) -> str:
-    lines = ["# Made by `palpate init`. Every role is a guess: read the reasons, correct what is wrong."]
-    lines += [f"# {line}" for line in ROLES]
-    lines += [_comment(f"QUESTION: {question}") for question in questions]
-    lines += [_comment(f"NOTE: {note}") for note in notes]
-    return "\n".join(lines)
 
 
 def _images(images: CaseImages, folder: Path, *, from_ct: bool) -> str:

@@ -16,7 +16,7 @@ from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.laws.registry import law_named
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Forecast, Progress, about, during, silent
-from palpate.study.body import Body, joint_problem, make_body
+from palpate.study.body import NOTHING_MOVES, Body, joint_problem, make_body
 from palpate.study.case import SOUGHT_RATIOS, Case, Mechanics
 from palpate.study.case_body import LAW_NAMES
 from palpate.study.case_loads import load_warnings
@@ -27,12 +27,11 @@ from palpate.study.imaged import ImagedStates
 from palpate.study.inverted import inverted
 from palpate.study.plausibility import estimate_warnings, unit_warnings
 from palpate.study.poisson_ratios import with_found_ratios
-from palpate.study.provenance import input_digests, software_versions
+from palpate.study.provenance import image_names, input_digests, software_versions
 from palpate.study.read import read_pairs, read_states
 from palpate.study.refusals import linear_strain_warnings
-from palpate.study.result import CaseResult, MeshResult, PairResult, Provenance, image_names
+from palpate.study.result import CaseResult, MeshResult, MeshSummary, PairResult, Provenance
 from palpate.study.samples import require_samples
-from palpate.study.simulate import mesh_summary
 from palpate.study.variations import Variation, voxel_mm, what_would_change
 from palpate.uncertainty import FittedState
 
@@ -120,7 +119,7 @@ def estimate_states(
         case,
         estimation,
         with_found_ratios(body.space, estimation.poisson_ratios),
-        mesh_summary(body),
+        _summary(body),
         states.before,
         states.after,
         Provenance({key: round(float(value), 3) for key, value in seconds.items()}, {}, software_versions()),
@@ -134,8 +133,12 @@ def estimate_states(
     )
 
 
-def mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
-    """Mesh the reference state of a case and pass it through the gate."""
+def make_mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
+    """The tetrahedra of a case's reference image, passed through the gate on their quality, as `palpate mesh` has them.
+
+    progress: is called with a sentence at each stage. Raises `InputDataError` for images that cannot be used,
+    `GeometryError` for organs that cannot be meshed, `MeshQualityError` for a mesh that fails its gate.
+    """
     began = time.perf_counter()
     progress("reading and aligning the images")
     states = read_states(case, progress=progress)
@@ -143,7 +146,7 @@ def mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
     body = make_body(states, case, progress=progress)
     seconds = {"total": round(time.perf_counter() - began, 3)}
     provenance = Provenance(seconds, inputs, software_versions())
-    return MeshResult(case, body.space, mesh_summary(body), states.before, provenance, _remarks(case, body))
+    return MeshResult(case, body.space, _summary(body), states.before, provenance, _remarks(case, body))
 
 
 def _what_would_change(
@@ -207,6 +210,10 @@ def fitted_states(inversion: Inversion, *bodies: Body) -> tuple[FittedState, ...
     )
 
 
+def _summary(body: Body) -> MeshSummary:
+    return MeshSummary.of(body.quality, body.space, body.edge_length)
+
+
 def _further(bodies: tuple[Body, ...], estimation: Estimation) -> tuple[PairResult, ...]:
     """The bodies after the first with their displacements."""
     first = bodies[0].states.n_later
@@ -217,7 +224,7 @@ def _further(bodies: tuple[Body, ...], estimation: Estimation) -> tuple[PairResu
         found.append(
             PairResult(
                 with_found_ratios(body.space, estimation.poisson_ratios),
-                mesh_summary(body),
+                _summary(body),
                 states.before,
                 states.after,
                 motions,
@@ -243,10 +250,7 @@ def refuse_what_cannot_be_estimated(case: Case) -> None:
         )
     movers = [tissue for tissue in case.tissues if tissue.role in (Role.DRIVER, Role.RIGID)]
     if case.tissues and case.images is not None and not movers and not case.loads and not case.data:
-        raise ConfigurationError(
-            'nothing moves this body: no tissue has role = "driver" (or "rigid", and moves between the images), so no'
-            " modulus can be estimated; give the role driver to the hollow organ whose wall deforms the others"
-        )
+        raise ConfigurationError(NOTHING_MOVES)
 
 
 def _remarks(case: Case, *bodies: Body) -> tuple[Finding, ...]:
