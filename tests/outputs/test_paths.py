@@ -108,7 +108,7 @@ def test_a_tissue_of_sixty_letters_of_four_bytes_has_its_surface(tmp_path, monke
     named = dataclasses.replace(mesh, tissues=(dataclasses.replace(mesh.tissues[0], name=60 * "𝒜"), *mesh.tissues[1:]))
     space = dataclasses.replace(case_result.space, mesh=named)
     made = MeshResult(case_result.case, space, case_result.mesh_summary, case_result.before, case_result.provenance)
-    monkeypatch.setattr(run, "mesh", lambda _, **__: made)
+    monkeypatch.setattr(run, "make_mesh", lambda _, **__: made)
     (tmp_path / "case.toml").write_text('id = "a"\n[phantom]\nkind = "spheres"\n')
     assert main(["mesh", str(tmp_path / "case.toml"), "--output", str(tmp_path / "out"), "--quiet"]) == 0
     assert [path.name for path in (tmp_path / "out" / "surfaces").glob("00_*")] == [f"00_{15 * '𝒜'}_before.vtp"]
