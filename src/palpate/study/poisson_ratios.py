@@ -9,7 +9,8 @@ import numpy as np
 
 from palpate.inversion import ParameterMap, eta_of_ratio
 from palpate.mesh.space import LagrangeSpace
-from palpate.study.case import RATIO_SD, Case
+from palpate.study.case import Case
+from palpate.study.case_tissue import RATIO_SD
 from palpate.uncertainty import Interval
 
 NOT_IDENTIFIED = "not identified"  # the verdict of what has no interval
