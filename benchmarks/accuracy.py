@@ -261,7 +261,7 @@ def _summary(results: Sequence[Result]) -> Result:
         "rms_ln_error": _rms(errors),
         "worst_ln_error": float(np.abs(errors).max()),
         "mean_ln_error": float(errors.mean()),
-        "all_converged": all(r["outcome"] in ("CONVERGED", "STALLED") for r in results),
+        "all_converged": all(r["outcome"] == "CONVERGED" for r in results),
         "estimate_seconds": float(np.mean([r["estimate_seconds"] for r in results])),
         "dofs": int(np.mean([r["dofs"] for r in results])),
     }

@@ -37,6 +37,7 @@ from palpate.inversion import (
     InversionSettings,
     Objective,
     ReducedBasis,
+    frozen_posterior,
     invert,
     posterior_sd,
     reduced_basis,
@@ -56,7 +57,7 @@ from palpate.study import (
     inversion_settings,
     make_body,
 )
-from palpate.uncertainty import frozen_posterior, posterior_chains, sandwich_covariance
+from palpate.uncertainty import posterior_chains, sandwich_covariance
 
 PARTS = "solver,linear,nonlinear,gradient,posterior,scaling,front_end,default,signals,field,map"
 IN_A_ROW = 20  # gradients, as an optimiser asks for them

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial import Delaunay
 
-from palpate.inversion import invert
+from palpate.inversion import fixed_correspondence, invert
 from palpate.inversion.objective import Evaluation
 from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimate_findings import pair_findings
 from palpate.study.together import ImagePairs, PairAlone, StatedPosterior, combinations_of, image_pairs_of, regions_of
-from palpate.uncertainty import fixed_correspondence, sandwich_covariance
+from palpate.uncertainty import sandwich_covariance
 
 NOISE = NoiseModel(np.array([0.1**2]), np.array([3.0]))
 

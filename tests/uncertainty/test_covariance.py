@@ -14,7 +14,7 @@ from palpate.inversion.optimise import Minimum, Outcome, posterior_sd
 from palpate.observation.contract import Residuals, Weighting
 from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import NoiseModel
-from palpate.observation.robust_loss import Tukey
+from palpate.observation.robust_loss import PowerLaw
 from palpate.phantoms.motion import smooth_field
 from palpate.uncertainty import NORMAL_95, FittedState, gain, sandwich_covariance
 from palpate.uncertainty.covariance import (
@@ -60,7 +60,7 @@ def surface(places, normals, jacobian, *, precision, noise, state=0, kind="surfa
     residuals = Residuals(np.zeros(n), weights, places, normals, places, None, None)
     columns = np.arange(jacobian.shape[1])
     return Linearisation(
-        Seen(noise, Weighting(precision, Tukey()), state, kind, of_driver),
+        Seen(noise, Weighting(precision, PowerLaw()), state, kind, of_driver),
         state,
         residuals,
         columns,

@@ -18,7 +18,7 @@ from palpate.observation.contract import DataFile, Residuals, Weighting, seen_by
 from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.point_displacement import point_displacement
-from palpate.observation.robust_loss import Tukey
+from palpate.observation.robust_loss import PowerLaw
 from palpate.observation.surface_distance import SurfaceDistance
 from palpate.phantoms.motion import smooth_field
 from palpate.uncertainty import sandwich_covariance
@@ -53,7 +53,7 @@ def seen(jacobian):
     places, normals = sphere()
     n, weights = len(places), np.full(len(places), 1.0 / len(places))
     target = SimpleNamespace(area=np.ones(n), surface=SimpleNamespace(driver=False))
-    surface = SurfaceDistance(target, None, NOISE, Weighting(PRECISION, Tukey()), stated_noise=NOISE)
+    surface = SurfaceDistance(target, None, NOISE, Weighting(PRECISION, PowerLaw()), stated_noise=NOISE)
     residuals = Residuals(np.zeros(n), weights, places, normals, places, None, None)
     line = Linearisation(surface, 0, residuals, np.arange(5), Jacobian.of(jacobian), weights, None)
     prior = np.diag([0.0, 0.0, 1.0, 1.0, 1.0])

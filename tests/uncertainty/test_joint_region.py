@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.inversion import Bounds, Outcome, gauss_newton
+from palpate.inversion import Bounds, Outcome, fixed_correspondence, gauss_newton
 from palpate.uncertainty.joint_region import DIRECTIONS, LEVEL, joint_region
-from palpate.uncertainty.profile import fixed_correspondence, profile
+from palpate.uncertainty.profile import profile
 
 WIDE = Bounds(np.full(2, np.log(0.02)), np.full(2, np.log(200.0)))
 

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.inversion import Bounds, Outcome, gauss_newton
+from palpate.inversion import Bounds, Outcome, fixed_correspondence, frozen_posterior, gauss_newton
 from palpate.mechanics.curved import CurvedModel
 from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.first_order import expanded
 from palpate.mechanics.laws.registry import law_named
-from palpate.uncertainty import NORMAL_95, frozen_posterior, posterior_chains
-from palpate.uncertainty.profile import fixed_correspondence, profile
+from palpate.uncertainty import NORMAL_95, posterior_chains
+from palpate.uncertainty.profile import profile
 
 WIDE = Bounds(np.full(2, np.log(0.02)), np.full(2, np.log(200.0)))
 

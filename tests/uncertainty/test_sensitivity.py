@@ -18,7 +18,7 @@ from palpate.mechanics.reaction import surface_reaction
 from palpate.observation.contract import Weighting, seen_by
 from palpate.observation.force import Force
 from palpate.observation.noise_model import NoiseModel
-from palpate.observation.robust_loss import Tukey
+from palpate.observation.robust_loss import PowerLaw
 from palpate.observation.surface_distance import surface_distance
 from palpate.observation.target import surface_target
 from palpate.uncertainty import (
@@ -93,7 +93,7 @@ def test_a_force_changes_with_poissons_ratio_as_differences_say(twin, dilatation
         model = with_poisson(twin, {"rest": ratio}, dilatation)
         there = model.solve(twin.moduli, twin.coefficients)
         reaction = surface_reaction(model.space, triangles, direction, law_named("linear"), dilatation=dilatation)
-        term = Force("force", reaction, direction, 0.0, stated, stated, Weighting(1.0, Tukey()))
+        term = Force("force", reaction, direction, 0.0, stated, stated, Weighting(1.0, PowerLaw()))
         seen = term.under(twin.moduli, np.zeros(0)).residuals(there.values[term.dofs])
         return term, there, seen
 

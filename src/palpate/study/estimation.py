@@ -21,6 +21,7 @@ from palpate.inversion import (
     OuterIterate,
     StartRun,
     as_good,
+    frozen_posterior,
     ratio_of_eta,
     with_released,
 )
@@ -64,7 +65,6 @@ from palpate.uncertainty import (
     ModulusInterval,
     StiffnessMap,
     covariance_of,
-    frozen_posterior,
     grid_errors,
     information,
     information_shares,
@@ -90,7 +90,8 @@ class Iteration:
 class Start:
     """What one start did alone: moduli (kPa, or ratios) it began and ended with, its steps and how they ended.
 
-    minimum: number, from 0, of the distinct minimum that it leads to.
+    minimum: number, from 0, of the distinct minimum that it leads to; None where that was not followed, others being
+    lower.
     """
 
     start: Mapping[str, float]
@@ -98,7 +99,7 @@ class Start:
     objective_mm2: float
     status: str
     reason: str
-    minimum: int
+    minimum: int | None
     history: tuple[Iteration, ...]
 
     @property

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.inversion import Objective, first_noise_of, fit_coefficients
-from palpate.inversion.optimise import TO_THE_NOISE
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Progress
 from palpate.study.body import Body, joint_problem, on_linear_elements
@@ -113,7 +112,7 @@ def predicted_intervals(bodies: Sequence[Body], case: Case, *, progress: Progres
     progress("the information of the images at the guessed moduli")
     guess = nearby.unknowns.copy()
     guess[: objective.n_parameters] = _guessed(case, objective, np.median(np.stack(settings.starts), axis=0))
-    fitted = fit_coefficients(objective, guess, bounds=settings.bounds, tolerance=TO_THE_NOISE)
+    fitted = fit_coefficients(objective, guess, bounds=settings.bounds)
     found = covariance_of(objective, fitted.evaluation, (), unknowns=fitted.unknowns, noise_of=noise_of)
     free = sandwich_covariance(*objective.released(fitted.evaluation, fitted.unknowns), noise_of)
     found = found.with_released(objective, fitted.evaluation, free)

@@ -13,9 +13,8 @@ from scipy import sparse
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue_distance import cropped, window_of
-from palpate.inversion.evidence import undecided_covariance
+from palpate.inversion.hyper_parameters import of_one_noise, undecided_covariance
 from palpate.inversion.objective import Evaluation, Linearisation, Objective
-from palpate.inversion.reweighting import of_one_noise
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Imaged

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from palpate.inversion import Bounds, Minimum, Objective, OuterIterate, gauss_newton
+from palpate.inversion import Bounds, Minimum, Objective, OuterIterate, fixed_correspondence, gauss_newton
 from palpate.observation.noise_model import NoiseModel
 from palpate.uncertainty.covariance import (
     GridErrors,
@@ -27,7 +27,6 @@ from palpate.uncertainty.covariance import (
     shifts_by,
 )
 from palpate.uncertainty.intervals import NORMAL_95, within_subject_cv
-from palpate.uncertainty.profile import fixed_correspondence
 
 OUTLIER = 0.01  # probability, over all pairs together, of calling one an outlier that is none
 MOST_OUTLIERS = 4  # one of so many: where more contradict the others the pairs differ, and none is wrong

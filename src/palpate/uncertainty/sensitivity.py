@@ -14,7 +14,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inversion import Bounds, Evaluation, Linearisation, Minimum, Objective, gauss_newton
+from palpate.inversion import (
+    Bounds,
+    Evaluation,
+    FixedCorrespondence,
+    Linearisation,
+    Minimum,
+    Objective,
+    fixed_correspondence,
+    gauss_newton,
+)
 from palpate.inversion.expansion import Expansion
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, finite_strain_model
@@ -23,7 +32,7 @@ from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.linear_model import LinearEquilibrium, poisson_tangents
 from palpate.mechanics.newton import NewtonSettings
 from palpate.observation.contract import Imaged, OfMaterial, seen_by
-from palpate.uncertainty.profile import PASSES, FixedCorrespondence, fixed_correspondence, refitted
+from palpate.uncertainty.profile import PASSES, refitted
 
 TOLERANCE = 1e-6  # decrement of a minimum
 STEPS = 120  # at the most: a modulus that runs away has far to go

@@ -47,9 +47,7 @@ FIELD_MM = (110.0, 120.0, 120.0)
 POISSON_RATIO = 0.45
 SPREAD = 3.0  # the reduced model is made at the middle modulus, and at it times and over this factor
 SEARCHED = (0.1, 100.0)  # bounds of the moduli, relative to the surroundings
-REDUCED_ALONE = StopRule(  # residuals are weighted robustly once, and the full model is not asked again
-    step_sd=np.inf, model_error=np.inf, derivatives=False, solve_above=np.inf, passes=1, iterations=1
-)
+REDUCED_ALONE = StopRule(step_sd=0.1, model_error=np.inf, derivatives=False)  # the full model is not asked again
 
 
 @dataclass(frozen=True, slots=True)
