@@ -133,11 +133,12 @@ def test_a_step_that_raises_the_objective_is_refused_and_a_shorter_one_taken(twi
 
     def uphill(times):
         def told(*of):
-            there, value, spent = evaluated(*of)
+            there, judged, spent = evaluated(*of)
             if len(refused) < times:
                 refused.append(there.minimum.unknowns)
-                return there, value + 1e6, spent
-            return there, value, spent
+                way = there.minimum.unknowns - start.minimum.unknowns
+                return there, replace(judged, value=judged.value + 1e6, score=judged.score + 1e6 * way), spent
+            return there, judged, spent
 
         return told
 

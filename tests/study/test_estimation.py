@@ -9,7 +9,15 @@ import pytest
 
 from palpate.errors import NotConverged
 from palpate.images.tissue import Role
-from palpate.inversion import Inversion, Outcome, OuterIterate, gauss_newton, invert, known_modulus_blocks
+from palpate.inversion import (
+    Inversion,
+    Outcome,
+    OuterIterate,
+    frozen_posterior,
+    gauss_newton,
+    invert,
+    known_modulus_blocks,
+)
 from palpate.inversion.estimate import Candidate
 from palpate.inversion.trust_region import Convergence
 from palpate.mechanics.forward import SolveCounts
@@ -19,7 +27,6 @@ from palpate.study.samples import draw_moduli
 from palpate.study.together import StatedPosterior
 from palpate.uncertainty import (
     FittedState,
-    frozen_posterior,
     grid_position_shifts,
     mesh_covariance,
     sandwich_covariance,
