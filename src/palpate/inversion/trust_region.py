@@ -262,35 +262,36 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
     trusted = [state.approximation.reach for state in objective.states if state.approximation]
     theta, reach = at.unknowns[:n], min([region.radius, *trusted])
     near = Bounds(np.maximum(bounds.lower, theta - reach), np.minimum(bounds.upper, theta + reach))
-    linear = LinearisedObjective(objective, at.unknowns, at.evaluation, region.damping)
-    plain = replace(linear, damping=0.0)
-    here = plain(at.unknowns)
-    within = 0.05 * rule.tolerance(replace(at, evaluation=here), n)
+    damping = region.damping
+    linear = LinearisedObjective(objective, at.unknowns, at.evaluation, damping)
+    within = 0.05 * rule.tolerance(at, n)
     found = gauss_newton(linear, at.unknowns, bounds=near, held=held, tolerance=INNER, within=within)
+    found = found if not damping else replace(found, evaluation=replace(linear, damping=0.0)(found.unknowns))
     longest = float(np.max(np.abs(found.unknowns - at.unknowns)[:n], initial=0.0))
     cut = not held and (longest > STRAIGHT or _cut_short(found.unknowns[:n], near, bounds))
-    there = plain(found.unknowns)
     if cut or not rule.learn:
-        ends = objective.total(here), objective.total(there)
-        return _Step(objective, replace(found, evaluation=there), here, *ends, cut)
+        ends = objective.total(at.evaluation), objective.total(found.evaluation)
+        return _Step(objective, found, at.evaluation, *ends, cut)
+    now, total = objective.total(at.evaluation), objective.total(found.evaluation)
     if rule.correlate and start.correlated < CORRELATED:
-        objective = with_correlations(objective, there)
-    linear, plain = replace(linear, objective=objective), replace(plain, objective=objective)
-    now, total = objective.total(plain(at.unknowns)), objective.total(plain(found.unknowns))
+        objective = with_correlations(objective, found.evaluation)
+        plain = LinearisedObjective(objective, at.unknowns, at.evaluation)
+        found = replace(found, evaluation=plain(found.unknowns))
+        now, total = objective.total(plain(at.unknowns)), objective.total(found.evaluation)
     for _ in range(PASSES):
-        learned = with_hyper_parameters(objective, plain(found.unknowns), found.unknowns)
-        linear, plain = replace(linear, objective=learned), replace(plain, objective=learned)
+        learned = with_hyper_parameters(objective, found.evaluation, found.unknowns)
+        linear = LinearisedObjective(learned, at.unknowns, at.evaluation, damping)
         again = gauss_newton(linear, found.unknowns, bounds=near, held=held, tolerance=INNER, within=within)
-        lower = learned.total(plain(again.unknowns))
+        again = again if not damping else replace(again, evaluation=replace(linear, damping=0.0)(again.unknowns))
+        lower = learned.total(again.evaluation)
         if lower > total:
             break
         moved = np.abs(again.unknowns - found.unknowns)[:n] / rule.tolerance(again, n)
         change, objective, found, total = total - lower, learned, again, lower
         if np.all(moved < 0.1) and change < 0.01:
             break
-    plain = replace(plain, objective=objective)
-    end = replace(found, evaluation=plain(found.unknowns))
-    return _Step(objective, end, plain(at.unknowns), now, total, False)
+    begin = LinearisedObjective(objective, at.unknowns, at.evaluation)(at.unknowns)
+    return _Step(objective, found, begin, now, total, False)
 
 
 def _cut_short(theta: NDArray[np.float64], near: Bounds, bounds: Bounds) -> bool:
