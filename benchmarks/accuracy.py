@@ -23,17 +23,9 @@ from accuracy_rows import ROWS, Row, Truths, posed
 from cramer_rao import cramer_rao, model_to_image
 from numpy.typing import NDArray
 
+from palpate.approximation import Place, exact_approximation
 from palpate.images import Role
-from palpate.inversion import (
-    InverseProblem,
-    Inversion,
-    InversionSettings,
-    Objective,
-    Place,
-    continue_at_finite_strain,
-    exact_approximation,
-    invert,
-)
+from palpate.inversion import InverseProblem, Inversion, InversionSettings, Objective, continue_at_finite_strain, invert
 from palpate.mesh import LagrangeSpace, triangle_normals
 from palpate.observation import NoiseModel, fit_noise_model, observed_surface
 from palpate.phantoms import Noise, Scene

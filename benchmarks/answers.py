@@ -26,16 +26,15 @@ import numpy as np
 from accuracy import Array, Result, true_ratios
 from accuracy_rows import ROWS, Posed, Truths, posed
 
+from palpate.approximation import Place, exact_approximation
 from palpate.inversion import (
     InverseProblem,
     Inversion,
     InversionSettings,
     Objective,
     OuterIterate,
-    Place,
     StopRule,
     begun,
-    exact_approximation,
     fit_coefficients,
     invert,
     minimised,

@@ -11,8 +11,15 @@ import numpy as np
 import pytest
 
 import palpate.inversion
-from palpate.inversion import Approximation, ExactApproximation, Place, ReducedBasis, exact_approximation, reduced_basis
-from palpate.inversion.expansion import Expansion, coarse_equilibrium, expansion_around
+from palpate.approximation import (
+    Approximation,
+    ExactApproximation,
+    Place,
+    ReducedBasis,
+    exact_approximation,
+    reduced_basis,
+)
+from palpate.approximation.expansion import Expansion, coarse_equilibrium, expansion_around
 from palpate.mechanics.conditions import Conditions
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_model
@@ -149,7 +156,7 @@ def test_elsewhere_its_error_is_stated(kind, body, made, there):
 
 
 def test_along_the_directions_wanted_its_derivatives_are_those_of_the_full_model(body, made, deciding, monkeypatch):
-    monkeypatch.setattr("palpate.inversion.expansion.FEW", 0)  # or all of them were made exact
+    monkeypatch.setattr("palpate.approximation.expansion.FEW", 0)  # or all of them were made exact
     updated = made.update(deciding)
     exactly = body.solve(deciding).tangent() @ deciding.directions
     before, after = (

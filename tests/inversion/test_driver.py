@@ -10,17 +10,9 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from palpate.inversion import (
-    Acts,
-    Block,
-    LaterState,
-    Objective,
-    ParameterMap,
-    hyper_parameters,
-    unit_blocks,
-    wall_blocks,
-)
+from palpate.inversion import LaterState, Objective, hyper_parameters
 from palpate.observation.wall_modes import Wall, wall_modes, wall_of
+from palpate.unknowns import Acts, Block, ParameterMap, unit_blocks, wall_blocks
 
 N_MODES = 90
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from palpate.inversion import (
-    Block,
     LinearisedObjective,
     StopRule,
     begun,
@@ -18,9 +17,10 @@ from palpate.inversion import (
     with_first_noise,
     with_hyper_parameters,
 )
-from palpate.inversion.blocks import Acts
 from palpate.inversion.hyper_parameters import fitted_noise, with_scales
 from palpate.observation.noise_model import NoiseModel
+from palpate.unknowns import Block
+from palpate.unknowns.blocks import Acts
 
 NOISE = NoiseModel(np.array([0.2**2]), np.array([4.0]))
 CHEAP = StopRule(model_error=np.inf, derivatives=False, learn=False)

@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 
 import palpate.inversion
+from palpate.approximation import reduced_basis
 from palpate.images.tissue import Role
-from palpate.inversion import Objective, layer_blocks, reduced_basis
+from palpate.inversion import Objective
 from palpate.inversion.objective import LinearisedObjective
 from palpate.observation.contract import Weighting
 from palpate.observation.robust_loss import PowerLaw
+from palpate.unknowns import layer_blocks
 
 MEMBERS = ("__call__", "value", "value_and_gradient", "rematched")
 PRIOR_SD = np.array([0.5, 2.0])

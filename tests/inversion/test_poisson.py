@@ -7,24 +7,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from palpate.approximation import exact_approximation, reduced_basis
 from palpate.errors import ConfigurationError
-from palpate.inversion import (
-    InverseProblem,
-    LaterState,
-    Objective,
-    ParameterMap,
-    exact_approximation,
-    invert,
-    parameter_map,
-    posterior_sd,
-    reduced_basis,
-    unit_blocks,
-)
+from palpate.inversion import InverseProblem, LaterState, Objective, invert, posterior_sd
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.laws.registry import law_named
 from palpate.mechanics.linear_model import LinearModel, linear_model
 from palpate.observation.noise_model import NoiseModel
+from palpate.unknowns import ParameterMap, parameter_map, unit_blocks
 
 NOISE = NoiseModel(np.array([0.03**2]), np.array([3.0]))
 KINDS = [("P1", Dilatation.POINTWISE), ("P2", Dilatation.MEAN), ("P2", Dilatation.BLENDED)]

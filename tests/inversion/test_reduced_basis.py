@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.inversion import Place, reduced_basis
+from palpate.approximation import Place, reduced_basis
+from palpate.approximation.reduced_basis import SERIES
 from palpate.inversion.objective import deciding_directions
-from palpate.inversion.reduced_basis import SERIES
 from palpate.observation.noise_model import SEGMENTATION_NOISE
 
 

@@ -7,24 +7,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from palpate.approximation import Place, exact_approximation, reduced_basis
+from palpate.approximation.contract import ModelError
 from palpate.errors import NotConverged
 from palpate.inversion import (
     LinearisedObjective,
     Objective,
     Outcome,
-    Place,
     StopRule,
     begun,
-    exact_approximation,
     fit_coefficients,
     invert,
     minimised,
     posterior_sd,
-    reduced_basis,
     trust_region,
     with_first_noise,
 )
-from palpate.inversion.approximation import ModelError
 from palpate.inversion.trust_region import Convergence, Criterion
 
 CHEAP = StopRule(model_error=np.inf, derivatives=False)

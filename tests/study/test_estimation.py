@@ -9,15 +9,7 @@ import pytest
 
 from palpate.errors import NotConverged
 from palpate.images.tissue import Role
-from palpate.inversion import (
-    Inversion,
-    Outcome,
-    OuterIterate,
-    frozen_posterior,
-    gauss_newton,
-    invert,
-    known_modulus_blocks,
-)
+from palpate.inversion import Inversion, Outcome, OuterIterate, frozen_posterior, gauss_newton, invert
 from palpate.inversion.estimate import Candidate
 from palpate.inversion.trust_region import Convergence
 from palpate.mechanics.forward import SolveCounts
@@ -32,6 +24,7 @@ from palpate.uncertainty import (
     sandwich_covariance,
 )
 from palpate.uncertainty.covariance import scatter
+from palpate.unknowns import known_modulus_blocks
 
 NOISE = NoiseModel(np.array([0.03**2]), np.array([3.0]))
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import EstimationError
-from palpate.inversion import LaterState, Objective, ParameterMap, unit_blocks
+from palpate.inversion import LaterState, Objective
 from palpate.inversion.objective import Evaluation, Linearisation, deciding_directions
 from palpate.inversion.optimise import Minimum, Outcome, posterior_sd
 from palpate.observation.contract import Residuals, Weighting
@@ -26,6 +26,7 @@ from palpate.uncertainty.covariance import (
     scatter,
 )
 from palpate.uncertainty.intervals import log_interval
+from palpate.unknowns import ParameterMap, unit_blocks
 
 SD = 0.3
 

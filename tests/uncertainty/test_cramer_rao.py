@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from palpate.inversion import Evaluation, LaterState, Objective, ParameterMap, unit_blocks
+from palpate.inversion import Evaluation, LaterState, Objective
 from palpate.inversion.objective import Linearisation
 from palpate.mesh import lagrange_space, located, point_interpolation
 from palpate.observation.contract import DataFile, Residuals, Weighting, seen_by
@@ -22,6 +22,7 @@ from palpate.observation.robust_loss import PowerLaw
 from palpate.observation.surface_distance import SurfaceDistance
 from palpate.phantoms.motion import smooth_field
 from palpate.uncertainty import sandwich_covariance
+from palpate.unknowns import ParameterMap, unit_blocks
 from palpate_validation.structured_meshes import box_mesh
 
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "cramer_rao.py"

@@ -1,21 +1,5 @@
 """The inverse problem: from later states and what is observed of them to the moduli that explain them."""
 
-from palpate.inversion.approximation import Approximation as Approximation
-from palpate.inversion.approximation import ExactApproximation as ExactApproximation
-from palpate.inversion.approximation import Place as Place
-from palpate.inversion.approximation import exact_approximation as exact_approximation
-from palpate.inversion.blocks import FIELD as FIELD
-from palpate.inversion.blocks import KNOWN_MODULUS as KNOWN_MODULUS
-from palpate.inversion.blocks import Acts as Acts
-from palpate.inversion.blocks import Block as Block
-from palpate.inversion.blocks import frame_blocks as frame_blocks
-from palpate.inversion.blocks import instrument_block as instrument_block
-from palpate.inversion.blocks import known_modulus_blocks as known_modulus_blocks
-from palpate.inversion.blocks import layer_blocks as layer_blocks
-from palpate.inversion.blocks import material_blocks as material_blocks
-from palpate.inversion.blocks import offset_block as offset_block
-from palpate.inversion.blocks import unit_blocks as unit_blocks
-from palpate.inversion.blocks import wall_blocks as wall_blocks
 from palpate.inversion.driver_fit import fit_driver as fit_driver
 from palpate.inversion.estimate import Inversion as Inversion
 from palpate.inversion.estimate import InversionSettings as InversionSettings
@@ -45,13 +29,6 @@ from palpate.inversion.optimise import Minimum as Minimum
 from palpate.inversion.optimise import Outcome as Outcome
 from palpate.inversion.optimise import gauss_newton as gauss_newton
 from palpate.inversion.optimise import posterior_sd as posterior_sd
-from palpate.inversion.parameters import ParameterMap as ParameterMap
-from palpate.inversion.parameters import eta_of_ratio as eta_of_ratio
-from palpate.inversion.parameters import parameter_map as parameter_map
-from palpate.inversion.parameters import ratio_of_eta as ratio_of_eta
-from palpate.inversion.reduced_basis import ReducedBasis as ReducedBasis
-from palpate.inversion.reduced_basis import reduced_basis as reduced_basis
-from palpate.inversion.total_variation import TotalVariation as TotalVariation
 from palpate.inversion.trust_region import OuterIterate as OuterIterate
 from palpate.inversion.trust_region import StopRule as StopRule
 from palpate.inversion.trust_region import begun as begun

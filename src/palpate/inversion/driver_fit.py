@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.approximation.contract import Approximation, Place
+from palpate.approximation.expansion import coarse_equilibrium, expansion_around
+from palpate.approximation.reduced_basis import reduced_basis
 from palpate.errors import NotConverged
-from palpate.inversion.approximation import Approximation, Place
-from palpate.inversion.expansion import coarse_equilibrium, expansion_around
 from palpate.inversion.hyper_parameters import with_amplitudes
 from palpate.inversion.later_state import InverseProblem
 from palpate.inversion.objective import Objective
 from palpate.inversion.optimise import Bounds
-from palpate.inversion.reduced_basis import reduced_basis
 from palpate.inversion.trust_region import StopRule, begun, fit_coefficients, minimised
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.observation.noise_model import SEGMENTATION_NOISE

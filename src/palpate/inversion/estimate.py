@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.approximation.expansion import Expansion, coarse_equilibrium, expansion_around
 from palpate.errors import ConfigurationError, EstimationError, NotConverged
-from palpate.inversion.expansion import Expansion, coarse_equilibrium, expansion_around
 from palpate.inversion.frozen_posterior import fixed_correspondence, frozen_posterior
 from palpate.inversion.hyper_parameters import with_first_noise
 from palpate.inversion.informed_subspace import informed_problem

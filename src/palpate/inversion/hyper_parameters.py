@@ -14,18 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, optimize
 
-from palpate.inversion.blocks import Acts, Block
+from palpate.approximation.contract import determined
 from palpate.inversion.objective import (
     AS_GOOD,
     Evaluation,
     Linearisation,
     Objective,
-    determined,
     log_det,
     worse_driver,
 )
 from palpate.observation.contract import Observation
 from palpate.observation.noise_model import NoiseModel
+from palpate.unknowns.blocks import Acts, Block
 
 FIRST, ELSEWHERE = 0.3, 0.05  # amplitudes of one term and of the others; one may hide the other
 LEAST_VARIANCE = 1e-3  # of a coefficient, times its variance under the block's own kernel: no mode is forbidden

@@ -13,17 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from palpate.inversion.blocks import Acts, Block
+from palpate.approximation.reduced_basis import SNAPSHOT, ReducedBasis, basis_of
 from palpate.inversion.hyper_parameters import with_first_noise
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import Objective
 from palpate.inversion.optimise import Bounds
-from palpate.inversion.reduced_basis import SNAPSHOT, ReducedBasis, basis_of
 from palpate.inversion.trust_region import fit_coefficients
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import LinearModel, LinearSystem
 from palpate.progress import Progress
+from palpate.unknowns.blocks import Acts, Block
 
 SMALL = 12  # unknowns of a block, which are kept
 

@@ -2,37 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.errors import EstimationError
-from palpate.inversion.approximation import Approximation, Derivatives, Place
+from palpate.approximation.contract import Approximation, Derivatives, Place, determined
 from palpate.inversion.later_state import LaterState
-from palpate.inversion.parameters import ParameterMap
 from palpate.mechanics.forward import Equilibrium
 from palpate.observation.contract import Observation, OfMaterial, Rematched, Residuals
 from palpate.observation.jacobian import Jacobian, jacobian_of
 from palpate.parallel import mapped
+from palpate.unknowns.parameters import ParameterMap
 
 DRIVER_LN_SD = float(np.log(2.0))  # of a driver's scale over that of its kind: how far its modes cannot follow it
 AS_GOOD = 1.92  # of minus the log posterior: half the 95 % quantile of chi-squared with one degree of freedom
-
-
-@contextmanager
-def determined() -> Iterator[None]:
-    """Where images and prior leave an unknown open, its matrix has no inverse: raises `EstimationError` for it."""
-    try:
-        yield
-    except np.linalg.LinAlgError as error:
-        raise EstimationError(
-            f"the images do not determine what is sought ({error}): beside the noise ([noise] surface_sd_mm, or that of"
-            " the residuals) the driver's motion cannot be told from none; state the noise smaller, or use images in"
-            " which the organs move more"
-        ) from error
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,8 +12,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.approximation.contract import Derivatives
 from palpate.errors import NotConverged
-from palpate.inversion.approximation import Derivatives
 from palpate.inversion.hyper_parameters import with_correlations, with_hyper_parameters
 from palpate.inversion.objective import AS_GOOD, Evaluation, LinearisedObjective, Objective
 from palpate.inversion.optimise import Bounds, Iterate, Minimum, Outcome, gauss_newton, newton_decrement, posterior_sd

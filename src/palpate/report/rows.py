@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from palpate.inversion import FIELD, KNOWN_MODULUS
 from palpate.uncertainty import NORMAL_95, Interval
+from palpate.unknowns import FIELD, KNOWN_MODULUS
 
 NONE = "–"
 BELIEVED = "what was believed before"

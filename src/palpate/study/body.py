@@ -18,20 +18,7 @@ from palpate.images.registration import ON, Registration, registration
 from palpate.images.segmentation import Segmentation
 from palpate.images.surface_alignment import align_surfaces
 from palpate.images.tissue import Role
-from palpate.inversion import (
-    Block,
-    InverseProblem,
-    LaterState,
-    frame_blocks,
-    instrument_block,
-    known_modulus_blocks,
-    layer_blocks,
-    material_blocks,
-    offset_block,
-    parameter_map,
-    unit_blocks,
-    wall_blocks,
-)
+from palpate.inversion import InverseProblem, LaterState
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.conditions import Conditions
 from palpate.mechanics.dilatation import choose_element
@@ -58,6 +45,18 @@ from palpate.study.edge_length import EdgeLength
 from palpate.study.meshing import ReferenceMesh, mesh_reference
 from palpate.study.poisson_ratios import with_stated_priors
 from palpate.study.refusals import refuse_lost, refuse_unmeshable
+from palpate.unknowns import (
+    Block,
+    frame_blocks,
+    instrument_block,
+    known_modulus_blocks,
+    layer_blocks,
+    material_blocks,
+    offset_block,
+    parameter_map,
+    unit_blocks,
+    wall_blocks,
+)
 
 SMALL_FRAME_MOTION = 1.0 / 3.0  # of what the organs do against each other: a smaller one is not worth a word
 LEVER_MM = 25.0  # about the size of an organ, at which a turn counts as a motion

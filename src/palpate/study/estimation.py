@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from palpate.errors import EstimationError
 from palpate.findings import Finding
 from palpate.inversion import (
-    KNOWN_MODULUS,
     Inversion,
     InversionSettings,
     Iterate,
@@ -22,7 +21,6 @@ from palpate.inversion import (
     StartRun,
     as_good,
     frozen_posterior,
-    ratio_of_eta,
     with_released,
 )
 from palpate.mesh.voxelise import voxelise
@@ -73,6 +71,7 @@ from palpate.uncertainty import (
     sandwich_covariance,
     stiffness_maps,
 )
+from palpate.unknowns import KNOWN_MODULUS, ratio_of_eta
 
 IDENTIFIED, WEAK = 4.0, 10.0  # largest ratio of an interval's ends: a factor of 2 to each side, and of 3.2
 

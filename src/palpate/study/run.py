@@ -12,7 +12,7 @@ from scipy.stats import qmc
 from palpate.errors import ConfigurationError, EstimationError, ResourceError
 from palpate.findings import Finding, of_pair
 from palpate.images.tissue import Role
-from palpate.inversion import Bounds, Inversion, InversionSettings, ParameterMap, eta_of_ratio
+from palpate.inversion import Bounds, Inversion, InversionSettings
 from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.laws.registry import law_named
 from palpate.parallel import blas_on_one_thread
@@ -33,6 +33,7 @@ from palpate.study.samples import require_samples
 from palpate.study.simulate import mesh_summary
 from palpate.study.variations import Variation, voxel_mm, what_would_change
 from palpate.uncertainty import FittedState
+from palpate.unknowns import ParameterMap, eta_of_ratio
 
 FURTHER = 13  # starts beside those of the case
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.approximation.expansion import Expansion
 from palpate.inversion import (
     Bounds,
     Evaluation,
@@ -24,7 +25,6 @@ from palpate.inversion import (
     fixed_correspondence,
     gauss_newton,
 )
-from palpate.inversion.expansion import Expansion
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, finite_strain_model
 from palpate.mechanics.hyperelastic import elements_of

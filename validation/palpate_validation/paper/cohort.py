@@ -8,20 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.approximation import Place, ReducedBasis, reduced_basis
 from palpate.images import Role, Tissue
-from palpate.inversion import (
-    Bounds,
-    InverseProblem,
-    InversionSettings,
-    LaterState,
-    Place,
-    ReducedBasis,
-    StopRule,
-    invert,
-    parameter_map,
-    reduced_basis,
-    unit_blocks,
-)
+from palpate.inversion import Bounds, InverseProblem, InversionSettings, LaterState, StopRule, invert
 from palpate.mechanics import Conditions, LinearModel, LinearSystem, linear_model, outer_constraint
 from palpate.mesh import Anatomy, LagrangeSpace, lagrange_space, tetrahedralise
 from palpate.observation import NoiseModel, observed_surface, prescribed_motion, surface_distance
@@ -35,6 +24,7 @@ from palpate.phantoms import (
     smooth_field,
 )
 from palpate.study import DriverMotion
+from palpate.unknowns import parameter_map, unit_blocks
 from palpate_validation.truth import target_of_truth
 
 __all__ = ["ORGANS", "CohortSettings", "PatientResult", "estimate_patient", "patient_space", "true_moduli"]

@@ -8,8 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inversion.approximation import ModelError, Place
-from palpate.inversion.objective import determined
+from palpate.approximation.contract import ModelError, Place, determined
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import LinearModel, LinearSystem, weighted_sum
 from palpate.mechanics.reduced import Projection, ReducedModel, projection

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Protocol, Self
@@ -9,6 +11,7 @@ from typing import Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.errors import EstimationError
 from palpate.mechanics.equilibrium import from_start
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
 from palpate.mechanics.first_order import FirstOrderModel, expanded
@@ -16,6 +19,19 @@ from palpate.mechanics.forward import ForwardModel, Outputs, SolveCounts
 from palpate.mechanics.linear_model import LinearEquilibrium, LinearModel
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.constraint import Constraint
+
+
+@contextmanager
+def determined() -> Iterator[None]:
+    """Where images and prior leave an unknown open, its matrix has no inverse: raises `EstimationError` for it."""
+    try:
+        yield
+    except np.linalg.LinAlgError as error:
+        raise EstimationError(
+            f"the images do not determine what is sought ({error}): beside the noise ([noise] surface_sd_mm, or that of"
+            " the residuals) the driver's motion cannot be told from none; state the noise smaller, or use images in"
+            " which the organs move more"
+        ) from error
 
 
 class LocalModel(ForwardModel, Protocol):

@@ -13,9 +13,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.approximation.contract import Approximation, Derivatives, ModelError, Place, determined
 from palpate.errors import NotConverged, SolverError
-from palpate.inversion.approximation import Approximation, Derivatives, ModelError, Place
-from palpate.inversion.objective import determined
 from palpate.mechanics.equilibrium import from_start
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
 from palpate.mechanics.first_order import FirstOrderModel
