@@ -10,7 +10,7 @@ from dataclasses import FrozenInstanceError, dataclass, fields, replace
 import numpy as np
 import pytest
 
-import palpate.inversion
+import palpate.approximation
 from palpate.approximation import (
     Approximation,
     ExactApproximation,
@@ -32,9 +32,9 @@ MEMBERS = [name for name in vars(Approximation) if not name.startswith("_")]
 
 
 def implementations():
-    """All classes of the inversion that have every member of the contract."""
+    """All classes among the approximations that have every member of the contract."""
     found = set()
-    for module in pkgutil.walk_packages(palpate.inversion.__path__, "palpate.inversion."):
+    for module in pkgutil.walk_packages(palpate.approximation.__path__, "palpate.approximation."):
         for _, kind in inspect.getmembers(importlib.import_module(module.name), inspect.isclass):
             own = kind.__module__ == module.name and kind is not Approximation
             if own and all(hasattr(kind, member) for member in MEMBERS):

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from palpate.approximation import expansion
 from palpate.approximation.contract import Derivatives
 from palpate.errors import EstimationError, NotConverged, SolverError
-from palpate.inversion import Outcome, continue_at_finite_strain, estimate, expansion, invert
+from palpate.inversion import Outcome, continue_at_finite_strain, estimate, invert
 from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.laws.registry import law_named
 

@@ -23,6 +23,7 @@ from palpate.inversion import (
     trust_region,
     with_first_noise,
 )
+from palpate.inversion.optimise import RADIUS, TRIALS
 from palpate.inversion.trust_region import Convergence, Criterion
 
 CHEAP = StopRule(model_error=np.inf, derivatives=False)
@@ -99,7 +100,7 @@ def test_where_the_trust_region_cuts_a_step_short_no_hyper_parameter_moves(twins
     filled = fit_coefficients(with_first_noise(basis), unknowns, bounds=settings.bounds)
     start = begun(with_first_noise(basis), filled.unknowns)
     one = minimised(start, settings.bounds, replace(CHEAP, iterations=1), progress=twins.silent, title="")
-    assert np.abs(one.minimum.unknowns - filled.unknowns)[:2].max() == pytest.approx(trust_region.FIRST_RADIUS)
+    assert np.abs(one.minimum.unknowns - filled.unknowns)[:2].max() == pytest.approx(0.5 * RADIUS)
     assert one.objective.states[0].noise == start.objective.states[0].noise
     assert Criterion.STEP in one.convergence.unmet
     assert one.minimum.outcome is Outcome.STEPS
@@ -135,7 +136,7 @@ def test_a_step_that_raises_the_objective_is_refused_and_a_shorter_one_taken(twi
             if len(refused) < times:
                 refused.append(there.minimum.unknowns)
                 way = there.minimum.unknowns - start.minimum.unknowns
-                return there, replace(judged, value=judged.value + 1e6, score=judged.score + 1e6 * way), spent
+                return there, replace(judged, value=judged.value + 1e6, score=judged.score + 1e9 * way), spent
             return there, judged, spent
 
         return told
@@ -151,7 +152,7 @@ def test_a_step_that_raises_the_objective_is_refused_and_a_shorter_one_taken(twi
     stuck = minimised(start, bounds, one, progress=twins.silent, title="")
     assert stuck.minimum.outcome is Outcome.STUCK
     assert np.array_equal(stuck.minimum.unknowns, start.minimum.unknowns)
-    assert len(refused) == trust_region.TRIALS
+    assert len(refused) == TRIALS
 
 
 def test_a_trial_without_equilibrium_is_refused_and_its_reason_told_where_there_is_no_other(

@@ -34,7 +34,6 @@ from palpate.progress import Progress, during, silent
 REPORTED = StopRule()
 CHEAP = StopRule(step_sd=0.3, floor=0.01, model_error=np.inf, derivatives=False)
 ELSEWHERE = replace(CHEAP, correlate=False)  # the numbers of independent residuals stay: objectives are compared
-SCREENED = 1e-2  # decrement of a start's minimum
 FOLLOWED = 2  # minima of starts beside the first one, the best
 FIRST_GUESS = StopRule(step_sd=0.5, model_error=np.inf, derivatives=False)
 RELEASED = StopRule(step_sd=0.2)  # an interval, to a tenth of its half-width
@@ -300,7 +299,7 @@ def _screened(first: OuterIterate, settings: InversionSettings, progress: Progre
     found = []
     for theta in settings.every_start:
         begin = np.concatenate([theta, at.unknowns[n:]])
-        found.append(gauss_newton(cheap, begin, bounds=settings.bounds, tolerance=SCREENED))
+        found.append(gauss_newton(cheap, begin, bounds=settings.bounds, tolerance=AS_GOOD / 200.0))
     return found
 
 

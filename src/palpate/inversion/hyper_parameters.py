@@ -30,7 +30,6 @@ from palpate.unknowns.blocks import Acts, Block
 FIRST, ELSEWHERE = 0.3, 0.05  # amplitudes of one term and of the others; one may hide the other
 LEAST_VARIANCE = 1e-3  # of a coefficient, times its variance under the block's own kernel: no mode is forbidden
 FITTED = 0.5  # of a kind's residuals, the largest share that is taken for fitted by the unknowns
-NEGLIGIBLE = 1e-3  # posterior probability of an alternative
 
 
 def with_first_noise(objective: Objective) -> Objective:
@@ -251,7 +250,7 @@ def undecided_covariance(
             shares /= shares.sum()
             part = np.zeros((n, n))
             for k, (_, believed) in enumerate(beliefs):
-                if k == chosen or shares[k] < NEGLIGIBLE:
+                if k == chosen:
                     continue
                 other = prior.copy()
                 other[np.ix_(places, places)] = linalg.inv(believed)

@@ -13,12 +13,11 @@ from palpate.errors import SolverError
 from palpate.inversion.objective import Evaluation
 
 AT_BOUND = 1e-6  # of ln E
-FIRST_RADIUS = 1.0  # of the log-moduli, per step: a factor e
-MAX_RADIUS = 2.0
-LEAST_DAMPING = 1e-2  # of the diagonal: less is nearly the step that was refused
-SEARCHES = 12  # trials of a step
+RADIUS = 2.0  # of the log-moduli, the largest of a step; a first one has half of it
+LEAST_DAMPING = 0.1  # of the diagonal: less is nearly the step that was refused
+BAD, GOOD = 0.25, 0.75  # shares of the reduction that is promised (Nocedal & Wright 2006, Algorithm 4.1)
+TRIALS = 12  # of a step
 SAME_MINIMUM = 0.02  # of ln E: minima no further apart are one
-SAME_SD = 1.0  # posterior standard deviations, too: two normal densities up to two apart have one mode together
 
 
 class LeastSquares(Protocol):
@@ -95,22 +94,25 @@ class Minimum:
 
 
 @dataclass(frozen=True, slots=True)
-class _Region:
-    """Trust region: radius of theta, and Levenberg-Marquardt damping of all unknowns relative to the diagonal."""
+class TrustRegion:
+    """The largest step of a log-modulus, and Levenberg-Marquardt damping of all unknowns relative to the diagonal."""
 
-    radius: float = FIRST_RADIUS
+    radius: float = 0.5 * RADIUS
     damping: float = 0.0
 
-    def smaller(self) -> _Region:
-        """After a step that was refused."""
-        return _Region(self.radius / 3.0, max(10.0 * self.damping, LEAST_DAMPING))
+    def smaller(self, longest: float) -> TrustRegion:
+        """After a step that was refused, whose `longest` log-modulus is known."""
+        return TrustRegion(0.5 * min(self.radius, longest), max(4.0 * self.damping, LEAST_DAMPING))
 
-    def larger(self) -> _Region:
-        """After a step that brought what it promised."""
-        return _Region(min(2.0 * self.radius, MAX_RADIUS), self.damping / 10.0 if self.damping > LEAST_DAMPING else 0.0)
+    def after(self, share: float, longest: float, *, grows: bool = True) -> TrustRegion:
+        """After a step that was taken, which brought a `share` of what it promised."""
+        damping = self.damping / 4.0 if self.damping > LEAST_DAMPING else 0.0
+        if share < BAD:
+            return TrustRegion(0.5 * min(self.radius, longest), damping)
+        return TrustRegion(min(2.0 * self.radius, RADIUS) if share > GOOD and grows else self.radius, damping)
 
 
-WHOLE = _Region(np.inf, 0.0)  # the step to the minimum of the quadratic model
+WHOLE = TrustRegion(np.inf, 0.0)  # the step to the minimum of the quadratic model
 
 
 def posterior_sd(minimum: Minimum, n_parameters: int) -> NDArray[np.float64]:
@@ -122,8 +124,11 @@ def posterior_sd(minimum: Minimum, n_parameters: int) -> NDArray[np.float64]:
 
 
 def same_minimum(unknowns: NDArray[np.float64], minimum: Minimum, n_parameters: int) -> bool:
-    """Whether unknowns (n_unknowns,) lie so near a minimum that both are one."""
-    width = np.maximum(SAME_MINIMUM, SAME_SD * posterior_sd(minimum, n_parameters))
+    """Whether unknowns (n_unknowns,) lie so near a minimum that both are one: within a posterior standard deviation.
+
+    Two normal densities up to two apart have one mode together.
+    """
+    width = np.maximum(SAME_MINIMUM, posterior_sd(minimum, n_parameters))
     return bool(np.all(np.abs(unknowns - minimum.unknowns)[:n_parameters] < width))
 
 
@@ -145,7 +150,7 @@ def gauss_newton(
     to the model's minimum moves each log-modulus by less than `within` (one number, or (n_parameters,)). `held`: which
     log-moduli (n_parameters,) keep their values, or whether all do.
     """
-    unknowns, region, history, n = start.copy(), _Region(), list[Iterate](), objective.n_parameters
+    unknowns, region, history, n = start.copy(), TrustRegion(), list[Iterate](), objective.n_parameters
     now, evaluations, outcome = objective(unknowns), 1, Outcome.STEPS
     for _ in range(max_steps):
         if not np.isfinite(now.value):
@@ -174,26 +179,27 @@ def _search(
     *,
     free: NDArray[np.bool_],
     bounds: Bounds,
-    region: _Region,
-) -> tuple[tuple[NDArray[np.float64], Evaluation, _Region] | None, int, bool]:
+    region: TrustRegion,
+) -> tuple[tuple[NDArray[np.float64], Evaluation, TrustRegion] | None, int, bool]:
     """First step that reduces the objective, with the next region, or None; the trials; whether any was solved."""
     n, solved = objective.n_parameters, False
-    for trials in range(SEARCHES):
+    for trials in range(TRIALS):
         trial = unknowns + _step(now, free, n, region)
         trial[:n] = np.clip(trial[:n], bounds.lower, bounds.upper)
         step = trial - unknowns
+        longest = float(np.abs(step[:n]).max(initial=0.0))
         promised = -now.score @ step - 0.5 * step @ now.matrix @ step
         try:
             there = objective(trial)
         except SolverError:  # no law answers where elements are turned inside out
-            region = region.smaller()
+            region = region.smaller(longest)
             continue
         solved = True
         gain = now.value - there.value
         if promised > 0.0 and gain > 1e-4 * promised:  # what a bound leaves of a step may lead uphill
-            return (trial, there, region.larger() if gain > 0.25 * promised else region), trials + 1, True
-        region = region.smaller()
-    return None, SEARCHES, solved
+            return (trial, there, region.after(float(gain / promised), longest)), trials + 1, True
+        region = region.smaller(longest)
+    return None, TRIALS, solved
 
 
 def _free(
@@ -216,7 +222,7 @@ def newton_decrement(now: Evaluation, free: NDArray[np.bool_] | slice = slice(No
     return float(0.5 * score @ _solve(matrix, score))
 
 
-def _step(now: Evaluation, free: NDArray[np.bool_], n_parameters: int, region: _Region) -> NDArray[np.float64]:
+def _step(now: Evaluation, free: NDArray[np.bool_], n_parameters: int, region: TrustRegion) -> NDArray[np.float64]:
     """Damped Gauss-Newton step (n,) whose log-moduli stay within the radius."""
     matrix = now.matrix + region.damping * np.diag(np.diag(now.matrix))
     ridge = np.diag(np.where(np.arange(len(free)) < n_parameters, np.diag(now.matrix), 0.0))

@@ -16,22 +16,26 @@ from palpate.approximation.contract import Derivatives
 from palpate.errors import NotConverged
 from palpate.inversion.hyper_parameters import with_correlations, with_hyper_parameters
 from palpate.inversion.objective import AS_GOOD, Evaluation, LinearisedObjective, Objective
-from palpate.inversion.optimise import Bounds, Iterate, Minimum, Outcome, gauss_newton, newton_decrement, posterior_sd
+from palpate.inversion.optimise import (
+    BAD,
+    TRIALS,
+    Bounds,
+    Iterate,
+    Minimum,
+    Outcome,
+    TrustRegion,
+    gauss_newton,
+    newton_decrement,
+    posterior_sd,
+)
 from palpate.mechanics.forward import SolveCounts
 from palpate.observation.contract import seen_by
 from palpate.progress import silent
 
-FIRST_RADIUS, MAX_RADIUS = 1.0, 2.0  # of ln E, of a first step, and of any
 NOISE = 0.5  # of the objective: that of closest points that slide over voxels (Sun & Nocedal 2023, Math. Program.)
-ACCEPTED, BAD, GOOD = 0.1, 0.25, 0.75  # shares of the reduction that the linear residuals promise
 INNER = 1e-4  # decrement of a minimum on linear residuals
-PASSES = 12  # of unknowns and hyper-parameters in turn on them
-TRIALS = 6  # of a step
-GROWS = 10  # iterations, after which the trust region no longer does: minima that explain as much end in one of them
-CORRELATED = 6  # times that the numbers of independent residuals are taken anew: what is left of them is their noise
+SETTLES = 6  # iterations, after which numbers of independent residuals stay, and the trust region no longer grows
 STRAIGHT = 0.4  # of ln E, within which what linear residuals leave is noise
-NEAR = 0.5  # posterior standard deviations: a shorter step ends where exact derivatives are worth their price
-FORCING = 0.1  # of a step, that the model's error may set off before the model is made exact
 SLOW = 0.5  # of the model's error an iteration before: where more is left all derivatives are made exact
 LEAST_SD = 0.03  # of ln E, see `_linearisation`
 
@@ -120,23 +124,6 @@ def begun(objective: Objective, unknowns: NDArray[np.float64]) -> OuterIterate:
 
 
 @dataclass(frozen=True, slots=True)
-class _Region:
-    """Trust region: the largest step of a log-modulus, and damping of all unknowns relative to the diagonal."""
-
-    radius: float = FIRST_RADIUS
-    damping: float = 0.0
-
-    def after(self, ratio: float, longest: float, *, refused: bool = False, grows: bool = True) -> _Region:
-        """The region after a step whose `longest` log-modulus brought a `ratio` of what it promised."""
-        if refused:
-            return _Region(0.5 * min(self.radius, longest), max(4.0 * self.damping, 0.1))
-        damping = self.damping / 4.0 if self.damping > 0.1 else 0.0
-        if ratio < BAD:
-            return _Region(0.5 * min(self.radius, longest), damping)
-        return _Region(min(2.0 * self.radius, MAX_RADIUS) if ratio > GOOD and grows else self.radius, damping)
-
-
-@dataclass(frozen=True, slots=True)
 class _Step:
     """A minimum on linear residuals: unknowns, the hyper-parameters there, J at both ends; cut: by the trust region.
 
@@ -185,12 +172,12 @@ def minimised(
     begin = replace(start.minimum, history=(first,), outcome=Outcome.STEPS)
     now = replace(start, minimum=begin, totals=(), correlated=0)
     del start
-    region = _Region()
+    region = TrustRegion()
     for number in range(1, rule.iterations + 1):
         line = f"{title}, iteration {number}"
         lowered = f", objective {now.totals[-1][0]:.2f} to {now.totals[-1][1]:.2f}" if now.totals else ""
         progress(f"{line}: {now.objective.parameters.in_words(now.minimum.unknowns)}{lowered}")
-        now, region = _iteration(now, bounds, rule, region, held, grows=number <= GROWS)
+        now, region = _iteration(now, bounds, rule, region, held, grows=number <= SETTLES)
         if now.minimum.outcome is Outcome.STUCK:
             break
         if now.convergence.converged:
@@ -216,8 +203,8 @@ def fit_coefficients(objective: Objective, begin: NDArray[np.float64], *, bounds
 
 
 def _iteration(
-    now: OuterIterate, bounds: Bounds, rule: StopRule, region: _Region, held: bool, *, grows: bool
-) -> tuple[OuterIterate, _Region]:
+    now: OuterIterate, bounds: Bounds, rule: StopRule, region: TrustRegion, held: bool, *, grows: bool
+) -> tuple[OuterIterate, TrustRegion]:
     """One accepted step, or `STUCK` where none of some trials is; the region for the next, and whether it may grow."""
     n, before = now.objective.n_parameters, now.minimum
     failure, trial_evaluations = None, 0
@@ -228,13 +215,13 @@ def _iteration(
         try:
             there, judged, spent = _evaluated(step, now, rule)
         except NotConverged as error:
-            failure, region = error, region.after(0.0, longest, refused=True)
+            failure, region = error, region.smaller(longest)
             continue
         failure, trial_evaluations = None, trial_evaluations + spent
         then = step.then + judged.value - step.minimum.evaluation.value
         gain, promised = step.reductions(before.unknowns, judged)
         ratio = (gain + NOISE) / (promised + NOISE)
-        if ratio >= ACCEPTED:
+        if ratio > BAD:
             share = gain / max(promised, 1e-9) if longest > STRAIGHT or not grows else ratio
             region = region.after(share, longest, grows=grows)
             end = there.minimum
@@ -243,14 +230,14 @@ def _iteration(
             end = replace(end, history=(*before.history, arrived), evaluations=spent)
             totals = (*now.totals, (step.now, then))
             return replace(there, minimum=end, totals=totals), region
-        region = region.after(ratio, longest, refused=True)
+        region = region.smaller(longest)
     if failure is not None:
         raise failure
     spent = before.evaluations + trial_evaluations
     return replace(now, minimum=replace(before, outcome=Outcome.STUCK, evaluations=spent)), region
 
 
-def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region: _Region, held: bool) -> _Step:
+def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region: TrustRegion, held: bool) -> _Step:
     """Unknowns and hyper-parameters with the least objective on residuals linear around a minimum so far.
 
     In turn, each of which lowers it: unknowns under given hyper-parameters, and these (see `with_hyper_parameters`).
@@ -273,12 +260,12 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
         ends = objective.total(at.evaluation), objective.total(found.evaluation)
         return _Step(objective, found, at.evaluation, *ends, cut)
     now, total = objective.total(at.evaluation), objective.total(found.evaluation)
-    if rule.correlate and start.correlated < CORRELATED:
+    if rule.correlate and start.correlated < SETTLES:
         objective = with_correlations(objective, found.evaluation)
         plain = LinearisedObjective(objective, at.unknowns, at.evaluation)
         found = replace(found, evaluation=plain(found.unknowns))
         now, total = objective.total(plain(at.unknowns)), objective.total(found.evaluation)
-    for _ in range(PASSES):
+    for _ in range(rule.iterations):
         learned = with_hyper_parameters(objective, found.evaluation, found.unknowns)
         linear = LinearisedObjective(learned, at.unknowns, at.evaluation, damping)
         again = gauss_newton(linear, found.unknowns, bounds=near, held=held, tolerance=INNER, within=within)
@@ -325,13 +312,11 @@ def _evaluated(step: _Step, now: OuterIterate, rule: StopRule) -> tuple[OuterIte
     _, off, cost = model_error(objective, minimum)
     missing = float(np.max(off / (rule.model_error * tolerance), initial=0.0))
     left = float(np.max(_linearisation(objective, minimum) / tolerance, initial=0.0)) if rule.derivatives else 0.0
-    near = bool(np.all(moved < NEAR * posterior_sd(minimum, n)))
-    checks = now.checks + cost
-    matters = missing > max(1.0, FORCING * size / rule.model_error) or (near and max(missing, left) >= 1.0)
+    checks, matters = now.checks + cost, max(missing, left) >= 1.0
     judged = minimum.evaluation
     if matters:
         slow = missing >= 1.0 and missing > SLOW * now.convergence.model_error
-        worth = Derivatives.KEPT if not near else Derivatives.ALL if slow else Derivatives.DECIDING
+        worth = Derivatives.ALL if slow else Derivatives.DECIDING
         places = objective.places(unknowns, minimum.evaluation, worth)
         pairs = zip(objective.approximations, places, strict=True)
         objective = objective.under([approximation.update(place) for approximation, place in pairs])
