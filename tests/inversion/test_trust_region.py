@@ -136,7 +136,7 @@ def test_a_step_that_raises_the_objective_is_refused_and_a_shorter_one_taken(twi
             if len(refused) < times:
                 refused.append(there.minimum.unknowns)
                 way = there.minimum.unknowns - start.minimum.unknowns
-                return there, replace(judged, value=judged.value + 1e6, score=judged.score + 1e9 * way), spent
+                return there, replace(judged, value=judged.value + 1e6, score=judged.score + 1e12 * way), spent
             return there, judged, spent
 
         return told

@@ -255,7 +255,7 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
     found = gauss_newton(linear, at.unknowns, bounds=near, held=held, tolerance=INNER, within=within)
     found = found if not damping else replace(found, evaluation=replace(linear, damping=0.0)(found.unknowns))
     longest = float(np.max(np.abs(found.unknowns - at.unknowns)[:n], initial=0.0))
-    cut = not held and (longest > STRAIGHT or _cut_short(found.unknowns[:n], near, bounds))
+    cut = damping > 0.0 or (not held and (longest > STRAIGHT or _cut_short(found.unknowns[:n], near, bounds)))
     if cut or not rule.learn:
         ends = objective.total(at.evaluation), objective.total(found.evaluation)
         return _Step(objective, found, at.evaluation, *ends, cut)
@@ -267,9 +267,8 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
         now, total = objective.total(plain(at.unknowns)), objective.total(found.evaluation)
     for _ in range(rule.iterations):
         learned = with_hyper_parameters(objective, found.evaluation, found.unknowns)
-        linear = LinearisedObjective(learned, at.unknowns, at.evaluation, damping)
+        linear = LinearisedObjective(learned, at.unknowns, at.evaluation)
         again = gauss_newton(linear, found.unknowns, bounds=near, held=held, tolerance=INNER, within=within)
-        again = again if not damping else replace(again, evaluation=replace(linear, damping=0.0)(again.unknowns))
         lower = learned.total(again.evaluation)
         if lower > total:
             break
