@@ -20,7 +20,6 @@ from palpate.inversion.objective import (
     Evaluation,
     Linearisation,
     Objective,
-    log_det,
     worse_driver,
 )
 from palpate.observation.contract import Observation
@@ -199,7 +198,6 @@ def with_edges(objective: Objective, evaluation: Evaluation, unknowns: NDArray[n
     prior, centre = parameters.prior_matrix, parameters.prior_centre
     data = evaluation.matrix - evaluation.prior
     pull = data @ unknowns - (evaluation.score - evaluation.prior_score)
-    beyond = 0.0
     for i in numbers:
         places, variation = parameters.columns(i), parameters.blocks[i].variation
         assert variation is not None
@@ -210,9 +208,8 @@ def with_edges(objective: Objective, evaluation: Evaluation, unknowns: NDArray[n
             prior[np.ix_(places, places)] = curvature = variation.curvature(x)
             away = linalg.solve(curvature, variation.gradient(x), assume_a="pos")
         centre[places] = x - away
-        beyond += variation.value(x) - 0.5 * float(away @ curvature @ away) + 0.5 * log_det(curvature)
     believed = replace(parameters, nuisance_precision=prior[n:, n:], nuisance_mean=centre[n:])
-    return replace(objective, parameters=believed, beyond_normal=beyond)
+    return replace(objective, parameters=believed)
 
 
 def undecided_covariance(

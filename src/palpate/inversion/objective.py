@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
 from palpate.approximation.contract import Approximation, Derivatives, Place, determined
 from palpate.inversion.later_state import LaterState
@@ -79,15 +80,13 @@ class Objective:
     scales s_k of the observations' `weighting`, the blocks' covariance P^-1, and the numbers of the alternatives
     that are `chosen` for them, with their odds as p(h); the last term integrates over x by Laplace's approximation, H =
     J^T W J + P. A call gives what depends on x at these h, `log_terms` the rest. Each observation has an offset, where
-    `parameters` have one. last_open: whether the blocks that are learned last have a choice yet. beyond_normal: what
-    minus the logarithm of priors that are not normal has beside the normal laws that `parameters` have in their place.
+    `parameters` have one. last_open: whether the blocks that are learned last have a choice yet.
     """
 
     states: tuple[LaterState, ...]
     parameters: ParameterMap
     chosen: tuple[int | None, ...] = ()
     last_open: bool = False
-    beyond_normal: float = 0.0
 
     @property
     def n_parameters(self) -> int:
@@ -96,7 +95,6 @@ class Objective:
 
     def log_terms(self, evaluation: Evaluation) -> float:
         """What J has beside an evaluation's value: ln Z of the residuals, ln det P, ln p(h), ln det H."""
-        precision = self.parameters.nuisance_precision
         pairs = zip(self.parameters.blocks, self.chosen, strict=False)
         odds = [block.odds[c] for block, c in pairs if block.odds and c is not None]
         residuals = sum(o.weighting.log_normaliser for o in self.observations)
@@ -104,8 +102,27 @@ class Objective:
             kinds = {o.kind: o.weighting.sd for o in state.observations if not o.of_driver}
             drivers = [o for o in state.observations if o.of_driver and o.kind in kinds]
             residuals += sum(worse_driver(o.weighting.sd, kinds[o.kind]) for o in drivers)
-        prior = self.beyond_normal - 0.5 * log_det(precision) - sum(odds)
-        return residuals + prior + 0.5 * log_det(evaluation.matrix)
+        normal, beyond = self._as_normal(evaluation)
+        n = self.n_parameters
+        determinants = log_det(evaluation.matrix - evaluation.prior + normal) - log_det(normal[n:, n:])
+        return residuals + beyond - sum(odds) + 0.5 * determinants
+
+    def _as_normal(self, evaluation: Evaluation) -> tuple[NDArray[np.float64], float]:
+        """Precision P (n_unknowns, n_unknowns) for the determinants; what J has beside the normal laws of `parameters`.
+
+        A total variation counts as it is where it was evaluated, and in the determinants as the normal law with which
+        it begins: its curvature has edges, which no smooth function of x follows.
+        """
+        normal, beyond = evaluation.prior, 0.0
+        for i, block in enumerate(self.parameters.blocks):
+            if block.variation:
+                own = self.parameters.columns(i)
+                away = linalg.solve(normal[np.ix_(own, own)], evaluation.prior_score[own], assume_a="pos")
+                x = self.parameters.prior_centre[own] + away
+                beyond += block.variation.value(x) - 0.5 * float(away @ evaluation.prior_score[own])
+                normal = normal.copy()
+                normal[np.ix_(own, own)] = block.precision
+        return normal, beyond
 
     def total(self, evaluation: Evaluation) -> float:
         """J, dimensionless, where it was evaluated."""
