@@ -60,9 +60,10 @@ def with_scales(objective: Objective, evaluation: Evaluation) -> Objective:
     1992): s^2 = n rho / (n - g) of a mean square rho where no outlier is.
     """
     lines, found, inverse = evaluation.lines, dict[int, float](), np.zeros_like(evaluation.matrix)
-    seen = np.flatnonzero(np.diag(evaluation.matrix) > 0.0)
+    matrix = evaluation.matrix - evaluation.prior + objective.as_normal(evaluation)[0]
+    seen = np.flatnonzero(np.diag(matrix) > 0.0)
     with determined():
-        inverse[np.ix_(seen, seen)] = np.linalg.inv(evaluation.matrix[np.ix_(seen, seen)])
+        inverse[np.ix_(seen, seen)] = np.linalg.inv(matrix[np.ix_(seen, seen)])
     for own, telling in of_one_noise(evaluation).values():
         pooled = _scale([lines[i] for i in telling], inverse, 0.0)
         apart = [i for i in own if i not in telling]

@@ -102,12 +102,12 @@ class Objective:
             kinds = {o.kind: o.weighting.sd for o in state.observations if not o.of_driver}
             drivers = [o for o in state.observations if o.of_driver and o.kind in kinds]
             residuals += sum(worse_driver(o.weighting.sd, kinds[o.kind]) for o in drivers)
-        normal, beyond = self._as_normal(evaluation)
+        normal, beyond = self.as_normal(evaluation)
         n = self.n_parameters
         determinants = log_det(evaluation.matrix - evaluation.prior + normal) - log_det(normal[n:, n:])
         return residuals + beyond - sum(odds) + 0.5 * determinants
 
-    def _as_normal(self, evaluation: Evaluation) -> tuple[NDArray[np.float64], float]:
+    def as_normal(self, evaluation: Evaluation) -> tuple[NDArray[np.float64], float]:
         """Precision P (n_unknowns, n_unknowns) for the determinants; what J has beside the normal laws of `parameters`.
 
         A total variation counts as it is where it was evaluated, and in the determinants as the normal law with which
