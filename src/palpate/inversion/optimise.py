@@ -101,8 +101,12 @@ class TrustRegion:
     damping: float = 0.0
 
     def smaller(self, longest: float) -> TrustRegion:
-        """After a step that was refused, whose `longest` log-modulus is known."""
-        return TrustRegion(0.5 * min(self.radius, longest), max(4.0 * self.damping, LEAST_DAMPING))
+        """After a step that was refused, whose `longest` log-modulus is known.
+
+        It is damped only where no log-modulus is left to be shortened: damping all unknowns ends a step along a valley.
+        """
+        damping = self.damping if longest > SAME_MINIMUM else max(4.0 * self.damping, LEAST_DAMPING)
+        return TrustRegion(0.5 * min(self.radius, longest), damping)
 
     def after(self, share: float, longest: float, *, grows: bool = True) -> TrustRegion:
         """After a step that was taken, which brought a `share` of what it promised."""
