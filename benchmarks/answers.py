@@ -26,7 +26,7 @@ import numpy as np
 from accuracy import Array, Result, true_ratios
 from accuracy_rows import ROWS, Posed, Truths, posed
 
-from palpate.approximation import Place, exact_approximation
+from palpate.approximation import LinearisationPoint, exact_approximation
 from palpate.inversion import (
     InverseProblem,
     Inversion,
@@ -134,7 +134,7 @@ def _exact(objective: Objective, unknowns: Array, *, finite_strain: bool = False
     moduli, coefficients = objective.parameters.moduli(unknowns), objective.parameters.coefficients(unknowns)
     models = [(state.model, state.finite_strain if finite_strain else None) for state in objective.states]
     return objective.under(
-        [exact_approximation(*m, Place(moduli, q)) for m, q in zip(models, coefficients, strict=True)]
+        [exact_approximation(*m, LinearisationPoint(moduli, q)) for m, q in zip(models, coefficients, strict=True)]
     )
 
 

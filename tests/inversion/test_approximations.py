@@ -14,7 +14,7 @@ import palpate.approximation
 from palpate.approximation import (
     Approximation,
     ExactApproximation,
-    Place,
+    LinearisationPoint,
     ReducedBasis,
     exact_approximation,
     reduced_basis,
@@ -98,13 +98,13 @@ def body(kind, twin):
 
 @pytest.fixture(scope="module")
 def here(twin):
-    return Place(np.array([16.0, 14.0, 10.0]), 0.5 * twin.coefficients)
+    return LinearisationPoint(np.array([16.0, 14.0, 10.0]), 0.5 * twin.coefficients)
 
 
 @pytest.fixture(scope="module")
 def there(twin):
     """Ten per cent from `here` in the moduli and in the motion."""
-    return Place(np.array([17.6, 12.6, 10.0]), 0.55 * twin.coefficients)
+    return LinearisationPoint(np.array([17.6, 12.6, 10.0]), 0.55 * twin.coefficients)
 
 
 @pytest.fixture(scope="module")
@@ -185,7 +185,7 @@ def test_what_it_cost_grows_with_an_update_and_not_where_it_is_exact_already(mad
     again = updated.update(there)
     assert total(updated.counts) > total(made.counts)
     assert total(again.counts) == total(updated.counts)
-    assert made.reach > 0.0
+    assert made.trust_radius > 0.0
 
 
 def test_what_its_error_costs_is_stated(made, there, monkeypatch):

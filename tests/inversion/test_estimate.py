@@ -196,7 +196,7 @@ def hold(monkeypatch):
     follow = estimate.minimised
 
     def here(start, bounds, rule, **named):
-        return follow(start, bounds, rule, held=True, **named)
+        return follow(start, bounds, rule, fixed=True, **named)
 
     monkeypatch.setattr(estimate, "minimised", here)
 

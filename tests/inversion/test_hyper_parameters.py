@@ -57,7 +57,7 @@ def test_the_first_noise_does_not_depend_on_what_was_weighted_before(minimum):
 
 def test_a_drivers_residuals_do_not_tell_the_noise(minimum):
     _, found = minimum
-    lines = found.evaluation.lines
+    lines = found.evaluation.linearisations
     telling = [line.residuals for line in lines if not line.observation.of_driver]
     assert 0 < len(telling) < len(lines)
     alone = lines[0].observation.fitted_noise(telling)
@@ -137,9 +137,9 @@ def test_a_later_image_that_was_drawn_badly_leaves_the_others_their_noise(twins)
         )
         if line.state == 1
         else line
-        for line in evaluation.lines
+        for line in evaluation.linearisations
     ]
-    spoilt_evaluation = replace(evaluation, lines=tuple(lines))
+    spoilt_evaluation = replace(evaluation, linearisations=tuple(lines))
     good, spoilt = (fitted_noise(e) for e in (evaluation, spoilt_evaluation))
     assert spoilt[0, "surface distance"].key == good[0, "surface distance"].key
     assert spoilt[1, "surface distance"].sd > 1.3 * good[1, "surface distance"].sd
@@ -174,4 +174,4 @@ def test_what_is_learned_last_waits_until_it_is_asked_for(minimum):
     one = mixture(objective, (0.02 * size, size), odds=(0.0, 0.0), last=True)
     here = linear(one, found)(found.unknowns)
     assert with_hyper_parameters(one, here, found.unknowns).chosen == (None,)
-    assert with_hyper_parameters(replace(one, last_open=True), here, found.unknowns).chosen == (1,)
+    assert with_hyper_parameters(replace(one, learn_last=True), here, found.unknowns).chosen == (1,)

@@ -107,9 +107,9 @@ def test_matrix_and_score_are_those_of_weighted_residuals_and_the_prior(objectiv
     stated = np.any(parameters.prior_precision != 0.0)
     mean, precision = (PRIOR_MEAN, PRIOR_SD**-2.0) if stated else (np.zeros(2), np.zeros(2))
     prior = np.diag(np.append(precision, np.ones(len(unknowns) - 2)))
-    roots = [np.sqrt(line.precision * line.weights) for line in now.lines]
-    rows = np.concatenate([r[:, None] * whole(s, unknowns) for r, s in zip(roots, now.lines, strict=True)])
-    values = np.concatenate([r * s.residuals.values for r, s in zip(roots, now.lines, strict=True)])
+    roots = [np.sqrt(line.precision * line.weights) for line in now.linearisations]
+    rows = np.concatenate([r[:, None] * whole(s, unknowns) for r, s in zip(roots, now.linearisations, strict=True)])
+    values = np.concatenate([r * s.residuals.values for r, s in zip(roots, now.linearisations, strict=True)])
     pull = prior @ (unknowns - np.append(mean, np.zeros(len(unknowns) - 2)))
     assert now.prior == pytest.approx(prior)
     assert now.prior_score == pytest.approx(pull)
@@ -147,8 +147,8 @@ def test_the_modes_of_one_image_do_not_move_the_other(twins, twin):
     objective = two_images(twins, twin)
     now = objective(place(objective, 5))
     n = twin.model.n_modes
-    assert all(s.columns.tolist() == [*range(2 + n)] for s in now.lines[:3])
-    assert all(s.columns.tolist() == [0, 1, *range(2 + n, 2 + 2 * n)] for s in now.lines[3:])
+    assert all(s.columns.tolist() == [*range(2 + n)] for s in now.linearisations[:3])
+    assert all(s.columns.tolist() == [0, 1, *range(2 + n, 2 + 2 * n)] for s in now.linearisations[3:])
 
 
 def test_at_the_truth_only_the_prior_pulls(twin, exact):
@@ -164,10 +164,10 @@ def test_at_the_truth_only_the_prior_pulls(twin, exact):
 def test_residuals_beyond_the_cutoff_count_less(twins, twin):
     objective = robust(twins, twin)
     now = objective(np.concatenate([[0.0, 0.0], -twin.coefficients]))
-    values = np.concatenate([line.residuals.values for line in now.lines])
-    weights = np.concatenate([line.weights for line in now.lines])
+    values = np.concatenate([line.residuals.values for line in now.linearisations])
+    weights = np.concatenate([line.weights for line in now.linearisations])
     assert np.any(np.abs(values) > 0.5)
-    shares = np.concatenate([line.residuals.weights for line in now.lines])
+    shares = np.concatenate([line.residuals.weights for line in now.linearisations])
     assert np.array_equal(weights < shares, np.abs(values) > 0.5)
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.approximation import Place, exact_approximation, reduced_basis
+from palpate.approximation import LinearisationPoint, exact_approximation, reduced_basis
 from palpate.approximation.contract import ModelError
 from palpate.errors import NotConverged
 from palpate.inversion import (
@@ -86,7 +86,7 @@ def test_going_on_from_the_estimate_changes_nothing(twins, found):
 
 def test_the_full_model_finds_the_same_where_the_reduced_one_stands(twins, twin, found):
     """All derivatives of the full model exact at every place."""
-    place = Place(found.objective.parameters.moduli(found.minimum.unknowns), found.minimum.unknowns[2:])
+    place = LinearisationPoint(found.objective.parameters.moduli(found.minimum.unknowns), found.minimum.unknowns[2:])
     end = on(found, found.objective.under([exact_approximation(twin.model, None, place)]), twins, exact=True)
     assert end.minimum.converged
     assert moved(end.minimum, found.minimum) < 1.0
@@ -219,10 +219,10 @@ def test_what_an_approximation_misses_is_told_by_how_far_it_sets_the_moduli_off(
     start = begun(twins.objective_of(voxels, twin.coefficients).under([crude]), twin.unknowns)
     objective, here = start.objective, start.minimum
     error, off, _ = trust_region.model_error(objective, here)
-    place = Place(objective.parameters.moduli(here.unknowns), here.unknowns[2:])
+    place = LinearisationPoint(objective.parameters.moduli(here.unknowns), here.unknowns[2:])
     full = objective.under([exact_approximation(twin.model, None, place)])(here.unknowns)
     pull = np.zeros(len(here.unknowns))
-    for line, exact in zip(here.evaluation.lines, full.lines, strict=True):
+    for line, exact in zip(here.evaluation.linearisations, full.linearisations, strict=True):
         change = exact.residuals.values - line.residuals.values
         pull[line.columns] += line.jacobian.transposed_times(line.precision * line.weights * change)
     true = np.abs(here.evaluation.covariance_columns(2).T @ pull)
@@ -244,7 +244,9 @@ def test_an_approximation_that_cannot_say_what_it_misses_leaves_everything_open(
 def test_derivatives_that_are_exact_nowhere_leave_everything_open(found):
     state, minimum = found.objective.states[0], found.minimum
     basis, sd = state.approximation, posterior_sd(minimum, 2)
-    here = Place(found.objective.parameters.moduli(minimum.unknowns), minimum.unknowns[2:], np.eye(3, 1), np.eye(3))
+    here = LinearisationPoint(
+        found.objective.parameters.moduli(minimum.unknowns), minimum.unknowns[2:], np.eye(3, 1), np.eye(3)
+    )
 
     def left(place):
         return trust_region._linearisation(found.objective.under([replace(basis, place=place)]), minimum)

@@ -54,7 +54,7 @@ def single(twins, twin, settings):
 
 
 def no_errors(inversion):
-    return [[np.zeros(len(line.weights)) for line in inversion.minimum.evaluation.lines]] * 8
+    return [[np.zeros(len(line.weights)) for line in inversion.minimum.evaluation.linearisations]] * 8
 
 
 def test_later_images_are_stated_in_kpa_each_alone(both, settings):

@@ -266,8 +266,8 @@ def test_later_states_of_one_rest_state_have_the_same_image_of_it(twins, twin, i
 
     def errors(reference):
         states = (objective.states[0], replace(objective.states[0], reference=reference))
-        lines = [*evaluation.lines, *(replace(line, state=1) for line in evaluation.lines)]
-        both = replace(evaluation, lines=tuple(lines))
+        lines = [*evaluation.linearisations, *(replace(line, state=1) for line in evaluation.linearisations)]
+        both = replace(evaluation, linearisations=tuple(lines))
         found = imaging_errors(replace(objective, states=states), both, (state, state), rng=np.random.default_rng(3))
         first, second = np.concatenate(found[:3]), np.concatenate(found[3:])
         return np.corrcoef(first, second)[0, 1]
@@ -306,9 +306,9 @@ def test_the_grid_adds_to_stated_noise_and_to_what_residuals_tell_what_that_lack
     assert grid_covariance(told, noise, 1.1 * noise) == pytest.approx(np.zeros((3, 3)), abs=1e-12)
     lines = [
         replace(line, observation=replace(line.observation, stated_noise=NoiseModel(np.ones(1), np.ones(1))))
-        for line in told.lines
+        for line in told.linearisations
     ]
-    assert np.array_equal(grid_covariance(replace(told, lines=tuple(lines)), grid, noise), grid)
+    assert np.array_equal(grid_covariance(replace(told, linearisations=tuple(lines)), grid, noise), grid)
 
 
 def test_nothing_is_taken_from_what_is_known_of_fewer_unknowns(rng):

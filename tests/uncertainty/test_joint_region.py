@@ -69,9 +69,9 @@ def test_the_order_of_the_two_is_that_of_the_columns(fixed, minimum, covariance,
 def test_a_fit_that_does_not_end_leaves_the_region_open(objective, minimum, covariance, monkeypatch):
     """With two moduli held, the drivers' motion is not."""
 
-    def ended(of, start, *, held=False, **given):
-        found = gauss_newton(of, start, held=held, **given)
-        return replace(found, evaluation=of(start), unknowns=start, outcome=Outcome.STUCK) if np.any(held) else found
+    def ended(of, start, *, fixed=False, **given):
+        found = gauss_newton(of, start, fixed=fixed, **given)
+        return replace(found, evaluation=of(start), unknowns=start, outcome=Outcome.STUCK) if np.any(fixed) else found
 
     monkeypatch.setattr("palpate.uncertainty.profile.gauss_newton", ended)
     fixed = fixed_correspondence(objective, minimum.unknowns, minimum.evaluation)

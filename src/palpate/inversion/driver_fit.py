@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.approximation.contract import Approximation, Place
+from palpate.approximation.contract import Approximation, LinearisationPoint
 from palpate.approximation.expansion import coarse_equilibrium, expansion_around
 from palpate.approximation.reduced_basis import reduced_basis
 from palpate.errors import NotConverged
@@ -43,7 +43,7 @@ def fit_driver(
     first = []
     for state, basis, q in zip(problem.states, linear, amounts, strict=True):
         assert state.finite_strain is not None
-        coarse = coarse_equilibrium(state.finite_strain, basis, Place(moduli, q))
+        coarse = coarse_equilibrium(state.finite_strain, basis, LinearisationPoint(moduli, q))
         first.append(expansion_around(coarse, tolerance=ACCURACY))
     amounts = _fitted(held, first, np.concatenate(amounts))
     found = []
@@ -67,7 +67,7 @@ def _fitted(
     objective = held.under(models).with_observations([o.with_noise(SEGMENTATION_NOISE) for o in held.observations])
     first = fit_coefficients(objective, begin, bounds=bounds)
     objective = with_amplitudes(objective, first.evaluation, first.unknowns)
-    found = minimised(begun(objective, first.unknowns), bounds, FITTED, progress=silent, title="", held=True).minimum
+    found = minimised(begun(objective, first.unknowns), bounds, FITTED, progress=silent, title="", fixed=True).minimum
     if not found.converged:
         raise NotConverged(f"the driver's wall could not be fitted to the later image: {found.outcome.value}")
     return held.parameters.coefficients(found.unknowns)

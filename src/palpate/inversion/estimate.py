@@ -320,7 +320,7 @@ def _coarse(linear: OuterIterate) -> tuple[Objective, list[FiniteStrainEquilibri
 
     Its states bend as the linear law does.
     """
-    before, places = linear.objective, linear.objective.places(linear.minimum.unknowns)
+    before, places = linear.objective, linear.objective.linearisation_points(linear.minimum.unknowns)
     found, states = list[FiniteStrainEquilibrium](), list[LaterState]()
     for state, basis, place in zip(before.states, before.approximations, places, strict=True):
         assert state.finite_strain is not None
@@ -342,7 +342,7 @@ def _expanded(
 def _at_equilibrium(end: OuterIterate, before: tuple[Iterate, ...]) -> OuterIterate:
     """The end of an outer loop at exact equilibria; `before`: the way to where it began."""
     exact = []
-    places = end.objective.places(end.minimum.unknowns)
+    places = end.objective.linearisation_points(end.minimum.unknowns)
     for approximation, place in zip(end.objective.approximations, places, strict=True):
         assert isinstance(approximation, Expansion)
         exact.append(approximation.at_equilibrium(place, tolerance=ACCURACY))

@@ -84,7 +84,7 @@ def fixed_correspondence(
         values = model.solve(moduli, q).values
         displacements += [values[rows] for rows in state.slices]
         models.append(CurvedModel.of(model, like) if like and isinstance(model, FirstOrderModel) else model)
-    return FixedCorrespondence(objective, unknowns, tuple(models), evaluation.lines, tuple(displacements))
+    return FixedCorrespondence(objective, unknowns, tuple(models), evaluation.linearisations, tuple(displacements))
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,7 +188,7 @@ def frozen_posterior(
                 f"the posterior is frozen on reduced models; state {s} has a {type(model).__name__}"
             )
         answer = np.concatenate([reduced.output_basis, reduced.output_modes, reduced.output_material], axis=1)
-        lines = [line for line in evaluation.lines if line.state == s]
+        lines = [line for line in evaluation.linearisations if line.state == s]
         expanded = moduli if any(line.residuals.direct is not None for line in lines) else None
         if expanded is not None:
             answer = np.pad(answer, ((0, 0), (0, len(moduli))))
@@ -214,6 +214,6 @@ def frozen_posterior(
             side = by_z.transposed_times(line.weights * rest)[:, None]
             own = np.block([[by_z.gram(line.weights), side], [side.T, float(line.weights @ rest**2)]])
             form += line.precision * own
-            square += own / len(evaluation.lines)
+            square += own / len(evaluation.linearisations)
         states.append(replace(bare, form=form, square=square))
     return FrozenPosterior(objective, tuple(states), evaluation.prior)

@@ -59,7 +59,7 @@ def with_scales(objective: Objective, evaluation: Evaluation) -> Objective:
     d/d ln s of 1/2 ln det H is -g, g = tr H^-1 J^T W J the number of unknowns that the residuals determine (MacKay
     1992): s^2 = n rho / (n - g) of a mean square rho where no outlier is.
     """
-    lines, found, inverse = evaluation.lines, dict[int, float](), np.zeros_like(evaluation.matrix)
+    lines, found, inverse = evaluation.linearisations, dict[int, float](), np.zeros_like(evaluation.matrix)
     matrix = evaluation.matrix - evaluation.prior + objective.as_normal(evaluation)[0]
     seen = np.flatnonzero(np.diag(matrix) > 0.0)
     with determined():
@@ -107,7 +107,7 @@ def fitted_noise(evaluation: Evaluation) -> dict[tuple[int, str], NoiseModel]:
 
     Each later image has its own: one that was drawn badly would else take from what the others are believed.
     """
-    lines, groups = evaluation.lines, of_one_noise(evaluation)
+    lines, groups = evaluation.linearisations, of_one_noise(evaluation)
     telling = {key: [lines[i] for i in those] for key, (_, those) in groups.items()}
     return {key: of[0].observation.fitted_noise([line.residuals for line in of]) for key, of in telling.items()}
 
@@ -118,7 +118,7 @@ def of_one_noise(evaluation: Evaluation) -> dict[tuple[int, str], tuple[list[int
     Modes flatten a driver's residuals: they tell where nothing else is seen.
     """
     groups: dict[tuple[int, str], tuple[list[int], list[int]]] = {}
-    for i, line in enumerate(evaluation.lines):
+    for i, line in enumerate(evaluation.linearisations):
         own, telling = groups.setdefault((line.state, line.observation.kind), ([], []))
         own.append(i)
         telling += [] if line.observation.of_driver else [i]
@@ -169,7 +169,7 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
     data, prior = evaluation.matrix - evaluation.prior, evaluation.prior.copy()
     pull = data @ unknowns - (evaluation.score - evaluation.prior_score)
     for i, block in enumerate(parameters.blocks):
-        if not block.alternatives or (block.last and not objective.last_open):
+        if not block.alternatives or (block.last and not objective.learn_last):
             continue
         places = parameters.columns(i)
         beliefs = _beliefs(block, places, data, prior, pull + prior @ parameters.prior_centre)

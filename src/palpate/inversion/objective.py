@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from palpate.approximation.contract import Approximation, Derivatives, Place, determined
+from palpate.approximation.contract import Approximation, Derivatives, LinearisationPoint, determined
 from palpate.inversion.later_state import LaterState
 from palpate.mechanics.forward import Equilibrium
 from palpate.observation.contract import Observation, OfMaterial, Rematched, Residuals
@@ -58,7 +58,7 @@ class Evaluation:
     gradient: NDArray[np.float64]
     score: NDArray[np.float64]
     matrix: NDArray[np.float64]
-    lines: tuple[Linearisation, ...]
+    linearisations: tuple[Linearisation, ...]
     prior: NDArray[np.float64]
     prior_score: NDArray[np.float64]
 
@@ -80,13 +80,13 @@ class Objective:
     scales s_k of the observations' `weighting`, the blocks' covariance P^-1, and the numbers of the alternatives
     that are `chosen` for them, with their odds as p(h); the last term integrates over x by Laplace's approximation, H =
     J^T W J + P. A call gives what depends on x at these h, `log_terms` the rest. Each observation has an offset, where
-    `parameters` have one. last_open: whether the blocks that are learned last have a choice yet.
+    `parameters` have one. learn_last: whether the blocks that are learned last have a choice yet.
     """
 
     states: tuple[LaterState, ...]
     parameters: ParameterMap
     chosen: tuple[int | None, ...] = ()
-    last_open: bool = False
+    learn_last: bool = False
 
     @property
     def n_parameters(self) -> int:
@@ -140,19 +140,22 @@ class Objective:
         assert len(found) == len(self.states), "an objective is made of states with approximations"
         return found
 
-    def places(
-        self, unknowns: NDArray[np.float64], evaluation: Evaluation | None = None, worth: Derivatives = Derivatives.KEPT
-    ) -> list[Place]:
+    def linearisation_points(
+        self,
+        unknowns: NDArray[np.float64],
+        evaluation: Evaluation | None = None,
+        derivatives: Derivatives = Derivatives.KEPT,
+    ) -> list[LinearisationPoint]:
         """What unknowns (n_unknowns,) mean for each state; by an `evaluation` with the directions that decide there."""
         mapping = self.parameters
         moduli, coefficients = mapping.moduli(unknowns), mapping.coefficients(unknowns)
         if evaluation is None:
-            return [Place(moduli, q) for q in coefficients]
+            return [LinearisationPoint(moduli, q) for q in coefficients]
         directions, places = deciding_directions(evaluation, mapping.n_parameters), []
         for s, q in enumerate(coefficients):
             own, chain = mapping.unknowns_of(s), mapping.chain(s, unknowns)
             metric = chain @ evaluation.matrix[np.ix_(own, own)] @ chain.T
-            places.append(Place(moduli, q, chain @ directions[own], metric, worth))
+            places.append(LinearisationPoint(moduli, q, chain @ directions[own], metric, derivatives))
         return places
 
     def under(self, approximations: Sequence[Approximation]) -> Objective:
@@ -337,7 +340,7 @@ class LinearisedObjective:
             gradient = known.jacobian.transposed_times(observation.weighting.precision * weights * values)
             return replace(known, observation=observation, residuals=residuals, weights=weights, gradient=gradient)
 
-        lines = mapped(line, zip(self.objective.observations, self.evaluation.lines, strict=True))
+        lines = mapped(line, zip(self.objective.observations, self.evaluation.linearisations, strict=True))
         found = self.objective.assembled(unknowns, lines)
         if not self.damping:
             return found

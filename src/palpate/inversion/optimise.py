@@ -122,9 +122,15 @@ WHOLE = TrustRegion(np.inf, 0.0)  # the step to the minimum of the quadratic mod
 def posterior_sd(minimum: Minimum, n_parameters: int) -> NDArray[np.float64]:
     """Standard deviations (n_parameters,) of the log-moduli by the Gauss-Newton matrix.
 
-    Raises `EstimationError` where neither images nor prior determine some unknown.
+    Infinite where a modulus moves nothing, as in a body at rest. Raises `EstimationError` where neither images nor prior
+    determine some other unknown.
     """
-    return np.asarray(np.sqrt(np.diag(minimum.evaluation.covariance_columns(n_parameters))))
+    evaluation, sd = minimum.evaluation, np.full(n_parameters, np.inf)
+    seen = np.diag(evaluation.matrix) > 0.0
+    kept = seen[:n_parameters]
+    own = evaluation if seen.all() else replace(evaluation, matrix=evaluation.matrix[np.ix_(seen, seen)])
+    sd[kept] = np.sqrt(np.diag(own.covariance_columns(int(kept.sum()))))
+    return sd
 
 
 def same_minimum(unknowns: NDArray[np.float64], minimum: Minimum, n_parameters: int) -> bool:
@@ -141,7 +147,7 @@ def gauss_newton(
     start: NDArray[np.float64],
     *,
     bounds: Bounds,
-    held: NDArray[np.bool_] | bool = False,
+    fixed: NDArray[np.bool_] | bool = False,
     tolerance: float = 1e-3,
     within: NDArray[np.float64] | float = np.inf,
     max_steps: int = 40,
@@ -151,7 +157,7 @@ def gauss_newton(
     Step: (J^T W J + P + mu D) d = -s, s the score, with the log-moduli's part no longer than the trust radius; a step
     is taken when it reduces the objective (Nocedal & Wright 2006, Algorithm 4.1). It ends when the decrement -s.d / 2,
     the reduction that the quadratic model still promises in units of log-likelihood, is under `tolerance` and the step
-    to the model's minimum moves each log-modulus by less than `within` (one number, or (n_parameters,)). `held`: which
+    to the model's minimum moves each log-modulus by less than `within` (one number, or (n_parameters,)). `fixed`: which
     log-moduli (n_parameters,) keep their values, or whether all do.
     """
     unknowns, region, history, n = start.copy(), TrustRegion(), list[Iterate](), objective.n_parameters
@@ -160,7 +166,7 @@ def gauss_newton(
         if not np.isfinite(now.value):
             outcome = Outcome.NOT_FINITE
             break
-        free = _free(objective, unknowns, now, bounds, held)
+        free = _free(objective, unknowns, now, bounds, fixed)
         decrement = newton_decrement(now, free)
         history.append(Iterate(unknowns[:n], now.value, now.misfit_mm2, decrement))
         if decrement < tolerance and np.all(np.abs(_step(now, free, n, WHOLE)[:n]) < within):
@@ -211,12 +217,12 @@ def _free(
     unknowns: NDArray[np.float64],
     now: Evaluation,
     bounds: Bounds,
-    held: NDArray[np.bool_] | bool,
+    fixed: NDArray[np.bool_] | bool,
 ) -> NDArray[np.bool_]:
-    """Unknowns that may move: not a log-modulus at a bound that pulls outwards, nor a held one."""
+    """Unknowns that may move: not a log-modulus at a bound that pulls outwards, nor a fixed one."""
     n = objective.n_parameters
     theta, slope = unknowns[:n], now.score[:n]
-    still = ((theta <= bounds.lower) & (slope > 0.0)) | ((theta >= bounds.upper) & (slope < 0.0)) | held
+    still = ((theta <= bounds.lower) & (slope > 0.0)) | ((theta >= bounds.upper) & (slope < 0.0)) | fixed
     return np.concatenate([~still, np.ones(len(unknowns) - n, dtype=bool)])
 
 

@@ -35,7 +35,7 @@ from palpate.progress import silent
 NOISE = 0.5  # of the objective: that of closest points that slide over voxels (Sun & Nocedal 2023, Math. Program.)
 INNER = 1e-4  # decrement of a minimum on linear residuals
 SETTLES = 6  # iterations, after which numbers of independent residuals stay, and the trust region no longer grows
-STRAIGHT = 0.4  # of ln E, within which what linear residuals leave is noise
+LINEAR_RANGE = 0.4  # of ln E, within which what linear residuals leave is noise
 SLOW = 0.5  # of the model's error an iteration before: where more is left all derivatives are made exact
 LEAST_SD = 0.03  # of ln E, see `_linearisation`
 
@@ -159,13 +159,13 @@ def minimised(
     *,
     progress: Callable[[str], None],
     title: str,
-    held: bool = False,
+    fixed: bool = False,
 ) -> OuterIterate:
     """Lower the objective from `start` until a stop rule is met.
 
-    held: whether the log-moduli stay. `title` begins each line of `progress`. The minimum's history is that of the loop
-    alone, its evaluations are added to those of `start`. Raises `NotConverged` when the full model has no equilibrium
-    where every trial leads.
+    fixed: whether the log-moduli stay. `title` begins each line of `progress`. The minimum's history is that of the
+    loop alone, its evaluations are added to those of `start`. Raises `NotConverged` when the full model has no
+    equilibrium where every trial leads.
     """
     at, n = start.minimum.evaluation, start.objective.n_parameters
     first = Iterate(start.minimum.unknowns[:n], at.value, at.misfit_mm2, newton_decrement(at))
@@ -177,12 +177,12 @@ def minimised(
         line = f"{title}, iteration {number}"
         lowered = f", objective {now.totals[-1][0]:.2f} to {now.totals[-1][1]:.2f}" if now.totals else ""
         progress(f"{line}: {now.objective.parameters.in_words(now.minimum.unknowns)}{lowered}")
-        now, region = _iteration(now, bounds, rule, region, held, grows=number <= SETTLES)
+        now, region = _iteration(now, bounds, rule, region, fixed, grows=number <= SETTLES)
         if now.minimum.outcome is Outcome.STUCK:
             break
         if now.convergence.converged:
-            wider = replace(now.objective, last_open=True)
-            if now.objective.last_open or not rule.learn or not any(b.last for b in wider.parameters.blocks):
+            wider = replace(now.objective, learn_last=True)
+            if now.objective.learn_last or not rule.learn or not any(b.last for b in wider.parameters.blocks):
                 now = replace(now, minimum=replace(now.minimum, outcome=Outcome.CONVERGED))
                 break
             learned = with_hyper_parameters(wider, now.minimum.evaluation, now.minimum.unknowns)
@@ -199,17 +199,17 @@ def fit_coefficients(objective: Objective, begin: NDArray[np.float64], *, bounds
     To a fifth of their standard deviations each, in the mean.
     """
     rule = StopRule(step_sd=np.inf, coefficients=0.02, model_error=np.inf, derivatives=False, learn=False)
-    return minimised(begun(objective, begin), bounds, rule, progress=silent, title="coefficients", held=True).minimum
+    return minimised(begun(objective, begin), bounds, rule, progress=silent, title="coefficients", fixed=True).minimum
 
 
 def _iteration(
-    now: OuterIterate, bounds: Bounds, rule: StopRule, region: TrustRegion, held: bool, *, grows: bool
+    now: OuterIterate, bounds: Bounds, rule: StopRule, region: TrustRegion, fixed: bool, *, grows: bool
 ) -> tuple[OuterIterate, TrustRegion]:
     """One accepted step, or `STUCK` where none of some trials is; the region for the next, and whether it may grow."""
     n, before = now.objective.n_parameters, now.minimum
     failure, trial_evaluations = None, 0
     for _ in range(TRIALS):
-        step = _linear_minimum(now, bounds, rule, region, held)
+        step = _linear_minimum(now, bounds, rule, region, fixed)
         moved = np.abs(step.minimum.unknowns - before.unknowns)
         longest = float(np.max(moved[:n], initial=0.0))
         try:
@@ -222,7 +222,7 @@ def _iteration(
         gain, promised = step.reductions(before.unknowns, judged)
         ratio = (gain + NOISE) / (promised + NOISE)
         if ratio > BAD:
-            share = gain / max(promised, 1e-9) if longest > STRAIGHT or not grows else ratio
+            share = gain / max(promised, 1e-9) if longest > LINEAR_RANGE or not grows else ratio
             region = region.after(share, longest, grows=grows)
             end = there.minimum
             seen, spent = end.evaluation, before.evaluations + trial_evaluations
@@ -237,7 +237,7 @@ def _iteration(
     return replace(now, minimum=replace(before, outcome=Outcome.STUCK, evaluations=spent)), region
 
 
-def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region: TrustRegion, held: bool) -> _Step:
+def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region: TrustRegion, fixed: bool) -> _Step:
     """Unknowns and hyper-parameters with the least objective on residuals linear around a minimum so far.
 
     In turn, each of which lowers it: unknowns under given hyper-parameters, and these (see `with_hyper_parameters`).
@@ -246,16 +246,16 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
     they have been taken anew some times.
     """
     objective, at, n = start.objective, start.minimum, start.objective.n_parameters
-    trusted = [state.approximation.reach for state in objective.states if state.approximation]
+    trusted = [state.approximation.trust_radius for state in objective.states if state.approximation]
     theta, reach = at.unknowns[:n], min([region.radius, *trusted])
     near = Bounds(np.maximum(bounds.lower, theta - reach), np.minimum(bounds.upper, theta + reach))
     damping = region.damping
     linear = LinearisedObjective(objective, at.unknowns, at.evaluation, damping)
     within = 0.05 * rule.tolerance(at, n)
-    found = gauss_newton(linear, at.unknowns, bounds=near, held=held, tolerance=INNER, within=within)
+    found = gauss_newton(linear, at.unknowns, bounds=near, fixed=fixed, tolerance=INNER, within=within)
     found = found if not damping else replace(found, evaluation=replace(linear, damping=0.0)(found.unknowns))
     longest = float(np.max(np.abs(found.unknowns - at.unknowns)[:n], initial=0.0))
-    cut = damping > 0.0 or (not held and (longest > STRAIGHT or _cut_short(found.unknowns[:n], near, bounds)))
+    cut = damping > 0.0 or (not fixed and (longest > LINEAR_RANGE or _cut_short(found.unknowns[:n], near, bounds)))
     if cut or not rule.learn:
         ends = objective.total(at.evaluation), objective.total(found.evaluation)
         return _Step(objective, found, at.evaluation, *ends, cut)
@@ -268,7 +268,7 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
     for _ in range(rule.iterations):
         learned = with_hyper_parameters(objective, found.evaluation, found.unknowns)
         linear = LinearisedObjective(learned, at.unknowns, at.evaluation)
-        again = gauss_newton(linear, found.unknowns, bounds=near, held=held, tolerance=INNER, within=within)
+        again = gauss_newton(linear, found.unknowns, bounds=near, fixed=fixed, tolerance=INNER, within=within)
         lower = learned.total(again.evaluation)
         if lower > total:
             break
@@ -315,8 +315,8 @@ def _evaluated(step: _Step, now: OuterIterate, rule: StopRule) -> tuple[OuterIte
     judged = minimum.evaluation
     if matters:
         slow = missing >= 1.0 and missing > SLOW * now.convergence.model_error
-        worth = Derivatives.ALL if slow else Derivatives.DECIDING
-        places = objective.places(unknowns, minimum.evaluation, worth)
+        derivatives = Derivatives.ALL if slow else Derivatives.DECIDING
+        places = objective.linearisation_points(unknowns, minimum.evaluation, derivatives)
         pairs = zip(objective.approximations, places, strict=True)
         objective = objective.under([approximation.update(place) for approximation, place in pairs])
         minimum, spent = replace(minimum, evaluation=objective(unknowns)), 2
@@ -352,14 +352,14 @@ def model_error(objective: Objective, minimum: Minimum) -> tuple[float, NDArray[
     that is missing, the residuals' smooth derivatives S by it and the Gauss-Newton matrix H = J^T W J + P; infinite
     where an approximation cannot say.
     """
-    pairs = list(zip(objective.approximations, objective.places(minimum.unknowns), strict=True))
+    pairs = list(zip(objective.approximations, objective.linearisation_points(minimum.unknowns), strict=True))
     cost = sum((approximation.error_counts for approximation, _ in pairs), SolveCounts())
     errors = [approximation.error(at) for approximation, at in pairs]
     largest = max(error.relative for error in errors)
     if not np.isfinite(largest):
         return np.inf, np.full(objective.n_parameters, np.inf), cost
     pull = np.zeros(len(minimum.unknowns))
-    for line in minimum.evaluation.lines:
+    for line in minimum.evaluation.linearisations:
         du = seen_by(line.observation, errors[line.state].missing)
         missing = np.asarray(line.residuals.smooth_jacobian @ du)
         pull[line.columns] += line.jacobian.transposed_times(line.precision * line.weights * missing)

@@ -109,7 +109,7 @@ def data_findings(inversion: Inversion) -> tuple[Finding, ...]:
     And for each reading of an instrument whose sign no modulus gives.
     """
     findings, mapping, unknowns = [], inversion.objective.parameters, inversion.minimum.unknowns
-    for line in inversion.minimum.evaluation.lines:
+    for line in inversion.minimum.evaluation.linearisations:
         seen = line.observation
         if isinstance(seen, OfInstrument):
             names, offsets = mapping.offset_names(line.state), mapping.offsets(unknowns, line.state)

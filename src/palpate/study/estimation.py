@@ -595,7 +595,7 @@ def _fit(line: Linearisation, modelled: NDArray[np.int16] | None, image: NDArray
 def _forces(inversion: Inversion) -> tuple[ForceFit, ...]:
     """The readings of instruments beside what the fitted model says."""
     found = []
-    for line in inversion.minimum.evaluation.lines:
+    for line in inversion.minimum.evaluation.linearisations:
         seen = line.observation
         if isinstance(seen, OfInstrument):
             fitted = seen.measured + float(line.residuals.values[0])
@@ -607,7 +607,7 @@ def _forces(inversion: Inversion) -> tuple[ForceFit, ...]:
 def _points(inversion: Inversion, observed: Observed) -> tuple[PointFit, ...]:
     """The points of every observation that has some, as measured and as the fitted states move them."""
     found = []
-    for line in inversion.minimum.evaluation.lines:
+    for line in inversion.minimum.evaluation.linearisations:
         seen = line.observation
         if isinstance(seen, OfPoints):
             motions = seen.point_motions(seen_by(line.observation, observed.states[line.state].displacement.ravel()))
@@ -628,7 +628,7 @@ def _fits(inversion: Inversion, observed: Observed) -> tuple[tuple[TissueFit, ..
     for s, (fitted, image) in enumerate(zip(observed.states, observed.images, strict=True)):
         motions = (np.zeros_like(fitted.displacement), fitted.displacement)
         modelled = [None if image is None else voxelise(fitted.space, u, fitted.after, crossing=True) for u in motions]
-        seen = zip(inversion.rest.lines, inversion.minimum.evaluation.lines, strict=True)
+        seen = zip(inversion.rest.linearisations, inversion.minimum.evaluation.linearisations, strict=True)
         of_state = [pair for pair in seen if pair[0].state == s and pair[0].observation.unit == "mm"]
         fits.append(
             tuple(

@@ -98,7 +98,7 @@ class Ray:
     def _at_its_best(self, start: NDArray[np.float64]) -> Minimum:
         """All that is not held at its best, sought from unknowns (n,), and once more from where that did not end."""
         for _ in range(TRIES):
-            found = gauss_newton(self.fixed, start, bounds=self.bounds, held=self.held, tolerance=1e-4)
+            found = gauss_newton(self.fixed, start, bounds=self.bounds, fixed=self.held, tolerance=1e-4)
             if found.converged:
                 break
             start = found.unknowns

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.approximation import Place, ReducedBasis, reduced_basis
+from palpate.approximation import LinearisationPoint, ReducedBasis, reduced_basis
 from palpate.images import Role, Tissue
 from palpate.inversion import Bounds, InverseProblem, InversionSettings, LaterState, StopRule, invert
 from palpate.mechanics import Conditions, LinearModel, LinearSystem, linear_model, outer_constraint
@@ -154,7 +154,7 @@ class _Pair:
         settings = InversionSettings((np.log(np.full(len(ORGANS), 2.0)),), bounds)
         found = invert(problem, settings, progress=lambda _: None, rule=REDUCED_ALONE).minimum
         coefficients = problem.parameters.coefficients(found.unknowns)[0]
-        bound = self.basis.error(Place(problem.parameters.moduli(found.unknowns), coefficients)).relative
+        bound = self.basis.error(LinearisationPoint(problem.parameters.moduli(found.unknowns), coefficients)).relative
         return _Estimate(SURROUNDINGS_KPA * np.exp(found.unknowns[: len(ORGANS)]), found.converged, bound)
 
     def problem(self) -> InverseProblem:
