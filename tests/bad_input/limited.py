@@ -1,14 +1,12 @@
 """Run by the tests of bad input: a warm process that forks one with limits for each command line it is given.
 
 Reads a JSON line {"argv", "cwd", "memory_mb", "seconds", "wall_seconds", "file_mb", "env", "interrupt",
-"narrow_pipes", "append_after_reading"} and answers with one {"code", "out", "err", "seconds"}; a command that a signal
+"append_after_reading"} and answers with one {"code", "out", "err", "seconds"}; a command that a signal
 ended has a negative code.
 """
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import json
 import os
 import resource
@@ -71,8 +69,6 @@ def _child(request: dict, out: int, err: int) -> None:
         if request.get("file_mb") is not None:
             size = int(request["file_mb"] * 2**20)
             resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
-        if request.get("narrow_pipes"):
-            _narrow_pipes()
         if request.get("append_after_reading"):
             _append_after_reading()
         try:
@@ -83,18 +79,6 @@ def _child(request: dict, out: int, err: int) -> None:
         sys.stderr.flush()
     finally:
         os._exit(code)
-
-
-def _narrow_pipes() -> None:
-    """The system refuses to widen a pipe, as it does when a user's share of pipe memory is used up."""
-    real = fcntl.fcntl
-
-    def refusing(file, command, *argument):
-        if command == fcntl.F_SETPIPE_SZ:
-            raise PermissionError(errno.EPERM, "Operation not permitted")
-        return real(file, command, *argument)
-
-    fcntl.fcntl = refusing
 
 
 def _append_after_reading() -> None:

@@ -147,11 +147,6 @@ def test_check_says_what_it_refuses_even_when_quiet(folder, palpate):
     assert "label 1 is claimed" in sentence(palpate("check", "case.toml", "--quiet", cwd=folder), 2)
 
 
-def test_images_are_read_where_no_memory_is_left_for_a_wider_pipe(folder, palpate):
-    done = palpate("check", "case.toml", "--quiet", cwd=folder, narrow_pipes=True)
-    assert (done["code"], done["err"]) == (0, "")
-
-
 def test_a_result_certifies_the_bytes_that_were_read(folder, palpate):
     """The later image is changed as soon as it was read, the earlier one stays."""
     before = palpate("mesh", "case.toml", "--output", "a", "--json", "--quiet", cwd=folder)

@@ -25,7 +25,7 @@ from dicom_files import PLANTED, TILTED, ct_slices, save_series
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.export import abaqus, febio
 from palpate.export.fitted_model import fitted_model
-from palpate.export.formats import Options, format_named
+from palpate.export.formats import format_named
 from palpate.export.groups import OFF, element_faces, face_groups, plain_names
 from palpate.images.alignment import RigidMotion
 from palpate.images.label_image import VoxelGrid
@@ -476,12 +476,12 @@ def test_each_later_image_bears_its_own_loads(model, tmp_path):
     pressed = CaseLoad("pressure", surface="outer", pressure_kpa=2.0)
     linear = model.bodies[0].with_linear_tetrahedra()
     body = dataclasses.replace(linear, displacements=2 * linear.displacements, loads=((weight, pressed), (pressed,)))
-    febio.write(model, body, tmp_path, None)
+    febio.write(model, body, tmp_path)
     root = ET.parse(tmp_path / "palpate.feb").getroot()
     curves = {c.get("id"): [pt.text for pt in c.find("points")] for c in root.find("LoadData")}
     of_load = [[node.get("lc") for node in load.iter() if node.get("lc")] for load in root.find("Loads")]
     assert [curves[of[0]] for of in of_load] == [["0,0", "1,1", "2,0"], ["0,0", "1,1", "2,1"]]
-    abaqus.write(model, body, tmp_path, None)
+    abaqus.write(model, body, tmp_path)
     first, second = (tmp_path / "palpate.inp").read_text().split("*STEP")[1:]
     assert "*CLOAD\n" in first
     assert "*DLOAD\n" in first
@@ -562,7 +562,7 @@ def test_elements_of_a_tissue_that_is_not_homogeneous_have_their_own_moduli_in_e
     wanted = 58.9 * np.exp(logs[own])
     np.testing.assert_allclose(body.element_moduli(model.moduli)[own], wanted)
     for name in ("abaqus", "febio", "gmsh", "sofa"):
-        format_named(name).write(model, body, tmp_path, Options(linear=False))
+        format_named(name).write(model, body, tmp_path)
 
     parts = parts_of(tmp_path / "palpate.inp")
     assert sorted(np.concatenate([cells for cells, _ in parts]).tolist()) == list(range(len(mesh.region)))

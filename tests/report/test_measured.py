@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import io
 import json
 import re
 import zlib
 
+import matplotlib.image as mpimg
 import numpy as np
 import pytest
 
@@ -16,7 +18,7 @@ from palpate.report.case_report import write_case_report
 from palpate.report.collect import collect
 from palpate.report.measured import evenly, measured_points, nice_factor
 from palpate.report.payload import payload
-from palpate.report.pictures import arrow_triangles
+from palpate.report.render import Arrows, Camera, Triangles, render_png
 from palpate.report.report_data import MOST_ARROWS, ReportData
 from palpate.study.case_data import CaseData
 from palpate.study.estimation import ForceFit, PointFit
@@ -124,12 +126,14 @@ def test_arrows_are_as_long_as_can_be_seen_by_a_factor_that_can_be_read():
 
 
 def test_an_arrow_of_the_picture_begins_and_ends_where_it_should():
-    foot, way = np.array([[1.0, 2.0, 3.0]]), np.array([[0.0, 0.0, 5.0]])
-    corners = arrow_triangles(foot, way, radius=20.0, wide=1.0).reshape(-1, 3)
-    np.testing.assert_allclose([corners[:, 2].min(), corners[:, 2].max()], [3.0, 8.0])
-    tip = corners[corners[:, 2] > 8.0 - 1e-9]
-    np.testing.assert_allclose(tip, np.tile([1.0, 2.0, 8.0], (len(tip), 1)))
-    assert arrow_triangles(foot, 1e-6 * way, radius=20.0, wide=1.0).shape == (0, 3, 3)
+    camera = Camera(*np.eye(3))
+    none = Triangles(*[np.zeros((0, 3, 3))] * 3)
+    arrow = Arrows(np.array([[1.0, 2.0, 3.0]]), np.array([[40.0, 20.0, 5.0]]), "#ff0000", 1.0)
+    content = render_png(none, camera, width=100, height=60, fill=0.8, arrows=[arrow])
+    rows, columns = np.nonzero(mpimg.imread(io.BytesIO(content))[..., 3] > 0.5)
+    np.testing.assert_allclose([columns.min(), columns.max()], [10, 89], atol=2)
+    np.testing.assert_allclose([rows.min(), rows.max()], [10, 49], atol=2)
+    assert rows[columns.argmin()] > rows[columns.argmax()]  # it rises to the right
 
 
 def test_the_page_shows_them_and_says_how(measured, tmp_path):

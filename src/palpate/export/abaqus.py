@@ -14,7 +14,6 @@ import numpy as np
 
 from palpate.export.conditions import prescribed
 from palpate.export.fitted_model import FittedBody, FittedModel
-from palpate.export.formats import Options
 from palpate.export.groups import (
     OFF,
     MaterialPart,
@@ -39,9 +38,8 @@ LAWS = (Linear, NeoHookean, MooneyRivlin)  # that it has
 INCREMENT = 0.2  # of a step at finite strain, at first
 
 
-def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
+def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
     """Write palpate.inp; where Palpate averages the volume change, too, palpate_hybrid.inp, C3D10H for Abaqus alone."""
-    del options  # the body has been made linear already
     space = body.space
     write_text(folder / "palpate.inp", _text(model, body, space, "C3D10" if space.order == 2 else "C3D4"))
     if model.element in ("auto", "P2-P0") and space.order == 2:

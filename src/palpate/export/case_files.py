@@ -59,7 +59,7 @@ def write_estimate_files(result: CaseResult, folder: Path) -> tuple[Path, ...]:
     element = tetrahedron_image(result.space.mesh, grid)
     for path, values in zip(paths[1:], images, strict=False):
         write_scalar_image(path, np.append(values, np.nan)[element], grid)  # -1, outside the mesh, takes the last entry
-    paths += _write_labels(result.before, folder)
+    paths += write_labels(result.before, folder)
     for number, pair in enumerate(result.further, start=2):
         paths.append(folder / f"mesh_{number}.vtu")
         _write_fitted(paths[-1], result, number - 1, pair.space, pair.displacements)
@@ -83,14 +83,17 @@ def _write_fitted(
         extra |= {"ln_modulus_sd": sd, "resolution": resolution}
     last = displacements[-1] if displacements else np.zeros_like(space.points)
     kilopascals = stiffness if result.unit == "kPa" else np.full_like(stiffness, np.nan)
-    cells = _cell_data(space.mesh, kilopascals) | extra
-    _write_moved(path, space, last, cells)
+    cells = cell_data(space.mesh, kilopascals) | extra
+    write_moved(path, space, last, cells)
 
 
-def _write_moved(
+def write_moved(
     path: Path, space: LagrangeSpace, displacement: NDArray[np.float64], cells: Mapping[str, NDArray[Any]]
 ) -> None:
-    """A mesh with a displacement (n_points, 3) mm and the strain that it makes of each tetrahedron."""
+    """A mesh (.vtu) with a displacement (n_points, 3) mm, the strain that it makes of each tetrahedron, and cell data.
+
+    cells: name -> (n_tets,). Raises `ResourceError` when the disk refuses.
+    """
     strained = {**cells, "largest_strain": largest_strains(space, displacement)}
     write_vtu(path, space, point_data={"displacement_mm": displacement}, cell_data=strained)
 
@@ -102,8 +105,8 @@ def write_mesh_files(result: MeshResult, folder: Path) -> tuple[Path, ...]:
     given = np.array([tissue.youngs_modulus_kpa or np.nan for tissue in mesh.tissues])
     path = folder / "mesh.vtu"
     still = np.zeros_like(space.points)
-    write_vtu(path, space, point_data={"displacement_mm": still}, cell_data=_cell_data(mesh, given[mesh.region]))
-    labels = _write_labels(result.before, folder)
+    write_vtu(path, space, point_data={"displacement_mm": still}, cell_data=cell_data(mesh, given[mesh.region]))
+    labels = write_labels(result.before, folder)
     return (path, *labels, *_write_surfaces(space, still, folder / "surfaces", ending="before"))
 
 
@@ -115,8 +118,8 @@ def write_simulation_files(result: Simulation, folder: Path) -> tuple[Path, ...]
     write_label_image(images[1], result.after)
     space, last = result.space, result.displacements[-1]
     moduli = np.array([result.moduli_kpa.get(tissue.name, np.nan) for tissue in space.mesh.tissues])
-    cells = _cell_data(space.mesh, moduli[space.mesh.region])
-    _write_moved(folder / "mesh.vtu", space, last, cells)
+    cells = cell_data(space.mesh, moduli[space.mesh.region])
+    write_moved(folder / "mesh.vtu", space, last, cells)
     table = write_label_table(folder / "labels.csv", space.mesh.tissues)
     surfaces, still = folder / "surfaces", np.zeros_like(last)
     paths = [*images, folder / "mesh.vtu", table]
@@ -127,15 +130,18 @@ def write_simulation_files(result: Simulation, folder: Path) -> tuple[Path, ...]
         steps_folder = make_folder(folder / "steps")
         steps = [steps_folder / f"step_{number:03d}.vtu" for number in range(len(states))]
         for path, displacement in zip(steps, states, strict=True):
-            _write_moved(path, space, displacement, cells)
+            write_moved(path, space, displacement, cells)
         times = np.linspace(0.0, 1.0, len(steps))
         write_pvd(folder / "mesh.pvd", [(float(t), f"steps/{path.name}") for t, path in zip(times, steps, strict=True)])
         paths += [folder / "mesh.pvd", *steps]
     return tuple(paths)
 
 
-def _write_labels(before: Segmentation, folder: Path) -> tuple[Path, Path]:
-    """The earlier image with our numbers of the tissues, and the table that names them."""
+def write_labels(before: Segmentation, folder: Path) -> tuple[Path, Path]:
+    """Write labels.nii.gz, the earlier image with our numbers of the tissues, and labels.csv, which names them.
+
+    Returns the paths; raises `ResourceError` when the disk refuses.
+    """
     image, numbers = folder / "labels.nii.gz", first_labels(before.tissues)
     write_label_image(image, LabelImage(numbers[before.index], before.grid))
     return image, write_label_table(folder / "labels.csv", before.tissues)
@@ -162,10 +168,9 @@ def _write_surfaces(
     return tuple(paths)
 
 
-def _cell_data(mesh: TetMesh, moduli: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
+def cell_data(
+    mesh: TetMesh, moduli: NDArray[np.float64], *, called: str = "youngs_modulus_kpa"
+) -> dict[str, NDArray[Any]]:
+    """Label, modulus (n_tets,) under the name `called`, and Poisson's ratio of each tetrahedron."""
     poisson = np.array([tissue.poisson_ratio for tissue in mesh.tissues])
-    return {
-        "label": first_labels(mesh.tissues)[mesh.region],
-        "youngs_modulus_kpa": moduli,
-        "poisson_ratio": poisson[mesh.region],
-    }
+    return {"label": first_labels(mesh.tissues)[mesh.region], called: moduli, "poisson_ratio": poisson[mesh.region]}

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from palpate.export.case_files import file_name
 from palpate.export.fitted_model import FittedBody, FittedModel
-from palpate.export.formats import Options
+from palpate.export.formats import Write
 from palpate.export.groups import rows
 from palpate.images.tissue import Role
 from palpate.mesh.surface import tissue_surface, triangle_normals
@@ -71,57 +71,45 @@ def closed_surfaces(body: FittedBody) -> Iterator[ClosedSurface]:
             yield ClosedSurface(stem, tissue.name, state, own, closed)
 
 
-def write_obj(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
-    """Write NN_tissue_before.obj and NN_tissue_after.obj, Wavefront's text; the tissue's name is its object's."""
-    del model, options
-
-    def content(surface: ClosedSurface) -> bytes:
-        """Points, then triangles that count them from 1."""
-        heading = f"# {HEADING.decode()}\no {surface.name}\n"
-        text = heading + rows("v %.9g %.9g %.9g", surface.points) + rows("f %d %d %d", surface.triangles + 1)
-        return text.encode()
-
-    _write_surfaces(body, folder, "obj", content)
+def _obj(surface: ClosedSurface) -> bytes:
+    """Wavefront's text: points, then triangles that count them from 1; the tissue's name is its object's."""
+    heading = f"# {HEADING.decode()}\no {surface.name}\n"
+    text = heading + rows("v %.9g %.9g %.9g", surface.points) + rows("f %d %d %d", surface.triangles + 1)
+    return text.encode()
 
 
-def write_ply(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
-    """Write NN_tissue_before.ply and NN_tissue_after.ply, binary little-endian, double precision."""
-    del model, options
-
-    def content(surface: ClosedSurface) -> bytes:
-        """A heading that describes the rows of numbers after it."""
-        heading = (
-            f"ply\nformat binary_little_endian 1.0\ncomment {HEADING.decode()}\n"
-            f"element vertex {len(surface.points)}\nproperty double x\nproperty double y\nproperty double z\n"
-            f"element face {len(surface.triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
-        )
-        faces = np.zeros(len(surface.triangles), dtype=FACE)
-        faces["count"], faces["corners"] = 3, surface.triangles
-        return heading.encode() + surface.points.astype("<f8").tobytes() + faces.tobytes()
-
-    _write_surfaces(body, folder, "ply", content)
+def _ply(surface: ClosedSurface) -> bytes:
+    """Binary little-endian, double precision: a heading that describes the rows of numbers after it."""
+    heading = (
+        f"ply\nformat binary_little_endian 1.0\ncomment {HEADING.decode()}\n"
+        f"element vertex {len(surface.points)}\nproperty double x\nproperty double y\nproperty double z\n"
+        f"element face {len(surface.triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    faces = np.zeros(len(surface.triangles), dtype=FACE)
+    faces["count"], faces["corners"] = 3, surface.triangles
+    return heading.encode() + surface.points.astype("<f8").tobytes() + faces.tobytes()
 
 
-def write_stl(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
-    """Write NN_tissue_before.stl and NN_tissue_after.stl, binary."""
-    del model, options
-
-    def content(surface: ClosedSurface) -> bytes:
-        """80 bytes of heading, the number of facets, and each with its normal."""
-        facets = np.zeros(len(surface.triangles), dtype=FACET)
-        normals = triangle_normals(surface.points, surface.triangles)
-        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-        facets["normal"] = normals / np.maximum(lengths, np.finfo(float).tiny)
-        facets["corners"] = surface.points[surface.triangles]
-        return HEADING.ljust(80) + np.uint32(len(facets)).tobytes() + facets.tobytes()
-
-    _write_surfaces(body, folder, "stl", content)
+def _stl(surface: ClosedSurface) -> bytes:
+    """Binary: 80 bytes of heading, the number of facets, and each with its normal."""
+    facets = np.zeros(len(surface.triangles), dtype=FACET)
+    normals = triangle_normals(surface.points, surface.triangles)
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    facets["normal"] = normals / np.maximum(lengths, np.finfo(float).tiny)
+    facets["corners"] = surface.points[surface.triangles]
+    return HEADING.ljust(80) + np.uint32(len(facets)).tobytes() + facets.tobytes()
 
 
-def _write_surfaces(body: FittedBody, folder: Path, ending: str, content: Callable[[ClosedSurface], bytes]) -> None:
-    """Write each closed surface to a file of its own; raises `ResourceError` when the disk refuses."""
-    for surface in closed_surfaces(body):
-        write_bytes(folder / f"{surface.stem}.{ending}", content(surface))
+def _writer(ending: str, content: Callable[[ClosedSurface], bytes]) -> Write:
+    """Writes NN_tissue_before and NN_tissue_after, each closed surface in a file of its own."""
+
+    def write(model: FittedModel, body: FittedBody, folder: Path, *_: Path | None) -> None:
+        """Write them; raises `ResourceError` when the disk refuses."""
+        del model
+        for surface in closed_surfaces(body):
+            write_bytes(folder / f"{surface.stem}.{ending}", content(surface))
+
+    return write
 
 
 def _rims(triangles: NDArray[np.int64]) -> list[NDArray[np.int64]]:
@@ -144,3 +132,6 @@ def _rims(triangles: NDArray[np.int64]) -> list[NDArray[np.int64]]:
             point = point_after
         rims.append(np.array(rim))
     return rims
+
+
+write_obj, write_ply, write_stl = _writer("obj", _obj), _writer("ply", _ply), _writer("stl", _stl)

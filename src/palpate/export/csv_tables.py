@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from palpate.export.fitted_model import FittedBody, FittedModel
-from palpate.export.formats import Options
 from palpate.export.groups import face_groups
 from palpate.export.netcdf import moduli_samples
 from palpate.images.segmentation import first_labels
@@ -37,9 +36,8 @@ TISSUES = (
 )
 
 
-def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
+def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
     """Write tissues.csv, groups.csv and samples.csv (chain, draw, tissue, youngs_modulus); no value: empty."""
-    del options
     areas = []
     for group in face_groups(body.mesh):
         area = float(np.linalg.norm(triangle_normals(body.mesh.nodes, group.triangles), axis=1).sum())

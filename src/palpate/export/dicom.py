@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 
 from palpate.errors import InputDataError, ResourceError
 from palpate.export.fitted_model import FittedBody, FittedModel
-from palpate.export.formats import Options
 from palpate.images.input_file import read_input
 from palpate.images.segmentation import first_labels
 from palpate.images.tissue import tissue_colours
-from palpate.mesh.locate import region_image
+from palpate.mesh.locate import modulus_image
 from palpate.study.outputs import write_bytes
 from palpate.study.provenance import software_versions
 
@@ -43,7 +42,7 @@ ORGANS = {  # SNOMED CT, by words in a tissue's name
 }
 
 
-def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
+def write(model: FittedModel, body: FittedBody, folder: Path, source: Path | None = None) -> None:
     """Write stiffness.dcm and segmentation.dcm.
 
     Raises `ResourceError` without the extra `dicom`, `InputDataError` where the series of `--source` cannot be read or
@@ -55,7 +54,7 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
         raise ResourceError(
             "DICOM files are written by highdicom, which is not installed: pip install 'palpate[dicom]'"
         ) from error
-    slices = [_placeholder()] if options.source is None else _series(options.source, body)
+    slices = [_placeholder()] if source is None else _series(source, body)
     frame = str(slices[0].FrameOfReferenceUID)
     affine = LPS @ body.grid.affine[:, [2, 1, 0, 3]]  # slices, rows, columns
     across, down = np.reshape(np.array(slices[0].ImageOrientationPatient, dtype=float), (2, 3))
@@ -67,8 +66,7 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
         found = highdicom.Volume(turned, affine, coordinate_system="PATIENT", frame_of_reference_uid=frame)
         return found.to_patient_orientation(axes)
 
-    moduli = np.nan_to_num(np.append(model.moduli, 0.0)).astype(np.float32)  # 0 where nothing is meshed
-    stiffness = volume(moduli[region_image(body.mesh, body.grid)])
+    stiffness = volume(modulus_image(body.mesh, body.grid, model.moduli).astype(np.float32))
     common = {
         "manufacturer": "Palpate",
         "manufacturer_model_name": "Palpate",
@@ -82,7 +80,7 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
         "segmentation.dcm": _segmentation(highdicom, slices, volume, body, common),
     }
     for name, dataset in made.items():
-        if options.source is None:
+        if source is None:
             _forget_source(dataset)
         content = io.BytesIO()
         dataset.save_as(content, enforce_file_format=True)

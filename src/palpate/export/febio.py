@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from palpate.errors import ConfigurationError
 from palpate.export.conditions import Prescribed, prescribed
 from palpate.export.fitted_model import FittedBody, FittedModel
-from palpate.export.formats import Options
 from palpate.export.groups import face_groups, tissue_groups
 from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
@@ -33,9 +32,8 @@ LAWS = (Linear, NeoHookean, MooneyRivlin)  # that it has
 STEPS = 10  # of the time a later image takes, at first
 
 
-def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
+def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
     """Write palpate.feb; raises `ConfigurationError` for faces that slide on an image askew to the world's axes."""
-    del options
     space = body.space
     held = prescribed(body, space, outer=model.outer_boundary)
     if not held.along_world:
@@ -95,11 +93,7 @@ def _material(
     """A tissue's law with its constants in kPa; those that differ between its elements, (n,) each."""
     cells = tissue_groups(body.mesh)[name]
     index = int(body.mesh.region[cells[0]])
-    modulus, ratio, law = (
-        float(model.moduli[index]),
-        body.tissues[index].poisson_ratio,
-        model.law_among(Linear, NeoHookean, MooneyRivlin),
-    )
+    modulus, ratio, law = float(model.moduli[index]), body.tissues[index].poisson_ratio, model.law_among(*LAWS)
     log_ratio = np.zeros(1) if body.log_ratio is None else body.log_ratio[cells]
     scale = np.exp(log_ratio) if np.ptp(log_ratio) > 0.0 else np.ones(1)
     constants = {"E": modulus, "v": ratio}

@@ -127,6 +127,11 @@ class FittedModel:
         return self.bodies[0].tissues
 
     @property
+    def modulus_name(self) -> str:
+        """What files call Young's modulus, with its unit."""
+        return "youngs_modulus_kpa" if self.unit == "kPa" else "youngs_modulus_ratio"
+
+    @property
     def units(self) -> str:
         """The units of all numbers, as a file's heading says them."""
         stress = "kPa" if self.unit == "kPa" else f"moduli are ratios to '{self.relative_to}'"

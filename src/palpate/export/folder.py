@@ -53,5 +53,6 @@ def export_into(outputs: OutputFolder, model: FittedModel, name: str, options: O
     with outputs.staged() as staging:
         for number, body in enumerate(model.bodies if form.every_pair else model.bodies[:1], start=1):
             folder = staging.area if number == 1 else make_folder(staging.area / f"pair_{number}")
-            form.write(model, body.with_linear_tetrahedra() if options.linear else body, folder, options)
+            source = (options.source,) if form.refers else ()
+            form.write(model, body.with_linear_tetrahedra() if options.linear else body, folder, *source)
         staging.commit()

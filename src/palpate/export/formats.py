@@ -25,7 +25,7 @@ class Options:
 class Write(Protocol):
     """The function that writes a format: one body's files into a folder that is there."""
 
-    def __call__(self, model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
+    def __call__(self, model: FittedModel, body: FittedBody, folder: Path, *source: Path | None) -> None:
         """Write them; raises `ResourceError` when the disk refuses, or a library is missing."""
         ...
 
@@ -34,13 +34,15 @@ class Write(Protocol):
 class Format:
     """A format: the module of `palpate.export` that writes it, and what it is, in a few words.
 
-    every_pair: whether each pair of images has files of its own; function: of the module.
+    every_pair: whether each pair of images has files of its own; function: of the module; refers: whether that takes
+    the folder of a DICOM series, too.
     """
 
     module: str
     description: str
     every_pair: bool = True
     function: str = "write"
+    refers: bool = False
 
     @property
     def write(self) -> Write:
@@ -51,7 +53,7 @@ class Format:
 FORMATS = {
     "abaqus": Format("abaqus", "Abaqus and CalculiX, .inp"),
     "csv": Format("csv_tables", "tidy tables of moduli, fits and samples, .csv"),
-    "dicom": Format("dicom", "DICOM Parametric Map and Segmentation, .dcm"),
+    "dicom": Format("dicom", "DICOM Parametric Map and Segmentation, .dcm", refers=True),
     "febio": Format("febio", "FEBio 4, .feb"),
     "gmsh": Format("gmsh", "gmsh 4.1 with physical groups, .msh"),
     "netcdf": Format("netcdf", "posterior samples for ArviZ and xarray, .nc", every_pair=False),

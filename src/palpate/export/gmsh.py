@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.export.fitted_model import FittedBody, FittedModel
-from palpate.export.formats import Options
 from palpate.export.groups import element_faces, face_groups, rows, tissue_groups
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.outputs import write_text
@@ -20,9 +19,8 @@ TETRAHEDRON, TRIANGLE = {1: 4, 2: 11}, {1: 2, 2: 9}  # gmsh's element types by o
 EDGES = np.array([0, 1, 2, 3, 4, 5, 6, 7, 9, 8])  # gmsh has the last two edges the other way round
 
 
-def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
+def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
     """Write palpate.msh: the mesh at rest, moduli and Poisson's ratios of its elements, displacements of its nodes."""
-    del options
     space = body.space
     surfaces, names = _surfaces(body)
     volumes = tissue_groups(body.mesh)
@@ -51,7 +49,7 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
     cells = np.concatenate([*behind, *volumes.values()])
     poisson = np.array([tissue.poisson_ratio for tissue in body.tissues])
     for name, values in (
-        ("youngs_modulus_kpa" if model.unit == "kPa" else "youngs_modulus_ratio", body.element_moduli(model.moduli)),
+        (model.modulus_name, body.element_moduli(model.moduli)),
         ("poisson_ratio", poisson[body.mesh.region]),
     ):
         heading = f'$ElementData\n1\n"{name}"\n1\n0\n3\n0\n1\n{len(cells)}\n'

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,7 @@ from numpy.typing import NDArray
 from palpate.images.tissue import Role
 from palpate.mesh.surface import tissue_surface
 from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh
+from palpate.study.outputs import write_text
 
 STEP = 0.05  # of ln E, between the materials of a tissue that is not homogeneous
 OFF = float(np.expm1(0.5 * STEP))  # of a modulus, that an element has less or more than its material, at the most
@@ -22,6 +25,12 @@ def rows(pattern: str, *columns: NDArray[Any]) -> str:
     parts = [column[:, None] if column.ndim == 1 else column for column in columns]
     cells = [list(map(tuple, part.tolist())) for part in parts]
     return "".join(f"{pattern % sum(row, ())}\n" for row in zip(*cells, strict=True))
+
+
+def write_script(path: Path) -> None:
+    """Write the script of that name, one of export/scripts, to `path`; raises `ResourceError` when the disk refuses."""
+    script = resources.files("palpate.export") / "scripts" / f"{path.name}.txt"
+    write_text(path, script.read_text(encoding="utf-8"))
 
 
 def wrapped(numbers: NDArray[np.int64], *, width: int = 12) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -13,7 +12,6 @@ from numpy.typing import NDArray
 
 from palpate.errors import ResourceError
 from palpate.export.fitted_model import FittedBody, FittedModel
-from palpate.export.formats import Options
 from palpate.study.outputs import write_bytes
 from palpate.study.samples import CHAINS, POSTERIOR
 
@@ -56,9 +54,9 @@ def moduli_samples(model: FittedModel) -> Samples:
     return Samples(tuple(item.tissue for item in model.estimates), np.exp(logarithms), density, LINEARISED)
 
 
-def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
+def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
     """Write posterior.nc: groups posterior, sample_stats, constant_data; `ResourceError` without the extra `netcdf`."""
-    del body, options
+    del body
     write_posterior(model, folder / POSTERIOR)
 
 
@@ -90,19 +88,15 @@ def write_posterior(model: FittedModel, path: Path) -> None:
         if model.samples is not None:
             accepted = model.samples.accepted
             file["sample_stats"].create_variable("acceptance_rate", ("chain",), data=accepted)
-        for name, values in _constants(model):
+        given = [item.interval95 if model.unit == "kPa" else item.ratio_interval95 for item in model.estimates]
+        ends = np.array([[np.nan if end is None else end for end in pair or (None, None)] for pair in given])
+        constants = {"interval95_low": ends[:, 0], "interval95_high": ends[:, 1]}
+        if model.samples is not None:  # their own intervals, and how they mixed
+            own, found = model.samples.interval95, model.samples.diagnostics
+            constants |= {"samples_interval95_low": own[:, 0], "samples_interval95_high": own[:, 1]}
+            constants |= {"r_hat": found.r_hat, "ess_bulk": found.ess_bulk, "ess_tail": found.ess_tail}
+        for name, values in constants.items():
             variable = file["constant_data"].create_variable(name, ("tissue",), data=values)
             if "interval95" in name:
                 variable.attrs["units"], variable.attrs["interval_probability"] = unit, PROBABILITY
     write_bytes(path, memory.getvalue())
-
-
-def _constants(model: FittedModel) -> Iterator[tuple[str, NDArray[np.float64]]]:
-    """Numbers (n,) beside the draws: the intervals of the result; of chains also their own, and how they mixed."""
-    given = [item.interval95 if model.unit == "kPa" else item.ratio_interval95 for item in model.estimates]
-    ends = np.array([[np.nan if end is None else end for end in pair or (None, None)] for pair in given])
-    yield from (("interval95_low", ends[:, 0]), ("interval95_high", ends[:, 1]))
-    if model.samples is not None:
-        own, found = model.samples.interval95, model.samples.diagnostics
-        yield from (("samples_interval95_low", own[:, 0]), ("samples_interval95_high", own[:, 1]))
-        yield from (("r_hat", found.r_hat), ("ess_bulk", found.ess_bulk), ("ess_tail", found.ess_tail))

@@ -13,7 +13,7 @@ from palpate.errors import ResourceError
 from palpate.images.label_image import LabelImage
 from palpate.images.readers import write_label_image, write_scalar_image
 from palpate.images.tissue import Role, tissue_colours
-from palpate.mesh.locate import region_image
+from palpate.mesh.locate import modulus_image
 from palpate.study.result import CaseResult
 
 
@@ -28,12 +28,12 @@ def notebook_viewer(result: CaseResult, *, background: Path | None = None, opaci
         raise ResourceError(
             "the viewer for notebooks is ipyniivue, which is not installed: pip install 'palpate[notebook]'"
         ) from error
-    moduli = np.nan_to_num(np.append(result.stiffness, 0.0))
+    grid = result.before.grid
     with tempfile.TemporaryDirectory() as folder:
         labels, stiffness = Path(folder) / "tissues.nii.gz", Path(folder) / "stiffness.nii.gz"
-        write_label_image(labels, LabelImage(result.before.index.astype(np.int32), result.before.grid))
-        write_scalar_image(stiffness, moduli[region_image(result.space.mesh, result.before.grid)], result.before.grid)
-        known = moduli[moduli > 0.0]
+        write_label_image(labels, LabelImage(result.before.index.astype(np.int32), grid))
+        write_scalar_image(stiffness, modulus_image(result.space.mesh, grid, result.stiffness), grid)
+        known = result.stiffness[result.stiffness > 0.0]
         over = ipyniivue.Volume(
             data=stiffness.read_bytes(),
             name=stiffness.name,

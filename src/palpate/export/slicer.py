@@ -7,77 +7,23 @@ from pathlib import Path
 import numpy as np
 
 from palpate.export import warp
-from palpate.export.case_files import write_label_table
+from palpate.export.case_files import write_labels
 from palpate.export.closed_surfaces import closed_surfaces, write_ply
 from palpate.export.fitted_model import FittedBody, FittedModel
-from palpate.export.formats import Options
-from palpate.images.label_image import LabelImage
-from palpate.images.readers import write_label_image, write_scalar_image
-from palpate.images.segmentation import first_labels
+from palpate.export.groups import write_script
+from palpate.images.readers import write_scalar_image
+from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import tissue_colours
-from palpate.mesh.locate import region_image
-from palpate.study.outputs import write_json, write_text
-
-SCRIPT = '''"""Load what Palpate exported into 3D Slicer: paste into its Python console
-
-    exec(open(r"/path/to/load_in_slicer.py").read(), {"__file__": r"/path/to/load_in_slicer.py"})
-
-or start Slicer with: Slicer --python-script load_in_slicer.py. Grey images named before.* and after.* (.nii.gz, .nrrd)
-that lie beside this script are loaded, too.
-"""
-
-import json
-from pathlib import Path
-
-import slicer
-
-HERE = Path(__file__).resolve().parent
-SCENE = json.loads((HERE / "scene.json").read_text(encoding="utf-8"))
+from palpate.mesh.locate import modulus_image
+from palpate.study.outputs import write_json
 
 
-def load():
-    grey = {}
-    for state in ("before", "after"):
-        for path in [*HERE.glob(f"{state}.nii*"), *HERE.glob(f"{state}.nrrd")][:1]:
-            grey[state] = slicer.util.loadVolume(str(path))
-    colours = slicer.util.loadColorTable(str(HERE / "labels.csv"))
-    labels = slicer.util.loadLabelVolume(str(HERE / "labels.nii.gz"), {"colorNodeID": colours.GetID()})
-    segmentation = slicer.mrmlScene.AddNewNodeByClass("vtkMRMLSegmentationNode", "tissues")
-    slicer.modules.segmentations.logic().ImportLabelmapToSegmentationNode(labels, segmentation)
-    stiffness = slicer.util.loadVolume(str(HERE / "stiffness.nii.gz"))
-    stiffness.SetName(SCENE["stiffness"]["name"])
-    display = stiffness.GetDisplayNode()
-    display.SetAndObserveColorNodeID("vtkMRMLColorTableNodeFileViridis.txt")
-    low, high = SCENE["stiffness"]["range"]
-    display.AutoWindowLevelOff()
-    display.SetWindowLevelMinMax(low, high)
-    display.SetApplyThreshold(True)
-    display.SetLowerThreshold(SCENE["stiffness"]["least"])
-    for model in SCENE["models"]:
-        node = slicer.util.loadModel(str(HERE / model["file"]))
-        node.SetName(model["name"])
-        node.GetDisplayNode().SetColor(*model["colour"])
-        node.GetDisplayNode().SetOpacity(0.4)
-        node.GetDisplayNode().SetVisibility(model["visible"])
-    for name in SCENE["warps"]:
-        slicer.util.loadTransform(str(HERE / name))
-    background = grey.get("before", labels)
-    slicer.util.setSliceViewerLayers(background=background, foreground=stiffness, foregroundOpacity=0.5, fit=True)
-
-
-load()
-'''
-
-
-def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
+def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
     """Write load_in_slicer.py, labels.nii.gz and .csv, stiffness.nii.gz, the surfaces (.ply), the warp, scene.json."""
-    numbers = first_labels(body.tissues)
-    write_label_image(folder / "labels.nii.gz", LabelImage(numbers[body.index], body.grid))
-    write_label_table(folder / "labels.csv", body.tissues)
-    moduli = np.nan_to_num(np.append(model.moduli, 0.0))  # 0 where nothing is meshed: Slicer shows NaN as anything
-    write_scalar_image(folder / "stiffness.nii.gz", moduli[region_image(body.mesh, body.grid)], body.grid)
-    write_ply(model, body, folder, options)
-    warp.write(model, body, folder, options)
+    write_labels(Segmentation(body.index, body.grid, body.tissues), folder)
+    write_scalar_image(folder / "stiffness.nii.gz", modulus_image(body.mesh, body.grid, model.moduli), body.grid)
+    write_ply(model, body, folder)
+    warp.write(model, body, folder)
     shown = zip(body.tissues, tissue_colours(body.tissues), strict=True)
     colours = {tissue.name: [part / 255.0 for part in bytes.fromhex(colour[1:])] for tissue, colour in shown}
     roles = {tissue.name: str(tissue.role) for tissue in body.tissues}
@@ -98,4 +44,4 @@ def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) 
         "warps": sorted(path.name for path in folder.glob("*warp*.nii.gz")),
     }
     write_json(folder / "scene.json", scene)
-    write_text(folder / "load_in_slicer.py", SCRIPT)
+    write_script(folder / "load_in_slicer.py")

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from palpate.export.fitted_model import FittedBody, FittedModel
-from palpate.export.formats import Options
 from palpate.export.groups import element_faces
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers import write_displacement_field
@@ -31,9 +30,9 @@ INVERSIONS = 30  # steps of the fixed-point iteration for the inverse
 SAME_MM = 1e-3
 
 
-def write(model: FittedModel, body: FittedBody, folder: Path, options: Options) -> None:
+def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
     """Write warp.nii.gz, inverse_warp.nii.gz (numbered where there are several later images) and warp.json."""
-    del model, options
+    del model
     space, grid = body.space, _field_grid(body.grid)
     meshed = [number for number, tissue in enumerate(body.tissues) if tissue.meshed]
     borders = np.concatenate([tissue_surface(body.mesh, number).triangles for number in meshed])

@@ -179,7 +179,7 @@ def fit_rigid_motion(pairs: Sequence[tuple[DistanceMap, DistanceMap]]) -> RigidF
             inside = [within_border(match.after.grid, start.apply(match.surface.places)) for match in matches]
             if sum(map(np.count_nonzero, inside)) >= MIN_POINTS:
                 best = min(best, _descend(start, matches), key=_misfit)
-    weight = best.area * _tukey(best, _scale(best))
+    weight = best.area * tukey(best.residual, TUKEY * _scale(best))
     rms = float(np.sqrt(weight @ best.residual**2 / weight.sum()))
     return RigidFit(best.motion, rms, int(np.count_nonzero(weight)), _shown(best, weight)[1].T)
 
@@ -193,10 +193,7 @@ def align(before: Segmentation, after: Segmentation) -> Alignment:
     rigid = [i for i, tissue in enumerate(before.tissues) if tissue.role is Role.RIGID]
     if not rigid:
         raise InputDataError("no tissue is `rigid`, so nothing shows the motion between the images; set align = 'none'")
-    width = smoothing_width(before.grid, after.grid)
-    images = product(rigid, (before, after))
-    maps = mapped(lambda of: tissue_distance_map(of[1], of[0], smoothing_mm=width), images)
-    pairs = dict(zip(rigid, zip(maps[::2], maps[1::2], strict=True), strict=True))
+    pairs = distance_pairs(before, after, rigid, smoothing_mm=smoothing_width(before.grid, after.grid))
     overall = fit_rigid_motion(list(pairs.values()))
 
     def alone(tissue: int) -> tuple[RigidFit, float]:
@@ -215,6 +212,15 @@ def align(before: Segmentation, after: Segmentation) -> Alignment:
         {name: fit for name, (fit, _) in each.items()},
         {name: off for name, (_, off) in each.items() if off > limit},
     )
+
+
+def distance_pairs(
+    before: Segmentation, after: Segmentation, tissues: Sequence[int], *, smoothing_mm: float
+) -> dict[int, tuple[DistanceMap, DistanceMap]]:
+    """Distance maps of tissues (indices) in both images, each smoothed by so much; raises as `tissue_distance_map`."""
+    images = product(tissues, (before, after))
+    maps = mapped(lambda of: tissue_distance_map(of[1], of[0], smoothing_mm=smoothing_mm), images)
+    return dict(zip(tissues, zip(maps[::2], maps[1::2], strict=True), strict=True))
 
 
 def moved(segmentation: Segmentation, motion: RigidMotion) -> Segmentation:
@@ -316,8 +322,9 @@ def _scale(state: _State) -> float:
     return max(1.4826 * float(np.median(np.abs(state.residual[state.area > 0.0]))), 1e-4)
 
 
-def _tukey(state: _State, scale: float) -> NDArray[np.float64]:
-    return np.asarray(np.maximum(1.0 - (state.residual / (TUKEY * scale)) ** 2, 0.0) ** 2)
+def tukey(residual: NDArray[np.float64], cutoff: float) -> NDArray[np.float64]:
+    """Weights (n,), 0 to 1, dimensionless, of residuals (n,) mm by Tukey's biweight: none from `cutoff` (mm) on."""
+    return np.asarray(np.maximum(1.0 - (residual / cutoff) ** 2, 0.0) ** 2)
 
 
 def _cost(state: _State, scale: float) -> float:
@@ -347,7 +354,7 @@ def _shown(state: _State, weight: NDArray[np.float64]) -> tuple[NDArray[np.float
 
 def _step(state: _State, scale: float) -> NDArray[np.float64]:
     """Turn (rad) and shift (mm), (6,), of one Gauss-Newton step among the turns that the surface shows."""
-    weight = state.area * _tukey(state, scale)
+    weight = state.area * tukey(state.residual, TUKEY * scale)
     shown, _ = _shown(state, weight)
     basis = np.zeros((6, shown.shape[1] + 3))
     basis[:3, :-3], basis[3:, -3:] = shown / state.radius, np.eye(3)

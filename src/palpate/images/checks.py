@@ -44,11 +44,8 @@ def wall_motion(before: Segmentation, after: Segmentation, tissue: int) -> float
     """
     lost = _outside(before, after, tissue) * before.grid.voxel_volume
     gained = _outside(after, before, tissue) * after.grid.voxel_volume
-    faces = 0.0
     spacing = before.grid.spacing
-    mask = before.mask(tissue)
-    for axis in range(3):
-        faces += np.count_nonzero(np.diff(mask, axis=axis)) * float(np.prod(spacing) / spacing[axis])
+    faces = float(np.array(_faces(before.mask(tissue))) @ (np.prod(spacing) / spacing))
     return float((lost + gained) / max(2.0 / 3.0 * faces, 1e-9))
 
 
@@ -129,8 +126,7 @@ def check_segmentation(segmentation: Segmentation, name: str) -> tuple[Finding, 
         if tissue.role is not Role.RIGID:
             mask = segmentation.mask(i)
             if touching := _touching(mask):
-                surface = touching + sum(int(np.count_nonzero(np.diff(mask, axis=axis))) for axis in range(3))
-                share = f"{touching / surface:.1%}"
+                share = f"{touching / (touching + sum(_faces(mask))):.1%}"
                 text = (
                     f"'{tissue.name}' reaches the border of '{name}': {share} of its surface is a cut of the image,"
                     " which says nothing about its stiffness; a larger field of view is better"
@@ -193,6 +189,11 @@ def check_pair(before: Segmentation, after: Segmentation, *, name: str = "after"
 def _touching(mask: NDArray[np.bool_]) -> int:
     """Number of outer voxel faces of the image that belong to the organ."""
     return sum(int(np.count_nonzero(np.take(mask, end, axis))) for axis in range(3) for end in (0, -1))
+
+
+def _faces(mask: NDArray[np.bool_]) -> list[int]:
+    """Number of voxel faces across each axis between the organ and what is beside it in the image."""
+    return [int(np.count_nonzero(np.diff(mask, axis=axis))) for axis in range(3)]
 
 
 def _too_thin(mask: NDArray[np.bool_], box: tuple[slice, ...], tissue: Tissue, name: str) -> list[Finding]:
@@ -353,8 +354,7 @@ def _moving_void(before: Segmentation, after: Segmentation, i: int, name: str) -
     tissue, mask = before.tissues[i], before.mask(i)
     if tissue.role is not Role.VOID or not mask.any() or not after.mask(i).any():
         return []
-    faces = sum(int(np.count_nonzero(np.diff(mask, axis=axis))) for axis in range(3))
-    if _touching(mask) > VOID_INSIDE * (faces + _touching(mask)):
+    if _touching(mask) > VOID_INSIDE * (sum(_faces(mask)) + _touching(mask)):
         return []  # the air around the body
     motion, voxel = wall_motion(before, after, i), float(max(before.grid.spacing.max(), after.grid.spacing.max()))
     if motion <= VOID_STILL * STILL_VOXELS * voxel:

@@ -15,68 +15,32 @@ NO_WAIT = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)  # a pipe th
 FLAGS = os.O_RDONLY | NO_WAIT | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 
 
-class _Digested(io.RawIOBase):
-    """Digests a file in its order while it is read here and there: what is read again was digested before."""
+class _Digested(io.FileIO):
+    """A file that is digested as it is read, from its start on."""
 
     def __init__(self, descriptor: int) -> None:
-        self._file = io.FileIO(descriptor, "rb")
-        self._hash = hashlib.sha256()
-        self._done = 0  # bytes from the start that were digested
+        super().__init__(descriptor, "rb")
+        self.digest = hashlib.sha256()
 
-    def readable(self) -> bool:
-        """Always: `io.BufferedReader` asks before it reads."""
-        return True
-
-    def seekable(self) -> bool:
-        """Always: a regular file is."""
-        return True
-
-    def fileno(self) -> int:
-        """The descriptor."""
-        return self._file.fileno()
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-        super().close()
-
-    def tell(self) -> int:
-        """Where the file stands, bytes from its start."""
-        return self._file.tell()
-
-    def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        """Go elsewhere; what is passed over is digested when something behind it is read."""
-        return self._file.seek(offset, whence)
-
-    def readinto(self, buffer: Any) -> int:
+    def readinto(self, buffer: Any, /) -> int:
         """Fill `buffer` from where the file stands."""
-        begin = self._file.tell()
-        self._digest_to(begin)
-        count = self._file.readinto(buffer) or 0
-        self._hash.update(memoryview(buffer).cast("B")[max(self._done - begin, 0) : count])
-        self._done = max(self._done, begin + count)
+        count = super().readinto(buffer) or 0
+        self.digest.update(memoryview(buffer).cast("B")[:count])
         return count
 
-    def sha256(self) -> str:
-        """The digest, after the rest of the file was read for it."""
-        self._digest_to(None)
-        return self._hash.hexdigest()
+    def readall(self) -> bytes:
+        """What is left."""
+        content = super().readall() or b""
+        self.digest.update(content)
+        return content
 
-    def _digest_to(self, end: int | None) -> None:
-        """Digest what lies before `end`, None: all, and was never read; the file then stands where it stood."""
-        place = self._file.tell()
-        self._file.seek(self._done)
-        while end is None or self._done < end:
-            content = self._file.read(CHUNK if end is None else min(CHUNK, end - self._done))
-            if not content:
-                break
-            self._hash.update(content)
-            self._done += len(content)
-        self._file.seek(place)
+    def seekable(self) -> bool:
+        """Never: what is passed over would not be digested."""
+        return False
 
 
 class InputFile(io.BufferedReader):
-    """A regular file; `n_bytes` is its size when it was opened."""
+    """A regular file, which is read from its start on; `n_bytes` is its size when it was opened."""
 
     def __init__(self, descriptor: int) -> None:
         self._digested = _Digested(descriptor)
@@ -84,8 +48,10 @@ class InputFile(io.BufferedReader):
         super().__init__(self._digested)
 
     def sha256(self) -> str:
-        """SHA-256 (hexadecimal) of the whole file: of its bytes as they were first read, and of the rest as it is."""
-        return self._digested.sha256()
+        """SHA-256 (hexadecimal) of the whole file: of its bytes as they were read, and of the rest, read for it."""
+        while self.read(CHUNK):
+            pass
+        return self._digested.digest.hexdigest()
 
 
 def open_input(path: Path) -> InputFile:

@@ -11,7 +11,7 @@ import csv
 import io
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -92,29 +92,25 @@ def read_label_table(path: Path | str) -> LabelTable:
     return replace(table, sha256=sha256)
 
 
-def column_names(text: str, delimiter: str) -> tuple[str, ...]:
-    """The names in the first line, in lower case."""
-    first = text.splitlines()[0] if text else ""
-    return tuple(name.strip().strip('"').lower() for name in first.split(delimiter))
+def _delimited(text: str, path: Path, *, delimiter: str, needs: str) -> list[dict[str, str]]:
+    """Each line after the first that is not blank: name of the column in lower case -> text.
 
-
-def delimited_rows(text: str, path: Path, *, delimiter: str) -> list[Mapping[str, str]]:
-    """Each line after the first: name of the column in lower case -> text. Raises `InputDataError` for damaged text."""
-    names = column_names(text, delimiter)
+    Raises `InputDataError` for damaged text and where a column of `needs` is missing.
+    """
     try:
-        lines = list(csv.reader(io.StringIO(text), delimiter=delimiter))[1:]
+        names, *lines = csv.reader(io.StringIO(text), delimiter=delimiter)
     except csv.Error as error:
         raise InputDataError(f"the label table '{path}' is damaged: {error}; export it again") from error
-    return [
-        dict(zip(names, (cell.strip() for cell in line), strict=False))
-        for line in lines
-        if any(cell.strip() for cell in line)
-    ]
+    names = [name.strip().lower() for name in names]
+    missing = set(needs.lower().split(", ")) - set(names)
+    if missing:
+        raise InputDataError(f"the label table '{path}' lacks the columns {sorted(missing)}; it needs {needs}")
+    cells = [[cell.strip() for cell in line] for line in lines]
+    return [dict.fromkeys(names, "") | dict(zip(names, line, strict=False)) for line in cells if any(line)]
 
 
-def whole_number(text: str, path: Path) -> int:
-    """`text` as a label; raises `InputDataError` when it is no whole number."""
-    if not (text.isascii() and text.isdigit() and len(text) <= 9):
+def _label(text: str, path: Path) -> int:
+    if not DIGITS.fullmatch(text):
         raise InputDataError(
             f"the label table '{path}' has the label {text[:50]!r}; it must be a whole number from 0 to 65535"
         )
@@ -123,32 +119,22 @@ def whole_number(text: str, path: Path) -> int:
 
 def read_bids_table(text: str, path: Path) -> list[NamedLabel]:
     """Rows of a dseg.tsv; "n/a" is no colour. Raises `InputDataError` for a missing column."""
-    missing = {"index", "name"} - set(column_names(text, "\t"))
-    if missing:
-        raise InputDataError(f"the label table '{path}' lacks the columns {sorted(missing)}; it needs index and name")
     rows = []
-    for row in delimited_rows(text, path, delimiter="\t"):
+    for row in _delimited(text, path, delimiter="\t", needs="index, name"):
         colour = row.get("color", "").lower()
-        label = whole_number(row.get("index", ""), path)
-        rows.append(NamedLabel(label, row.get("name", ""), colour if COLOUR.fullmatch(colour) else None))
+        rows.append(NamedLabel(_label(row["index"], path), row["name"], colour if COLOUR.fullmatch(colour) else None))
     return rows
 
 
 def read_slicer_table(text: str, path: Path) -> list[NamedLabel]:
     """Rows of a colour table; a missing or impossible colour is none. Raises `InputDataError` for a missing column."""
-    missing = {"labelvalue", "name"} - set(column_names(text, ","))
-    if missing:
-        raise InputDataError(f"the label table '{path}' lacks the columns {sorted(missing)}; it needs LabelValue, Name")
     found = []
-    for row in delimited_rows(text, path, delimiter=","):
-        name, parts = row.get("name", ""), [row.get(f"color_{letter}", "") for letter in "rgb"]
+    for row in _delimited(text, path, delimiter=",", needs="LabelValue, Name"):
+        name, parts = row["name"], [row.get(f"color_{letter}", "") for letter in "rgb"]
         if name.startswith("'") and computed_by_spreadsheets(name[1:]):
             name = name[1:]
-        plain = all(part.isascii() and part.isdigit() and len(part) <= 3 for part in parts)
-        red, green, blue = map(int, parts) if plain else (-1, -1, -1)
-        found.append(
-            NamedLabel(whole_number(row.get("labelvalue", ""), path), name, hex_colour(red, green, blue, top=255))
-        )
+        red, green, blue = map(int, parts) if all(map(DIGITS.fullmatch, parts)) else (-1, -1, -1)
+        found.append(NamedLabel(_label(row["labelvalue"], path), name, hex_colour(red, green, blue, top=255)))
     return found
 
 
@@ -167,8 +153,8 @@ def slicer_table(rows: Iterable[NamedLabel]) -> str:
     return text.getvalue()
 
 
-def pattern_rows(text: str, path: Path, pattern: re.Pattern[str], *, form: str) -> list[NamedLabel]:
-    """Rows by the groups label, name, red, green and blue (0 to 255) of the pattern.
+def read_lines(text: str, path: Path, *, pattern: re.Pattern[str], form: str) -> list[NamedLabel]:
+    """Rows by the groups label, name, red, green and blue (0 to 255) of the pattern; `#` begins a comment.
 
     Raises `InputDataError` for a line that it does not match; `form`: what the line should have been, in words.
     """
@@ -184,28 +170,9 @@ def pattern_rows(text: str, path: Path, pattern: re.Pattern[str], *, form: str) 
     return rows
 
 
-def begins_with(pattern: re.Pattern[str], text: str) -> bool:
-    """Whether the first line that is neither blank nor a comment matches."""
-    lines = _lines(text)
-    return bool(lines) and pattern.fullmatch(lines[0][1]) is not None
-
-
 def _lines(text: str) -> list[tuple[int, str]]:
     lines = enumerate(text.splitlines(), start=1)
     return [(number, line) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
-
-
-def read_ctbl_table(text: str, path: Path) -> list[NamedLabel]:
-    """Rows of a colour table, names as they stand there; `#` begins a comment.
-
-    Raises `InputDataError` for a line of another form.
-    """
-    return pattern_rows(text, path, CTBL_ROW, form="the form `1 prostate 255 0 0 255` (no blank in a name)")
-
-
-def read_itksnap_table(text: str, path: Path) -> list[NamedLabel]:
-    """Rows of a label description; `#` begins a comment. Raises `InputDataError` for a line of another form."""
-    return pattern_rows(text, path, ITKSNAP_ROW, form='ITK-SNAP\'s form `1 255 0 0 1 1 1 "prostate"`')
 
 
 class _Pairs(list[tuple[str, Any]]):
@@ -240,15 +207,30 @@ def read_json_table(text: str, path: Path) -> list[NamedLabel]:
     return rows
 
 
-def _has(delimiter: str) -> Callable[[str], bool]:
-    """Whether the first line has a delimiter."""
-    return lambda text: delimiter in text.partition("\n")[0]
+def _begins(text: str, pattern: re.Pattern[str]) -> bool:
+    """Whether the first line that is neither blank nor a comment matches."""
+    lines = _lines(text)
+    return bool(lines) and pattern.fullmatch(lines[0][1]) is not None
 
 
+CTBL_FORM = "the form `1 prostate 255 0 0 255` (no blank in a name)"
+ITKSNAP_FORM = 'ITK-SNAP\'s form `1 255 0 0 1 1 1 "prostate"`'
 TABLES = (
-    TableFormat("a BIDS dseg.tsv", (".tsv",), _has("\t"), read_bids_table),
-    TableFormat("3D Slicer's CSV colour table", (".csv",), _has(","), read_slicer_table),
-    TableFormat("3D Slicer's colour table", (".ctbl", ".txt"), partial(begins_with, CTBL_ROW), read_ctbl_table),
-    TableFormat("ITK-SNAP's label description", (".txt", ".label"), partial(begins_with, QUOTED), read_itksnap_table),
+    TableFormat("a BIDS dseg.tsv", (".tsv",), lambda text: "\t" in text.partition("\n")[0], read_bids_table),
+    TableFormat(
+        "3D Slicer's CSV colour table", (".csv",), lambda text: "," in text.partition("\n")[0], read_slicer_table
+    ),
+    TableFormat(
+        "3D Slicer's colour table",
+        (".ctbl", ".txt"),
+        partial(_begins, pattern=CTBL_ROW),
+        partial(read_lines, pattern=CTBL_ROW, form=CTBL_FORM),
+    ),
+    TableFormat(
+        "ITK-SNAP's label description",
+        (".txt", ".label"),
+        partial(_begins, pattern=QUOTED),
+        partial(read_lines, pattern=ITKSNAP_ROW, form=ITKSNAP_FORM),
+    ),
     TableFormat("JSON", (".json",), lambda _: True, read_json_table),
 )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +12,18 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from palpate.errors import InputDataError
-from palpate.images.alignment import TUKEY, RigidFit, RigidMotion, seen_surface, within_border
+from palpate.images.alignment import (
+    TUKEY,
+    RigidFit,
+    RigidMotion,
+    distance_pairs,
+    seen_surface,
+    tukey,
+    within_border,
+)
 from palpate.images.distance import DistanceMap, smoothing_width
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
-from palpate.images.tissue_distance import tissue_distance_map
-from palpate.parallel import mapped
 
 SMOOTHER = 2.0  # times the usual smoothing: it takes the stairs of the voxels, and does the same to both images
 MOST_POINTS = 400  # of one surface: those between them say the same
@@ -114,7 +119,7 @@ def align_surfaces(before: Segmentation, after: Segmentation) -> RigidFit:
         best = still
     seen = np.concatenate(best.seen)
     residual = np.concatenate(best.residuals)[seen]
-    weight = _tukey(residual, _cutoff(best))
+    weight = tukey(residual, _cutoff(best))
     rms = float(np.sqrt(weight @ residual**2 / max(float(weight.sum()), 1e-12)))
     return RigidFit(best.motion, rms, int(np.count_nonzero(weight)), np.zeros((0, 3)))
 
@@ -138,10 +143,7 @@ def _maps(before: Segmentation, after: Segmentation) -> dict[int, tuple[Distance
     """Distance maps in both images of every tissue with a surface of its own that both have."""
     present = [set(np.unique(image.index).tolist()) for image in (before, after)]
     tissues = [i for i in shown_tissues(before) if i in present[0] & present[1]]
-    width = SMOOTHER * smoothing_width(before.grid, after.grid)
-    images = list(product(tissues, (before, after)))
-    maps = mapped(lambda of: tissue_distance_map(of[1], of[0], smoothing_mm=width), images)
-    return dict(zip(tissues, zip(maps[::2], maps[1::2], strict=True), strict=True))
+    return distance_pairs(before, after, tissues, smoothing_mm=SMOOTHER * smoothing_width(before.grid, after.grid))
 
 
 def _surfaces(
@@ -205,7 +207,7 @@ def _noise(
     """Cholesky factors of the residuals' covariance among the points that are seen; outliers of the trial have more."""
     factors, cutoff = [], _cutoff(trial)
     for surface, residual, inside in zip(surfaces, trial.residuals, seen, strict=True):
-        rough = ROUGHNESS_MM**2 / np.maximum(_tukey(residual[inside], cutoff), LEAST_WEIGHT)
+        rough = ROUGHNESS_MM**2 / np.maximum(tukey(residual[inside], cutoff), LEAST_WEIGHT)
         factors.append(linalg.cholesky(surface.own[np.ix_(inside, inside)] + np.diag(rough), lower=True))
     return tuple(factors)
 
@@ -251,7 +253,3 @@ def _cutoff(trial: _Trial) -> float:
     """Size from which a residual is an outlier, mm: 4.685 of their robust standard deviations."""
     residual = np.concatenate(trial.residuals)[np.concatenate(trial.seen)]
     return TUKEY * max(1.4826 * float(np.median(np.abs(residual))), OWN_MOTION_MM[Role.ESTIMATE])
-
-
-def _tukey(residual: NDArray[np.float64], cutoff: float) -> NDArray[np.float64]:
-    return np.asarray(np.maximum(1.0 - (residual / cutoff) ** 2, 0.0) ** 2)

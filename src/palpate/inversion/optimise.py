@@ -122,8 +122,8 @@ WHOLE = TrustRegion(np.inf, 0.0)  # the step to the minimum of the quadratic mod
 def posterior_sd(minimum: Minimum, n_parameters: int) -> NDArray[np.float64]:
     """Standard deviations (n_parameters,) of the log-moduli by the Gauss-Newton matrix.
 
-    Infinite where a modulus moves nothing, as in a body at rest. Raises `EstimationError` where neither images nor prior
-    determine some other unknown.
+    Infinite where a modulus moves nothing, as in a body at rest. Raises `EstimationError` where neither images nor
+    prior determine some other unknown.
     """
     evaluation, sd = minimum.evaluation, np.full(n_parameters, np.inf)
     seen = np.diag(evaluation.matrix) > 0.0

@@ -10,7 +10,7 @@ from scipy import sparse
 
 from palpate.mechanics.hyperelastic import Elements, Moduli
 from palpate.mechanics.linearised import LinearisedSystem, symmetric_part
-from palpate.mechanics.loads import Load
+from palpate.mechanics.loads import Load, summed
 from palpate.mechanics.pattern import BlockPattern, Restriction, Stiffness
 from palpate.mechanics.rigid import rigid_modes
 from palpate.mechanics.solvers.contract import Factorisation
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class TissueBalance:
-    """Internal and external forces with Lame's constants `moduli`; implements `newton.Balance`.
+    """Internal and external forces with Lame's constants `moduli`, as functions of the displacement.
 
     element_region (n_tets,): number of each tetrahedron's tissue among the n_regions meshed ones; free (n_dof, n_free).
     """
@@ -108,8 +108,5 @@ class TissueBalance:
 
     def _sum(self, forces: Array, part: NDArray[np.bool_] | None = None) -> Array:
         """Nodal forces (n_dof,) of element forces (n_cells, n_a, 3), of all or of a part of the elements."""
-        n = len(self.space.points)
         cells = self.elements.cells if part is None else self.elements.cells[part]
-        chosen = (forces if part is None else forces[part]).reshape(-1, 3)
-        columns = [np.bincount(cells.ravel(), chosen[:, axis], minlength=n) for axis in range(3)]
-        return np.stack(columns, axis=1).ravel().astype(np.float64)
+        return summed(cells, forces if part is None else forces[part], len(self.space.points))

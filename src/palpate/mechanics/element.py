@@ -18,22 +18,33 @@ CENTRE = np.full((1, 4), 0.25)
 def quadrature(degree: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Points (n_q, 4) barycentric and positive weights (n_q,), sum 1, exact for polynomials up to `degree`.
 
-    Degree 1: the centroid; degree 2: four points (Keast 1986); above: the conical product of Gauss-Jacobi rules
-    (Stroud 1971), with ceil((degree + 1) / 2) points a direction.
+    Degree 1: the centroid; degree 2: four points (Keast 1986); above: `_conical_product`.
     """
     if degree <= 1:
         return np.full((1, 4), 0.25), np.ones(1)
     if degree == 2:
         low = (5.0 - np.sqrt(5.0)) / 20.0
         return np.full((4, 4), low) + (1.0 - 4.0 * low) * np.eye(4), np.full(4, 0.25)
-    # from the cube by lambda_1 = x, lambda_2 = (1 - x) y, lambda_3 = (1 - x)(1 - y) z
-    n = degree // 2 + 1
-    rules = [roots_jacobi(n, power, 0.0) for power in (2.0, 1.0, 0.0)]
-    x, y, z = np.meshgrid(*[0.5 * (1.0 + points) for points, _ in rules], indexing="ij")
-    weights = np.einsum("i,j,k->ijk", *[w / w.sum() for _, w in rules])
-    first, second, third = x, (1.0 - x) * y, (1.0 - x) * (1.0 - y) * z
-    points = np.stack([1.0 - first - second - third, first, second, third], axis=-1)
-    return np.asarray(points.reshape(-1, 4)), np.asarray(weights.ravel())
+    return _conical_product(degree, 3)
+
+
+def triangle_quadrature(degree: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Points (n_q, 3) barycentric on a triangle and positive weights (n_q,), sum 1, exact up to `degree`."""
+    return _conical_product(degree, 2)
+
+
+def _conical_product(degree: int, dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Of Gauss-Jacobi rules (Stroud 1971), with ceil((degree + 1) / 2) points a direction, on a simplex.
+
+    From the cube by lambda_1 = x, lambda_2 = (1 - x) y, lambda_3 = (1 - x)(1 - y) z.
+    """
+    rules = [roots_jacobi(degree // 2 + 1, float(power), 0.0) for power in reversed(range(dimension))]
+    cube = np.stack(np.meshgrid(*[0.5 * (1.0 + points) for points, _ in rules], indexing="ij"), axis=-1)
+    weights = np.prod(np.stack(np.meshgrid(*[w / w.sum() for _, w in rules], indexing="ij"), axis=-1), axis=-1)
+    left = np.cumprod(1.0 - cube, axis=-1)  # of 1, once each coordinate has had its share
+    shares = cube * np.concatenate([np.ones_like(left[..., :1]), left[..., :-1]], axis=-1)
+    points = np.concatenate([left[..., -1:], shares], axis=-1)
+    return np.asarray(points.reshape(-1, dimension + 1)), np.asarray(weights.ravel())
 
 
 def shape_derivatives(order: int, barycentric: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -76,18 +87,6 @@ def barycentric_gradients(
     inverse = np.linalg.inv(edges)
     gradients = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
     return gradients, np.asarray(np.linalg.det(edges) / 6.0)
-
-
-def triangle_quadrature(degree: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points (n_q, 3) barycentric on a triangle and positive weights (n_q,), sum 1, exact up to `degree`.
-
-    The conical product of Gauss-Jacobi rules (Stroud 1971), with ceil((degree + 1) / 2) points a direction.
-    """
-    rules = [roots_jacobi(degree // 2 + 1, power, 0.0) for power in (1.0, 0.0)]
-    x, y = np.meshgrid(*[0.5 * (1.0 + points) for points, _ in rules], indexing="ij")
-    weights = np.einsum("i,j->ij", *[w / w.sum() for _, w in rules])
-    points = np.stack([(1.0 - x) * (1.0 - y), x, (1.0 - x) * y], axis=-1)
-    return np.asarray(points.reshape(-1, 3)), np.asarray(weights.ravel())
 
 
 def triangle_slopes(order: int, barycentric: NDArray[np.float64]) -> NDArray[np.float64]:

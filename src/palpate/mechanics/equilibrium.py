@@ -9,7 +9,7 @@ from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel, finite_strain_model
 from palpate.mechanics.forward import Equilibrium
 from palpate.mechanics.laws.contract import Law
-from palpate.mechanics.linear_model import LinearSystem, linear_model
+from palpate.mechanics.linear_model import linear_model
 from palpate.mechanics.loads import Load
 from palpate.mechanics.newton import NewtonSettings
 from palpate.mechanics.solvers.contract import Factorisation
@@ -42,18 +42,8 @@ def equilibrium(
     model = finite_strain_model(
         space, constraint, law, dilatation=dilatation, loads=loads, settings=settings, strained=strained
     )
-    return from_linear(model, system, still)
-
-
-def from_linear(
-    model: FiniteStrainModel, system: LinearSystem, coefficients: NDArray[np.float64]
-) -> FiniteStrainEquilibrium:
-    """Equilibrium at the moduli of the linear `system` and mode coefficients (n_modes,), from its displacement.
-
-    Raises `NotConverged` as `from_start` does.
-    """
-    start = system.solve(coefficients).displacement
-    return from_start(model, system.moduli, coefficients, start=start, nearby=system.factorisation)
+    start = system.solve(still).displacement
+    return from_start(model, system.moduli, still, start=start, nearby=system.factorisation)
 
 
 def from_start(

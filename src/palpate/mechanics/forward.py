@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
+from operator import add, sub
 from typing import Protocol
 
 import numpy as np
@@ -25,20 +26,10 @@ class SolveCounts:
     factorisations: int = 0
 
     def __add__(self, other: SolveCounts) -> SolveCounts:
-        return SolveCounts(
-            self.forward + other.forward,
-            self.adjoint + other.adjoint,
-            self.tangent + other.tangent,
-            self.factorisations + other.factorisations,
-        )
+        return SolveCounts(*map(add, astuple(self), astuple(other)))
 
     def __sub__(self, other: SolveCounts) -> SolveCounts:
-        return SolveCounts(
-            self.forward - other.forward,
-            self.adjoint - other.adjoint,
-            self.tangent - other.tangent,
-            self.factorisations - other.factorisations,
-        )
+        return SolveCounts(*map(sub, astuple(self), astuple(other)))
 
 
 class Equilibrium(Protocol):

@@ -16,7 +16,7 @@ from scipy import sparse
 
 from palpate.mechanics.conditions import Conditions
 from palpate.mechanics.dilatation import Dilatation
-from palpate.mechanics.forward import SolveCounts, checked_coefficients, checked_moduli
+from palpate.mechanics.forward import DenseEquilibrium, SolveCounts, checked_coefficients, checked_moduli
 from palpate.mechanics.hyperelastic import Elements, Moduli, elements_of
 from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.loads import Load
@@ -145,7 +145,7 @@ class LinearModel:
 
         At an equilibrium u (n_dof,) mm and moduli (n_regions,) kPa.
         """
-        forces = self.material_forces(moduli, values, np.eye(self.material.n_modes))
+        forces = self.by_material(moduli, values).along(np.eye(self.material.n_modes))
         material = -np.asarray(self.constraint.free.T @ forces)
         return np.concatenate([self.boundary_loads(moduli, values), material], axis=1)
 
@@ -309,17 +309,12 @@ class LinearSystem:
 
 
 @dataclass(frozen=True, slots=True)
-class LinearEquilibrium:
+class LinearEquilibrium(DenseEquilibrium):
     """The displacement at one system and one set of mode coefficients; implements `Equilibrium`."""
 
     system: LinearSystem
     coefficients: NDArray[np.float64]
     values: NDArray[np.float64]
-
-    @property
-    def displacement(self) -> NDArray[np.float64]:
-        """Displacement u (n_points, 3) mm."""
-        return self.values.reshape(-1, 3)
 
     @property
     def counts(self) -> SolveCounts:

@@ -8,7 +8,7 @@ held (Bonet & Wood, Nonlinear Continuum Mechanics, 2nd ed. 2008, sections 8.5.2 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,12 +45,9 @@ class Load(Protocol):
 class DeadLoad:
     """Nodal forces (n_dof,) mN that stay what they are."""
 
-    nodal: Array
+    follows: ClassVar[bool] = False
 
-    @property
-    def follows(self) -> bool:
-        """Dead: no."""
-        return False
+    nodal: Array
 
     def forces(self, displacement: Array) -> Array:
         """Nodal forces (n_dof,) mN, the same at every u (n_points, 3)."""
@@ -66,14 +63,11 @@ class DeadLoad:
 class FollowingPressure:
     """A pressure (kPa) on faces (n_faces, 3 or 6) of `space`, normals out of the body; it pushes along -n."""
 
+    follows: ClassVar[bool] = True  # it turns and grows with its surface
+
     space: LagrangeSpace
     faces: NDArray[np.int64]
     kilopascal: float
-
-    @property
-    def follows(self) -> bool:
-        """It turns and grows with its surface."""
-        return True
 
     def forces(self, displacement: Array) -> Array:
         """Nodal forces (n_dof,) mN at u (n_points, 3) mm."""
@@ -81,7 +75,7 @@ class FollowingPressure:
         along = np.einsum("qad,fai->dfqi", slopes, self._corners(displacement))
         normals = np.cross(along[0], along[1])
         nodal = -self.kilopascal * np.einsum("q,qa,fqi->fai", weights, shape, normals, optimize=True)
-        return _summed(self.faces, nodal, len(self.space.points))
+        return summed(self.faces, nodal, len(self.space.points))
 
     def stiffness(self, displacement: Array) -> sparse.csr_matrix[np.float64]:
         """Derivative of the forces (n_dof, n_dof) mN/mm at u (n_points, 3) mm."""
@@ -125,7 +119,7 @@ def traction(space: LagrangeSpace, triangles: NDArray[np.int64], kilopascal: Arr
     along = np.einsum("qad,fai->dfqi", slopes, space.points[faces])
     areas = np.linalg.norm(np.cross(along[0], along[1]), axis=2)
     nodal = np.einsum("q,qa,fq,i->fai", weights, shape, areas, vector, optimize=True)
-    return DeadLoad(_summed(faces, nodal, len(space.points)))
+    return DeadLoad(summed(faces, nodal, len(space.points)))
 
 
 def gravity(space: LagrangeSpace, densities: Array, acceleration: Array) -> DeadLoad:
@@ -143,7 +137,7 @@ def gravity(space: LagrangeSpace, densities: Array, acceleration: Array) -> Dead
     points, weights = quadrature(2)
     shares = weights @ shape_functions(space.order, points)
     heavy = PER_CUBIC_MILLIMETRE * mass[space.mesh.region] * space.mesh.volumes
-    return DeadLoad(_summed(space.cells, np.einsum("e,a,i->eai", heavy, shares, vector), len(space.points)))
+    return DeadLoad(summed(space.cells, np.einsum("e,a,i->eai", heavy, shares, vector), len(space.points)))
 
 
 def boundary_named(mesh: TetMesh, name: str) -> NDArray[np.int64]:
@@ -166,8 +160,8 @@ def _face_rule(order: int) -> tuple[Array, Array, Array]:
     return shape_functions(order, points), triangle_slopes(order, points), 0.5 * weights
 
 
-def _summed(cells: NDArray[np.int64], nodal: Array, n_points: int) -> Array:
-    """Nodal forces (n_dof,) of forces (n_cells, n_a, 3)."""
+def summed(cells: NDArray[np.int64], nodal: Array, n_points: int) -> Array:
+    """Nodal forces (n_dof,), mN, of forces (n_cells, n_a, 3) on the points of cells (n_cells, n_a)."""
     flat = nodal.reshape(-1, 3)
     columns = [np.bincount(cells.ravel(), flat[:, axis], minlength=n_points) for axis in range(3)]
     return np.stack(columns, axis=1).ravel().astype(np.float64)

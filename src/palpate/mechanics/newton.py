@@ -22,13 +22,12 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from palpate.errors import SolverError
+from palpate.mechanics.balance import TissueBalance
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.pattern import Stiffness
 from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
@@ -41,48 +40,6 @@ FORCING = (1e-3, 3e-2)  # least and largest relative residual to which conjugate
 MAX_GRADIENTS = 18  # steps of them, after which a new factorisation is cheaper
 SEARCHES = 8  # trials of a line search
 EASY = 4  # iterations; a step that needs no more is followed by one of twice its length
-
-
-class Balance(Protocol):
-    """Forces on a body as functions of its displacement u (n_dof,) mm."""
-
-    @property
-    def free(self) -> sparse.csr_matrix[np.float64]:
-        """Orthonormal columns F (n_dof, n_free) of the free displacements."""
-        ...
-
-    def residual(self, displacement: Array) -> tuple[Array, float]:
-        """Internal less external forces R (n_dof,) mN, and the length of the internal ones, at u (n_dof,)."""
-        ...
-
-    def stiffness(self, displacement: Array, pressure: Array | None = None) -> Stiffness:
-        """K = dR/du (n_dof, n_dof) mN/mm at u (n_dof,), or with other pressures (n_cells,) kPa than those at u."""
-        ...
-
-    def pressure_ahead(self, displacement: Array, change: Array) -> Array:
-        """Mean pressures (n_cells,) kPa at u + du by linear extrapolation from u (n_dof,) along du (n_dof,)."""
-        ...
-
-    @property
-    def symmetric(self) -> bool:
-        """Whether the stiffness is symmetric."""
-        ...
-
-    def restricted(self, stiffness: Stiffness) -> sparse.csr_matrix[np.float64]:
-        """F^T K F (n_free, n_free) mN/mm of K (n_dof, n_dof)."""
-        ...
-
-    def factorise(self, stiffness: Stiffness) -> Factorisation:
-        """Factorisation of F^T K F (n_free, n_free); raises `SolverError`."""
-        ...
-
-    def smallest_volume(self, displacement: Array) -> float:
-        """Smallest volume ratio J of all elements at u (n_dof,), infinity for a law without a limit."""
-        ...
-
-    def weakest(self, displacement: Array) -> str:
-        """Words for the element with the smallest J at u (n_dof,)."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +83,7 @@ class NewtonPath:
         counts = self.counts + SolveCounts(factorisations=1)
         return replace(self, factorisation=factorisation, counts=counts)
 
-    def moved(self, balance: Balance, change: Array, share: float) -> NewtonPath:
+    def moved(self, balance: TissueBalance, change: Array, share: float) -> NewtonPath:
         """A share of `change` (n_dof,) mm further, pressures foreseen along with the displacement."""
         now = balance.pressure_ahead(self.displacement, 0.0 * change) if self.pressure is None else self.pressure
         ahead = balance.pressure_ahead(self.displacement, change)
@@ -150,7 +107,7 @@ class _StepFailed(Exception):  # noqa: N818 - never leaves this module
 class _Way:
     """The whole way: unit boundary increment (n_dof,) mm and the out-of-balance forces of the start (n_free,) mN."""
 
-    balance: Balance
+    balance: TissueBalance
     settings: NewtonSettings
     increment: Array
     unbalanced: Array
@@ -162,7 +119,7 @@ class _Way:
 
 
 def follow(
-    balance: Balance, start: Array, increment: Array, *, settings: NewtonSettings, nearby: Factorisation | None
+    balance: TissueBalance, start: Array, increment: Array, *, settings: NewtonSettings, nearby: Factorisation | None
 ) -> NewtonPath:
     """Lead the displacement `start` (n_dof,) mm to equilibrium while the boundary moves by `increment` (n_dof,) mm.
 

@@ -21,4 +21,5 @@ from palpate.mesh.tet_mesh import OUTER as OUTER
 from palpate.mesh.tet_mesh import TetMesh as TetMesh
 from palpate.mesh.tetrahedralise import SizeField as SizeField
 from palpate.mesh.tetrahedralise import boundary_of as boundary_of
+from palpate.mesh.tetrahedralise import outer_faces as outer_faces
 from palpate.mesh.tetrahedralise import tetrahedralise as tetrahedralise

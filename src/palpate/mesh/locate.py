@@ -74,6 +74,14 @@ def region_image(mesh: TetMesh, grid: VoxelGrid) -> NDArray[np.int16]:
     return np.append(mesh.region, -1).astype(np.int16)[tetrahedron_image(mesh, grid)]
 
 
+def modulus_image(mesh: TetMesh, grid: VoxelGrid, moduli: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Moduli (n_tissues,) at each voxel centre (n_x, n_y, n_z) of `grid`, in their unit; 0 where nothing is meshed.
+
+    Viewers show NaN as anything.
+    """
+    return np.asarray(np.nan_to_num(np.append(moduli, 0.0))[region_image(mesh, grid)])
+
+
 def tetrahedron_image(mesh: TetMesh, grid: VoxelGrid) -> NDArray[np.int32]:
     """Number (n_x, n_y, n_z) of the tetrahedron at each voxel centre of `grid`; -1: none."""
     image = np.full(grid.shape, -1, dtype=np.int32)

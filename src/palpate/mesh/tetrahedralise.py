@@ -159,9 +159,15 @@ def _better(grid: Grid, anatomy: Anatomy, sizes: SizeField, progress: Progress) 
 
 def boundary_of(tets: NDArray[np.int64]) -> NDArray[np.int64]:
     """Faces (n, 3) that belong to one of the tets (n_tets, 4) only, normals pointing out of it."""
+    return outer_faces(tets)[0]
+
+
+def outer_faces(tets: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """As `boundary_of`, and of which tetrahedron (n,) each is."""
     faces = tets[:, FACES].reshape(-1, 3)
     _, place, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    return np.asarray(faces[np.sort(place[count == 1])])
+    outside = np.sort(place[count == 1])
+    return np.asarray(faces[outside]), outside // 4
 
 
 def _beyond(anatomy: Anatomy, nodes: NDArray[np.float64], boundary: NDArray[np.int64]) -> NDArray[np.int64]:

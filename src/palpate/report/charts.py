@@ -1,17 +1,20 @@
-"""Charts of a report: residuals, convergence and waterfall of the starts, angles of the mesh."""
+"""Charts of a report: residuals and forces, convergence, angles of the mesh, and what is known of the moduli."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline, PchipInterpolator
 
 from palpate.report.report_data import ModelSurface, ReportData
-from palpate.report.rows import number
+from palpate.report.rows import interval_text, main_numbers, moduli_in, number
 from palpate.report.svg import INK, draw_svg
 from palpate.uncertainty import NORMAL_95
 
@@ -20,6 +23,7 @@ DASHED = (0, (4, 3))
 BINS = 41
 BROAD: dict[str, Any] = {"color": "#c98b00", "linewidth": 7.0, "alpha": 0.6, "solid_capstyle": "butt"}
 FITTED = "#3d8be0"
+LIMIT = NORMAL_95**2  # deviance at the ends of a 95 % interval
 FEWEST_MARKS = 3  # of an axis that can be read
 ROW_INCHES, MOST_LETTERS = 0.3, 24
 START_COLOURS = ("#3b7dd8", "#d9822b", "#3a9d5d", "#b0559b", "#8a6d3b", "#4aa3a3", "#c0504d", "#7f7fd0")
@@ -88,7 +92,7 @@ def objective_svg(data: ReportData, *, name: str) -> str:
     """Misfit (mm^2) of every start against the iteration, then of the outer loop that they share, as SVG."""
     histories = [start["history_mm2"] for start in data.document["starts"]]
     histories.append(data.document["outer_loop"]["history_mm2"])
-    paths = [[_finite(value) for value in history] for history in histories]
+    paths = [list(np.array(history, dtype=np.float64)) for history in histories]  # NaN for nothing
     says = f"Misfit by iteration. {_told(paths, 'mm²')}"
     return draw_svg(lambda figure: _paths(figure, paths, "misfit (mm²)"), size=SIZE, name=name, says=says)
 
@@ -102,7 +106,7 @@ def modulus_svg(data: ReportData, estimate: int, *, name: str) -> str:
 
     def draw(figure: Figure) -> None:
         """The paths, the 95 % interval as a band and the truth as a dashed line, where they are known."""
-        _paths(figure, paths, "E (kPa)" if in_kpa else f"E / {item['relative_to'][:24]}")
+        _paths(figure, paths, _label(item))
         interval = item["interval95"] if in_kpa else item["ratio_interval95"]
         if interval is not None and None not in interval:
             figure.axes[0].axhspan(interval[0], interval[1], color=INK, alpha=0.1, linewidth=0)
@@ -117,7 +121,7 @@ def modulus_svg(data: ReportData, estimate: int, *, name: str) -> str:
 def waterfall_svg(data: ReportData, *, name: str) -> str:
     """Final misfits (mm^2) of the starts from the best to the worst, as SVG; hollow where a start did not converge."""
     starts = data.document["starts"]
-    ends = np.array([_finite(start["objective_mm2"]) for start in starts])
+    ends = np.array([start["objective_mm2"] for start in starts], dtype=np.float64)
     order = np.argsort(ends, kind="stable")
     told = ", ".join(f"start {rank + 1} {number(float(ends[rank]), digits=4)}" for rank in order)
 
@@ -166,6 +170,131 @@ def angle_svg(angles: NDArray[np.float32], *, name: str) -> str:
     return draw_svg(draw, size=SIZE, name=name, says=says)
 
 
+def profile_svg(data: ReportData, estimate: int, *, name: str) -> str:
+    """Deviance of one estimate (its number) at each value of its modulus, all else at its best, as SVG.
+
+    Between the points that were computed its signed root is monotone in ln E; the interval is a band, and the dashed
+    line the deviance 1.96^2 at the ends of a profile's.
+    """
+    item = data.document["estimates"][estimate]
+    colour = _colour(data, item)
+    value, interval = main_numbers(item)
+    at, root = np.array(sorted(item["profile"]), dtype=np.float64).T
+    fine = np.linspace(np.log(at[0]), np.log(at[-1]), 201)
+    between = PchipInterpolator(np.log(at), root)(fine)
+
+    def draw(figure: Figure) -> None:
+        """The profile with its points, the interval and the estimate."""
+        axes = figure.add_axes((0.14, 0.2, 0.83, 0.74))
+        room = (at[-1] / at[0]) ** 0.12
+        ends = (at[0] / room, at[-1] * room)
+        low, high = interval or (None, None)
+        axes.axvspan(low or ends[0], high or ends[1], color=INK, alpha=0.1, linewidth=0)
+        axes.plot(np.exp(fine), between**2, color=colour, linewidth=1.6)
+        axes.plot(at, root**2, "o", color=colour, markersize=3.2)
+        axes.axhline(LIMIT, color=INK, linewidth=0.9, linestyle=DASHED)
+        axes.plot([np.nan if value is None else value], [0.0], "o", color=colour, markeredgecolor=INK, clip_on=False)
+        axes.set_xscale("log")
+        axes.set_xlim(*ends)
+        axes.set_ylim(0.0, 1.6 * LIMIT)
+        _plain_numbers(axes.xaxis)
+        axes.set_xlabel(_label(item))
+        axes.set_ylabel("deviance")
+        axes.yaxis.set_major_locator(MaxNLocator(4))
+
+    told = f"lowest at {number(value)}, 95 % interval {interval_text(interval)}"
+    return draw_svg(draw, size=SIZE, name=name, says=f"Profile likelihood of {item['tissue']}: {told}.")
+
+
+def region_svg(data: ReportData, region: int, *, name: str) -> str:
+    """The joint 95 % region of two moduli (its number), with the ellipse, the estimate and the truth, as SVG.
+
+    Between the directions that were computed the boundary is a periodic cubic spline of ln E.
+    """
+    of = data.document["regions"][region]
+    first, second = (next(i for i in moduli_in(data.document) if i["tissue"] == tissue) for tissue in of["tissues"])
+    boundary, ellipse = _closed(of["boundary"]), _closed(of["ellipse"])
+    colour = _colour(data, first)
+
+    def draw(figure: Figure) -> None:
+        """Both boundaries on logarithmic axes."""
+        axes = figure.add_axes((0.16, 0.2, 0.81, 0.74))
+        axes.fill(*boundary, facecolor=colour, alpha=0.25, linewidth=0)
+        axes.plot(*boundary, color=colour, linewidth=1.4)
+        axes.plot(*ellipse, color=INK, linewidth=1.0, linestyle=DASHED)
+        axes.plot([_value(first)], [_value(second)], "o", color=colour, markeredgecolor=INK)
+        if first["truth"] is not None and second["truth"] is not None:
+            axes.plot([first["truth"]], [second["truth"]], "x", color=INK, markersize=7)
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.set_xlabel(_label(first, of_tissue=True))
+        axes.set_ylabel(_label(second, of_tissue=True))
+        for axis in (axes.xaxis, axes.yaxis):
+            _plain_numbers(axis)
+
+    spans = [
+        f"{t} {number(line.min())} to {number(line.max())}" for t, line in zip(of["tissues"], boundary, strict=True)
+    ]
+    says = f"Joint 95 % region: {' and '.join(spans)}{', cut by the bounds of the search' if of['open'] else ''}."
+    return draw_svg(draw, size=SIZE, name=name, says=says)
+
+
+def repeats_svg(data: ReportData, estimate: int, *, name: str) -> str:
+    """One modulus (the estimate's number) as each later image alone says it, with the joint value, as SVG."""
+    item, pairs = moduli_in(data.document)[estimate], data.document["image_pairs"]
+    tissue, colour = item["tissue"], _colour(data, item)
+    alone = [  # nothing of an image that has no minimum alone
+        (pair["moduli"].get(tissue), pair["interval95"].get(tissue), pair["outlier"]) for pair in pairs["alone"]
+    ]
+    low, high = pairs["mean_interval95"][tissue]
+
+    def draw(figure: Figure) -> None:
+        """A dot with its interval for each image, hollow where it is an outlier."""
+        axes = figure.add_axes((0.16, 0.2, 0.81, 0.74))
+        axes.axhspan(low, high, color=INK, alpha=0.1, linewidth=0)
+        axes.axhline(_value(item), color=INK, linewidth=1.0)
+        if item["truth"] is not None:
+            axes.axhline(item["truth"], color=INK, linewidth=1.0, linestyle=DASHED)
+        for place, (value, ends, outlier) in enumerate(alone, start=1):
+            if value is None:
+                continue
+            axes.plot([place, place], ends, color=colour, linewidth=1.6)
+            inside = "none" if outlier else colour
+            axes.plot([place], [value], "o", color=colour, markerfacecolor=inside, markersize=7)
+        axes.set_xlim(0.5, len(alone) + 0.5)
+        axes.set_xlabel("later image")
+        axes.set_ylabel(_label(item))
+        axes.set_yscale("log")
+        axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
+        _plain_numbers(axes.yaxis)
+
+    told = [f"{k} {number(value)}{' (an outlier)' if out else ''}" for k, (value, _, out) in enumerate(alone, start=1)]
+    says = f"{tissue} by each later image alone: {', '.join(told)}; all together {number(_value(item))}."
+    return draw_svg(draw, size=SIZE, name=name, says=says)
+
+
+def _closed(corners: list[list[float]]) -> NDArray[np.float64]:
+    """A smooth closed line (2, n) through places (n_corners, 2), both kPa or ratios."""
+    logarithms = np.log(np.array([*corners, corners[0]]))
+    line = CubicSpline(np.arange(len(logarithms)), logarithms, bc_type="periodic")
+    return np.asarray(np.exp(line(np.linspace(0.0, len(corners), 241))).T)
+
+
+def _colour(data: ReportData, item: Mapping[str, Any]) -> str:
+    return next((tissue.colour for tissue in data.tissues if tissue.name == item["tissue"]), "#888888")
+
+
+def _value(item: Mapping[str, Any]) -> float:
+    value = main_numbers(item)[0]
+    return np.nan if value is None else value
+
+
+def _label(item: Mapping[str, Any], *, of_tissue: bool = False) -> str:
+    """The quantity of an axis, with its unit."""
+    quantity = "E (kPa)" if item["unit"] == "kPa" else f"E / {item['relative_to'][:24]}"
+    return f"{item['tissue'][:24]}, {quantity}" if of_tissue else quantity
+
+
 def _told(paths: list[list[float]], unit: str) -> str:
     """What the lines of `_paths` show, in words: where each begins and ends, in `unit`."""
     names = [*(f"start {k + 1}" for k in range(len(paths) - 1)), "outer loop"]
@@ -173,10 +302,6 @@ def _told(paths: list[list[float]], unit: str) -> str:
         f"{name} from {number(path[0])} to {number(path[-1])}" for name, path in zip(names, paths, strict=True) if path
     ]
     return f"{'; '.join(ends)} {unit}".strip() + "."
-
-
-def _finite(value: float | None) -> float:
-    return np.nan if value is None else float(value)
 
 
 def _paths(figure: Figure, paths: list[list[float]], label: str) -> None:
@@ -196,8 +321,7 @@ def _paths(figure: Figure, paths: list[list[float]], label: str) -> None:
     values = np.array([value for path in paths for value in path])
     if len(values) and (values > 0).all():
         axes.set_yscale("log")
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
-        axes.yaxis.set_minor_formatter(NullFormatter())
+        _plain_numbers(axes.yaxis)
         _mark(axes)
     axes.grid(visible=True, axis="y")
 
@@ -210,3 +334,10 @@ def _mark(axes: Axes) -> None:
         marks = [m for m in MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high) if low <= m <= high]
     axes.yaxis.set_major_locator(FixedLocator(marks))
     axes.yaxis.set_minor_locator(NullLocator())
+
+
+def _plain_numbers(axis: Axis) -> None:
+    """A few round numbers on a logarithmic axis that spans less than a decade."""
+    axis.set_major_locator(MaxNLocator(5))
+    axis.set_major_formatter(FuncFormatter(lambda tick, _: f"{tick:.3g}"))
+    axis.set_minor_formatter(NullFormatter())

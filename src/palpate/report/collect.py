@@ -107,7 +107,7 @@ def collect(result: CaseResult) -> ReportData:
         document=result.to_dict(),
         created=_now(),
         settings=_settings(result.case, result.mesh_summary),
-        tissues=_tissues(result.tissues, result.stiffness),
+        tissues=report_tissues(result.tissues, result.stiffness),
         unit=result.unit,
         images=images,
         moduli_paths=tuple(
@@ -130,7 +130,7 @@ def collect_failure(case: Case, error: PalpateError) -> ReportData:
         document=failure_document(case, error),
         created=_now(),
         settings=_settings(case),
-        tissues=_tissues(tissues, np.full(len(tissues), np.nan)),
+        tissues=report_tissues(tissues, np.full(len(tissues), np.nan)),
         unit=stated_unit(case),
     )
 
@@ -215,7 +215,8 @@ def _vector(parts: tuple[float, float, float]) -> str:
     return "(" + ", ".join(f"{part:g}" for part in parts) + ")"
 
 
-def _tissues(tissues: tuple[Tissue, ...], moduli: NDArray[np.float64]) -> tuple[ReportTissue, ...]:
+def report_tissues(tissues: tuple[Tissue, ...], moduli: NDArray[np.float64]) -> tuple[ReportTissue, ...]:
+    """Tissues as the page shows them, with moduli (n_tissues,) in the result's unit, NaN where there is none."""
     return tuple(
         ReportTissue(
             name=tissue.name,
@@ -247,7 +248,10 @@ def _with_grey(drawing: _Drawing) -> _Drawing:
 def _reference(drawing: _Drawing) -> Reference:
     pair, attempt = drawing.pair, drawing.attempt
     result, name = pair.result, pair.before
-    image = result.before if result.after else _of_mesh(result.before)
+    image = result.before
+    if not result.after:  # voxels show a mesh: those of hollow tissues stand behind its surfaces only by name
+        meshed = np.array([tissue.meshed for tissue in image.tissues])
+        image = replace(image, index=np.where(meshed[image.index], image.index, -1))
     box = attempt.part(f"slices of {name}", lambda: slice_box(result.before, result.after), None)
     shown = attempt.part(
         f"background of {name}",
@@ -323,9 +327,3 @@ def _mesh(result: CaseResult) -> MeshPicture:
         angles=tet_dihedrals(mesh.nodes[mesh.tets]).astype(np.float32),
         strains=np.max(strains, axis=0).astype(np.float32) if strains else np.zeros(0, np.float32),
     )
-
-
-def _of_mesh(image: Segmentation) -> Segmentation:
-    """The voxels that show a mesh, without those of hollow tissues, which stand behind its surfaces only by name."""
-    meshed = np.array([tissue.meshed for tissue in image.tissues])
-    return Segmentation(np.where(meshed[image.index], image.index, -1).astype(np.int16), image.grid, image.tissues)

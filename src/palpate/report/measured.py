@@ -52,7 +52,11 @@ def measured_states(
         if pair < len(references) and len(found) < most:
             after = state - first[pair]
             drawn = later.get((pair, after))
-            outlines = drawn.outlines if drawn else _outlines(pairs[pair].result, references[pair], after)
+            outlines = drawn.outlines if drawn else ()
+            if drawn is None:  # a body without later images, as the fit moves it
+                own = pairs[pair].result
+                meshed = [each for each in references[pair].surfaces if result.tissues[each.tissue].meshed]
+                outlines = tuple(carried_outline(own, surface, after) for surface in meshed)
             name = pair_names(result.case)[pair][1][after]
             points = tuple(measured_points(fit) for fit in fits)
             found.append(_state(name, pair, references[pair].slices, points, outlines))
@@ -116,12 +120,6 @@ def _one_a_cell(points: NDArray[np.float64], edge: float) -> NDArray[np.int64]:
     first = np.ones(len(points), dtype=bool)
     first[1:] = (np.diff(cells[order], axis=0) != 0).any(axis=1)
     return np.sort(order[first])
-
-
-def _outlines(result: CaseResult, reference: Reference, after: int) -> tuple[TriangleSurface, ...]:
-    """Surfaces of a body without later images, as the fit moves them."""
-    meshed = [surface for surface in reference.surfaces if result.tissues[surface.tissue].meshed]
-    return tuple(carried_outline(result, surface, after) for surface in meshed)
 
 
 def _state(

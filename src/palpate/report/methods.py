@@ -64,7 +64,7 @@ def methods_text(data: ReportData) -> Methods:
     )
     own = SOURCES["palpate"]
     version = {"version": str(data.document["versions"].get("palpate", ""))}
-    sources = SOURCES | {"palpate": replace(own, fields={**version, **own.fields})}
+    sources = SOURCES | {"palpate": replace(own, fields={**own.fields, **version})}
     return Methods(
         paragraphs,
         tuple(reference_line(sources[key]) for key in cite.cited),
@@ -79,21 +79,17 @@ def _aim(data: ReportData, cite: _Citations) -> str:
     aligned = ALIGNED.get(dict(data.settings).get("alignment", ""), "")
     known = [f"{t.name} ({t.given_kpa:g} kPa)" for t in data.tissues if t.given_kpa is not None]
     moved = f" The motion was driven by {listed(roles['driver'])} (hollow, not meshed)." if "driver" in roles else ""
+    source = "segmented images of the same body in two or more states"
+    if dict(data.settings).get("body") == MESH:
+        source = "measurements of one body, given as a mesh, in two or more states"
     scale = " No modulus was given, so only ratios were found."
     forces = ["the measured forces"] if data.document.get("forces") else []
     if known or data.unit == "kPa":
         scale = f" The scale was set by {listed(known or forces or ['the known loads'])}."
     return (
-        f"Young's moduli of {listed(roles.get('estimate', []))} were estimated at once from {_source(data)} with"
+        f"Young's moduli of {listed(roles.get('estimate', []))} were estimated at once from {source} with"
         f" Palpate {cite('palpate')}, whose method starts from {cite('yang')}.{moved}{aligned}{scale}"
     )
-
-
-def _source(data: ReportData) -> str:
-    """What the estimate was made of."""
-    if dict(data.settings).get("body") == MESH:
-        return "measurements of one body, given as a mesh, in two or more states"
-    return "segmented images of the same body in two or more states"
 
 
 def _model(data: ReportData, cite: _Citations) -> str:

@@ -22,10 +22,12 @@ from palpate.report.charts import (
     forces_svg,
     modulus_svg,
     objective_svg,
+    profile_svg,
+    region_svg,
+    repeats_svg,
     residual_svg,
     waterfall_svg,
 )
-from palpate.report.interval_charts import profile_svg, region_svg, repeats_svg
 from palpate.report.methods import methods_text
 from palpate.report.payload import payload
 from palpate.report.pictures import mesh_png, organs_png, points_png

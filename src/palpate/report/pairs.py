@@ -8,12 +8,11 @@ from dataclasses import dataclass, replace
 import igl
 import numpy as np
 
+from palpate.images.alignment import within_border
 from palpate.images.tissue import Role
 from palpate.report.report_data import BoneDistance, InputImage, TriangleSurface
 from palpate.study.case import Images
 from palpate.study.result import CaseResult, pair_names
-
-BORDER_VOXELS = 3.0  # nearer to the later image's border its surface is cut
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +38,7 @@ def image_pairs(result: CaseResult) -> tuple[ImagePair, ...]:
             mesh_summary=pair.mesh_summary,
             before=pair.before,
             after=pair.after,
+            alignments=pair.alignments,
             further=(),
         )
         results.append(alone)
@@ -83,8 +83,7 @@ def bone_distances(
         if result.tissues[surface.tissue].role is not Role.RIGID or surface.tissue not in target:
             continue
         points = surface.points.astype(np.float64)
-        place = grid.index(points)
-        points = points[((place > BORDER_VOXELS) & (place < np.array(grid.shape) - 1 - BORDER_VOXELS)).all(axis=1)]
+        points = points[within_border(grid, points)]  # nearer to the later image's border its surface is cut
         if len(points):
             other = target[surface.tissue]
             squared = igl.point_mesh_squared_distance(

@@ -11,11 +11,10 @@ import numpy as np
 
 from palpate.errors import InputDataError
 from palpate.images.checks import VOLUME_CHANGE
-from palpate.images.label_image import VoxelGrid
-from palpate.images.readers import read_intensities
 from palpate.images.registration import length_text
 from palpate.images.tissue import Role, tissue_colours
 from palpate.progress import about
+from palpate.report.collect import MOST_LATER
 from palpate.report.page import page_scripts, picture_of, policy_of, widths_of
 from palpate.report.payload import payload
 from palpate.report.preview_data import ROLE_COLOURS, PreviewImage, preview_data, preview_image
@@ -23,7 +22,7 @@ from palpate.report.report_data import ReportData
 from palpate.report.rows import NONE, EstimateRow, estimate_rows, interval_text, number, scale_marks
 from palpate.report.slices import alignment_svg, first_planes, slice_svg
 from palpate.report.svg import template_of
-from palpate.report.volume import Grey
+from palpate.report.volume import Grey, grey_of
 from palpate.study.body import ImagedStates
 from palpate.study.case import Case
 from palpate.study.check import Checked, Problem
@@ -32,7 +31,6 @@ from palpate.study.prediction import Prediction
 
 GENERATOR = '<meta name="generator" content="Palpate preview">'  # by which a page of ours is known
 SCRIPTS = ("report.js", "slices.js", "preview.js", "start.js")
-MOST_LATER = 4  # later images that are drawn
 LEAST_SHARE = 0.005  # of a variance, that is told
 MEANING = {
     Role.ESTIMATE: "its stiffness is sought",
@@ -246,13 +244,9 @@ def _grey(case: Case, states: ImagedStates, after: int | None) -> Grey | None:
     if path is None:
         return None
     try:
-        values, grid = read_intensities(path)
+        return grey_of(path, states.alignments[after] if after is not None and states.alignments else None)
     except InputDataError:  # a problem of the report, which says why
         return None
-    if after is None or not states.alignments:
-        return Grey(values, grid)
-    back = states.alignments[after].motion.inverse().matrix
-    return Grey(values, VoxelGrid(grid.shape, back @ grid.affine))
 
 
 def _later(shown: _Shown, k: int, image: PreviewImage) -> Mapping[str, Any]:

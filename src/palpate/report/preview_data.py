@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from palpate.images.alignment import moved
 from palpate.images.distance import smoothing_width
 from palpate.images.segmentation import Segmentation
-from palpate.images.tissue import Role, tissue_colours
 from palpate.mesh.anatomy import Box, domain_box
+from palpate.report.collect import SHOWN, report_tissues
 from palpate.report.report_data import (
     LaterImage,
     Reference,
     ReportData,
-    ReportTissue,
     SliceBox,
     TriangleSurface,
     Volume,
@@ -29,7 +28,6 @@ from palpate.study.first_look import FrameLook, TissueLook
 
 # One hue a role, apart on black and for the colour-blind; after Okabe & Ito, "Color Universal Design" (2008).
 ROLE_COLOURS = {"estimate": "#e69f00", "driver": "#56b4e9", "known": "#2ba888", "rigid": "#cfc8b8", "void": "#6d7278"}
-SHOWN = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
 ALL_TRIANGLES = 240_000  # of all surfaces, so that the page stays small
 RIM = 0.04  # of the longest side of an image, around it
 LONGEST_ARROW_MM = 20.0  # as it is drawn
@@ -85,10 +83,7 @@ def preview_data(
     later = tuple(
         LaterImage(name, surfaces=_surfaces(image, most)) for name, image in zip(names[1:], states.after, strict=True)
     )
-    tissues = tuple(
-        ReportTissue(t.name, t.role.value, colour, t.poisson_ratio, t.youngs_modulus_kpa, None)
-        for t, colour in zip(before.tissues, tissue_colours(before.tissues), strict=True)
-    )
+    tissues = report_tissues(before.tissues, np.full(len(before.tissues), np.nan))
     return ReportData(document, created, (), tissues, "kPa", references=(reference,), later=later)
 
 

@@ -139,10 +139,16 @@ def _furnish(axes: Axes, plane: Plane) -> None:
 
 
 def _backed(figure: Figure, data: ReportData, volume: Volume | None, plane: Plane) -> Axes:
-    """Axes that fill the figure, with a volume on the plane, or black."""
+    """Axes that fill the figure, with a volume on the plane: its window of greys, its tissues' colours, or black."""
     axes = figure.add_axes((0, 0, 1, 1))
     across, up = plane.axes
-    shades = np.zeros((2, 2, 3)) if volume is None else _shades(data, volume, plane)
+    shades = np.zeros((2, 2, 3))
+    if volume is not None and volume.kind == "grey":
+        shades = np.repeat(_brightness(data, volume, plane)[..., None], 3, axis=2)
+    elif volume is not None:
+        colours = [(0.0, 0.0, 0.0), *(0.06 + 0.3 * np.array(to_rgb(tissue.colour)) for tissue in data.tissues)]
+        steps = np.nan_to_num(cut_image(volume.values, volume.grid, plane, order=0))
+        shades = np.array(colours)[np.rint(steps).astype(int)]
     axes.imshow(shades, extent=(across[0], across[-1], up[0], up[-1]), origin="lower", interpolation="none")
     return axes
 
@@ -165,15 +171,6 @@ def _arrows(
         places = [of[:, axis] for of in (rest, way) for axis in (plane.view.across, plane.view.up)]
         options = {"angles": "xy", "scale_units": "xy", "scale": 1.0, "units": "inches", "minlength": 0.5}
         axes.quiver(*places, color=style[0], width=style[1], zorder=3.0, **options).set_gid(gid)
-
-
-def _shades(data: ReportData, volume: Volume, plane: Plane) -> NDArray[np.float64]:
-    """Colours (n_up, n_across, 3), 0 to 1, of a volume on the plane's pixels: its window of greys, or its tissues'."""
-    if volume.kind == "grey":
-        return np.repeat(_brightness(data, volume, plane)[..., None], 3, axis=2)
-    colours = [(0.0, 0.0, 0.0), *(0.06 + 0.3 * np.array(to_rgb(tissue.colour)) for tissue in data.tissues)]
-    steps = np.nan_to_num(cut_image(volume.values, volume.grid, plane, order=0))
-    return np.asarray(np.array(colours)[np.rint(steps).astype(int)])
 
 
 def _brightness(data: ReportData, volume: Volume, plane: Plane) -> NDArray[np.float64]:

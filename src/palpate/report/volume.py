@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from palpate.images.body_in_ct import shows_air
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers import read_intensities
+from palpate.images.registration import Registration
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.images.tissue_distance import cropped, window_of
@@ -21,7 +24,6 @@ from palpate.study.result import CaseResult
 MOST_VOXELS = 2_500_000  # what a page can carry and a telephone can hold
 CT_WINDOW = (-160.0, 240.0)  # Hounsfield units in which soft tissues differ
 CT_SPAN = (-1024.0, 3072.0)  # Hounsfield units from air to metal, which clips nothing in four to a step
-CT_AIR = -500.0  # an image with less is a CT
 MOST_TISSUES = 254
 AWAY_FROM_TIES = 5e-4  # voxels: half-way between two voxels images that differ by rounding show the same one
 MOST_WHOLE_GREY = 400_000  # voxels of an image that the check of the alignment shows
@@ -40,7 +42,7 @@ def grey_volume(values: NDArray[Any], grid: VoxelGrid, box: SliceBox, *, most_vo
     cut = _cut(values, grid, box, step=step, order=1)
     finite = cut[np.isfinite(cut)]
     unit, span, window = "", (0.0, 1.0), (0.0, 1.0)
-    if len(finite) and finite.min() < CT_AIR:
+    if shows_air(finite):
         unit, span, window = "HU", CT_SPAN, CT_WINDOW
     elif len(finite):
         least, low, high, most = np.percentile(finite, [0.0, 1.0, 99.0, 100.0]).tolist()
@@ -96,28 +98,30 @@ class Grey:
     grid: VoxelGrid
 
 
+def grey_of(path: Path, registration: Registration | None = None, *, sha256: str | None = None) -> Grey:
+    """The grey image in a file, brought back as the label image beside it was; raises as `read_intensities` does."""
+    values, grid = read_intensities(path, sha256=sha256)
+    if registration is not None:
+        grid = VoxelGrid(grid.shape, registration.motion.inverse().matrix @ grid.affine)
+    return Grey(values, grid)
+
+
 def earlier_grey(result: CaseResult) -> Grey | None:
-    """The grey image of the reference state, if the case gives one; raises as `read_intensities` does."""
+    """The grey image of the reference state, if the case gives one; raises as `grey_of` does."""
     images = result.case.images
     if images is None or images.intensities_before is None:
         return None
-    digest = result.provenance.inputs.get("intensities_before")
-    return Grey(*read_intensities(images.intensities_before, sha256=digest))
+    return grey_of(images.intensities_before, sha256=result.provenance.inputs.get("intensities_before"))
 
 
 def later_grey(result: CaseResult, after: int) -> Grey | None:
-    """The grey image of later image number `after`, where its label image was brought to.
-
-    That is known when both have one grid; raises `ValueError` when they have not, else as `read_intensities` does.
-    """
-    images, aligned = result.case.images, result.after[after].grid
+    """The grey image of later image number `after`, where that was brought to; raises as `grey_of` does."""
+    images = result.case.images
     if images is None or after >= len(images.intensities_after):
         return None
     digest = result.provenance.inputs.get(f"intensities_after[{after}]")
-    values, grid = read_intensities(images.intensities_after[after], sha256=digest)
-    if values.shape != aligned.shape or not np.allclose(grid.spacing, aligned.spacing, rtol=1e-3):
-        raise ValueError("the later grey image is not on the grid of its label image")
-    return Grey(values, aligned)
+    found = result.alignments[after] if result.alignments else None
+    return grey_of(images.intensities_after[after], found, sha256=digest)
 
 
 def background(
@@ -166,22 +170,17 @@ def slice_box(image: Segmentation, later: Sequence[Segmentation]) -> SliceBox:
     These show as much of every tissue as possible. Of an image without later ones the box is the whole of it.
     """
     moving = tuple(i for i, tissue in enumerate(image.tissues) if tissue.role in MOVING)
-    boxes = [_extent(_thinned(each), moving) for each in (image, *later)]
+    boxes = []  # of each image the corners (3,) mm of the box around their voxels; the whole of it when there are none
+    for each in map(_thinned, (image, *later)):
+        index = np.argwhere(np.isin(each.index, moving)).astype(np.float64)
+        points = each.grid.world(index if len(index) else np.array([[0.0, 0.0, 0.0], [*each.grid.shape]]))
+        boxes.append((points.min(axis=0), points.max(axis=0)))
     border = np.array([_range(image.grid, axis) for axis in range(3)])
     low = np.maximum(np.min([pair[0] for pair in boxes], axis=0) - MARGIN_MM, border[:, 0])
     high = np.minimum(np.max([pair[1] for pair in boxes], axis=0) + MARGIN_MM, border[:, 1])
     before = _thinned(image)
     position = np.array([_richest(before, moving, axis) for axis in range(3)])
     return SliceBox(low, high, position) if later else whole_box(image, position)
-
-
-def _extent(image: Segmentation, tissues: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Corners (3,) mm of the box around the tissues' voxels; the whole image when there are none."""
-    index = np.argwhere(np.isin(image.index, tissues)).astype(np.float64)
-    if not len(index):
-        index = np.array([[0.0, 0.0, 0.0], [*image.grid.shape]])
-    points = image.grid.world(index)
-    return points.min(axis=0), points.max(axis=0)
 
 
 def _thinned(image: Segmentation) -> Segmentation:

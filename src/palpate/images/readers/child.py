@@ -14,9 +14,8 @@ import numpy as np
 
 from palpate.errors import PalpateError
 from palpate.images.label_image import VoxelGrid
-from palpate.images.readers.isolation import GREETING
 from palpate.images.readers.registry import format_of
-from palpate.images.readers.values import REDUCED
+from palpate.images.readers.values import reduced
 
 try:
     import resource
@@ -38,8 +37,6 @@ def main(arguments: list[str]) -> None:
         nowhere = os.open(os.devnull, os.O_WRONLY)  # where goes what a C library prints on standard output
         os.dup2(nowhere, 1)
         os.close(nowhere)
-        pipe.write(GREETING)
-        pipe.flush()
         _limit(memory_bytes, cpu_seconds, wall_seconds)
         try:
             grid = None
@@ -50,7 +47,7 @@ def main(arguments: list[str]) -> None:
             for module in image_format.needless:
                 sys.modules[module] = cast("ModuleType", None)  # whoever imports it is told that it is not installed
             stored = image_format.stored(path, grid)
-            values = np.asfortranarray(REDUCED[kind](stored.values, path))
+            values = np.asfortranarray(reduced(stored.values, path, kind=kind))
         except PalpateError as error:
             _send(pipe, {"error": type(error).__name__, "message": str(error)})
         except MemoryError:

@@ -11,10 +11,9 @@ from importlib import import_module
 from pathlib import Path
 
 from palpate.errors import InputDataError, ResourceError
-from palpate.images.input_file import open_input
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
-from palpate.images.readers.voxel_stream import damaged
+from palpate.images.readers.voxel_stream import opened
 
 MARK = b"DICM"  # at byte 128
 SOP_CLASS = re.compile(rb"\x02\x00\x02\x00UI(..)([0-9.]{1,64})\0?", re.DOTALL)  # in the file meta information
@@ -31,11 +30,8 @@ def read_dicom(path: Path, grid: VoxelGrid | None = None) -> StoredImage:
     `grid` is taken where the series that it refers to is not beside it. Raises `InputDataError` for other classes and
     damaged files, `ResourceError` without the extra `dicom`.
     """
-    try:
-        with open_input(path) as file:
-            head = file.read(2000)
-    except OSError as error:
-        raise damaged(path, error) from error
+    with opened(path) as file:
+        head = file.read(2000)
     if head[128:132] != MARK:
         raise InputDataError(f"'{path}' does not begin as a DICOM file does; export the segmentation again")
     found = SOP_CLASS.search(head)

@@ -18,11 +18,11 @@ from pydicom.dataset import Dataset
 
 from palpate.errors import InputDataError, PalpateError
 from palpate.images.input_file import read_input
-from palpate.images.label_image import VoxelGrid
+from palpate.images.label_image import LPS_TO_RAS, VoxelGrid
 from palpate.images.readers.values import to_canonical
 from palpate.images.readers.voxel_stream import check_size
 
-LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
+LPS_AFFINE = np.diag([*LPS_TO_RAS, 1.0])
 MOST_FILES = 5000  # in the folder of a segmentation and those in it
 MOST_BYTES = 2**31  # of a segmentation
 MOST_SLICE_BYTES = 2**26  # of another file beside it, to be one of its series
@@ -118,5 +118,5 @@ def _stack(found: list[tuple[Dataset, str]], path: Path) -> Series:
     total = hashlib.sha256("".join(digest for _, digest in alike).encode()).hexdigest()
     shape = (len(alike), int(first.Rows), int(first.Columns))
     check_size(shape, 0, path, available=0, packed=False)
-    empty, affine = to_canonical(np.zeros(shape, dtype=np.uint8), LPS_TO_RAS @ lps)
+    empty, affine = to_canonical(np.zeros(shape, dtype=np.uint8), LPS_AFFINE @ lps)
     return Series(VoxelGrid((empty.shape[0], empty.shape[1], empty.shape[2]), affine), total)

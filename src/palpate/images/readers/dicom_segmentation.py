@@ -15,7 +15,7 @@ from palpate.errors import InputDataError
 from palpate.findings import Finding
 from palpate.images.label_image import VoxelGrid
 from palpate.images.named_labels import MAX_NAME, NamedLabel, hex_colour, printable
-from palpate.images.readers.dicom_dataset import LPS_TO_RAS, Series, read_dataset, sentences, series_beside
+from palpate.images.readers.dicom_dataset import LPS_AFFINE, Series, read_dataset, sentences, series_beside
 from palpate.images.readers.merged_masks import Mask, merged
 from palpate.images.readers.registry import StoredImage
 from palpate.images.readers.values import to_canonical
@@ -59,7 +59,7 @@ def read(path: Path, grid: VoxelGrid | None) -> StoredImage:
             name = printable(str(item.get("SegmentLabel", "")).strip())[:MAX_NAME] or f"segment {number}"
             rows.append(NamedLabel(number, name, colour))
         labels, findings = _labels(segmentation, rows, tuple(geometry.spatial_shape))
-        affine = LPS_TO_RAS @ geometry.affine
+        affine = LPS_AFFINE @ geometry.affine
         referenced = dataset.get("ReferencedSeriesSequence") or ()
         series = series_beside(path, str(referenced[0].SeriesInstanceUID)) if referenced else None
         series = series or (Series(grid) if grid else None)

@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import subprocess
 import sys
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -23,18 +21,11 @@ from palpate.findings import Finding, known_code
 from palpate.images.label_image import VoxelGrid
 from palpate.images.named_labels import NamedLabel, printable
 from palpate.images.readers.registry import ImageFormat, StoredImage
-from palpate.images.readers.voxel_stream import MAX_VOXELS, read_exactly
+from palpate.images.readers.voxel_stream import MAX_VOXELS
 from palpate.parallel import environment_of_child, name_of_end
 
-if sys.platform == "linux":
-    import fcntl
-
-
-GREETING = b"palpate reads\n"
-PIPE = 2**20  # bytes that the pipe holds, where the system lets us choose
 MAX_ANSWER = 2**24  # bytes of the line that goes before the voxels
-DTYPE = re.compile(r"[<>|][iuf][1248]")
-DIGEST = re.compile(r"[0-9a-f]{64}")
+NEVER_BEGAN = 1  # how Python ends that cannot import what it is to run; our code sends every failure
 ERRORS: Mapping[str, type[PalpateError]] = {
     error.__name__: error for error in (ConfigurationError, InputDataError, ResourceError)
 }
@@ -60,17 +51,23 @@ def read_stored(
     if not image_format.read.__module__.startswith("palpate."):
         return image_format.stored(path, grid)  # the program's own code, which another process would not find
     limits = replace(limits, cpu_seconds=image_format.patience * limits.cpu_seconds)
-    with _started(_command(path, kind, limits, grid), path) as process:
+    numbers = [str(limits.memory_bytes), str(limits.cpu_seconds), str(limits.wall_seconds)]
+    place = [] if grid is None else [json.dumps([grid.shape, grid.affine.tolist()])]
+    # -P: an image's folder, if it is the working folder, must not be searched for modules.
+    module = ["-P", "-W", "ignore", "-m", "palpate.images.readers.child"]
+    try:
+        process = subprocess.Popen(  # noqa: S603 - our own interpreter and module, no shell
+            [sys.executable, *module, *numbers, kind, str(path), *place],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=environment_of_child(),  # on one thread: a pool of them would eat address space
+        )
+    except OSError as error:
+        raise _sudden_end(NEVER_BEGAN, path, limits) from error
+    with process:
         try:
-            pipe = cast("BinaryIO", process.stdout)
-            if pipe.readline(len(GREETING)) != GREETING:
-                raise _not_started(path)
-            line = pipe.readline(MAX_ANSWER)
-            try:  # a process that died before or while it wrote the line leaves none, or half of one
-                answer = json.loads(line) if line.endswith(b"\n") else None
-            except ValueError:
-                answer = None
-            stored = _stored(answer, pipe, path) if isinstance(answer, dict) else None
+            stored = _stored(cast("BinaryIO", process.stdout), path)
             if stored is None:
                 raise _sudden_end(process.wait(), path, limits)
             return stored
@@ -78,35 +75,13 @@ def read_stored(
             process.kill()
 
 
-def _command(path: Path, kind: str, limits: ReadLimits, grid: VoxelGrid | None) -> list[str]:
-    # -P: an image's folder, if it is the working folder, must not be searched for modules.
-    numbers = [str(limits.memory_bytes), str(limits.cpu_seconds), str(limits.wall_seconds)]
-    place = [] if grid is None else [json.dumps([grid.shape, grid.affine.tolist()])]
-    module = ["-P", "-W", "ignore", "-m", "palpate.images.readers.child"]
-    return [sys.executable, *module, *numbers, kind, str(path), *place]
-
-
-def _started(command: list[str], path: Path) -> subprocess.Popen[bytes]:
-    """The process, on one thread: a pool of them would eat address space."""
-    try:
-        process = subprocess.Popen(  # noqa: S603 - our own interpreter and module, no shell
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env=environment_of_child(),
-        )
-    except OSError as error:
-        raise _not_started(path) from error
-    if sys.platform == "linux":
-        with suppress(OSError):
-            fcntl.fcntl(cast("BinaryIO", process.stdout), fcntl.F_SETPIPE_SZ, PIPE)
-    return process
-
-
 def _sudden_end(code: int, path: Path, limits: ReadLimits) -> PalpateError:
     """Why a process ended that sent no image, by its exit code."""
     name = name_of_end(code)
+    if code == NEVER_BEGAN:
+        return ResourceError(
+            f"the process that reads '{path}' did not start; is Palpate installed in {sys.prefix} and is memory left?"
+        )
     if name in ("SIGXCPU", "SIGALRM"):
         return ResourceError(
             f"reading '{path}' took more than {limits.cpu_seconds} s of processor time, or {limits.wall_seconds:g} s in"
@@ -119,33 +94,33 @@ def _sudden_end(code: int, path: Path, limits: ReadLimits) -> PalpateError:
     return InputDataError(f"the reader of '{path}' crashed ({name}); the file is most likely damaged: export it again")
 
 
-def _not_started(path: Path) -> ResourceError:
-    return ResourceError(
-        f"the process that reads '{path}' did not start; is Palpate installed in {sys.prefix} and is memory left?"
-    )
-
-
-def _stored(answer: Mapping[str, Any], pipe: BinaryIO, path: Path) -> StoredImage | None:
-    """The image, None when the process died while it sent the voxels; raises what the reader raised."""
+def _stored(pipe: BinaryIO, path: Path) -> StoredImage | None:
+    """The image, None when the process died while it sent it; raises what the reader raised."""
+    line = pipe.readline(MAX_ANSWER)
+    try:  # a process that died before or while it wrote the line leaves none, or half of one
+        answer: Any = json.loads(line) if line.endswith(b"\n") else None
+    except ValueError:
+        answer = None
+    if not isinstance(answer, dict):
+        return None
     if "error" in answer:
         raise ERRORS.get(str(answer["error"]), InputDataError)(printable(str(answer.get("message", ""))))
     try:
-        shape = tuple(int(n) for n in answer["shape"])
+        shape, dtype = tuple(int(n) for n in answer["shape"]), np.dtype(answer["dtype"])
         affine = np.array(answer["affine"], dtype=np.float64)
         names = tuple(NamedLabel(int(k), str(name), None if c is None else str(c)) for k, name, c in answer["names"])
         digests = {printable(str(part)): str(digest) for part, digest in answer.get("digests", {}).items()}
         findings = tuple(Finding(known_code(code), printable(str(text))) for code, text in answer.get("findings", ()))
-        placed = len(shape) == 3 and min(shape) > 0 and affine.shape == (4, 4)
-        valid = placed and DTYPE.fullmatch(answer["dtype"]) and all(map(DIGEST.fullmatch, digests.values()))
+        placed = len(shape) == 3 and min(shape) > 0 and math.prod(shape) <= MAX_VOXELS and affine.shape == (4, 4)
+        valid = placed and dtype.kind in "iuf" and all(map(str.isalnum, digests.values()))
     except (AttributeError, KeyError, TypeError, ValueError):
-        valid = None
-    if not valid or math.prod(shape) > MAX_VOXELS:
+        valid = False
+    if not valid:
         raise InputDataError(
             f"the process that read '{path}' gave an answer that cannot be used; export the image again"
         )
-    dtype = np.dtype(answer["dtype"])
-    try:
-        content = read_exactly(pipe, math.prod(shape) * dtype.itemsize, path)
-    except InputDataError:
+    content = pipe.read(math.prod(shape) * dtype.itemsize)
+    if len(content) < math.prod(shape) * dtype.itemsize:
         return None
-    return StoredImage(content.view(dtype).reshape(shape, order="F"), affine, names, digests, findings)
+    values = np.frombuffer(content, dtype).reshape(shape, order="F")
+    return StoredImage(values, affine, names, digests, findings)

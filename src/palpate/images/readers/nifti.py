@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import gzip
-import io
 import math
 import os
-import zlib
 from importlib import import_module
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -20,11 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, InputDataError, ResourceError
-from palpate.images.input_file import open_input
 from palpate.images.label_image import LPS_TO_RAS, LabelImage, VoxelGrid, corners_apart
 from palpate.images.readers.nifti_extension import extension_names
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
-from palpate.images.readers.voxel_stream import MAX_OFFSET, VoxelBlock, check_end, check_size, damaged, read_exactly
+from palpate.images.readers.voxel_stream import (
+    MAX_OFFSET,
+    VoxelBlock,
+    check_size,
+    gzip_stream,
+    opened,
+    read_exactly,
+    read_voxels,
+)
 
 MILLIMETRES = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}  # xyzt_units: unknown, metre, millimetre, micrometre
 HEADERS = {348: "Nifti1Header", 540: "Nifti2Header"}  # by nibabel, which is imported when an image comes
@@ -33,28 +38,19 @@ MAGIC = {348: b"n+1\0", 540: b"n+2\0\r\n\032\n"}
 
 def read_nifti(path: Path) -> StoredImage:
     """Read one image of three axes from `path`; raises `InputDataError` with a sentence for whatever is wrong."""
-    try:
-        with open_input(path) as file:
-            zipped = file.read(2) == b"\x1f\x8b"
-            file.seek(0)
-            if zipped != path.name.lower().endswith(".gz"):
-                is_and_should = ("is compressed", ".nii.gz") if zipped else ("is not compressed by gzip", ".nii")
-                raise InputDataError(
-                    f"'{path}' {is_and_should[0]}, against its ending; rename it to {is_and_should[1]}"
-                )
-            stream = io.BufferedReader(gzip.GzipFile(fileobj=file, mode="rb")) if zipped else file
-            header, used = _header(stream, path)
-            block, slope, intercept = _block(header, path)
-            affine = _affine(header, path)
-            packed = stream is not file
-            check_size(block.shape, block.skip + block.n_bytes, path, available=file.n_bytes, packed=packed)
-            between = read_exactly(stream, block.skip - used, path).tobytes()
-            values = read_exactly(stream, block.n_bytes, path).view(block.dtype)
-            check_end(stream, block.n_bytes, path)
-            digests = {"": file.sha256()}
-    except (OSError, EOFError, zlib.error) as error:
-        raise damaged(path, error) from error
-    values = values.reshape(block.shape, order="F").astype(block.dtype.newbyteorder("="), copy=False)
+    with opened(path) as file:
+        zipped = file.peek(2)[:2] == b"\x1f\x8b"
+        if zipped != path.name.lower().endswith(".gz"):
+            is_and_should = ("is compressed", ".nii.gz") if zipped else ("is not compressed by gzip", ".nii")
+            raise InputDataError(f"'{path}' {is_and_should[0]}, against its ending; rename it to {is_and_should[1]}")
+        stream = gzip_stream(file) if zipped else file
+        header, used = _header(stream, path)
+        block, slope, intercept = _block(header, path)
+        affine = _affine(header, path)
+        check_size(block.shape, block.skip + block.n_bytes, path, available=file.n_bytes, packed=zipped)
+        between = read_exactly(stream, block.skip - used, path)
+        values = read_voxels(stream, block, path)
+        digests = {"": file.sha256()}
     if (slope, intercept) != (1.0, 0.0):
         with np.errstate(over="ignore", invalid="ignore"):
             values = np.asarray(values * slope + intercept)
@@ -64,11 +60,11 @@ def read_nifti(path: Path) -> StoredImage:
 
 def _header(stream: BinaryIO, path: Path) -> tuple[Any, int]:
     """The decoded header and its length in bytes."""
-    block = read_exactly(stream, 348, path).tobytes()
+    block = read_exactly(stream, 348, path)
     for sign in ("<", ">"):
         length = int(np.frombuffer(block[:4], dtype=f"{sign}i4")[0])
         if length in HEADERS:
-            block += read_exactly(stream, length - len(block), path).tobytes()
+            block += read_exactly(stream, length - len(block), path)
             magic = block[344:348] if length == 348 else block[4:12]
             if magic == MAGIC[length]:
                 decode = getattr(import_module("nibabel"), HEADERS[length])

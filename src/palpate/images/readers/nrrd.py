@@ -7,23 +7,20 @@ header, and of a segmentation the names, colours, values and layers of its segme
 from __future__ import annotations
 
 import re
-import zlib
-from collections.abc import Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
-from palpate.images.input_file import open_input
+from palpate.images.input_file import InputFile
 from palpate.images.named_labels import printable
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
 from palpate.images.readers.segments import flattened, segments_of
-from palpate.images.readers.text_header import beside, counts, header_line, numbers
-from palpate.images.readers.voxel_stream import MAX_OFFSET, VoxelBlock, bytes_to_skip, damaged, read_block
+from palpate.images.readers.text_header import TextHeader, header_line, voxels_of
+from palpate.images.readers.voxel_stream import MAX_OFFSET, VoxelBlock, bytes_to_skip, opened, read_block
 
 SYNONYMS = {"datafile": "data file", "lineskip": "line skip", "byteskip": "byte skip"}
 RAS_SIGNS = {  # of the three world axes
@@ -56,26 +53,6 @@ VECTOR = re.compile(r"none|\(([^()]*)\)", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True)
-class _Header:
-    """Fields in lower case, and the key-values; both may be damaged."""
-
-    fields: Mapping[str, str]
-    keys: Mapping[str, str]
-    path: Path
-
-    def need(self, field: str) -> str:
-        """A field that must be there."""
-        if field not in self.fields:
-            raise InputDataError(f"the header of '{self.path}' has no '{field}'; export the image again")
-        return self.fields[field]
-
-    def refused(self, field: str, advice: str) -> InputDataError:
-        """The sentence for a field that cannot be used."""
-        shown = printable(self.fields.get(field, "")[:60])
-        return InputDataError(f"the header of '{self.path}' has '{field}: {shown}'; {advice}")
-
-
-@dataclass(frozen=True, slots=True)
 class _Place:
     """`affine` (4, 4) index -> RAS mm of the axes in space, and which axis, if any, lists layers or channels."""
 
@@ -88,26 +65,21 @@ def read_nrrd(path: Path) -> StoredImage:
 
     Layers that do not overlap become one label image. Raises `InputDataError` with a sentence for whatever is wrong.
     """
-    try:
-        with ExitStack() as stack:
-            file = stack.enter_context(open_input(path))
-            files = [file]
-            header = _header(file, path)
-            block, place = _block(header), _place(header)
-            name = header.fields.get("data file")
-            if name is not None:
-                file = stack.enter_context(open_input(beside(path, name)))
-                files.append(file)
-            text = header.fields.get("line skip", "0")
-            if not (text.isascii() and text.isdigit() and len(text) <= 4):
-                raise header.refused("line skip", "it must lie between 0 and 9999; export the image again")
+    with opened(path) as file:
+        header, keys = _header(file, path)
+        block, place = _block(header), _place(header)
+        text = header.fields.get("line skip", "0")
+        if not (text.isascii() and text.isdigit() and len(text) <= 4):
+            raise header.refused("line skip", "it must lie between 0 and 9999; export the image again")
+
+        def voxels(rest: InputFile) -> NDArray[Any]:
+            """Those behind the lines that are to be skipped."""
             for _ in range(int(text)):
-                header_line(file, header.path)
-            values = read_block(file, block, path)
-            digests = {part: each.sha256() for part, each in zip(("", "voxels"), files, strict=False)}
-    except (OSError, EOFError, zlib.error) as error:
-        raise damaged(path, error) from error
-    segments = segments_of(header.keys, path)
+                header_line(rest, path)
+            return read_block(rest, block, path)
+
+        values, digests = voxels_of(file, path, header.fields.get("data file"), voxels)
+    segments = segments_of(keys, path)
     lists = [k for k in place.list_axes if values.shape[k] > 1]
     if len(lists) > 1 or (lists and not segments):
         raise InputDataError(
@@ -123,7 +95,8 @@ def read_nrrd(path: Path) -> StoredImage:
     return StoredImage(labels, place.affine, names, digests)
 
 
-def _header(file: BinaryIO, path: Path) -> _Header:
+def _header(file: BinaryIO, path: Path) -> tuple[TextHeader, dict[str, str]]:
+    """The header's fields, and its key-values."""
     first = header_line(file, path) or ""
     if not re.fullmatch(r"NRRD000[1-5]\s*", first):
         raise InputDataError(f"'{path}' does not begin as an NRRD file does; export the image as NRRD or NIfTI")
@@ -142,11 +115,11 @@ def _header(file: BinaryIO, path: Path) -> _Header:
         if name in known:
             raise InputDataError(f"the header of '{path}' has '{printable(name[:60])}' twice; export the image again")
         known[name] = value[1:] if known is keys else value.strip()
-    return _Header(fields, keys, path)
+    return TextHeader(fields, path), keys
 
 
-def _block(header: _Header) -> VoxelBlock:
-    sizes = counts(header.need("sizes"), header.path, field="sizes")
+def _block(header: TextHeader) -> VoxelBlock:
+    sizes = header.counts("sizes")
     if header.need("dimension") != str(len(sizes)) or len(sizes) > 16:
         raise header.refused("dimension", f"but {len(sizes)} sizes; export the image again")
     code = TYPES.get(header.need("type").lower())
@@ -164,7 +137,7 @@ def _block(header: _Header) -> VoxelBlock:
     return VoxelBlock(sizes, np.dtype(code).newbyteorder("<" if endian == "little" else ">"), packing, skip)
 
 
-def _place(header: _Header) -> _Place:
+def _place(header: TextHeader) -> _Place:
     """By `space`, `space directions` and `space origin`; a missing origin is zero, as ITK has it."""
     path = header.path
     signs = RAS_SIGNS.get(header.fields.get("space", "").lower())
@@ -179,19 +152,15 @@ def _place(header: _Header) -> _Place:
         raise header.refused("space directions", "an image of three axes is needed; extract one volume")
     affine = np.eye(4)
     for column, k in enumerate(in_space):
-        affine[:3, column] = _vector(vectors[k][1], header, "space directions")
+        affine[:3, column] = header.numbers("space directions", 3, vectors[k][1].replace(",", " "))
     origin = VECTOR.fullmatch(header.fields.get("space origin", "(0,0,0)"))
-    affine[:3, 3] = _vector((origin and origin[1]) or "", header, "space origin")
+    affine[:3, 3] = header.numbers("space origin", 3, ((origin and origin[1]) or "").replace(",", " "))
     units = set(re.findall(r'"([^"]*)"', header.fields.get("space units", '"mm"')))
     if len(units) != 1 or not units <= set(MILLIMETRES):
         raise header.refused("space units", 'it must be "mm" "mm" "mm"; correct it')
     affine[:3] *= np.array(signs)[:, None] * MILLIMETRES[units.pop()]
     affine += 0.0  # no minus zero
     return _Place(affine, tuple(k for k in range(len(vectors)) if k not in in_space))
-
-
-def _vector(text: str, header: _Header, field: str) -> NDArray[np.float64]:
-    return numbers(text.replace(",", " "), 3, header.path, field=field)
 
 
 register(ImageFormat("NRRD", (".nrrd", ".nhdr"), read_nrrd))

@@ -15,7 +15,7 @@ from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.named_labels import LabelTable, checked_table
 from palpate.images.readers.isolation import ReadLimits, read_stored
 from palpate.images.readers.registry import StoredImage, format_of
-from palpate.images.readers.values import REDUCED, to_canonical
+from palpate.images.readers.values import reduced, to_canonical
 
 MAX_SHEAR = 1e-3  # cosine between two axes; distances are computed on a rectangular grid
 LIMITS = ReadLimits()
@@ -60,7 +60,7 @@ def read_intensities(
 def _read(
     path: Path, kind: str, limits: ReadLimits | None, given: VoxelGrid | None = None
 ) -> tuple[StoredImage, VoxelGrid]:
-    """The image in the order closest to RAS, and its grid; `kind`: what its values are, a key of `REDUCED`."""
+    """The image in the order closest to RAS, and its grid; `kind`: what its values are, "labels" or "intensities"."""
     image_format = format_of(path)
     _check_file(path, kind)
     try:
@@ -69,7 +69,7 @@ def _read(
         else:
             stored = read_stored(path, kind, image_format, limits, given)
         _check_affine(stored.affine, path)
-        values, affine = to_canonical(REDUCED[kind](stored.values, path), stored.affine)
+        values, affine = to_canonical(reduced(stored.values, path, kind=kind), stored.affine)
     except MemoryError as error:
         raise ResourceError(
             f"'{path}' does not fit into the memory of this machine; crop the image to the organs of the case"

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
+from palpate.images.input_file import InputFile, open_input
 from palpate.images.named_labels import hex_colour, printable
 
 # Not what float() takes besides: nan, inf, 1_0, digits of other scripts.
@@ -34,20 +35,46 @@ def header_line(file: BinaryIO, path: Path) -> str | None:
     return line.decode("utf-8", errors="replace").rstrip("\r\n") if line else None
 
 
-def numbers(text: str, n: int, path: Path, *, field: str) -> NDArray[np.float64]:
-    """The `n` numbers (n,) in `text`, separated by blanks, in the unit of its field.
+@dataclass(frozen=True, slots=True)
+class TextHeader:
+    """Fields of the header at `path` by their names in lower case; they may be damaged."""
 
-    Raises `InputDataError` when it holds anything else.
-    """
-    words = text.split()
-    plain = len(words) == n and all(NUMBER.fullmatch(word) for word in words)
-    values = np.array([float(word) for word in words]) if plain else np.zeros(0)
-    if len(values) != n or not (np.abs(values) < MAX_NUMBER).all():
-        raise InputDataError(
-            f"the header of '{path}' has '{field}: {printable(text[:60])}', but {n} numbers under {MAX_NUMBER:g} are"
-            " needed; export the image again"
-        )
-    return values
+    fields: Mapping[str, str]
+    path: Path
+
+    def need(self, field: str, advice: str = "export the image again") -> str:
+        """A field that must be there."""
+        if field not in self.fields:
+            raise InputDataError(f"the header of '{self.path}' has no '{field}'; {advice}")
+        return self.fields[field]
+
+    def refused(self, field: str, advice: str, *, text: str | None = None) -> InputDataError:
+        """The sentence for a field, or for a text in it, that cannot be used."""
+        shown = printable((self.fields.get(field, "") if text is None else text)[:60])
+        return InputDataError(f"the header of '{self.path}' has '{field}: {shown}'; {advice}")
+
+    def numbers(self, field: str, n: int, text: str | None = None) -> NDArray[np.float64]:
+        """The `n` numbers (n,) of a field, or of a text in it, separated by blanks, in the field's unit.
+
+        Raises `InputDataError` when it holds anything else.
+        """
+        text = self.need(field) if text is None else text
+        words = text.split()
+        plain = len(words) == n and all(NUMBER.fullmatch(word) for word in words)
+        values = np.array([float(word) for word in words]) if plain else np.zeros(0)
+        if len(values) != n or not (np.abs(values) < MAX_NUMBER).all():
+            advice = f"{n} numbers under {MAX_NUMBER:g} are needed: export the image again"
+            raise self.refused(field, advice, text=text)
+        return values
+
+    def counts(self, field: str) -> tuple[int, ...]:
+        """The whole numbers >= 1 of a field; raises `InputDataError` when it holds anything else."""
+        words = self.need(field).split()
+        plain = all(word.isascii() and word.isdigit() and len(word) <= 20 for word in words)
+        sizes = tuple(int(word) for word in words) if plain else ()
+        if not sizes or min(sizes) < 1:
+            raise self.refused(field, "it must be positive counts: export the image again")
+        return sizes
 
 
 def unit_colour(words: Sequence[str]) -> str | None:
@@ -58,17 +85,14 @@ def unit_colour(words: Sequence[str]) -> str | None:
     return hex_colour(red, green, blue, top=1.0)
 
 
-def counts(text: str, path: Path, *, field: str) -> tuple[int, ...]:
-    """The whole numbers >= 1 in `text`; raises `InputDataError` when it holds anything else."""
-    words = text.split()
-    if not words or not all(word.isascii() and word.isdigit() and len(word) <= 20 for word in words) or "0" in words:
-        raise InputDataError(
-            f"the header of '{path}' has '{field}: {printable(text[:60])}', not positive counts; export the image again"
-        )
-    sizes = tuple(int(word) for word in words)
-    if math.prod(sizes) == 0:
-        raise InputDataError(f"the header of '{path}' has a size of zero in '{field}'; export the image again")
-    return sizes
+def voxels_of(
+    file: InputFile, path: Path, name: str | None, read: Callable[[InputFile], NDArray[Any]]
+) -> tuple[NDArray[Any], dict[str, str]]:
+    """What `read` makes of the rest of the file at `path`, or of the file `name` beside it; the digests of both."""
+    if name is None:
+        return read(file), {"": file.sha256()}
+    with open_input(beside(path, name)) as other:
+        return read(other), {"": file.sha256(), "voxels": other.sha256()}
 
 
 def beside(path: Path, name: str) -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from itertools import permutations
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,10 @@ from palpate.images.named_labels import MAX_LABEL
 INTEGRAL_TOLERANCE = 1e-3  # resampling and 32-bit scaling leave 0.9999; more is a probability map or a grey image
 
 
-def intensity_values(values: NDArray[Any], path: Path) -> NDArray[Any]:
-    """Intensities (n_1, n_2, n_3) as float32, in the image's own unit (HU in a CT)."""
-    del path
+def reduced(values: NDArray[Any], path: Path, *, kind: str) -> NDArray[Any]:
+    """Values (n_1, n_2, n_3) as `label_values`, or as "intensities": float32 in the image's own unit (HU in a CT)."""
+    if kind == "labels":
+        return label_values(values, path)
     with np.errstate(over="ignore"):
         return values.astype(np.float32, copy=False)
 
@@ -52,12 +52,6 @@ def label_values(values: NDArray[Any], path: Path) -> NDArray[Any]:
             " is this a grey image? Name the label image (segmentation) instead, or renumber its labels"
         )
     return values.astype(np.uint8 if high <= 255 else np.uint16, copy=False)
-
-
-REDUCED: Mapping[str, Callable[[NDArray[Any], Path], NDArray[Any]]] = {
-    "labels": label_values,
-    "intensities": intensity_values,
-}
 
 
 def to_canonical(values: NDArray[Any], affine: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[np.float64]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -50,14 +52,14 @@ def log_derivatives(F: Array) -> tuple[Array, Array, Array]:
 
 
 class FiniteStrain:
-    """Volume ratio J = det F and bulk energy (ln J)^2 / 2, as in Simo & Pister, CMAME 46 (1984) 201-215."""
+    """Volume ratio J = det F and bulk energy (ln J)^2 / 2, as in Simo & Pister, CMAME 46 (1984) 201-215.
+
+    Rotations cost nothing, and J must stay positive.
+    """
 
     __slots__ = ()
 
-    @property
-    def finite(self) -> bool:
-        """Rotations cost nothing, and J must stay positive."""
-        return True
+    finite: ClassVar[bool] = True
 
     def volume(self, F: Array) -> Array:
         """J = det F (n,) at F (n, 3, 3)."""

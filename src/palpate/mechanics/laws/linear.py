@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,27 +18,12 @@ SYMMETRIC = IDENTITY4 + np.einsum("il,jk->ijkl", np.eye(3), np.eye(3))
 
 @dataclass(frozen=True, slots=True)
 class Linear:
-    """Hooke's law for small strains and rotations; J stands for 1 + div u."""
+    """Hooke's law for small strains; rotations count as strain, and J stands for 1 + div u, without a limit."""
 
-    @property
-    def name(self) -> str:
-        """The law's name in `case.toml`."""
-        return "linear"
-
-    @property
-    def description(self) -> str:
-        """For a methods section."""
-        return "isotropic linear elasticity at small strains"
-
-    @property
-    def parameters(self) -> tuple[LawParameter, ...]:
-        """None."""
-        return ()
-
-    @property
-    def finite(self) -> bool:
-        """It takes rotations for strain and has no limit on J."""
-        return False
+    name: ClassVar[str] = "linear"
+    description: ClassVar[str] = "isotropic linear elasticity at small strains"
+    parameters: ClassVar[tuple[LawParameter, ...]] = ()
+    finite: ClassVar[bool] = False
 
     def volume(self, F: Array) -> Array:
         """1 + div u (n,) at F (n, 3, 3)."""

@@ -7,6 +7,7 @@ stress, and (mu, lambda) the moduli at small strain: the I2 term alone would add
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,9 @@ C01_OVER_C10 = LawParameter("c01_over_c10", 0.25, 0.0, 1000.0, "ratio of the law
 class MooneyRivlin(FiniteStrain):
     """Compressible Mooney-Rivlin law with the dimensionless ratio c01 / c10 >= 0; 0 is the neo-Hookean law."""
 
+    name: ClassVar[str] = "mooney-rivlin"
+    parameters: ClassVar[tuple[LawParameter, ...]] = (C01_OVER_C10,)
+
     c01_over_c10: float = C01_OVER_C10.default
 
     def __post_init__(self) -> None:
@@ -31,19 +35,9 @@ class MooneyRivlin(FiniteStrain):
             raise ConfigurationError(f"c01_over_c10 is {self.c01_over_c10}; give a finite number, zero or greater")
 
     @property
-    def name(self) -> str:
-        """The law's name in `case.toml`."""
-        return "mooney-rivlin"
-
-    @property
     def description(self) -> str:
         """For a methods section."""
         return f"a compressible Mooney-Rivlin law (c01 / c10 = {self.c01_over_c10:g}) at finite strains"
-
-    @property
-    def parameters(self) -> tuple[LawParameter, ...]:
-        """The ratio of its two constants."""
-        return (C01_OVER_C10,)
 
     @property
     def coefficients(self) -> tuple[float, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,20 +18,9 @@ Array = NDArray[np.float64]
 class NeoHookean(FiniteStrain):
     """Compressible neo-Hookean law; Bonet & Wood, Nonlinear Continuum Mechanics (2nd ed., 2008), section 6.4.3."""
 
-    @property
-    def name(self) -> str:
-        """The law's name in `case.toml`."""
-        return "neo-hookean"
-
-    @property
-    def description(self) -> str:
-        """For a methods section."""
-        return "a compressible neo-Hookean law at finite strains"
-
-    @property
-    def parameters(self) -> tuple[LawParameter, ...]:
-        """None."""
-        return ()
+    name: ClassVar[str] = "neo-hookean"
+    description: ClassVar[str] = "a compressible neo-Hookean law at finite strains"
+    parameters: ClassVar[tuple[LawParameter, ...]] = ()
 
     def shear_energy(self, F: Array) -> Array:
         """Shear energy w = (I1 - 3) / 2 - ln J (n,) at F (n, 3, 3)."""
