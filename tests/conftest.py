@@ -231,9 +231,38 @@ def environment(monkeypatch):
 
 
 @pytest.fixture
-def without(monkeypatch):
+def first_place(tmp_path_factory):
+    """A folder in which this process, and those that it starts, look for modules first."""
+    folder = tmp_path_factory.mktemp("first-place")
+    sys.path.insert(0, str(folder))
+    yield folder
+    sys.path.remove(str(folder))
+
+
+@pytest.fixture
+def registered():
+    """Adds things to registries by their names, for one test."""
+    added = []
+
+    def add(registry, name, thing):
+        registry[name] = thing
+        added.append((registry, name))
+
+    yield add
+    for registry, name in added:
+        del registry[name]
+
+
+@pytest.fixture
+def put_library(monkeypatch):
+    """Puts a module in the place of a library by its name."""
+    return lambda name, module: monkeypatch.setitem(sys.modules, name, module)
+
+
+@pytest.fixture
+def without(put_library):
     """Makes a library one that is not installed."""
-    return lambda name: monkeypatch.setitem(sys.modules, name, None)
+    return lambda name: put_library(name, None)
 
 
 @pytest.fixture(scope="session")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+from contextlib import chdir
 from dataclasses import replace
 from pathlib import Path
 
@@ -77,23 +78,25 @@ def test_from_a_clone_to_ones_own_result_it_is_ten_minutes_of_reading_and_typing
     assert 2.0 < read / WORDS_A_MINUTE + typed / KEYS_A_MINUTE <= 10.0
 
 
-def test_the_tutorials_steps_lead_to_the_demos_case(tmp_path, monkeypatch, capsys):
+def test_the_tutorials_steps_lead_to_the_demos_case(tmp_path, capsys):
     """On the masks that the page writes; numbers to 15 %, as another mesher makes another mesh.
 
     What is estimated there is the demo's case under another name, whose outcome the page shows.
     """
-    monkeypatch.chdir(tmp_path)
-    exec(compile(MASKS, "docs/tutorial.md", "exec"), {})
-    *first, (program, command, file, *options) = [shlex.split(line) for line in TYPED if line.startswith("palpate ")]
-    for typed, shown in zip(first, SHOWN[:-1], strict=True):
-        assert main(typed[1:]) == 0
-        printed, told = (MACHINE.sub("", text) for text in (capsys.readouterr().out, shown))
-        assert NUMBER.sub("#", printed).split() == NUMBER.sub("#", told).split()
-        assert [float(n) for n in NUMBER.findall(printed)] == pytest.approx(
-            [float(n) for n in NUMBER.findall(told)], rel=0.15, abs=0.05
-        )
-    assert (program, command, options[:3:2]) == ("palpate", "estimate", ["--output", "--set"])
-    case, demos = read_case(Path(file), options[3::2]), read_case(DATA / "demo.toml")
+    with chdir(tmp_path):
+        exec(compile(MASKS, "docs/tutorial.md", "exec"), {})
+        *first, (program, command, file, *options) = [
+            shlex.split(line) for line in TYPED if line.startswith("palpate ")
+        ]
+        for typed, shown in zip(first, SHOWN[:-1], strict=True):
+            assert main(typed[1:]) == 0
+            printed, told = (MACHINE.sub("", text) for text in (capsys.readouterr().out, shown))
+            assert NUMBER.sub("#", printed).split() == NUMBER.sub("#", told).split()
+            assert [float(n) for n in NUMBER.findall(printed)] == pytest.approx(
+                [float(n) for n in NUMBER.findall(told)], rel=0.15, abs=0.05
+            )
+        assert (program, command, options[:3:2]) == ("palpate", "estimate", ["--output", "--set"])
+        case, demos = read_case(Path(file), options[3::2]), read_case(DATA / "demo.toml")
     assert {(t.role, t.modulus_kpa, t.poisson_ratio) for t in case.tissues} == {
         (t.role, t.modulus_kpa, t.poisson_ratio) for t in demos.tissues
     }

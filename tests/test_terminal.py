@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import os
+import pty
+import termios
 
 import numpy as np
 import pytest
@@ -15,16 +17,6 @@ from palpate.images.registration import Registration, length_text
 from palpate.report.tornado import TornadoRow, effect_text
 
 SETTINGS = ", ".join(f"{setting}: -{setting} %" for setting in range(30))
-
-
-class Terminal(io.StringIO):
-    """A stream that says it is a terminal."""
-
-    def isatty(self) -> bool:
-        return True
-
-    def fileno(self) -> int:
-        return 7
 
 
 def test_a_wide_table_is_broken_in_its_widest_column_and_loses_nothing():
@@ -42,10 +34,12 @@ def test_a_narrow_table_stands_as_it_is():
 
 
 @pytest.mark.parametrize("width", [40, 80])
-def test_a_sentence_is_broken_between_words_and_set_in(monkeypatch, width):
-    monkeypatch.setattr(os, "get_terminal_size", lambda _: os.terminal_size((width, 24)))
+def test_a_sentence_is_broken_between_words_and_set_in(width):
+    keyboard, screen = pty.openpty()
+    termios.tcsetwinsize(screen, (24, width))
     sentence = "[   1.0 s] " + "finite strain: the equilibrium at the linear estimate " * 3
-    lines = fitted(sentence.strip(), Terminal()).split("\n")
+    with os.fdopen(screen, "w") as terminal, os.fdopen(keyboard):
+        lines = fitted(sentence.strip(), terminal).split("\n")
     assert max(map(len, lines)) < width
     assert " ".join(line.strip() for line in lines).split() == sentence.split()
     assert all(line.startswith(" " * 11) for line in lines[1:])

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
-import sys
-import types
+from contextlib import nullcontext
+from types import SimpleNamespace
 
 import pytest
 
 from palpate.cohort.engines import dask
 from palpate.cohort.engines.dask import DaskEngine, attempt_on_worker
-from palpate.cohort.engines.packing import packed
 from palpate.cohort.task import Limits, Outcome, Row, Task
 from palpate.errors import ResourceError
 
@@ -24,6 +22,8 @@ class Future:
     def result(self, timeout):
         if self.task.row.id == "gathered late" and self.task.attempt == 1:
             raise TimeoutError(timeout)
+        if self.task.row.id == "cut off":
+            raise ConnectionResetError
         return Outcome(self.task.row.id, "done", attempts=self.task.attempt).to_dict()
 
     def exception(self):
@@ -61,60 +61,61 @@ class Client:
         return future
 
 
-@pytest.fixture(autouse=True)
-def no_waiting(monkeypatch):
-    monkeypatch.setattr(dask, "MOMENT_S", 0.01)
-    monkeypatch.setattr(dask, "PATIENCE_S", 0.02)
+@pytest.fixture
+def outcomes(put_library):
+    """The outcomes of tasks on the workers of a client, by a scheduler whose address is never asked."""
+
+    def of(client, tasks):
+        put_library("distributed", SimpleNamespace(Client=lambda *_, **__: nullcontext(client)))
+        return list(DaskEngine("tcp://here:1", work="a:b").outcomes(tasks))
+
+    return of
 
 
 def tasks(folder, *names):
     return [Task(Row(name, "P"), str(folder / name), "0" * 64, (), Limits()) for name in names]
 
 
-def test_rows_of_workers_that_are_gone_go_to_others(tmp_path):
+def test_rows_of_workers_that_are_gone_go_to_others(tmp_path, outcomes):
     client = Client(mortal=2)
     names = [f"r{i}" for i in range(6)]
-    found = {o.id: o for o in packed(dask._Cluster(client, "a:b", None), tasks(tmp_path, *names))}
+    found = {o.id: o for o in outcomes(client, tasks(tmp_path, *names))}
     assert {outcome.state for outcome in found.values()} == {"done"}
     assert sorted(found) == names
     assert sorted(outcome.attempts for outcome in found.values()) == [1, 1, 1, 1, 2, 2]
     assert all(future.cancelled == (future.worker != "immortal") for future in client.futures)
 
 
-def test_an_outcome_that_went_with_its_worker_is_asked_for_again(tmp_path):
+def test_an_outcome_that_went_with_its_worker_is_asked_for_again(tmp_path, outcomes):
     client = Client(mortal=0)
-    (found,) = packed(dask._Cluster(client, "a:b", None), tasks(tmp_path, "gathered late"))
+    (found,) = outcomes(client, tasks(tmp_path, "gathered late"))
     assert (found.state, found.attempts) == ("done", 2)
     assert client.futures[0].cancelled
 
 
-def test_a_worker_that_fails_is_a_crash_of_its_row(tmp_path):
-    (found,) = packed(dask._Cluster(Client(mortal=0), "a:b", None), tasks(tmp_path, "bad"))
+def test_a_worker_that_fails_is_a_crash_of_its_row(tmp_path, outcomes):
+    (found,) = outcomes(Client(mortal=0), tasks(tmp_path, "bad"))
     assert (found.failure_class, found.message) == ("crash", "the worker failed: OSError: no such folder")
 
 
-def test_a_row_that_every_worker_dies_of_is_lost(tmp_path):
+def test_a_row_that_every_worker_dies_of_is_lost(tmp_path, outcomes):
     client = Client(mortal=4)
     del client.workers["immortal"]
-    (found,) = packed(dask._Cluster(client, "a:b", None), tasks(tmp_path, "heavy"))
+    (found,) = outcomes(client, tasks(tmp_path, "heavy"))
     assert (found.failure_class, found.attempts) == ("lost", 3)
     assert (tmp_path / "heavy/done.json").exists()
 
 
-def test_a_scheduler_that_is_gone_ends_the_run(tmp_path, monkeypatch):
-    distributed = types.SimpleNamespace(Client=lambda *_, **__: contextlib.nullcontext(client))
-    monkeypatch.setitem(sys.modules, "distributed", distributed)
-    client = Client(mortal=0, status="closed")
+def test_a_scheduler_that_is_gone_ends_the_run(tmp_path, outcomes):
     with pytest.raises(ResourceError, match="--resume"):
-        list(DaskEngine("tcp://here:1").outcomes(tasks(tmp_path, "a")))
-    client = Client(mortal=0)
-    monkeypatch.setattr(Future, "result", lambda *_, **__: (_ for _ in ()).throw(ConnectionResetError()))
+        outcomes(Client(mortal=0, status="closed"), tasks(tmp_path, "a"))
     with pytest.raises(ResourceError, match="tcp://here:1 is gone"):
-        list(DaskEngine("tcp://here:1").outcomes(tasks(tmp_path, "a")))
+        outcomes(Client(mortal=0), tasks(tmp_path, "cut off"))
 
 
-def test_without_workers_rows_wait(tmp_path):
+def test_without_workers_rows_wait(tmp_path, outcomes, monkeypatch):
+    monkeypatch.setattr(dask, "PATIENCE_S", 0.02)
     client = Client(mortal=0)
     client.workers.clear()
     with pytest.raises(ResourceError, match="no worker"):
-        list(packed(dask._Cluster(client, "a:b", None), tasks(tmp_path, "a")))
+        outcomes(client, tasks(tmp_path, "a"))

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import json
-import sys
 
 import numpy as np
 import pytest
 from scipy import stats
 
+from doubled_parts import doubled
 from palpate.cli import main
 from palpate.errors import ConfigurationError, GeometryError, ResourceError
 from palpate.mesh.anatomy import Box
@@ -93,36 +92,13 @@ def test_a_row_that_did_not_converge_has_no_value(table):
     assert "none" in table.text()[3]
 
 
-DOUBLED = """
-import os
-from palpate.errors import GeometryError
-
-def doubled(key, progress):
-    progress(f"doubling {key}")
-    if key == "bad":
-        raise GeometryError("this one cannot be doubled")
-    if key == "dead":
-        os._exit(3)
-    return {"x": 2 * int(key)}
-"""
-
-
-@pytest.fixture
-def doubled(tmp_path, monkeypatch):
-    """A function of a module that a new process can import."""
-    (tmp_path / "doubled_parts.py").write_text(DOUBLED)
-    monkeypatch.syspath_prepend(tmp_path)
-    yield importlib.import_module("doubled_parts").doubled
-    del sys.modules["doubled_parts"]
-
-
 def computed(make, ledger, keys, workers=1):
     said = []
     return compute([Job((key,), make) for key in keys], ledger, workers=workers, progress=said.append), said
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_finished_parts_are_not_computed_again(tmp_path, doubled, workers):
+def test_finished_parts_are_not_computed_again(tmp_path, workers):
     ledger = Ledger(tmp_path / "parts.jsonl", "a")
     first, said = computed(doubled, ledger, ("1", "2", "3"), workers)
     assert first == {"1": {"x": 2}, "2": {"x": 4}, "3": {"x": 6}}
@@ -135,7 +111,7 @@ def test_finished_parts_are_not_computed_again(tmp_path, doubled, workers):
     assert "doubling 1" in said
 
 
-def test_what_a_process_raises_is_raised_and_what_was_finished_stays(tmp_path, doubled):
+def test_what_a_process_raises_is_raised_and_what_was_finished_stays(tmp_path):
     ledger = Ledger(tmp_path / "parts.jsonl", "a")
     jobs = [Job(("1", "bad"), doubled), Job(("2",), doubled)]
     with pytest.raises(GeometryError, match="cannot be doubled"):
@@ -143,12 +119,12 @@ def test_what_a_process_raises_is_raised_and_what_was_finished_stays(tmp_path, d
     assert ledger.finished()["1"] == {"x": 2}
 
 
-def test_a_process_that_dies_is_an_error(doubled):
+def test_a_process_that_dies_is_an_error():
     with pytest.raises(ResourceError, match="ended before its part was done"):
         computed(doubled, Ledger(None, "a"), ("1", "dead"), workers=2)
 
 
-def test_a_line_cut_by_an_interruption_is_computed_again(tmp_path, doubled):
+def test_a_line_cut_by_an_interruption_is_computed_again(tmp_path):
     path = tmp_path / "parts.jsonl"
     ledger = Ledger(path, "a")
     ledger.keep("1", {"x": 1})

@@ -7,7 +7,6 @@ import dataclasses
 import json
 import re
 import runpy
-import sys
 import types
 from collections import Counter
 from xml.etree import ElementTree as ET
@@ -430,10 +429,9 @@ class Recorder(types.ModuleType):
 
 
 @pytest.mark.parametrize(("name", "module"), [("slicer", "slicer"), ("paraview", "paraview")])
-def test_the_scripts_of_viewers_load_files_that_are_there(exported, monkeypatch, name, module):
+def test_the_scripts_of_viewers_load_files_that_are_there(exported, put_library, name, module):
     folder, viewer = exported(name), Recorder(module)
-    monkeypatch.setitem(sys.modules, module, viewer)
-    monkeypatch.setattr(sys, "argv", ["script"])
+    put_library(module, viewer)
     runpy.run_path(str(folder / f"load_in_{name}.py"))
     loaded = [path for path in viewer.files if path.startswith(str(folder))]
     assert len(loaded) >= (12 if name == "slicer" else 1)
@@ -489,7 +487,7 @@ def test_each_later_image_bears_its_own_loads(model, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["abaqus", "febio", "sofa"])
-def test_a_law_that_a_format_has_not_is_refused(case_result, tmp_path, monkeypatch, name):
+def test_a_law_that_a_format_has_not_is_refused(case_result, tmp_path, registered, name):
     """Another program would else compute with a neo-Hookean solid, and nobody would know."""
 
     class Plain:
@@ -499,7 +497,7 @@ def test_a_law_that_a_format_has_not_is_refused(case_result, tmp_path, monkeypat
         parameters = ()
         finite = True
 
-    monkeypatch.setitem(LAWS, "plain", Plain())
+    registered(LAWS, "plain", Plain())
     result = with_mechanics(case_result, "plain")
     with pytest.raises(ConfigurationError, match="'plain' is none that this format"):
         palpate.export(result, tmp_path, format=name, linear=True)

@@ -25,12 +25,18 @@ youngs_modulus_kpa = 10.0
 """
 
 
+def plain_page(data, **_):
+    return f"the page of {data.document['id']}"
+
+
 @pytest.fixture
 def estimate(tmp_path, monkeypatch, case_result):
-    """Run `palpate estimate` of a patient into the folder `out`; `meanwhile` is called in the place of the numbers."""
-    monkeypatch.setattr(case_report, "render", lambda data, **_: f"the page of {data.document['id']}")
+    """Run `palpate estimate` of a patient into the folder `out`.
 
-    def run(patient: str, *flags: str, meanwhile=lambda: None) -> int:
+    `meanwhile` is called in the place of the numbers; `draw` draws the page, this time and until another does.
+    """
+
+    def run(patient: str, *flags: str, meanwhile=lambda: None, draw=plain_page) -> int:
         def compute(case, *, progress, truth):
             assert truth is None
             progress("working")
@@ -38,6 +44,7 @@ def estimate(tmp_path, monkeypatch, case_result):
             return dataclasses.replace(case_result, case=case)
 
         monkeypatch.setattr(study_run, "estimate", compute)
+        monkeypatch.setattr(case_report, "render", draw)
         (tmp_path / f"{patient}.toml").write_text(CASE.replace("ID", patient))
         return main(["estimate", str(tmp_path / f"{patient}.toml"), "--output", str(tmp_path / "out"), *flags])
 

@@ -16,7 +16,6 @@ from children import in_a_child
 from palpate.cli import main
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers import write_label_image
-from palpate.report import case_report
 from palpate.study import outputs
 
 FILES = {
@@ -63,12 +62,11 @@ def test_a_result_lists_all_its_files_with_their_hashes(estimate, out):
 
 
 @pytest.mark.parametrize("error", [NO_SPACE, MemoryError(), ValueError("no ink")])
-def test_without_its_page_a_result_keeps_its_numbers_and_has_nobody_elses(estimate, out, monkeypatch, capsys, error):
+def test_without_its_page_a_result_keeps_its_numbers_and_has_nobody_elses(estimate, out, capsys, error):
     assert estimate("anna", "--quiet") == 0
-    monkeypatch.setattr(case_report, "render", refuse(error))
-    assert estimate("bert") == 0
+    assert estimate("bert", draw=refuse(error)) == 0
     assert result(out)["id"] == "bert"
-    assert "report" in [warning["code"] for warning in result(out)["warnings"]]
+    assert [warning["code"] for warning in result(out)["warnings"]] == ["report", "example"]  # others' come last
     assert {path.name for path in out.iterdir()} == FILES - {"report.html", "report-data.npz"}
     assert "report.html," not in capsys.readouterr().out
     assert main(["report", str(out)]) == 3
@@ -95,11 +93,10 @@ def test_a_disk_that_is_full_after_the_page_costs_the_page_only(estimate, out):
     assert set(result(out)["files"]) == files
 
 
-def test_a_page_that_nobody_vouches_for_is_set_aside(estimate, out, monkeypatch):
+def test_a_page_that_nobody_vouches_for_is_set_aside(estimate, out):
     out.mkdir()
     (out / "report.html").write_text("of somebody")
-    monkeypatch.setattr(case_report, "render", refuse(ValueError("no ink")))
-    assert estimate("bert", "--quiet") == 0
+    assert estimate("bert", "--quiet", draw=refuse(ValueError("no ink"))) == 0
     assert not (out / "report.html").exists()
     assert (out / "report.html.earlier").read_text() == "of somebody"
     assert any("report.html.earlier" in warning["message"] for warning in result(out)["warnings"])
@@ -134,12 +131,13 @@ def test_a_page_is_drawn_of_no_other_run_than_the_result_tells_of(estimate, out,
     assert contents(out) == before
 
 
-def test_the_page_drawn_again_is_that_of_the_result(estimate, out, monkeypatch):
-    assert estimate("anna", "--quiet") == 0
-    monkeypatch.setattr(case_report, "render", lambda *_, **__: "another page")
+def test_the_page_drawn_again_is_that_of_the_result(estimate, out):
+    """By a version that draws it otherwise."""
+    pages = (f"page {number}" for number in range(2))
+    assert estimate("anna", "--quiet", draw=lambda *_, **__: next(pages)) == 0
     assert main(["report", str(out), "--quiet"]) == 0
-    assert (out / "report.html").read_text() == "another page"
-    assert result(out)["files"]["report.html"]["sha256"] == hashlib.sha256(b"another page").hexdigest()
+    assert (out / "report.html").read_text() == "page 1"
+    assert result(out)["files"]["report.html"]["sha256"] == hashlib.sha256(b"page 1").hexdigest()
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])

@@ -19,6 +19,7 @@ from palpate.images.readers import write_scalar_image
 from palpate.report import collect as collect_module
 from palpate.report import page as page_module
 from palpate.report.case_report import redrawn_page, write_case_report, write_failure_report
+from palpate.report.collect import MOST_LATER
 from palpate.report.pairs import drawn_images
 from palpate.report.rows import number
 from palpate.study.case import Mechanics
@@ -138,21 +139,24 @@ def test_of_many_later_images_the_first_of_each_pair_is_drawn():
     assert drawn_images([1, 1, 1, 1, 1], 4) == ((0, 0), (1, 0), (2, 0), (3, 0))
 
 
-def test_what_is_not_drawn_is_told_of(case_result, tmp_path, monkeypatch):
-    fits = 2 * case_result.estimation.fits
-    images = dataclasses.replace(case_result.case.images, after=(Path("second.nii.gz"), Path("third.nii.gz")))
+def test_what_is_not_drawn_is_told_of(case_result, tmp_path):
+    later = MOST_LATER + 1
+    names = tuple(Path(f"later_{number}.nii.gz") for number in range(later))
+    images = dataclasses.replace(case_result.case.images, after=names)
     result = dataclasses.replace(
         case_result,
         case=dataclasses.replace(case_result.case, images=images),
-        after=2 * case_result.after,
+        after=later * case_result.after,
         estimation=dataclasses.replace(
-            case_result.estimation, fits=fits, displacements=2 * case_result.estimation.displacements
+            case_result.estimation,
+            fits=later * case_result.estimation.fits,
+            displacements=later * case_result.estimation.displacements,
         ),
     )
-    monkeypatch.setattr(collect_module, "MOST_LATER", 1)
     page = write_case_report(result, tmp_path).read_text()
-    assert "1 of 2 later images are drawn" in page
-    assert "Slices: before.nii.gz, third.nii.gz" not in page
+    assert f"{later - 1} of {later} later images are drawn" in page
+    assert f"Slices: before.nii.gz, later_{later - 2}.nii.gz" in page
+    assert f"Slices: before.nii.gz, later_{later - 1}.nii.gz" not in page
 
 
 def with_name(result, name):

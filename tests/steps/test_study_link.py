@@ -12,19 +12,20 @@ LINK = 'href="sensitivity.html"'
 
 
 class Study:
-    """A sensitivity study that has only the estimates of a result."""
+    """A sensitivity study of the estimates of a result, of whose assumptions the law alone was changed."""
 
     def __init__(self, estimates):
         self.estimates = estimates
 
     def to_dict(self):
-        keys = {"id": "a", "law": "linear", "element": "P2", "versions": {}, "sobol": None, "variations": []}
-        return keys | {"estimates": self.estimates, "warnings": []}
+        keys = {"id": "a", "law": "linear", "element": "P2", "versions": {}, "sobol": None}
+        of_law = {"cause": "law", "subject": "", "setting": "linear", "method": "exact", "at_bound": [], "reason": None}
+        variations = [of_law | {"changes": {item["tissue"]: 0.1 for item in self.estimates}}]
+        return keys | {"estimates": self.estimates, "variations": variations, "warnings": []}
 
 
 @pytest.fixture
-def folder(case_result, tmp_path, monkeypatch):
-    monkeypatch.setattr("palpate.report.sensitivity_page", lambda document: str(document["id"]))
+def folder(case_result, tmp_path):
     saving.save_estimate(case_result, OutputFolder(tmp_path))
     return tmp_path
 

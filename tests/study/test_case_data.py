@@ -170,9 +170,9 @@ class Dot:
         return point_motion(point, space.points[point], np.zeros(3), sd_mm=self.file.sd_mm), ()
 
 
-def test_another_kind_is_one_file_and_one_line(case, monkeypatch):
+def test_another_kind_is_one_file_and_one_line(case, registered):
     """A corner of the held border: it tells nothing, which is said, and no layer asks what it is."""
-    monkeypatch.setitem(SOURCES, "dot", SourceKind(Dot, needs=("sd_mm",), may_have=()))
+    registered(SOURCES, "dot", SourceKind(Dot, needs=("sd_mm",), may_have=()))
     result = estimate(replace(case, data=(CaseData("dot", sd_mm=0.1),)))
     assert result.estimation.information_shares["core"]["point motion"] < 1e-12
     assert result.estimation.fits[0][-1].tissue == "landmark"

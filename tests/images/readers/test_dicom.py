@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import shutil
-import sys
 from functools import partial
 from pathlib import Path
 
@@ -178,18 +177,16 @@ def test_a_plain_series_is_refused_with_what_converts_it(tmp_path: Path) -> None
 
 
 def test_without_the_extra_a_segmentation_names_it_and_a_series_its_converters(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, first_place: Path
 ) -> None:
     path = save_segmentation(tmp_path / "a.dcm", series(), "BINARY", NAMES, masks())
     save_series(tmp_path, series())
-    for name in ("dicom_segmentation", "dicom_dataset"):
-        monkeypatch.delitem(sys.modules, f"palpate.images.readers.{name}", raising=False)
-    monkeypatch.setitem(sys.modules, "pydicom", None)
-    monkeypatch.setitem(sys.modules, "highdicom", None)
+    for name in ("pydicom", "highdicom"):
+        (first_place / f"{name}.py").write_text("raise ModuleNotFoundError(__name__)")
     with pytest.raises(ResourceError, match=r'pip install "palpate\[dicom\]"'):
-        read_label_image(path)
+        readers.read_label_image(path)
     with pytest.raises(InputDataError, match="dcm2niix"):
-        read_label_image(next(each for each in tmp_path.iterdir() if each != path))
+        readers.read_label_image(next(each for each in tmp_path.iterdir() if each != path))
 
 
 def test_damaged_files_are_sentences_without_a_word_of_the_patient(tmp_path: Path) -> None:

@@ -314,20 +314,12 @@ def test_files_that_are_no_images_are_refused_with_advice(tmp_path: Path) -> Non
                 read(tmp_path / name)
 
 
-def test_a_gzip_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gzip_bomb_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:
+    """Its end is missing: whoever unpacked three of its fifty million bytes would come upon that."""
     path = raw(tmp_path / "a.nii.gz", tail=bytes(50_000_000))
-    unpacked: list[int] = []
-    plain_read = gzip.GzipFile.read
-
-    def counted(self: gzip.GzipFile, size: int = -1) -> bytes:
-        content = plain_read(self, size)
-        unpacked.append(len(content))
-        return content
-
-    monkeypatch.setattr(gzip.GzipFile, "read", counted)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 3 // 50])
     with pytest.raises(InputDataError, match="goes on for more than"):
         read_label_image(path)
-    assert HEADER < sum(unpacked) < 3_000_000
 
 
 def test_a_small_file_cannot_make_the_reader_take_much_memory(tmp_path: Path) -> None:

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from children import in_a_child
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.readers import read_label_image
-from palpate.images.readers.registry import _FORMATS, ImageFormat, StoredImage, format_of, register
+from palpate.images.readers.registry import ImageFormat, StoredImage, format_of, register
 
 
 def ones(path: Path) -> StoredImage:
@@ -17,14 +18,17 @@ def ones(path: Path) -> StoredImage:
     return StoredImage(np.full((2, 3, 4), value), np.diag([-1.0, -1.0, 1.0, 1.0]))
 
 
-def test_a_registered_format_is_read_without_touching_the_core(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delitem(_FORMATS, ".ones", raising=False)
-    register(ImageFormat("Ones", (".ones",), ones))
+def test_a_registered_format_is_read_without_touching_the_core(tmp_path: Path) -> None:
     (tmp_path / "a.ones").write_text("1")
-    image = read_label_image(tmp_path / "a.ones")
-    assert image.labels.sum() == 24
-    np.testing.assert_allclose(image.grid.affine[:3, 3], [-1.0, -2.0, 0.0])
-    _FORMATS.pop(".ones")
+
+    def read() -> int:
+        register(ImageFormat("Ones", (".ones",), ones))
+        image = read_label_image(tmp_path / "a.ones")
+        assert image.labels.sum() == 24
+        np.testing.assert_allclose(image.grid.affine[:3, 3], [-1.0, -2.0, 0.0])
+        return 0
+
+    assert in_a_child(read) == 0  # what is registered there is forgotten with it
 
 
 def test_no_format_takes_the_ending_of_another() -> None:

@@ -64,13 +64,13 @@ def test_an_indefinite_stiffness_is_refused_with_its_pivot():
         direct.SOLVER.factorise(chain(50, 3) - sparse.csr_matrix(np.eye(50)), NOTHING)
 
 
-def test_memory_that_is_not_there_is_refused_before_it_is_taken(monkeypatch):
+def test_memory_that_is_not_there_is_refused_before_it_is_taken(environment):
     line = sparse.diags_array([-np.ones(14), np.full(15, 2.1), -np.ones(14)], offsets=[-1, 0, 1])
     matrix = sparse.csr_matrix(
         sparse.kron(sparse.kronsum(line, line), sparse.eye_array(15)) + sparse.kron(sparse.eye_array(225), line)
     )
     needed = direct.SOLVER.expect(matrix, NOTHING).bytes
-    monkeypatch.setattr(direct, "available_memory", lambda: 0.9 * needed)
+    environment(PALPATE_MEMORY_GB=f"{0.9e-9 * needed:.6f}")
     tracemalloc.start()
     try:
         with pytest.raises(ResourceError, match=r"3375 unknowns needs [\d.]+ GB and [\d.]+ GB are free"):

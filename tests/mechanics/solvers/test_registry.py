@@ -101,13 +101,13 @@ def test_a_floating_body_is_refused(solver, element, meshes):
         factorise(stiffness, solver=solver)
 
 
-def test_a_solver_that_misses_its_tolerance_is_found_out(monkeypatch):
+def test_a_solver_that_misses_its_tolerance_is_found_out(registered):
     class Sloppy:
         def solve(self, rhs, **_):
             return 0.4 * rhs
 
     solver = Solver("sloppy", lambda *_: Sloppy(), False, lambda *_: Expectation(0.0, 0.0), SOLVERS["multigrid"].expect)
-    monkeypatch.setitem(registry.SOLVERS, "sloppy", solver)
+    registered(SOLVERS, "sloppy", solver)
     with pytest.raises(SolverError, match="'sloppy' left a relative residual of"):
         factorise(laplacian(10), solver="sloppy").solve(np.ones((10, 1)))
 
