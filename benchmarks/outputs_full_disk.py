@@ -128,7 +128,7 @@ def refusing(disk: Disk, name: str, function: Callable[..., Any]) -> Callable[..
 def compute(bench: Bench) -> None:
     """Let estimate, mesh, page and guess of the case be known from here on."""
     case = read_case(bench.root / "case.toml")
-    estimated, meshed = RUN.estimate(case), RUN.mesh(case)
+    estimated, meshed = RUN.estimate(case), RUN.make_mesh(case)
     images = [bench.root / f"{name}.nii.gz" for name in ("before", "after")]
     guess = NEW_CASE.new_case(NEW_CASE.CaseImages(images[0], (images[1],)), bench.new("init"))
     pages: dict[str, str] = {}
@@ -145,7 +145,7 @@ def compute(bench: Bench) -> None:
         CASE_REPORT.write_case_report(estimated, Path(folder))
     CASE_REPORT.render = lambda data, **options: pages.get(data.document["status"]) or first(data, **options)
     RUN.estimate = lambda *_, **__: estimated
-    RUN.mesh = lambda *_, **__: meshed
+    RUN.make_mesh = lambda *_, **__: meshed
     NEW_CASE.new_case = lambda *_: guess
 
 

@@ -25,7 +25,7 @@ from palpate.mesh.tetrahedralise import boundary_of
 from palpate.observation.contract import Fit
 from palpate.report import render
 from palpate.study.case import Case, CaseTissue, Estimate, Images
-from palpate.study.estimation import Estimation, Iteration, ModulusEstimate, Start, TissueFit
+from palpate.study.estimated import Estimation, Iteration, ModulusEstimate, Start, TissueFit
 from palpate.study.result import CaseResult, MeshSummary, Provenance
 from palpate.study.samples import ModulusSamples
 from palpate.uncertainty import ChainDiagnostics, Covariance

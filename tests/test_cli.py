@@ -282,7 +282,9 @@ def test_mesh_and_simulate_write_their_files(case_file, tmp_path, runner, case_r
             provenance=r.provenance,
         )
 
-    runner(mesh=lambda case, **_: MeshResult(case, r.space, r.mesh_summary, r.before, r.provenance), simulate=simulate)
+    runner(
+        make_mesh=lambda case, **_: MeshResult(case, r.space, r.mesh_summary, r.before, r.provenance), simulate=simulate
+    )
     assert main(["mesh", str(case_file), "--output", str(tmp_path / "m"), "--json"]) == 0
     assert json.loads(capfd.readouterr().out)["mesh"]["tets"] == len(r.space.mesh.tets)
     assert (tmp_path / "m" / "mesh.vtu").exists()

@@ -13,9 +13,9 @@ from palpate.images.alignment import Alignment, RigidFit, RigidMotion
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.segmentation import segment
 from palpate.images.tissue import Role, Tissue
-from palpate.study import body
-from palpate.study.body import aligned
+from palpate.study import imaged
 from palpate.study.estimate_findings import inversion_findings
+from palpate.study.imaged import aligned
 
 SEEN = [Finding("thin", f"thin in {image}", "prostate", f"in {image}") for image in ("before", "after[1]", "after[2]")]
 
@@ -59,7 +59,7 @@ def test_bones_in_pieces_unseen_or_round_are_one_warning_each_over_all_bones_and
     still = RigidMotion(np.eye(3), np.zeros(3))
     fits = {"hip": RigidFit(still, 0.1, 0, np.zeros((0, 3))), "femur": RigidFit(still, 0.1, 90, np.eye(3)[:1])}
     loose = {"hip": 2.0, "femur": 1.5}
-    monkeypatch.setattr(body, "align", lambda *_: Alignment(fits["femur"], fits, loose))
+    monkeypatch.setattr(imaged, "align", lambda *_: Alignment(fits["femur"], fits, loose))
     found = one_a_cause(aligned(images[0], tuple(images[1:]), method="rigid-tissues").findings)
     of_bones = [each for each in found if each.code in ("several-bodies", "rigid-unseen", "rotation-undetermined")]
     assert [each.code for each in of_bones] == ["several-bodies", "rotation-undetermined", "rigid-unseen"]

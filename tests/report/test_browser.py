@@ -17,10 +17,10 @@ from palpate.images.readers import write_scalar_image
 from palpate.observation.contract import PointMotions
 from palpate.report.case_report import write_case_report
 from palpate.report.preview import preview_page
-from palpate.study.body import brought
 from palpate.study.case import Case, CaseTissue, Images
 from palpate.study.check import Checked, CheckReport
-from palpate.study.estimation import PointFit
+from palpate.study.estimated import PointFit
+from palpate.study.imaged import brought
 
 playwright = pytest.importorskip("playwright.sync_api", reason="no playwright; pip install palpate[browser]")
 

@@ -21,7 +21,7 @@ from palpate.report.payload import payload
 from palpate.report.render import Arrows, Camera, Triangles, render_png
 from palpate.report.report_data import MOST_ARROWS, ReportData
 from palpate.study.case_data import CaseData
-from palpate.study.estimation import ForceFit, PointFit
+from palpate.study.estimated import ForceFit, PointFit
 
 EVIL = '</script><img src=x onerror=alert(1)>$\\frac{"&'
 rng = np.random.default_rng(3)

@@ -14,9 +14,10 @@ from palpate.inversion.estimate import Candidate
 from palpate.inversion.trust_region import Convergence
 from palpate.mechanics.forward import SolveCounts
 from palpate.observation.noise_model import NoiseModel
-from palpate.study.estimation import Observed, conclude, hull, verdict
+from palpate.study.estimation import Observed, conclude
 from palpate.study.samples import draw_moduli
 from palpate.study.together import StatedPosterior
+from palpate.study.verdicts import hull, verdict
 from palpate.uncertainty import (
     FittedState,
     grid_position_shifts,

@@ -7,7 +7,7 @@ import pytest
 
 from bodies import ELSEWHERE, STILL, body
 from palpate.images.alignment import RigidMotion
-from palpate.study.body import brought
+from palpate.study.imaged import brought
 
 
 def codes(after, method: str) -> list[str]:

@@ -10,8 +10,9 @@ import pytest
 
 from palpate.images.segmentation import segment
 from palpate.images.tissue import Role
-from palpate.study.body import aligned, make_body
+from palpate.study.body import make_body
 from palpate.study.case import Case, CaseTissue, Discrepancy, DriverMotion, Images, Mechanics, MeshSettings, Noise
+from palpate.study.imaged import aligned
 from palpate.study.prediction import predicted_intervals
 from palpate.study.run import estimate_states
 from palpate.uncertainty import NORMAL_95

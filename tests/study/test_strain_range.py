@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from palpate.mechanics.laws.registry import LAWS
-from palpate.study.body import Body, ImagedStates
+from palpate.study.body import Body
 from palpate.study.case import Mechanics
+from palpate.study.imaged import ImagedStates
 from palpate.study.refusals import linear_strain_warnings
 from palpate.study.run import strain_warnings
 

@@ -95,10 +95,10 @@ def voxelise(arguments: argparse.Namespace, _: None, outputs: OutputFolder, prog
 def mesh(_: argparse.Namespace, case: Case, outputs: OutputFolder, progress: Progress) -> Outcome:
     """Make a mesh and write it."""
     from palpate.export.case_files import write_mesh_files
-    from palpate.steps import commands
     from palpate.steps.saving import save_document
+    from palpate.study.run import make_mesh
 
-    result = commands.make_mesh(case, progress=progress)
+    result = make_mesh(case, progress=progress)
     progress("writing the mesh")
     document = result.to_dict()
     with outputs.staged() as staging:
@@ -115,10 +115,10 @@ def mesh(_: argparse.Namespace, case: Case, outputs: OutputFolder, progress: Pro
 def simulate(arguments: argparse.Namespace, case: Case, outputs: OutputFolder, progress: Progress) -> Outcome:
     """Simulate a later state and write it."""
     from palpate.export.case_files import write_simulation_files
-    from palpate.steps import commands
     from palpate.steps.saving import save_document
+    from palpate.study.simulate import simulate as simulated
 
-    result = commands.simulate(case, progress=progress, steps=arguments.steps)
+    result = simulated(case, steps=arguments.steps, progress=progress)
     progress("writing the simulated state")
     document = result.to_dict()
     with outputs.staged() as staging:

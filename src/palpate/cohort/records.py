@@ -9,9 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from palpate.cohort.plan import CASES, Plan, document_of
+from palpate.cohort.plan import CASES, Plan
 from palpate.cohort.task import Outcome, Row
+from palpate.errors import InputDataError
 from palpate.parallel import mapped
+from palpate.study.outputs import RESULT, read_json
 from palpate.uncertainty import NORMAL_95
 from palpate.unknowns import KNOWN_MODULUS
 
@@ -84,8 +86,9 @@ def _record(plan: Plan, folder: Path, marks: Sequence[Outcome | None], number: i
     took = (mark.seconds, mark.peak_gb, page)
     if mark.state != "done":
         return Record(row, "failed", mark.failure_class, mark.message, (), *took)
-    document = document_of(place, mark)
-    if document is None:
+    try:
+        document = read_json(place / RESULT)
+    except InputDataError:  # gone since
         return Record(row, "waiting")
     moduli = tuple(_modulus(item) for item in document["estimates"] if item["parameter"] == "youngs_modulus")
     codes = tuple(dict.fromkeys(warning["code"] for warning in document.get("warnings", ())))

@@ -16,9 +16,9 @@ from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.laws.registry import law_from
 from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.tet_mesh import TetMesh
-from palpate.study.case import CaseLoad
+from palpate.study.case_data import CaseLoad
 from palpate.study.discrepancy import FittedMaterial
-from palpate.study.estimation import ModulusEstimate
+from palpate.study.estimated import ModulusEstimate
 from palpate.study.result import CaseResult, PairResult
 from palpate.study.samples import ModulusSamples
 

@@ -36,8 +36,8 @@ from palpate.report.report_data import (
 from palpate.report.stiffness_maps import tissue_maps
 from palpate.report.surfaces import MOST_TRIANGLES, carried_outline, contour_width, image_surface, model_surface
 from palpate.report.volume import MOVING, Grey, background, earlier_grey, later_grey, slice_box, whole_box, whole_images
-from palpate.study.case import Case, CaseLoad
-from palpate.study.case_data import CaseData
+from palpate.study.case import Case
+from palpate.study.case_data import CaseData, CaseLoad
 from palpate.study.result import CaseResult, MeshSummary, failure_document, stated_unit
 
 LOGGER = logging.getLogger(__name__)

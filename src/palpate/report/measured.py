@@ -20,8 +20,9 @@ from palpate.report.report_data import (
     TriangleSurface,
 )
 from palpate.report.surfaces import carried_outline
-from palpate.study.estimation import PointFit
-from palpate.study.result import CaseResult, pair_names
+from palpate.study.estimated import PointFit
+from palpate.study.provenance import pair_names
+from palpate.study.result import CaseResult
 
 OF_BOX = 0.1  # of the slices' longest edge: how long an arrow is drawn that is longer than all but some
 USUAL = 95.0  # per cent of the arrows that are no longer than that

@@ -11,8 +11,9 @@ import numpy as np
 from palpate.images.alignment import within_border
 from palpate.images.tissue import Role
 from palpate.report.report_data import BoneDistance, InputImage, TriangleSurface
-from palpate.study.case import Images
-from palpate.study.result import CaseResult, pair_names
+from palpate.study.case_body import Images
+from palpate.study.provenance import pair_names
+from palpate.study.result import CaseResult
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,10 +23,10 @@ from palpate.report.rows import NONE, EstimateRow, estimate_rows, interval_text,
 from palpate.report.slices import alignment_svg, first_planes, slice_svg
 from palpate.report.svg import template_of
 from palpate.report.volume import Grey, grey_of
-from palpate.study.body import ImagedStates
 from palpate.study.case import Case
 from palpate.study.check import Checked, Problem
 from palpate.study.first_look import FrameLook, TissueLook, frame_look, tissue_looks
+from palpate.study.imaged import ImagedStates
 from palpate.study.prediction import Prediction
 
 GENERATOR = '<meta name="generator" content="Palpate preview">'  # by which a page of ours is known

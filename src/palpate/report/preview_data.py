@@ -23,8 +23,8 @@ from palpate.report.report_data import (
 )
 from palpate.report.surfaces import MOST_TRIANGLES, image_surface
 from palpate.report.volume import MOST_VOXELS, Grey, grey_volume, label_volume, slice_box, whole_box
-from palpate.study.body import ImagedStates
 from palpate.study.first_look import FrameLook, TissueLook
+from palpate.study.imaged import ImagedStates
 
 # One hue a role, apart on black and for the colour-blind; after Okabe & Ito, "Color Universal Design" (2008).
 ROLE_COLOURS = {"estimate": "#e69f00", "driver": "#56b4e9", "known": "#2ba888", "rigid": "#cfc8b8", "void": "#6d7278"}

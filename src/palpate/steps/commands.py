@@ -1,4 +1,4 @@
-"""The steps of the commands: a new case, its check, its mesh, a simulation, an estimate."""
+"""The steps of the commands: a new case, its check, an estimate, what its images and their noise tell."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 from palpate.errors import ConfigurationError, InputDataError
+from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_label_image
 from palpate.progress import Progress, silent
 from palpate.steps.previewing import checked_with_page, new_case_with_page, place_page, refuse_other_page
 from palpate.steps.results import CaseResult, SavedResult
 from palpate.steps.saving import save_sensitivity
 from palpate.study import run
-from palpate.study import simulate as simulation
 from palpate.study.case import Case
 from palpate.study.check import CheckReport, check_case
 from palpate.study.lock import held_folder
 from palpate.study.new_case import NewCase
-from palpate.study.null_pair import NullPair, drawing_noise
+from palpate.study.null_pair import NullPair, noise_of_drawings
 from palpate.study.outputs import RESULT, OutputFolder, read_json
-from palpate.study.result import SCHEMA, MeshResult, Simulation
+from palpate.study.result import SCHEMA
 from palpate.study.sensitivity import Kept, Sensitivity
 from palpate.study.sensitivity import sensitivity as vary
 from palpate.study.surface_labels import SurfaceLabels, surface_labels
@@ -98,8 +98,9 @@ def noise(
     is given are the blocks [noise] and [discrepancy] of a case. Raises `InputDataError` for images that cannot be used,
     are the same, or cannot be of one state.
     """
-    table = None if labels is None else Path(labels)
-    return drawing_noise(Path(first), Path(second), labels=table, align=align, progress=progress)
+    table = None if labels is None else read_label_table(Path(labels))
+    progress("reading the images")
+    return noise_of_drawings(*(read_label_image(Path(path), names=table) for path in (first, second)), align=align)
 
 
 def voxelise(
@@ -118,24 +119,6 @@ def voxelise(
     grid = None if like is None else read_label_image(Path(like)).grid
     paths = [Path(path) for path in surfaces]
     return surface_labels(paths, spacing_mm=spacing_mm, margin_mm=margin_mm, axes=axes, like=grid, progress=progress)
-
-
-def make_mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
-    """The tetrahedra of a case's reference image, passed through the gate on their quality, as `palpate mesh` has them.
-
-    progress: is called with a sentence at each stage. Raises `InputDataError` for images that cannot be used,
-    `GeometryError` for organs that cannot be meshed, `MeshQualityError` for a mesh that fails its gate.
-    """
-    return run.mesh(case, progress=progress)
-
-
-def simulate(case: Case, *, steps: int = 1, progress: Progress = silent) -> Simulation:
-    """A later state of a case whose tissues all state their `youngs_modulus_kpa`, under its law, motion and loads.
-
-    steps: how many states to give, each in equilibrium at its share of the motion. Raises as `make_mesh` does, and
-    `ConfigurationError` when a modulus is missing, `NotConverged` where a finite-strain path ends early.
-    """
-    return simulation.simulate(case, progress=progress, steps=steps)
 
 
 def estimate(

@@ -50,10 +50,7 @@ def checked_with_page(
 def write_page(case: Case, outputs: OutputFolder, *, progress: Progress = silent) -> None:
     """Write preview.html of a case into its output folder, which this process holds; raises as `place_page` does."""
     refuse_other_page(outputs.path / PREVIEW)
-    page = checked_with_page(case, progress=progress)[1]
-    with outputs.staged() as staging:
-        write_text(staging.area / PREVIEW, page)
-        staging.commit()
+    _put(checked_with_page(case, progress=progress)[1], outputs, PREVIEW)
 
 
 def new_case_with_page(
@@ -85,18 +82,21 @@ def new_case_with_page(
         page = _page(replace(checked, report=report), NOT_YET)
     except Exception:  # a drawing never costs the case
         LOGGER.exception("the preview could not be drawn")
-        return new
-    with outputs.staged() as staging:
-        write_text(staging.area / PREVIEW, page)
-        staging.commit()
+    else:
+        _put(page, outputs, PREVIEW)
     return new
 
 
 def place_page(page: str, path: Path) -> None:
     """Put a page in its place; raises as `refuse_other_page`, and `ResourceError` where the disk refuses."""
     refuse_other_page(path)
-    with held_folder(path.parent), OutputFolder(path.parent).staged() as staging:
-        write_text(staging.area / path.name, page)
+    with held_folder(path.parent):
+        _put(page, OutputFolder(path.parent), path.name)
+
+
+def _put(page: str, outputs: OutputFolder, name: str) -> None:
+    with outputs.staged() as staging:
+        write_text(staging.area / name, page)
         staging.commit()
 
 

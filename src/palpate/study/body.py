@@ -1,22 +1,17 @@
-"""From the images of a case to a body that can be computed with: alignment, mesh, space, motion, targets."""
+"""From the images of a case to a body that can be computed with: mesh, space, motion, unknowns, targets."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.errors import ConfigurationError, InputDataError
+from palpate.errors import ConfigurationError
 from palpate.findings import Finding
-from palpate.images.alignment import Alignment, Motion, align, moved
-from palpate.images.checks import check_headers, check_images, later_names
 from palpate.images.distance import observation_width
-from palpate.images.registration import ON, Registration, registration
-from palpate.images.segmentation import Segmentation
-from palpate.images.surface_alignment import align_surfaces
 from palpate.images.tissue import Role
 from palpate.inversion import InverseProblem, LaterState
 from palpate.mechanics.boundary import outer_constraint
@@ -33,18 +28,17 @@ from palpate.mesh.layers import Layer, layer_thickness_mm, layered_space, layers
 from palpate.mesh.quality import MeshQuality, mesh_figures
 from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.tet_mesh import TetMesh
-from palpate.observation.contract import DataSource, Imaged, ImagedBody, Observation, OfInstrument
+from palpate.observation.contract import Imaged, ImagedBody, Observation, OfInstrument
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.prescribed_motion import FrameMotion, PrescribedMotion, prescribed_motion
 from palpate.observation.registry import observations
-from palpate.progress import Progress, silent
+from palpate.progress import Progress
 from palpate.study.case import Case
 from palpate.study.case_loads import case_loads
-from palpate.study.contacts import every_finding
 from palpate.study.edge_length import EdgeLength
+from palpate.study.imaged import ImagedStates
 from palpate.study.meshing import ReferenceMesh, mesh_reference
 from palpate.study.poisson_ratios import with_stated_priors
-from palpate.study.refusals import refuse_lost, refuse_unmeshable
 from palpate.unknowns import (
     Block,
     frame_blocks,
@@ -58,43 +52,10 @@ from palpate.unknowns import (
     wall_blocks,
 )
 
-SMALL_FRAME_MOTION = 1.0 / 3.0  # of what the organs do against each other: a smaller one is not worth a word
-LEVER_MM = 25.0  # about the size of an organ, at which a turn counts as a motion
-SEEN_MM = 0.2  # less is the measurement's own error
-STATED = (
-    "motion-below-noise",
-    "sides-exchanged",
-    "front-exchanged",
-)  # findings on contacts stand in the result as observed shares
-
-
-@dataclass(frozen=True, slots=True)
-class ImagedStates:
-    """The reference state and the later states, brought to it; `bones`: each later state's motions by tissue index.
-
-    `inputs`: SHA-256 of each file that was read for them, by its key in `result.json`; `alignments`: how each later
-    state lay before it was brought to the first; none where nothing was aligned; `data`: measurements beside the
-    images; `mesh`: where the body is given as one, and no later state is imaged.
-    """
-
-    before: Segmentation
-    after: tuple[Segmentation, ...]
-    bones: tuple[Mapping[int, Motion], ...]
-    findings: tuple[Finding, ...]
-    inputs: Mapping[str, str] = field(default_factory=dict)
-    data: tuple[DataSource, ...] = ()
-    alignments: tuple[Registration, ...] = ()
-    mesh: TetMesh | None = None
-
-    @property
-    def n_later(self) -> int:
-        """Number of later states, imaged or not."""
-        return max(len(self.bones), len(self.after))
-
-    @property
-    def later(self) -> tuple[Segmentation | None, ...]:
-        """The image of each later state, None where there is none."""
-        return self.after or (None,) * self.n_later
+NOTHING_MOVES = (
+    'nothing moves this body: no tissue has role = "driver" (or "rigid", and moves between the images), so no'
+    " modulus can be estimated; give the role driver to the hollow organ whose wall deforms the others"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,122 +88,6 @@ class Body:
         """What observations are made of, under the noise that a case states."""
         states = self.states
         return ImagedBody(self.space, states.before, states.after, self.smoothing_mm, stated_noise)
-
-
-def aligned(
-    before: Segmentation,
-    after: tuple[Segmentation, ...],
-    *,
-    method: str,
-    loaded: bool = False,
-    progress: Progress = silent,
-) -> ImagedStates:
-    """Bring the later images to the first (`method`: "rigid-tissues", "surfaces" or "none") and check them all.
-
-    `loaded`: whether known loads act on the body, for what is found of its motion.
-    Raises `InputDataError` as `check_images`, `align` and `refuse_lost` do, `GeometryError` as `refuse_unmeshable`.
-    """
-    found = brought(before, after, method=method, progress=progress)
-    progress("checking the images")
-    findings, images = [*found.findings, *check_images(before, found.after)], found.after
-    refuse_unmeshable(before, "before")
-    for name, image in zip(later_names(len(images)), images, strict=True):
-        refuse_unmeshable(image, name)
-        refuse_lost(before, image, name)
-    findings += [finding for finding in every_finding(before, images, loaded=loaded) if finding.code in STATED]
-    return replace(found, findings=tuple(findings))
-
-
-def brought(
-    before: Segmentation, after: tuple[Segmentation, ...], *, method: str, progress: Progress = silent
-) -> ImagedStates:
-    """Bring the later images to the first as `aligned` does, but check nothing besides their headers.
-
-    Raises `InputDataError` as `align` and `align_surfaces`.
-    """
-    images, bones, findings, alignments = [], [], list[Finding](), list[Registration]()
-    if method == "none":
-        for name, image in zip(later_names(len(after)), after, strict=True):
-            progress(f"looking for a motion of the whole in '{name}'")
-            findings += check_headers(before.grid, image.grid, name)
-            findings += _unaligned_findings(before, image, name)
-        return ImagedStates(before, after, tuple(dict[int, Motion]() for _ in after), tuple(findings))
-    rigid = {i: t.name for i, t in enumerate(before.tissues) if t.role is Role.RIGID}
-    for name, image in zip(later_names(len(after)), after, strict=True):
-        progress(f"aligning '{name}' on {ON[method]}")
-        findings += check_headers(before.grid, image.grid, name)
-        alignment = align(before, image) if rigid or method == "rigid-tissues" else None
-        fit = alignment.overall if alignment and method == "rigid-tissues" else align_surfaces(before, image)
-        alignments.append(registration(before, image, fit, by=method))
-        progress(f"'{name}' {alignments[-1].in_words}")
-        images.append(moved(image, fit.motion.inverse()))
-        bones.append({i: alignment.remaining(bone, fit) for i, bone in rigid.items()} if alignment else {})
-        findings += _alignment_findings(alignment, name) if alignment else []
-        findings += _frame_findings(before, alignments[-1], name)
-    return ImagedStates(before, tuple(images), tuple(bones), tuple(findings), alignments=tuple(alignments))
-
-
-def _frame_findings(before: Segmentation, found: Registration, name: str, *, aligned: bool = True) -> list[Finding]:
-    """What is said of a motion of the whole that is larger than a third of what the organs do against each other."""
-    own = found.own_motion_mm(before.tissues)
-    moved_mm = float(np.hypot(found.distance_mm, LEVER_MM * np.deg2rad(found.rotation_deg)))
-    if moved_mm <= SMALL_FRAME_MOTION * own or moved_mm < SEEN_MM:
-        return []
-    size = f"{found.distance_mm:.1f} mm and {found.rotation_deg:.1f} degrees"
-    place = f"in '{name}' ({size})"
-    if aligned:
-        text = (
-            f"'{name}' lay {size} elsewhere, measured on {ON[found.by]}, where organs and drivers move by {own:.2g} mm"
-            " against each other: it was brought back before anything was compared; look at the alignment in the report"
-        )
-        return [Finding("frame-aligned", text, place=place)]
-    text = (
-        f"all surfaces together say that '{name}' lies {size} elsewhere, where organs and drivers move by {own:.2g} mm"
-        " against each other, and nothing was done about it, for the case states that the images lie on each other: an"
-        " offset in a header (half a voxel, say), or a patient who lay otherwise, will pass for motion of the organs."
-        ' Look at the headers, or set images.align = "surfaces"'
-    )
-    return [Finding("frame-moves", text, place=place)]
-
-
-def _unaligned_findings(before: Segmentation, image: Segmentation, name: str) -> list[Finding]:
-    """What is said of a later image that is taken as it lies."""
-    try:
-        found = registration(before, image, align_surfaces(before, image), by="surfaces")
-    except InputDataError:  # too little is seen for a motion of the whole; nothing rests on it here
-        return []
-    return _frame_findings(before, found, name, aligned=False)
-
-
-def _alignment_findings(alignment: Alignment, name: str) -> list[Finding]:
-    """What the motion of the bones to the image called `name` rests on, all bones in one finding a cause."""
-    findings = []
-    unseen = [bone for bone, fit in alignment.tissues.items() if fit.n_points == 0]
-    if unseen:
-        text = (
-            f"too little of the surface of {_quoted(unseen)} is seen in '{name}' for a motion of its own, so that it"
-            " moves with the other rigid tissues; a larger field of view shows more"
-        )
-        findings.append(Finding("rigid-unseen", text, place=f"in '{name}' ({_quoted(unseen)})"))
-    if alignment.loose:
-        off = ", ".join(f"'{bone}' {distance:.1f} mm" for bone, distance in alignment.loose.items())
-        text = (
-            f"pieces of a rigid tissue lie off the motion of the whole, which moves as one body, in '{name}': {off};"
-            " give each bone a tissue of its own"
-        )
-        findings.append(Finding("several-bodies", text, place=f"in '{name}' ({off})"))
-    round_ones = [bone for bone, fit in alignment.tissues.items() if len(fit.undetermined)]
-    if round_ones:
-        text = (
-            f"the surface of {_quoted(round_ones)} does not show all of its rotation from 'before' to '{name}', and is"
-            " taken as not turning where it does not; join it to a bone that it moves with, if there is one"
-        )
-        findings.append(Finding("rotation-undetermined", text, place=f"to '{name}' ({_quoted(round_ones)})"))
-    return findings
-
-
-def _quoted(names: Sequence[str]) -> str:
-    return ", ".join(f"'{name}'" for name in names)
 
 
 def make_body(states: ImagedStates, case: Case, *, progress: Progress) -> Body:
@@ -314,7 +159,11 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
     bodies = [body if body.layers == shared else _remade(body, case, layers=shared) for body in bodies]
     progress("distances to the surfaces of all images")
     noise = stated_noise(case)
-    imaged = [(r, o) for r, body in enumerate(bodies) for o in _seen(body, noise)]
+    shown = [  # nothing of states that are not imaged
+        observations(body.imaged(noise)) if body.states.after else tuple(() for _ in body.states.bones)
+        for body in bodies
+    ]
+    imaged = [(r, o) for r, of_body in enumerate(shown) for o in of_body]
     measured = [of for body in bodies for of in body.measured]
     seen = [(r, (*o, *(term for s, term in measured if s == n))) for n, (r, o) in enumerate(imaged, start=1)]
     progress("assembling one stiffness matrix a tissue")
@@ -322,10 +171,7 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
     pairs = [pair for body, first in zip(bodies, numbers, strict=False) for pair in _models(body, case, first)]
     models = tuple(model for model, _ in pairs)
     if not case.known_force and not any(motion.walls or model.constraint.offset.any() for model, motion in pairs):
-        raise ConfigurationError(  # at rest every modulus explains the images equally badly
-            'nothing moves this body: no tissue has role = "driver" and no `rigid` tissue moves between the images, so'
-            " no modulus can be estimated; give the role driver to the hollow organ whose wall deforms the others"
-        )
+        raise ConfigurationError(NOTHING_MOVES)  # at rest every modulus explains the images equally badly
     strained = [body.strained for body in bodies for _ in range(body.states.n_later)]
     finite = _finite_strain(models, strained, case)
     states = tuple(
@@ -345,11 +191,6 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
         dilatation=choose_element(case.mechanics.element).dilatation,
     )
     return InverseProblem(states, with_stated_priors(parameters, case))
-
-
-def _seen(body: Body, noise: NoiseModel | None) -> tuple[tuple[Observation, ...], ...]:
-    """What each later image shows; nothing of states that are not imaged."""
-    return observations(body.imaged(noise)) if body.states.after else tuple(() for _ in body.states.bones)
 
 
 def _blocks(

@@ -2,140 +2,32 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, field
 
 from palpate.errors import ConfigurationError
-from palpate.images.named_labels import MAX_LABEL, MAX_NAME, computed_by_spreadsheets
-from palpate.images.tissue import FieldPrior, Role, Tissue
+from palpate.images.tissue import Role, Tissue
 from palpate.mechanics.laws.contract import Law
-from palpate.mechanics.laws.registry import LAWS, law_from, law_parameters
+from palpate.mechanics.laws.registry import law_from, law_parameters
 from palpate.mechanics.solvers.registry import SOLVERS
 from palpate.observation.contract import DataFile
-from palpate.study.case_data import CaseData
-from palpate.study.schema import nearest, rule, shown
-from palpate.uncertainty.intervals import NORMAL_95
+from palpate.study.case_body import AUTO, LAW_NAMES, SEED, CaseSurface, Images, MeshBody, Motion, Pair, Phantom
+from palpate.study.case_data import CaseData, CaseLoad
+from palpate.study.case_tissue import KILOPASCALS, REMAINING, CaseTissue, refuse_name
+from palpate.study.schema import rule, shown
 
-REMAINING = "remaining"
-AUTO = "auto"
-GAUSSIAN, TOTAL_VARIATION = FIELD_PRIORS = ("gaussian", "total-variation")
-TISSUE_ROLES = tuple(str(role) for role in Role if role is not Role.SLIDING)
 HELD = ("fixed", "sliding")  # outer boundaries that leave a body no rigid motion
-SURFACE_ROLES = {  # of what lies behind a surface of a mesh
-    "moving": Role.DRIVER,
-    "fixed": Role.RIGID,
-    "sliding": Role.SLIDING,
-    "free": Role.VOID,
-    "prescribed": Role.RIGID,
-}
-LAW_NAMES = tuple(LAWS)
 SOLVER_NAMES = ("auto", *SOLVERS)
 
 POSITIVE_NUMBERS = "a list of positive numbers"
 LOW_HIGH = "[low, high] with low < high"
-LARGEST_SEED = 2**53 - 1  # the largest whole number that JSON keeps everywhere
 RATIOS = (1e-6, 1e6)
 SAMPLES = (100, 100_000)  # draws of a chain: with fewer nothing is told of the tails, more take hours
-KILOPASCALS = (1e-3, 1e9)  # of a modulus: from the softest gels to diamond
-POISSON_RATIO = 0.45
 SOUGHT_RATIOS = (0.02, 0.4995)  # between which a Poisson's ratio is searched
-RATIO_SD, RATIO_SDS = 0.03, (1e-4, 10.0)  # of what is believed of one: soft tissue is usually given 0.40 to 0.49
-POISSON_RATIOS = (-0.99, 0.4999)  # beyond, a solid loses its shape or its volume's give, and equations their digits
-STRESSES_KPA = (-1e4, 1e4)
-SEED = rule(between=(0, LARGEST_SEED))
-NOT_EMPTY = rule(test=bool, wanted="a list with at least one entry")
 
 
 def _ordered(bounds: tuple[float, float]) -> bool:
     return bounds[0] < bounds[1]
-
-
-def _label(value: object) -> tuple[int, ...] | str:
-    """A tissue's `label`: an integer, a list of integers, a name of the table, or "remaining"."""
-    if isinstance(value, str) and value:
-        return value
-    items = value if isinstance(value, list) else [value]
-    whole = [item for item in items if isinstance(item, int) and not isinstance(item, bool)]
-    if not items or whole != items or not 0 <= min(whole) <= max(whole) <= MAX_LABEL:
-        raise ConfigurationError(
-            f"a tissue's label is {shown(value)}; it must be an integer from 0 to {MAX_LABEL}, a list of them, a name"
-            f" of the label table, or '{REMAINING}'"
-        )
-    return tuple(items)
-
-
-def refuse_name(name: str, of: str) -> None:
-    """Raise `ConfigurationError` when `name` is no printable name of 1 to 200 characters; `of`: what it is of."""
-    if not name.isprintable() or not name.strip() or len(name) > MAX_NAME:
-        raise ConfigurationError(f"{of} is {shown(name)}; give a printable name of 1 to {MAX_NAME} characters")
-
-
-def is_tissue_name(name: str) -> bool:
-    """Whether a printable name may be a tissue's: our files list it beside other keys and in a table of cells."""
-    return name != "after" and name == name.strip() and not computed_by_spreadsheets(name)
-
-
-@dataclass(frozen=True, slots=True)
-class Images:
-    """Label images: `before` the reference state, `after` the later states; `names` a label table; grey images.
-
-    `after` may be left out where [motion] says how the driver moves, or [[loads]] act. `body_from_ct`: label 0 is air,
-    or what the body lies on, only outside the body that the grey image of its state shows, a CT in HU; inside it, and
-    where a state has none, it is of the remaining tissue.
-    """
-
-    before: Path
-    after: tuple[Path, ...] = field(default=(), metadata=NOT_EMPTY)
-    names: Path | None = None
-    intensities_before: Path | None = None
-    intensities_after: tuple[Path, ...] = ()
-    align: str = field(default=AUTO, metadata=rule(choices=(AUTO, "rigid-tissues", "surfaces", "none")))
-    body_from_ct: bool = False
-
-    def __post_init__(self) -> None:
-        if self.body_from_ct and self.intensities_before is None:
-            raise ConfigurationError("[images] body_from_ct needs the CT of the reference state: intensities_before")
-
-
-@dataclass(frozen=True, slots=True)
-class MeshBody:
-    """A body that is given as a mesh, RAS mm; `tissue_data`: the cell data that tell the tissue."""
-
-    mesh: Path
-    tissue_data: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class CaseSurface:
-    """A named surface of a mesh: a group of triangles, an outermost plane, or all of the boundary.
-
-    `where`: the group's name, "x_min" ... "z_max" within `within_mm`, or "boundary". `boundary` "moving": its motion is
-    an unknown; "fixed": it is held; "sliding": it moves within itself alone; "free": nothing holds it, loads may act;
-    "prescribed": it moves as the measured points of its state say.
-    """
-
-    name: str
-    where: str
-    boundary: str = field(default="moving", metadata=rule(choices=tuple(SURFACE_ROLES)))
-    within_mm: float = field(default=1.0, metadata=rule(between=(1e-6, 1e4)))
-
-    def __post_init__(self) -> None:
-        refuse_name(self.name, "the name of a surface")
-
-    @property
-    def behind(self) -> Tissue:
-        """The hollow tissue that stands behind it in a mesh."""
-        return Tissue(self.name, SURFACE_ROLES[self.boundary])
-
-
-@dataclass(frozen=True, slots=True)
-class Pair:
-    """A further pair of images of the same patient, with its own reference state."""
-
-    before: Path
-    after: tuple[Path, ...] = field(metadata=NOT_EMPTY)
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,105 +64,6 @@ class Discrepancy:
 
 
 @dataclass(frozen=True, slots=True)
-class CaseTissue:
-    """A tissue as the case names it: `label` is a tuple of labels, a name of the label table, or "remaining".
-
-    `poisson_ratio` None: 0.45, or what a phantom draws; `poisson_ratio_sd`: standard deviation of what is believed of
-    it where it is sought, None: 0.03. `youngs_modulus_kpa`: a number, or the 95 % range of what is believed of a
-    `known` one. `modulus` "field": it varies in the tissue and is mapped; `field_sd`: prior standard deviation of ln E
-    inside, `field_length_mm`: of its kernel; `field_prior`: Gaussian, or by its total variation; `field_modes`: how
-    many modes make it at the most.
-    """
-
-    name: str
-    label: tuple[int, ...] | str = field(metadata=rule(convert=_label))
-    role: Role = field(metadata=rule(choices=TISSUE_ROLES))
-    poisson_ratio: float | None = field(
-        default=None,
-        metadata=rule(
-            between=POISSON_RATIOS,
-            wanted="an isotropic elastic solid needs -1 < nu < 0.5; soft tissue is usually given 0.40 to 0.49",
-        ),
-    )
-    youngs_modulus_kpa: float | tuple[float, float] | None = field(
-        default=None,
-        metadata=rule(between=KILOPASCALS, wanted="a positive number in kPa (soft tissue: 0.5 to 1000 kPa)"),
-    )
-    density_kg_m3: float = field(default=1000.0, metadata=rule(between=(0.1, 3e4)))
-    poisson_ratio_sd: float | None = field(default=None, metadata=rule(between=RATIO_SDS))
-    modulus: str = field(default="one", metadata=rule(choices=("one", "field")))
-    field_sd: float = field(default=0.7, metadata=rule(between=(0.01, 3.0)))
-    field_length_mm: float = field(default=8.0, metadata=rule(between=(1.0, 1e3)))
-    field_prior: str = field(default=GAUSSIAN, metadata=rule(choices=FIELD_PRIORS))
-    field_modes: int = field(default=400, metadata=rule(between=(1, 2000)))
-
-    def __post_init__(self) -> None:
-        refuse_name(self.name, "the name of a tissue")
-        if not is_tissue_name(self.name):
-            raise ConfigurationError(
-                f"a tissue cannot be called {shown(self.name)}; choose another name for it: not 'after', no blanks"
-                " around it, and nothing that spreadsheets compute, which begins with =, +, - or @ (also after a ;)"
-            )
-        if isinstance(self.label, str):
-            refuse_name(self.label, f"the label of tissue '{self.name}'")
-        if isinstance(self.youngs_modulus_kpa, tuple):
-            if self.role is not Role.KNOWN:
-                raise ConfigurationError(
-                    f"tissue '{self.name}': youngs_modulus_kpa is a range, which is what is believed of a `known`"
-                    f" modulus, but its role is '{self.role}'; give a number, or leave it out"
-                )
-            if not self.youngs_modulus_kpa[0] < self.youngs_modulus_kpa[1]:
-                raise ConfigurationError(
-                    f"tissue '{self.name}': youngs_modulus_kpa is {shown(self.youngs_modulus_kpa)}; a range begins with"
-                    " its smaller end"
-                )
-        if self.modulus == "field" and self.role is not Role.ESTIMATE:
-            raise ConfigurationError(
-                f"tissue '{self.name}': modulus is \"field\", but its role is '{self.role}'; only a tissue whose"
-                " modulus is estimated can be mapped: give it the role `estimate`, or leave `modulus` out"
-            )
-        self.with_labels(())  # a tissue's constants are checked by the tissue itself
-
-    def with_labels(self, labels: tuple[int, ...]) -> Tissue:
-        """The tissue with its labels; raises `ConfigurationError` when its constants are impossible."""
-        ratio = POISSON_RATIO if self.poisson_ratio is None else self.poisson_ratio
-        believed = FieldPrior(
-            self.field_sd, self.field_length_mm, self.field_prior == TOTAL_VARIATION, self.field_modes
-        )
-        mapped = believed if self.modulus == "field" else None
-        return Tissue(self.name, self.role, labels, ratio, self.modulus_kpa, modulus_sd=self.modulus_sd, field=mapped)
-
-    @property
-    def modulus_kpa(self) -> float | None:
-        """Young's modulus, kPa: the number that is given, or the geometric mean of a range's ends."""
-        given = self.youngs_modulus_kpa
-        return math.sqrt(given[0] * given[1]) if isinstance(given, tuple) else given
-
-    @property
-    def modulus_sd(self) -> float:
-        """Standard deviation of ln E, by the 95 % range that is given; 0 of a number."""
-        given = self.youngs_modulus_kpa
-        return math.log(given[1] / given[0]) / (2.0 * NORMAL_95) if isinstance(given, tuple) else 0.0
-
-    def resolve(self, names: Mapping[int, str]) -> Tissue:
-        """The tissue with the labels that `names` (label -> name) gives to its label's name.
-
-        Raises `ConfigurationError` when the table has no such name.
-        """
-        if self.label == REMAINING:
-            return self.with_labels(())
-        if not isinstance(self.label, str):
-            return self.with_labels(self.label)
-        labels = tuple(sorted(number for number, name in names.items() if name == self.label))
-        if not labels:
-            known = nearest(self.label, names.values()) if names else "give a label table, [images] names"
-            raise ConfigurationError(
-                f"tissue '{self.name}': no label is called '{self.label}' in the label table; {known}"
-            )
-        return self.with_labels(labels)
-
-
-@dataclass(frozen=True, slots=True)
 class Mechanics:
     """Material law, finite element and linear solver (`palpate.mechanics.laws`, `.dilatation`, `.solvers.registry`).
 
@@ -289,56 +82,6 @@ class Mechanics:
     def material_law(self) -> Law:
         """The law with its parameters."""
         return law_from(self.law, self.law_parameters)
-
-
-@dataclass(frozen=True, slots=True)
-class CaseLoad:
-    """A known load on a later state: a pressure or traction on a surface, or gravity; kPa, RAS directions.
-
-    `surface`: a hollow tissue whose wall moves freely (role `void`), or "outer", the cut of the image; a pressure of
-    `pressure_kpa` pushes into the body, on the surface as it moves or (`following` false) as it was; `traction_kpa`
-    (3,) is per area at rest; `acceleration_m_s2` (3,) acts on the tissues' `density_kg_m3`. `state`: number, from 1, of
-    the later image in which it acts, those of further [[pairs]] after those of [images]; None: it acts in all of them;
-    0: it acts in the reference state, whose shape the images, or the mesh, show under it.
-    """
-
-    kind: str = field(metadata=rule(choices=("pressure", "traction", "gravity")))
-    state: int | None = field(default=None, metadata=rule(between=(0, 1000)))
-    surface: str | None = None
-    pressure_kpa: float | None = field(default=None, metadata=rule(between=STRESSES_KPA))
-    following: bool = True
-    traction_kpa: tuple[float, float, float] | None = field(default=None, metadata=rule(between=STRESSES_KPA))
-    acceleration_m_s2: tuple[float, float, float] | None = field(default=None, metadata=rule(between=(-100.0, 100.0)))
-
-    @property
-    def taken(self) -> CaseLoad:
-        """What takes the load off a body that bears it: its forces, turned round."""
-        return replace(
-            self,
-            following=False,
-            pressure_kpa=None if self.pressure_kpa is None else -self.pressure_kpa,
-            traction_kpa=_turned(self.traction_kpa),
-            acceleration_m_s2=_turned(self.acceleration_m_s2),
-        )
-
-    def __post_init__(self) -> None:
-        needed = {
-            "pressure": ("surface", "pressure_kpa"),
-            "traction": ("surface", "traction_kpa"),
-            "gravity": ("acceleration_m_s2",),
-        }[self.kind]
-        keys = ("surface", "pressure_kpa", "traction_kpa", "acceleration_m_s2")
-        given = [key for key in keys if getattr(self, key) is not None]
-        for key in needed:
-            if key not in given:
-                raise ConfigurationError(f"[[loads]]: a {self.kind} needs the key '{key}'")
-        for key in given:
-            if key not in needed:
-                raise ConfigurationError(f"[[loads]]: a {self.kind} has no '{key}'; it has {' and '.join(needed)}")
-
-
-def _turned(vector: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
-    return None if vector is None else (-vector[0], -vector[1], -vector[2])
 
 
 @dataclass(frozen=True, slots=True)
@@ -432,25 +175,6 @@ class Estimate:
                     f"[estimate] {name}: {shown(outside)} do not lie between the bounds {list(bounds or ())}; move the"
                     " start or widen the bounds"
                 )
-
-
-@dataclass(frozen=True, slots=True)
-class Phantom:
-    """A scene with a known truth instead of images; `law`: that of the truth (default: the case's).
-
-    The truth's moduli and Poisson's ratios are those that the case's tissues state, else the phantom's own.
-    """
-
-    kind: str = field(metadata=rule(choices=("pelvis", "spheres")))
-    seed: int = field(default=1, metadata=SEED)
-    law: str | None = field(default=None, metadata=rule(choices=LAW_NAMES))
-
-
-@dataclass(frozen=True, slots=True)
-class Motion:
-    """The driver's motion in a simulation: how far its wall moves outwards, mm."""
-
-    filling_mm: float = field(default=7.0, metadata=rule(between=(-100.0, 100.0)))
 
 
 @dataclass(frozen=True, slots=True)

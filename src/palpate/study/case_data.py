@@ -1,8 +1,8 @@
-"""[[data]] of a case: measurements of a later state beside its images, or in place of them."""
+"""[[data]] and [[loads]] of a case: measurements of a later state, and the loads that act in it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from palpate.study.schema import rule
 
 Row = tuple[float, float, float]
 FORCES_N = (-1e9, 1e9)
+STRESSES_KPA = (-1e4, 1e4)
 register_brought()  # before the words that a case may use are listed
 
 
@@ -90,3 +91,53 @@ class CaseData:
             self.sd_n or 1.0,
             self.offset_sd_n,
         )
+
+
+@dataclass(frozen=True, slots=True)
+class CaseLoad:
+    """A known load on a later state: a pressure or traction on a surface, or gravity; kPa, RAS directions.
+
+    `surface`: a hollow tissue whose wall moves freely (role `void`), or "outer", the cut of the image; a pressure of
+    `pressure_kpa` pushes into the body, on the surface as it moves or (`following` false) as it was; `traction_kpa`
+    (3,) is per area at rest; `acceleration_m_s2` (3,) acts on the tissues' `density_kg_m3`. `state`: number, from 1, of
+    the later image in which it acts, those of further [[pairs]] after those of [images]; None: it acts in all of them;
+    0: it acts in the reference state, whose shape the images, or the mesh, show under it.
+    """
+
+    kind: str = field(metadata=rule(choices=("pressure", "traction", "gravity")))
+    state: int | None = field(default=None, metadata=rule(between=(0, 1000)))
+    surface: str | None = None
+    pressure_kpa: float | None = field(default=None, metadata=rule(between=STRESSES_KPA))
+    following: bool = True
+    traction_kpa: Row | None = field(default=None, metadata=rule(between=STRESSES_KPA))
+    acceleration_m_s2: Row | None = field(default=None, metadata=rule(between=(-100.0, 100.0)))
+
+    @property
+    def taken(self) -> CaseLoad:
+        """What takes the load off a body that bears it: its forces, turned round."""
+        return replace(
+            self,
+            following=False,
+            pressure_kpa=None if self.pressure_kpa is None else -self.pressure_kpa,
+            traction_kpa=_turned(self.traction_kpa),
+            acceleration_m_s2=_turned(self.acceleration_m_s2),
+        )
+
+    def __post_init__(self) -> None:
+        needed = {
+            "pressure": ("surface", "pressure_kpa"),
+            "traction": ("surface", "traction_kpa"),
+            "gravity": ("acceleration_m_s2",),
+        }[self.kind]
+        keys = ("surface", "pressure_kpa", "traction_kpa", "acceleration_m_s2")
+        given = [key for key in keys if getattr(self, key) is not None]
+        for key in needed:
+            if key not in given:
+                raise ConfigurationError(f"[[loads]]: a {self.kind} needs the key '{key}'")
+        for key in given:
+            if key not in needed:
+                raise ConfigurationError(f"[[loads]]: a {self.kind} has no '{key}'; it has {' and '.join(needed)}")
+
+
+def _turned(vector: Row | None) -> Row | None:
+    return None if vector is None else (-vector[0], -vector[1], -vector[2])

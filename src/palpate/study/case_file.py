@@ -15,7 +15,8 @@ from palpate.errors import ConfigurationError
 from palpate.images.input_file import read_input
 from palpate.images.named_labels import printable
 from palpate.images.tissue import Role
-from palpate.study.case import POISSON_RATIO, RATIO_SD, Case, CaseTissue
+from palpate.study.case import Case
+from palpate.study.case_tissue import POISSON_RATIO, RATIO_SD, CaseTissue
 from palpate.study.schema import Rule, read_table, shortened
 
 LARGEST_FILE = 100_000  # bytes; a case is a page of text, and one of a hundred tissues has 40 000

@@ -12,7 +12,8 @@ from palpate.findings import Finding
 from palpate.images.tissue import Role
 from palpate.mechanics.loads import Load, boundary_named, gravity, pressure, traction
 from palpate.mesh.space import LagrangeSpace
-from palpate.study.case import Case, CaseLoad
+from palpate.study.case import Case
+from palpate.study.case_data import CaseLoad
 
 
 def case_loads(case: Case, space: LagrangeSpace, state: int, *, share: float = 1.0) -> tuple[Load, ...]:

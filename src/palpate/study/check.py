@@ -12,7 +12,7 @@ import numpy as np
 
 from palpate.errors import GeometryError, InputDataError, PalpateError, ResourceError
 from palpate.findings import Finding, of_pair, one_a_cause, rank
-from palpate.images.checks import check_pair, check_segmentation, later_names
+from palpate.images.checks import OBSERVED, check_pair, check_segmentation, later_names
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_intensities
 from palpate.images.registration import Registration, length_text
@@ -20,7 +20,7 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.observation.observed_surface import field_of_view, observed_surfaces, seen_in
 from palpate.progress import Progress
-from palpate.study.body import Body, ImagedStates, brought, make_body
+from palpate.study.body import Body, make_body
 from palpate.study.case import Case
 from palpate.study.case_file import read_case
 from palpate.study.case_loads import load_warnings
@@ -36,6 +36,7 @@ from palpate.study.cost import (
     machine_memory_gb,
 )
 from palpate.study.edge_length import case_domain, edge_length_of
+from palpate.study.imaged import ImagedStates, brought
 from palpate.study.meshing import refuse_edge
 from palpate.study.plausibility import unit_warnings
 from palpate.study.prediction import Prediction
@@ -45,7 +46,6 @@ from palpate.study.run import refuse_what_cannot_be_estimated
 from palpate.study.samples import require_samples
 
 T = TypeVar("T")
-OBSERVED = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
 REFUSED_FINDINGS = {"hardly-observed": GeometryError.exit_code}  # what an estimate refuses, found here as a finding
 
 

@@ -16,7 +16,7 @@ from palpate.images.tissue import Role
 from palpate.images.tissue_distance import REACH_MM, window_around
 from palpate.mechanics.solvers.registry import expected_of_size
 from palpate.memory import available_memory, total_memory
-from palpate.mesh import Box, SizeField, TetMesh
+from palpate.mesh import SizeField, TetMesh
 from palpate.parallel import processors
 from palpate.progress import STAGES, Stage
 from palpate.study.case import Case
@@ -132,7 +132,17 @@ def expected_tets(case: Case, before: Segmentation, after: tuple[Segmentation, .
 
 def tets_by_edge_length(case: Case, before: Segmentation) -> Callable[[EdgeLength], int]:
     """The same as a function of the edge lengths: distances to the organs are computed once."""
-    index, cell = _lattice(before, case_domain(before, case))
+    box = case_domain(before, case)
+    # the tissue at the middles of cells that fill the box, -1 outside the image
+    counts = np.maximum(np.ceil(box.lengths / box.lengths.max() * LATTICE), 4).astype(int)
+    cell = box.lengths / counts
+    ticks = [(np.arange(n) + 0.5) * size for n, size in zip(counts, cell, strict=True)]
+    local = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+    voxels = np.rint(before.grid.index(box.world(local))).astype(np.int64)
+    inside = ((voxels >= 0) & (voxels < before.grid.shape)).all(axis=1)
+    index = np.full(len(voxels), -1, dtype=np.int64)
+    index[inside] = before.index[tuple(voxels[inside].T)]
+    index = index.reshape(tuple(counts))
     tissues = [i for i, tissue in enumerate(before.tissues) if tissue.meshed]
     # the mesher's filler: the remaining tissue if it is meshed, else the largest
     filler = max(tissues, key=lambda i: (not before.tissues[i].labels, before.volume(i)), default=-1)
@@ -171,19 +181,6 @@ def lack_of_memory(cost: ExpectedCost) -> str:
     if has is None or cost.memory_gb <= MEMORY_FACTOR * has:
         return ""
     return f"about {cost.memory_gb:.1f} GB of memory would be needed and this machine has {has:.1f} GB"
-
-
-def _lattice(before: Segmentation, box: Box) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Tissue (n_1, n_2, n_3) at the middles of cells that fill the box, -1 outside the image; their edges (3,) mm."""
-    counts = np.maximum(np.ceil(box.lengths / box.lengths.max() * LATTICE), 4).astype(int)
-    cell = box.lengths / counts
-    ticks = [(np.arange(n) + 0.5) * size for n, size in zip(counts, cell, strict=True)]
-    local = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
-    index = np.rint(before.grid.index(box.world(local))).astype(np.int64)
-    inside = ((index >= 0) & (index < before.grid.shape)).all(axis=1)
-    found = np.full(len(index), -1, dtype=np.int64)
-    found[inside] = before.index[tuple(index[inside].T)]
-    return found.reshape(tuple(counts)), cell
 
 
 def _distance_to_surface(mask: NDArray[np.bool_], cell: NDArray[np.float64]) -> NDArray[np.float64]:

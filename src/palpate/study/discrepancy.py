@@ -108,16 +108,13 @@ def discrepancy_of(inversion: Inversion, states: Sequence[FittedState]) -> Found
             heterogeneity.append(HeterogeneityFound(block.of, learned, float(np.sqrt(patchy))))
         elif block.cause == "frame":
             smooth.setdefault(block.states[0], learned * block.unit_mm)
-    frames = tuple(None if s not in smooth else _frame(fitted, smooth[s]) for s, fitted in enumerate(states))
-    return FoundDiscrepancy(frames, tuple(offsets), tuple(heterogeneity))
-
-
-def _frame(fitted: FittedState, prior_mm: float) -> FrameFound:
-    points = np.unique(fitted.space.facets(cut_faces(fitted.space.mesh)))
-    motion: NDArray[np.float64] = np.linalg.norm(fitted.displacement[points], axis=1)
-    if not len(points):
-        return FrameFound(0.0, 0.0, prior_mm)
-    return FrameFound(float(np.sqrt(np.mean(motion**2))), float(motion.max()), prior_mm)
+    frames = list[FrameFound | None]()
+    for s, fitted in enumerate(states):
+        points = np.unique(fitted.space.facets(cut_faces(fitted.space.mesh)))
+        motion = np.linalg.norm(fitted.displacement[points], axis=1) if len(points) else np.zeros(1)
+        found = FrameFound(float(np.sqrt(np.mean(motion**2))), float(motion.max()), smooth.get(s, 0.0))
+        frames.append(found if s in smooth else None)
+    return FoundDiscrepancy(tuple(frames), tuple(offsets), tuple(heterogeneity))
 
 
 def discrepancy_findings(found: FoundDiscrepancy) -> tuple[Finding, ...]:

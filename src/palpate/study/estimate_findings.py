@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,8 +75,14 @@ def pair_findings(pairs: ImagePairs | None) -> tuple[Finding, ...]:
     """What is told of later images: which the others contradict, which fit worse, whether the rest differ by more."""
     if pairs is None:
         return ()
-    findings = list(_noisy_pairs(pairs))
+    findings, several = list[Finding](), len(pairs.alone) >= LEAST_IMAGES
     for name, pair in zip(later_names(len(pairs.alone)), pairs.alone, strict=True):
+        for kind, noise in pair.noise_mm.items() if several else ():
+            usual = float(np.median([other.noise_mm[kind] for other in pairs.alone if other is not pair]))
+            if noise > NOISIER * usual:
+                text = f"'{name}' fits worse than the other later images: noise of {noise:.2g} mm beside {usual:.2g} mm"
+                advice = f"{text}, so that it counts for less. Look at its labels; it may be left out"
+                findings.append(Finding("pair-noise", advice, place=f"in '{name}'"))
         if pair.outlier:
             moved = ", ".join(f"{tissue} by {by:+.1f}" for tissue, by in pair.influence.items())
             mean = ", ".join(f"{tissue} {value:.3g}" for tissue, value in pairs.mean.items())
@@ -88,19 +94,6 @@ def pair_findings(pairs: ImagePairs | None) -> tuple[Finding, ...]:
         advice = f"{text}: read the mean over them, `image_pairs` in result.json, whose interval holds the differences"
         findings.append(Finding("heterogeneous", advice))
     return tuple(findings)
-
-
-def _noisy_pairs(pairs: ImagePairs) -> Iterable[Finding]:
-    """A finding for each of three or more later images whose residuals have far more noise than those of the others."""
-    if len(pairs.alone) < LEAST_IMAGES:
-        return
-    for name, pair in zip(later_names(len(pairs.alone)), pairs.alone, strict=True):
-        for kind, noise in pair.noise_mm.items():
-            usual = float(np.median([other.noise_mm[kind] for other in pairs.alone if other is not pair]))
-            if noise > NOISIER * usual:
-                text = f"'{name}' fits worse than the other later images: noise of {noise:.2g} mm beside {usual:.2g} mm"
-                advice = f"{text}, so that it counts for less. Look at its labels; it may be left out"
-                yield Finding("pair-noise", advice, place=f"in '{name}'")
 
 
 def data_findings(inversion: Inversion) -> tuple[Finding, ...]:

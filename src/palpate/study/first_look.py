@@ -9,14 +9,13 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.images.checks import share_inside
+from palpate.images.checks import OBSERVED, share_inside
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.mesh.anatomy import Box
 from palpate.study.case import Case
 from palpate.study.edge_length import case_domain
 
-SEEN = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
 TOWARDS = (("left side", "right side"), ("back", "front"), ("feet", "head"))  # low and high end of each RAS axis
 HELD = {
     "fixed": "The frame is held still: what the box cuts does not move.",
@@ -59,7 +58,7 @@ def tissue_looks(before: Segmentation, after: Sequence[Segmentation], box: Box) 
     found = []
     for i, tissue in enumerate(before.tissues):
         volumes = tuple(image.volume(i) / 1000.0 for image in (before, *after))
-        if tissue.role not in SEEN or not all(volumes):
+        if tissue.role not in OBSERVED or not all(volumes):
             found.append(TissueLook(i, volumes))
             continue
         middle = before.middle(i)

@@ -10,11 +10,12 @@ import numpy as np
 from scipy import ndimage
 
 from palpate.errors import InputDataError
+from palpate.images.checks import OBSERVED
 from palpate.images.label_image import LabelImage
 from palpate.images.named_labels import MAX_NAME
 from palpate.images.tissue import Role
 from palpate.images.totalsegmentator import CLASSES
-from palpate.study.case import is_tissue_name
+from palpate.study.case_tissue import is_tissue_name
 from palpate.study.plausibility import TABLE, usual_stiffness
 
 SURROUNDINGS = "surroundings"
@@ -84,8 +85,7 @@ def guess_tissues(before: LabelImage, after: Sequence[LabelImage] = ()) -> tuple
     border = {int(label): float(share) for label, share in zip(at_border, n / n.sum(), strict=True)}
     guesses = [_guess(label, before, after, border) for label in sizes]
     for i, guess in enumerate(guesses):
-        watched = guess.role in (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
-        if watched and any(not np.isin(image.labels, guess.labels).any() for image in after):
+        if guess.role in OBSERVED and any(not np.isin(image.labels, guess.labels).any() for image in after):
             reason = f"'{guess.name}' is absent in a later image"
             guesses[i] = replace(guess, name=SURROUNDINGS, role=Role.KNOWN, reason=reason)
     guesses = _with_driver(_with_one_skeleton(guesses), before, after)

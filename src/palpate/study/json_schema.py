@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from palpate.images.named_labels import MAX_LABEL, MAX_NAME
-from palpate.study.case import Case, CaseTissue
+from palpate.study.case import Case
+from palpate.study.case_tissue import CaseTissue
 from palpate.study.schema import MOST_LETTERS, Rule
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"

@@ -22,8 +22,9 @@ from palpate.mesh.voxelise import voxelise
 from palpate.observation.measured_motion import measured_motion
 from palpate.observation.measured_points import MeasuredPoints
 from palpate.progress import Progress
-from palpate.study.body import ImagedStates
-from palpate.study.case import Case, CaseSurface, MeshBody
+from palpate.study.case import Case
+from palpate.study.case_body import CaseSurface, MeshBody
+from palpate.study.imaged import ImagedStates
 from palpate.study.schema import nearest
 
 OUTSIDE = "outside"

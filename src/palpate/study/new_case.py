@@ -16,12 +16,12 @@ from palpate.images.label_table import read_label_table
 from palpate.images.named_labels import MAX_NAME, printable
 from palpate.images.readers import read_intensities, read_label_image
 from palpate.images.tissue import Role
-from palpate.study.case import REMAINING
 from palpate.study.case_file import relative_path, toml_key, toml_text
+from palpate.study.case_tissue import REMAINING
 from palpate.study.earlier import CASE_NAME
 from palpate.study.guess import GuessedTissue, class_names, guess_tissues
 from palpate.study.outputs import OutputFolder, read_regular, write_text
-from palpate.study.proposed_mesh import MARGIN_MM, Background, background_of, proposed_edge, proposed_window
+from palpate.study.proposed_mesh import MARGIN_MM, background_of, proposed_edge, proposed_window
 
 LARGEST_CASE = 1_000_000  # bytes
 WIDE_MM = 250.0  # of an image: more than the body of many, so that it must show what lies around, too
@@ -123,7 +123,9 @@ def new_case(images: CaseImages, folder: Path) -> NewCase:
     known = class_names(before)
     tissues = guess_tissues(replace(before, names=known.names) if known.names else before, after)
     window = proposed_window(before, tissues)
-    background = _background(images, before, window, tissues)
+    background = None  # label 0 where it is taken for surroundings
+    if not any(0 in tissue.labels for tissue in tissues) and any(not tissue.labels for tissue in tissues):
+        background = background_of(before, window, read_intensities(images.cts[0]) if images.cts else None)
     guessed = tissues
     if background is not None and background.has_air:
         name = next(name for name in ("air", "air around", "label 0") if name not in {t.name for t in guessed})
@@ -143,7 +145,12 @@ def new_case(images: CaseImages, folder: Path) -> NewCase:
         notes.append(background.in_words)
     from_ct = background is not None and background.has_air
     named_by = _identifier([images.before, *images.after])
-    blocks = [f"{_heading(questions, notes)}\nid = {toml_text(named_by)}", _images(images, folder, from_ct=from_ct)]
+    heading = ["# Made by `palpate init`. Every role is a guess: read the reasons, correct what is wrong."]
+    heading += [f"# {line}" for line in ROLES]
+    heading += [_comment(f"QUESTION: {question}") for question in questions]
+    heading += [_comment(f"NOTE: {note}") for note in notes]
+    heading.append(f"id = {toml_text(named_by)}")
+    blocks = ["\n".join(heading), _images(images, folder, from_ct=from_ct)]
     share = float(np.prod([s.stop - s.start for s in window]) / before.labels.size)
     if share < 1.0:
         blocks.append(f'[domain]\nextent = "margin"  # {MARGIN_MM:g} mm around the organs: {share:.0%} of the image')
@@ -161,15 +168,6 @@ def _identifier(images: Sequence[Path]) -> str:
     folder = images[0].absolute().parent.name
     found = alike if len(alike) >= LEAST_NAME else folder or alike
     return printable(found)[:MAX_NAME] or "case"
-
-
-def _background(
-    images: CaseImages, before: LabelImage, window: tuple[slice, ...], tissues: Sequence[GuessedTissue]
-) -> Background | None:
-    """Label 0 where it is taken for surroundings; None where a tissue has it."""
-    if any(0 in tissue.labels for tissue in tissues) or not any(not tissue.labels for tissue in tissues):
-        return None
-    return background_of(before, window, read_intensities(images.cts[0]) if images.cts else None)
 
 
 def _questions(tissues: Sequence[GuessedTissue]) -> tuple[str, ...]:
@@ -195,14 +193,6 @@ def _questions(tissues: Sequence[GuessedTissue]) -> tuple[str, ...]:
             " youngs_modulus_kpa to get kPa"
         )
     return tuple(asked)
-
-
-def _heading(questions: Sequence[str], notes: Sequence[str]) -> str:
-    lines = ["# Made by `palpate init`. Every role is a guess: read the reasons, correct what is wrong."]
-    lines += [f"# {line}" for line in ROLES]
-    lines += [_comment(f"QUESTION: {question}") for question in questions]
-    lines += [_comment(f"NOTE: {note}") for note in notes]
-    return "\n".join(lines)
 
 
 def _images(images: CaseImages, folder: Path, *, from_ct: bool) -> str:

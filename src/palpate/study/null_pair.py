@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,14 +16,11 @@ from palpate.images.alignment import RigidMotion, fit_rigid_motion, moved, seen_
 from palpate.images.checks import check_pair
 from palpate.images.distance import DistanceMap, IsosurfacePoints, observation_width
 from palpate.images.label_image import LabelImage
-from palpate.images.label_table import read_label_table
-from palpate.images.readers import read_label_image
 from palpate.images.segmentation import Segmentation, segment
 from palpate.images.tissue import Role, Tissue
 from palpate.images.tissue_distance import tissue_distance_map
 from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import FitResponse, NoiseModel, fit_noise_model
-from palpate.progress import Progress, silent
 from palpate.study.schema import nearest
 from palpate.uncertainty import NORMAL_95
 
@@ -103,20 +99,6 @@ class NullPair:
         }
 
 
-def drawing_noise(
-    first: Path, second: Path, *, labels: Path | None = None, align: str = "auto", progress: Progress = silent
-) -> NullPair:
-    """Read two label images of one state and compare them; see `noise_of_drawings`.
-
-    labels: a label table. Raises as `read_label_image` and `noise_of_drawings` do.
-    """
-    if align not in ALIGNMENTS:
-        raise ConfigurationError(f"align is '{align}': {nearest(align, ALIGNMENTS)}")
-    table = read_label_table(labels) if labels is not None else None
-    progress("reading the images")
-    return noise_of_drawings(*(read_label_image(path, names=table) for path in (first, second)), align=align)
-
-
 def noise_of_drawings(first: LabelImage, second: LabelImage, *, align: str = "auto") -> NullPair:
     """The noise with which the organs of two label images of one state were drawn.
 
@@ -126,9 +108,12 @@ def noise_of_drawings(first: LabelImage, second: LabelImage, *, align: str = "au
     o follows from it. surface_offset_mm is the root mean square of all offsets, their errors included.
 
     align: "surfaces" brings the second image to the first, all organs as one rigid body, which also takes the rigid
-    part of the noise out; "none" does not, "auto" only where their grids differ. Raises `InputDataError` when the
-    images are the same, show no organ that both have, or cannot be of one state (`check_pair`).
+    part of the noise out; "none" does not, "auto" only where their grids differ. Raises `ConfigurationError` for any
+    other, `InputDataError` when the images are the same, show no organ that both have, or cannot be of one state
+    (`check_pair`).
     """
+    if align not in ALIGNMENTS:
+        raise ConfigurationError(f"align is '{align}': {nearest(align, ALIGNMENTS)}")
     before, after, left_out = _organs(first, second)
     grids = (before.grid, after.grid)
     alike = grids[0].shape == grids[1].shape and np.allclose(grids[0].affine, grids[1].affine, atol=1e-3)

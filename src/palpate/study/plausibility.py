@@ -12,7 +12,7 @@ from typing import Any
 from palpate.findings import Finding
 from palpate.images.tissue import Role
 from palpate.study.case import Case
-from palpate.study.estimation import Estimation
+from palpate.study.estimated import Estimation
 
 MARGIN = 3.0  # methods differ by ten to a hundred times: an estimate is doubtful only well outside what was published
 SOFT_TISSUE_KPA = (0.05, 1000.0)  # of a tissue for whose name nothing was published, with room on both sides

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from palpate.mesh.space import LagrangeSpace
-from palpate.study.case import RATIO_SD, Case
+from palpate.study.case import Case
+from palpate.study.case_tissue import RATIO_SD
 from palpate.uncertainty import Interval
 from palpate.unknowns import ParameterMap, eta_of_ratio
 

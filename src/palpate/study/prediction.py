@@ -7,15 +7,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from palpate.inversion import Objective, first_noise_of, fit_coefficients
+from palpate.inversion import first_noise_of, fit_coefficients
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Progress
 from palpate.study.body import Body, joint_problem, on_linear_elements
 from palpate.study.case import Case, Mechanics
-from palpate.study.estimation import verdict
 from palpate.study.run import inversion_settings
+from palpate.study.verdicts import verdict
 from palpate.uncertainty import Interval, covariance_of, error_noise, log_interval, sandwich_covariance
 
 
@@ -110,8 +109,11 @@ def predicted_intervals(bodies: Sequence[Body], case: Case, *, progress: Progres
     objective, nearby = first_noise_of(problem, settings, progress=progress)
     noise_of = error_noise(nearby.evaluation)
     progress("the information of the images at the guessed moduli")
-    guess = nearby.unknowns.copy()
-    guess[: objective.n_parameters] = _guessed(case, objective, np.median(np.stack(settings.starts), axis=0))
+    guess, stated = nearby.unknowns.copy(), {tissue.name: tissue.modulus_kpa for tissue in case.tissues}
+    guess[: objective.n_parameters] = np.median(np.stack(settings.starts), axis=0)
+    for i, name in enumerate(objective.parameters.tissues):
+        if (kpa := stated.get(name)) is not None:
+            guess[i] = float(np.log(kpa / objective.parameters.scale_kpa))
     fitted = fit_coefficients(objective, guess, bounds=settings.bounds)
     found = covariance_of(objective, fitted.evaluation, (), unknowns=fitted.unknowns, noise_of=noise_of)
     free = sandwich_covariance(*objective.released(fitted.evaluation, fitted.unknowns), noise_of)
@@ -145,13 +147,3 @@ def predicted_intervals(bodies: Sequence[Body], case: Case, *, progress: Progres
         float(np.sqrt(noise.correlation_area / (2.0 * np.pi))),
         case.noise.surface_sd_mm is not None,
     )
-
-
-def _guessed(case: Case, objective: Objective, middle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The parameters (n_parameters,) at the moduli that tissues state, at the middle start where they do not."""
-    stated = {tissue.name: tissue.modulus_kpa for tissue in case.tissues}
-    guess, scale = middle.copy(), objective.parameters.scale_kpa
-    for i, name in enumerate(objective.parameters.tissues):
-        if (kpa := stated.get(name)) is not None:
-            guess[i] = float(np.log(kpa / scale))
-    return guess

@@ -14,7 +14,9 @@ from palpate.images.body_in_ct import outside_body, shows_air
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.segmentation import segment
 from palpate.images.tissue import Role
-from palpate.study.case import REMAINING, Case, CaseTissue, Domain, Images, MeshSettings
+from palpate.study.case import Case, Domain, MeshSettings
+from palpate.study.case_body import Images
+from palpate.study.case_tissue import REMAINING, CaseTissue
 from palpate.study.cost import MEMORY_FACTOR, cost_of_meshes, expected_size, machine_memory_gb, tets_by_edge_length
 from palpate.study.edge_length import edge_length_of
 from palpate.study.guess import GuessedTissue

@@ -1,4 +1,4 @@
-"""What a result was made from: digests of the inputs, versions of the software."""
+"""What a result was made from: names and digests of the inputs, versions of the software."""
 
 from __future__ import annotations
 
@@ -65,3 +65,25 @@ def file_digest(path: Path) -> str:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputDataError(f"cannot read {path}: {reason}; check the path in the case") from error
+
+
+def image_names(case: Case) -> list[str]:
+    """A name for each later image of the case, pair after pair, as in `pair_names`."""
+    return [name for _, later in pair_names(case) for name in later]
+
+
+def pair_names(case: Case) -> list[tuple[str, tuple[str, ...]]]:
+    """Names of the images of each pair, the reference state's and the later ones': their files', no two alike."""
+    if case.body is not None:
+        return [("body", tuple(f"state {number}" for number in range(1, case.n_states + 1)))]
+    if case.images is None:
+        return [("before", ("after",))]
+    pairs = [(case.images.before, case.images.after), *((pair.before, pair.after) for pair in case.pairs)]
+    paths = [path for before, after in pairs for path in (before, *after)]
+    names = [path.name for path in paths]
+    for depth in range(2, max(len(path.parts) for path in paths) + 1):  # folders, to tell two of one name apart
+        alike = [name for name in names if names.count(name) > 1]
+        deeper = ["/".join(path.parts[-depth:]) for path in paths]
+        names = [longer if name in alike else name for name, longer in zip(names, deeper, strict=True)]
+    left = iter(names)
+    return [(next(left), tuple(next(left) for _ in after)) for _, after in pairs]

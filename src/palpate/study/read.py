@@ -22,8 +22,8 @@ from palpate.phantoms.pelvis import PelvisOptions, pelvis, pelvis_anatomy
 from palpate.phantoms.scene import Scene
 from palpate.phantoms.spheres import SpheresOptions, spheres, spheres_anatomy
 from palpate.progress import Progress, silent
-from palpate.study.body import ImagedStates, aligned
 from palpate.study.case import Case
+from palpate.study.imaged import ImagedStates, aligned
 from palpate.study.meshed_body import mesh_states, with_prescribed
 from palpate.study.provenance import file_digest
 from palpate.study.refusals import refuse_large
@@ -48,14 +48,12 @@ def read_states(case: Case, *, progress: Progress = silent) -> ImagedStates:
 
 
 def read_pairs(case: Case, *, progress: Progress = silent) -> tuple[ImagedStates, ...]:
-    """The same of each of the case's further [[pairs]]; their findings begin with the pair's number, from 2."""
+    """The same of each of the case's further [[pairs]]."""
     found, first = [], len(case.images.after) if case.images else 0
-    for number, pair in enumerate(case.pairs, start=2):
-        key = f"pairs[{number - 2}]."
-        states = _read_pair(case, pair.before, pair.after, key=key, first=first, progress=progress)
+    for number, pair in enumerate(case.pairs):
+        key = f"pairs[{number}]."
+        found.append(_read_pair(case, pair.before, pair.after, key=key, first=first, progress=progress))
         first += len(pair.after)
-        findings = tuple(replace(f, message=f"pair {number}: {f.message}") for f in states.findings)
-        found.append(replace(states, findings=findings))
     return tuple(found)
 
 

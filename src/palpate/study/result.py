@@ -17,13 +17,17 @@ from palpate.images.label_image import LabelImage
 from palpate.images.registration import Registration
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
+from palpate.mesh.quality import MeshQuality
 from palpate.mesh.space import LagrangeSpace
-from palpate.study.case import Case, CaseTissue
+from palpate.study.case import Case
 from palpate.study.case_file import case_tables
+from palpate.study.case_tissue import CaseTissue
 from palpate.study.discrepancy import FoundDiscrepancy
-from palpate.study.estimation import Estimation, ModulusEstimate, TissueFit, no_estimate
+from palpate.study.edge_length import EdgeLength
+from palpate.study.estimated import Estimation, ModulusEstimate, no_estimate
 from palpate.study.map_words import map_words
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio
+from palpate.study.provenance import image_names
 from palpate.uncertainty import StiffnessMap
 
 SCHEMA = "palpate.result/1"
@@ -45,6 +49,13 @@ class MeshSummary:
     volume_error: Mapping[str, float]
     edge_length_mm: float | None = None
     edge_length_reason: str = ""
+
+    @classmethod
+    def of(cls, quality: MeshQuality, space: LagrangeSpace, edge: EdgeLength | None = None) -> MeshSummary:
+        """Of a mesh with these figures, and the space on it."""
+        angles = quality.min_dihedral_deg, quality.p5_dihedral_deg
+        stated = (edge.mm, edge.in_words) if edge else (None, "")
+        return cls(quality.nodes, quality.tets, 3 * len(space.points), *angles, quality.volume_error, *stated)
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +181,18 @@ class CaseResult:
             "image_pairs": pairs and _plain(pairs) | {"alone": alone},
             "samples": drawn and drawn.to_dict(),
             "alignment": [found.row(name) for name, found in zip(names, self.every_alignment, strict=False)],
-            "fit": [_fit(name, fits) for name, fits in zip(names, estimation.fits, strict=False)],
+            "fit": [
+                {"after": name}
+                | {
+                    fit.tissue: {
+                        "start": _plain(fit.start),
+                        "end": _plain(fit.end),
+                        "observed_share": fit.observed_share,
+                    }
+                    for fit in fits
+                }
+                for name, fits in zip(names, estimation.fits, strict=False)
+            ],
             "forces": [
                 {"after": names[force.state], **{k: v for k, v in _plain(force).items() if k != "state"}}
                 for force in estimation.forces
@@ -382,39 +404,3 @@ def _discrepancy(found: FoundDiscrepancy, names: Sequence[str]) -> dict[str, Any
         ],
         "heterogeneity": [_plain(of) for of in found.heterogeneity],
     }
-
-
-def _fit(name: str, fits: tuple[TissueFit, ...]) -> dict[str, Any]:
-    entries = {
-        fit.tissue: {"start": _plain(fit.start), "end": _plain(fit.end), "observed_share": fit.observed_share}
-        for fit in fits
-    }
-    return {"after": name} | entries
-
-
-def image_names(case: Case) -> list[str]:
-    """A name for each later image of the case, pair after pair, as in `pair_names`."""
-    return [name for _, later in pair_names(case) for name in later]
-
-
-def pair_names(case: Case) -> list[tuple[str, tuple[str, ...]]]:
-    """Names of the images of each pair, the reference state's and the later ones': their files', no two alike."""
-    if case.body is not None:
-        return [("body", tuple(f"state {number}" for number in range(1, case.n_states + 1)))]
-    if case.images is None:
-        return [("before", ("after",))]
-    pairs = [(case.images.before, case.images.after), *((pair.before, pair.after) for pair in case.pairs)]
-    names = iter(distinct_names([path for before, after in pairs for path in (before, *after)]))
-    return [(next(names), tuple(next(names) for _ in after)) for _, after in pairs]
-
-
-def distinct_names(paths: Sequence[Path]) -> list[str]:
-    """Names of files, with as many of their folders' as it takes to tell two of one name apart."""
-    names = [path.name for path in paths]
-    deepest = max((len(path.parts) for path in paths), default=0)
-    for depth in range(2, deepest + 1):
-        alike = [name for name in names if names.count(name) > 1]
-        names = [
-            "/".join(path.parts[-depth:]) if name in alike else name for path, name in zip(paths, names, strict=True)
-        ]
-    return names

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,20 +17,22 @@ from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.laws.registry import law_named
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Forecast, Progress, about, during, silent
-from palpate.study.body import Body, ImagedStates, joint_problem, make_body
-from palpate.study.case import LAW_NAMES, SOUGHT_RATIOS, Case, Mechanics
+from palpate.study.body import NOTHING_MOVES, Body, joint_problem, make_body
+from palpate.study.case import SOUGHT_RATIOS, Case, Mechanics
+from palpate.study.case_body import LAW_NAMES
 from palpate.study.case_loads import load_warnings
 from palpate.study.cost import LESS_MEMORY, ExpectedCost, cost_of_meshes, expected_cost, lack_of_memory
-from palpate.study.estimation import Estimation, Observed, conclude
+from palpate.study.estimated import Estimation
+from palpate.study.estimation import Observed, conclude
+from palpate.study.imaged import ImagedStates
 from palpate.study.inverted import inverted
 from palpate.study.plausibility import estimate_warnings, unit_warnings
 from palpate.study.poisson_ratios import with_found_ratios
-from palpate.study.provenance import input_digests, software_versions
+from palpate.study.provenance import image_names, input_digests, software_versions
 from palpate.study.read import read_pairs, read_states
 from palpate.study.refusals import linear_strain_warnings
-from palpate.study.result import CaseResult, MeshResult, PairResult, Provenance, image_names
+from palpate.study.result import CaseResult, MeshResult, MeshSummary, PairResult, Provenance
 from palpate.study.samples import require_samples
-from palpate.study.simulate import mesh_summary
 from palpate.study.variations import Variation, voxel_mm, what_would_change
 from palpate.uncertainty import FittedState
 from palpate.unknowns import ParameterMap, eta_of_ratio
@@ -38,17 +40,12 @@ from palpate.unknowns import ParameterMap, eta_of_ratio
 FURTHER = 13  # starts beside those of the case
 
 
-def unconditional(cost: ExpectedCost) -> None:
-    """An estimate goes on once its images are read, whatever it costs."""
-    del cost
-
-
 def estimate(
     case: Case,
     *,
     progress: Progress = silent,
     truth: Mapping[str, float] | None = None,
-    condition: Callable[[ExpectedCost], None] = unconditional,
+    condition: Callable[[ExpectedCost], None] | None = None,
 ) -> CaseResult:
     """Estimate the Young's modulus of every `estimate` tissue of a case, from its images or its phantom.
 
@@ -66,7 +63,8 @@ def estimate(
     cost = expected_cost(case, states.before, states.after, n_pairs=1 + len(further), mesh=states.mesh)
     if lack := lack_of_memory(cost):
         raise ResourceError(f"{lack}; {LESS_MEMORY}")
-    condition(cost)
+    if condition is not None:
+        condition(cost)
     progress(_forecast(cost))
     if case.phantom:
         stated = [(t.name, t.youngs_modulus_kpa) for t in states.before.tissues if t.role is Role.ESTIMATE]
@@ -104,13 +102,11 @@ def estimate_states(
     clock.append(time.perf_counter())
     settings = inversion_settings(case, problem.parameters)
     inversion = inverted(bodies, problem, case, settings, progress=progress)
-    images = tuple(image.index if image else None for pair in bodies for image in pair.states.later)
-    observed = Observed(fitted_states(inversion, *bodies), images)
     stating = during("intervals", progress)
     estimation = conclude(
         inversion,
         settings,
-        observed,
+        observed_of(inversion, bodies),
         truth=truth or {},
         seed=case.seed,
         samples=case.estimate.samples,
@@ -127,7 +123,7 @@ def estimate_states(
         case,
         estimation,
         with_found_ratios(body.space, estimation.poisson_ratios),
-        mesh_summary(body),
+        _summary(body),
         states.before,
         states.after,
         Provenance({key: round(float(value), 3) for key, value in seconds.items()}, {}, software_versions()),
@@ -141,8 +137,12 @@ def estimate_states(
     )
 
 
-def mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
-    """Mesh the reference state of a case and pass it through the gate."""
+def make_mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
+    """The tetrahedra of a case's reference image, passed through the gate on their quality, as `palpate mesh` has them.
+
+    progress: is called with a sentence at each stage. Raises `InputDataError` for images that cannot be used,
+    `GeometryError` for organs that cannot be meshed, `MeshQualityError` for a mesh that fails its gate.
+    """
     began = time.perf_counter()
     progress("reading and aligning the images")
     states = read_states(case, progress=progress)
@@ -150,7 +150,7 @@ def mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
     body = make_body(states, case, progress=progress)
     seconds = {"total": round(time.perf_counter() - began, 3)}
     provenance = Provenance(seconds, inputs, software_versions())
-    return MeshResult(case, body.space, mesh_summary(body), states.before, provenance, _remarks(case, body))
+    return MeshResult(case, body.space, _summary(body), states.before, provenance, _remarks(case, body))
 
 
 def _what_would_change(
@@ -203,6 +203,12 @@ def inversion_settings(case: Case, parameters: ParameterMap) -> InversionSetting
     return InversionSettings(begin, Bounds(*ends), further)
 
 
+def observed_of(inversion: Inversion, bodies: Sequence[Body]) -> Observed:
+    """The fitted states of bodies, with the images that they are held against."""
+    images = tuple(image.index if image else None for body in bodies for image in body.states.later)
+    return Observed(fitted_states(inversion, *bodies), images)
+
+
 def fitted_states(inversion: Inversion, *bodies: Body) -> tuple[FittedState, ...]:
     """Displacements of the whole meshes at the estimate, with the grids that they were seen on, body after body."""
     objective, unknowns = inversion.objective, inversion.minimum.unknowns
@@ -212,6 +218,10 @@ def fitted_states(inversion: Inversion, *bodies: Body) -> tuple[FittedState, ...
         FittedState(body.space, state.displacement(moduli, q), body.states.before.grid, image.grid)
         for state, q, (body, image) in zip(objective.states, coefficients, images, strict=True)
     )
+
+
+def _summary(body: Body) -> MeshSummary:
+    return MeshSummary.of(body.quality, body.space, body.edge_length)
 
 
 def _further(bodies: tuple[Body, ...], estimation: Estimation) -> tuple[PairResult, ...]:
@@ -224,7 +234,7 @@ def _further(bodies: tuple[Body, ...], estimation: Estimation) -> tuple[PairResu
         found.append(
             PairResult(
                 with_found_ratios(body.space, estimation.poisson_ratios),
-                mesh_summary(body),
+                _summary(body),
                 states.before,
                 states.after,
                 motions,
@@ -255,10 +265,7 @@ def refuse_what_cannot_be_estimated(case: Case) -> None:
         )
     movers = [tissue for tissue in case.tissues if tissue.role in (Role.DRIVER, Role.RIGID)]
     if case.tissues and case.images is not None and not movers and not case.loads and not case.data:
-        raise ConfigurationError(
-            'nothing moves this body: no tissue has role = "driver" (or "rigid", and moves between the images), so no'
-            " modulus can be estimated; give the role driver to the hollow organ whose wall deforms the others"
-        )
+        raise ConfigurationError(NOTHING_MOVES)
 
 
 def _remarks(case: Case, *bodies: Body) -> tuple[Finding, ...]:

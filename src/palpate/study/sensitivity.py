@@ -31,17 +31,19 @@ from palpate.inversion import Inversion, InversionSettings, StopRule
 from palpate.mechanics.dilatation import choose_element
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Progress, silent
-from palpate.study.body import Body, ImagedStates, joint_problem, make_body
-from palpate.study.case import LAW_NAMES, Case
+from palpate.study.body import Body, joint_problem, make_body
+from palpate.study.case import Case
+from palpate.study.case_body import LAW_NAMES
 from palpate.study.case_file import case_tables
 from palpate.study.edge_length import edge_length_of
-from palpate.study.estimation import Observed, conclude
+from palpate.study.estimation import conclude
+from palpate.study.imaged import ImagedStates
 from palpate.study.inverted import inverted
 from palpate.study.outputs import OutputFolder, read_json, write_json
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.read import read_pairs, read_states
 from palpate.study.result import Provenance, closing, json_object
-from palpate.study.run import fitted_states, inversion_settings, refuse_what_cannot_be_estimated
+from palpate.study.run import inversion_settings, observed_of, refuse_what_cannot_be_estimated
 from palpate.study.variations import SobolResult, Variation, fast_variations, sobol_result, voxel_mm
 from palpate.uncertainty import require_salib
 
@@ -211,7 +213,7 @@ def _estimated(case: Case, bodies: Bodies, sobol: int, progress: Progress) -> di
             " depends on; see what `palpate estimate` tells of it"
         )
     later = tuple(image for body in bodies for image in body.states.after)
-    observed = Observed(fitted_states(inversion, *bodies), tuple(image.index for image in later))
+    observed = observed_of(inversion, bodies)
     estimation = conclude(inversion, settings, observed, truth={}, seed=case.seed, progress=progress)
     given: dict[str, Any] = {
         "dilatation": choose_element(case.mechanics.element).dilatation,

@@ -20,12 +20,12 @@ from palpate.mechanics.equilibrium import equilibrium
 from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.loads import Load
 from palpate.mechanics.rest_state import unloaded_displacement
+from palpate.mesh.quality import mesh_figures
 from palpate.mesh.space import LagrangeSpace
-from palpate.mesh.tet_mesh import tet_dihedrals
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.phantoms.motion import wall_filling
-from palpate.progress import Progress
+from palpate.progress import Progress, silent
 from palpate.study.body import Body, inverse_problem, make_body, strained_body
 from palpate.study.case import Case, Mechanics
 from palpate.study.case_loads import case_loads
@@ -34,13 +34,14 @@ from palpate.study.read import phantom_scene, read_states
 from palpate.study.result import MeshSummary, Provenance, Simulation
 
 
-def simulate(case: Case, *, progress: Progress, steps: int = 1) -> Simulation:
-    """Deform the reference state of a case under the moduli that its tissues state (`youngs_modulus_kpa`) and its law.
+def simulate(case: Case, *, steps: int = 1, progress: Progress = silent) -> Simulation:
+    """A later state of a case whose tissues all state their `youngs_modulus_kpa`, under its law, motion and loads.
 
     The driver moves as in the later image (its wall is fitted together with the organs' surfaces, the moduli held),
-    by [motion] filling_mm, or as in the [phantom]. `steps`: how many states to give, each in equilibrium at its share
-    of the motion, the last one the whole (of a phantom, shares of its displacement). Raises `ConfigurationError` when
-    an `estimate` tissue has no modulus, `NotConverged` where a finite-strain path ends early.
+    by [motion] filling_mm, or as in the [phantom]. steps: how many states to give, each in equilibrium at its share
+    of the motion, the last one the whole (of a phantom, shares of its displacement); progress: is called with a
+    sentence at each stage. Raises as `make_mesh` does, and `ConfigurationError` when a modulus is missing,
+    `NotConverged` where a finite-strain path ends early.
     """
     began = time.perf_counter()
     inputs: Mapping[str, str] = {}
@@ -48,15 +49,7 @@ def simulate(case: Case, *, progress: Progress, steps: int = 1) -> Simulation:
         scene = phantom_scene(case)
         space, tissues = scene.space, scene.tissues
         before, after, remarks = scene.before, scene.after, tuple[Finding, ...]()
-        smallest = tet_dihedrals(space.mesh.nodes[space.mesh.tets]).min(axis=1)
-        summary = MeshSummary(
-            len(space.mesh.nodes),
-            len(space.mesh.tets),
-            3 * len(space.points),
-            float(smallest.min()),
-            float(np.percentile(smallest, 5.0)),
-            {},
-        )
+        summary = MeshSummary.of(mesh_figures(space.mesh), space)
         displacements = tuple(scene.displacement * (step / steps) for step in range(1, steps + 1))
     else:
         progress("reading and aligning the images")
@@ -65,7 +58,7 @@ def simulate(case: Case, *, progress: Progress, steps: int = 1) -> Simulation:
         tissues = states.before.tissues
         _refuse_unknown(tissues)
         body = make_body(states, case, progress=progress)
-        space, summary = body.space, mesh_summary(body)
+        space, summary = body.space, MeshSummary.of(body.quality, body.space, body.edge_length)
         progress("solving for the displacement")
         displacements = _steps(body, case, steps, progress)
         last = displacements[-1]
@@ -175,18 +168,3 @@ def _labels(segmentation: Segmentation, space: LagrangeSpace, displacement: NDAr
     hollow = np.array([not tissue.meshed for tissue in tissues])
     index = np.where(hollow[index] & hollow[segmentation.index], segmentation.index, index)
     return LabelImage(table[index], segmentation.grid, names)
-
-
-def mesh_summary(body: Body) -> MeshSummary:
-    """Figures of the mesh of `body`."""
-    quality = body.quality
-    return MeshSummary(
-        quality.nodes,
-        quality.tets,
-        3 * len(body.space.points),
-        quality.min_dihedral_deg,
-        quality.p5_dihedral_deg,
-        quality.volume_error,
-        body.edge_length.mm if body.edge_length else None,
-        body.edge_length.in_words if body.edge_length else "",
-    )

@@ -86,10 +86,11 @@ def surface_labels(
     labels, findings = merged(masks(), grid.shape)
     digests = {name: surface.digest for name, surface in zip(names, surfaces, strict=True)}
     image = LabelImage(labels, grid, dict(enumerate(names, start=1)), {}, digests, findings)
-    volumes = {
-        name: (_volume(surface), insides[name] * grid.voxel_volume)
-        for name, surface in zip(names, surfaces, strict=True)
-    }
+    volumes = dict[str, tuple[float, float]]()
+    for name, surface in zip(names, surfaces, strict=True):
+        a, b, c = np.moveaxis(surface.points[surface.triangles], 1, 0)
+        held = float(abs(np.einsum("ni,ni->n", a, np.cross(b, c)).sum()) / 6.0)
+        volumes[name] = (held, insides[name] * grid.voxel_volume)
     return SurfaceLabels(image, volumes)
 
 
@@ -122,9 +123,3 @@ def _inside(surface: SurfaceFile, grid: VoxelGrid) -> NDArray[np.bool_]:
         part = tuple(slice(each.start, each.stop) for each in ranges)
         found[part] = (np.abs(winding) > HALF).reshape(index.shape[:3])
     return found
-
-
-def _volume(surface: SurfaceFile) -> float:
-    """Volume, mm^3, that a closed surface holds."""
-    a, b, c = np.moveaxis(surface.points[surface.triangles], 1, 0)
-    return float(abs(np.einsum("ni,ni->n", a, np.cross(b, c)).sum()) / 6.0)

@@ -132,7 +132,10 @@ def fast_variations(
         for width in PRIOR_WIDTHS:
             change = partial(path.shift, width=width)
             found.append(_stated(names, ("driver_prior", "", f"{width:g} times as wide"), change))
-        fewer = partial(path.shift, dropped=_finer_half(inversion))
+        # the finer half of each wall's modes, which are sorted by their size
+        blocks = inversion.objective.parameters.blocks
+        finer = [(np.arange(b.size) >= 3 * (b.size // 6)) & (b.cause == "driver") for b in blocks]
+        fewer = partial(path.shift, dropped=np.concatenate(finer))
         found.append(_stated(names, ("driver_modes", "", "the smoother half alone"), fewer))
     return tuple(found)
 
@@ -323,15 +326,6 @@ def _exact(inversion: Inversion, tissues: tuple[Tissue, ...]) -> list[Variation]
         Variation("known_modulus", known[0], words, "exact", dict.fromkeys(mapping.tissues, sign * step))
         for sign, words in ((-1.0, f"/ {KNOWN_FACTOR:g}"), (1.0, f"x {KNOWN_FACTOR:g}"))
     ]
-
-
-def _finer_half(inversion: Inversion) -> NDArray[np.bool_]:
-    """The finer half of the modes (n_coefficients,) of each driver's wall, which are sorted by their size."""
-    dropped = []
-    for block in inversion.objective.parameters.blocks:
-        finer = np.arange(block.size) >= 3 * (block.size // 6)
-        dropped.append(finer & (block.cause == "driver"))
-    return np.concatenate(dropped)
 
 
 def _stated(names: tuple[str, ...], what: tuple[str, str, str], change: Callable[[], Shift]) -> Variation:

@@ -1,0 +1,206 @@
+"""Intervals and verdicts: what is stated of each modulus, and of each Poisson's ratio that was sought."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from palpate.inversion import Inversion, InversionSettings, as_good
+from palpate.parallel import mapped
+from palpate.study.estimated import ModulusEstimate, no_estimate
+from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio, ratio_verdict
+from palpate.study.together import StatedPosterior
+from palpate.uncertainty import NORMAL_95, Covariance, Interval, ModulusInterval, log_interval, modulus_interval
+from palpate.unknowns import KNOWN_MODULUS, ratio_of_eta
+
+IDENTIFIED, WEAK = 4.0, 10.0  # largest ratio of an interval's ends: a factor of 2 to each side, and of 3.2
+
+
+def hull(intervals: Sequence[Interval]) -> Interval:
+    """Smallest interval that holds all of one or more; an end that is open in one of them is open."""
+    lows, highs = [low for low, _ in intervals], [high for _, high in intervals]
+    low = None if None in lows else min(end for end in lows if end is not None)
+    high = None if None in highs else max(end for end in highs if end is not None)
+    return low, high
+
+
+def verdict(interval: Interval, *, at_bound: bool, absolute: bool) -> tuple[str, str]:
+    """Verdict and its reason from the interval of a modulus or ratio.
+
+    `identified`: closed and high/low <= 4, a factor of 2 to each side; `weak`: closed and wider; `not identified`: an
+    open end, a bound, or high/low > 10; `ratio only`: identified or weak, but no known modulus holds the scale.
+    """
+    low, high = interval
+    if at_bound:
+        return NOT_IDENTIFIED, "the estimate lies at its bound; the images do not hold it back"
+    if low is None or high is None:
+        return NOT_IDENTIFIED, "the 95 % interval is open: it reaches beyond the bounds of the search"
+    width = high / low
+    if width > WEAK:
+        return NOT_IDENTIFIED, f"the 95 % interval spans a factor {width:.1f}"
+    if not absolute:
+        return "ratio only", f"no modulus is known, so only the ratio is determined (within a factor {width:.2f})"
+    if width <= IDENTIFIED:
+        return "identified", f"the 95 % interval spans a factor {width:.2f}"
+    return "weak", f"the 95 % interval spans a factor {width:.2f}; more image pairs or a larger motion narrow it"
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """Of one parameter: its own interval, one that holds all minima that fit as well, both of e^theta; at a bound."""
+
+    own: ModulusInterval
+    interval: Interval
+    at_bound: bool
+
+
+def intervals_of(
+    inversion: Inversion, settings: InversionSettings, posteriors: Sequence[StatedPosterior]
+) -> tuple[Known, ...]:
+    """Of each parameter its interval, which holds that of each of the `posteriors`; none where nothing converged."""
+    if not inversion.minimum.converged:
+        return ()
+    first, n, bounds = posteriors[0], inversion.objective.n_parameters, settings.bounds
+    found, variances, at_bound = [], np.diag(first.covariance), bounds.reached(inversion.minimum.unknowns[:n])
+
+    def interval(of: tuple[int, StatedPosterior]) -> ModulusInterval:
+        """That of one parameter by one posterior."""
+        number, by = of
+        variance = float(by.covariance[number, number])
+        return modulus_interval(by.frozen, by.minimum, number, variance=variance, bounds=bounds)
+
+    every = mapped(interval, product(range(n), posteriors))
+    best = inversion.candidates[inversion.best]
+    minima = [c for c in inversion.candidates if c is not best and c.minimum.converged]
+    scales = np.diag(inversion.minimum.evaluation.covariance_columns(n)[:n]) / variances  # of a profile's deviance
+    for i in range(n):
+        limits = {"lower": float(np.exp(bounds.lower[i])), "upper": float(np.exp(bounds.upper[i]))}
+        own, *wider = every[i * len(posteriors) : (i + 1) * len(posteriors)]
+        sd = float(np.sqrt(variances[i]))
+        good = [c.minimum.unknowns for c in minima if as_good(c.value, best.value, scale=float(scales[i]))]
+        ellipses = (log_interval(float(np.exp(x[i])), sd, **limits) for x in good)
+        whole = hull([own.ends, *ellipses, *(of.ends for of in wider)])
+        found.append(Known(own, whole, bool(at_bound[i])))
+    return tuple(found)
+
+
+def estimates_of(
+    inversion: Inversion,
+    known: Sequence[Known],
+    covariance: Covariance,
+    *,
+    truth: Mapping[str, float],
+    layers_told: bool = True,
+) -> tuple[ModulusEstimate, ...]:
+    """What is stated of the moduli whose intervals are `known`; `truth`: true moduli (kPa) by tissue, where known.
+
+    layers_told: whether the covariance holds what layers round organs would do; where it does not, nothing is
+    `identified`.
+    """
+    mapping, scale = inversion.objective.parameters, inversion.objective.parameters.scale_kpa
+    none = [
+        no_estimate(
+            name,
+            absolute=mapping.absolute,
+            relative_to=mapping.relative_to,
+            why=_not_converged(inversion),
+            truth=truth.get(name),
+        )
+        for name in mapping.tissues
+    ]
+    if not known:
+        return tuple(none)
+    found, unit = [], scale if mapping.absolute else 1.0
+    given = np.diag(covariance.total if covariance.given_model is None else covariance.given_model)
+    shift = mapping.reference_shift(inversion.minimum.unknowns)
+    for i, (nothing, of) in enumerate(zip(none, known, strict=False)):
+        theta, (low, high) = float(inversion.minimum.unknowns[i]), of.interval
+        value, shares = float(np.exp(theta)), covariance.shares(i)
+        of_scale = float(np.sqrt(shares.get(KNOWN_MODULUS, 0.0) * covariance.total[i, i]))
+        by_ratio = _without(of_scale, of.interval, value, centre=float(np.exp(theta - shift)))
+        word, why = verdict(of.interval, at_bound=of.at_bound, absolute=mapping.absolute)
+        if word != "identified" and of_scale > 0.0:
+            word, why = _of_range(word, why, verdict(by_ratio, at_bound=of.at_bound, absolute=True))
+        if not layers_told and word != NOT_IDENTIFIED:
+            word = "weak" if word == "identified" else word
+            why = f"{why}, but does not hold what layers round the organs would do (warning `unsettled`)"
+        points = zip(unit * np.exp(of.own.profile.theta), of.own.profile.root, strict=True)
+        inside = log_interval(value, float(np.sqrt(given[i])), lower=low or 0.0, upper=high or np.inf)
+        within = (inside[0] or low, inside[1] or high)
+        found.append(
+            replace(
+                nothing,
+                interval_kind=of.own.kind,
+                interval95_given_model=_stated(within, word, unit),
+                variance_shares=shares,
+                profile=tuple((float(at), float(root)) for at, root in points),
+                value=value * scale if mapping.absolute else None,
+                interval95=_stated(of.interval, word, scale) if mapping.absolute else None,
+                ratio=None if mapping.by_load else float(np.exp(theta - shift)),
+                ratio_interval95=None if mapping.by_load else _stated(by_ratio, word),
+                verdict=word,
+                why=why,
+            )
+        )
+    return tuple(found)
+
+
+def _without(sd: float, interval: Interval, value: float, *, centre: float) -> Interval:
+    """An interval of a value about another centre, its half-widths in ln less those of an independent cause of it.
+
+    sd: that of the cause, in ln; h -> sqrt(h^2 - (1.96 sd)^2).
+    """
+    halves = [None if end is None else abs(np.log(end / value)) for end in interval]
+    low, high = (None if h is None else float(np.sqrt(max(h**2 - (NORMAL_95 * sd) ** 2, 0.0))) for h in halves)
+    return (
+        None if low is None else float(centre * np.exp(-low)),
+        None if high is None else float(centre * np.exp(high)),
+    )
+
+
+def _of_range(word: str, why: str, of_ratio: tuple[str, str]) -> tuple[str, str]:
+    """The verdict on a modulus whose scale is known within a range alone: the ratio may say more."""
+    if of_ratio[0] == NOT_IDENTIFIED or of_ratio[0] == word:
+        return word, why
+    return "ratio only", f"of the ratio {of_ratio[1]}; the range of the known modulus leaves more of it open in kPa"
+
+
+def _stated(interval: Interval, word: str, unit: float = 1.0) -> Interval | None:
+    """The interval, times a unit, that a verdict lets stand: of what is not identified there is none."""
+    low, high = interval
+    return None if word == NOT_IDENTIFIED else (low and low * unit, high and high * unit)
+
+
+def ratios_of(inversion: Inversion, known: Sequence[Known], covariance: Covariance) -> tuple[PoissonRatioEstimate, ...]:
+    """The same of the Poisson's ratios that are sought."""
+    mapping, found = inversion.objective.parameters, list[PoissonRatioEstimate]()
+    for open_ in mapping.poisson:
+        i, nothing = open_.column, no_ratio(open_.tissue, why=_not_converged(inversion))
+        if not known:
+            found.append(nothing)
+            continue
+        of = known[i]
+        low, high = (None if end is None else ratio_of_eta(np.log(end)) for end in of.interval)
+        of_prior = float(np.sqrt(covariance.total[i, i] * mapping.prior_precision[i, i]))
+        word, why = ratio_verdict((low, high), at_bound=of.at_bound, of_prior=of_prior)
+        points = zip(of.own.profile.theta, of.own.profile.root, strict=True)
+        found.append(
+            replace(
+                nothing,
+                value=open_.ratio(inversion.minimum.unknowns),
+                interval95=_stated((low, high), word),
+                interval_kind=of.own.kind,
+                verdict=word,
+                why=why,
+                variance_shares=covariance.shares(i),
+                profile=tuple((ratio_of_eta(eta), float(root)) for eta, root in points),
+            )
+        )
+    return tuple(found)
+
+
+def _not_converged(inversion: Inversion) -> str:
+    return f"the estimation did not converge: {inversion.minimum.outcome.value}"
