@@ -1,6 +1,6 @@
 """Whether an answer hangs on the constants of the inversion: each is halved and doubled, all else as it is.
 
-    python benchmarks/constants.py [--rows clean,finite-clean] [--seed S] [--edge MM] [--json]
+    python benchmarks/constants.py [--rows clean,finite-clean] [--only NAME,...] [--seed S] [--edge MM] [--json]
 
 Simulated data: rows of accuracy.py. An estimate is made with each number that stands in capitals in `palpate.inversion`
 half and twice as large (shares of a whole at most the mean of themselves and 1); the table says how far the log-moduli
@@ -34,11 +34,14 @@ def main() -> int:
     """Estimate with each constant changed and print by how much the answer moves."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rows", default="clean")
+    parser.add_argument("--only", help="constants instead of all")
     parser.add_argument("--seed", type=int, default=101)
     parser.add_argument("--edge", type=float, help="edge length (mm) instead of the row's own")
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     arguments = parser.parse_args()
     found, numbers = [], constants()
+    if arguments.only:
+        numbers = {name: numbers[name] for name in arguments.only.split(",")}
     for name in arguments.rows.split(","):
         row = ROWS[name] if arguments.edge is None else replace(ROWS[name], edge_mm=arguments.edge)
         case = posed(row, arguments.seed, 0, {})

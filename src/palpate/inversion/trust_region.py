@@ -81,7 +81,7 @@ class StopRule:
     step_sd: float = 0.02
     floor: float = 3e-4
     coefficients: float = np.inf
-    model_error: float = 0.5
+    model_error: float = 1.0
     derivatives: bool = True
     learn: bool = True
     correlate: bool = True
