@@ -31,9 +31,9 @@ from typing import Any
 from cohort_case import make_stub_table, make_table, numbers_of
 
 from cohort_stub import WORK, run
-from palpate.cohort.engines.attempts import Engine
 from palpate.cohort.engines.dask import DaskEngine
 from palpate.cohort.engines.local import LocalEngine
+from palpate.cohort.engines.packing import Engine
 from palpate.errors import PalpateError
 
 PALPATE = [sys.executable, "-m", "palpate"]

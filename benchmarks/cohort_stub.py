@@ -19,9 +19,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from palpate.cohort.engines.attempts import Engine
 from palpate.cohort.engines.dask import DaskEngine
 from palpate.cohort.engines.local import LocalEngine
+from palpate.cohort.engines.packing import Engine
 from palpate.cohort.progress import status_of
 from palpate.cohort.run import Options, run_cohort
 from palpate.cohort.table import read_table

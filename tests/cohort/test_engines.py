@@ -9,13 +9,12 @@ import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
-from palpate.cohort.engines.attempts import Memory, outcome_of
 from palpate.cohort.engines.local import LocalEngine
+from palpate.cohort.engines.packing import Place, packed
 from palpate.cohort.plan import read_mark
 from palpate.cohort.progress import status_of
 from palpate.cohort.run import Options, run_cohort
@@ -179,60 +178,51 @@ def test_a_child_that_is_killed_is_taken_for_too_large_beyond_half_of_its_limit(
 
 
 def test_tasks_are_json(tmp_path):
-    one = task(tmp_path, "needs 3", room_gb=1.0 / 3.0, remarks=("a", "b"))
+    one = task(tmp_path, "needs 3", expected_gb=1.0 / 3.0, remarks=("a", "b"))
     assert Task.from_json(one.to_json()) == one
 
 
-class Needs:
-    """A supervisor whose attempts need so much memory each, for a moment; and the most that was used at once."""
+class Places:
+    """A pool that ends the oldest attempt each time it is asked, and keeps what ran side by side."""
 
-    closed = False
+    def __init__(self, places, needs):
+        self.needs, self._places, self.reserved, self.most = needs, places, {}, {}
 
-    def __init__(self, needs):
-        self.needs, self.used, self.most, self.order, self._lock = needs, 0.0, 0.0, [], threading.Lock()
+    def places(self):
+        return self._places
 
-    def attempt(self, task):
+    def start(self, task, place):
+        handle = (task.row.id, task.expected_gb)
         needed = self.needs[task.row.id]
-        if task.room_gb is not None and needed > task.room_gb:
-            return Outcome(task.row.id, "failed", cause="room", expected_gb=needed)
-        with self._lock:
-            self.used += needed
-            self.most = max(self.most, self.used)
-            self.order.append(task.row.id)
-        time.sleep(0.02)
-        with self._lock:
-            self.used -= needed
-        return Outcome(task.row.id, "done")
+        too_big = task.room_gb is not None and needed > task.room_gb
+        self.reserved[handle] = (place, 0.0 if too_big else needed, too_big)
+        used = sum(gb for where, gb, _ in self.reserved.values() if where == place)
+        self.most[place] = max(self.most.get(place, 0.0), used)
+        return handle
 
-
-def outcomes_beside(supervisor, memory, slots, **options):
-    with ThreadPoolExecutor(slots) as threads:
-        tasks = [Task(Row(name, "P"), "nowhere") for name in supervisor.needs]
-        return list(threads.map(lambda one: outcome_of(one, supervisor, memory, **options), tasks))
+    def ended(self, running):
+        handle = next(iter(running))
+        _, needed, too_big = self.reserved.pop(handle)
+        state = ("failed", "room") if too_big else ("done", "")
+        return [(handle, Outcome(handle[0], state[0], cause=state[1], expected_gb=needed or self.needs[handle[0]]))]
 
 
 def test_what_runs_side_by_side_fits_into_memory():
-    supervisor = Needs({f"r{i}": gb for i, gb in enumerate([1.0, 6.0, 6.0, 2.0, 9.0, 1.0, 3.0, 4.0])})
-    found = outcomes_beside(supervisor, Memory(12.0, 3), 3)
-    assert [outcome.state for outcome in found] == ["done"] * 8
-    assert 6.0 < supervisor.most <= 12.0
+    needs = {f"r{i}": gb for i, gb in enumerate([1.0, 6.0, 6.0, 2.0, 9.0, 1.0, 3.0, 30.0])}
+    tasks = [Task(Row(name, "P"), "nowhere") for name in needs]
+    pool = Places({"small": Place(4.0, 2), "large": Place(12.0, 3)}, needs)
+    assert sorted(outcome.id for outcome in packed(pool, tasks)) == sorted(needs)
+    assert pool.most["small"] <= 4.0
+    assert pool.most["large"] == 30.0  # larger than any place: alone on the largest
+    del needs["r7"]
+    pool = Places({"small": Place(4.0, 2), "large": Place(12.0, 3)}, needs)
+    list(packed(pool, tasks[:-1]))
+    assert pool.most["large"] <= 12.0
 
 
-def test_what_is_larger_than_its_place_runs_alone_or_elsewhere():
-    supervisor = Needs({"a": 1.0, "b": 30.0, "c": 1.0})
-    assert {outcome.state for outcome in outcomes_beside(supervisor, Memory(12.0, 3), 3)} == {"done"}
-    assert supervisor.most == 30.0
-    supervisor = Needs({"b": 30.0})
-    (found,) = outcomes_beside(supervisor, Memory(12.0, 3), 1, elsewhere_gb=24.0)
-    assert (found.cause, found.expected_gb, supervisor.order) == ("room", 30.0, [])
-    (found,) = outcomes_beside(supervisor, Memory(12.0, 3), 1, elsewhere_gb=12.0)
-    assert found.state == "done"
-
-
-def test_a_large_case_is_not_passed_by_small_ones_for_ever():
-    supervisor = Needs({"large": 11.0} | {f"small-{i}": 1.0 for i in range(20)})
-    outcomes_beside(supervisor, Memory(12.0, 4), 4)
-    assert supervisor.order.index("large") < 10
+def test_a_pool_without_places_leaves_its_tasks_waiting():
+    with pytest.raises(ResourceError, match="no worker"):
+        list(packed(Places({}, {}), [Task(Row("a", "P"), "nowhere")]))
 
 
 def test_an_engine_that_dies_leaves_tables_of_what_is_done(tmp_path):

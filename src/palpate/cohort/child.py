@@ -2,8 +2,8 @@
 
 Started as `python -m palpate.cohort.child MODULE:FUNCTION` in a process group of its own, it imports the work, takes a
 task as a line of JSON on its standard input, and answers on its standard output with lines of JSON: {"begun"}: the most
-memory (GB) held by then, {"expected"}: memory (GB) and time (s), {"outcome"}. It keeps to its limit on memory itself.
-What it breaks, it breaks for itself alone.
+memory (GB) held by then, {"expected"}: memory (GB) and time (s), {"outcome"}. What it breaks, it breaks for itself
+alone.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import logging
 import os
-import select
 import signal
 import sys
 import threading
@@ -21,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.cohort.task import Outcome, Task
-from palpate.memory import held_memory_gb, peak_memory_gb
+from palpate.memory import peak_memory_gb
 from palpate.study.lock import own_file
 
 try:
@@ -34,7 +33,6 @@ else:
 Work = Callable[[Task, Callable[[float, float], None]], Outcome]
 
 LOG = "log.txt"
-LOOK_S = 0.1  # how often memory is looked at
 MARGIN_BYTES = 2**30  # of address space for data beyond the limit on memory, whose watcher looks now and then
 
 
@@ -55,7 +53,10 @@ def main(work: str) -> None:
     layout = "%(asctime)s %(levelname)s %(name)s: %(message)s"
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format=layout, force=True)
     logging.captureWarnings(capture=True)
-    limit_gb = task.limits.memory_gb or float("inf")
+    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    earlier = signal.pthread_sigmask(signal.SIG_BLOCK, signals)  # for ever in that thread: they reach the main one
+    threading.Thread(target=_end_with_standard_input, daemon=True).start()
+    signal.pthread_sigmask(signal.SIG_SETMASK, earlier)
 
     def say(content: dict[str, Any]) -> None:
         """Answer with a line."""
@@ -63,30 +64,21 @@ def main(work: str) -> None:
 
     def tell(memory_gb: float, seconds: float) -> None:
         """Pass the prediction on, and do not take more than it allows."""
-        nonlocal limit_gb
         say({"expected": [memory_gb, seconds]})
-        limit_gb = task.limits.memory_for(memory_gb)
         if LIMITED:
-            n_bytes = int(1e9 * limit_gb) + MARGIN_BYTES
+            n_bytes = int(1e9 * task.limits.memory_for(memory_gb)) + MARGIN_BYTES
             _, hard = resource.getrlimit(resource.RLIMIT_DATA)
             resource.setrlimit(resource.RLIMIT_DATA, (n_bytes if hard < 0 else min(n_bytes, hard), hard))
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
-    def watch() -> None:
-        """End with all that it started when whoever holds the standard input is gone, or it takes too much memory."""
-        while not select.select([0], [], [], LOOK_S)[0]:
-            if (held_memory_gb() or 0.0) > limit_gb:
-                text = f"it took more than the {limit_gb:.1f} GB of memory that it was given"
-                say({"outcome": Outcome.failed(task, "resources", text, cause="memory").to_dict()})
-                break
-        os.killpg(os.getpgrp(), signal.SIGKILL)
-
-    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    earlier = signal.pthread_sigmask(signal.SIG_BLOCK, signals)  # for ever in that thread: they reach the main one
-    threading.Thread(target=watch, daemon=True).start()
-    signal.pthread_sigmask(signal.SIG_SETMASK, earlier)
     say({"begun": peak_memory_gb() or 0.0})
     say({"outcome": function(task, tell).to_dict()})
+
+
+def _end_with_standard_input() -> None:
+    """Whoever started this process holds its standard input: when he is gone, it ends with all that it started."""
+    os.read(0, 1)
+    os.killpg(os.getpgrp(), signal.SIGKILL)
 
 
 if __name__ == "__main__":

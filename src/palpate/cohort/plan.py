@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+from palpate.cohort.resolve import row_key
 from palpate.cohort.task import FAILURE_CLASSES, Limits, Outcome, Row, Task
 from palpate.errors import FolderInUse, InputDataError, ResourceError
 from palpate.parallel import mapped
@@ -51,6 +53,16 @@ def read_mark(folder: Path, *, checked: bool = True) -> Outcome | None:
     except (InputDataError, ResourceError, KeyError, TypeError):
         return None
     return found
+
+
+def document_of(folder: Path, mark: Outcome) -> dict[str, Any] | None:
+    """The result.json that a row's mark vouches for; None where the row is not done, or that file is gone."""
+    if mark.state != "done":
+        return None
+    try:
+        return read_json(folder / RESULT)
+    except InputDataError:
+        return None
 
 
 @contextmanager
@@ -96,6 +108,12 @@ class Plan:
         """Row `number` as a task of the cohort's folder."""
         row = self.rows[number]
         return Task(row, str((folder / CASES / row.id).absolute()), self.keys[number], self.overrides, limits)
+
+
+def make_plan(rows: Sequence[Row], overrides: Sequence[str], *, engine: str, workers: int | None, began: str) -> Plan:
+    """The plan of the rows, all their inputs digested as they are at the moment."""
+    keys = mapped(partial(row_key, overrides=overrides), rows)
+    return Plan(tuple(rows), tuple(keys), tuple(overrides), engine, workers, began)
 
 
 def write_plan(plan: Plan, folder: Path) -> None:

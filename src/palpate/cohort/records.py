@@ -9,12 +9,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from palpate.cohort.plan import CASES, Plan
+from palpate.cohort.plan import CASES, Plan, document_of
 from palpate.cohort.task import Outcome, Row
-from palpate.errors import InputDataError
 from palpate.inversion import KNOWN_MODULUS
 from palpate.parallel import mapped
-from palpate.study.outputs import RESULT, read_json
 from palpate.uncertainty import NORMAL_95
 
 NEARLY = 0.95  # of that: a profile that comes so far has reached the end
@@ -86,9 +84,8 @@ def _record(plan: Plan, folder: Path, marks: Sequence[Outcome | None], number: i
     took = (mark.seconds, mark.peak_gb, page)
     if mark.state != "done":
         return Record(row, "failed", mark.failure_class, mark.message, (), *took)
-    try:
-        document = read_json(place / RESULT)
-    except InputDataError:  # gone since
+    document = document_of(place, mark)
+    if document is None:
         return Record(row, "waiting")
     moduli = tuple(_modulus(item) for item in document["estimates"] if item["parameter"] == "youngs_modulus")
     codes = tuple(dict.fromkeys(warning["code"] for warning in document.get("warnings", ())))

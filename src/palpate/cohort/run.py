@@ -8,20 +8,17 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 
-from palpate.cohort.engines.attempts import Engine
+from palpate.cohort.engines.packing import Engine
 from palpate.cohort.page import cohort_page
-from palpate.cohort.plan import CASES, MARK, PLAN, Plan, held_soon, write_plan
+from palpate.cohort.plan import CASES, MARK, PLAN, Plan, held_soon, make_plan, write_plan
 from palpate.cohort.progress import Tally
 from palpate.cohort.records import Record, records_of
-from palpate.cohort.resolve import row_key
 from palpate.cohort.statistics.document import statistics_document
 from palpate.cohort.tables import CSV, PARQUET, write_csv, write_parquet
 from palpate.cohort.task import Limits, Outcome, Row
 from palpate.errors import ConfigurationError, FolderInUse, PalpateError
-from palpate.parallel import mapped
 from palpate.progress import Progress
 from palpate.study.outputs import STAGING, make_folder, staged, write_json, write_text
 from palpate.study.provenance import software_versions
@@ -64,8 +61,7 @@ def run_cohort(
         raise ConfigurationError(f"{folder / foreign[0]} is of no cohort of Palpate's, and would be replaced: move it")
     progress(f"{len(rows)} rows: reading what each depends on")
     began = datetime.now(UTC).isoformat(timespec="seconds")
-    keys = mapped(partial(row_key, overrides=options.overrides), rows)
-    plan = Plan(tuple(rows), tuple(keys), options.overrides, engine.name, options.workers, began)
+    plan = make_plan(rows, options.overrides, engine=engine.name, workers=options.workers, began=began)
     make_folder(folder / CASES)
     for place in [folder / CASES / row.id for row in rows]:
         if (place / STAGING).exists():  # whoever wrote there was killed, perhaps after the mark

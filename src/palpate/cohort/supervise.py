@@ -1,4 +1,4 @@
-"""One attempt of one task: in a process of its own, with a limit of time, whose sudden end is an outcome, too."""
+"""One attempt of one task: in a process of its own, watched for memory, time and sudden ends."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import sys
 import time
 from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, BinaryIO, cast
 
 from palpate.cohort.task import Outcome, Task
@@ -18,6 +19,7 @@ from palpate.errors import ResourceError
 from palpate.parallel import environment_of_child, name_of_end
 
 ESTIMATE = "palpate.cohort.work:estimate_row"
+LOOK_S = 0.1  # how often memory is looked at
 START_S = 600.0  # for the process to import what it needs
 BEFORE_PREDICTION_S = 3600.0  # for the images, each of which has limits of its own
 MUCH = 0.5  # of the limit on memory: a child that the system kills beyond that was most likely too large
@@ -32,8 +34,8 @@ class Supervisor:
     """
 
     work: str = ESTIMATE
-    closed: bool = False
     _running: set[int] = field(default_factory=set)  # process groups
+    _closed: bool = False
 
     def attempt(self, task: Task) -> Outcome:
         """What one attempt of a task comes to; whatever happens to its process is an outcome.
@@ -52,29 +54,33 @@ class Supervisor:
             raise ResourceError(
                 f"no process could be started ({error.strerror}): is memory left, and a process for this user?"
             ) from error
-        tasks, answers = cast("BinaryIO", process.stdin), cast("BinaryIO", process.stdout)
-        watch = _Watch(task)
+        watch = _Watch(task, process)
         self._running.add(process.pid)
         try:
-            if not self.closed:
+            if not self._closed:
+                tasks, answers, rest = cast("BinaryIO", process.stdin), cast("BinaryIO", process.stdout).fileno(), b""
                 with suppress(BrokenPipeError):  # it has ended already
                     tasks.write(task.to_json().encode("ascii") + b"\n")
                     tasks.flush()
-                watch.listen(answers.fileno())
+                while watch.ended is None:
+                    watch.look()
+                    patience = LOOK_S if watch.ended is None else 0.0
+                    while select.select([answers], [], [], patience)[0] and (part := os.read(answers, READ_SIZE)):
+                        *lines, rest = (rest + part).split(b"\n")
+                        for line in lines:
+                            watch.hear(json.loads(line))
         finally:
             _end_group(process.pid)  # and what it has started
-            _, status, usage = os.wait4(process.pid, 0)
-            process.returncode = os.waitstatus_to_exitcode(status)
+            watch.reap()
             self._running.discard(process.pid)
-            for pipe in (tasks, answers):
+            for pipe in (process.stdin, process.stdout):
                 with suppress(OSError):
-                    pipe.close()
-        peak_gb = round(usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9, 3)
-        return watch.verdict(process.returncode, peak_gb)
+                    cast("BinaryIO", pipe).close()
+        return watch.verdict()
 
     def close(self) -> None:
         """End all processes; from any thread."""
-        self.closed = True
+        self._closed = True
         for group in tuple(self._running):
             _end_group(group)
 
@@ -89,59 +95,82 @@ class _Watch:
     """What is known of the process that works on a task, and the verdict when it has ended."""
 
     task: Task
+    process: subprocess.Popen[bytes]
     began: float = field(default_factory=time.monotonic)  # the process, then its work
-    before_gb: float | None = None  # the most memory when its work began, in part of whoever started it; None: not yet
-    expected: tuple[float, float] | None = None  # memory (GB) and time (s)
+    working: bool = False
+    before_gb: float = 0.0  # the most memory that was held by then, in part by whoever started it: that counts along
+    expected_gb: float | None = None
+    memory_gb: float = float("inf")  # limits
+    seconds: float = BEFORE_PREDICTION_S
+    peak_gb: float = 0.0
+    stopped: str = ""  # why we ended it
     outcome: Outcome | None = None
-    late: bool = False
+    ended: int | None = None
+    page: int = field(default_factory=lambda: os.sysconf("SC_PAGE_SIZE"))
 
-    @property
-    def seconds(self) -> float:
-        """How long it may take from `began` on."""
-        if self.before_gb is None:
-            return START_S
-        limits = self.task.limits
-        return limits.seconds_for(self.expected[1]) if self.expected else limits.seconds or BEFORE_PREDICTION_S
+    def __post_init__(self) -> None:
+        if self.task.limits.seconds is not None:
+            self.seconds = self.task.limits.seconds
+        if self.task.limits.memory_gb is not None:
+            self.memory_gb = self.task.limits.memory_gb
 
-    def listen(self, answers: int) -> None:
-        """Hear what it says until it has told its outcome, has ended, or is late."""
-        rest = b""
-        while self.outcome is None:
-            left = max(self.began + self.seconds - time.monotonic(), 0.0)
-            if not select.select([answers], [], [], left)[0]:
-                self.late = True
-                return
-            if not (part := os.read(answers, READ_SIZE)):
-                return
-            *lines, rest = (rest + part).split(b"\n")
-            for line in lines:
-                self._hear(json.loads(line))
-
-    def _hear(self, message: dict[str, Any]) -> None:
+    def hear(self, message: dict[str, Any]) -> None:
+        """Take one message."""
         if "begun" in message:
-            self.began, self.before_gb = time.monotonic(), float(message["begun"])
+            self.working, self.began, self.before_gb = True, time.monotonic(), float(message["begun"])
         elif "expected" in message:
-            memory_gb, seconds = map(float, message["expected"])
-            self.expected = memory_gb, seconds
-        elif self.outcome is None:  # the first that it told
+            self.expected_gb, seconds = map(float, message["expected"])
+            self.memory_gb = self.task.limits.memory_for(self.expected_gb)
+            self.seconds = self.task.limits.seconds_for(seconds)
+        else:
             self.outcome = Outcome(**message["outcome"])
 
-    def verdict(self, code: int, most_gb: float) -> Outcome:
-        """The outcome that the child told, or what its exit code means; most_gb: the most memory that it held."""
-        peak_gb = most_gb if self.before_gb is not None and most_gb > self.before_gb else 0.0
-        told = self.outcome or self._sudden_end(code, peak_gb)
-        expected_gb = self.expected[0] if self.expected else told.expected_gb
-        peak_gb = round(max(peak_gb, told.peak_gb or 0.0), 3)
-        return told.took(time.monotonic() - self.began, expected_gb=expected_gb, peak_gb=peak_gb)
+    def look(self) -> None:
+        """Whether the process has ended; it is ended when it runs over a limit."""
+        self.reap(os.WNOHANG)
+        if self.ended is not None or self.outcome is not None or self.stopped:
+            return
+        seconds = time.monotonic() - self.began
+        try:
+            pages = int(Path(f"/proc/{self.process.pid}/statm").read_text(encoding="ascii").split()[1])
+        except (OSError, IndexError, ValueError):  # it has ended, or the system does not tell
+            pages = 0
+        self.peak_gb = max(self.peak_gb, pages * self.page / 1e9)
+        if self.working and pages * self.page / 1e9 > self.memory_gb:
+            self.stopped = "memory"
+        elif seconds > (self.seconds if self.working else START_S):
+            self.stopped = "time" if self.working else "start"
+        if self.stopped:
+            _end_group(self.process.pid)
 
-    def _sudden_end(self, code: int, peak_gb: float) -> Outcome:
-        task, limits = self.task, self.task.limits
-        if self.late and self.before_gb is not None:
+    def reap(self, options: int = 0) -> None:
+        """Take in how the process ended; waits for it unless the options say otherwise."""
+        if self.ended is None:
+            pid, status, usage = os.wait4(self.process.pid, options)
+            if pid:
+                self.ended = self.process.returncode = os.waitstatus_to_exitcode(status)
+                most = round(usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9, 3)
+                if self.working and most > self.before_gb:
+                    self.peak_gb = max(self.peak_gb, most)
+
+    def verdict(self) -> Outcome:
+        """The outcome that the child told, or what its end means."""
+        seconds = time.monotonic() - self.began
+        told = self.outcome if self.outcome is not None and not self.stopped else self._sudden_end()
+        expected = told.expected_gb if self.expected_gb is None else self.expected_gb
+        return told.took(seconds, expected_gb=expected, peak_gb=round(max(self.peak_gb, told.peak_gb or 0.0), 3))
+
+    def _sudden_end(self) -> Outcome:
+        task, limit = self.task, self.memory_gb
+        if self.stopped == "time":
             return Outcome.failed(task, "timeout", f"it took more than the {self.seconds:g} s that it was given")
-        limit_gb = limits.memory_for(self.expected[0]) if self.expected else limits.memory_gb or float("inf")
-        if code == -signal.SIGKILL and peak_gb > MUCH * limit_gb:
-            text = f"the system ended it at {peak_gb:.1f} GB of memory, most likely for want of more"
+        if self.stopped == "memory":
+            text = f"it took more than the {limit:.1f} GB of memory that it was given"
             return Outcome.failed(task, "resources", text, cause="memory")
+        if self.ended == -signal.SIGKILL and self.peak_gb > MUCH * limit:
+            text = f"the system ended it at {self.peak_gb:.1f} GB of memory, most likely for want of more"
+            return Outcome.failed(task, "resources", text, cause="memory")
+        code = self.ended or 0
         name = name_of_end(code)
         if code in (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGHUP, -signal.SIGINT):
             return Outcome.failed(task, "lost", f"something ended the process that computed it ({name})", cause="lost")

@@ -79,8 +79,9 @@ class Task:
     """A row to be computed into its folder.
 
     key: digest of what the row depends on, when the task was made; overrides: --set of the whole cohort; coarser: by
-    which factor the mesh is coarser than asked for; room_gb: memory (GB) that it may count on where it runs, None:
-    whatever there is; remarks: what earlier attempts came to; attempt: number of this one, from 1.
+    which factor the mesh is coarser than asked for; expected_gb: predicted memory (GB), None until an attempt has told;
+    room_gb: memory (GB) that it may count on where it runs, None: whatever there is; remarks: what earlier attempts
+    came to; attempt: number of this one, from 1.
     """
 
     row: Row
@@ -89,6 +90,7 @@ class Task:
     overrides: tuple[str, ...] = ()
     limits: Limits = field(default_factory=Limits)
     coarser: float = 1.0
+    expected_gb: float | None = None
     room_gb: float | None = None
     remarks: tuple[str, ...] = ()
     attempt: int = 1

@@ -12,12 +12,11 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import ClassVar
 
-from palpate.cohort.engines.attempts import LOST_ATTEMPTS, marked
 from palpate.cohort.engines.local import LocalEngine
+from palpate.cohort.engines.packing import again, marked
 from palpate.cohort.plan import read_mark
 from palpate.cohort.resolve import case_of
 from palpate.cohort.task import LEAST_MEMORY_GB, Outcome, Task
@@ -45,12 +44,15 @@ class SlurmEngine:
     its own environment variables (SBATCH_PARTITION ...).
     """
 
-    name: ClassVar[str] = "slurm"
-
     folder: Path
     workers: int | None = None
     command: tuple[str, ...] = (sys.executable, "-m", "palpate")
     poll_seconds: float = POLL_S
+
+    @property
+    def name(self) -> str:
+        """As `--engine` calls it."""
+        return "slurm"
 
     def outcomes(self, tasks: Sequence[Task]) -> Iterator[Outcome]:
         """The outcome of each task, as its mark appears; what SLURM loses is submitted again. `ResourceError`."""
@@ -70,12 +72,13 @@ class SlurmEngine:
                 yield from self._watched(job, left)
             finally:
                 _run("scancel", job)
-            lost = list(left.values())
-            left = {
-                task.row.id: replace(task, attempt=task.attempt + 1) for task in lost if task.attempt < LOST_ATTEMPTS
-            }
-            for task in (task for task in lost if task.row.id not in left):
-                yield marked(task, Outcome.failed(task, "lost", "its SLURM job is gone", cause="lost"))
+            lost = [Outcome.failed(task, "lost", "its SLURM job is gone", cause="lost") for task in left.values()]
+            for outcome in lost:
+                task = left.pop(outcome.id)
+                if (next_one := again(task, outcome)) is not None:
+                    left[outcome.id] = next_one
+                else:
+                    yield marked(task, outcome)
 
     def _watched(self, job: str, left: dict[str, Task]) -> Iterator[Outcome]:
         """Outcomes as they appear, taken out of `left`, until all are there or the job is gone."""

@@ -66,20 +66,17 @@ def _organ(usable: Usable, records: Sequence[Record]) -> dict[str, Any]:
     remarks += [f"{without} patients have no stage"] if without else []
     covariates = _numeric_covariates(records)
     clean = [scan for scan in usable.scans if not set(scan.warnings) & set(MISLEADING)]
+    warned = len(clean) < len(usable.scans)
     censored = sum(scan.value is None for scan in usable.scans)
     adjusted = stage_regression(usable.scans, covariates=covariates, seed=SEED) if covariates else None
-    without_warned = None
-    if len(clean) < len(usable.scans):  # there to be compared, without its test
-        found = stage_regression(clean, seed=SEED)
-        without_warned = {key: value for key, value in found.items() if key not in ("p", "arrangements", "exact")}
     # quartiles of the scans of each stage
-    by_stage = []
+    found = []
     for stage in sorted({scan.stage for scan in usable.scans if scan.stage is not None}):
         scans = [scan for scan in usable.scans if scan.stage == stage]
         low, middle, high = _quantiles(scans)
         counts = {"n_patients": len({scan.patient for scan in scans}), "n_scans": len(scans)}
         counts["n_censored"] = sum(scan.value is None for scan in scans)
-        by_stage.append({"stage": stage, **counts, "q25": low, "median": middle, "q75": high})
+        found.append({"stage": stage, **counts, "q25": low, "median": middle, "q75": high})
     return {
         "unit": usable.unit,
         "used": {"scans": len(usable.scans), "patients": len(usable.patients), "censored": censored},
@@ -90,10 +87,15 @@ def _organ(usable: Usable, records: Sequence[Record]) -> dict[str, Any]:
         **asdict(association(lows, highs, stages)),
         "regression": stage_regression(usable.scans, seed=SEED),
         "regression_adjusted": adjusted if adjusted is None or adjusted.get("covariates", True) else None,
-        "regression_without_warned": without_warned,
+        "regression_without_warned": _untested(stage_regression(clean, seed=SEED)) if warned else None,
         "repeatability": repeatability(usable),
-        "by_stage": by_stage,
+        "by_stage": found,
     }
+
+
+def _untested(regression: dict[str, Any]) -> dict[str, Any]:
+    """A regression that is there to be compared, without its test."""
+    return {key: value for key, value in regression.items() if key not in ("p", "arrangements", "exact")}
 
 
 def _identical_images(records: Sequence[Record]) -> list[dict[str, Any]]:

@@ -88,7 +88,7 @@ def unit_colour(words: Sequence[str]) -> str | None:
 def voxels_of(
     file: InputFile, path: Path, name: str | None, read: Callable[[InputFile], NDArray[Any]]
 ) -> tuple[NDArray[Any], dict[str, str]]:
-    """What `read` makes of the rest of the file at `path`, or of the file `name` beside it; the digests of both."""
+    """Voxels (nx, ny, nz) that `read` finds in the rest of the file at `path`, or in `name` beside it; the digests."""
     if name is None:
         return read(file), {"": file.sha256()}
     with open_input(beside(path, name)) as other:

@@ -88,7 +88,7 @@ def read_block(file: InputFile, block: VoxelBlock, path: Path) -> NDArray[Any]:
 
 
 def read_voxels(stream: BinaryIO, block: VoxelBlock, path: Path) -> NDArray[Any]:
-    """The voxels (n_1, ...) of `block`, whose size was checked, from where `stream` stands.
+    """The voxels (nx, ny, nz) of `block`, whose size was checked, from where `stream` stands.
 
     Raises `InputDataError` when it ends before they do, or goes on for long after them.
     """
