@@ -12,7 +12,7 @@ from palpate.errors import ConfigurationError, ResourceError
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from palpate.cohort.engines.attempts import Engine
+    from palpate.cohort.engines.packing import Engine
     from palpate.cohort.records import Record
     from palpate.cohort.task import Row
     from palpate.progress import Progress
