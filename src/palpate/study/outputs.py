@@ -1,8 +1,8 @@
 """The files that a run writes: made out of sight in the output folder, put in place all together or not at all.
 
-New files are made in `.writing-outputs/new`. When all are on the disk, with the names of those that give way, `new` is
-renamed to `ready`, which decides: nothing has changed before it; from here on old files leave, then new ones move to
-their places. Whoever finds such a folder goes on with that, so a kill is completed by the next command.
+New files are made in `.writing-outputs/new`. When all are on the disk, those that give way step aside into `old`; then
+`new` is renamed to `ready`, which decides: from here on the new files move to their places, before it the old ones
+would move back. Either is done by whoever finds such a folder, so a kill is completed or undone by the next command.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import shutil
 import signal
 import stat
 import threading
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -27,7 +27,7 @@ from palpate.errors import InputDataError, ResourceError
 Digests = Mapping[str, Mapping[str, str]]  # name of a file in the folder -> {"sha256": hexadecimal}
 
 STAGING = ".writing-outputs"  # the hidden folder in an output folder
-NEW, READY, LEAVING = "new", "ready", "leaving.json"  # in it: being made; about to take their places; what gives way
+NEW, READY, OLD = "new", "ready", "old"  # in it: being made; about to take their places; what gives way
 ASIDE = ".earlier"  # behind the name of a file that is set aside
 LARGEST_DOCUMENT = 2**26  # bytes of a JSON document that is read
 SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
@@ -62,8 +62,8 @@ class Staging:
 
     @property
     def unfinished(self) -> bool:
-        """Whether a `commit` that failed after it was decided is left to the next run in the folder."""
-        return (self.folder / STAGING / READY).exists()
+        """Whether a `commit` that failed is left to the next run in the folder, for it could not be undone either."""
+        return _is_unfinished(self.folder)
 
     def names(self) -> tuple[str, ...]:
         """The staged files, relative to the folder, with slashes; sorted, documents that list others last."""
@@ -89,19 +89,14 @@ class Staging:
         try:
             for name in aside:
                 shutil.copy2(self.folder / name, self.area / f"{name}{ASIDE}")
+            for name in (*names, *renamed):  # to the disk
+                with (self.area / name).open("rb+") as file:
+                    os.fsync(file.fileno())
+            _sync_folders(self.area)
             # documents that list others leave first
             leaving = [*reversed(names), *renamed, *retired, *(name for name in aside if name not in names)]
-            listed = self.area.with_name(LEAVING)
-            listed.write_text(
-                json.dumps({"names": [name for name in leaving if (self.folder / name).exists()]}), "utf-8"
-            )
-            for path in (listed, *(self.area / name for name in (*names, *renamed))):  # to the disk
-                with path.open("rb+") as file:
-                    os.fsync(file.fileno())
-            _sync_folders(self.area.parent)
             with _interrupts_deferred():
-                self.area.replace(self.area.with_name(READY))  # it is decided
-                _settle_at_last(self.folder)
+                _exchange(self.folder, [name for name in leaving if (self.folder / name).exists()])
                 self.written.extend(names)
         except OSError as error:
             with suppress(OSError):
@@ -139,7 +134,8 @@ class OutputFolder:
         make_folder(self.path)
         recover(self.path)
         try:
-            (self.path / STAGING / NEW).mkdir(parents=True)
+            for part in (NEW, OLD):
+                (self.path / STAGING / part).mkdir(parents=True)
             yield Staging(self.path, self.written)
         except OSError as error:
             raise _refused(self.path, error) from error
@@ -148,12 +144,12 @@ class OutputFolder:
 
 
 def recover(folder: Path) -> None:
-    """Complete what a killed run left in `folder`, which this process holds, and remove its hidden files.
+    """Complete or undo what a killed run left in `folder`, which this process holds, and remove its hidden files.
 
     Raises `ResourceError` when the renames are refused again, or the hidden folder is not one of Palpate's.
     """
     area = folder / STAGING
-    if any(path.is_symlink() or (path.exists() and not path.is_dir()) for path in (area, area / READY)):
+    if any(path.is_symlink() or (path.exists() and not path.is_dir()) for path in (area, area / READY, area / OLD)):
         raise ResourceError(f"{area} is no folder of Palpate's: remove it, or choose another --output folder")
     try:
         with _interrupts_deferred():
@@ -166,46 +162,59 @@ def recover(folder: Path) -> None:
     _clear(folder)
 
 
-def _settle_at_last(folder: Path) -> None:
-    """`_settle`, tried twice; raises `ResourceError` where the rest is left to the next command."""
+def _exchange(folder: Path, leaving: Sequence[str]) -> None:
+    """Let the `leaving` files step aside and the staged ones take their places; raises `OSError` with all as it was."""
+    area = folder / STAGING
     try:
+        for name in leaving:
+            _move(folder / name, area / OLD / name)
+        _sync_folders(area / OLD, *{(folder / name).parent for name in leaving})
+        (area / NEW).replace(area / READY)  # it is decided
+        _sync_folders(area)
         _settle(folder)
-    except OSError:
+    except OSError as error:
         try:
-            _settle(folder)
-        except OSError as error:
+            decided = _settle(folder)
+        except OSError as again:
+            whose = "new files" if (area / READY).exists() else "files that were there"
             raise ResourceError(
-                f"cannot write in {folder} ({error.strerror or error}): the new files are whole in {folder / STAGING},"
-                " from which the next command with this folder completes them"
+                f"cannot write in {folder} ({again.strerror or again}): the {whose} are whole in {area}, from which the"
+                " next command with this folder completes them"
             ) from error
+        if not decided:
+            raise
 
 
-def _settle(folder: Path) -> None:
-    """Where files are ready, let what gives way to them leave, then move them to their places."""
-    ready, leaving = folder / STAGING / READY, folder / STAGING / LEAVING
-    if not ready.is_dir():
-        return
-    names = _files(ready)
-    if outside := [name for name in names if not is_inside(folder, name)]:
-        raise ResourceError(f"{folder / outside[0]} leads out of the folder through a link: remove the link")
-    if leaving.is_file():  # so nothing has its place yet
-        for place in [folder / name for name in read_json(leaving)["names"] if is_inside(folder, name)]:
-            place.unlink(missing_ok=True)
-            if place.parent != folder:
-                with suppress(OSError):  # not empty
-                    place.parent.rmdir()
-        leaving.unlink()
-        _sync_folders(folder, leaving.parent)
+def _settle(folder: Path) -> bool:
+    """Move files that are ready to their places, or else back what has stepped aside; whether it were those ready."""
+    area = folder / STAGING
+    decided = (area / READY).is_dir()
+    source = area / (READY if decided else OLD)
+    names = _files(source)
     for name in names:
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (ready / name).replace(folder / name)
+        if not is_inside(folder, name):
+            raise ResourceError(f"{folder / name} leads out of the folder through a link: remove the link")
+        if decided or not os.path.lexists(folder / name):
+            _move(source / name, folder / name)
     _sync_folders(*{(folder / name).parent for name in names})
-    shutil.rmtree(ready)
+    if decided:  # what stepped aside must not come back
+        for name in _files(area / OLD):
+            if (folder / name).parent != folder:
+                with suppress(OSError):  # not empty
+                    (folder / name).parent.rmdir()
+        shutil.rmtree(area / OLD, ignore_errors=True)
+        if not _files(area / OLD):
+            shutil.rmtree(area / READY)
+    return decided
+
+
+def _is_unfinished(folder: Path) -> bool:
+    return (folder / STAGING / READY).exists() or bool(_files(folder / STAGING / OLD))
 
 
 def _clear(folder: Path) -> None:
-    """Remove the hidden folder, unless there is something to complete."""
-    if not (folder / STAGING / READY).exists():
+    """Remove the hidden folder, unless there is something to complete or to undo."""
+    if not _is_unfinished(folder):
         shutil.rmtree(folder / STAGING, ignore_errors=True)
 
 
@@ -214,6 +223,11 @@ def _files(folder: Path) -> tuple[str, ...]:
     paths = [path for path in folder.rglob("*") if path.is_file() and not path.is_symlink()]
     names = [path.relative_to(folder).as_posix() for path in paths]
     return tuple(sorted(names, key=lambda name: (name.endswith(".json"), name)))
+
+
+def _move(path: Path, place: Path) -> None:
+    place.parent.mkdir(parents=True, exist_ok=True)
+    path.replace(place)
 
 
 def _sync_folders(*folders: Path) -> None:
