@@ -17,7 +17,7 @@ else:
 
 
 STATED = "PALPATE_MEMORY_GB"  # in the environment: what others leave of a machine that is shared without control groups
-MACHINE, OWN = Path("/proc/meminfo"), Path("/proc/self/statm")
+MACHINE = Path("/proc/meminfo")
 Groups = tuple[tuple[str, str, str], ...]
 # Control groups, version 2 and 1, as a container sees its own: limit, use, and the line of its caches in memory.stat.
 CGROUPS: Groups = (
@@ -48,15 +48,6 @@ def peak_memory_gb() -> float | None:
         return None
     unit = 1 if sys.platform == "darwin" else 1024
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9, 3)
-
-
-def held_memory_gb() -> float | None:
-    """The memory (GB) that this process holds now; None where the system does not tell."""
-    try:
-        pages = int(OWN.read_text(encoding="ascii").split()[1])
-    except (OSError, IndexError, ValueError):
-        return None
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e9
 
 
 def total_memory(groups: Groups = CGROUPS, machine: Path = MACHINE) -> float | None:

@@ -6,13 +6,16 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from palpate.images.alignment import RigidMotion, moved
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers import write_scalar_image
+from palpate.images.registration import Registration
 from palpate.report.collect import collect
 from palpate.report.section import cut_image
 from palpate.report.slices import first_planes
-from palpate.report.volume import whole_box, whole_images
+from palpate.report.volume import grey_of, whole_box, whole_images
 
 
 @pytest.fixture
@@ -87,3 +90,16 @@ def test_images_that_lie_on_each_other_but_for_rounding_look_the_same(case_resul
         for plane in first_planes(whole_box(image)):
             shown = [cut_image(volume.values, volume.grid, plane, order=0) for volume in (first, second)]
             np.testing.assert_array_equal(*shown)
+
+
+def test_a_grey_image_lies_where_the_label_image_beside_it_was_brought_to(case_result, tmp_path):
+    """On whatever grid: a point that both show is one point afterwards."""
+    motion = RigidMotion(Rotation.from_euler("z", 5.0, degrees=True).as_matrix(), np.array([4.0, -2.0, 1.0]))
+    label = case_result.before
+    grid = VoxelGrid((9, 8, 7), label.grid.affine @ np.diag([2.0, 2.0, 3.0, 1.0]))
+    write_scalar_image(tmp_path / "grey.nii.gz", np.zeros(grid.shape), grid)
+    grey = grey_of(tmp_path / "grey.nii.gz", Registration("surfaces", motion, np.zeros(3), 0.1))
+    brought = moved(label, motion.inverse())
+    places = np.array([[0.0, 0.0, 0.0], [3.0, 1.0, 2.0]])
+    same = places * np.array([2.0, 2.0, 3.0])
+    assert grey.grid.world(places) == pytest.approx(brought.grid.world(same), abs=1e-5)

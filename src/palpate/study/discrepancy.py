@@ -108,12 +108,11 @@ def discrepancy_of(inversion: Inversion, states: Sequence[FittedState]) -> Found
             heterogeneity.append(HeterogeneityFound(block.of, learned, float(np.sqrt(patchy))))
         elif block.cause == "frame":
             smooth.setdefault(block.states[0], learned * block.unit_mm)
-    frames = list[FrameFound | None]()
-    for s, fitted in enumerate(states):
-        points = np.unique(fitted.space.facets(cut_faces(fitted.space.mesh)))
-        motion = np.linalg.norm(fitted.displacement[points], axis=1) if len(points) else np.zeros(1)
-        found = FrameFound(float(np.sqrt(np.mean(motion**2))), float(motion.max()), smooth.get(s, 0.0))
-        frames.append(found if s in smooth else None)
+    frames = list[FrameFound | None]([None] * len(states))
+    for s, prior_mm in smooth.items():
+        points = np.unique(states[s].space.facets(cut_faces(states[s].space.mesh)))
+        motion = np.linalg.norm(states[s].displacement[points], axis=1) if len(points) else np.zeros(1)
+        frames[s] = FrameFound(float(np.sqrt(np.mean(motion**2))), float(motion.max()), prior_mm)
     return FoundDiscrepancy(tuple(frames), tuple(offsets), tuple(heterogeneity))
 
 

@@ -134,6 +134,8 @@ def test_a_process_that_cannot_start_is_a_resource_error(tmp_path: Path, first: 
         {"shape": [4, 5, 6], "dtype": "|u1", "affine": [[1, 2]], "names": []},
         {"shape": [4, 5, 6], "dtype": "|u1", "affine": AFFINE.tolist(), "names": [["a"]]},
         {"shape": [4, 5, 6], "dtype": 3, "affine": AFFINE.tolist(), "names": []},
+        {"shape": [4, 5, 6], "dtype": "(f8", "affine": AFFINE.tolist(), "names": []},
+        {"shape": [4, 5, 6], "dtype": "|u1", "affine": AFFINE.tolist(), "names": [], "digests": {"": "é" * 64}},
         {"error": "SystemExit", "message": "\u001b[2J"},
         {"error": 3},
     ],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import tracemalloc
 import zlib
 from functools import partial
 from pathlib import Path
@@ -150,3 +151,15 @@ def test_a_cut_or_endless_stream_is_refused(tmp_path: Path) -> None:
             read_label_image(write(tmp_path / "a.mha", head + body))
     with pytest.raises(InputDataError, match="cannot hold"):
         read_label_image(write(tmp_path / "a.mha", header(CompressedData="True", DimSize="800 800 800") + packed))
+
+
+@pytest.mark.parametrize("pack", [zlib.compress, gzip.compress])
+def test_packed_voxels_take_no_more_memory_than_the_image(tmp_path: Path, pack) -> None:
+    image = write(tmp_path / "a.mha", header(CompressedData="True", DimSize="256 256 1024") + pack(bytes(2**26)))
+    tracemalloc.start()
+    try:
+        readers.metaimage.read_metaimage(image)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert 2**26 < peak < 1.5 * 2**26

@@ -350,3 +350,15 @@ def test_no_damaged_byte_lets_a_foreign_error_out(tmp_path: Path) -> None:
                 texts.append(str(error))
     assert len(texts) > 100
     assert all(str(path) in text for text in texts)
+
+
+def test_packed_voxels_take_no_more_memory_than_the_image(tmp_path: Path) -> None:
+    voxels = np.zeros((256, 256, 1024), dtype=np.uint8)
+    write_label_image(tmp_path / "a.nii.gz", LabelImage(voxels, VoxelGrid(voxels.shape, np.eye(4))))
+    tracemalloc.start()
+    try:
+        readers.nifti.read_nifti(tmp_path / "a.nii.gz")
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert voxels.nbytes < peak < 1.5 * voxels.nbytes

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -25,6 +26,7 @@ from palpate.images.readers.voxel_stream import MAX_VOXELS
 from palpate.parallel import environment_of_child, name_of_end
 
 MAX_ANSWER = 2**24  # bytes of the line that goes before the voxels
+DTYPE, DIGEST = re.compile(r"[<>|][iuf][1248]"), re.compile(r"[0-9a-f]{64}")
 NEVER_BEGAN = 1  # how Python ends that cannot import what it is to run; our code sends every failure
 ERRORS: Mapping[str, type[PalpateError]] = {
     error.__name__: error for error in (ConfigurationError, InputDataError, ResourceError)
@@ -106,19 +108,20 @@ def _stored(pipe: BinaryIO, path: Path) -> StoredImage | None:
     if "error" in answer:
         raise ERRORS.get(str(answer["error"]), InputDataError)(printable(str(answer.get("message", ""))))
     try:
-        shape, dtype = tuple(int(n) for n in answer["shape"]), np.dtype(answer["dtype"])
+        shape = tuple(int(n) for n in answer["shape"])
         affine = np.array(answer["affine"], dtype=np.float64)
         names = tuple(NamedLabel(int(k), str(name), None if c is None else str(c)) for k, name, c in answer["names"])
         digests = {printable(str(part)): str(digest) for part, digest in answer.get("digests", {}).items()}
         findings = tuple(Finding(known_code(code), printable(str(text))) for code, text in answer.get("findings", ()))
         placed = len(shape) == 3 and min(shape) > 0 and math.prod(shape) <= MAX_VOXELS and affine.shape == (4, 4)
-        valid = placed and dtype.kind in "iuf" and all(map(str.isalnum, digests.values()))
+        valid = placed and DTYPE.fullmatch(answer["dtype"]) and all(map(DIGEST.fullmatch, digests.values()))
     except (AttributeError, KeyError, TypeError, ValueError):
-        valid = False
+        valid = None
     if not valid:
         raise InputDataError(
             f"the process that read '{path}' gave an answer that cannot be used; export the image again"
         )
+    dtype = np.dtype(answer["dtype"])
     content = pipe.read(math.prod(shape) * dtype.itemsize)
     if len(content) < math.prod(shape) * dtype.itemsize:
         return None

@@ -48,7 +48,7 @@ def read_nifti(path: Path) -> StoredImage:
         block, slope, intercept = _block(header, path)
         affine = _affine(header, path)
         check_size(block.shape, block.skip + block.n_bytes, path, available=file.n_bytes, packed=zipped)
-        between = read_exactly(stream, block.skip - used, path)
+        between = read_exactly(stream, block.skip - used, path).tobytes()
         values = read_voxels(stream, block, path)
         digests = {"": file.sha256()}
     if (slope, intercept) != (1.0, 0.0):
@@ -60,11 +60,11 @@ def read_nifti(path: Path) -> StoredImage:
 
 def _header(stream: BinaryIO, path: Path) -> tuple[Any, int]:
     """The decoded header and its length in bytes."""
-    block = read_exactly(stream, 348, path)
+    block = read_exactly(stream, 348, path).tobytes()
     for sign in ("<", ">"):
         length = int(np.frombuffer(block[:4], dtype=f"{sign}i4")[0])
         if length in HEADERS:
-            block += read_exactly(stream, length - len(block), path)
+            block += read_exactly(stream, length - len(block), path).tobytes()
             magic = block[344:348] if length == 348 else block[4:12]
             if magic == MAGIC[length]:
                 decode = getattr(import_module("nibabel"), HEADERS[length])

@@ -22,6 +22,7 @@ MAX_VOXELS = 2**29  # 512 x 512 x 2048, a whole body at 1 mm; a distance map of 
 MAX_OFFSET = 2**26  # bytes that may stand between header and voxels
 MAX_DEFLATE_RATIO = 1032  # no deflate stream expands further (zlib's technical notes)
 SLACK = 2**20  # bytes that may follow the voxels
+CHUNK = 2**22  # bytes that are read, and unpacked, at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,10 +79,7 @@ def read_block(file: InputFile, block: VoxelBlock, path: Path) -> NDArray[Any]:
     if block.packing == "gzip":
         stream = gzip_stream(file)
     elif block.packing == "zlib":
-        inflate = zlib.decompressobj(47)  # 32 + 15: either head
-        stream = io.BytesIO(inflate.decompress(file.read(), skip + block.n_bytes + SLACK + 1))
-        if not (inflate.eof or inflate.unconsumed_tail):
-            raise EOFError("the compressed voxels end before their end mark")
+        stream = io.BufferedReader(_Inflated(file), buffer_size=CHUNK)
     while skip:
         skip -= len(read_exactly(stream, min(skip, SLACK), path))
     return read_voxels(stream, block, path)
@@ -92,7 +90,7 @@ def read_voxels(stream: BinaryIO, block: VoxelBlock, path: Path) -> NDArray[Any]
 
     Raises `InputDataError` when it ends before they do, or goes on for long after them.
     """
-    values = np.frombuffer(read_exactly(stream, block.n_bytes, path), block.dtype)
+    values = read_exactly(stream, block.n_bytes, path).view(block.dtype)
     if len(stream.read(SLACK + 1)) > SLACK:  # to its end, where gzip checks its sum
         raise InputDataError(
             f"'{path}' goes on for more than {SLACK} bytes after the {block.n_bytes} bytes of voxels that its header"
@@ -123,14 +121,50 @@ def check_size(shape: tuple[int, ...], needed: int, path: Path, *, available: in
 
 def gzip_stream(file: InputFile) -> BinaryIO:
     """What is packed in the file from where it stands; no more is unpacked than is asked for."""
-    return gzip.GzipFile(fileobj=file, mode="rb")  # type: ignore[return-value]
+    return io.BufferedReader(gzip.GzipFile(fileobj=file, mode="rb"))
 
 
-def read_exactly(stream: BinaryIO, n_bytes: int, path: Path) -> bytes:
-    """The next bytes of the stream; raises `InputDataError` when it ends before."""
-    content = stream.read(n_bytes)
-    if len(content) < n_bytes:
-        raise InputDataError(
-            f"'{path}' is cut short: {n_bytes - len(content)} of {n_bytes} bytes are missing; export or copy it again"
-        )
-    return content
+def read_exactly(stream: BinaryIO, n_bytes: int, path: Path) -> NDArray[np.uint8]:
+    """The next bytes (n_bytes,) of the stream; pages of the buffer are only taken as the data come.
+
+    Raises `InputDataError` when it ends before.
+    """
+    buffer = np.empty(n_bytes, dtype=np.uint8)
+    done = 0
+    while done < n_bytes:
+        chunk = stream.read(min(CHUNK, n_bytes - done))
+        if not chunk:
+            raise InputDataError(
+                f"'{path}' is cut short: {n_bytes - done} of {n_bytes} bytes are missing; export or copy it again"
+            )
+        buffer[done : done + len(chunk)] = np.frombuffer(chunk, dtype=np.uint8)
+        done += len(chunk)
+    return buffer
+
+
+class _Inflated(io.RawIOBase):
+    """A zlib or gzip stream, unpacked no further than is asked for."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._inflate = zlib.decompressobj(47)  # 32 + 15: either head
+
+    def readable(self) -> bool:
+        """Always: `io.BufferedReader` asks before it reads."""
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        """Fill `buffer` from its start with unpacked bytes and return their number, 0 after the stream's end mark.
+
+        Raises `EOFError` when the file ends before that mark.
+        """
+        target = memoryview(buffer).cast("B")
+        while not self._inflate.eof:
+            packed = self._inflate.unconsumed_tail or self._file.read(CHUNK)
+            content = self._inflate.decompress(packed, len(target))
+            if content:
+                target[: len(content)] = content
+                return len(content)
+            if not packed:
+                raise EOFError("the compressed voxels end before their end mark")
+        return 0
