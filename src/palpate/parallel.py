@@ -6,12 +6,8 @@ The threads are ours; BLAS's own only wait for each other, so that its limit is 
 
 from __future__ import annotations
 
-import os
-import signal
-import sys
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import TypeVar
 
 from multifrontal import blas_on_one_thread, processors
@@ -31,15 +27,3 @@ def mapped(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Re
         return [function(item) for item in items]
     with ThreadPoolExecutor(max_workers=processors()) as pool:
         return list(pool.map(function, items))
-
-
-def environment_of_child() -> dict[str, str]:
-    """The environment of a process of ours: our places to import from, and one thread."""
-    places = os.pathsep.join(str(Path(place).resolve()) for place in sys.path if place)
-    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    return {**os.environ, **threads, "PYTHONPATH": places}
-
-
-def name_of_end(code: int) -> str:
-    """The signal, or the exit code, by which a process ended."""
-    return {-int(number): number.name for number in signal.Signals}.get(code, f"exit code {code}")
