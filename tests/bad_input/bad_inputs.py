@@ -117,7 +117,7 @@ def layers(*masks: np.ndarray) -> bytes:
 
 def bomb(folder: Path) -> None:
     content = gzip.decompress((folder / "after.nii.gz").read_bytes())
-    with gzip.open(folder / "after.nii.gz", "wb", 9) as file:
+    with gzip.open(folder / "after.nii.gz", "wb", 1) as file:
         file.write(content)
         for _ in range(64):
             file.write(bytes(2**24))  # a gigabyte of zeros

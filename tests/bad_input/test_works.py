@@ -154,6 +154,7 @@ def test_a_folder_that_cannot_be_written_ends_with_6(folder, palpate):
 
 
 def test_memory_that_runs_out_ends_with_6(folder, palpate):
+    changed(folder, "edge_length_mm = 6.0", "edge_length_mm = 2.0")  # for which the mesher makes room for millions
     done = palpate("mesh", "case.toml", "--output", "out", "--quiet", cwd=folder, memory_mb=700)
     assert done["code"] == 6, done["err"]
     assert "Traceback" not in done["err"]

@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,10 @@ from palpate.mesh.anatomy import Box
 from palpate.mesh.cutting import Grid
 from palpate.mesh.tet_mesh import FACES
 
+# Mmg makes room for millions of tetrahedra, and walks through all of it again and again, which takes half a second a
+# mesh. A small one gets less, which is room for many times what it has and is to have; it comes out the same.
+SMALL_TETS = 20_000
+SMALL_MB = 256
 HOLLOW_REFERENCE = 8  # references 1 to 6 are the faces of the box, 8 any hollow tissue, the rest pairs of regions
 
 
@@ -63,6 +67,8 @@ def remeshed(grid: Grid, sizes: NDArray[np.float64], *, box: Box, sag_mm: float)
     Surfaces move by no more than about `sag_mm`. Raises `GeometryError` when Mmg gives up.
     """
     mesh = MmgMesh3D()
+    if max(len(grid.tets), _wanted_tets(grid, sizes)) < SMALL_TETS:
+        _take_less(mesh, SMALL_MB)
     triangles, references = _surfaces(grid, box)
     # where two faces of the box meet, or one meets a hollow tissue, Mmg must keep the edge sharp
     border = references <= HOLLOW_REFERENCE
@@ -93,6 +99,19 @@ def remeshed(grid: Grid, sizes: NDArray[np.float64], *, box: Box, sag_mm: float)
         ) from error
     tets, region = mesh.get_tetrahedra_with_refs()
     return compact(np.array(mesh.get_vertices()), np.array(tets, dtype=np.int64), np.array(region, dtype=np.int64) - 1)
+
+
+def _wanted_tets(grid: Grid, sizes: NDArray[np.float64]) -> float:
+    """About how many regular tetrahedra of the wanted edges fill the grid."""
+    corners = grid.nodes[grid.tets]
+    volume = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 6.0
+    return float(6.0 * np.sqrt(2.0) * np.sum(volume / sizes[grid.tets].mean(axis=1) ** 3))
+
+
+def _take_less(mesh: MmgMesh3D, memory_mb: int) -> None:
+    """Let Mmg take no more memory for a mesh that is still empty: it refuses to remesh that, but keeps the limit."""
+    with suppress(RuntimeError), interrupts_held(), _silent():
+        mesh.remesh(mem=memory_mb, verbose=-1)
 
 
 def compact(nodes: NDArray[np.float64], tets: NDArray[np.int64], region: NDArray[np.int64]) -> Grid:
