@@ -38,7 +38,7 @@ lint: style
 	$(BIN)/mypy
 
 # A file's tests stay in one process, which makes what they share once; those of tests/slow.txt begin. Each process
-# keeps the memory that it freed: Mmg takes a third of a gigabyte for every mesh, which the system would clear each time;
+# keeps the memory that it freed: Mmg takes up to a third of a gigabyte for a mesh, which the system would clear each time;
 # and has it in large pages, where the system lets a process choose, which saves a twentieth of the time.
 PYTEST = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MALLOC_MMAP_THRESHOLD_=4294967296 MALLOC_TRIM_THRESHOLD_=4294967296 \
   GLIBC_TUNABLES=glibc.malloc.hugetlb=1 $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder

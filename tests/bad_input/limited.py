@@ -19,9 +19,14 @@ import time
 import nibabel  # noqa: F401
 
 import palpate.cli
+import palpate.cli.entry
+import palpate.cli.written
 import palpate.demo
 import palpate.export.case_files
 import palpate.report.case_report
+import palpate.steps.commands
+import palpate.steps.previewing
+import palpate.steps.saving
 import palpate.study.check
 import palpate.study.new_case
 import palpate.study.run

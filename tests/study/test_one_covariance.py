@@ -54,7 +54,7 @@ def without(twins, bodies, observed):
 
 @pytest.fixture(scope="module")
 def found(twins, bodies, observed):
-    return concluded(twins, bodies, observed, layers=True, samples=2000)
+    return concluded(twins, bodies, observed, layers=True, samples=1000)
 
 
 def half_widths(intervals):
