@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from palpate.approximation.contract import Derivatives
 from palpate.errors import NotConverged
 from palpate.inversion.hyper_parameters import with_correlations, with_hyper_parameters
-from palpate.inversion.objective import AS_GOOD, Evaluation, LinearisedObjective, Objective
+from palpate.inversion.objective import Evaluation, LinearisedObjective, Objective
 from palpate.inversion.optimise import (
     BAD,
     TRIALS,
@@ -140,16 +140,13 @@ class _Step:
     def reductions(self, unknowns: NDArray[np.float64], judged: Evaluation) -> tuple[float, float]:
         """By how much J falls on a way from unknowns (n,) to where it is `judged`, and on linear residuals.
 
-        Closest points that slide over voxels are noise of J that its score, by the smooth Jacobians, does not have.
-        So a way that promises less than what tells two minima apart is judged by the scores at both of its ends,
-        -1/2 (s + s')^T d.
+        By the scores at both ends, -1/2 (s + s')^T d: closest points that slide over voxels are noise of J, as large as
+        what moduli promise, that the score, by the smooth Jacobians, does not have.
         """
-        promised, d = self.now - self.then, self.minimum.unknowns - unknowns
-        if promised < AS_GOOD:
-            ends = judged.score, self.minimum.evaluation.score
-            gain, promised = (-0.5 * float((self.begin.score + end) @ d) for end in ends)
-            return gain, promised
-        return promised - (judged.value - self.minimum.evaluation.value), promised
+        d = self.minimum.unknowns - unknowns
+        ends = judged.score, self.minimum.evaluation.score
+        gain, promised = (-0.5 * float((self.begin.score + end) @ d) for end in ends)
+        return gain, promised
 
 
 def minimised(
@@ -256,11 +253,11 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
     found = found if not damping else replace(found, evaluation=replace(linear, damping=0.0)(found.unknowns))
     longest = float(np.max(np.abs(found.unknowns - at.unknowns)[:n], initial=0.0))
     cut = damping > 0.0 or (not fixed and (longest > LINEAR_RANGE or _cut_short(found.unknowns[:n], near, bounds)))
-    if cut or not rule.learn:
+    if not rule.learn:
         ends = objective.total(at.evaluation), objective.total(found.evaluation)
         return _Step(objective, found, at.evaluation, *ends, cut)
     now, total = objective.total(at.evaluation), objective.total(found.evaluation)
-    if rule.correlate and start.correlated < SETTLES:
+    if rule.correlate and not cut and start.correlated < SETTLES:
         objective = with_correlations(objective, found.evaluation)
         plain = LinearisedObjective(objective, at.unknowns, at.evaluation)
         found = replace(found, evaluation=plain(found.unknowns))
@@ -277,7 +274,7 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
         if np.all(moved < 0.1) and change < 0.01:
             break
     begin = LinearisedObjective(objective, at.unknowns, at.evaluation)(at.unknowns)
-    return _Step(objective, found, begin, now, total, False)
+    return _Step(objective, found, begin, now, total, cut)
 
 
 def _cut_short(theta: NDArray[np.float64], near: Bounds, bounds: Bounds) -> bool:
