@@ -35,7 +35,6 @@ from palpate.progress import silent
 NOISE = 0.5  # of the objective: that of closest points that slide over voxels (Sun & Nocedal 2023, Math. Program.)
 INNER = 1e-4  # decrement of a minimum on linear residuals
 SETTLES = 6  # iterations, after which numbers of independent residuals stay, and the trust region no longer grows
-LINEAR_RANGE = 0.4  # of ln E, within which what linear residuals leave is noise
 SLOW = 0.5  # of the model's error an iteration before: where more is left all derivatives are made exact
 LEAST_SD = 0.03  # of ln E, see `_linearisation`
 
@@ -217,10 +216,8 @@ def _iteration(
         failure, trial_evaluations = None, trial_evaluations + spent
         then = step.then + judged.value - step.minimum.evaluation.value
         gain, promised = step.reductions(before.unknowns, judged)
-        ratio = (gain + NOISE) / (promised + NOISE)
-        if ratio > BAD:
-            share = gain / max(promised, 1e-9) if longest > LINEAR_RANGE or not grows else ratio
-            region = region.after(share, longest, grows=grows)
+        if (gain + NOISE) / (promised + NOISE) > BAD:
+            region = region.after(gain / max(promised, 1e-9), longest, grows=grows)
             end = there.minimum
             seen, spent = end.evaluation, before.evaluations + trial_evaluations
             arrived = Iterate(end.unknowns[:n], seen.value, seen.misfit_mm2, newton_decrement(seen))
@@ -238,9 +235,9 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
     """Unknowns and hyper-parameters with the least objective on residuals linear around a minimum so far.
 
     In turn, each of which lowers it: unknowns under given hyper-parameters, and these (see `with_hyper_parameters`).
-    Where the trust region, and no bound, ends the step, or linear residuals are not believed so far away,
-    hyper-parameters stay: what is still motion would pass for noise. So do the numbers of independent residuals once
-    they have been taken anew some times.
+    Where the step is damped hyper-parameters stay. So do the numbers of independent residuals where the trust region,
+    and no bound, ends the step, for what is still motion is alike over whole surfaces; and once they have been taken
+    anew some times.
     """
     objective, at, n = start.objective, start.minimum, start.objective.n_parameters
     trusted = [state.approximation.trust_radius for state in objective.states if state.approximation]
@@ -251,9 +248,8 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
     within = 0.05 * rule.tolerance(at, n)
     found = gauss_newton(linear, at.unknowns, bounds=near, fixed=fixed, tolerance=INNER, within=within)
     found = found if not damping else replace(found, evaluation=replace(linear, damping=0.0)(found.unknowns))
-    longest = float(np.max(np.abs(found.unknowns - at.unknowns)[:n], initial=0.0))
-    cut = damping > 0.0 or (not fixed and (longest > LINEAR_RANGE or _cut_short(found.unknowns[:n], near, bounds)))
-    if not rule.learn:
+    cut = damping > 0.0 or (not fixed and _cut_short(found.unknowns[:n], near, bounds))
+    if damping or not rule.learn:
         ends = objective.total(at.evaluation), objective.total(found.evaluation)
         return _Step(objective, found, at.evaluation, *ends, cut)
     now, total = objective.total(at.evaluation), objective.total(found.evaluation)
