@@ -32,7 +32,7 @@ from palpate.parallel import blas_on_one_thread
 from palpate.progress import Progress, during, silent
 
 REPORTED = StopRule()
-CHEAP = StopRule(step_sd=0.3, floor=0.01, model_error=np.inf, derivatives=False)
+CHEAP = StopRule(step_sd=0.3, floor=0.01)
 ELSEWHERE = replace(CHEAP, correlate=False)  # the numbers of independent residuals stay: objectives are compared
 FOLLOWED = 2  # minima of starts beside the first one, the best
 FIRST_GUESS = StopRule(step_sd=0.5, model_error=np.inf, derivatives=False)

@@ -313,7 +313,6 @@ def _evaluated(step: _Step, now: OuterIterate, rule: StopRule) -> tuple[OuterIte
         pairs = zip(objective.approximations, places, strict=True)
         objective = objective.under([approximation.update(place) for approximation, place in pairs])
         minimum, spent = replace(minimum, evaluation=objective(unknowns)), 2
-        judged = minimum.evaluation if now.exact else judged
     there = OuterIterate(objective, minimum, Convergence(wanted, left, missing), checks, now.totals, exact=matters)
     return replace(there, correlated=correlated), judged, spent
 
