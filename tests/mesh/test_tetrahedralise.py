@@ -50,6 +50,19 @@ def test_organs_that_contain_or_touch_each_other_pass_the_gate(mesh, anatomy):
     assert set(np.unique(mesh.region)) == {0, 1, 3}
 
 
+def test_a_mesh_is_the_same_in_whatever_room_mmg_takes(mesh, anatomy, monkeypatch):
+    monkeypatch.setattr("palpate.mesh.remeshing.SMALL_TETS", 0)
+    wide = tetrahedralise(anatomy, edge_length_mm=4.0)
+    assert np.array_equal(wide.nodes, mesh.nodes)
+    assert np.array_equal(wide.tets, mesh.tets)
+
+
+def test_mmg_without_room_is_an_error_that_says_what_to_do(anatomy, monkeypatch):
+    monkeypatch.setattr("palpate.mesh.remeshing.SMALL_MB", 16)
+    with pytest.raises(GeometryError, match=r"try another mesh\.edge_length_mm"):
+        tetrahedralise(anatomy, edge_length_mm=8.0)
+
+
 def test_the_wall_of_the_driver_is_known_from_the_cut_of_the_image(mesh):
     corners = mesh.nodes[mesh.boundary]
     on_box = BOX.faces_of(corners).any(axis=1)

@@ -20,7 +20,7 @@ from palpate.mesh.cutting import Grid
 from palpate.mesh.tet_mesh import FACES
 
 # Mmg makes room for millions of tetrahedra, and walks through all of it again and again, which takes half a second a
-# mesh. A small one gets less, which is room for many times what it has and is to have; it comes out the same.
+# mesh. A small one gets less (6 000 tetrahedra need a quarter of it), and comes out the same.
 SMALL_TETS = 20_000
 SMALL_MB = 256
 HOLLOW_REFERENCE = 8  # references 1 to 6 are the faces of the box, 8 any hollow tissue, the rest pairs of regions
@@ -67,8 +67,12 @@ def remeshed(grid: Grid, sizes: NDArray[np.float64], *, box: Box, sag_mm: float)
     Surfaces move by no more than about `sag_mm`. Raises `GeometryError` when Mmg gives up.
     """
     mesh = MmgMesh3D()
-    if max(len(grid.tets), _wanted_tets(grid, sizes)) < SMALL_TETS:
-        _take_less(mesh, SMALL_MB)
+    corners = grid.nodes[grid.tets]
+    volumes = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 6.0
+    wanted = 6.0 * np.sqrt(2.0) * np.sum(volumes / sizes[grid.tets].mean(axis=1) ** 3)  # regular tetrahedra
+    if max(len(grid.tets), wanted) < SMALL_TETS:
+        with suppress(RuntimeError), interrupts_held(), _silent():
+            mesh.remesh(mem=SMALL_MB, verbose=-1)  # an empty mesh, which is refused; the limit stays
     triangles, references = _surfaces(grid, box)
     # where two faces of the box meet, or one meets a hollow tissue, Mmg must keep the edge sharp
     border = references <= HOLLOW_REFERENCE
@@ -76,14 +80,15 @@ def remeshed(grid: Grid, sizes: NDArray[np.float64], *, box: Box, sag_mm: float)
     kinds = np.unique(np.column_stack([edges, np.repeat(references[border], 3)]), axis=0)
     unique, count = np.unique(kinds[:, :2], axis=0, return_counts=True)
     ridges = unique[count > 1]
-    mesh.set_mesh_size(vertices=len(grid.nodes), tetrahedra=len(grid.tets), triangles=len(triangles), edges=len(ridges))
-    mesh.set_vertices(grid.nodes)
-    mesh.set_tetrahedra(grid.tets.astype(np.int32), (grid.region + 1).astype(np.int32))
-    mesh.set_triangles(triangles.astype(np.int32), references.astype(np.int32))
-    mesh.set_edges(ridges.astype(np.int32))
-    mesh.set_ridge_edges(np.arange(len(ridges), dtype=np.int32))
-    mesh["metric"] = sizes[:, None]
+    n_nodes, n_tets = len(grid.nodes), len(grid.tets)
     try:
+        mesh.set_mesh_size(vertices=n_nodes, tetrahedra=n_tets, triangles=len(triangles), edges=len(ridges))
+        mesh.set_vertices(grid.nodes)
+        mesh.set_tetrahedra(grid.tets.astype(np.int32), (grid.region + 1).astype(np.int32))
+        mesh.set_triangles(triangles.astype(np.int32), references.astype(np.int32))
+        mesh.set_edges(ridges.astype(np.int32))
+        mesh.set_ridge_edges(np.arange(len(ridges), dtype=np.int32))
+        mesh["metric"] = sizes[:, None]
         with interrupts_held(), _silent():
             mesh.remesh(
                 hmin=0.4 * float(sizes.min()),
@@ -95,23 +100,10 @@ def remeshed(grid: Grid, sizes: NDArray[np.float64], *, box: Box, sag_mm: float)
             )
     except RuntimeError as error:
         raise GeometryError(
-            f"Mmg could not improve a mesh of {len(grid.tets)} tetrahedra ({error}); try another mesh.edge_length_mm"
+            f"Mmg could not improve a mesh of {n_tets} tetrahedra ({error}); try another mesh.edge_length_mm"
         ) from error
     tets, region = mesh.get_tetrahedra_with_refs()
     return compact(np.array(mesh.get_vertices()), np.array(tets, dtype=np.int64), np.array(region, dtype=np.int64) - 1)
-
-
-def _wanted_tets(grid: Grid, sizes: NDArray[np.float64]) -> float:
-    """About how many regular tetrahedra of the wanted edges fill the grid."""
-    corners = grid.nodes[grid.tets]
-    volume = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 6.0
-    return float(6.0 * np.sqrt(2.0) * np.sum(volume / sizes[grid.tets].mean(axis=1) ** 3))
-
-
-def _take_less(mesh: MmgMesh3D, memory_mb: int) -> None:
-    """Let Mmg take no more memory for a mesh that is still empty: it refuses to remesh that, but keeps the limit."""
-    with suppress(RuntimeError), interrupts_held(), _silent():
-        mesh.remesh(mem=memory_mb, verbose=-1)
 
 
 def compact(nodes: NDArray[np.float64], tets: NDArray[np.int64], region: NDArray[np.int64]) -> Grid:
