@@ -9,6 +9,8 @@ import pytest
 from scipy import sparse
 
 from palpate.images.tissue import Role, Tissue
+from palpate.inversion.approximation import Place
+from palpate.inversion.reduced_basis import reduced_basis
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.finite_strain import finite_strain_model
@@ -136,6 +138,20 @@ def test_a_gradient_by_all_modes_takes_one_solve_however_many_they_are(body, rng
     assert there.system.factorisation.solved - before == 1
     assert len(gradient) == 2 + body[1].n_modes + modes.n_modes
     assert np.all(gradient != 0.0)
+
+
+def test_a_reduced_basis_tells_what_its_responses_to_the_material_miss_elsewhere(body, modes, coefficients):
+    """All of them are those at the moduli where it was made, its displacement of homogeneous tissues is exact."""
+    model, (boundary, material) = linear_model(*body, material=modes), coefficients
+    moduli = MODULI * [1.4, 1.0]
+    there = Place(moduli, np.concatenate([boundary, material]))
+    homogeneous = Place(moduli, np.concatenate([boundary, 0.0 * material]))
+    first = reduced_basis(model, MODULI)
+    first = first.with_material(first.system.material_responses(model.solve(MODULI, homogeneous.coefficients).values))
+    basis = first.update(homogeneous)
+    missing = model.solve(moduli, there.coefficients).values - basis.model.solve(moduli, there.coefficients).values
+    assert basis.error(homogeneous).relative < 1e-5
+    assert np.linalg.norm(basis.error(there).missing - missing) < 0.3 * np.linalg.norm(missing)
 
 
 @pytest.mark.parametrize("dilatation", list(Dilatation))

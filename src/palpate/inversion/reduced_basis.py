@@ -122,8 +122,19 @@ class ReducedBasis:
         return SolveCounts(forward=1)
 
     def error(self, at: Place) -> ModelError:
-        """Upper bound of the displacement's relative error in energy (see `LinearSystem.error_bound`)."""
-        return ModelError(*self.system.error_bound(at.moduli, self._homogeneous(at)))
+        """Upper bound of the displacement's relative error in energy (see `LinearSystem.error_bound`).
+
+        Of its parts, too, that follow the material modes.
+        """
+        model, homogeneous = self.full_model, self._homogeneous(at)
+        material = at.coefficients[model.constraint.n_modes :, None]
+        if not np.any(material):
+            return ModelError(*self.system.error_bound(at.moduli, homogeneous))
+        forces = model.material_forces(at.moduli, homogeneous, material)
+        forces = forces + model.forces(at.moduli, self.model.output_material @ material)
+        return ModelError(
+            *self.system.error_bound(at.moduli, homogeneous, np.asarray(model.constraint.free.T @ forces))
+        )
 
     def with_material(self, responses: NDArray[np.float64]) -> ReducedBasis:
         """With the responses (n_dof, n_material) mm to the material modes at the factorised moduli."""

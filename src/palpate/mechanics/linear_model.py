@@ -291,16 +291,20 @@ class LinearSystem:
         return LinearEquilibrium(self, checked, values)
 
     def error_bound(
-        self, moduli: NDArray[np.float64], displacement: NDArray[np.float64]
+        self,
+        moduli: NDArray[np.float64],
+        displacement: NDArray[np.float64],
+        further: NDArray[np.float64] | float = 0.0,
     ) -> tuple[float, NDArray[np.float64]]:
         """Upper bound of the relative energy-norm error of an admissible displacement (n_dof,) mm at `moduli`.
 
+        further (n_free, 1) mN: what a small displacement beside it leaves unbalanced, which counts as its residual.
         With it comes what it misses (n_dof,) mm, if K(E) is like the system's own K(E0). With the residual
         r = F^T (K(E) u - f) the error is exactly |r|_{K(E)^-1}; K(E0) stands in for K(E), as
         K(E) >= min_r(E_r / E0_r) K(E0): |e|_K / |u|_K <= sqrt(r^T K(E0)^-1 r / min_r(E_r / E0_r)) / |u|_K.
         Source: Patera & Rozza, Reduced Basis Approximation (2007), section 4.2 (min-theta approach).
         """
-        residual = self.model.residual(moduli, displacement[:, None])
+        residual = self.model.residual(moduli, displacement[:, None]) + further
         missing = -self.factorisation.solve(residual, tolerance=OF_ERROR)
         energy = float(displacement @ self.model.forces(moduli, displacement[:, None])[:, 0])
         least = float(np.min(np.asarray(moduli) / self.moduli))
